@@ -414,173 +414,25 @@ def test_a_reasoning_that_argues_against_its_decision_is_refused(reasons, decisi
     assert is_taken or found.reason == "decision_against_reasoning"
 
 
-FALSE_TEMPLATES = {
-    "en": (
-        "The drone at {speed} is outpaced by the walker, who does {target_speed}.",
-        "The walker, who does {target_speed}, is outpaced by the drone at {speed}.",
-        "The walker moves at {speed}.",
-        "The drone flies at {target_speed}.",
-        "The speed of the walker is {speed}.",
-        "The altitude is {distance} and the distance is {altitude}.",
-        "The distance {trend:altitude}.",
-        "The walker is {comparison:speed} the drone.",
-        "The drone stays {comparison:speed} the walker by twice its pace.",
-        "The pedestrian strolls at {mean:target_speed}.",
-        "The distance went from {distance} to {distance@t0}.",
-        "At t0 the distance was {distance}.",
-        "The drone is {visibility} in the picture.",
-        "The walker has turned {yaw} to the {side:yaw}.",
-        "It lies {distance} {side:offset_x} of the image centre.",
-        "The walker is near the edge of the picture, {offset_x} {side:offset_x} of the centre.",
-        "The drone trails the walker by {distance}.",
-        "The gap of {distance} is the largest so far.",
-        "The distance is now {distance@t0}.",
-        "The drone outpaces the walker at {speed} against {target_speed}.",
-        "The walker at {speed} follows the drone at {target_speed}.",
-        "The target's altitude is {altitude}.",
-        "The walker flies at an altitude of {altitude}.",
-        "The drone stands on the ground at {altitude}.",
-        "The distance to the camera of the drone is {altitude}.",
-        "The gap of {distance} is now {distance@t1}.",
-        "The gap was {distance} at t1.",
-        "The speed of the drone {trend:target_speed}.",
-        "The drone is {compare:target_speed,drone_speed} the walker.",
-        "The walker is {compare:drone_speed,target_speed} the drone.",
-        "The drone is {framing}.",
-        "The drone {walking} the walker.",
-        "The drone {target_motion} at {speed}.",
-        "The walker is {drone_motion}.",
-        "The distance {trend:distance} from t4 to t0.",
-        "The distance {trend:distance@t0-t2} over the whole window.",
-        "From {distance} to {distance@t0} the distance {trend:distance}.",
-        "The altitude is {height_over_target}.",
-        "The box is {box_width} high.",
-        "The box height is {box_width}.",
-        "The box width is {box_height}.",
-        "The pedestrian turned {yaw} to the {side:yaw}.",
-        "The nose has turned {yaw} to the {side:target_heading}.",
-        "The walker bends to the {side:yaw}.",
-        "The target lies {offset_x} {side:offset_y} of the image centre.",
-        "The target lies {offset_y} {side:offset_x} of the image centre.",
-        "The drone lies {offset_x} {side:offset_x} of the image centre.",
-        "The slant range is {distance}.",
-        "The horizontal distance is {slant}.",
-        "The gap shrinks to {distance}.",
-        "The walker, at {distance} from the drone, comes closer.",
-        "The speed is {distance}.",
-        "The pitch of the drone is {yaw}.",
-        "Each second the distance changes by {change:distance}.",
-        "The distance changed by {rate:distance}.",
-        "The mean distance is {max:distance}.",
-        "The largest distance is {min:distance}.",
-        "The distance now and at t0 is {distance}.",
-        "The drone flew {travelled} in the last second.",
-        "The walker at {target_speed} and the drone at the same {target_speed}.",
-        "The drone at {speed}, as the walker.",
-        "Both move at {speed}.",
-        "The target is {visibility}, and the drone is too.",
-        "The target is not {visibility}.",
-        "The target is never {framing}.",
-        "The target is hardly {comparison:speed} the drone.",
-        "The speed of the target, {speed}, {trend:target_speed}.",
-        "The drone moves at {target_speed} to the target.",
-        "The person {trend:distance} to {distance}.",
-        "Since t2 the nose has turned {yaw} to the {side:yaw}.",
-        "Since t2 the distance {trend:distance}.",
-        "Over the observed frames the distance {trend:distance@t3-t4}.",
-        "The target is on the {side:yaw}.",
-        "The drone is on the {side:target}.",
-        "The drone turned to the {side:target_heading}.",
-        "The distance to the drone of the target grows at {target_speed}.",
-        "The drone is at a distance of {distance} and an altitude of {distance@t0}.",
-        "The walker at {target_speed} is {comparison:speed} the drone.",
-        "The drone, at {target_speed}, is near the target, at {speed}.",
-        "The target has a speed of {speed_difference}.",
-        "The drone has a speed of {speed_difference}.",
-        "The range is {altitude}.",
-        "The drone flies at {mean:target_speed}.",
-        "The target and the drone at {speed} and {target_speed}.",
-        "Of the drone and the target, the target moves at {speed}.",
-        "The speed of the target and of the drone: {speed}, {target_speed}.",
-        "The drone to the target: {compare:target_speed,drone_speed}.",
-        "The yaw angle of the target is {target_heading}.",
-        "The heading of the drone is {target_heading}.",
-        "The target's heading is {heading}.",
-        "Since t0 the altitude is {altitude}.",
-        "The altitude is {altitude} since t0.",
-        "The distance is {distance@t3} at t4.",
-        "At t0 and t4 the altitude is {altitude@t0}.",
-        "The altitude {trend:altitude} to {altitude@t0}.",
-        "The altitude {trend:altitude} from {altitude}.",
-        "The altitude {trend:altitude} from {altitude@t0} to {altitude@t2}.",
-        "The altitude {trend:altitude@t0-t2} to {altitude}.",
-    ),
-    "zh": (
-        "行人以 {speed}的速度前行。",
-        "无人机速度为 {target_speed}。",
-        "高度为 {distance}，水平距离为 {altitude}。",
-        "目标{comparison:speed}无人机。",
-        "行人比无人机快，速度为 {target_speed}。",
-        "水平距离从 {distance}到 {distance@t0}。",
-        "目标的偏航角为 {yaw}。",
-        "行人以 {speed}飞行。",
-        "目标速度为 {speed}。",
-        "目标的速度为 {speed}，无人机的速度为 {target_speed}。",
-        "无人机{compare:target_speed,drone_speed}目标。",
-        "目标{comparison:speed}无人机。",
-        "无人机{walking}行人。",
-        "无人机{framing}。",
-        "目标高度为 {altitude}。",
-        "斜距为 {distance}。",
-        "水平距离为 {slant}。",
-        "高度为 {distance}。",
-        "t0 时水平距离为 {distance}。",
-        "目前水平距离为 {distance@t0}。",
-        "机头已向{side:target_heading}转动 {yaw}。",
-        "行人已向{side:yaw}转动 {yaw}。",
-        "目标向{side:yaw}转弯。",
-        "水平距离{trend:altitude}。",
-        "水平距离从 {distance}{trend:distance}到 {distance@t0}。",
-        "水平距离从 {distance@t0}{trend:distance}到 {distance@t2}。",
-        "边界框高度为 {box_width}。",
-        "边界框宽度为 {box_height}。",
-        "目标并非{visibility}。",
-        "目标未{visibility}。",
-        "目标航向为 {heading}。",
-        "无人机航向为 {target_heading}。",
-        "行人速度{trend:speed}到 {target_speed}。",
-        "无人机的偏航角为 {target_heading}。",
-        "观测期间水平距离{trend:distance@t3-t4}。",
-        "目标比无人机的速度 {target_speed}{comparison:speed}。",
-    ),
-}
-TRUE_TEMPLATES = {
-    "en": (
-        "The drone at {speed} is {comparison:speed} the walker, who moves at {target_speed}.",
-        "The walker at {target_speed} is {compare:target_speed,drone_speed} the drone.",
-        "The horizontal distance {trend:distance} from {distance@t0} to {distance}.",
-        "The walker {walking} the drone.",
-        "The pedestrian is {framing} and {visibility}.",
-        "The distance was {distance@t0} at t0 and is now {distance}.",
-        "The nose has turned {yaw} to the {side:yaw} since t0.",
-        "The target is on the {side:target}.",
-    ),
-    "zh": (
-        "无人机以 {speed}飞行，{comparison:speed}目标。",
-        "行人{compare:target_speed,drone_speed}无人机。",
-        "水平距离从 {distance@t0}{trend:distance}到 {distance}。",
-        "行人{walking}无人机，行人{framing}。",
-    ),
-}
+def earned_texts() -> dict[str, list[str]]:
+    """Give the sentences of earned.txt by their heading: `false en`, `true zh` ..."""
+    lines = (Path(__file__).parent / "earned.txt").read_text("utf-8").splitlines()
+    found: dict[str, list[str]] = {}
+    for line in filter(None, lines[2:]):
+        if line.startswith("["):
+            texts = found[line[1:-1]] = []
+        else:
+            texts.append(line)
+    return found
 
 
 def test_a_sentence_is_proved_only_where_its_words_are_true_with_its_slots():
-    for language, texts in FALSE_TEMPLATES.items():
-        for text in texts:
+    texts = earned_texts()
+    for language in ("en", "zh"):
+        for text in texts[f"false {language}"]:
             found = read_sentence(text, language, 5, 0.5)
             assert isinstance(found, Refused) or found.state == "unread", text
-    for language, texts in TRUE_TEMPLATES.items():
-        for text in texts:
+        for text in texts[f"true {language}"]:
             found = read_sentence(text, language, 5, 0.5)
             assert isinstance(found, Sentence), (text, found)
             assert found.state == "proved", text
@@ -635,12 +487,12 @@ def writing_server(english: str, corrected: str | None = None) -> TeacherServer:
 
 
 def test_a_record_holds_the_plain_text_and_the_template(tree, tmp_path):
-    with writing_server("The gap of {distance} calls for nothing but patience.") as server:
+    with writing_server("The gap of {distance} calls for this decision.") as server:
         captions = list(read_captions(run(settings(server.url), tree, tmp_path / "out")))
     for caption in captions:
         assert caption.writing == "slots"
-        assert caption.slots["en"].reasoning_trace == "The gap of {distance} calls for nothing but patience."
-        assert re.fullmatch(r"The gap of \d+\.\d m calls for nothing but patience\.", caption.en.reasoning_trace)
+        assert caption.slots["en"].reasoning_trace == "The gap of {distance} calls for this decision."
+        assert re.fullmatch(r"The gap of \d+\.\d m calls for this decision\.", caption.en.reasoning_trace)
         number = re.search(r"\d+\.\d", caption.en.reasoning_trace)[0]
         assert f"{number} 米" in caption.zh.reasoning_trace
         assert caption.checks.sentences == {"en": ["unread", "proved"], "zh": ["unread", "unread"]}  # "ahead"
@@ -674,7 +526,7 @@ def test_a_refused_answer_is_mended_when_it_is_told_what_was_wrong(tree, tmp_pat
     ("reasons", "reason"),
     [
         ("The gap of 18.5 m calls for nothing.", "slots_number_outside"),
-        ("The gap of {gap} calls for nothing but patience.", "slots_unknown_reference"),
+        ("The gap of {gap} calls for this decision.", "slots_unknown_reference"),
         ("The walker is on the left of the road there.", "slots_pole_outside"),
         ("The decision is to ascend, given all of this.", "slots_pole_outside"),
         ("The drone should move forward, given all of this.", "decision_against_reasoning"),

@@ -14,7 +14,7 @@ from caption.teachers.statements import BEND_DEG, CENTERED_SHARE, Both, describe
 from caption.truth.facts import Facts
 from cosfly.products.actions import actions_in_use
 
-MODEL = "rules-6"  # its name in the records; counts changes of decisions and wording
+MODEL = "rules-7"  # its name in the records; counts changes of decisions and wording
 STEPS_AHEAD = 5.0  # the observed trend is taken to hold for the next 2.5 s
 DEGREES_PER_IMAGE_WIDTH = 60.0  # a typical field of view: turns a pixel offset into a bearing
 MIN_TURN_DEG, MIN_CLIMB_M, MIN_GAP_M, MIN_PACE_MPS, STILL_MPS = 3.0, 1.0, 1.0, 0.3, 0.3
@@ -154,8 +154,8 @@ def _offset(side: int, f: Facts, c: Cues) -> Both | None:
     if -side * c.offset_share < CENTERED_SHARE:
         return None
     return (
-        "The target has drifted {offset_x} to the {side:offset_x} of the image centre.",
-        "目标已偏离到画面中心{side:offset_x}侧 {offset_x}处。",
+        "The target lies {offset_x} {side:offset_x} of the image centre.",
+        "目标在画面中心{side:offset_x}侧 {offset_x}处。",
     )
 
 

@@ -56,8 +56,8 @@ def _walk(f: Facts) -> tuple[Both, ...]:
     if word_of(f, "target_motion") == "standing":
         return (
             (
-                "The target {target_motion} almost in place ({mean:target_speed}).",
-                "目标几乎原地{target_motion}（{mean:target_speed}）。",
+                "The target {target_motion} ({mean:target_speed}).",
+                "目标{target_motion}（{mean:target_speed}）。",
             ),
         )
     if f.target_turn_deg is not None and abs(f.target_turn_deg) >= BEND_DEG:

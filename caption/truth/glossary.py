@@ -48,12 +48,8 @@ class _Forms(Config):
 
 
 class _Beside(Config):
-    drone: _Pair = Field(description="names of the drone")
-    target: _Pair = Field(description="names of the person")
-    quantities: dict[str, _Pair] = Field(description="quantities -> words that speak of them")
-    now: _Pair = Field(description="words for the current frame")
-    whole: _Pair = Field(description="words for the whole window")
-    neutral: _Pair = Field(description="words that state nothing measurable")
+    quantities: dict[str, _Pair] = Field(description="quantities, or the aspect of one, -> words that speak of them")
+    kinds: dict[str, _Pair] = Field(description="kind -> its words")
 
 
 class _GlossaryFile(Config):
@@ -229,10 +225,13 @@ def written_units(language: Language) -> dict[str, Unit]:
 @cache
 def words_beside(language: Language) -> dict[str, tuple[str, frozenset[str]]]:
     """Give the words with which a sentence with slots may be proved: word -> kind, and the quantities that it speaks of."""
-    beside = _file().beside
-    kinds = [(kind, frozenset[str](), getattr(beside, kind)) for kind in ("neutral", "now", "whole", "target", "drone")]
-    kinds += [("quantity", frozenset(names.split()), pair) for names, pair in beside.quantities.items()]
-    return {word.strip(): (kind, names) for kind, names, pair in kinds for word in getattr(pair, language).split(",")}
+    beside, found = _file().beside, dict[str, tuple[str, frozenset[str]]]()
+    for names, pair in (beside.kinds | beside.quantities).items():
+        kind = names if names in beside.kinds else "aspect" if names in ("mean", "min", "max", "change") else "quantity"
+        kind = "middle" if names.startswith("middle") else kind
+        words = filter(None, map(str.strip, getattr(pair, language).split(",")))
+        found |= dict.fromkeys(words, (kind, frozenset(names.split())))
+    return found
 
 
 @in_place.kept()

@@ -1,9 +1,9 @@
 """Whether a sentence with slots is proved: its words beside them are on a closed list and fit its slots.
 
-A slot is true by construction; what a sentence says with it is not. So the drone's values must stand behind the drone
-and the person's behind the person, a quantity's name beside its own values, a comparison between its two sides in
-their order, and "now", a frame's name and "from ... to ..." beside values of these frames. A word that is not listed
-leaves the sentence unread.
+A slot is true by construction; what a sentence says with it is not. So each kind of word of the list has a rule here: the drone's values
+stand behind the drone and the person's behind the person, a value beside its name, a change or a mean beside a word that says so, what is not
+of now beside the name of its frame, a comparison between its two sides in their order, and nothing measured behind "should". A word that is
+not listed, or that does not fit, leaves the sentence unread.
 """
 
 from __future__ import annotations
@@ -14,29 +14,26 @@ from functools import cache
 from typing import NamedTuple
 
 from caption.truth.glossary import words_beside
-from caption.truth.references import TURNING, Reference
+from caption.truth.references import ANGLES, QUANTITIES, STEPS, TURNING, Reference
 from cosfly.products.captions import Language
 
-_OF_DRONE = frozenset(
-    ("speed", "altitude", "climb_rate", "yaw", "yaw_rate", "heading", "pitch", "travelled", "displacement",
-     "drone_motion")
+_PLACES = ("offset_x", "offset_y")
+_IN_PICTURE = ("visibility", "framing", "box_width", "box_height", *_PLACES)
+_MOTIONS = ("target_motion", "drone_motion", "walking")
+_STATES = ("visibility", "framing", *_MOTIONS)
+_OF_TARGET = ("target_speed", "target_heading", "target_travelled", "target_motion", "walking", *_IN_PICTURE)
+_OF_DRONE = (
+    "speed", "altitude", "climb_rate", "yaw", "yaw_rate", "heading", "pitch", "travelled", "displacement", "drone_motion",
 )  # fmt: skip
-_OF_TARGET = frozenset(
-    (
-        "target_speed", "target_heading", "target_travelled", "target_motion", "visibility", "framing", "walking",
-        "box_width", "box_height", "offset_x", "offset_y",
-    )
-)  # fmt: skip
-_STATES = ("visibility", "target_motion", "drone_motion", "framing", "walking")
-_SINCE_START = frozenset(("yaw", "travelled", "displacement", "target_travelled"))  # counted from the first frame
+_NAMELESS = ("speed", "target_speed", *_STATES, *_IN_PICTURE)  # their unit tells what they are
+_SINCE_START = ("yaw", "travelled", "displacement", "target_travelled")  # counted from the first frame
 _BREAK = re.compile(r"[,;:.!?()，；：。！？（）、—]|\b(?:and|but|while)\b|并且|且|而")
-_LINKS = ("of", "for", "by", "的")
-_AXES = {"heading": "yaw"}
 _SIDED = {"comparison": ("drone", "target"), "compared": ("target", "drone")}
+_OTHER = {"drone": "target", "target": "drone"}
 
 
 class Token(NamedTuple):
-    """A word or a slot of a sentence. kind: as in the glossary, or slot | frame | from | link. clause: its number."""
+    """A word or a slot of a sentence. kind: as in the glossary, or slot | frame. clause: its number. frame: t0 is 0."""
 
     kind: str
     clause: int
@@ -59,7 +56,9 @@ def is_earned(beside: str, references: Sequence[Reference | None], num_frames: i
         beside: its text, a mark in the place of each slot. references: of the slots, in order; None: the decision.
     """
     tokens = _read(beside, references, language)
-    return tokens is not None and bool(references) and all(_fits(tokens, i, num_frames) for i in range(len(tokens)))
+    if tokens is None or not references:
+        return False
+    return all(_Word(tokens, i, num_frames - 1).fits() for i in range(len(tokens)))
 
 
 def _read(beside: str, references: Sequence[Reference | None], language: Language) -> list[Token] | None:
@@ -81,126 +80,224 @@ def _read(beside: str, references: Sequence[Reference | None], language: Languag
         elif match["word"]:
             word = match["word"].lower()
             kind, names = listed.get(word) or listed[word.removesuffix("'s")]
-            tokens.append(
-                Token("link" if word in _LINKS else "from" if word in ("from", "从") else kind, clause, names)
-            )
+            tokens.append(Token(kind, clause, names))
     return tokens
 
 
-def _fits(tokens: Sequence[Token], i: int, num_frames: int) -> bool:
-    token = tokens[i]
-    own = [one for one in tokens if one.clause == token.clause]
-    slots = [one.reference for one in own if one.kind == "slot" and one.reference is not None]
-    if token.kind == "slot":
-        if token.reference is None:
-            return True
-        return (
-            _has_owner(tokens, i)
-            and _has_name(tokens, i)
-            and _has_side_of(tokens, i)
-            and _is_end(tokens, i, num_frames)
-        )
-    if token.kind == "quantity":
-        return any(reference.quantity in token.names for reference in slots)
-    if token.kind == "now":
-        values = [one.reference for one in (*tokens[i:], *reversed(tokens[:i])) if one.reference is not None]
-        return not values or _frame(values[0], num_frames) == num_frames - 1
-    if token.kind == "frame":
-        return any(
-            _frame(reference, num_frames) == token.frame or _first(reference) == token.frame for reference in slots
-        )
-    if token.kind == "whole":
-        return all(
-            _first(reference) == 0
-            for reference in slots
-            if reference.aspect not in ("", "comparison") or reference.quantity in _SINCE_START
-        )
-    if token.kind == "from":
-        after = [
-            one.reference
-            for one in tokens[i:]
-            if one.kind == "slot" and one.reference is not None and not one.reference.aspect
+class _Word:
+    """A token among the others, and whether it fits them."""
+
+    def __init__(self, tokens: Sequence[Token], i: int, now: int) -> None:
+        self.token, self.earlier, self.later, self.now = tokens[i], tokens[:i], tokens[i + 1 :], now
+        self.before = [one for one in self.earlier if one.clause == self.token.clause]
+        self.after = [one for one in self.later if one.clause == self.token.clause]
+        self.beside = [*self.before, *self.after]
+        self.references = [
+            one.reference for one in (*self.before, self.token, *self.after) if one.reference is not None
         ]
-        frames = [_frame(reference, num_frames) for reference in after if reference.quantity == after[0].quantity]
-        named = [one.frame for one in own if one.kind == "frame"]
-        return frames == sorted(frames) and named == sorted(named)
-    return True
+        self.last = next((one for one in reversed(self.before) if one.kind not in ("neutral", "approx")), Token("", 0))
+        self.next = next((one for one in self.after if one.kind not in ("neutral", "approx")), Token("", 0))
+        self.spoken_of = self.references or [one.reference for one in self.later if one.reference is not None][:1]
+
+    def fits(self) -> bool:
+        """Ask the rule of its kind; a kind without one states nothing."""
+        rule = getattr(self, f"_{self.token.kind}", None)
+        return rule is None or rule()
+
+    def _slot(self) -> bool:
+        reference = self.token.reference
+        if reference is None:
+            return True
+        if any(one.kind == "plan" or (one.kind == "slot" and one.reference is None) for one in self.before):
+            return False  # what should be was not measured
+        rules = (self._has_owner, self._has_name, self._has_date, self._has_aspect, self._has_side)
+        return all(rule(reference) for rule in rules)
+
+    # --- words ------------------------------------------------------------------------------------------------------
+
+    def _quantity(self) -> bool:
+        return any(reference.quantity in self.token.names for reference in self.references)
+
+    def _middle(self) -> bool:
+        """Tell whether the image centre is that from which something is measured, not where it is."""
+        is_followed = self.next.reference is not None and self.next.reference.quantity in _PLACES
+        is_off = not set(_PLACES).isdisjoint(self.last.names | self.next.names)
+        return self._quantity() and (is_followed or is_off or self.last.kind in ("of", "from"))
+
+    def _aspect(self) -> bool:
+        return any(reference.aspect in self.token.names for reference in self.references)
+
+    def _away(self) -> bool:
+        return self.last.reference is not None and self.last.reference.quantity == "distance"
+
+    def _approx(self) -> bool:
+        return self.next.reference is not None and self.next.reference.quantity in QUANTITIES
+
+    def _sight(self) -> bool:
+        """Tell whether sight is a purpose, or a slot says it."""
+        is_purpose = any(one.kind == "plan" for one in self.before)
+        return is_purpose or any(reference.quantity in _IN_PICTURE for reference in self.references)
+
+    def _pursuit(self) -> bool:
+        return [one.kind for one in self.before if one.kind in _OTHER][-1:] != ["target"]
+
+    def _motion(self) -> bool:
+        """Tell whether nothing says where a motion goes but a turn."""
+        return self._is_turn() or not any(reference.aspect == "side" for reference in self.references)
+
+    def _to(self) -> bool:
+        """Tell whether it leads to a value, or is of a distance to somebody; "turned to the walker" is neither."""
+        return self.next.kind not in _OTHER or any(
+            "distance" in one.names or "slant" in one.names for one in self.before
+        )
+
+    def _from(self) -> bool:
+        """Tell whether the earliest value of a quantity follows, the others in their order; or a distance to somebody."""
+        if self.next.kind in _OTHER:
+            last = self.last.reference
+            return self.last.kind == "away" or (last is not None and last.quantity in ("distance", "walking"))
+        if self.next.reference is not None and not self.next.reference.aspect:
+            name = self.next.reference.quantity
+            before, after = (
+                [
+                    self._end(one.reference)
+                    for one in part
+                    if one.reference is not None and one.reference[:2] == (name, "")
+                ]
+                for part in (self.before, self.after)
+            )
+            if after != sorted(after) or any(frame <= after[0] for frame in before):
+                return False
+        frames = [one.frame for one in self.beside if one.kind == "frame"]
+        return frames == sorted(frames)
+
+    def _now(self) -> bool:
+        tokens = (*self.after, *reversed(self.before), *self.later, *reversed(self.earlier))
+        nearest = [one.reference for one in tokens if one.reference is not None][:1]
+        return all(self._end(one) == self.now and one.aspect not in ("mean", "min", "max") for one in nearest)
+
+    def _moment(self) -> bool:
+        return self._now() and all(_start(reference) is None for reference in self.spoken_of)
+
+    def _frame(self) -> bool:
+        """Tell whether a value of this frame stands beside, or behind "from" and "since" one that is counted from it."""
+        if self.last.kind in ("from", "since"):
+            return any(_start(reference) == self.token.frame for reference in self.spoken_of)
+        is_end = self.last.kind == "to"
+        return any(
+            self._end(reference) == self.token.frame and (is_end or reference.aspect in ("", "side", *_SIDED))
+            for reference in self.spoken_of
+        )
+
+    def _whole(self) -> bool:
+        """Tell whether something is counted from the first frame on, and no state is of one frame."""
+        starts = [_start(reference) for reference in self.spoken_of]
+        is_counted = any(start is not None for start in starts) and all(start in (0, None) for start in starts)
+        return is_counted and not any(reference.quantity in _STATES for reference in self.spoken_of)
+
+    # --- whether a slot stands with its own -------------------------------------------------------------------------
+
+    def _end(self, reference: Reference) -> int:
+        last = reference.first if reference.last is None else reference.last
+        return self.now if last is None else last
+
+    def _is_turn(self) -> bool:
+        return any("turned" in one.names for one in self.beside)
+
+    def _has_owner(self, reference: Reference) -> bool:
+        """Tell whether it stands behind its owner: last in its clause, else, where its name is anybody's, in the sentence."""
+        names = [one.names for one in self.beside if one.kind == "quantity" and reference.quantity in one.names]
+        is_anybodys = not names or any(
+            not name.isdisjoint(_OF_DRONE) and not name.isdisjoint(_OF_TARGET) for name in names
+        )
+        owners, behind = ([one.kind for one in part if one.kind in _OTHER] for part in (self.before, self.after))
+        earlier = [one.kind for one in self.earlier if one.kind in _OTHER]
+        if reference.aspect in _SIDED:
+            subject, other = _SIDED[reference.aspect]
+            owners = owners or (earlier if len(set(earlier)) < 2 else [])
+            return owners[-1:] == [subject] and behind[:1] in ([], [other])
+        is_turned = reference.aspect == "side" and reference.quantity in TURNING
+        if (is_turned or reference.quantity in _PLACES) and behind:  # "left of the drone"
+            return False
+        wanted = "drone" if reference.quantity in _OF_DRONE else "target" if reference.quantity in _OF_TARGET else ""
+        if not wanted:
+            return True
+        wrong = _OTHER[wanted]
+        if reference.quantity == "walking":
+            return behind[:1] == ["drone"] and owners[-1:] != [wrong]
+        if self.next.kind in ("of", wrong) and behind[:1] == [wrong]:  # "{speed} of the walker"
+            return False
+        if not owners and is_anybodys:
+            owners = earlier or [one.kind for one in self.later if one.kind in _OTHER][:1]
+            if not owners and names and wanted == "target":
+                return False  # "the speed" is the drone's
+        return owners[-1:] != [wrong]
+
+    def _has_name(self, reference: Reference) -> bool:
+        """Tell whether the name nearest to a value, before it in its clause or else after it, is its own."""
+        if reference.aspect in _SIDED or reference.quantity in _STATES:
+            return True
+        named = ("quantity", "away", "middle")
+        before, after, earlier = (
+            [one.names for one in part if one.kind in named] for part in (self.before, self.after, self.earlier)
+        )
+        if reference.aspect == "trend":  # a verb: its subject stands before it
+            return bool(earlier) and reference.quantity in (before or earlier)[-1]
+        if before or after:
+            return any(reference.quantity in names for names in ((before or after[:1])[-1], *after[:1]))
+        is_at = self.last.kind == "at" and reference.quantity in ("altitude", "distance")
+        is_from = self.next.kind == "from" and reference.quantity == "distance"
+        is_named = is_at or is_from or reference.quantity in _NAMELESS or reference.aspect == "side"
+        return is_named or (bool(earlier) and reference.quantity in earlier[-1])
+
+    def _has_date(self, reference: Reference) -> bool:
+        """Tell whether the frames of a value stand in its sentence where they are not the current one or the whole window."""
+        frames = {one.frame for one in (*self.earlier, *self.later) if one.kind == "frame"}
+        end, start = self._end(reference), _start(reference)
+        is_dated = end in (self.now, *frames) or (self.last.kind == "from" and not reference.aspect)
+        return is_dated and (start in (None, 0, *frames))
+
+    def _has_aspect(self, reference: Reference) -> bool:
+        """Tell whether a word says what a number is of its quantity; and beside a trend, where that ends or begins."""
+        aspect, end, start = reference.aspect, self._end(reference), _start(reference)
+        trends = [one for one in self.references if one[:2] == (reference.quantity, "trend")]
+        is_change = self.last.kind == "by" or (
+            self.last.reference is not None and self.last.reference.aspect == "trend"
+        )
+        if aspect in ("mean", "min", "max"):
+            is_named = any(one.kind == "aspect" and aspect in one.names for one in self.beside)
+            return is_named or (aspect, reference.quantity) == ("mean", "target_speed")
+        if aspect in ("change", "growth"):
+            is_same = all((_start(one), self._end(one)) == (start, end) for one in trends)
+            return is_same and (is_change or self.last.kind == "aspect" or self._is_turn())
+        if aspect or reference.quantity not in QUANTITIES:
+            return True
+        if (is_change and reference.quantity not in _SINCE_START) or (reference.quantity in ANGLES and self._is_turn()):
+            return False
+        is_start = [one.kind for one in self.before if one.kind in ("from", "slot")][-1:] == ["from"]
+        first = 1 if reference.quantity in STEPS else 0
+        return all(end in (_start(one), _start(one) or first) if is_start else end == self._end(one) for one in trends)
+
+    def _has_side(self, reference: Reference) -> bool:
+        """Tell whether a side is no way of a motion, of a turn that is named, and that of the value before it."""
+        if reference.aspect != "side":
+            return True
+        own = [one.names for one in self.beside if one.kind == "quantity" and reference.quantity in one.names]
+        is_going = any(one.quantity in _MOTIONS for one in self.references)
+        if (reference.quantity in TURNING and not own) or (is_going and not self._is_turn()):
+            return False
+        values = [
+            one.reference for one in self.before if one.reference is not None and one.reference.quantity not in _STATES
+        ]
+        if not values or values[-1].aspect not in ("", "change"):
+            return True
+        value, axis = ("yaw" if one.quantity == "heading" else one.quantity for one in (values[-1], reference))
+        return value == axis or (self.last.reference is not values[-1] and value not in (*TURNING, *_PLACES))
 
 
-def _frame(reference: Reference, num_frames: int) -> int:
-    last = reference.first if reference.last is None else reference.last
-    return num_frames - 1 if last is None else last
-
-
-def _first(reference: Reference) -> int | None:
+def _start(reference: Reference) -> int | None:
     """Give the frame from which a value is counted, None where it is of one frame alone."""
-    if reference.aspect in ("", "comparison") and reference.quantity not in _SINCE_START:
+    is_of_frame = reference.aspect in ("", *_SIDED) and reference.quantity not in _SINCE_START
+    if is_of_frame or (reference.aspect == "side" and reference.quantity not in TURNING):
         return None
     return 0 if reference.first is None or not reference.aspect else reference.first
-
-
-def _has_owner(tokens: Sequence[Token], i: int) -> bool:
-    """Tell whether a value stands behind its owner: last in its clause, or before where that names no quantity."""
-    reference, clause = tokens[i].reference, tokens[i].clause
-    assert reference is not None
-    before, after = tokens[:i], [one for one in tokens[i + 1 :] if one.clause == clause]
-    inside = [one for one in before if one.clause == clause]
-    owners = [one.kind for one in inside if one.kind in ("drone", "target")]
-    if not owners and not any(one.kind == "quantity" for one in inside):
-        owners = [one.kind for one in before if one.kind in ("drone", "target")]
-        if reference.aspect in _SIDED and len(set(owners)) > 1:
-            return False
-    behind = [one.kind for one in after if one.kind in ("drone", "target")]
-    if reference.aspect in _SIDED:
-        subject, other = _SIDED[reference.aspect]
-        return owners[-1:] == [subject] and behind[:1] in ([], [other])
-    wanted = "drone" if reference.quantity in _OF_DRONE else "target" if reference.quantity in _OF_TARGET else ""
-    wrong = {"drone": "target", "target": "drone"}.get(wanted, "")
-    linked = [one.kind for one in after[:2] if one.kind != "link"] if after and after[0].kind in ("link", wrong) else []
-    is_sided = reference.quantity == "walking"  # towards, away from, across the view of: the drone is its object
-    return not wrong or (owners[-1:] != [wrong] and (is_sided or linked[:1] != [wrong]))
-
-
-def _has_name(tokens: Sequence[Token], i: int) -> bool:
-    """Tell whether the name of a quantity nearest to a value, before it in its clause or else after it, is its own."""
-    reference, clause = tokens[i].reference, tokens[i].clause
-    assert reference is not None
-    if reference.aspect in _SIDED or reference.quantity in _STATES:
-        return True
-    before = [one for one in tokens[:i] if one.clause == clause and one.kind == "quantity"]
-    after = [one for one in tokens[i + 1 :] if one.clause == clause and one.kind == "quantity"]
-    if reference.aspect == "trend":  # a verb: its subject stands before it
-        before = before or [one for one in tokens[:i] if one.kind == "quantity"]
-        return bool(before) and reference.quantity in before[-1].names
-    named = before[-1:] or after[:1]
-    return (
-        not named or reference.quantity in named[0].names or any(reference.quantity in one.names for one in after[:1])
-    )
-
-
-def _values(tokens: Sequence[Token], i: int) -> list[Reference]:
-    """Give the values of the clause of a token, before it."""
-    return [one.reference for one in tokens[:i] if one.clause == tokens[i].clause and one.reference is not None]
-
-
-def _has_side_of(tokens: Sequence[Token], i: int) -> bool:
-    """Tell whether a side behind a value is the value's own."""
-    reference, before = tokens[i].reference, _values(tokens, i)
-    assert reference is not None
-    if reference.aspect != "side" or not before or before[-1].aspect not in ("", "change"):
-        return True
-    axes = {_AXES.get(one.quantity, one.quantity) for one in (reference, before[-1])}
-    return len(axes) == 1 or before[-1].quantity not in (*TURNING, "offset_x", "offset_y")
-
-
-def _is_end(tokens: Sequence[Token], i: int, num_frames: int) -> bool:
-    """Tell whether a value beside the trend of its quantity is where that ends, or behind "from" where it begins."""
-    token = tokens[i]
-    assert token.reference is not None
-    own = [one.reference for one in tokens if one.clause == token.clause and one.reference is not None]
-    trends = [one for one in own if one.aspect == "trend" and one.quantity == token.reference.quantity]
-    if token.reference.aspect or not trends:
-        return True
-    kinds = [one.kind for one in tokens[:i] if one.clause == token.clause and one.kind in ("from", "slot")]
-    end = _first(trends[0]) if kinds[-1:] == ["from"] else _frame(trends[0], num_frames)
-    return _frame(token.reference, num_frames) == end
