@@ -1,6 +1,6 @@
 """cosfly: from a 3D map to a data set that teaches a model to follow a person from the air.
 
-As a library: `load_map`, `plan`, `render_frames` and `read_captions` (docs/library.md), which load what they need when they are used.
+As a library: `load_map`, `plan`, `render_frames` and `read_captions` (docs/library.md), which load what they need.
 """
 
 import importlib

@@ -1,6 +1,6 @@
 """Foreign text on its way to people: escaped and cut here for terminal and Markdown; for HTML in `cosfly/look/page.py`.
 
-Names of folders, contents of files and words of servers may hold escape sequences of a terminal, tags, table bars, or 200 MB.
+Names of folders, contents of files and words of servers may hold escape sequences, tags, table bars, or 200 MB.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Any
 LONGEST = 2_000  # characters of one foreign text that a person is shown; the middle of a longer one is left out
 LONGEST_LOG = 20_000  # of one log record, which may be the traceback of a bug
 
-# What a terminal obeys instead of printing (C0, DEL, C1), and what turns the order of letters round (bidirectional controls).
-# Line feed and tab are harmless; whoever wants one line splits and joins before.
+# What a terminal obeys instead of printing (C0, DEL, C1), and what turns the order of letters round (bidirectional
+# controls). Line feed and tab are harmless; whoever wants one line splits and joins before.
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _MARKDOWN = re.compile(r"([\\`*\[\]|~#]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9]))")  # within a word, _ means itself
 
@@ -32,7 +32,7 @@ def for_terminal(text: str, longest: int = LONGEST) -> str:
 
 
 def for_markdown(text: str) -> str:
-    """Give text that Markdown shows as it is, on one line, also in a cell of a table: no tag, link, emphasis or bar works."""
+    """Give text that Markdown shows as it is, on one line, also in a table: no tag, link, emphasis or bar works."""
     line = " ".join(for_terminal(text).split())
     return _MARKDOWN.sub(r"\\\1", html.escape(line, quote=False))
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-DT_S = 0.5  # the paper's time step (2 Hz); `pedestrians.dt_s` sets another, and flights, frames and windows take it from the walks
+DT_S = 0.5  # the paper's time step (2 Hz); `pedestrians.dt_s` sets another, and all take it from the walks
 
 # Maps OpenCV camera coordinates to body coordinates: forward = z, left = -x, up = -y.
 BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -112,7 +112,7 @@ def box_corners(center: np.ndarray, half_extents: np.ndarray, yaw_rad: float = 0
 
 
 def mask_box(mask: np.ndarray) -> np.ndarray:
-    """Give the box round the pixels of a mask (h, w) bool: (4,) xmin, ymin, xmax, ymax px, edges at pixel borders; NaN where it has none."""
+    """Give the box round a mask (h, w) bool: (4,) xmin, ymin, xmax, ymax px, at pixel borders; NaN without pixels."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return np.full(4, np.nan)
@@ -142,7 +142,7 @@ def mirror_rotations(rotations_deg: np.ndarray) -> np.ndarray:
     return np.asarray(rotations_deg, dtype=np.float64) * np.array([1.0, -1.0, 1.0])
 
 
-# --- time ---------------------------------------------------------------------------------------------------------------
+# --- time -------------------------------------------------------------------------------------------------------------
 
 
 def step_s(time_s: np.ndarray) -> float:
@@ -156,7 +156,7 @@ def headings_of(positions_m: np.ndarray, time_s: np.ndarray) -> np.ndarray:
     Args:
         positions_m: (n, 2 or more), n >= 2; time_s: (n,), increasing.
     Returns:
-        By central differences. Who is slower than STANDS_MPS keeps the last direction, at the start the first one to come; who never moves faces east.
+        Central differences. Below STANDS_MPS the last direction stays, at first the one to come; else east.
     """
     velocity = np.gradient(positions_m[:, :2], time_s, axis=0)
     moves = np.linalg.norm(velocity, axis=1) > STANDS_MPS

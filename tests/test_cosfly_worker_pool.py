@@ -16,9 +16,9 @@ from toy_workers import make_broken_worker, make_counting_worker, make_talking_w
 from cosfly.errors import EnvironmentMissing
 from cosfly.work.journal import Journal
 from cosfly.work.runner import Item, Watch, run_items
-from cosfly.work.stage_events import EVENTS, PROBES_OF_ONE_PACE, EventLog, HowFar, progress_of, read_events
+from cosfly.work.stage_events import EVENTS, LOSSES, PROBES_OF_ONE_PACE, EventLog, HowFar, progress_of, read_events
 from cosfly.work.stage_folder import Failed
-from cosfly.work.worker_pool import WORDS, limit_s
+from cosfly.work.worker_pool import limit_s
 
 QUICK = Watch(item_limit_s=2.0, heartbeat_s=0.1, check_s=0.4, probe_s=0.3, failed_checks=5)  # stands still after 2 s
 
@@ -39,7 +39,7 @@ def test_workers_that_die_and_stall_once_cost_nothing_but_time(tmp_path, workers
     kinds = ["once-stop", "once-die", "once-sleep"][: len(lost)] + ["nothing"] * 2
     finished = work_on(tmp_path, kinds, workers)
     assert [record.id for record in finished.kept] == [f"i{k}" for k in range(len(kinds))]
-    found = {event.item: event.event for event in read_events(tmp_path / "s") if event.event in WORDS}
+    found = {event.item: event.event for event in read_events(tmp_path / "s") if event.event in LOSSES}
     assert found == found | lost
     assert not list((tmp_path / "s").glob(".*.partial"))
     assert all((tmp_path / "s" / record.id / "frame").read_text() == record.id for record in finished.kept)

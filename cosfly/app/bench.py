@@ -1,4 +1,4 @@
-"""`cosfly bench`: a stage of a finished run again, with several counts of worker processes; its figures come from its events."""
+"""`cosfly bench`: a stage of a finished run again, with several counts of workers; figures come from its events."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import logging
 import os
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from pydantic import BaseModel
@@ -20,7 +19,6 @@ from cosfly.errors import ConfigError, ResumeError
 from cosfly.work.stage_events import EVENTS, LOSSES, Event, read_events
 from cosfly.work.stage_folder import Manifest, read_manifest
 from cosfly.work.store import write_bytes, write_model
-from cosfly.work.worker_pool import WORDS
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +26,7 @@ SCHEMA, VERSION = "cosfly.bench", "1.1"
 STAGES = ("pedestrians", "plan", "render", "inspect", "caption", "release")  # those that do items
 
 
-class Row(BaseModel):
+class Measurement(BaseModel):
     """Figures of one run of the stage.
 
     attempted: frames of render, or items of another stage, that were done, and those that were lost with a worker.
@@ -49,7 +47,7 @@ class Row(BaseModel):
 
 
 class StageRow(BaseModel):
-    """What the watchdog saw of one stage of the run that was measured. launches: worker processes; modes: how workers were lost."""
+    """What the watchdog saw of a stage of the run. launches: worker processes; modes: how workers were lost."""
 
     stage: str
     launches: int
@@ -63,12 +61,12 @@ class Bench(BaseModel):
 
     stage: str
     cores: int
-    rows: list[Row]
+    rows: list[Measurement]
     stages: list[StageRow] = []
 
 
 def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterable[int]) -> Bench:
-    """Reads a run up to `stage`; writes `bench.json`, `bench.md` and the events of each run. The stage's products are removed again.
+    """Reads a run up to `stage`; writes `bench.json`, `bench.md` and the events of each run; products go again.
 
     Raises:
         ConfigError: the stage has no items, or a server does them. ResumeError: `out` holds something.
@@ -97,7 +95,7 @@ def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterab
     return bench
 
 
-def _measured(cfg: RunConfig, run_folder: Path, folder: Path, stage: str, workers: int) -> Row:
+def _measured(cfg: RunConfig, run_folder: Path, folder: Path, stage: str, workers: int) -> Measurement:
     """Run the stage once; gives its figures."""
     log.info("bench: %s with %d worker%s", stage, workers, "s" if workers > 1 else "")
     cfg = cfg.model_copy(update={"workers": workers})
@@ -108,20 +106,20 @@ def _measured(cfg: RunConfig, run_folder: Path, folder: Path, stage: str, worker
     return row
 
 
-def row_of(events: list[Event], manifest: Manifest, workers: int, *, counts_frames: bool) -> Row:
+def row_of(events: list[Event], manifest: Manifest, workers: int, *, counts_frames: bool) -> Measurement:
     """Give the figures of one run from what its events and its manifest say."""
     done = [event for event in events if event.event == "item_done"]
-    lost = [event for event in events if event.event in WORDS]
+    lost = [event for event in events if event.event in LOSSES]
     probes = [event for event in events if event.event == "probe"]
     size = (lambda event: event.steps or 0) if counts_frames else (lambda event: 1)
-    return Row(
+    return Measurement(
         workers=workers,
         seconds=manifest.seconds,
         attempted=sum(map(size, [*done, *lost])),
         successful=sum(size(event) for event in done if event.status == "kept"),
         cores_used=round(float(np.mean([probe.cores_used or 0.0 for probe in probes] or [0.0])), 2),
         peak_memory_mib=max((sum((probe.rss_mib or {}).values()) for probe in probes), default=0.0),
-        restarts=_num(events, "restarted"),
+        restarts=sum(event.event == "restarted" for event in events),
         failed=manifest.counts.failed.total(),
     )
 
@@ -133,51 +131,37 @@ def stage_rows(run_folder: Path, names: Iterable[str]) -> list[StageRow]:
         folder = run_folder / name
         if (folder / "manifest.json").is_file():
             events = read_events(folder)
-            rows.append(StageRow(
-                stage=name, launches=_num(events, "worker_started", "restarted"), restarts=_num(events, "restarted"),
-                seconds=read_manifest(folder).seconds, modes=dict(Counter(event.event for event in events if event.event in LOSSES)),
-            ))  # fmt: skip
+            counts = Counter(event.event for event in events)
+            restarts, seconds = counts["restarted"], read_manifest(folder).seconds
+            counted = {"launches": counts["worker_started"] + restarts, "restarts": restarts, "seconds": seconds}
+            rows.append(StageRow(stage=name, modes={k: n for k, n in counts.items() if k in LOSSES}, **counted))
     return rows
 
 
-def _num(events: list[Event], *kinds: str) -> int:
-    return sum(event.event in kinds for event in events)
+def tables(bench: Bench) -> dict[str, list[tuple[str, ...]]]:
+    """Give how the stage scales (tab:render_scaling), and the stages of the run (tab:watchdog_reliability).
 
-
-class TextTable(NamedTuple):
-    """A table of words; the first column is a name."""
-
-    title: str
-    head: tuple[str, ...]
-    rows: Sequence[tuple[str, ...]]
-
-
-def tables(bench: Bench) -> list[TextTable]:
-    """Give how the stage scales (tab:render_scaling), and the stages of the run (tab:watchdog_reliability)."""
+    A table's first row is its head, the first column is a name.
+    """
     unit, first = "frames" if bench.stage == "render" else "items", bench.rows[0].per_s
-    scaling = [
-        (str(row.workers), f"{row.seconds:.1f}", str(row.attempted), str(row.successful), f"{row.per_s:.2f}", f"{row.per_s / first:.2f}x",
-         f"{row.cores_used:.2f}", f"{row.peak_memory_mib:.0f}", str(row.restarts), str(row.failed))
-        for row in bench.rows
-    ]  # fmt: skip
-    stages = [
-        (row.stage, str(row.launches), str(row.restarts), f"{row.seconds:.1f}",
-         ", ".join(f"{WORDS[mode]} ({count})" for mode, count in row.modes.items()) or "none")  # type: ignore[index]
-        for row in bench.stages
-    ]  # fmt: skip
-    head = (
-        "workers", "wall s", "attempted", "successful", f"{unit}/s", "speed-up", "cores", "MiB", "restarts", "failed",
-    )  # fmt: skip
-    return [
-        TextTable(f"{bench.stage} on {bench.cores} cores", head, scaling),
-        TextTable("stages of the run", ("stage", "launches", "restarts", "wall s", "lost workers"), stages),
+    scaling: list[tuple[str, ...]] = [
+        ("workers", "wall s", "attempted", "successful", f"{unit}/s", "speed-up", "cores", "MiB", "restarts", "failed")
     ]
+    for row in bench.rows:
+        rates = f"{row.per_s:.2f}", f"{row.per_s / first:.2f}x", f"{row.cores_used:.2f}", f"{row.peak_memory_mib:.0f}"
+        counts = str(row.attempted), str(row.successful)
+        scaling.append((str(row.workers), f"{row.seconds:.1f}", *counts, *rates, str(row.restarts), str(row.failed)))
+    stages: list[tuple[str, ...]] = [("stage", "launches", "restarts", "wall s", "lost workers")]
+    for one in bench.stages:
+        lost = ", ".join(f"{LOSSES[mode]} ({count})" for mode, count in one.modes.items()) or "none"
+        stages.append((one.stage, str(one.launches), str(one.restarts), f"{one.seconds:.1f}", lost))
+    return {f"{bench.stage} on {bench.cores} cores": scaling, "stages of the run": stages}
 
 
 def markdown(bench: Bench) -> str:
     """Give the tables as Markdown."""
     parts = []
-    for title, head, rows in tables(bench):
+    for title, (head, *rows) in tables(bench).items():
         lines = [head, ("---",) * len(head), *rows]
         parts.append(f"**{title}**\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines))
     return "\n".join(parts)

@@ -1,6 +1,6 @@
-"""What a run will take, before and while it runs: time, disk and tokens by stage, from its settings and the figures of runs that are finished.
+"""What a run will take: time, disk and tokens by stage, from its settings and the figures of finished runs.
 
-A figure is never better than its basis, which is told with it: runs that stand beside the run, or else the quickstart on the machine of docs/first-runs.md.
+A figure's basis is told with it: runs that stand beside the run, or else the quickstart of docs/first-runs.md.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from cosfly.work.config import load
 from cosfly.work.stage_folder import Failed, StageFolder, flattened
 
 UNITS = {
-    "maps": "map", "simplify": "map", "pedestrians": "walks", "plan": "walks", "render": "frames", "inspect": "frames", "caption": "windows", "release": "frames",
+    "maps": "map", "simplify": "map", "pedestrians": "walks", "plan": "walks", "render": "frames", "inspect": "frames",
+    "caption": "windows", "release": "frames",
 }  # fmt: skip
 BY_PIXELS = ("render", "inspect", "release")  # what costs as much as its pictures have pixels
 MOST_RUNS = 3  # looked at, the newest
@@ -32,7 +33,7 @@ UNKNOWN_TOKENS = "not known before asking: cosfly caption --plan"
 
 @dataclass(frozen=True)
 class Rate:
-    """What one unit of a stage costs; of BY_PIXELS one of a million pixels. seconds: of the whole stage on its workers."""
+    """What one unit of a stage costs; of BY_PIXELS one of a million pixels. seconds: of the stage on its workers."""
 
     seconds: float
     bytes: float
@@ -52,13 +53,14 @@ def _rate(seconds: float, size_mb: float, units: float) -> Rate:
     return Rate(seconds / units, size_mb * 1e6 / units, "the quickstart on a 2-core machine (docs/first-runs.md)")
 
 
-# Of `cosfly run quickstart`: seconds of docs/first-runs.md (2 cores, AMD EPYC, idle), sizes of `du` today: 3 walks, 858 frames of 0.9216 Mpx,
-# 804 windows. Ends of a walk are 50 to 100 m apart; at 1.2 m/s and two frames a second 143 frames are 1.14 times the straight way.
+# Of `cosfly run quickstart`: seconds of docs/first-runs.md (2 cores, AMD EPYC, idle), sizes of `du` today: 3 walks, 858
+# frames of 0.9216 Mpx, 804 windows. Ends of a walk are 50 to 100 m apart; at 1.2 m/s and two frames a second 143 frames
+# are 1.14 times the straight way.
 SHIPPED = Rates(
     {
-        "maps": _rate(0.2, 1.1, 1), "simplify": _rate(5.6, 1.2, 1), "pedestrians": _rate(4.6, 0.3, 3), "plan": _rate(2.3, 0.4, 3),
-        "render": _rate(51.2, 4383, 858 * 0.9216), "inspect": _rate(8.3, 0.7, 858 * 0.9216), "caption": _rate(4.0, 7.4, 804),
-        "release": _rate(7.8, 1842, 858 * 0.9216),
+        "maps": _rate(0.2, 1.1, 1), "simplify": _rate(5.6, 1.2, 1), "pedestrians": _rate(4.6, 0.3, 3),
+        "plan": _rate(2.3, 0.4, 3), "render": _rate(51.2, 4383, 858 * 0.9216), "inspect": _rate(8.3, 0.7, 858 * 0.9216),
+        "caption": _rate(4.0, 7.4, 804), "release": _rate(7.8, 1842, 858 * 0.9216),
     },
     1.14,
     {"rules": (0.0, 0.0)},
@@ -202,7 +204,7 @@ def other_settings(cfg: RunConfig, out: Path) -> list[str]:
 
 
 def estimate(cfg: RunConfig, out: Path, rates: Rates) -> list[StageEstimate]:
-    """Estimate each stage of a run, of several towns each town's under its name; a stage that is finished costs nothing more.
+    """Estimate each stage of a run, of several towns each town's under its name; a finished stage costs nothing.
 
     Raises:
         CosflyError: what stands in `out` cannot be read.

@@ -1,6 +1,7 @@
-"""cosfly as a library: the stages as functions over values in memory, with the settings and the results of the commands.
+"""cosfly as a library: stages as functions over values in memory, with the settings and results of commands.
 
-`import cosfly` brings these names and loads nothing until one is used. Positions are world metres, x east, y north, z up; angles are degrees.
+`import cosfly` loads nothing until a name is used. Positions are world metres, x east, y north, z up; angles are
+degrees.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ def load_map(path: str | Path | None = None, *, source: str | None = None, seed:
     """Load or invent a map.
 
     Args:
-        path: `boxes_3d.json`, `step2_simplified.json`, a table or GeoJSON of boxes, or with `source` its file; None invents a town.
+        path: `boxes_3d.json`, `step2_simplified.json`, a table or GeoJSON of boxes, or a source's file; None invents a
+            town.
         source: `synthetic`, `simworld`, `cityjson` or `boxes`; None goes by the file.
         settings: of the source, as in `maps.<source>` of a configuration: `load_map(size_m=400)`.
     Raises:
@@ -73,7 +75,7 @@ def plan(
         walk: settings of the walk, as in `pedestrians` of a configuration.
         settings: as in `plan` of a configuration: `plan(box_map, planner="muco", altitude_max_m=30)`.
     Raises:
-        ConfigError: an unknown setting. InputError: the way is none. NoPathError: there is no way, or no flight that is free of collisions.
+        ConfigError: an unknown setting. InputError: the way is none. NoPathError: there is no way, or no flight.
     """
     from cosfly.planners.reacquire import screens_of
     from cosfly.space.kernels import obstacle_index
@@ -124,7 +126,7 @@ def render_frames(
     Returns:
         n frames: rgb (h, w, 3) uint8, depth (h, w) float32 z-depth in m, kinds and instance ids (h, w).
     Raises:
-        ConfigError: an unknown setting. InputError: shapes that do not belong together. EnvironmentMissing: there is no OpenGL.
+        ConfigError: an unknown setting. InputError: shapes that do not belong together. EnvironmentMissing: no OpenGL.
     """
     positions = _places(position_m, "position_m")
     targets = None if target_m is None else _places(target_m, "target_m", len(positions))

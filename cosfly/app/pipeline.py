@@ -60,7 +60,7 @@ class StageResult:
 
 
 def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path | None = None) -> list[Stage]:
-    """Give the stages of a run in order; each works in the folder of its name, in `into` if its products are not the run's."""
+    """Give the stages of a run in order; each works in the folder of its name, of the run or of `into`."""
     seed, working = cfg.seed, manner_of_work(cfg)
     boxes, simplified = out / "maps/boxes_3d.json", out / "simplify/step2_simplified.json"
     walks, traces, tree = out / "pedestrians/path.json", out / "plan/drone_trace.json", out / "render"
@@ -94,11 +94,11 @@ def _release(cfg: RunConfig, sources: list[Source], out: Path, resume: Resume) -
 
 
 def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageResult]:
-    """Make a data set: reads what the configuration names, writes one folder per stage below `out`; of several towns one run
-    folder for each, and `release`.
+    """Make a data set: reads what the configuration names, writes one folder per stage below `out`; of several towns
+    one run folder for each, and `release`.
 
-    Every stage is complete or resumable at any moment; running again continues. Ends with `contact_sheet.png`, `preview.gif`
-    and `summary.json` in the run folder, in that of each town where there are several.
+    Every stage is complete or resumable at any moment; running again continues. Ends with `contact_sheet.png`,
+    `preview.gif` and `summary.json` in the run folder, in that of each town where there are several.
     """
     use_limits(cfg.reading)
     check_out(out)
@@ -123,7 +123,7 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageR
 
 @contextlib.contextmanager
 def _run_folder(cfg: RunConfig, out: Path) -> Iterator[None]:
-    """Hold a run folder, and keep `run.yaml` in it: other settings replace it when every stage has taken them, not before."""
+    """Hold a run folder, and keep `run.yaml` in it, which other settings replace when every stage has taken them."""
     stood = (out / "run.yaml").exists()
     with hold_folder(out, nothing=() if stood else ("run.yaml",)):
         is_new = not (out / "run.yaml").exists()
@@ -139,7 +139,7 @@ def _run_folder(cfg: RunConfig, out: Path) -> Iterator[None]:
 
 
 def check(cfg: RunConfig) -> dict[str, RunConfig]:
-    """Check what the last stage would ask for, before the first; gives the settings of each town, none of a run without towns.
+    """Check what the last stage would ask for, before the first; gives the settings of each town, if there are any.
 
     Raises:
         ConfigError: nobody says under which licence the release goes out, or it asks for pictures that are not drawn.
@@ -149,24 +149,21 @@ def check(cfg: RunConfig) -> dict[str, RunConfig]:
     choose_licence(cfg.release.licence, maps)
     for one in towns.values() or [cfg]:
         if missing := sorted(set(cfg.release.modalities) - set(one.render.modalities)):
-            raise ConfigError(
-                "the release asks for pictures that nobody draws", where="render.modalities", got=f"no {', no '.join(missing)}",
-                fix=f"draw them, or --set 'release.modalities=[{', '.join(one.render.modalities)}]'",
-            )  # fmt: skip
+            what, got = "the release asks for pictures that nobody draws", f"no {', no '.join(missing)}"
+            fix = f"draw them, or --set 'release.modalities=[{', '.join(one.render.modalities)}]'"
+            raise ConfigError(what, where="render.modalities", got=got, fix=fix)
     return towns
 
 
 def check_out(out: Path) -> None:
-    """Refuse to make a run in the folder of a stage: its tree would hold a second one, and what is read of it would be of both.
+    """Refuse to make a run in the folder of a stage: its tree would hold a second one.
 
     Raises:
         ResumeError: there is a stage's record.
     """
     if (out / "stage.json").exists() and not (out / "run.yaml").exists():
-        raise ResumeError(
-            "the folder of a stage, not of a run", where=out, got="stage.json in it",
-            fix="choose another --out; a run goes on with its own folder, in which those of its stages stand",
-        )  # fmt: skip
+        fix = "choose another --out; a run goes on with its own folder, in which those of its stages stand"
+        raise ResumeError("the folder of a stage, not of a run", where=out, got="stage.json in it", fix=fix)
 
 
 def check_with_files(cfg: RunConfig) -> None:
@@ -206,7 +203,8 @@ class _TimeLeft:
         self._begun: set[str] = set()  # in this call: run.yaml has the settings of before until all stages are done
 
     def told(self, place: str, folder: Path) -> str:
-        """Say of a stage what it will take, and all that is not done: `[5/8] render: about 1 min; about 3 min with all that follows`."""
+        """Say what a stage will take, and all that is not done: `[5/8] render: about 1 min; with all that follows about
+        3 min`."""
         try:
             rows = estimate.estimate(self._cfg, self._out, self._rates)
         except CosflyError as error:  # the stage itself will say so, and what to do
@@ -216,7 +214,8 @@ class _TimeLeft:
         rows = [row for row in rows if row.name not in self._begun]
         self._begun.add(name)
         own = [row for row in rows if row.name == name]
-        return f"[{place}] {folder.name}: about {estimate.time_left(own)}; with all that follows about {estimate.time_left(rows)}"
+        own_time, all_time = estimate.time_left(own), estimate.time_left(rows)
+        return f"[{place}] {folder.name}: about {own_time}; with all that follows about {all_time}"
 
 
 def _run_town(cfg: RunConfig, out: Path, todo: list[Stage], left: _TimeLeft) -> list[StageResult]:
@@ -274,13 +273,8 @@ def _save_summary(results: list[StageResult], out: Path) -> None:
     path = out / SUMMARY
     before = _summary(path).get("peak_memory_mb", 0)
     if not isinstance(before, int | float):
-        raise InputError(
-            "not a summary",
-            where=f"{path}: peak_memory_mb",
-            got=repr(before)[:80],
-            expected="a number",
-            fix="remove it",
-        )
+        where = f"{path}: peak_memory_mb"
+        raise InputError("not a summary", where=where, got=repr(before)[:80], expected="a number", fix="remove it")
     unit = 1024 * 1024 if sys.platform == "darwin" else 1024
     peak_mb = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / unit
     write_json(path, {"stages": _rows(results), "peak_memory_mb": round(max(before, peak_mb), 1)})

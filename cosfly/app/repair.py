@@ -1,4 +1,4 @@
-"""`--repair`: what cannot be used in the journals of a folder is set aside, counted, and done again by whoever comes next."""
+"""`--repair`: what cannot be used in the journals of a folder is set aside, counted, and done again by the next run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ JOURNALS: dict[str, Callable[[dict], object]] = {
 
 
 def repair(folder: Path) -> int:
-    """Set aside what is broken in the journals of a stage folder, or of all stages of a run folder; gives the number of lines.
+    """Set aside what is broken in the journals of a stage folder, or of all stages of a run; gives the number of lines.
 
     A finished stage of which something is set aside is open again. Links are left alone.
 
@@ -52,7 +52,7 @@ def _repair_stage(stage: Path, out: Path) -> int:
 
 
 def _set_aside(path: Path, read: Callable[[dict], object], manifest: Path) -> int:
-    """Set aside what is broken. What follows from it is done before and with it: after a kill in between nobody would see it any more."""
+    """Set aside what is broken. What follows from it is done before: after a kill in between nobody would see it."""
     journal = Journal(path)
     num_lines = sum(not _is_usable(record, read) for record in journal.read()) + journal.num_damaged
     if num_lines:

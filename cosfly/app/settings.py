@@ -56,8 +56,9 @@ class RunConfig(Config):
     item_limit_s: float | None = Field(
         None,
         ge=0,
-        description="seconds that an item may take without getting on (a flight: without a new frame), then its worker is ended and the "
-        "item tried again, twice; null for 600 or 20 times what items take, whichever is more; 0 for no limit",
+        description="seconds that an item may take without getting on (a flight: without a new frame), then its worker "
+        "is ended and the item tried again, twice; null for 600 or 20 times what items take, whichever is more; "
+        "0 for no limit",
     )
     max_failed: int = Field(
         0, ge=0, description="failed items that are accepted; more make the command exit 1, at its end"
@@ -70,8 +71,9 @@ class RunConfig(Config):
     )
     towns: dict[str, dict[str, Any]] = Field(
         {},
-        description="towns of one data set: name -> the settings that differ there; each is a run in a folder of its name, and one "
-        "release is made of all. `maps` of a town stands for itself. None: one town, as the settings below say",
+        description="towns of one data set: name -> the settings that differ there; each is a run in a folder of its "
+        "name, and one release is made of all. `maps` of a town stands for itself. None: one town, as the settings "
+        "below say",
     )
     maps: MapsConfig = Field(default_factory=MapsConfig, description="step 1, where the boxes come from")
     simplify: SimplifyConfig = Field(default_factory=SimplifyConfig, description="step 2")
@@ -101,7 +103,7 @@ class RunConfig(Config):
         return self
 
     def of_town(self, name: str) -> RunConfig:
-        """Give the settings of one town's run. Its seed derives from the run's and its name, its map is called as it is.
+        """Give the settings of one town's run. Its seed derives from the run's and its name; its map has its name.
 
         Raises:
             ConfigError: what is set for it cannot be; names the town and the setting.
@@ -112,9 +114,8 @@ class RunConfig(Config):
         maps = {"source": "synthetic"} | _mapping(changes.get("maps", {}), f"towns.{name}.maps")
         source = str(maps["source"])
         maps[source] = {"name": name} | _mapping(maps.get(source, {}), f"towns.{name}.maps.{source}")
-        shared = self.model_dump(mode="json", exclude={"towns", "maps"}) | {
-            "name": name, "seed": int(rng_for(self.seed, "run", name).integers(2**31)),
-        }  # fmt: skip
+        seed = int(rng_for(self.seed, "run", name).integers(2**31))
+        shared = self.model_dump(mode="json", exclude={"towns", "maps"}) | {"name": name, "seed": seed}
         others = {setting: value for setting, value in changes.items() if setting != "maps"}
         return build(RunConfig, _merged(self, shared, others) | {"maps": maps}, f"towns.{name}")
 
@@ -126,7 +127,7 @@ def _mapping(value: Any, where: str) -> dict[str, Any]:
 
 
 def _merged(group: Config, settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """Give the settings of a group with the changes in them, group by group; a mapping that is one value, as shares are, is replaced."""
+    """Give a group's settings with the changes in them; a mapping that is one value, as shares are, is replaced."""
     merged = dict(settings)
     for name, value in changes.items():
         within = getattr(group, name, None)

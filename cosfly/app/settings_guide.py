@@ -1,4 +1,4 @@
-"""The settings explained: each with its value, what it may be and what it means, for a terminal and as a page."""
+"""The settings explained: each with its value, what it may be and what it means."""
 
 from __future__ import annotations
 
@@ -9,17 +9,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from cosfly.errors import ConfigError, nearest
-from cosfly.escaping import for_markdown
 from cosfly.work.store import dump_json
-
-PAGE_HEAD = """# Settings
-
-Every setting of `cosfly run` and of the single commands, with its default. Generated: `cosfly config show --describe --markdown > all-settings.md`.
-`--set plan.altitude_max_m=40` changes one for a command; a file holds them by section, as `cosfly config show` prints them, and needs no more than
-`cosfly config show FILE --changed` does: what is not the default. `cosfly config show --find altitude` finds settings by a word of theirs. `cosfly config schema`
-gives the JSON schema, with which an editor completes and checks such a file: `cosfly config schema > schema.json`, and in many
-editors `# yaml-language-server: $schema=schema.json` as the file's first line.
-"""
 
 
 @dataclass(frozen=True)
@@ -110,7 +100,10 @@ _BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusive
 
 
 def _kind_of(field: Mapping[str, Any], models: Mapping[str, Any]) -> str:
-    """Say what a setting may be: `number > 0`, `one of a, b`, `list of texts`."""
+    """Say what a setting may be: `number > 0`, `one of a, b`, `list of texts`, `text, as a, b`."""
+    if "examples" in field:
+        names = {name: value for name, value in field.items() if name != "examples"}
+        return f"{_kind_of(names, models)}, as {', '.join(map(str, field['examples']))}"
     if "$ref" in field:
         return _kind_of(models[field["$ref"].rpartition("/")[2]], models)
     if "anyOf" in field:
@@ -158,23 +151,3 @@ def as_lines(settings: list[Setting]) -> Iterator[str]:
         else:
             yield f"  {setting.name} = {dump_json(setting.value)}"
             yield f"      {setting.meaning} [{setting.kind}]"
-
-
-def as_page(settings: list[Setting]) -> str:
-    """Write all settings as Markdown: a table a group."""
-    parts = [PAGE_HEAD, *_table("## The run", [s for s in settings if "." not in s.name and not s.is_group])]
-    for group in settings:
-        if group.is_group:
-            within = [s for s in settings if s.name.rpartition(".")[0] == group.name and not s.is_group]
-            heading = f"{'#' * (2 + group.name.count('.'))} {group.name}"
-            meaning = group.meaning[:1].upper() + group.meaning[1:]
-            parts += _table(f"{heading}\n\n{meaning}.", within) if within else [f"{heading}\n\n{meaning}.\n"]
-    return "\n".join(parts)
-
-
-def _table(heading: str, settings: list[Setting]) -> list[str]:
-    rows = [
-        f"| `{s.name.rpartition('.')[2]}` | `{dump_json(s.value)}` | {for_markdown(s.kind)} | {for_markdown(s.meaning)} |"
-        for s in settings
-    ]
-    return [f"{heading}\n", "| setting | default | may be | meaning |", "|---|---|---|---|", *rows, ""]

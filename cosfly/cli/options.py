@@ -105,11 +105,9 @@ class Job:
         """Raise InputError, after everything was done, where more items failed than the settings accept."""
         failed = {stage: dict(counts.failed) for stage, counts in counts_by_stage.items() if counts.failed}
         if sum(sum(reasons.values()) for reasons in failed.values()) > self.cfg.max_failed:
-            raise InputError(
-                "some items failed; the others are done", where=where, got=str(failed),
-                expected=f"at most {self.cfg.max_failed} (max_failed)",
-                fix="mend what the records name and run the same command again: only the failed ones are done again",
-            )  # fmt: skip
+            what, expected = "some items failed; the others are done", f"at most {self.cfg.max_failed} (max_failed)"
+            fix = "mend what the records name and run the same command again: only the failed ones are done again"
+            raise InputError(what, where=where, got=str(failed), expected=expected, fix=fix)
 
 
 def takes(*names: str, flights: str | None = None) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -219,10 +217,9 @@ def data_folder(data: list[Path] | None) -> Path:
     """The playback tree: given, or that of the run folder one stands in; InputError where there is not one."""
     trees = data_folders(data)
     if len(trees) > 1:
-        raise InputError(
-            "this command takes one playback tree", where="--data", got=f"{len(trees)}: {', '.join(map(str, trees))}",
-            fix="run it once for each tree; distill and release take the results of several together",
-        )  # fmt: skip
+        what, got = "this command takes one playback tree", f"{len(trees)}: {', '.join(map(str, trees))}"
+        fix = "run it once for each tree; distill and release take the results of several together"
+        raise InputError(what, where="--data", got=got, fix=fix)
     return trees[0]
 
 

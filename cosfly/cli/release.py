@@ -283,9 +283,8 @@ def release_push(
     if yes:
         typer.echo(push.push(parcel, repo, private=not public))
     else:
-        typer.echo(
-            f"dry run: nothing was sent; with --yes it goes to {repo}, {'public' if public else 'private'} if it is made"
-        )
+        seen = "public" if public else "private"
+        typer.echo(f"dry run: nothing was sent; with --yes it goes to {repo}, {seen} if it is made")
 
 
 export_app = typer.Typer(no_args_is_help=True, help="Write parts of a data set for tools of others.")

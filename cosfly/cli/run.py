@@ -186,7 +186,7 @@ def bench(
     if min(counts) < 1:
         raise typer.BadParameter("whole numbers from 1 up, with commas between them", param_hint="'--workers'")
     measured = benchmark.run(job.cfg, config, out, stage, counts)
-    for title, head, rows in benchmark.tables(measured):  # eighty columns hold the widest
+    for title, (head, *rows) in benchmark.tables(measured).items():  # eighty columns hold the widest
         options.tell_table(console, head, rows, title=title, box=SIMPLE_HEAD, padding=0, show_edge=False)
     typer.echo(out)
 
@@ -213,7 +213,6 @@ def config_show(
     section: Annotated[str | None, Argument(help="Only this section or setting, for instance plan.muco.")] = None,
     overrides: Annotated[list[str] | None, Option("--set", "-s", metavar="A.B=C", help="Override one setting.")] = None,
     describe: Annotated[bool, Option("--describe", help="Say what each setting means and may be.")] = False,
-    markdown: Annotated[bool, Option("--markdown", help="With --describe: as a page.")] = False,
     changed: Annotated[bool, Option("--changed", help="Only what is not the default.")] = False,
     find: Annotated[
         list[str] | None,
@@ -232,9 +231,7 @@ def config_show(
     explained = (settings_guide.changed if changed else settings_guide.explain)(cfg, section)
     if find:
         explained = settings_guide.with_words(explained, find)
-    if markdown:
-        typer.echo(settings_guide.as_page(explained), nl=False)
-    elif describe or find:
+    if describe or find:
         for line in settings_guide.as_lines(explained):
             answer_console.print(line)
     else:

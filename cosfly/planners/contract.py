@@ -186,6 +186,7 @@ class PlanConfig(Config):
     styles: dict[str, float] = Field(
         {FOLLOW: 1.0},
         description="shares of the styles that flights are drawn from, by name; they need not add up to one",
+        examples=[*NAMES],
     )
     segment_s: float = Field(
         0.0, ge=0, description="length of the parts of a flight that draw a style each, about, s; 0: one style a flight"

@@ -1,7 +1,9 @@
-"""The closed set of decisions, `actions.yaml`: tokens, their names in both languages, and the rules by which a motion shows them.
+"""The closed set of decisions, `actions.yaml`: tokens, names in both languages, and the rules by which a motion shows
+them.
 
-One set ships, the paper's; another file of the same form may stand in its place (`caption.actions`), and what was made with it says so:
-`actions.json` beside captions, the records of training sets, evaluations and releases. How rules are measured lives in caption/truth/actions.py.
+One set ships, the paper's; another file of the same form may stand in its place (`caption.actions`), and what was made
+with it says so: `actions.json` beside captions, the records of training sets, evaluations and releases. How rules are
+measured lives in caption/truth/actions.py.
 """
 
 from __future__ import annotations
@@ -29,22 +31,23 @@ MOST_ACTIONS, MOST_TOKEN_CHARACTERS = 100, 40
 _TOKEN = re.compile(r"[a-z]+(?:_[a-z]+)*")
 RESERVED = ("none",)  # tables call so what is not there
 
-# What of a motion is measured: see Motion in caption/truth/actions.py. ordered: 1 where the mission orders the action itself.
+# What of a motion is measured: see Motion in caption/truth/actions.py. ordered: 1 where the mission orders the action.
 MEASURES = (
-    "yaw_deg", "altitude_m", "mean_speed_mps", "speed_change_mps", "forward_gain_mps", "forward_m", "left_m", "approach_m", "closing_m",
-    "sweep_deg", "target_path_m", "visible_now", "visible_share", "ordered",
+    "yaw_deg", "altitude_m", "mean_speed_mps", "speed_change_mps", "forward_gain_mps", "forward_m", "left_m",
+    "approach_m", "closing_m", "sweep_deg", "target_path_m", "visible_now", "visible_share", "ordered",
 )  # fmt: skip
 # In front of a threshold that is a setting of `caption.label` (caption/schema.py); its settings are:
 SETTING = "label."
 THRESHOLDS = (
-    "yaw_deg", "hard_turn_deg", "altitude_m", "speed_change_mps", "hover_mps", "moving_mps", "forward_m", "lateral_m", "approach_m",
-    "circle_deg",
+    "yaw_deg", "hard_turn_deg", "altitude_m", "speed_change_mps", "hover_mps", "moving_mps", "forward_m", "lateral_m",
+    "approach_m", "circle_deg",
 )  # fmt: skip
 
 T = TypeVar("T")
 
 _TERM = re.compile(
-    r"(?P<sign>-?)\s*(?:(?P<factor>\d+(?:\.\d+)?)\s*\*\s*)?(?:\|(?P<size>[a-z_]+)\||(?P<name>[a-z_]+(?:\.[a-z_]+)?)|(?P<number>\d+(?:\.\d+)?))"
+    r"(?P<sign>-?)\s*(?:(?P<factor>\d+(?:\.\d+)?)\s*\*\s*)?"
+    r"(?:\|(?P<size>[a-z_]+)\||(?P<name>[a-z_]+(?:\.[a-z_]+)?)|(?P<number>\d+(?:\.\d+)?))"
 )
 _CONDITION = re.compile(r"(?P<left>[^<>=]+?)\s*(?P<how><=|>=|<|>)\s*(?P<right>[^<>=]+)")
 
@@ -74,13 +77,11 @@ class Term:
         self.factor = (-1.0 if found["sign"] else 1.0) * float(found["factor"] or found["number"] or 1.0)
         self.setting = self.name[len(SETTING) :] if self.name and self.name.startswith(SETTING) else None
         if self.setting is not None and self.setting not in THRESHOLDS:
-            raise ValueError(
-                f"there is no threshold {self.name!r}{nearest(self.setting, THRESHOLDS)}; there are {', '.join(THRESHOLDS)}, or a number"
-            )
+            near = nearest(self.setting, THRESHOLDS)
+            raise ValueError(f"no threshold {self.name!r}{near}; there are {', '.join(THRESHOLDS)}, or a number")
         if self.name is not None and self.setting is None and self.name not in MEASURES:
-            raise ValueError(
-                f"{self.name!r} is not measured{nearest(self.name, MEASURES)}; there are {', '.join(MEASURES)}"
-            )
+            near = nearest(self.name, MEASURES)
+            raise ValueError(f"{self.name!r} is not measured{near}; there are {', '.join(MEASURES)}")
 
 
 class Condition:
@@ -107,8 +108,8 @@ class Size:
 
 
 class Rule(Config):
-    """How much of an action a motion has, in units of its own threshold: the least of its sizes that can be measured, and nothing where a
-    condition fails. Without sizes 1 where the conditions hold, else -1."""
+    """How much of an action a motion has, in units of its own threshold: the least of its sizes that can be measured,
+    and nothing where a condition fails. Without sizes 1 where the conditions hold, else -1."""
 
     size: tuple[str, ...] = Field(
         (), max_length=8, description="terms in units of a threshold; the least of them counts"
@@ -168,8 +169,7 @@ class Action(Config):
         None, description="of `shown`: less contradicts the decision; null takes caption.label.absent_share"
     )
     reads_like: str | None = Field(
-        None,
-        description="an action that ships, whose words in texts (climbing, braking ...) speak of this one too; null: none",
+        None, description="an action that ships, whose words in texts (climbing, braking ...) speak of this one too"
     )
 
     @property
@@ -193,8 +193,9 @@ class ActionSet(Config):
 
     @model_validator(mode="after")
     def _is_one_set(self) -> Self:
+        form = f"words of small letters joined by _, at most {MOST_TOKEN_CHARACTERS}, and not {', '.join(RESERVED)}"
         problems = [
-            f"{token!r} is no token: words of small letters joined by _, at most {MOST_TOKEN_CHARACTERS}, and not {', '.join(RESERVED)}"
+            f"{token!r} is no token: {form}"
             for token in self.actions
             if not _TOKEN.fullmatch(token) or len(token) > MOST_TOKEN_CHARACTERS or token in RESERVED
         ]
@@ -218,10 +219,11 @@ class ActionSet(Config):
             for token in self.actions
             if self.actions[token].implied and token not in listed
         ]
+        kin = {token: action.reads_like for token, action in self.actions.items() if action.reads_like is not None}
         problems += [
-            f"{token} reads like {action.reads_like!r}, which does not ship{nearest(action.reads_like, shipped_actions().tokens)}"
-            for token, action in self.actions.items()
-            if action.reads_like is not None and action.reads_like not in shipped_actions().tokens
+            f"{token} reads like {like!r}, which does not ship{nearest(like, shipped_actions().tokens)}"
+            for token, like in kin.items()
+            if like not in shipped_actions().tokens
         ]
         if problems:
             raise ValueError("; ".join(problems))
@@ -283,7 +285,7 @@ def export_actions(path: Path) -> None:
     write_bytes(path, read_bytes(ACTIONS_FILE))
 
 
-# --- beside what was made with it ---------------------------------------------------------------------------------------
+# --- beside what was made with it -------------------------------------------------------------------------------------
 
 
 def write_own_actions(folder: Path) -> list[Path]:
@@ -309,10 +311,9 @@ def actions_beside(captions: Path) -> ActionSet | None:
 
 def not_in_set(token: object, where: object) -> InputError:
     """Give the error of a decision that is none of the set in use."""
-    return InputError(
-        "not an action of the closed set", where=str(where), got=str(token), expected=f"one of {', '.join(action_tokens())}",
-        fix=f"captions of a set of their own have {OWN_ACTIONS} beside them: keep both together",
-    )  # fmt: skip
+    what, expected = "not an action of the closed set", f"one of {', '.join(action_tokens())}"
+    fix = f"captions of a set of their own have {OWN_ACTIONS} beside them: keep both together"
+    return InputError(what, where=str(where), got=str(token), expected=expected, fix=fix)
 
 
 def one_set(sets: Iterable[tuple[object, ActionSet | None]]) -> ActionSet | None:
@@ -325,9 +326,7 @@ def one_set(sets: Iterable[tuple[object, ActionSet | None]]) -> ActionSet | None
     for whose, one in found[1:]:
         if one != found[0][1]:
             differ = sorted(set((one or shipped_actions()).tokens) ^ set((found[0][1] or shipped_actions()).tokens))
-            raise InputError(
-                "these were captioned with different sets of actions", where=str(whose),
-                got=f"another one than {found[0][0]}" + (f": {', '.join(differ)}" if differ else ", of the same tokens"),
-                expected="one set in all of them", fix="caption them with one file (caption.actions), or use them apart",
-            )  # fmt: skip
+            got = f"another one than {found[0][0]}" + (f": {', '.join(differ)}" if differ else ", of the same tokens")
+            what, fix = "different sets of actions", "caption them with one file (caption.actions), or use them apart"
+            raise InputError(what, where=str(whose), got=got, expected="one set in all of them", fix=fix)
     return found[0][1] if found else None

@@ -1,4 +1,4 @@
-"""What the answer of a teacher or a student must look like: its JSON schema, and reading what somebody wrote (phase 3 of sec:appendix_e)."""
+"""What the answer of a teacher or a student must look like: its JSON schema, and how it is read (sec:appendix_e)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from cosfly.work import in_place
 
 _DECISION = re.compile(
     r"""[\s"'`*_<\[({“”‘’「『【《]*(?:[0-9]{1,2}[.)]\s*)?"""
-    r"""(?:(?:option|action|decision|answer|(?:flight|final)[\s_-]?(?:decision|action|answer)|动作|决策|飞行决策)["'`*]*\s*[:=]\s*["'`*]*)?"""
+    r"""(?:(?:option|action|decision|answer|(?:flight|final)[\s_-]?(?:decision|action|answer)|动作|决策|飞行决策)"""
+    r"""["'`*]*\s*[:=]\s*["'`*]*)?"""
     r"""(?P<action>[a-z]+(?:[\s_-]+[a-z]+)*)(?:\(\))?[\s"'`*_>\])}“”‘’」』】》.,;:!。、]*"""
 )
 
@@ -32,7 +33,7 @@ def _tokens_by_letters() -> dict[str, str]:
 
 
 def normalize_action(text: str) -> str | None:
-    """Give the token for any spelling (spaces, hyphens, case; quotes, marks and brackets round it; `Decision:` before it), else None."""
+    """Give the token for any spelling (spaces, hyphens, case; quotes, brackets; `Decision:` before it), else None."""
     by_letters = _tokens_by_letters()
     if by_letters.get(text.replace("_", "")) == text:
         return text
@@ -49,7 +50,7 @@ def answer_schema(
     """Give the JSON schema of an answer; a given decision is the enum's one value.
 
     Args:
-        more: further fields and their schemas; they stand after the texts and before the decision, which decoders keep to.
+        more: further fields and their schemas; they stand after the texts and before the decision.
     """
     properties: dict[str, dict] = {
         name: {"type": "string", "minLength": characters, "maxLength": MAX_CHARACTERS[name]}
@@ -81,9 +82,8 @@ _SLOT = re.compile(r"\{[^{}]*\}")
 _HAN = re.compile(r"[\u4e00-\u9fff]+")
 _LATIN = re.compile(r"[A-Za-z]{2,}")
 # All of it is Chinese but for numbers, marks, slots and single letters: most texts, and one scan tells.
-_PLAIN_ZH = re.compile(
-    r"[\u4e00-\u9fff\d\s，。、；：（）！？%/.,;:()-]*+(?:(?:\{[^{}]*\}|[A-Za-z](?![A-Za-z{]))[\u4e00-\u9fff\d\s，。、；：（）！？%/.,;:()-]*+)*+"
-)
+_ZH = r"[\u4e00-\u9fff\d\s，。、；：（）！？%/.,;:()-]*+"
+_PLAIN_ZH = re.compile(_ZH + r"(?:(?:\{[^{}]*\}|[A-Za-z](?![A-Za-z{]))" + _ZH + ")*+")
 _OTHER_LETTER = re.compile(r"[^\W\d_a-zA-Z\u00c0-\u024f\u4e00-\u9fff]")
 
 
@@ -92,8 +92,9 @@ def parse_answer(
 ) -> Parsed:
     """Check the structure of a raw answer (phase 3 of sec:appendix_e).
 
-    What stands round the answer's object, and what differs from JSON in punctuation alone, is taken off and named in `recovered`
-    (cosfly/reading/objects.py), as are raw control characters inside strings. Anything else is a failure with a reason word.
+    What stands round the answer's object, and what differs from JSON in punctuation alone, is taken off and named in
+    `recovered` (cosfly/reading/objects.py), as are raw control characters inside strings. Anything else is a failure
+    with a reason word.
 
     Args:
         more: names of the further fields that were asked for.
@@ -153,7 +154,7 @@ def _is_left_out(text: str, min_characters: int) -> bool:
 
 
 def is_in_script(text: str, language: Language) -> bool:
-    """Tell whether a text is written in its language: Chinese has no more Latin words than characters, English the reverse.
+    """Tell whether a text is written in its language: Chinese has no more Latin words than characters.
 
     Letters of other scripts are of neither. The names in slots are no words.
     """

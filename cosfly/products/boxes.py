@@ -25,14 +25,8 @@ BOXES_SCHEMA, BOXES_VERSION = "cosfly.boxes_3d", "1.0"
 AXES = "right-handed, metres, x east, y north, z up; degrees"
 # How far a told corner may be from the one that follows: exporters round, and turn boxes in single precision.
 CORNER_M = 0.05
-COMPUTED = {
-    "schema",
-    "schema_version",
-    "axes",
-    "bounds",
-    "num_boxes",
-    "counts",
-}  # written from the boxes, never carried
+# Written from the boxes, never carried.
+COMPUTED = {"schema", "schema_version", "axes", "bounds", "num_boxes", "counts"}
 ARRAYS = ("centers", "half_extents", "rotations_deg", "kinds", "ids")  # of a BoxMap, one row a box
 
 UNKNOWN_LICENCE, OUR_LICENCE = "unknown", "apache-2.0"  # the latter: of maps that cosfly invents
@@ -73,8 +67,8 @@ class SimplifyPass(_Kept):
 class MapHeader(_Kept):
     """What a map says about itself; what is not set is not written.
 
-    ground_z_m is the one height of the ground where it is flat; where it slopes, `ground` holds its heights. People walk on it, and
-    every stage counts heights from it: `BoxMap.ground`.
+    ground_z_m is the one height of the ground where it is flat; where it slopes, `ground` holds its heights. People
+    walk on it, and every stage counts heights from it: `BoxMap.ground`.
     """
 
     name: str = "map"
@@ -101,8 +95,8 @@ class BoxMap:
     """A map of boxes, the product of stages 1 and 2.
 
     centers, half_extents: (n, 3) float64, m. rotations_deg: (n, 3) float64: pitch, yaw, roll. kinds: (n,) uint8, KINDS.
-    ids: (n,) uint64, unique and stable. `header`: what the map says about itself. `meshes`: what some boxes are drawn as; in maps as
-    sources and files give them, not in simplified ones, whose boxes nobody draws.
+    ids: (n,) uint64, unique and stable. `header`: what the map says about itself. `meshes`: what some boxes are drawn
+    as; in maps as sources and files give them, not in simplified ones, whose boxes nobody draws.
     """
 
     centers: np.ndarray
@@ -179,17 +173,13 @@ def check_boxes(box_map: BoxMap, where: str | Path) -> None:
         bad = np.flatnonzero(~(np.abs(getattr(box_map, name)) <= LARGEST).all(axis=1))  # NaN is not
         if len(bad):
             row = int(bad[0])
-            raise InputError(
-                "a box is not finite", where=f"{where}: box {box_map.ids[row]}: {field_name}",
-                got=str(getattr(box_map, name)[row].tolist()), expected="finite numbers",
-            )  # fmt: skip
+            place, got = f"{where}: box {box_map.ids[row]}: {field_name}", str(getattr(box_map, name)[row].tolist())
+            raise InputError("a box is not finite", where=place, got=got, expected="finite numbers")
     bad = np.flatnonzero((box_map.half_extents < 0).any(axis=1))
     if len(bad):
         row = int(bad[0])
-        raise InputError(
-            "a box has a negative extent", where=f"{where}: box {box_map.ids[row]}: extent",
-            got=str(box_map.half_extents[row].tolist()), expected="half sizes of at least 0 m",
-        )  # fmt: skip
+        place, got = f"{where}: box {box_map.ids[row]}: extent", str(box_map.half_extents[row].tolist())
+        raise InputError("a box has a negative extent", where=place, got=got, expected="half sizes of at least 0 m")
     unknown = [int(kind) for kind in np.unique(box_map.kinds) if int(kind) not in KIND_NAMES]
     if unknown:
         raise InputError("unknown semantic id", where=where, got=str(unknown[0]), expected="0 to 28")
@@ -206,10 +196,9 @@ def check_ground(box_map: BoxMap, path: Path) -> None:
     """
     told = box_map.header.model_fields_set & {"ground_z_m", "ground"}
     if not told and not box_map.is_any_of(GROUND_KINDS).any():
-        raise InputError(
-            "the map has no ground", where=path, got="neither ground_z_m nor heights in the header, and no box of the ground",
-            expected="where people stand", fix="put ground_z_m into the header, or boxes of Roads, Sidewalks, Terrain or Ground",
-        )  # fmt: skip
+        what, got = "the map has no ground", "neither ground_z_m nor heights in the header, and no box of the ground"
+        fix = "put ground_z_m into the header, or boxes of Roads, Sidewalks, Terrain or Ground"
+        raise InputError(what, where=path, got=got, expected="where people stand", fix=fix)
 
 
 class _Box(BaseModel):
@@ -241,7 +230,7 @@ class _Boxes(BaseModel):
 
 
 def write_boxes(path: Path, box_map: BoxMap) -> None:
-    """Write boxes in the paper's fields (tab:boxes_schema), one box a line; what some are drawn as, in `meshes.glb` beside them."""
+    """Write boxes in the paper's fields (tab:boxes_schema), one box a line; meshes in `meshes.glb` beside them."""
     check_boxes(box_map, path)
     refs = box_map.meshes.beside(path.parent).refs
     columns = {name: np.round(getattr(box_map, name), 6) for name in ("centers", "half_extents", "rotations_deg")}
@@ -316,7 +305,7 @@ def read_boxes(path: Path) -> BoxMap:
 
 
 def _check_told(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, path: Path) -> None:
-    """Compare what a file tells beside its boxes with what follows from them; a wrong one is a sign of other axes, units or sizes.
+    """Compare what a file tells beside its boxes with what follows from them, which other axes or units would not.
 
     Raises:
         InputError: names the box and the field.
@@ -324,25 +313,16 @@ def _check_told(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, path
     told = (("axes", AXES), ("num_boxes", len(box_map)), ("counts", box_map.counts()))
     for name, follows in told:
         if header.get(name, follows) != follows:
-            raise InputError(
-                "not what its boxes are",
-                where=f"{path}: {name}",
-                got=str(header[name])[:200],
-                expected=str(follows)[:200],
-            )
+            got, expected = str(header[name])[:200], str(follows)[:200]
+            raise InputError("not what its boxes are", where=f"{path}: {name}", got=got, expected=expected)
     for box in boxes:
         if box.semantic_id not in (None, KINDS[box.type]):
-            raise InputError(
-                "not the number of its type",
-                where=f"{path}: box {box.id}: semantic_id",
-                got=box.semantic_id,
-                expected=f"{KINDS[box.type]}, {box.type}",
-            )
+            where, expected = f"{path}: box {box.id}: semantic_id", f"{KINDS[box.type]}, {box.type}"
+            raise InputError("not the number of its type", where=where, got=box.semantic_id, expected=expected)
     for name, corners in (("min", box_map.mins), ("max", box_map.maxs)):
         for row, box in enumerate(boxes):
             corner = getattr(box, name)
             if corner is not None and not np.allclose(corner, corners[row], atol=CORNER_M, rtol=1e-6):
-                raise InputError(
-                    "does not follow from center, extent and rotation", where=f"{path}: box {box.id}: {name}", got=str(corner),
-                    expected=str(rounded(corners[row])), fix="extent is half the size, in metres; rotation is pitch, yaw, roll in degrees",
-                )  # fmt: skip
+                what, where = "does not follow from center, extent and rotation", f"{path}: box {box.id}: {name}"
+                fix = "extent is half the size, in metres; rotation is pitch, yaw, roll in degrees"
+                raise InputError(what, where=where, got=str(corner), expected=str(rounded(corners[row])), fix=fix)

@@ -1,7 +1,7 @@
-"""Chain-of-Cause captions on disk: the three-field answer with its decision of the closed set (actions.py), `captions.jsonl`.
+"""Chain-of-Cause captions on disk: the three-field answer with its decision (actions.py), `captions.jsonl`.
 
-Shared by caption (which writes), distill and release (which read). What an answer must look like stands in answer_text.py; how a
-decision is judged against the geometry in caption/truth/actions.py.
+Shared by caption (which writes), distill and release (which read). What an answer must look like stands in
+answer_text.py; how a decision is judged against the geometry in caption/truth/actions.py.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ Writing = Literal["slots", "claims", "prose"]
 Modality = Literal["observed", "predicted", "hypothetical"]
 SentenceState = Literal["proved", "contradicted", "unread"]
 Verdict = Literal["CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN"]
-# Whose motion a label was taken from: the flight's own, which nothing perturbed; the clean flight beside it; its own less the
-# recorded offsets; or, where nobody recorded them, the perturbed one: then the label holds noise.
+# Whose motion a label was taken from: the flight's own, which nothing perturbed; the clean flight beside it; its own
+# less the recorded offsets; or, where nobody recorded them, the perturbed one: then the label holds noise.
 LabelFrom = Literal["flight", "twin", "offsets", "perturbed"]
 CAPTION_VERSION: Literal["2.0"] = "2.0"
 
@@ -77,9 +77,9 @@ PICTURES_MARK = "<pictures>"  # in a prompt: the place of the sentence that says
 
 
 class Prompt(BaseModel):
-    """A question in one language. That of a caption holds PICTURES_MARK: a teacher and a student see different pictures.
+    """A question in one language. That of a caption holds PICTURES_MARK: teacher and student see other pictures.
 
-    The line with the mark says what frames there are; the lines after it hold what was measured on them, and the mission.
+    The line with the mark says what frames there are; those after it, what was measured, and the mission.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -87,7 +87,7 @@ class Prompt(BaseModel):
     user: str
 
     def told(self, pictures: str, *, measured: bool = True) -> Prompt:
-        """Give the question with the sentence about the pictures at its mark, and if asked without what was measured."""
+        """Give the question with the sentence about the pictures at its mark, with or without what was measured."""
         begin, mark, end = self.user.partition(PICTURES_MARK)
         user = self.user if measured or not mark else begin + mark + end.partition("\n")[0]
         return Prompt(system=self.system, user=user.replace(PICTURES_MARK, pictures))
@@ -110,8 +110,8 @@ class TeacherSettings(BaseModel):
 
 
 class TeacherRecord(BaseModel):
-    """Who answered. structured: how the answer's shape was enforced (see Reply); left out where nothing was asked. run: of a student's
-    predictions for several trees, the one that these captions are of."""
+    """Who answered. structured: how the answer's shape was enforced (see Reply); left out where nothing was asked. run:
+    of a student's predictions for several trees, the one that these captions are of."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -123,7 +123,7 @@ class TeacherRecord(BaseModel):
 
 
 class JudgeRecord(BaseModel):
-    """What a judge said of a conflict: one of Judgement, or `unjudged`; overruled_by: geometry or text, where it was."""
+    """What a judge said of a conflict: one of Judgement, or `unjudged`; overruled_by: geometry or text."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -150,7 +150,7 @@ class RepairRecord(BaseModel):
 
 
 class KeyframeRecord(BaseModel):
-    """Why a window was taken (start, change, stride); windows left out up to the next; changes of the label among them."""
+    """Why a window was taken (start, change, stride); windows left out up to the next; label changes among them."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -162,9 +162,9 @@ class KeyframeRecord(BaseModel):
 class Claim(BaseModel):
     """One thing that a sentence states.
 
-    sentence: `C1` is the first of critical_components, `R1` of reasoning_trace. quantity: what is claimed, with its aspect
-    (`distance`, `trend:speed`), or `decision`. at: `t4`, `t0-t4`; empty: the current frame, the whole window. unit: m, mps, deg ...
-    quote: the words of the sentence that it stands for, where a reader made it.
+    sentence: `C1` is the first of critical_components, `R1` of reasoning_trace. quantity: what is claimed, with its
+    aspect (`distance`, `trend:speed`), or `decision`. at: `t4`, `t0-t4`; empty: the current frame, the whole window.
+    unit: m, mps, deg ... quote: the words of the sentence that it stands for, where a reader made it.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -181,8 +181,8 @@ class Claim(BaseModel):
 class ReaderRecord(BaseModel):
     """What language models read in texts that came without claims.
 
-    models: one or two. prompt: digest of the prompts. claims: language -> what both readings say, which is what was judged.
-    num_claims: language -> claims of each reading; None: it could not be read.
+    models: one or two. prompt: digest of the prompts. claims: language -> what both readings say, which is what was
+    judged. num_claims: language -> claims of each reading; None: it could not be read.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -204,10 +204,12 @@ class Template(BaseModel):
 
 
 class Evidence(BaseModel):
-    """What the states of a caption's sentences follow from, so that an outsider can judge them again: the column `evidence` of a release.
+    """What the states of a caption's sentences follow from, so that an outsider can judge them again: the column
+    `evidence` of a release.
 
-    slots: the templates that the texts were filled from. claims: what the English text states, by its writer. reader: what language models
-    read in texts that came without claims. problems: what is contradicted. contradicted: decisions that the flight contradicts.
+    slots: the templates that the texts were filled from. claims: what the English text states, by its writer. reader:
+    what language models read in texts that came without claims. problems: what is contradicted. contradicted: decisions
+    that the flight contradicts.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -222,9 +224,9 @@ class Evidence(BaseModel):
 class Checks(BaseModel):
     """What was checked. structure, bilingual: `ok` or a reason. refused: why answers of the right structure were
     not taken, one reason each. evidence: `ok` or the contradictions. sentences: language -> state of
-    each sentence of both texts, in order. contradicted: decisions that the flight contradicts, whatever was decided. recovered: what
-    was mended in the answers' text. frame: what is wrong with a picture. refusal: the server's words where it refused the window, or
-    how it cut the answer short of `max_tokens`."""
+    each sentence of both texts, in order. contradicted: decisions that the flight contradicts, whatever was decided.
+    recovered: what was mended in the answers' text. frame: what is wrong with a picture. refusal: the server's words
+    where it refused the window, or how it cut the answer short of `max_tokens`."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -243,8 +245,8 @@ class Checks(BaseModel):
 class Caption(BaseModel):
     """One line of `captions.jsonl`: one window, its answers, and everything that was found out about them.
 
-    `en` and `zh` are None when the window was dropped before an answer of the right structure existed; `zh` also where a file of captions
-    has English alone.
+    `en` and `zh` are None when the window was dropped before an answer of the right structure existed; `zh` also where
+    a file of captions has English alone.
     """
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -283,10 +285,8 @@ class Caption(BaseModel):
     @property
     def evidence(self) -> Evidence:
         problems = self.checks.evidence if isinstance(self.checks.evidence, list) else []
-        return Evidence(
-            slots=self.slots, claims=self.claims, reader=self.reader, problems=problems,
-            contradicted=self.checks.contradicted or [],
-        )  # fmt: skip
+        told: dict[str, Any] = {"slots": self.slots, "claims": self.claims, "reader": self.reader}
+        return Evidence(**told, problems=problems, contradicted=self.checks.contradicted or [])
 
     def coverage(self, language: Language) -> float | None:
         """Share of a language's sentences that are proved; None where none was judged."""
@@ -328,5 +328,5 @@ def read_captions(path: Path) -> Iterator[Caption]:
 
 
 def caption_lines(path: Path) -> Iterator[tuple[str, Caption]]:
-    """Yield each line of `captions.jsonl` as it stands there, its end included, and what it says; raises as `read_captions`."""
+    """Yield each line of `captions.jsonl`, its end included, and what it says; raises as `read_captions`."""
     return model_lines(path, Caption, what="captions", fix="run cosfly caption first")

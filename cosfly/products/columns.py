@@ -46,7 +46,7 @@ def text_id(record: dict, where: str) -> str:
 
 
 def column(record: dict, name: str, where: str, length: int | None = None) -> np.ndarray:
-    """Read a list of finite numbers, (n,) float64, n = `length` where it is given; raises InputError for anything else."""
+    """Read a list of finite numbers, (n,) float64, n = `length` where it is given; else InputError."""
     try:
         column = np.array(record[name], dtype=np.float64)
     except KeyError:

@@ -1,7 +1,7 @@
-"""How much of what could be flown was flown: heights, distances, directions, sizes, occlusion, styles and paces, frame by frame.
+"""How much of what could be flown was flown: heights, distances, directions, sizes, occlusion, styles, paces.
 
-A student cannot learn what it never sees. Counts of frames in fixed bins, so that flights, runs and releases add up; each shown beside those of
-the plain run that ships (`default_coverage.json`).
+A student cannot learn what it never sees. Counts of frames in fixed bins, so that flights, runs and releases add up;
+each shown beside those of the plain run that ships (`default_coverage.json`).
 """
 
 from __future__ import annotations
@@ -64,7 +64,8 @@ PAIR = " | "  # between the two names of a pair
 
 
 class Coverage(BaseModel):
-    """Frames by bin of each axis, by style, by pace, by label, which only captions tell, and by weather and time of day, where there is any.
+    """Frames by bin of each axis, by style, by pace, by label, which only captions tell, and by weather and time of
+    day, where there is any.
 
     skies: frames by both, as "heavy_rain | night".
     """
@@ -89,8 +90,8 @@ class Coverage(BaseModel):
         labels: Iterable[str] = (),
         skies: Iterable[tuple[str | None, str | None]] = (),
     ) -> Coverage:
-        """Count frames: values, (n,) of each axis, NaN where unknown; style and pace of each; labels of those that have one; weather and
-        time of day of each, None where nobody says.
+        """Count frames: values, (n,) of each axis, NaN where unknown; style and pace of each; labels of those that have
+        one; weather and time of day of each, None where nobody says.
         """
         pairs = [(weather and preset_token(weather), time and preset_token(time)) for weather, time in skies]
         weathers, times = ([pair[k] for pair in pairs if pair[k] is not None] for k in (0, 1))
@@ -132,7 +133,7 @@ def axis_values(
     """Give the value of each axis at each frame, NaN where unknown.
 
     Args:
-        offsets_m: (n, 3) from person to drone. headings_deg: (n,), whither the person walks. target_heights_px, visibility: (n,).
+        offsets_m: (n, 3) from person to drone. headings_deg: (n,), of the walk. target_heights_px, visibility: (n,).
     """
     return {
         "height_m": offsets_m[:, 2] + TARGET_HEIGHT_M,

@@ -45,21 +45,19 @@ def chosen_flights(folders: Sequence[Path], root: Path, choice: FlightChoice) ->
     """
     chosen = [folder for folder in folders if choice.names(folder.relative_to(root).as_posix())]
     if folders and not chosen:
-        raise InputError(
-            "no flight of the tree has such a name", where=root, got=", ".join(choice.match),
-            expected=f"a pattern for {folders[0].relative_to(root).as_posix()} and its like", fix="check --flights",
-        )  # fmt: skip
+        what, expected = "no flight of the tree has such a name", folders[0].relative_to(root).as_posix()
+        expected = f"a pattern for {expected} and its like"
+        raise InputError(what, where=root, got=", ".join(choice.match), expected=expected, fix="check --flights")
     if len(choice.tracks) < len(TRACKS):
         chosen = [folder for folder in chosen if track_of(folder) in choice.tracks]
         if not chosen:
-            raise InputError(
-                "no flight of the tree is of this track", where=root, got=", ".join(choice.tracks), fix="check --tracks"
-            )
+            what, got = "no flight of the tree is of this track", ", ".join(choice.tracks)
+            raise InputError(what, where=root, got=got, fix="check --tracks")
     return chosen
 
 
 def track_of(folder: Path) -> Track:
-    """Tell a flight's track: by its folder's name, and where that is another, by what its file says; one that cannot be read is perturbed."""
+    """Tell a flight's track: by its folder's name, else by its file; one that cannot be read is perturbed."""
     if folder.name == ORIGINAL:
         return "clean"
     if re.fullmatch(r"aug_\d+", folder.name):
@@ -71,7 +69,7 @@ def track_of(folder: Path) -> Track:
 
 
 def read_twin(flight: Flight) -> Flight | None:
-    """Read the clean flight beside a perturbed one, the same walk frame by frame; None for a clean flight or without one.
+    """Read the clean flight beside a perturbed one, the same walk frame by frame; None where there is none.
 
     Raises:
         InputError: what stands there cannot be read.

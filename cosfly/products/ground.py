@@ -1,4 +1,4 @@
-"""How high the ground lies: one height for a whole map, or a grid of heights with a flat triangle on each half of a cell.
+"""How high the ground lies: one height for a map, or a grid of heights with a flat triangle on each half of a cell.
 
 Triangles, not a bilinear surface: they are what renderers draw, so that feet, rays and pictures agree to the rounding.
 """
@@ -20,8 +20,9 @@ Height = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 class Ground:
     """Heights of the ground, world m.
 
-    heights_m: (ny, nx), the node [y, x] at (west_m + x cell_m, south_m + y cell_m); (1, 1) is flat ground without an end. Each cell has
-    two triangles, cut from its south-west to its north-east corner. Beyond the grid the height of its border goes on.
+    heights_m: (ny, nx), the node [y, x] at (west_m + x cell_m, south_m + y cell_m); (1, 1) is flat ground without an
+    end. Each cell has two triangles, cut from its south-west to its north-east corner. Beyond the grid the height of
+    its border goes on.
     """
 
     heights_m: np.ndarray
@@ -48,7 +49,7 @@ class Ground:
         return np.where(u >= v, low + u * (east - low) + v * (far - east), low + v * (north - low) + u * (far - north))
 
     def slope_at(self, points_m: np.ndarray) -> np.ndarray:
-        """Give the steepness under each of (n, 2 or 3) points: rise over run, (n,); beyond the grid only along its border."""
+        """Give rise over run under each of (n, 2 or 3) points, (n,); beyond the grid only along its border."""
         points = np.asarray(points_m, dtype=np.float64)
         if self.is_flat:
             return np.zeros(len(points))
@@ -60,14 +61,15 @@ class Ground:
         return np.hypot(rise_x * goes_on[:, 0], rise_y * goes_on[:, 1]) / self.cell_m
 
     def range_under(self, mins: np.ndarray, maxs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest ground under upright boxes with these corners, (n, 3) each, at their middles and corners; (n,) each."""
+        """Lowest and highest ground under upright boxes, at middles and corners: mins, maxs (n, 3); gives (n,) each."""
         middles = (mins + maxs)[:, :2] / 2
         corners = [np.stack([x, y], axis=1) for x in (mins[:, 0], maxs[:, 0]) for y in (mins[:, 1], maxs[:, 1])]
         heights = np.stack([self.height_at(places) for places in (middles, *corners)])
         return heights.min(axis=0), heights.max(axis=0)
 
     def _cells(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
-        """Places within cells, 0 to 1 along x and y, and the heights of the cells' corners: south-west, -east, north-west, -east."""
+        """Places within cells, 0 to 1 along x and y, and the heights of corners: south-west, -east, north-west,
+        -east."""
         num_y, num_x = self.heights_m.shape
         x = np.clip((points[:, 0] - self.west_m) / self.cell_m, 0.0, num_x - 1.0)
         y = np.clip((points[:, 1] - self.south_m) / self.cell_m, 0.0, num_y - 1.0)
@@ -96,9 +98,11 @@ class Ground:
         return pairs.reshape(-1, 3, 3)
 
     def slabs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Give solid boxes that fill the ground from below, one to a cell, nowhere higher than it: centers, half_extents (k, 3), world_from_box (k, 3, 3).
+        """Give boxes that fill the ground from below, one to a cell: centers, half_extents (k, 3), world_from_box (k,
+        3, 3).
 
-        A box follows the plane through its cell's corners; where these do not lie in a plane it lies lower, by a quarter of the twist.
+        A box follows the plane through its cell's corners; where they lie in none it is lower, by a quarter of the
+        twist.
         """
         low, east, north, far = (
             self.heights_m[a, b] for a in (slice(-1), slice(1, None)) for b in (slice(-1), slice(1, None))
@@ -124,7 +128,8 @@ class Ground:
 
 
 class GroundGrid(BaseModel):
-    """Ground that slopes, as the header of `boxes_3d.json` holds it. heights_m: rows from south to north, each from west to east."""
+    """Ground that slopes, in the header of `boxes_3d.json`. heights_m: rows from south to north, each from west to
+    east."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

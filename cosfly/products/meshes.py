@@ -34,8 +34,9 @@ UNTOLD = -1.0  # in the place of a colour that no file told, while they are sort
 class MeshRef(BaseModel):
     """What a box is drawn as.
 
-    fit `box`: what the mesh spans is stretched to the box, axis by axis. fit `world`: its vertices are places of the map, in metres; boxes that
-    name the same one stand for one thing, which is drawn once, with the id of the first of them.
+    fit `box`: what the mesh spans is stretched to the box, axis by axis. fit `world`: its vertices are places of the
+    map, in metres; boxes that name the same one stand for one thing, which is drawn once, with the id of the first of
+    them.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -57,8 +58,8 @@ class MeshRef(BaseModel):
 
 @dataclass(frozen=True)
 class Meshes:
-    """The meshes of a map. refs: box id -> what it is drawn as; folder: that their files are below; made: node -> mesh of a
-    MESHES_FILE that is not written yet.
+    """The meshes of a map. refs: box id -> what it is drawn as; folder: that their files are below; made: node -> mesh
+    of a MESHES_FILE that is not written yet.
     """
 
     refs: dict[int, MeshRef] = field(default_factory=dict)
@@ -83,10 +84,8 @@ class Meshes:
         for box_id, ref in self.refs.items():
             nodes = read.get(ref.file, self.made)
             if ref.node is not None and ref.node not in nodes:
-                raise InputError(
-                    "the mesh has no such node", where=f"{ref.file}, which box {box_id} names", got=ref.node[:80],
-                    expected=", ".join(list(nodes)[:8]),
-                )  # fmt: skip
+                where, expected = f"{ref.file}, which box {box_id} names", ", ".join(list(nodes)[:8])
+                raise InputError("the mesh has no such node", where=where, got=ref.node[:80], expected=expected)
             if ref not in found:
                 found[ref] = joined(list(nodes.values())) if ref.node is None else nodes[ref.node]
         num_drawn = sum(len(found[ref]) for ref in self.refs.values() if ref.fit == "box")
@@ -110,7 +109,7 @@ class Meshes:
 
 
 def write_meshes(path: Path, meshes: dict[str, Mesh]) -> None:
-    """Write meshes as binary glTF 2.0, a node each: vertices in single precision about the node's own place, so that a map may be wide."""
+    """Write meshes as binary glTF 2.0, a node each: vertices in single precision about the node's place."""
     nodes, shapes, views, accessors, materials = (list[dict]() for _ in range(5))
     parts, colors_known = list[bytes](), dict[tuple[float, ...], int]()
     at = 0

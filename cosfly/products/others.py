@@ -1,4 +1,5 @@
-"""`others.json`, the second product of step 3: who else moves while a walk lasts, people and cars, and who keeps clear of whom."""
+"""`others.json`, the second product of step 3: people and cars that move while a walk lasts, and who keeps clear of
+whom."""
 
 from __future__ import annotations
 
@@ -20,8 +21,8 @@ OTHERS_SCHEMA, OTHERS_VERSION = "cosfly.others", "1.0"
 
 @dataclass(frozen=True)
 class Build:
-    """Of what size one kind is: half_extents_m of its box, x along its heading; on the ground it lies within discs of one radius,
-    their middles at disc_offsets_m along the heading.
+    """Of what size one kind is: half_extents_m of its box, x along its heading; on the ground it lies within discs of
+    one radius, their middles at disc_offsets_m along the heading.
     """
 
     half_extents_m: tuple[float, float, float]
@@ -38,7 +39,8 @@ BUILDS = {
 
 @dataclass(frozen=True)
 class Other:
-    """One who moves beside the target: kind of BUILDS; positions_m (n, 3) on the ground below the box's middle; headings_rad (n,)."""
+    """One who moves beside the target: kind of BUILDS; positions_m (n, 3) on the ground below its middle; headings_rad
+    (n,)."""
 
     kind: str
     positions_m: np.ndarray

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -77,7 +77,8 @@ def place_of(folder: Path, run: str = "") -> Place:
 def tree_of_flight(folder: Path) -> Path:
     """Give the tree that a flight's folder stands in by its name: no link in it may lead out of that.
 
-    Of a flight that stands elsewhere inside the tree's parent folder, and in the tree by a link, the folder itself: its files must be its own.
+    Of a flight that stands elsewhere inside the tree's parent folder, and in the tree by a link, the folder itself: its
+    files must be its own.
     """
     parents = folder.absolute().parents
     tree = parents[min(2, len(parents) - 1)]
@@ -92,8 +93,8 @@ def tree_of_flight(folder: Path) -> Path:
 def flight_ids(places: Collection[Place]) -> dict[Place, str]:
     """Give each flight an id of its own: `trajectory_1776047127_ORI`.
 
-    Trajectories of one name in several towns get the town in front, and where that does not tell them apart the run and the town:
-    all flights of a trajectory the same, for training sets know by it what belongs together.
+    Trajectories of one name in several towns get the town in front, and where that does not tell them apart the run and
+    the town: all flights of a trajectory the same, for training sets know by it what belongs together.
 
     Raises:
         InputError: two flights are the same in all of it.
@@ -103,18 +104,14 @@ def flight_ids(places: Collection[Place]) -> dict[Place, str]:
         named[place.trajectory].append(place)
     ids: dict[Place, str] = {}
     for name, group in named.items():
-        fronts: tuple[Callable[[Place], str], ...] = (
-            lambda _: "", lambda p: f"{p.town}_", lambda p: f"{p.run}_{p.town}_",
-        )  # fmt: skip
-        front = next((f for f in fronts if len({(f(place), place.variant) for place in group}) == len(group)), None)
+        forms = ("", "{0.town}_", "{0.run}_{0.town}_")
+        fronts = ({place: form.format(place) for place in group} for form in forms)
+        front = next((f for f in fronts if len({(f[place], place.variant) for place in group}) == len(group)), None)
         if front is None:
-            raise InputError(
-                "two flights have one name",
-                got=f"{len(group)} of {name}",
-                expected="flights that differ in run, town, trajectory or variant",
-                fix="leave one of them out, or give the folders of their runs different names",
-            )
-        ids |= {place: f"{front(place)}{name}_{place.variant}" for place in group}
+            expected = "flights that differ in run, town, trajectory or variant"
+            fix = "leave one of them out, or give the folders of their runs different names"
+            raise InputError("two flights have one name", got=f"{len(group)} of {name}", expected=expected, fix=fix)
+        ids |= {place: f"{front[place]}{name}_{place.variant}" for place in group}
     return ids
 
 

@@ -17,7 +17,7 @@ FAILED = "failed_"  # what the reason of a prediction begins with that could not
 
 
 class Prediction(BaseModel):
-    """One line of `predictions.jsonl`. `coc` is None when the answer is not of the right structure, for the `reason`."""
+    """One line of `predictions.jsonl`. `coc` is None where the answer has not the right structure, for the `reason`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -1,4 +1,5 @@
-"""`roi_polygon.json`: where pedestrians may walk. The paper's form, ours with holes and several outer rings, and GeoJSON in the map's metres."""
+"""`roi_polygon.json`: where pedestrians may walk: the paper's form, ours with holes and several rings, and GeoJSON in
+metres."""
 
 from __future__ import annotations
 
@@ -80,7 +81,8 @@ def read_roi(path: Path) -> Roi:
 
 
 def _polygons_of(features: list[Feature], path: Path) -> list[dict[str, Any]]:
-    """Give polygons of GeoJSON, whose rings repeat their first point, in the form of this file; tells all that is wrong with them."""
+    """Give polygons of GeoJSON, whose rings repeat their first point, in the form of this file; tells all that is
+    wrong."""
     problems, polygons = [], []
     for feature in features:
         if feature.wrong:

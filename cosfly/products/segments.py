@@ -1,4 +1,4 @@
-"""Which style a part of a flight was flown in, and the mission that ended it: kept in `drone_trace.json` and `trajectory.json`.
+"""Styles of a flight's parts, and the mission that ended it: kept in `drone_trace.json` and `trajectory.json`.
 
 A file without them holds a flight that follows the walker, as the paper's do, and no mission.
 """
@@ -30,7 +30,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Mission:
-    """An order that ends a pursuit. kind: of MISSION_KINDS, its reason, which the drone knows from `at_frame` on and not before.
+    """An order that ends a pursuit. kind: of MISSION_KINDS, which the drone knows from `at_frame` on.
 
     From `at_frame` the drone breaks off, from `home_frame` it flies home, to home_m (x, y, z).
     """

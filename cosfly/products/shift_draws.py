@@ -1,4 +1,4 @@
-"""What the perturbed track draws for each frame, whatever becomes of it: who knows the seed and the settings can draw it again."""
+"""What the perturbed track draws for each frame: who knows the seed and the settings can draw it again."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ PERTURBED = "aug_001"  # the variant of the perturbed track
 
 @dataclass(frozen=True)
 class ShiftDraw:
-    """One frame's draws. events: (2,) of position and rotation, which happen below their probability; person_m, drone_m, view_m: (3,)."""
+    """One frame's draws. events: (2,) of position and rotation, below their probability; person_m, drone_m, view_m:
+    (3,)."""
 
     events: np.ndarray
     person_m: np.ndarray

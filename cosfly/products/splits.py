@@ -1,8 +1,8 @@
 """Walks, and splits that share none of them.
 
-Two flights after one person on one way show the same places at the same times, whatever their names, planners, runs and builds of the
-town are: a student that learnt from one of them has seen the answers to the other. Training sets and releases hand out whole walks.
-Knows positions and names only, no files.
+Two flights after one person on one way show the same places at the same times, whatever their names, planners, runs and
+builds of the town are: a student that learnt from one of them has seen the answers to the other. Training sets and
+releases hand out whole walks. Knows positions and names only, no files.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ SAME_M = 1e-3  # flights that differ by less are compared with others once
 class Course:
     """Where the person of a flight was, without any perturbation.
 
-    name: of the walk as the tree has it, `run/town/trajectory`; courses of one name are one walk, whatever is known of them.
-    time_s (n,) increasing; target_m (n, 3) right-handed, NaN where nobody knows.
+    name: of the walk as the tree has it, `run/town/trajectory`; courses of one name are one walk, whatever is known of
+    them. time_s (n,) increasing; target_m (n, 3) right-handed, NaN where nobody knows.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Course:
     target_m: np.ndarray
 
     def at_seconds(self) -> Course:
-        """Give the course at the full seconds that it knows, at most MOST_GAP_S between points apart: all that walks are told by."""
+        """Give the course at the full seconds that it knows, at most MOST_GAP_S between points apart."""
         known = ~np.isnan(self.target_m[:, :2]).any(axis=1)
         time_s, places_m = self.time_s[known], self.target_m[known]
         begun = np.floor(time_s + ON_TIME_S)
@@ -91,9 +91,10 @@ class _Track:
 def walks_of(courses: Iterable[Course]) -> dict[str, str]:
     """Tell which courses are of one walk: name -> walk.
 
-    Those are that are of one family of towns and within NEAR_M of each other on the map, in NEAR_SHARE of the full seconds that both
-    know and FEW_S at least, or in all of them; and all that are so joined one by one. A walk is called by the first of its names in the alphabet, so neither
-    the order of the courses nor their number of flights matters.
+    Those are that are of one family of towns and within NEAR_M of each other on the map, in NEAR_SHARE of the full
+    seconds that both know and FEW_S at least, or in all of them; and all that are so joined one by one. A walk is
+    called by the first of its names in the alphabet, so neither the order of the courses nor their number of flights
+    matters.
     """
     tracks = sorted((_track(course) for course in courses), key=lambda track: (track.name, track.key))
     groups = _Groups(track.name for track in tracks)
@@ -167,8 +168,8 @@ def assign_splits(
 ) -> dict[str, Split]:
     """Hand out groups to splits: group -> split.
 
-    Groups are ranked by a hash of (seed, group); the first go to test, the next to val, the rest to train, in numbers as near
-    to the fractions as a whole group allows and at least one for each split that has a share.
+    Groups are ranked by a hash of (seed, group); the first go to test, the next to val, the rest to train, in numbers
+    as near to the fractions as a whole group allows and at least one for each split that has a share.
 
     Args:
         fractions: shares of `val` and `test`, together below 1; 0 or none: no such split.

@@ -45,7 +45,7 @@ def read_town_map(town: Path) -> TownMap:
 
 
 class InstanceIds(BaseModel):
-    """person: the target's id; shared: that of boxes without one of their own; others: of who moves beside the target; boxes: (id, box id)."""
+    """person: the target's id; shared: of boxes without their own; others: of who else moves; boxes: (id, box id)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,19 +17,20 @@ from cosfly.reading.documents import check_schema, read_json
 from cosfly.work.store import write_json
 
 TRACE_SCHEMA, TRACE_VERSION = "cosfly.drone_trace", "1.0"
+MORE = ("metrics", "solver", "drop_reason", "instead_of")  # fields of a flight that are taken as they are
 
 
 @dataclass(frozen=True)
 class DroneTrace:
     """One flight, the product of stage 4; n points at the pedestrian's time stamps.
 
-    time_s: (n,). positions_m: (n, 3) drone. rotations_deg: (n, 3) pitch, yaw, roll of the camera, which looks at the target.
-    targets_m: (n, 3) the pedestrian's tracked point (hip height). visibility: (n,) five-ray fraction in [0, 1].
-    clearances_m: (n,) signed distance to the nearest obstacle. metrics and solver: JSON-able facts.
-    segments: the styles of its parts, none where it follows from end to end. mission: the order that ended the pursuit. instead_of: the
-    style that it should have had and the map did not hold, and why. On the way home and in a search the camera looks elsewhere.
-    drop_reason: why the planner-stage prefilter (sec:step6) rejects the flight, None if it passes; only those are rendered.
-    pace: of the walk.
+    time_s: (n,). positions_m: (n, 3) drone. rotations_deg: (n, 3) pitch, yaw, roll of the camera, which looks at the
+    target. targets_m: (n, 3) the pedestrian's tracked point (hip height). visibility: (n,) five-ray fraction in [0, 1].
+    clearances_m: (n,) signed distance to the nearest obstacle. metrics and solver: JSON-able facts. segments: the
+    styles of its parts, none where it follows from end to end. mission: the order that ended the pursuit. instead_of:
+    the style that it should have had and the map did not hold, and why. On the way home and in a search the camera
+    looks elsewhere. drop_reason: why the planner-stage prefilter (sec:step6) rejects the flight, None if it passes;
+    only those are rendered. pace: of the walk.
     """
 
     path_id: str
@@ -77,14 +79,13 @@ class DroneTrace:
             if not isinstance(part, dict):
                 raise InputError("missing", where=f"{where}.{group}", expected="an object of columns")
             groups[group] = np.stack([column(part, name, f"{where}.{group}", len(time_s)) for name in names], axis=1)
-        return cls(
-            text_id(record, where), str(record.get("planner", "")), time_s, groups["drone"][:, :3], groups["drone"][:, 3:],
-            groups["target"], column(record, "visibility", where, len(time_s)),
-            column(record, "clearance", where, len(time_s)), record.get("metrics", {}), record.get("solver", {}), record.get("drop_reason"),
-            read_segments(record.get("segments"), len(time_s), f"{where}.segments"),
-            read_mission(record.get("mission"), len(time_s), f"{where}.mission"), record.get("instead_of"),
-            pace_of(record, where),
-        )  # fmt: skip
+        visibility, clearances_m = (column(record, name, where, len(time_s)) for name in ("visibility", "clearance"))
+        segments = read_segments(record.get("segments"), len(time_s), f"{where}.segments")
+        mission = read_mission(record.get("mission"), len(time_s), f"{where}.mission")
+        more: dict[str, Any] = {name: record[name] for name in MORE if name in record}
+        more |= {"segments": segments, "mission": mission, "pace": pace_of(record, where)}
+        name, flown = str(record.get("planner", "")), (groups["drone"][:, :3], groups["drone"][:, 3:], groups["target"])
+        return cls(text_id(record, where), name, time_s, *flown, visibility, clearances_m, **more)
 
 
 def write_traces(path: Path, traces: list[DroneTrace], header: dict) -> None:

@@ -1,4 +1,4 @@
-"""The fields of `trajectory.json` (playback.py), one by one: what the layout asks for, and how far a tolerant reader goes."""
+"""The fields of `trajectory.json` (playback.py), one by one: what the layout asks for, and what a reader tolerates."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class FieldReader:
             return (), None
 
     def weather(self, raw: dict) -> None:
-        """Check the record of weather, where there is one as the paper has it; public files may call something else by its name."""
+        """Check the record of weather, where it is one as the paper has it; public files may call something else so."""
         told = raw.get("weather")
         if not (isinstance(told, dict) and ("params" in told or "mode" in told)):
             return
@@ -187,7 +187,7 @@ def mask_boxes(targets: list[dict]) -> np.ndarray | None:
 
 
 def offsets_of(points: list[dict], key: str, names: tuple[str, ...], is_original: bool) -> np.ndarray:
-    """Read what was added to each point, (n, len(names)): zero where nothing was, NaN where something was and no file says what."""
+    """Read what was added to each point, (n, len(names)): zero where nothing was, NaN where no file says what."""
     groups = [object_of(p, "perturbation") for p in points]
     is_none = [
         is_original or p.get("is_perturbed") is False or g.get(key) is False

@@ -26,7 +26,7 @@ PATHS_SCHEMA, PATHS_VERSION = "cosfly.path", "1.0"
 class Walk:
     """One walk, the product of stage 3.
 
-    polyline_m: (k, 2) the way that is walked: the A* route, or what a pace makes of it. time_s: (n,), even steps from 0.
+    polyline_m: (k, 2) the way: the A* route, or what a pace makes of it. time_s: (n,), even steps from 0.
     positions_m: (n, 3), feet on the ground. speeds_mps: (n,), 0 at a stop. pace: the profile.
     """
 

@@ -1,6 +1,6 @@
-"""Weather and time of day: the presets of the paper, their six knobs, and the record that a flight's files have of them (app:weather).
+"""Weather and time of day: the paper's presets, their six knobs, and the record in a flight's files (app:weather).
 
-How a preset is chosen for a flight stands in `cosfly/render/weather.py`, what it looks like with the renderer that draws it.
+How a preset is chosen stands in `cosfly/render/weather.py`, what it looks like with the renderer that draws it.
 """
 
 from __future__ import annotations

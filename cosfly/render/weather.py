@@ -36,8 +36,8 @@ class WeatherConfig(Config):
         description="off: sun and air as `look` says; fixed: weather_name and tod_name for every flight; random_per_path: each "
         "trajectory draws both by weather_seed and its index, its two tracks alike",
     )
-    weather_name: str | None = Field(None, description="preset of the weather in mode fixed, for instance heavy_rain")
-    tod_name: str | None = Field(None, description="preset of the time of day in mode fixed, for instance night")
+    weather_name: str | None = Field(None, description="preset of the weather in mode fixed", examples=[*WEATHERS])
+    tod_name: str | None = Field(None, description="preset of the time of day in mode fixed", examples=[*TIMES])
     weather_pool: MayDiffer[Path | None] = Field(
         None, description="YAML file with weather presets of yours in the place of the 15 that ship"
     )

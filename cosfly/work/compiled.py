@@ -1,13 +1,13 @@
 """Numba's `njit` with a cache that never serves stale code.
 
-Numba keeps a compiled function until its own file changes, with everything it calls compiled in: after an update of `kernels.py`
-alone, a planner would go on with the old kernels. Here every version of the compiled sources, taken together, has a cache folder
-of its own: $XDG_CACHE_HOME/cosfly/<digest>. NUMBA_CACHE_DIR, if set, is left alone.
+Numba keeps a compiled function until its own file changes, with everything it calls compiled in: after an update of
+`kernels.py` alone, a planner would go on with the old kernels. Here every version of the compiled sources, taken
+together, has a cache folder of its own: $XDG_CACHE_HOME/cosfly/<digest>. NUMBA_CACHE_DIR, if set, is left alone.
 
 Of several processes that need a function, one compiles it and the others wait for its lock and load it. Compiling costs
-seconds at first use. Two habits keep it down: a constant among the arguments of a compiled function is a type of its own to
-numba, which compiles the function once more, so it is passed as `int64(0)`; and whole arrays are set by `fill` or a loop,
-because numba's `array[:] = ...` brings the formatting of its error message along.
+seconds at first use. Two habits keep it down: a constant among the arguments of a compiled function is a type of its
+own to numba, which compiles the function once more, so it is passed as `int64(0)`; and whole arrays are set by `fill`
+or a loop, because numba's `array[:] = ...` brings the formatting of its error message along.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ UNUSED_DAYS = 30  # a cache of other sources that no process has opened for so l
 
 
 class _SharedCache(caching.FunctionCache):
-    """What is compiled of one function. Who finds nothing holds the function's lock until it has saved what it compiled."""
+    """What is compiled of a function. Who finds nothing holds the function's lock until it has saved its own."""
 
     _lock: Any = None
 
@@ -60,7 +60,8 @@ class _SharedCache(caching.FunctionCache):
         if self._lock is None:  # a function may need itself, or another overload of itself
             try:
                 os.makedirs(self.cache_path, exist_ok=True)
-                self._lock = open(os.path.join(self.cache_path, f"{self._py_func.__qualname__}.lock"), "w")  # noqa: SIM115
+                path = os.path.join(self.cache_path, f"{self._py_func.__qualname__}.lock")
+                self._lock = open(path, "w")  # noqa: SIM115
                 fcntl.flock(self._lock, fcntl.LOCK_EX)
             except OSError:  # no place for a lock: each compiles for itself
                 self._release_lock()
@@ -74,7 +75,8 @@ class _SharedCache(caching.FunctionCache):
 
 
 def njit(**options: Any) -> Callable[[Callable], Callable]:
-    """Numba's decorator, without the wrapper for callers in C: nobody calls from there, and it takes a tenth of the time."""
+    """Numba's decorator, without the wrapper for callers in C, which nobody uses and which takes a tenth of the
+    time."""
     compile_lazily = numba.njit(no_cfunc_wrapper=True, **options)  # type: ignore[call-overload]
 
     def decorate(function: Callable) -> Callable:
@@ -97,7 +99,7 @@ def sources_digest(package: Path) -> str:
 
 
 def use_own_cache(caches: Path, digest: str, now_s: float) -> None:
-    """Let numba cache in `caches/digest`, and delete what has not been used for long. Without such a folder numba does as it always does."""
+    """Let numba cache in `caches/digest`, if it can be made, and delete what has not been used for long."""
     folder = caches / digest
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -21,8 +21,8 @@ LEFT_OUT = {"wrong values": "left out"}
 
 T = TypeVar("T")
 
-# MayDiffer[int] is a setting that changes how a stage works and not what it makes: it does not stand in `stage.json`, and a
-# stage may be resumed with another value.
+# MayDiffer[int] is a setting that changes how a stage works and not what it makes: it does not stand in `stage.json`,
+# and a stage may be resumed with another value.
 _MAY_DIFFER = "may differ on resume"
 MayDiffer = Annotated[T, _MAY_DIFFER]
 
@@ -106,7 +106,7 @@ def build(model: type[C], data: dict, source: str | Path) -> C:
 
 
 def _hidden(model: type[BaseModel], data: dict, details: Sequence[Any]) -> list[str]:
-    """Give what is wrong across settings, which pydantic asks only where each is right alone: what is not is left out for it.
+    """Give what is wrong across settings, which pydantic asks only where each is right: what is not is left out.
 
     Nothing is said across a group of which a wrong value was left out: its default there is nobody's choice.
     """

@@ -100,14 +100,15 @@ def set_levels(level: int) -> None:
 
 
 class Advance(Protocol):
-    """Tells a bar that so much more is done, and what else is worth telling, which stands beside it until there is news."""
+    """Tells a bar that so much more is done, and words that stand beside it until there are others."""
 
     def __call__(self, count: int, told: str = "") -> None: ...
 
 
 @contextlib.contextmanager
 def progress_bar(label: str, total: int | None, done: int = 0) -> Iterator[Advance]:
-    """Show progress: a bar on a terminal, a log line every few seconds elsewhere; `total` None is not known. Yields advance(count)."""
+    """Show progress: a bar on a terminal, else a log line every few seconds; total None: unknown. Yields
+    advance(count)."""
     if console.is_terminal:
         columns = (
             TextColumn("{task.description}", markup=False),

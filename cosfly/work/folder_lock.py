@@ -1,7 +1,7 @@
 """One process at a time in a run or stage folder: a second one is refused and told who is at work.
 
-The lock is the system's (flock) on a file `.lock` in the folder, so a process that was killed holds nothing. Worker processes
-do not inherit it.
+The lock is the system's (flock) on a file `.lock` in the folder, so a process that was killed holds nothing. Worker
+processes do not inherit it.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ def hold_folder(folder: Path, nothing: Collection[str] = ()) -> FolderLock:
     """Hold a folder, which is made where there is none.
 
     Args:
-        nothing: names of files that are no work: where only these stand in the folder when it is given up, they go too, and so does
-            a folder that was made for them.
+        nothing: names of files that are no work: where only these stand in the folder when it is given up, they go too,
+            and so does a folder that was made for them.
     Raises:
         ResumeError: another process holds it; names its id, machine, command and since when.
         StorageError: the folder cannot be written to.
@@ -96,14 +96,14 @@ def hold_folder(folder: Path, nothing: Collection[str] = ()) -> FolderLock:
 
 
 def give_up(below: Path | None = None) -> None:
-    """Let go of all folders that this process holds, or those below one, the innermost first: a command ends with an error."""
+    """Let go of all folders that this process holds, or those below one, the innermost first, as after an error."""
     for path, held in sorted(_held.items(), key=lambda one: len(one[0].parts), reverse=True):
         if below is None or path.is_relative_to(below.resolve()):
             held.give_up()
 
 
 def remove_left_lock(folder: Path) -> None:
-    """Remove the file that a kill left in a finished folder, unless somebody holds it or nothing may be written there."""
+    """Remove the file that a kill left in a finished folder, unless somebody holds it or the disk is read-only."""
     if (folder / LOCK).exists() and not is_held(folder):
         with contextlib.suppress(ResumeError, StorageError):
             hold_folder(folder).release()

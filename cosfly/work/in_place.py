@@ -1,7 +1,7 @@
 """Data files of somebody's own in the place of those that ship, for as long as a stage works with them.
 
-Like the limits of reading they belong to the process; workers get those of the process that started them (worker_pool.py). What is worked
-out of such a file is kept by `kept`, and forgotten as soon as another takes its place.
+Like the limits of reading they belong to the process; workers get those of the process that started them
+(worker_pool.py). What is worked out of such a file is kept by `kept`, and forgotten as soon as another takes its place.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ def put(**files: Any) -> Iterator[None]:
 
 
 def kept(most: int | None = None) -> Callable[[Function], Function]:
-    """Keep the results of a function that reads such files, at most so many of them, until another file is put in place."""
+    """Keep the results of a function that reads such files, at most so many of them, until another file is put in
+    place."""
 
     def keep(function: Function) -> Function:
         cached = lru_cache(maxsize=most)(function)

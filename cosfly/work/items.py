@@ -43,7 +43,7 @@ _num_steps = 0
 
 
 def advance(num_steps: int = 1) -> None:
-    """Tell that the item in hand is getting on: a sign of life, and a step of the progress bar. Free outside of a stage."""
+    """Tell that the item in hand is getting on: a sign of life, and a step of the progress bar."""
     global _num_steps
     _num_steps += num_steps
     if _on_steps is not None:

@@ -26,10 +26,10 @@ T = TypeVar("T")
 class Journal:
     """An append-only JSON-lines file whose every line carries its own checksum.
 
-    A line is on the disk before `append` returns, or with `sync=False` in the hands of the system, which a kill of this process does
-    not reach; `sync` then waits for the disk. A line that a kill cut short, or that was damaged, is skipped by `read` and
-    counted in `num_damaged`; what stood in it is done again. `is_cut_short`: the last of these has no end, as a kill leaves it.
-    `line_num` is the number of the line that was read last.
+    A line is on the disk before `append` returns, or with `sync=False` in the hands of the system, which a kill of this
+    process does not reach; `sync` then waits for the disk. A line that a kill cut short, or that was damaged, is
+    skipped by `read` and counted in `num_damaged`; what stood in it is done again. `is_cut_short`: the last of these
+    has no end, as a kill leaves it. `line_num` is the number of the line that was read last.
     """
 
     def __init__(self, path: Path) -> None:
@@ -68,15 +68,13 @@ class Journal:
     def _unusable(self, error: ValidationError) -> InputError:
         detail = error.errors(include_url=False, include_input=False)[0]
         field = ".".join(str(part)[:40] for part in detail["loc"]) or "top level"
-        return InputError(
-            "a line that cannot be used",
-            where=f"{self.path}:{self.line_num}",
-            got=f"{field}: {plain(detail['msg'])[:200]}",
-            fix=f"run the same command with --repair: such lines go into {self.path.name}{ASIDE}, and what stood in them is done again",
-        )
+        where, got = f"{self.path}:{self.line_num}", f"{field}: {plain(detail['msg'])[:200]}"
+        fix = "run the same command with --repair: such lines go into"
+        fix = f"{fix} {self.path.name}{ASIDE}, and what stood in them is done again"
+        return InputError("a line that cannot be used", where=where, got=got, fix=fix)
 
     def set_aside(self, is_usable: Callable[[dict], bool]) -> int:
-        """Move the lines that are damaged or cannot be used to the end of a file beside, `<name>.aside`; gives their number."""
+        """Move lines that are damaged or cannot be used to the end of `<name>.aside`; gives their number."""
         kept, broken = list[bytes](), list[bytes]()
         for line in read_lines(self.path, what="journal"):
             record = _record_of(line)
@@ -144,7 +142,7 @@ def _record_of(line: bytes) -> dict | None:
 
 
 def _cut_torn_line(path: Path) -> None:
-    """Take off the line that a kill cut short: a reader skips it, so it must not come back to life when more is written."""
+    """Take off the line that a kill cut short, which must not come back to life when more is written."""
     if not path.exists() or not path.stat().st_size:  # nothing can be mapped of an empty file
         return
     with open(path, "r+b") as file:

@@ -1,8 +1,9 @@
 """What stands on disk against the records of the stages that made it.
 
-`manifest.json` holds the sha256 of what a stage made, `stage.json` that of what it was made of, and a flight's `checksums.sha256` that of
-each of its files. Every stage compares its inputs with the first two when it begins, for it reads them anyway; `verify` reads all of it.
-The digests find what was changed, exchanged or mixed up; they are no signatures against somebody who changes the records too.
+`manifest.json` holds the sha256 of what a stage made, `stage.json` that of what it was made of, and a flight's
+`checksums.sha256` that of each of its files. Every stage compares its inputs with the first two when it begins, for it
+reads them anyway; `verify` reads all of it. The digests find what was changed, exchanged or mixed up; they are no
+signatures against somebody who changes the records too.
 """
 
 from __future__ import annotations
@@ -45,8 +46,8 @@ class StageInput(_Record):
 
 
 class StageRecord(_Record):
-    """`stage.json`: what the folder was begun with. `grown_from` lists the sha256 of its products before more items were added,
-    which its product now begins with or holds unchanged.
+    """`stage.json`: what the folder was begun with. `grown_from` lists the sha256 of its products before more items
+    were added, which its product now begins with or holds unchanged.
 
     package_files: sha256 of what cosfly itself brings and a later version may bring otherwise, as prompts.
     """
@@ -86,7 +87,8 @@ def read_stage_record(folder: Path) -> StageRecord:
 
 
 def fingerprint(path: Path) -> str:
-    """Give one digest for an input: a file's bytes, what a finished stage says of its products, or a playback tree's trajectory files."""
+    """Give one digest for an input: a file's bytes, a finished stage's products, or a playback tree's trajectory
+    files."""
     if not path.exists():
         raise InputError(
             "there is no such file or folder", where=path, fix="check the path, or run the stage that makes it"
@@ -103,13 +105,13 @@ def fingerprint(path: Path) -> str:
 
 
 def has_grown_from(path: Path, digest: str) -> bool:
-    """Tell whether an input is what it was with that fingerprint, and more: its stage was gone on with for more items."""
+    """Tell whether an input is what it was with that fingerprint, and more items."""
     begun = _record_of(path)
     return begun is not None and digest in begun.grown_from
 
 
 def folder_digests(folder: Path) -> dict[str, str]:
-    """Give the sha256 of each file of a flight by its name: as `checksums.sha256` has it, of what that leaves out its own."""
+    """Give the sha256 of each file of a flight by its name: as `checksums.sha256` has it, else its own."""
     listed = read_checksums(folder) if (folder / CHECKSUMS).is_file() else {}
     known, root = listed.keys() | {CHECKSUMS}, f"{folder}{os.sep}"
     found = (  # of thousands of files: as text, paths take three times as long
@@ -123,7 +125,7 @@ def folder_digests(folder: Path) -> dict[str, str]:
 
 
 def recorded_digests(folder: Path) -> dict[str, str]:
-    """Give the sha256 of a finished stage's products by their paths in its folder; empty where there is no manifest of ours."""
+    """Give the sha256 of a finished stage's products by their paths; empty where there is no manifest of ours."""
     if not _has_record(folder, "manifest.json", MANIFEST_SCHEMA):
         return {}
     made = read_model(
@@ -148,8 +150,8 @@ def checked_inputs(inputs: Mapping[str, Path], audited: Collection[str] = ()) ->
         audited: names of inputs whose files the stage itself compares with their records, one by one.
     Raises:
         InputError: an input is missing, or its name is not UTF-8 text.
-        VerifyError: one was changed since its stage finished it, its stage is not finished, or it was made of another one than
-            that which is given with it.
+        VerifyError: one was changed since its stage finished it, its stage is not finished, or it was made of another
+            one than that which is given with it.
     """
     for name, path in inputs.items():
         _check_name(path)
@@ -169,7 +171,7 @@ def _check_name(path: Path) -> None:
 
 
 def _stage_folder(path: Path) -> Path | None:
-    """Find the folder of the stage that made an input: itself, the one it stands in, or that one's; None where none of ours did."""
+    """Find the folder of the stage that made an input: itself, the one it stands in, or that one's; None: not ours."""
     places = [path] if path.is_dir() else [path.absolute().parent, path.absolute().parent.parent]
     return next((place for place in places if any(_has_record(place, *record) for record in RECORDS)), None)
 
@@ -200,16 +202,12 @@ def _check_finished(path: Path) -> None:
     for name, schema in RECORDS:
         if not _has_record(folder, name, schema):
             if path.is_file() and (dropped := _kept_nothing(folder)):
-                raise VerifyError(
-                    "the stage that made this kept nothing, so there is nothing to go on with", where=path, got=dropped,
-                    expected="at least one item that was kept",
-                    fix=f"see in {folder} why, mend that or change the stage's settings, and choose another --out",
-                )  # fmt: skip
-            raise VerifyError(
-                "the stage that makes this is not finished, or its records are gone", where=path,
-                got=f"no {name} in {folder}", expected=f"{name} of that stage",
-                fix="run that stage again; to use what is there as it is, copy it to a folder of its own",
-            )  # fmt: skip
+                what, expected = "the stage that made this kept nothing", "at least one item that was kept"
+                fix = f"see in {folder} why, mend that or change the stage's settings, and choose another --out"
+                raise VerifyError(what, where=path, got=dropped, expected=expected, fix=fix)
+            what, got = "the stage that makes this is not finished, or its records are gone", f"no {name} in {folder}"
+            fix = "run that stage again; to use what is there as it is, copy it to a folder of its own"
+            raise VerifyError(what, where=path, got=got, expected=f"{name} of that stage", fix=fix)
     digests = recorded_digests(folder)
     if path.is_file():
         name = path.absolute().relative_to(folder.absolute()).as_posix()
@@ -243,15 +241,13 @@ def _strangers(folder: Path, listed: Collection[str]) -> Iterator[str]:
 
 def _not_as_recorded(where: Path, wrong: list[str]) -> VerifyError:
     more = f" and {len(wrong) - NUM_NAMED} more" if len(wrong) > NUM_NAMED else ""
-    return VerifyError(
-        "what stands here is not what its stage finished", where=where, got="; ".join(wrong[:NUM_NAMED]) + more,
-        expected="the files that its records hold the digests of",
-        fix="put the files back or make them again; to use a file that you changed, copy it to a folder of its own",
-    )  # fmt: skip
+    what, expected = "what stands here is not what its stage finished", "the files that its records hold the digests of"
+    fix = "put the files back or make them again; to use a file that you changed, copy it to a folder of its own"
+    return VerifyError(what, where=where, got="; ".join(wrong[:NUM_NAMED]) + more, expected=expected, fix=fix)
 
 
 def _check_belongs(name: str, path: Path, inputs: Mapping[str, Path], found: Mapping[str, StageInput]) -> None:
-    """See that what an input was made of, where it is given too, is what is given: of several, as playback trees, one of them."""
+    """See that what an input was made of, where it is given too, is what is given: of several, one of them."""
     begun = _record_of(path)
     if begun is None:
         return
@@ -266,11 +262,9 @@ def _check_belongs(name: str, path: Path, inputs: Mapping[str, Path], found: Map
             continue
         if not any(record.sha256 == found[peer].sha256 for _, record in records):
             wanted, record = records[0]
-            raise VerifyError(
-                f"it was made of another input {wanted!r} than the one given with it", where=path,
-                got=f"given: {inputs[peer]}", expected=f"{record.path}, as it was then",
-                fix=f"give the two that belong together, or make {path.name} again",
-            )  # fmt: skip
+            what, got = f"it was made of another input {wanted!r} than the one given with it", f"given: {inputs[peer]}"
+            fix = f"give the two that belong together, or make {path.name} again"
+            raise VerifyError(what, where=path, got=got, expected=f"{record.path}, as it was then", fix=fix)
 
 
 def _role(name: str) -> str:
@@ -291,8 +285,8 @@ def was_made_of(product: Path, name: str) -> str | None:
 
 
 def stages_behind(products: Iterable[Path]) -> list[StageRecord]:
-    """Give the records of the stages that made some products, before each those that made its inputs, as far as these still stand
-    as they were.
+    """Give the records of the stages that made some products, before each those that made its inputs, as far as these
+    still stand as they were.
 
     Raises:
         InputError: a record cannot be read.

@@ -1,8 +1,8 @@
-"""Items to work, on this machine: worker processes with resume, progress, a tally that adds up and a record per failure.
+"""Items to work: worker processes with resume, progress, a tally that adds up and a record per failure.
 
 `run_items` is the whole interface. A stage hands it items (an id and a payload that pickles) and `make_worker`, a
-module-level function that is called once in each worker process with `worker_args` and returns the function that does one
-item. Load maps and open GL contexts in it. The same signature fits an actor pool on other machines.
+module-level function that is called once in each worker process with `worker_args` and returns the function that does
+one item. Load maps and open GL contexts in it. The same signature fits an actor pool on other machines.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Kept, StageFol
 from cosfly.work.store import remove_partials
 from cosfly.work.worker_pool import Watch, WorkerPool
 
-__all__ = ["Finished", "Item", "Outcome", "Watch", "Work", "advance", "run_items"]
+__all__ = ["Item", "Outcome", "Results", "Watch", "Work", "advance", "run_items"]
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Finished:
+class Results:
     """All outcomes of a stage, in the order of the items."""
 
     records: list[ItemRecord]
@@ -48,14 +48,14 @@ def run_items(
     workers: int = 0,
     watch: Watch = Watch(),
     label: str | None = None,
-) -> Finished:
+) -> Results:
     """Do all items that the stage's journal does not hold yet.
 
-    An item whose work raises is recorded as failed and counted; a fatal CosflyError (full disk, no GL) stops the stage, and
-    what was finished stays. A worker that dies (out of memory, kill) or stalls costs only its item, which gets two more tries, the
-    last one alone. An item that stalls again has failed; if one's worker dies again, the others are finished first and the
-    stage then stops, unfinished.
-    On a later run kept and dropped items are taken from the journal and failed ones are tried again.
+    An item whose work raises is recorded as failed and counted; a fatal CosflyError (full disk, no GL) stops the stage,
+    and what was finished stays. A worker that dies (out of memory, kill) or stalls costs only its item, which gets two
+    more tries, the last one alone. An item that stalls again has failed; if one's worker dies again, the others are
+    finished first and the stage then stops, unfinished. On a later run kept and dropped items are taken from the
+    journal and failed ones are tried again.
 
     Args:
         make_worker: module-level function; `make_worker(*worker_args)` returns the work function, once in each process.
@@ -94,7 +94,7 @@ def run_items(
             got=f"{tally.failed['worker_died']} of {len(ordered)} items without an outcome",
             fix="free some memory or use fewer --workers, then run the same command again: finished items are kept",
         )
-    return Finished(ordered, tally)
+    return Results(ordered, tally)
 
 
 def _tell(stage: str, record: ItemRecord) -> None:

@@ -1,4 +1,4 @@
-"""`events.jsonl`: what happened to the workers of a stage, for people and `cosfly bench`. No product: nothing is decided by it."""
+"""`events.jsonl`: what happened to a stage's workers, for people and `cosfly bench`; nothing is decided by it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,12 @@ from cosfly.work.journal import Journal
 EVENTS = "events.jsonl"
 PROBES_OF_ONE_PACE = 500  # after so many the pace is halved: a week of work makes a few thousand lines
 MEBIBYTE = 2**20
-LOSSES = ("heartbeat_lost", "timed_out", "worker_died")  # events of a worker that is of no use any more
+Loss = Literal["heartbeat_lost", "timed_out", "worker_died"]
+LOSSES: dict[str, str] = {  # events of a worker that is of no use any more
+    "heartbeat_lost": "its worker stood still",
+    "timed_out": "it did not get on within its time limit",
+    "worker_died": "its worker process died; it may need more memory than there is",
+}
 
 Kind = Literal[
     "began",  # workers: how many
@@ -44,8 +49,8 @@ class HowFar(NamedTuple):
 class Event(BaseModel):
     """A line of `events.jsonl`. at_s: seconds since 1970. worker: its place, 0 and up; a restarted one keeps it.
 
-    Of a probe: rss_mib by worker (the most since the probe before), cores in use by all workers, free disk space, and how far the stage
-    is: `done` of `total`, of steps, as frames, or of items.
+    Of a probe: rss_mib by worker (the most since the probe before), cores in use by all workers, free disk space, and
+    how far the stage is: `done` of `total`, of steps, as frames, or of items.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -89,7 +94,7 @@ class EventLog:
         self._journal.append(line.model_dump(exclude_none=True), sync=False)
 
     def probe(self, pids: Mapping[int, int]) -> None:
-        """Look at memory and processor time of the workers (place -> process id) and at the disk; not every look is written."""
+        """Look at memory and time of the workers (place -> process id) and at the disk; not every look is written."""
         for worker, pid in pids.items():
             self._peaks_mib[worker] = max(self._peaks_mib.get(worker, 0.0), rss_mib(pid))
             cpu_s = cpu_seconds(pid)
@@ -123,7 +128,7 @@ def read_events(folder: Path) -> list[Event]:
 
 
 def progress_of(events: Sequence[Event]) -> tuple[HowFar, float | None] | None:
-    """Tell how far a stage is that works now, and the seconds that it will still take at the pace of this time; None: nobody knows."""
+    """Tell how far a stage at work is, and the seconds that it will still take at this pace; None: nobody knows."""
     began = max((k for k, event in enumerate(events) if event.event == "began"), default=0)
     told = [(event.at_s, far) for event in events[began:] if (far := event.how_far)]
     if not told:
@@ -134,7 +139,7 @@ def progress_of(events: Sequence[Event]) -> tuple[HowFar, float | None] | None:
 
 
 def lost_steps(folder: Path) -> int:
-    """Count the steps, as frames, that were done of items which then failed or were lost with their worker: they are in no product."""
+    """Count the steps, as frames, of items which then failed or were lost with their worker: they are in no product."""
     return sum(event.steps or 0 for event in read_events(folder) if event.event in LOSSES or event.status == "failed")
 
 

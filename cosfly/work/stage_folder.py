@@ -1,7 +1,7 @@
 """The folder of one stage and the records in it.
 
-A stage folder tells its own story: `stage.json` is written first (settings, inputs, seed, code version), `items.jsonl` grows
-while items are finished, `failures.jsonl` and `manifest.json` are written last. A manifest means: complete.
+A stage folder tells its own story: `stage.json` is written first (settings, inputs, seed, code version), `items.jsonl`
+grows while items are finished, `failures.jsonl` and `manifest.json` are written last. A manifest means: complete.
 """
 
 from __future__ import annotations
@@ -174,8 +174,8 @@ def read_manifest(folder: Path) -> Manifest:
 class StageFolder:
     """One stage's output folder, opened for one set of settings and inputs.
 
-    `open` writes `stage.json`; `finish` writes `manifest.json`. If the folder is already complete for the same settings and
-    inputs, and no item failed, `is_complete` is true and the stage has nothing to do.
+    `open` writes `stage.json`; `finish` writes `manifest.json`. If the folder is already complete for the same settings
+    and inputs, and no item failed, `is_complete` is true and the stage has nothing to do.
     """
 
     def __init__(self, path: Path, stage: str, is_complete: bool, lock: FolderLock | None = None) -> None:
@@ -199,18 +199,21 @@ class StageFolder:
     ) -> StageFolder:
         """Start or continue a stage.
 
-        A folder whose inputs have grown, and one whose settings in `grows` have, is gone on with: its items stay, more are added.
+        A folder whose inputs have grown, and one whose settings in `grows` have, is gone on with: its items stay, more
+        are added.
 
         Args:
             config: the stage's settings; those that are MayDiffer are not put on record.
             inputs: name -> file or folder that the stage reads.
-            resume: `never` refuses a folder that holds work; `if-same` continues only with equal settings, inputs and seed.
+            resume: `never` refuses a folder that holds work; `if-same` continues only with equal settings, inputs and
+                seed.
             package_files: name -> file or flat folder of the package that decides what is made.
             audited: names of inputs that the stage itself holds against their records, item by item.
             grows: names of settings of which more means more items, those of before unchanged.
             begins_anew: with grown inputs all items are other ones, so none of before is kept.
         Raises:
-            VerifyError: an input is not what its stage finished, or was made of another one than that which is given with it.
+            VerifyError: an input is not what its stage finished, or was made of another one than that which is given
+                with it.
             ResumeError: the folder holds work that may not be continued; names what differs.
         """
         record = StageRecord(
@@ -307,7 +310,8 @@ class StageFolder:
         """Give the error of a stage that has nothing for the next one: how often what happened, and the first failure.
 
         Args:
-            where: what stands on disk and says why; else the stage's folder. fix: what to do, where more is known of it.
+            where: what stands on disk and says why; else the stage's folder. fix: what to do, where more is known of
+                it.
         """
         path = self.path / "failures.jsonl"
         failures = read_failures(path) if path.exists() else []
@@ -332,7 +336,8 @@ def _taken_up(out: Path, record: StageRecord, resume: Resume, grows: Collection[
     found = read_stage_record(out)
     # An attempt that ended before anything was finished binds nobody to its settings, unless it grew from what was.
     if not _holds_work(out) and not found.grown_from:
-        # stage.json stays until the new one is written: without it a kill would leave what looks like somebody else's files.
+        # stage.json stays until the new one is written: without it a kill would leave what looks like somebody else's
+        # files.
         for name in BEGUN:
             if name != "stage.json":
                 (out / name).unlink(missing_ok=True)
@@ -381,7 +386,8 @@ def _holds_work(out: Path) -> bool:
 
 
 def _grown(found: StageRecord, wanted: StageRecord, grows: Collection[str]) -> dict[str, str]:
-    """Name what is more than it was and else the same: settings in `grows`, inputs whose stage has grown from what they were."""
+    """Name what is more than it was and else the same: settings in `grows`, inputs whose stage has grown from what they
+    were."""
     before, after = flattened(found.config), flattened(wanted.config)
     grown = {
         name: f"{name} was {before[name]!r}, is {after[name]!r}"

@@ -48,7 +48,8 @@ def _concerns(error: OSError, path: Path) -> bool:
 
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[IO[bytes]]:
-    """Fill a file under a temporary name; rename it when the block ends, so that a kill leaves either the old file or the new."""
+    """Fill a file under a temporary name; rename it when the block ends, so that a kill leaves either the old file or
+    the new."""
     refuse_link(path)
     if path.is_dir():  # asked first: `.` and `/` have no name to put a temporary one beside
         raise StorageError("cannot write a file where a folder is", where=path, fix="name a file in it")
@@ -73,7 +74,8 @@ def _partial(path: Path) -> Path:
 
 
 def _remove_left(path: Path) -> None:
-    """Remove what kills left under the temporary names of a file or folder: names of processes that are gone, and of this one."""
+    """Remove what kills left under the temporary names of a file or folder: names of processes that are gone, and of
+    this one."""
     begin = f".{path.name}."
     for name in os.listdir(path.parent):
         if name.startswith(begin) and name.endswith(".partial"):
@@ -134,7 +136,7 @@ def sha256_bytes(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-# --- folders of many files ----------------------------------------------------------------------------------------------
+# --- folders of many files --------------------------------------------------------------------------------------------
 
 
 def refuse_link(path: Path) -> None:
@@ -231,7 +233,8 @@ def read_checksums(folder: Path) -> dict[str, str]:
 
 
 def _is_plain_folder(root: str, name: str, known: set[str]) -> bool:
-    """Tell whether no part of a folder's name is a link; `known` are those of which that is known, each looked at once."""
+    """Tell whether no part of a folder's name is a link; `known` are those of which that is known, each looked at
+    once."""
     if name not in known:
         if not _is_plain_folder(root, os.path.dirname(name), known) or os.path.islink(root + name):
             return False

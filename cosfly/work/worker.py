@@ -44,13 +44,13 @@ class Sign:
 
 
 @dataclass(frozen=True)
-class Broken:
+class Abort:
     """The stage cannot go on: a fatal error, or the worker cannot be made."""
 
     error: Exception
 
 
-Message = Sign | Broken | logging.LogRecord | ItemRecord
+Message = Sign | Abort | logging.LogRecord | ItemRecord
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ class Manner:
 
 @dataclass(frozen=True)
 class Start:
-    """The first thing that a worker gets through its pipe; `make_worker` is a module-level function. own_files: what stands in the place of
-    files that ship (cosfly/work/in_place.py)."""
+    """The first thing that a worker gets through its pipe; `make_worker` is a module-level function. own_files: what
+    stands in the place of files that ship (cosfly/work/in_place.py)."""
 
     make_worker: Callable[..., Work]
     worker_args: tuple
@@ -75,7 +75,7 @@ class Start:
 
 @contextlib.contextmanager
 def signals_held_back() -> Iterator[None]:
-    """Hold back Ctrl-C and its like; a worker that starts here inherits that, or they would hit it in the middle of an import."""
+    """Hold back Ctrl-C and its like; a worker that starts here inherits that, or they would hit its imports."""
     resource_tracker.ensure_running()  # the first worker would start this, and with it end the holding back
     before = signal.pthread_sigmask(signal.SIG_BLOCK, LEFT_TO_THE_PARENT)
     try:
@@ -85,7 +85,8 @@ def signals_held_back() -> Iterator[None]:
 
 
 def keep_freed_memory() -> None:
-    """Let this process keep up to 64 MiB of what it frees, for the next frame: its arrays are megabytes each, and what the system gives anew it clears page by page.
+    """Let this process keep up to 64 MiB of what it frees, for the next frame: its arrays are megabytes each, and what
+    the system gives anew it clears page by page.
 
     Where another C library allocates, nothing changes.
     """
@@ -123,7 +124,7 @@ def work_through(connection: Connection, manner: Manner) -> None:
             if type(error).__module__ != "builtins":  # many of those do not cross the pipe; their words do
                 error = RuntimeError(f"a bug in a worker: {type(error).__name__}: {error}")
             error.add_note(traceback.format_exc())  # a bug keeps its traceback, which does not cross the pipe
-        voice.send(Broken(error))
+        voice.send(Abort(error))
 
 
 def _received(connection: Connection) -> Any:
@@ -135,7 +136,7 @@ def _received(connection: Connection) -> Any:
 
 
 def end_with_parent(parent_pid: int) -> None:
-    """Have the system kill this process with its parent; elsewhere than on Linux the pipe tells, at the next sign of life."""
+    """Have the system kill this process with its parent; elsewhere than on Linux the pipe tells."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent_pid:  # it died before we asked

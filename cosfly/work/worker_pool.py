@@ -1,7 +1,7 @@
 """Worker processes that are watched: one that dies, stalls or takes for ever is replaced, and its item tried again.
 
-All that can block on a worker (sending it an item, reading from it) happens in a thread of its own, so that nothing a worker
-does or leaves undone holds up the stage. `worker` is the other end of the pipe.
+All that can block on a worker (sending it an item, reading from it) happens in a thread of its own, so that nothing a
+worker does or leaves undone holds up the stage. `worker` is the other end of the pipe.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
-from typing import Any, Literal
+from typing import Any
 
 from cosfly.errors import EnvironmentMissing
 from cosfly.reading.limits import limits
 from cosfly.work.in_place import everything
 from cosfly.work.items import Item, Work
-from cosfly.work.stage_events import EventLog, cpu_seconds
+from cosfly.work.stage_events import LOSSES, EventLog, Loss, cpu_seconds
 from cosfly.work.stage_folder import Failed, ItemRecord
-from cosfly.work.worker import Broken, Manner, Message, Sign, Start, signals_held_back, work_through
+from cosfly.work.worker import Abort, Manner, Message, Sign, Start, signals_held_back, work_through
 
 log = logging.getLogger(__name__)
 
@@ -39,8 +39,9 @@ PATIENCE_S = 5.0  # for a worker that has no more to do to end by itself
 class Watch:
     """When a worker counts as stalled, and what is done then; the times are those of the paper (sec:dataset_watchdog).
 
-    item_limit_s: how long an item may go without getting on (no step of it is told of); 0: for ever; None: ten minutes or 20 times
-    what items take, whichever is more, and with each new attempt twice as long, as for the start of a worker.
+    item_limit_s: how long an item may go without getting on (no step of it is told of); 0: for ever; None: ten minutes
+    or 20 times what items take, whichever is more, and with each new attempt twice as long, as for the start of a
+    worker.
     """
 
     item_limit_s: float | None = None
@@ -58,7 +59,8 @@ def limit_s(watch: Watch, seconds: Collection[float], attempt: int, has_begun: b
     Args:
         seconds: what items took that are done.
         attempt: 0 for the first.
-        has_begun: False while the worker still reads maps and compiles, which a limit that somebody set was not meant for.
+        has_begun: False while the worker still reads maps and compiles, which a limit that somebody set was not meant
+            for.
     """
     if watch.item_limit_s == 0:
         return math.inf
@@ -66,14 +68,6 @@ def limit_s(watch: Watch, seconds: Collection[float], attempt: int, has_begun: b
         return watch.item_limit_s
     typical_s = statistics.median(seconds) if seconds else 0.0
     return max(LEAST_LIMIT_S, TYPICAL_ITEMS * typical_s, watch.item_limit_s or 0.0) * 2**attempt
-
-
-Loss = Literal["heartbeat_lost", "timed_out", "worker_died"]
-WORDS: dict[Loss, str] = {
-    "heartbeat_lost": "its worker stood still",
-    "timed_out": "it did not get on within its time limit",
-    "worker_died": "its worker process died; it may need more memory than there is",
-}
 
 
 @dataclass(frozen=True)
@@ -148,7 +142,7 @@ class WorkerPool:
         self._end(patience_s=PATIENCE_S)
         self.events.tell("ended")
 
-    # --- giving work ------------------------------------------------------------------------------------------------------
+    # --- giving work --------------------------------------------------------------------------------------------------
 
     def _busy(self) -> list[_Worker]:
         return [worker for worker in self._workers.values() if worker.attempt is not None]
@@ -162,7 +156,8 @@ class WorkerPool:
                 worker.give(attempt)
 
     def _next_attempt(self, place: int) -> _Attempt | None:
-        """Take what is to be done next, at a place. A last attempt is made alone: there may not be the memory for two."""
+        """Take what is to be done next, at a place. A last attempt is made alone: there may not be the memory for
+        two."""
         for k, attempt in enumerate(self._waiting):
             if attempt.number < self.watch.retries or attempt.number == 0:
                 del self._waiting[k]
@@ -188,7 +183,7 @@ class WorkerPool:
         self._lost.discard(place)
         return worker
 
-    # --- hearing what comes of it -----------------------------------------------------------------------------------------
+    # --- hearing what comes of it -------------------------------------------------------------------------------------
 
     def _told(self, until_s: float) -> list[tuple[_Worker, Message | None]]:
         """Wait for a message, at most until then; those of workers that were given up count no more."""
@@ -201,7 +196,7 @@ class WorkerPool:
     def _hear(self, worker: _Worker, message: Message | None) -> Iterator[ItemRecord]:
         if message is None:
             yield from self._lose(worker, "worker_died")
-        elif isinstance(message, Broken):
+        elif isinstance(message, Abort):
             raise message.error
         elif isinstance(message, logging.LogRecord):
             logging.getLogger(message.name).handle(message)
@@ -242,7 +237,7 @@ class WorkerPool:
             elif worker.quiet_s > limit_s(self.watch, self._seconds, worker.attempt.number, worker.has_begun):
                 yield from self._lose(worker, "timed_out")
 
-    # --- losing a worker --------------------------------------------------------------------------------------------------
+    # --- losing a worker ----------------------------------------------------------------------------------------------
 
     def _lose(self, worker: _Worker, loss: Loss) -> Iterator[ItemRecord]:
         """End a worker that is of no use any more; its item is tried again, or has failed."""
@@ -261,17 +256,17 @@ class WorkerPool:
             raise EnvironmentMissing(
                 "workers die or stall all the time",
                 where=item.item_id,
-                got=f"{self.num_lost} lost, {self._num_done} items done; the last: {WORDS[loss]}",
-                fix="see events.jsonl; free some memory, use fewer --workers or raise item_limit_s, then run the same command "
-                "again: finished items are kept",
+                got=f"{self.num_lost} lost, {self._num_done} items done; the last: {LOSSES[loss]}",
+                fix="see events.jsonl; free some memory, use fewer --workers or raise item_limit_s, then run the same "
+                "command again: finished items are kept",
             )
         if attempt.number < self.watch.retries:
-            log.warning("%s: %s; it is tried again", item.item_id, WORDS[loss])
+            log.warning("%s: %s; it is tried again", item.item_id, LOSSES[loss])
             self._waiting.append(_Attempt(item, attempt.number + 1))
             self.events.tell("retried", item=item.item_id, attempt=attempt.number + 1)
             return
         self.events.tell("given_up", item=item.item_id)
-        message = f"{item.item_id}: {WORDS[loss]}, {attempt.number + 1} times"
+        message = f"{item.item_id}: {LOSSES[loss]}, {attempt.number + 1} times"
         yield Failed(id=item.item_id, code="worker_died" if loss == "worker_died" else "timed_out", message=message)
 
     def _stop(self, worker: _Worker, patience_s: float) -> None:
@@ -291,7 +286,8 @@ class WorkerPool:
 
 
 def _attend(worker: _Worker, start: Start, connection: Connection, messages: queue.SimpleQueue) -> None:
-    """Carry items to a worker and what it says to the pool, until either wants no more; None in `messages`: it is gone."""
+    """Carry items to a worker and what it says to the pool, until either wants no more; None in `messages`: it is
+    gone."""
     try:
         with connection:
             connection.send(start)
@@ -301,10 +297,10 @@ def _attend(worker: _Worker, start: Start, connection: Connection, messages: que
                     message = connection.recv()
                     worker.has_told = True
                     messages.put((worker, message))
-                    if isinstance(message, Broken | ItemRecord):
+                    if isinstance(message, Abort | ItemRecord):
                         break
             connection.send(None)
     except (EOFError, OSError):
         messages.put((worker, None))
     except Exception as error:  # an item that does not pickle, a message that does not unpickle
-        messages.put((worker, Broken(error)))
+        messages.put((worker, Abort(error)))

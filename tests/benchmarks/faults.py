@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.work.chance import rng_for
-from cosfly.work.stage_events import read_events
-from cosfly.work.worker_pool import WORDS
+from cosfly.work.stage_events import LOSSES, read_events
 
 SIGNALS = {"kill": signal.SIGKILL, "stall": signal.SIGSTOP}
 SPAN = (0.05, 0.9)  # of an undisturbed run's time: when faults happen
@@ -80,7 +79,7 @@ def _workers(folder: Path, is_over: threading.Event) -> list[int]:
         pids: dict[int, int] = {}
         for event in read_events(folder):
             if event.worker is not None and event.pid is not None:
-                pids[event.worker] = 0 if event.event in WORDS else event.pid
+                pids[event.worker] = 0 if event.event in LOSSES else event.pid
         if running := sorted(pid for pid in pids.values() if pid and is_running_child(pid)):
             return running
         is_over.wait(LOOK_AGAIN_S)
