@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from cosfly.errors import InputError, RenderError
-from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, depth_values
+from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, depth_bytes, depth_values
 from cosfly.reading.arrays import parse_array, parse_picture
 from release.record import DepthCoding, DepthCodingName
 
@@ -60,14 +60,16 @@ class DepthErrors(BaseModel):
 
 
 def encoded(data: memoryview, coding: DepthCodingName, where: Path) -> tuple[bytes, DepthErrors]:
-    """Code a depth image otherwise than float32, which needs none: the bytes of its row, and what the coding costs.
+    """Code a depth image: the bytes of its row, and what the coding costs.
 
     Args:
-        data: of a `.npy` file, checked.
+        data: of a file of a playback tree, checked.
     Raises:
         InputError: it holds a depth that the coding has no number for.
     """
     values = depth_values(data, where)
+    if coding == "float32":
+        return depth_bytes(values), DepthErrors()
     is_measured = (values != SKY_DEPTH_M) & (values != INVALID_DEPTH_M)
     known = values[is_measured]
     coder = {"float16": _as_float16, "millimetre_png": _as_millimetres}[coding]

@@ -57,7 +57,7 @@ from cosfly.products.answer_text import Parsed, parse_answer
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.products.captions import Coc, read_captions
 from cosfly.products.flights import find_flights, read_twin
-from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
+from cosfly.products.frames import DEPTH_PNG, read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.inspection import read_inspection
 from cosfly.products.kinds import KINDS
 from cosfly.products.meshes import write_meshes
@@ -114,7 +114,7 @@ from release.transfer.stage import Choice
 from release.verify.verify import verify
 from release.viewer import page as viewer
 from release.viewer.content import ViewerConfig
-from specimens import make_playback_tree
+from specimens import make_playback_tree, pack_depth
 
 ANSWER = {
     "critical_components": "The pedestrian walks 12.4 m ahead, 3 px left of the centre; the drone flies 1.2 m/s at 8 m.",
@@ -183,6 +183,7 @@ def make_specimens(root: Path) -> Path:
         "boxes": [[1, 1], [7, 7]],
     }
     write_json(tree / "Town01" / IDS_FILE, {"schema": IDS_SCHEMA, "schema_version": IDS_VERSION, **ids})
+    pack_depth(root / TREE / "aug_001")
     for folder in find_flights(tree):
         write_checksums(
             folder, {name: digest for name, digest in provenance.folder_digests(folder).items() if name != CHECKSUMS}
@@ -682,6 +683,7 @@ READERS: dict[str, Reader] = {
     "annotation": _one(f"{TREE}/ORI/{FRAME}/meta.json", lambda path: read_meta(path.parent)),
     "rgb": _one(PICTURES[0], lambda path: read_rgb(path.parent)),
     "depth": _one(PICTURES[1], lambda path: read_depth(path.parent)),
+    "depth, packed": _one(f"{TREE}/aug_001/{FRAME}/{DEPTH_PNG}", lambda path: read_depth(path.parent)),
     "instance": _one(PICTURES[2], lambda path: read_instance(path.parent)),
     "PNG, by rows": Reader(PICTURES[::2], lambda root, _: [parse_png(read_bytes(root / name, what="picture"), name).pixels() for name in PICTURES[::2]]),
     "instance_ids": _one(f"render/Town01/{IDS_FILE}", lambda path: read_instance_ids(path.parent)),

@@ -20,8 +20,10 @@ from cosfly.products.frames import (
     TargetMeta,
     camera_meta,
     depth_bytes,
+    depth_file,
     frame_name,
     instance_bytes,
+    read_depth,
     rgb_bytes,
     tree_angles,
     tree_pose,
@@ -268,6 +270,14 @@ def paint(scene: Scene, flight: Flight, i: int) -> tuple[np.ndarray, np.ndarray,
         semantic.reshape(h, w).astype(np.uint8),
         instance.reshape(h, w).astype(np.uint16),
     )
+
+
+def pack_depth(folder: Path) -> None:
+    """Give all depth in a folder the form that `render` writes."""
+    for path in folder.rglob("depth.npy"):
+        name, data = depth_file(read_depth(path.parent), "png")
+        path.with_name(name).write_bytes(data)
+        path.unlink()
 
 
 def _write_frame(folder: Path, flight: Flight, scene: Scene, i: int) -> None:

@@ -26,7 +26,16 @@ from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
 from cosfly.products.boxes import make_box_map, read_boxes, write_boxes
 from cosfly.products.flights import find_flights
-from cosfly.products.frames import OtherMeta, OthersMeta, frame_name, read_instance, read_meta, tree_position
+from cosfly.products.frames import (
+    OtherMeta,
+    OthersMeta,
+    depth_file,
+    frame_name,
+    read_depth,
+    read_instance,
+    read_meta,
+    tree_position,
+)
 from cosfly.products.inspection import read_inspection
 from cosfly.products.issues import Issue, Report
 from cosfly.products.kinds import KINDS
@@ -36,7 +45,7 @@ from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
 from cosfly.space.kernels import obstacle_index, signed_distances
 from cosfly.work.store import CHECKSUMS, write_checksums, write_json
-from specimens import make_playback_tree
+from specimens import make_playback_tree, pack_depth
 
 NUM_POINTS = 10
 
@@ -59,14 +68,18 @@ def write_map(workplace: Path, *boxes) -> None:
     write_boxes(workplace / "map.json", made)
 
 
+def list_files(tree: Path) -> None:
+    for folder in find_flights(tree):
+        files = [p for p in folder.rglob("*") if p.is_file() and p.name != CHECKSUMS]
+        write_checksums(folder, {p.relative_to(folder).as_posix(): sha256_file(p) for p in files})
+
+
 @pytest.fixture(scope="module")
 def specimen(tmp_path_factory) -> Path:
     """A clean tree with checksums, and its plans; copied before anything is broken."""
     root = tmp_path_factory.mktemp("specimen")
     tree = make_playback_tree(root / "tree", num_flights=2, num_points=NUM_POINTS, width_px=192, height_px=108)
-    for folder in find_flights(tree):
-        files = [p for p in folder.rglob("*") if p.is_file()]
-        write_checksums(folder, {p.relative_to(folder).as_posix(): sha256_file(p) for p in files})
+    list_files(tree)
     plans = [plan_of(folder) for folder in find_flights(tree) if folder.name == "ORI"]
     write_traces(root / "drone_trace.json", plans, {})
     write_map(root)
@@ -125,6 +138,22 @@ def test_what_a_tree_was_never_to_have_is_not_missing(workplace):
     found = inspect(workplace)
     assert codes_of(found, lost)["missing_file"] == "error"
     assert codes_of(found, never) == {"not_in_this_tree": "note"}
+
+
+def test_packed_depth_is_judged_as_any_other(workplace):
+    tree = workplace / "tree"
+    pack_depth(tree)
+    good, wrong, cut = find_flights(tree)[:3]
+    name, data = depth_file(far_away(read_depth(wrong / FRAME)), "png")
+    (wrong / FRAME / name).write_bytes(data)
+    (cut / FRAME / name).write_bytes((cut / FRAME / name).read_bytes()[:-20])
+    list_files(tree)
+    found = inspect(workplace)
+    assert codes_of(found, good) == {}
+    assert codes_of(found, wrong)["depth_disagrees"] == "error"
+    assert codes_of(found, cut)["broken_image"] == "error"
+    where = {issue.where for flight in found.flights for issue in flight.issues if issue.severity == "error"}
+    assert where == {f"{FRAME}/{name}"}
 
 
 def test_what_nothing_lists_is_not_asked_for(workplace):

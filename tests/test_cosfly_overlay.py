@@ -56,7 +56,7 @@ def test_debug_pictures_are_written_where_they_are_asked_for(trees):
     (folder,) = find_flights(trees[True])
     named = [name for name in read_checksums(folder) if name.endswith("debug.png")]
     assert len(named) == len(list(folder.rglob("debug.png"))) == 3
-    for name in ("rgb.png", "depth.npy", "instance.png"):
+    for name in ("rgb.png", "depth_float32.png", "instance.png"):
         assert (frame_of(trees[True]) / name).read_bytes() == (frame_of(trees[False]) / name).read_bytes()
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from cosfly.errors import InputError
-from cosfly.products.png import areas_png, colours_png, parse_png
+from cosfly.products.png import areas_png, colours_png, floats_of, floats_png, parse_png
 
 KIND_OF = {1: 0, 2: 4, 3: 2, 4: 6}
 
@@ -128,3 +128,17 @@ def test_what_is_written_is_read_by_libraries(seed, height, width):
         np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1], picture)
         np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(data))), picture)
         np.testing.assert_array_equal(parse_png(data, "x").pixels(), picture)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 5), (72, 128)])
+def test_floats_come_back_to_the_bit_and_any_library_finds_their_bytes(shape):
+    values = np.random.default_rng(0).integers(0, 2**32, shape, dtype=np.uint32).view(np.float32)
+    data = floats_png(values)
+    assert floats_of(data, "x").tobytes() == values.tobytes(), "also what is no number"
+    with Image.open(io.BytesIO(data)) as image:
+        assert np.asarray(image).view("<f4")[..., 0].tobytes() == values.tobytes()
+
+
+def test_a_picture_is_no_depth():
+    with pytest.raises(InputError, match="3 channels, not the 4 bytes"):
+        floats_of(colours_png(np.zeros((2, 2, 3), np.uint8)), "x")

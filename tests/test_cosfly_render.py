@@ -564,6 +564,20 @@ def files_of(tree: Path) -> dict[str, str]:
 
 
 @needs_gl
+def test_the_public_layout_has_the_same_depth_in_a_file_of_its_own(finished, tmp_path):
+    tree, inputs = finished
+    public = run(build(RenderConfig, {**SMALL, "depth_format": "npy"}, "test"), *inputs, tmp_path / "out", seed=5)
+    for folder, other in zip(find_flights(tree), find_flights(public), strict=True):
+        assert folder.relative_to(tree) == other.relative_to(public), "the form makes no other flight of it"
+        assert set(read_checksums(other)) == {
+            n.replace("depth_float32.png", "depth.npy") for n in read_checksums(folder)
+        }
+        for frame in sorted(folder.glob("frames_playback/*")):
+            packed, plain = read_depth(frame), np.load(other / frame.relative_to(folder) / "depth.npy")
+            assert packed.tobytes() == plain.tobytes()
+
+
+@needs_gl
 def test_the_tree_is_complete_and_readable(finished):
     tree, _ = finished
     folders = find_flights(tree)

@@ -371,7 +371,7 @@ def test_records_stand_in_every_file_and_labels_are_those_of_fair_weather(trees)
             assert meta.look is None
             assert list(told["weather"]) == ["mode", "weather_name", "tod_name", "params"]
             assert "weather" not in read_json(before / "meta.json")
-            for name in ("depth.npy", "instance.png"):
+            for name in ("depth_float32.png", "instance.png"):
                 assert (frame / name).read_bytes() == (before / name).read_bytes()
             assert (read_rgb(frame) != read_rgb(before)).any()
             assert read_depth(frame).dtype == np.float32

@@ -324,6 +324,7 @@ CHANGES = {
     "exchanged": lambda data, other: other,
 }
 # Which stages refuse a changed file when they begin. Those that are missing here read pictures: of them below.
+PICTURES = ("rgb.png", "depth_float32.png", "instance.png")
 REFUSED_BY = {
     "maps/boxes_Nd.json": ("simplify", "render"),
     "simplify/stepN_simplified.json": ("pedestrians", "plan", "render", "inspect"),
@@ -389,14 +390,14 @@ def test_a_changed_file_is_refused_by_the_stages_that_read_it(tampered):
 def test_no_changed_picture_reaches_a_release(base, tmp_path):
     out = begin(base, tmp_path / "run", "release")
     flights = find_flights(out / "render")
-    for flight, name in zip(flights[:3], ("rgb.png", "depth.npy", "instance.png"), strict=True):
+    for flight, name in zip(flights[:3], PICTURES, strict=True):
         frames = flight / "frames_playback"
         shutil.copy(frames / "frame_00001" / name, frames / "frame_00000" / name)
     with pytest.raises(VerifyError, match="nothing is released"):
         work(tiny(), out, "release")
     failures = " ".join(failure.message for failure in read_failures(out / "release/failures.jsonl"))
     assert failures.count("not the one that is on record") == 3
-    assert all(f"frame_00000/{name}: a file" in failures for name in ("rgb.png", "depth.npy", "instance.png"))
+    assert all(f"frame_00000/{name}: a file" in failures for name in PICTURES)
     assert not (out / "release/dataset").exists()
     assert not (out / "release/manifest.json").exists()
 
@@ -439,7 +440,7 @@ def test_captions_and_inspections_of_another_tree_are_refused(base, tmp_path):
 
 def test_verify_on_the_command_line_names_the_file_before_anything_is_done(tampered):
     kinds = kinds_of(tampered)
-    picture = next(paths for kind, paths in kinds.items() if kind.endswith("depth.npy"))
+    picture = next(paths for kind, paths in kinds.items() if kind.endswith("depth_floatN.png"))
     settings = [word for setting in TINY for word in ("--set", setting)]
     caption = ["caption", "--data", str(tampered / "render"), "--out", str(tampered / "caption"), *settings]
     with changed(picture, "edited") as path:
@@ -461,7 +462,7 @@ def test_two_workers_give_the_same_products(base, tmp_path, stage):
 @pytest.mark.slow
 def test_a_damaged_frame_is_named_and_rejects_its_flight(base, tmp_path):
     out = begin(base, tmp_path / "run", "inspect")
-    depth = find_flights(out / "render")[0] / "frames_playback/frame_00003/depth.npy"
+    depth = find_flights(out / "render")[0] / "frames_playback/frame_00003/depth_float32.png"
     depth.write_bytes(b"half")
     work(tiny(), out, "inspect")
     assert "frame_00003" in json.dumps(read_json(out / "inspect/inspect.json"))

@@ -36,7 +36,7 @@ from release.package.config import ReleaseConfig
 from release.package.sources import Source
 from release.package.stage import run
 from release.record import ReleaseRecord, read_record
-from specimens import make_playback_tree
+from specimens import make_playback_tree, pack_depth
 
 POINTS = 14
 
@@ -240,6 +240,14 @@ def test_depth_is_lossless_unless_asked_and_millimetres_end_at_65_5_m(material, 
     row = table_of(folder, ["town", "trajectory", "variant", "frame_index", "depth"])[3]
     flight = read_flight(material / "tree" / row["town"] / row["trajectory"] / row["variant"])
     assert row["depth"] == depth_bytes(read_depth(flight.frame_folder(row["frame_index"])))
+    packed = shutil.copytree(material, tmp_path / "packed")
+    pack_depth(packed)
+    write_inspection(packed / "inspect.json", make_inspection(packed / "tree", {}))
+    assert {
+        p.name: p.read_bytes() for p in run(split_cfg(), [source_of(packed)], tmp_path / "p").rglob("*.parquet")
+    } == {p.name: p.read_bytes() for p in folder.rglob("*.parquet")}, (
+        "a release does not tell in which form the tree keeps depth"
+    )
     with pytest.raises(InputError, match=r"depth that a PNG of millimetres cannot hold.*at most 65\.5 m"):
         run(split_cfg(depth="millimetre_png"), [source_of(material)], tmp_path / "mm")
     record = record_of(material, tmp_path / "half", split_cfg(depth="float16"))

@@ -6,7 +6,6 @@ The observed frames and the future leave this module as two types, so that a pro
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,6 +25,7 @@ from caption.schema import (
 from caption.truth.actions import label_of, measure
 from cosfly.geometry import look_at
 from cosfly.products.captions import KeyframeRecord, LabelFrom
+from cosfly.products.frames import files_in
 from cosfly.products.places import sample_id
 from cosfly.products.playback import Flight
 from cosfly.products.segments import Mission
@@ -49,7 +49,7 @@ def cut_windows(
     """
     motion, frames = label_motion(flight, twin), frames_of(flight)
     folders = [flight.frame_folder(i) for i in range(len(flight))]
-    files = [_files_in(folder) for folder in folders]
+    files = [files_in(folder) for folder in folders]
     missing = {i for i, names in enumerate(files) if "rgb.png" not in names} if cfg.require_images else set()
     currents = list(current_frames(len(flight), cfg))
     keyframes: list[KeyframeRecord | None] = [None] * len(currents)
@@ -90,13 +90,6 @@ def choose_keyframes(labels: list[str | None], stride: int) -> dict[int, Keyfram
 def missed_changes(labels: list[str | None], chosen: set[int]) -> list[int]:
     """Give the windows at which the label changes and that were not chosen."""
     return [i for i in range(1, len(labels)) if labels[i] != labels[i - 1] and i not in chosen]
-
-
-def _files_in(folder: Path) -> frozenset[str]:
-    try:
-        return frozenset(os.listdir(folder))
-    except OSError:  # no such frame: the window says so
-        return frozenset()
 
 
 def frames_of(flight: Flight) -> tuple[ObservedFrame, ...]:

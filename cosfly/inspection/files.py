@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from cosfly.errors import InputError
-from cosfly.products.frames import FRAME_FILES, FRAMES_DIR, FrameMeta, frame_name, read_meta
+from cosfly.products.frames import FRAME_FILES, FRAMES_DIR, FrameMeta, frame_name, frame_path, public_name, read_meta
 from cosfly.products.issues import Report
 from cosfly.products.places import tree_of_flight
 from cosfly.products.playback import Flight
@@ -42,7 +42,8 @@ def check_files(flight: Flight, report: Report) -> dict[int, FrameMeta | None]:
     for i in range(len(flight)):
         problems_before, meta = len(report.issues), None
         for name in names:
-            path, where = flight.frame_folder(i) / name, f"{frame_name(i)}/{name}"
+            path = frame_path(flight.frame_folder(i), name)
+            where = f"{frame_name(i)}/{path.name}"
             if not path.is_file():
                 report.error("missing_file", where, "no such file", "one file per frame and modality")
             elif name == "meta.json":
@@ -64,13 +65,13 @@ def _lists(flight: Flight, names: Collection[str]) -> bool:
     if not (flight.folder / CHECKSUMS).is_file():
         return False
     try:
-        return any(listed.rpartition("/")[2] in names for listed in read_checksums(flight.folder))
+        return any(public_name(listed.rpartition("/")[2]) in names for listed in read_checksums(flight.folder))
     except InputError:
         return True
 
 
 def _has_any(flight: Flight, name: str) -> bool:
-    return any((flight.frame_folder(i) / name).exists() for i in range(len(flight)))
+    return any(frame_path(flight.frame_folder(i), name).exists() for i in range(len(flight)))
 
 
 def _check_header(path: Path, size: tuple[int, int], tree: Path, where: str, report: Report) -> None:

@@ -19,6 +19,7 @@ from cosfly.inspection.files import Checksums
 from cosfly.inspection.pixels import NUM_IDS, Look, Picture, look_at, unpack
 from cosfly.inspection.settings import InspectConfig
 from cosfly.products.frames import (
+    DEPTH_NPY,
     FILE_NAMES,
     INVALID_DEPTH_M,
     SKY_DEPTH_M,
@@ -26,6 +27,7 @@ from cosfly.products.frames import (
     OtherMeta,
     OthersMeta,
     frame_name,
+    frame_path,
 )
 from cosfly.products.issues import Report
 from cosfly.products.kinds import KIND_NAMES, KINDS
@@ -76,7 +78,7 @@ class Jumps:
         for i, pair in zip(self._frames, self._found, strict=True):
             if pair.seen < LEAST_SEEN:
                 continue
-            gone, agree, where = pair.through / pair.seen, pair.agree / pair.seen, f"{frame_name(i)}/depth.npy"
+            gone, agree, where = pair.through / pair.seen, pair.agree / pair.seen, _depth_place(self.flight, i)
             if gone > cfg.jump_gone_max:
                 got = f"{gone:.1%} of what the frame before shows is gone"
                 report.warn("temporal_jump", where, got, f"at most {cfg.jump_gone_max:.1%}")
@@ -213,7 +215,7 @@ def check_frames(
         left_out = _ids_of(told.get(i))
         look = look_at(picture, left_out, cfg.flat_pairs_min)
         _check_surfaces(look, where, cfg, report)
-        if picture.depth.size and _check_depth(picture.depth, where, numbers, report):
+        if picture.depth.size and _check_depth(picture.depth, _depth_place(flight, i), numbers, report):
             jumps.see(i, picture)
             if picture.instance.size:
                 _check_mask(flight, i, picture, look, left_out, cfg.mask_visibility_min, numbers, report)
@@ -225,9 +227,9 @@ def _read(flight: Flight, i: int, tree: Path, checksums: Checksums) -> dict[str,
     """Read the pictures of a frame that are there; `check_files` said which are not."""
     folder, files = flight.frame_folder(i), dict[str, bytes]()
     for name in FILE_NAMES.values():
-        if (path := folder / name).exists():
-            files[name] = read_bytes(path, what="image", tree=tree)
-            checksums.compare(f"{frame_name(i)}/{name}", files[name])
+        if (path := frame_path(folder, name)).exists():
+            files[path.name] = read_bytes(path, what="image", tree=tree)
+            checksums.compare(f"{frame_name(i)}/{path.name}", files[path.name])
     return files
 
 
@@ -258,9 +260,13 @@ def _moved(flight: Flight, i: int, k: int) -> bool:
     return bool(shift_m > 0.5 or turn_deg > 2.0)
 
 
-def _check_depth(depth: np.ndarray, where: str, numbers: FrameNumbers, report: Report) -> bool:
+def _depth_place(flight: Flight, i: int) -> str:
+    """Name the file that a finding on the depth of frame i is about."""
+    return f"{frame_name(i)}/{frame_path(flight.frame_folder(i), DEPTH_NPY).name}"
+
+
+def _check_depth(depth: np.ndarray, place: str, numbers: FrameNumbers, report: Report) -> bool:
     """Check that depths are metres between invalid (0) and sky (1000)."""
-    place = f"{where}/depth.npy"
     low, high = float(depth.min()), float(depth.max())  # NaN if any is
     if not np.isfinite([low, high]).all():
         report.error("depth_range", place, f"{int((~np.isfinite(depth)).sum())} pixels not finite", "finite metres")
@@ -314,7 +320,7 @@ def _check_mask(
     found_m = float(np.median(picture.depth[y0:y1, x0:x1][region]))
     if np.isfinite(expected_m) and abs(found_m - expected_m) > SURFACE_TOLERANCE_M:
         expected = f"{expected_m:.2f} m (target.depth) within {SURFACE_TOLERANCE_M:.1f} m"
-        report.error("depth_disagrees", f"{frame_name(i)}/depth.npy", f"{found_m:.2f} m at the person", expected)
+        report.error("depth_disagrees", _depth_place(flight, i), f"{found_m:.2f} m at the person", expected)
 
 
 def _kinds_without(instance: np.ndarray, left_out: np.ndarray) -> np.ndarray:

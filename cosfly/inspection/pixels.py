@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, depth_values
+from cosfly.products.frames import DEPTH_NPY, INVALID_DEPTH_M, SKY_DEPTH_M, depth_values, public_name
 from cosfly.products.kinds import KINDS
 from cosfly.products.png import parse_png
 from cosfly.work.compiled import njit
@@ -60,16 +60,17 @@ class Look:
 
 
 def unpack(files: dict[str, bytes], where: Path) -> Picture:
-    """Unpack the files of a frame, of which `depth.npy` and `instance.png` may be absent.
+    """Unpack the files of a frame, by their names; depth and `instance.png` may be absent.
 
     Raises:
         InputError: one is damaged, of another size than `rgb.png`, or no picture of a playback tree; names it.
     """
     colours = _pixels(files["rgb.png"], where / "rgb.png")
     instance = _pixels(files["instance.png"], where / "instance.png") if "instance.png" in files else NO_IDS
-    depth = depth_values(memoryview(files["depth.npy"]), where / "depth.npy") if "depth.npy" in files else NO_DEPTH
+    depth_name = next((name for name in files if public_name(name) == DEPTH_NPY), DEPTH_NPY)
+    depth = depth_values(memoryview(files[depth_name]), where / depth_name) if depth_name in files else NO_DEPTH
     depth.flags.writeable = False  # the compiled checks are compiled for such, once
-    for name, values in (("instance.png", instance), ("depth.npy", depth)):
+    for name, values in (("instance.png", instance), (depth_name, depth)):
         if values.size and values.shape[:2] != colours.shape[:2]:
             got, expected = ("{1} x {0} px".format(*found.shape) for found in (values, colours))
             raise InputError("of another size than rgb.png", where=where / name, got=got, expected=expected)

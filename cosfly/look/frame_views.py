@@ -16,7 +16,7 @@ import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.products.captions import Language
-from cosfly.products.frames import FILE_NAMES, SKY_DEPTH_M, read_depth, read_instance, read_meta, read_rgb
+from cosfly.products.frames import FILE_NAMES, SKY_DEPTH_M, frame_path, read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.kinds import KINDS
 
 View = Literal["rgb", "depth", "segmentation", "middle"]
@@ -56,7 +56,7 @@ class Pictures:
         pictures = []
         for view in self.views:
             picture = read_view(frame, view, max_side_px=max(self.size_px), depth_range_m=self.depth_range_m)
-            self.check_size(frame / VIEW_FILES[view], (picture.shape[1], picture.shape[0]))
+            self.check_size(frame_path(frame, VIEW_FILES[view]), (picture.shape[1], picture.shape[0]))
             pictures.append(picture)
         return [np.hstack(pictures)] if pictures and self.layout == "tiled" else pictures
 

@@ -15,7 +15,7 @@ from cosfly.look.overlay import Overlay
 from cosfly.look.topview import add_caption, draw_text
 from cosfly.products.boxes import BoxMap
 from cosfly.products.flights import find_flights
-from cosfly.products.frames import DEBUG_FILE, read_instance, read_meta, read_rgb, rgb_bytes
+from cosfly.products.frames import DEBUG_FILE, frame_path, read_instance, read_meta, read_rgb, rgb_bytes
 from cosfly.products.places import ALL_FLIGHTS, FlightChoice
 from cosfly.products.playback import Flight, read_flight
 from cosfly.products.town import read_instance_ids
@@ -142,7 +142,7 @@ def _row(flight: Flight) -> np.ndarray:
     tiles += [np.zeros_like(tiles[0])] * (NUM_RGB_TILES - len(tiles))
     middle = flight.frame_folder(frames[len(frames) // 2])
     for view in ("depth", "segmentation"):
-        if (middle / VIEW_FILES[view]).is_file():
+        if frame_path(middle, VIEW_FILES[view]).is_file():
             tiles.append(_tile(read_view(middle, view), view))
         else:
             tiles.append(_tile(np.zeros_like(tiles[0]), f"no {VIEW_FILES[view]}"))

@@ -1,4 +1,7 @@
-"""The files of one frame folder of the playback tree: rgb.png, depth.npy, instance.png, meta.json, and what `meta.json` holds.
+"""The files of one frame folder of the playback tree: rgb.png, depth, instance.png, meta.json, and what `meta.json` holds.
+
+Depth is float32 and stands as `depth_float32.png`, packed without loss, or as `depth.npy`, as in the public layout. Readers
+ask `frame_path` for a file by its name in the public layout.
 
 Axes inside the tree are CARLA's (left-handed); `tree_...` below take the project's right-handed values.
 """
@@ -6,6 +9,7 @@ Axes inside the tree are CARLA's (left-handed); `tree_...` below take the projec
 from __future__ import annotations
 
 import io
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -17,16 +21,20 @@ from pydantic import BaseModel, ConfigDict, Field
 from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations, world_from_camera
 from cosfly.products.places import tree_of_flight
-from cosfly.products.png import areas_png, colours_png
+from cosfly.products.png import areas_png, colours_png, floats_of, floats_png
 from cosfly.products.weather import WeatherRecord
-from cosfly.reading.arrays import parse_array_header, read_array, read_picture
+from cosfly.reading.arrays import PNG_SIGNATURE, parse_array_header, read_array, read_picture
 from cosfly.reading.documents import read_model
+from cosfly.reading.files import read_bytes
 from cosfly.work.config import Config
 from cosfly.work.store import dump_json
 
 FRAMES_DIR = "frames_playback"
 FrameFile = Literal["rgb", "depth", "instance"]
-FILE_NAMES: dict[FrameFile, str] = {"rgb": "rgb.png", "depth": "depth.npy", "instance": "instance.png"}
+DepthFormat = Literal["png", "npy"]
+DEPTH_NPY, DEPTH_PNG = "depth.npy", "depth_float32.png"
+# In the public layout.
+FILE_NAMES: dict[FrameFile, str] = {"rgb": "rgb.png", "depth": DEPTH_NPY, "instance": "instance.png"}
 DEBUG_FILE = "debug.png"  # for people, where the settings ask for it: no label, and nobody reads it but they
 FRAME_FILES = (*FILE_NAMES.values(), "meta.json")
 FILM_WIDTH_MM = 36.0  # of a 35 mm film's picture
@@ -273,6 +281,25 @@ def frame_name(index: int) -> str:
     return f"{FRAMES_DIR}/frame_{index:05d}"
 
 
+def public_name(name: str) -> str:
+    """Give the name that a frame's file has in the public layout."""
+    return DEPTH_NPY if name == DEPTH_PNG else name
+
+
+def frame_path(frame: Path, name: str) -> Path:
+    """Give the path of a frame's file by its name in the public layout; of depth that of `depth_float32.png` where it has one."""
+    packed = frame / DEPTH_PNG
+    return packed if name == DEPTH_NPY and packed.exists() else frame / name
+
+
+def files_in(frame: Path) -> frozenset[str]:
+    """Give the names, in the public layout, of the files of a frame folder; none where there is no such folder."""
+    try:
+        return frozenset(public_name(name) for name in os.listdir(frame))
+    except OSError:
+        return frozenset()
+
+
 def tree_of(frame: Path) -> Path:
     """Give the playback tree that a frame stands in."""
     return tree_of_flight(frame.absolute().parents[1])
@@ -299,17 +326,22 @@ def read_instance(frame: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_depth(frame: Path) -> np.ndarray:
-    """Read `depth.npy` of a frame folder, (h, w) float32 z-depth in m; 1000.0 is sky, 0.0 invalid."""
-    return read_array(frame / "depth.npy", dtype=np.float32, ndim=2, what="depth image", tree=tree_of(frame))
+    """Read the depth of a frame folder, (h, w) float32 z-depth in m; 1000.0 is sky, 0.0 invalid."""
+    path = frame_path(frame, DEPTH_NPY)
+    if path.name == DEPTH_PNG:
+        return floats_of(read_bytes(path, what="depth image", tree=tree_of(frame)), path)
+    return read_array(path, dtype=np.float32, ndim=2, what="depth image", tree=tree_of(frame))
 
 
-def depth_values(data: memoryview, where: Path) -> np.ndarray:
-    """Give the numbers of a depth image's bytes, (h, w) float32 as `read_depth`, without a copy.
+def depth_values(data: bytes | memoryview, where: Path) -> np.ndarray:
+    """Give the numbers of a depth image's bytes, of either form, (h, w) float32 as `read_depth`; of a `.npy` without a copy.
 
     Raises:
-        InputError: it is no complete array of that type.
+        InputError: it is no complete image of that type.
     """
-    header = parse_array_header(data, where, what="depth image")
+    if is_packed(data):
+        return floats_of(data, where)
+    header = parse_array_header(memoryview(data), where, what="depth image")
     if header.dtype != np.float32 or len(header.shape) != 2:
         raise InputError("not a depth image", where=where, got=str(header), expected="float32 of 2 dimensions")
     values = np.frombuffer(data, np.float32, offset=header.offset)
@@ -317,13 +349,23 @@ def depth_values(data: memoryview, where: Path) -> np.ndarray:
 
 
 def rgb_bytes(rgb: np.ndarray) -> bytes:
-    """The content of `rgb.png`, of (h, w, 3) uint8. The rows that pictures are compared by can be read without the others."""
+    """The content of `rgb.png`, of (h, w, 3) uint8."""
     return colours_png(rgb)
 
 
 def instance_bytes(kinds: np.ndarray, ids: np.ndarray) -> bytes:
     """The content of `instance.png` in CARLA's encoding: R the kind, G the low and B the high byte of the id."""
     return areas_png(kinds, (ids & 0xFF).astype(np.uint8), (ids >> 8).astype(np.uint8))
+
+
+def is_packed(data: bytes | memoryview) -> bool:
+    """Tell whether a depth image's bytes are those of a `depth_float32.png`."""
+    return data[: len(PNG_SIGNATURE)] == PNG_SIGNATURE
+
+
+def depth_file(depth: np.ndarray, form: DepthFormat) -> tuple[str, bytes]:
+    """Name and content of the file of a depth image, (h, w) float32."""
+    return (DEPTH_PNG, floats_png(depth)) if form == "png" else (DEPTH_NPY, depth_bytes(depth))
 
 
 def depth_bytes(depth: np.ndarray) -> bytes:

@@ -3,7 +3,7 @@
     Town*/trajectory_<unix seconds>/ORI/        the clean flight
     Town*/trajectory_<unix seconds>/aug_001/    the perturbed flight, same frame indices
         trajectory.json
-        frames_playback/frame_00000/{rgb.png, depth.npy, instance.png, meta.json}
+        frames_playback/frame_00000/{rgb.png, depth_float32.png or depth.npy, instance.png, meta.json}
 
 Axes inside the tree are CARLA's (left-handed); they are converted here and for `meta.json` in frames.py, and everything else in the
 project sees the right-handed frame. Keys that we do not know are kept in `Flight.raw` and survive a read-write round trip.
@@ -21,7 +21,7 @@ from pydantic import ValidationError
 
 from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations
-from cosfly.products.frames import ANGLES, COORDINATES, FRAME_FILES, FRAMES_DIR, XYZ, Camera, frame_name
+from cosfly.products.frames import ANGLES, COORDINATES, FRAME_FILES, FRAMES_DIR, XYZ, Camera, frame_name, frame_path
 from cosfly.products.places import place_of, tree_of_flight
 from cosfly.products.segments import FOLLOW, Mission, Segment, flown_as_json, mirrored
 from cosfly.products.trajectory import (
@@ -201,8 +201,9 @@ class Flight:
         return found
 
     def missing_frames(self, names: tuple[str, ...] = FRAME_FILES) -> list[int]:
-        """Indices of the points that lack one of the files."""
-        return [i for i in range(len(self)) if not all((self.frame_folder(i) / name).is_file() for name in names)]
+        """Indices of the points that lack one of the files, by their names in the public layout."""
+        folders = [self.frame_folder(i) for i in range(len(self))]
+        return [i for i, folder in enumerate(folders) if not all(frame_path(folder, name).is_file() for name in names)]
 
 
 def _was_moved(offsets: tuple[np.ndarray, ...], told: object) -> bool | None:

@@ -3,8 +3,9 @@
 Read: the checksums of chunks and stream and the number of bytes are always compared, so a picture that passes is whole; it is never unpacked to
 more than its header says. Filters are undone when pixels are wanted.
 
-Written, of two kinds: colours have texture, so each row is stored as the difference to the average of its left and upper neighbours. Instance masks
-have areas: their bytes stay as they are, and the packing finds the row above.
+Written, of three kinds: colours have texture, so each row is stored as the difference to the average of its left and
+upper neighbours. Instance masks have areas: their bytes stay as they are, and the packing finds the row above. Of depth
+a pixel's four channels are the bytes of a float32, lowest first, each row stored as the difference to the one above.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from cosfly.work.compiled import njit
 CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # by colour type; palettes are no pictures of a data set
 MOST_NAMED = 8  # chunks
 CHUNK, NUMBER = struct.Struct(">I4s"), struct.Struct(">I")
-RGB = 3
+RGB, RGBA = 3, 4
 NONE, SUB, UP, AVERAGE, PAETH = range(5)  # filters
 LEVEL = 1
 NOT_UNPACKED: Any = zlib.error  # its stub says that it is no class
@@ -77,7 +78,7 @@ def colours_png(rgb: np.ndarray) -> bytes:
     lines = np.empty((height, 1 + RGB * width), np.uint8)
     lines[:, 0] = AVERAGE
     _filter(np.ascontiguousarray(rgb).reshape(height, -1), lines)
-    return _png(lines)
+    return _png(lines, RGB)
 
 
 def areas_png(red: np.ndarray, green: np.ndarray, blue: np.ndarray) -> bytes:
@@ -86,12 +87,32 @@ def areas_png(red: np.ndarray, green: np.ndarray, blue: np.ndarray) -> bytes:
     lines = np.zeros((height, 1 + RGB * width), np.uint8)
     for k, channel in enumerate((red, green, blue)):
         lines[:, 1 + k :: RGB] = channel
-    return _png(lines)
+    return _png(lines, RGB)
 
 
-def _png(lines: np.ndarray) -> bytes:
+def floats_png(values: np.ndarray) -> bytes:
+    """Encode (h, w) float32 without loss, the bytes of a number as the channels of a pixel."""
+    height, width = values.shape
+    raw = np.ascontiguousarray(values, "<f4").view(np.uint8).reshape(height, RGBA * width)
+    lines = np.empty((height, 1 + RGBA * width), np.uint8)
+    lines[:, 0] = UP
+    lines[:1, 1:] = raw[:1]
+    np.subtract(raw[1:], raw[:-1], out=lines[1:, 1:])
+    return _png(lines, RGBA)
+
+
+def floats_of(data: bytes | memoryview, where: object) -> np.ndarray:
+    """Decode what `floats_png` wrote, (h, w) float32; raises as `parse_png`, and where it has not four channels."""
+    png = parse_png(data, where)
+    if png.channels != RGBA:
+        raise _broken(where, f"{png.channels} channels, not the 4 bytes of a float32")
+    return png.pixels().view("<f4")[..., 0]
+
+
+def _png(lines: np.ndarray, channels: int) -> bytes:
     height, stride = lines.shape
-    head = struct.pack(">IIBBBBB", stride // RGB, height, 8, 2, 0, 0, 0)
+    colour_type = next(kind for kind, count in CHANNELS.items() if count == channels)
+    head = struct.pack(">IIBBBBB", stride // channels, height, 8, colour_type, 0, 0, 0)
     chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(lines.data, LEVEL)), (b"IEND", b""))
     return PNG_SIGNATURE + b"".join(
         CHUNK.pack(len(data), name) + data + NUMBER.pack(zlib.crc32(data, zlib.crc32(name))) for name, data in chunks

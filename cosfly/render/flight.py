@@ -15,7 +15,7 @@ from cosfly.errors import RenderError
 from cosfly.geometry import mask_box, world_from_camera
 from cosfly.look.overlay import Overlay
 from cosfly.products import frames
-from cosfly.products.frames import Camera, FrameFile, FrameMeta, Look, OthersMeta, TargetMeta, frame_name
+from cosfly.products.frames import Camera, DepthFormat, FrameFile, FrameMeta, Look, OthersMeta, TargetMeta, frame_name
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import Flight, write_flight
 from cosfly.products.segments import Mission, Segment
@@ -107,6 +107,7 @@ class Writing:
 
     files: tuple[FrameFile, ...]
     visible_threshold: float
+    depth_format: DepthFormat = "png"
     overlay: Overlay | None = None
 
 
@@ -180,12 +181,12 @@ def draw_frame(renderer: Renderer, script: FlightScript, i: int, poses: Poses, t
 
 def _write_frame(folder: Path, name: str, frame: Frame, meta: FrameMeta, writing: Writing) -> dict[str, str]:
     """Encode and write one frame; gives file name -> sha256. Runs beside the drawing: OpenCV and hashing release the lock."""
-    makers: dict[FrameFile, Callable[[], bytes]] = {
-        "rgb": lambda: frames.rgb_bytes(frame.rgb),
-        "depth": lambda: frames.depth_bytes(frame.depth),
-        "instance": lambda: frames.instance_bytes(frame.kinds, frame.ids),
+    makers: dict[FrameFile, Callable[[], tuple[str, bytes]]] = {
+        "rgb": lambda: (frames.FILE_NAMES["rgb"], frames.rgb_bytes(frame.rgb)),
+        "depth": lambda: frames.depth_file(frame.depth, writing.depth_format),
+        "instance": lambda: (frames.FILE_NAMES["instance"], frames.instance_bytes(frame.kinds, frame.ids)),
     }
-    contents = {frames.FILE_NAMES[file]: makers[file]() for file in writing.files}
+    contents = dict(makers[file]() for file in writing.files)
     if writing.overlay is not None:
         debug = writing.overlay.draw(frame.rgb, frame.ids, meta)
         contents[frames.DEBUG_FILE] = frames.rgb_bytes(debug)

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cosfly.products.frames import LEAST_FOV_DEG, MOST_FOV_DEG, FrameFile, Look
+from cosfly.products.frames import LEAST_FOV_DEG, MOST_FOV_DEG, DepthFormat, FrameFile, Look
 from cosfly.products.places import folder_name
 from cosfly.render.lens import ZoomConfig
 from cosfly.render.perturbation import PerturbationConfig
@@ -46,6 +46,11 @@ class RenderConfig(WeatherConfig):
     look: Look = Field(Look(), description="sun and air of flights without weather")
     modalities: tuple[FrameFile, ...] = Field(
         ("rgb", "depth", "instance"), min_length=1, description="which images to write; meta.json is always written"
+    )
+    depth_format: DepthFormat = Field(
+        "png",
+        description="png: float32 without loss in depth_float32.png, an eighth of the size; npy: depth.npy, as in the "
+        "public layout",
     )
     debug: bool = Field(
         False, description="also write debug.png: boxes, ids and distances projected over the colour picture"

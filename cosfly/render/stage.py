@@ -265,7 +265,9 @@ def _names(
             return place.town, int(place.trajectory.removeprefix(TRAJECTORY)) - number
     town = town_folder(cfg.town or map_name)
     of_others = [] if others is None else [fingerprint(others)]
-    what = dump_json([town, seed, fingerprint(traces), cfg.recorded(), *of_others])
+    settings = cfg.recorded()
+    del settings["depth_format"]  # flights are the same in either
+    what = dump_json([town, seed, fingerprint(traces), settings, *of_others])
     derived = FIRST_S + int(sha256_bytes(what.encode()), 16) % SPAN_S
     return town, derived if cfg.first_timestamp is None else cfg.first_timestamp
 
@@ -320,7 +322,7 @@ def make_worker(
     renderer = open_renderer(cfg.backend, drawn, cfg.width_px, cfg.height_px, cfg.look, num_others)
     pools = read_pools(cfg)
     overlay = Overlay(drawn, instance_ids(drawn, num_others)) if cfg.debug else None
-    writing = Writing(tuple(cfg.modalities), cfg.visible_threshold, overlay)
+    writing = Writing(tuple(cfg.modalities), cfg.visible_threshold, cfg.depth_format, overlay)
 
     def work(item: Item) -> Outcome:
         number, track = item.payload

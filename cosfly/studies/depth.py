@@ -18,7 +18,15 @@ from pydantic import BaseModel
 from cosfly.errors import InputError
 from cosfly.look.frame_views import depth_colors
 from cosfly.look.topview import INK, PAPER, Color, draw_line, draw_text, png_bytes
-from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, depth_bytes, read_rgb
+from cosfly.products.frames import (
+    INVALID_DEPTH_M,
+    SKY_DEPTH_M,
+    depth_bytes,
+    depth_values,
+    frame_path,
+    is_packed,
+    read_rgb,
+)
 from cosfly.reading.arrays import parse_array, parse_array_header
 from cosfly.reading.files import read_bytes
 from cosfly.work.store import write_bytes, write_model
@@ -29,7 +37,8 @@ SCHEMA, VERSION = "cosfly.depth_study", "1.0"
 MOST_HALF_M = float(np.finfo(np.float16).max)  # more is no number in 16 bits
 BITS = (8, 10, 12, 16)
 ENTROPY_BINS = 8192  # of the frame's range, the same for all codings: exact values of a float are nearly all unlike
-CM, KB = 100.0, 1000.0
+CM = 100.0
+KB = 1024.0  # bytes, as the paper's column counts them
 PANEL_PX = (480, 270)  # width, height of each of six
 GAP_PX, TITLE_PX = 14, 30
 PROFILE_COLORS: dict[str, Color] = {"8-bit": (215, 60, 50), "10-bit": (240, 150, 40), "truth": (30, 30, 30)}
@@ -78,7 +87,7 @@ def run(frame: Path, out: Path) -> Study:
     Raises:
         InputError: there is no depth image, it is not of metres, or it holds fewer than two different depths.
     """
-    file = frame / "depth.npy" if frame.is_dir() else frame
+    file = frame_path(frame, "depth.npy") if frame.is_dir() else frame
     data = read_bytes(file, what="depth image")
     truth = _truth(data, file)
     measured = (truth != INVALID_DEPTH_M) & (truth != SKY_DEPTH_M)
@@ -116,6 +125,9 @@ def _truth(data: bytes, file: Path) -> np.ndarray:
     Raises:
         InputError: it is no array of this form, or of whole numbers, which may be millimetres as well as 256ths of a metre.
     """
+    if is_packed(data):
+        truth = depth_values(data, file)
+        return np.where(np.isfinite(truth), truth, np.float32(INVALID_DEPTH_M))
     kind = parse_array_header(memoryview(data), file, what="depth image").dtype
     if kind.kind in "iu":
         raise InputError(
@@ -234,7 +246,7 @@ def markdown(study: Study) -> str:
     buffer.write(
         f"Depth of `{study.frame}`, {study.width_px} x {study.height_px} px, {study.min_m:.2f} to {study.max_m:.2f} m, {study.share_measured:.1%} of the pixels "
         f"measured; errors against {study.truth}.\n\n"
-        "| coding | unique values | max error, cm | mean error, cm | RMSE, cm | PSNR, dB | entropy, bits | edge correlation | size, KB | deflated, KB |\n"
+        "| coding | unique values | max error, cm | mean error, cm | RMSE, cm | PSNR, dB | entropy, bits | edge correlation | size, KB of 1,024 bytes | deflated, KB |\n"
         "|---|---|---|---|---|---|---|---|---|---|\n"
     )
     for row in study.rows:

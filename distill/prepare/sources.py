@@ -14,7 +14,7 @@ from cosfly.look.frame_views import VIEW_FILES, View
 from cosfly.products.actions import OWN_ACTIONS
 from cosfly.products.captions import Caption
 from cosfly.products.flights import find_flights, track_of
-from cosfly.products.frames import frame_name
+from cosfly.products.frames import frame_name, frame_path
 from cosfly.products.places import TRACKS, FlightChoice, Place, flight_ids, folder_name, sample_id
 from cosfly.products.playback import read_flight
 from cosfly.products.splits import Course, walks_of
@@ -130,7 +130,7 @@ class CaptionedFlight:
             return set(range(self.num_frames))
         found = set()
         for folder in (self.folder / frame_name(0)).parent.glob("frame_*"):
-            if folder.name[6:].isdigit() and all((folder / VIEW_FILES[view]).is_file() for view in views):
+            if folder.name[6:].isdigit() and all(frame_path(folder, VIEW_FILES[view]).is_file() for view in views):
                 found.add(int(folder.name[6:]))
         return found
 

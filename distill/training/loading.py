@@ -17,6 +17,7 @@ import numpy as np
 
 from cosfly.errors import CosflyError, EnvironmentMissing, InputError
 from cosfly.look.frame_views import VIEW_FILES
+from cosfly.products.frames import frame_path
 from cosfly.products.places import flight_of
 from cosfly.reading.limits import Limits, limits, use_limits
 from cosfly.work.console import progress_bar
@@ -313,7 +314,7 @@ class Counting:
             if picture not in checked:
                 checked[picture] = ""
                 try:
-                    path = inside(self.trees[picture.run], picture.frame) / VIEW_FILES[picture.view]
+                    path = frame_path(inside(self.trees[picture.run], picture.frame), VIEW_FILES[picture.view])
                     sample.pictures.check_size(path, image_size(path))
                 except InputError as error:
                     checked[picture] = str(error)

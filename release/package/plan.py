@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from cosfly.errors import CosflyError, InputError, NothingKept, VerifyError
-from cosfly.products.frames import FILE_NAMES, frame_name
+from cosfly.products.frames import DEPTH_PNG, FILE_NAMES, frame_name, frame_path
 from cosfly.products.places import FlightChoice
 from cosfly.products.review import how_to_decide
 from cosfly.work.stage_folder import Failed, StageFolder, Tally, write_failures
@@ -78,14 +79,14 @@ def plan_shards(sizes: Sequence[int], target_bytes: int) -> list[list[int]]:
 
 
 def selected_bytes(flight: Surveyed, cfg: ReleaseConfig, window_frames: int, tell: Tell) -> tuple[int, int]:
-    """Give the number of a flight's selected frames and the bytes of their files; `tell` takes files that are not there."""
+    """Count a flight's selected frames and the bytes of their files, depth unpacked; `tell` takes files that are not there."""
     folder, total = flight.candidate.folder, 0
     selected = select_frames(flight.num_frames, cfg.num_frames, window_frames, cfg.uniform_stride).tolist()
     for i in selected:
         for file in cfg.modalities:
-            path = folder / frame_name(i) / FILE_NAMES[file]
+            path = frame_path(folder / frame_name(i), FILE_NAMES[file])
             size = _size(path)
-            total += size
+            total += 4 * math.prod(flight.size_px) if size and path.name == DEPTH_PNG else size
             if not size:
                 tell(flight.name, InputError("a frame's file is missing or empty", where=path, fix="render it again"))
     return len(selected), total

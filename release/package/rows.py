@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import BaseModel
 
-from cosfly.products.frames import FILE_NAMES, FrameFile
+from cosfly.products.frames import FILE_NAMES, FrameFile, frame_path, is_packed
 from cosfly.products.places import sample_id
 from cosfly.products.playback import Flight
 from cosfly.reading.files import read_into
@@ -198,10 +198,11 @@ class Rows:
 
     def add(self, scalars: dict[str, Any], flight: Flight, i: int, *, keep: bool) -> None:
         """Add a frame whose pictures were read. keep: False where nothing will be written any more."""
-        if "depth" in self.pictures and self._plan.depth != "float32":
-            where = flight.frame_folder(i) / FILE_NAMES["depth"]
-            coded, cost = encoded(self.pictures["depth"].last(), self._plan.depth, where)
-            self.pictures["depth"].replace(coded)
+        depth = self.pictures.get("depth")
+        if depth is not None and (self._plan.depth != "float32" or is_packed(depth.last())):
+            where = frame_path(flight.frame_folder(i), FILE_NAMES["depth"])
+            coded, cost = encoded(depth.last(), self._plan.depth, where)
+            depth.replace(coded)
             self.depth = self.depth.merged(cost)
         if not keep:
             return

@@ -18,7 +18,16 @@ import pyarrow as pa
 from pydantic import BaseModel
 
 from cosfly.errors import CosflyError, InputError, VerifyError
-from cosfly.products.frames import FILE_NAMES, FRAMES_DIR, SKY_DEPTH_M, FrameFile, depth_values, frame_name, tree_of
+from cosfly.products.frames import (
+    FILE_NAMES,
+    FRAMES_DIR,
+    SKY_DEPTH_M,
+    FrameFile,
+    depth_values,
+    frame_name,
+    frame_path,
+    tree_of,
+)
 from cosfly.products.playback import Flight
 from cosfly.reading.arrays import PNG_HEADER_BYTES, PNG_SIGNATURE, png_size
 from cosfly.reading.files import check_stays_below, sha256_file
@@ -177,9 +186,9 @@ def _write_flight(part: FlightPart, plan: ShardPlan, rows: Rows, problems: _Prob
             _check_digest(folder, f"{frame_name(i)}/{META}", None, digests)
             placed = Placed(placing.walk, placing.split, placing.pair, look_of(flight, i))
             for file in plan.files:
-                name = FILE_NAMES[file]
-                data = _read_picture(flight, frame / name, file, tree, rows, is_known=bool(digests))
-                _check_digest(folder, f"{frame_name(i)}/{name}", data, digests)
+                path = frame_path(frame, FILE_NAMES[file])
+                data = _read_picture(flight, path, file, tree, rows, is_known=bool(digests))
+                _check_digest(folder, f"{frame_name(i)}/{path.name}", data, digests)
             rows.add(columns.scalar_row(flight, i, captions.get(i), placed), flight, i, keep=not problems.errors)
         advance()
     return ReleasedPart(

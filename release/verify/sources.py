@@ -19,7 +19,7 @@ import pyarrow.compute as pc
 
 from cosfly.errors import InputError
 from cosfly.products.flights import find_flights
-from cosfly.products.frames import FILE_NAMES, FrameFile
+from cosfly.products.frames import FILE_NAMES, FrameFile, frame_path
 from cosfly.products.places import Place, flight_ids
 from cosfly.products.playback import read_flight
 from cosfly.reading.files import read_bytes
@@ -182,7 +182,7 @@ class Tree:
             for flight in folders
             for frame in sorted(flight.glob("frames_playback/*"))[:1]
             for file, name in FILE_NAMES.items()
-            if (frame / name).exists()
+            if frame_path(frame, name).exists()
         }
         tree = cls(folder, tuple(file for file in FILE_NAMES if file in has))
         entries = []
@@ -211,10 +211,9 @@ class Tree:
         for i in range(len(flight)):
             frame = flight.frame_folder(i)
             yield {
-                file: read_bytes(frame / FILE_NAMES[file], what="frame's file", tree=self.folder)
-                if (frame / FILE_NAMES[file]).is_file()
-                else None
+                file: read_bytes(path, what="frame's file", tree=self.folder) if path.is_file() else None
                 for file in self.files
+                for path in [frame_path(frame, FILE_NAMES[file])]
             }
 
 

@@ -15,6 +15,7 @@ from cosfly.look.frame_views import VIEW_FILES, View, read_view
 from cosfly.products.boxes import read_boxes
 from cosfly.products.captions import Caption, read_captions
 from cosfly.products.flights import find_flights
+from cosfly.products.frames import frame_path
 from cosfly.products.places import folder_name, place_of, town_folder
 from cosfly.products.playback import Flight, read_flight
 from cosfly.products.review import read_settled
@@ -171,7 +172,7 @@ def _flight(tree: Tree, flight: Flight, result: str | None, num_captions: int) -
 def _frame(flight: Flight, index: int, caption: Caption | None, pictures: Pictures) -> ShownFrame:
     folder = flight.frame_folder(index)
     views: Mapping[View, Callable[[], np.ndarray]] = {
-        view: partial(read_view, folder, view) for view in VIEWS if (folder / VIEW_FILES[view]).exists()
+        view: partial(read_view, folder, view) for view in VIEWS if frame_path(folder, VIEW_FILES[view]).exists()
     }
     values = None if caption is None else caption_values(caption)
     row = scalar_row(flight, index, values, Placed(walk="", split="train"))
