@@ -7,9 +7,11 @@ import http.server
 import io
 import json
 import logging
+import os
 import re
 import shutil
 import threading
+import time
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -114,6 +116,13 @@ def test_a_whole_release_comes_byte_for_byte(dataset, tmp_path):
     assert server.sent < 1.2 * sum(path.stat().st_size for path in dataset.rglob("*") if path.is_file())
 
 
+def in_memory(dataset: Path) -> str:
+    memory = pytest.importorskip("fsspec", reason="extra remote").filesystem("memory")
+    for name, data in all_bytes(dataset).items():
+        memory.pipe_file(f"/release/{name}", data)
+    return "memory://release"
+
+
 @pytest.mark.parametrize("kind", ["folder", "stage folder", "zip", "memory", "http, two processes"])
 def test_from_everywhere_the_same(kind, dataset, tmp_path):
     wanted = choice(towns=["Town01"], modalities=["rgb"])
@@ -134,11 +143,7 @@ def test_from_everywhere_the_same(kind, dataset, tmp_path):
                 archive.writestr(f"inner/{name}", data)
         same(get(wanted, f"zip://inner::{tmp_path / 'release.zip'}", tmp_path / "out"))
     elif kind == "memory":
-        fsspec = pytest.importorskip("fsspec", reason="extra remote")
-        memory = fsspec.filesystem("memory")
-        for name, data in all_bytes(dataset).items():
-            memory.pipe_file(f"/release/{name}", data)
-        same(get(wanted, "memory://release", tmp_path / "out", workers=2))
+        same(get(wanted, in_memory(dataset), tmp_path / "out", workers=2))
     else:
         with served(dataset) as (_, address):
             same(get(wanted, address, tmp_path / "out", workers=2))
@@ -298,7 +303,7 @@ def test_within_a_shard_it_goes_on_where_it_broke_off(ranges, dataset, tmp_path,
         return read(self, name, start, length)
 
     with served(dataset) as (_, address):
-        address = address if ranges == "http" else f"local://{dataset}"
+        address = address if ranges == "http" else in_memory(dataset)
         with monkeypatch.context() as broken:
             broken.setattr(kind, "read", breaks)
             with pytest.raises(InputError, match="could not be fetched"):
@@ -429,6 +434,101 @@ def huge_size(handler, path, data):
 def test_a_server_that_lies_is_refused(fault, words, dataset, tmp_path):
     with served(dataset, fault=fault) as (_, address), pytest.raises(InputError, match=words):
         get(choice(), address, tmp_path / "out")
+
+
+def dripping(handler, path, data):
+    """A header a moment, for ever."""
+    handler.send_response(206)
+    with contextlib.suppress(OSError):
+        for k in range(10_000):
+            handler.wfile.write(b"x-%d: 0\r\n" % k)
+            time.sleep(0.05)
+    return True
+
+
+def wait_a_moment(handler, path, data):
+    with contextlib.suppress(OSError):
+        for _ in range(10_000):
+            handler.wfile.write(b"HTTP/1.1 100 Continue\r\n\r\n")
+            time.sleep(0.05)
+    return True
+
+
+@pytest.mark.parametrize("fault", [dripping, wait_a_moment])
+def test_an_answer_that_never_ends_is_given_up(fault, dataset, monkeypatch):
+    monkeypatch.setattr(remotes, "TIMEOUT_S", 0.5)
+    monkeypatch.setattr(remotes, "TRIES", 2)
+    with served(dataset, fault=fault) as (_, address), pytest.raises(InputError, match="the transfer broke"):
+        open_remote(address).size("release.json")
+
+
+def leads_to(place: str):
+    def fault(handler, path, data):
+        if path.startswith("there/"):
+            return False
+        handler.send_response(302)
+        handler.send_header("location", place.format(port=handler.server.server_port, path=path))
+        handler.send_header("content-length", "0")
+        handler.end_headers()
+        return True
+
+    return fault
+
+
+def test_a_redirect_is_followed_without_user_and_password(dataset, tmp_path, monkeypatch):
+    folder = tmp_path / "served"
+    shutil.copytree(dataset, folder / "there")
+    shutil.copy(dataset / "release.json", folder)
+    data, seen = (dataset / "release.json").read_bytes(), []
+
+    def noted(fault):
+        def note(handler, path, data):
+            seen.append((handler.headers["host"].partition(":")[0], handler.headers["authorization"], handler.path))
+            return fault(handler, path, data)
+
+        return note
+
+    monkeypatch.setattr(remotes, "public_address", lambda host: {"cdn.example": "127.0.0.1"}.get(host))
+    for place, host in (
+        ("/there/{path}", "127.0.0.1"),
+        ("http://127.0.0.1:{port}/there/{path}", "127.0.0.1"),
+        ("http://me:hush@cdn.example:{port}/there/{path}?own=1", "cdn.example"),
+    ):
+        with served(folder, fault=noted(leads_to(place))) as (_, address):
+            seen.clear()
+            remote = open_remote(address.replace("http://", "http://user:hush@") + "?token=hush")
+            assert remote.read("release.json", 0, 500) == data[:500]
+        (_, authorized, asked), (last, none, path) = seen
+        assert (authorized is not None, asked) == (True, "/release.json?token=hush")
+        assert (last, none, "hush" in path) == (host, None, False)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "http://localhost:{port}/there/{path}", "http://169.254.169.254/{path}", "http://10.0.0.1/", "http://[::1]:{port}/x", "http://[::ffff:127.0.0.1]/",
+        "http://0x7f000001:{port}/x", "http://0/", "file:///etc/passwd", "http://[::1", "//", "ftp://example.org/", "http://x:99999/", "\x1b[31m", "",
+        "/{path}", "http://xn--0/",
+    ],
+)  # fmt: skip
+def test_a_redirect_to_a_private_place_or_none_is_refused(place, dataset):
+    with served(dataset, fault=leads_to(place)) as (server, address):
+        with pytest.raises(InputError, match=r"not what was asked for; got HTTP 302|broke; got .*Protocol"):
+            open_remote(address).size("release.json")
+        assert len(server.asked) <= max(remotes.MOST_REDIRECTS + 1, remotes.TRIES)
+        assert server.sent == 0
+
+
+def test_a_public_address_has_no_private_one(monkeypatch):
+    found = {
+        "one": ["93.184.216.34"],
+        "both": ["93.184.216.34", "10.0.0.1"],
+        "six": ["2606:4700::1"],
+        "mapped": ["::ffff:10.0.0.1"],
+    }
+    known = lambda host, *_, **__: [(0, 0, 0, "", (address, 0)) for address in found[host]]  # noqa: E731
+    monkeypatch.setattr(remotes.socket, "getaddrinfo", known)
+    assert [remotes.public_address(host) for host in found] == ["93.184.216.34", None, "2606:4700::1", None]
 
 
 def retold(change):
@@ -588,14 +688,28 @@ def test_finished_shards_that_are_gone_are_told_of(dataset, tmp_path):
         get(choice(modalities=["rgb"]), str(dataset), tmp_path / "out")
 
 
-def test_what_cannot_be_opened(tmp_path):
-    with pytest.raises(InputError, match="no such folder"):
-        open_remote(str(tmp_path / "nothing"))
-    pytest.importorskip("fsspec", reason="extra remote")
-    with pytest.raises(InputError, match="no such address"):
-        FsspecRemote("nosuchprotocol://x").size("release.json")
-    with pytest.raises(InputError):
-        HttpRemote("http://127.0.0.1:9").size("release.json")  # nobody listens
+@pytest.mark.parametrize(
+    "address",
+    [
+        "http://[::1", "reference://x", "", "http://", "http://host:99999/x", "http://xn--0/", "http://127.0.0.1:9/", "zip://", "::", "nosuchprotocol://x",
+        "data:text/plain,x", "x" * 100_000, "http://\0/", "a\0b", "\ud800", "hf://", "memory://nothing", "simplecache::reference://",
+        "file:///proc/self",
+    ],
+    ids=lambda address: repr(address[:30]),
+)  # fmt: skip
+def test_what_cannot_be_opened_is_one_clear_line(address, tmp_path):
+    with pytest.raises(CosflyError) as told:
+        get(choice(), address, tmp_path / "out")
+    assert len(str(told.value)) < 5000
+
+
+def test_a_pipe_in_a_folder_is_not_waited_for(dataset, tmp_path):
+    copy = shutil.copytree(dataset, tmp_path / "copy")
+    (copy / "release.json").unlink()
+    os.mkfifo(copy / "release.json")
+    for address in (str(copy), f"file://{copy}"):
+        with pytest.raises(InputError, match="a named pipe"):
+            get(choice(), address, tmp_path / "out")
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

@@ -9,8 +9,8 @@ import math
 import ssl
 import time
 import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from email.utils import parsedate_to_datetime
 
 import httpx
@@ -28,12 +28,14 @@ class Response:
     """What a server answered. body: unpacked; of one that is longer than the limit its beginning (`is_cut`).
 
     retry_after_s: how long it asks to wait; None where it does not say, or says what nobody can wait for.
+    headers: by their names, in whatever case.
     """
 
     status: int
     body: bytes
     is_cut: bool = False
     retry_after_s: float | None = None
+    headers: Mapping[str, str] = field(default_factory=dict)
 
 
 class Connections:
@@ -62,18 +64,28 @@ class Connections:
         for connection in self._free:
             await connection.aclose()
 
-    async def exchange(self, url: str, content: bytes | None = None) -> Response:
+    async def exchange(
+        self,
+        url: str,
+        content: bytes | None = None,
+        headers: Mapping[str, str] = HEADERS,
+        *,
+        tls_name: str | None = None,
+    ) -> Response:
         """Send one request, a POST where it has a content, and read its answer. Redirects are not followed: the key stays here.
 
+        Args:
+            tls_name: whose certificate is asked for, where the URL names an IP address.
         Raises:
             TimeoutError: it was not all there in time, from the first byte sent to the last one read, however steadily it dripped.
             httpx.RequestError: no connection, or it broke; or what came is not packed as it says.
         """
         method = "GET" if content is None else "POST"
-        with self._connection() as connection:
+        about = {"sni_hostname": tls_name} if tls_name else None
+        with self._connection() as connection, _url_errors():
             async with (
                 asyncio.timeout(self._timeout_s),
-                connection.stream(method, url, content=content, headers=HEADERS) as response,
+                connection.stream(method, url, content=content, headers=headers, extensions=about) as response,
             ):
                 body = _Body(response.headers.get("content-encoding", ""), self._most_bytes)
                 async for packed in response.aiter_raw():
@@ -81,7 +93,7 @@ class Connections:
                     if body.is_cut:  # the rest stays unread, and the connection is closed
                         break
                 wait_s = retry_after_s(response.headers.get("retry-after", ""), time.time())
-                return Response(response.status_code, body.whole(), body.is_cut, wait_s)
+                return Response(response.status_code, body.whole(), body.is_cut, wait_s, response.headers)
 
     @contextlib.contextmanager
     def _connection(self) -> Iterator[httpx.AsyncClient]:
@@ -99,6 +111,15 @@ class Connections:
         except (httpx.InvalidURL, ValueError, ImportError) as error:
             where = "HTTP_PROXY, HTTPS_PROXY, ALL_PROXY"
             raise TeacherError("the proxy cannot be used", where=where, got=type(error).__name__) from None
+
+
+@contextlib.contextmanager
+def _url_errors() -> Iterator[None]:
+    """Name what httpx raises of an address that is none, that of a redirect too, which it reads and does not follow."""
+    try:
+        yield
+    except (httpx.InvalidURL, UnicodeError) as error:
+        raise httpx.UnsupportedProtocol(f"no address: {type(error).__name__}") from None
 
 
 @functools.cache

@@ -7,16 +7,17 @@ that is logged, recorded or put in an error.
 
 from __future__ import annotations
 
-import contextlib
+import asyncio
 import io
+import ipaddress
 import os
 import re
+import socket
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
-from urllib.parse import urlsplit, urlunsplit
+from typing import TYPE_CHECKING, Any, Protocol
+from urllib.parse import SplitResult, urljoin, urlsplit, urlunsplit
 
 from cosfly.errors import EnvironmentMissing, InputError
 from cosfly.escaping import published_name
@@ -25,12 +26,15 @@ from cosfly.work.runner import advance
 from cosfly.work.store import inside
 from release.record import release_folder
 
-Answer = TypeVar("Answer")
+if TYPE_CHECKING:
+    from cosfly.chat.wire import Response
+
 MB = 1024 * 1024
 CHUNK = 4 * MB
 TRIES, FIRST_WAIT_S = 4, 0.5  # a request that broke is made anew, after 0.5, 1, 2 s
-TIMEOUT_S = 60.0
-MOST_REDIRECTS = 5
+TIMEOUT_S = 90.0  # of one answer, from its first byte to its last, however steadily it drips
+REDIRECTS, MOST_REDIRECTS = (301, 302, 303, 307, 308), 5
+MOST_DIGITS = 15  # of a size
 LOCAL = ("file", "local")  # schemes of files of this machine
 CHAIN = re.compile(r"::(?![^\[]*\])")  # between the links of a chain, not within [::1]
 
@@ -55,12 +59,13 @@ def open_remote(address: str) -> Remote:
     Raises:
         InputError: no such folder, or not an address. EnvironmentMissing: what opens such addresses is not installed.
     """
-    if address.startswith(("http://", "https://")):
+    scheme, mark, path = address.partition("://")
+    if scheme.lower() in ("http", "https") and not CHAIN.search(address):
         return HttpRemote(address)
-    if "://" in address:
+    if mark and scheme not in LOCAL:
         return FsspecRemote(address)
-    folder = Path(address)
-    if not folder.is_dir():
+    folder = Path(path if mark else address)
+    if not os.path.isdir(folder):  # of any text; a path's own raises
         raise InputError("there is no such folder", where=folder, expected="a release folder, or an address")
     return FolderRemote(folder)
 
@@ -117,97 +122,127 @@ class FolderRemote:
 
 
 class HttpRemote:
-    """Files below an http(s) address, by ranges."""
+    """Files below an http(s) address, by ranges.
+
+    Redirects are followed, as hubs need it: never from https to http, never with user and password, and to a private address only on the
+    host that was named.
+    """
 
     def __init__(self, address: str) -> None:
-        parts = urlsplit(address)
+        self.shown = without_secrets(address.partition("?")[0].partition("#")[0].rstrip("/"))
+        parts = parts_of(address)
         self._base, self._query = urlunsplit((parts.scheme, parts.netloc, parts.path.rstrip("/"), "", "")), parts.query
-        self.shown = without_secrets(self._base)
-        self._client: Any = None
+        self._host = parts.hostname
+        self._lines: Any = None  # an event loop, connections to the host that was named, and to those that it leads to
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_client": None}
+        return {**vars(self), "_lines": None}
 
     def size(self, name: str) -> int:
-        return self._tried(name, lambda: self._size_once(name))
+        response = self._asked(name, 0, 1)
+        total = response.headers.get("content-range", "").rpartition("/")[2]
+        if not (total.isascii() and total.isdigit() and len(total) <= MOST_DIGITS):
+            raise self._refusal(name, response, "an answer to a range with the size of the file")
+        return int(total)
 
     def read(self, name: str, start: int, length: int) -> bytes:
-        return self._tried(name, lambda: self._read_once(name, start, length)) if length else b""
+        if not length:
+            return b""
+        response = self._asked(name, start, length)
+        wanted = f"bytes {start}-{start + length - 1}/"
+        if not response.headers.get("content-range", "").startswith(wanted):
+            raise self._refusal(name, response, f"HTTP 206 with {wanted}...")
+        return check_length(response.body, length, f"{self.shown}/{name}")
 
-    def _tried(self, name: str, ask: Callable[[], Answer]) -> Answer:
+    def _asked(self, name: str, start: int, length: int) -> Response:
+        """Ask for a range, again where that broke."""
+        import httpx
+
+        from cosfly.chat.wire import Connections
+
+        if self._lines is None:
+            lines = (Connections("", timeout_s=TIMEOUT_S, most_bytes=CHUNK) for _ in range(2))
+            self._lines = asyncio.Runner(), *lines
         for attempt in range(TRIES):
+            time.sleep(FIRST_WAIT_S * 2 ** (attempt - 1) if attempt else 0.0)
             try:
-                return ask()
-            except _Broken as broken:
-                why = str(broken)
-            if attempt + 1 < TRIES:
-                time.sleep(FIRST_WAIT_S * 2**attempt)
+                response = self._lines[0].run(self._answer(name, f"bytes={start}-{start + length - 1}"))
+            except (httpx.HTTPError, OSError) as error:  # their words may hold the address
+                why = type(error).__name__
+                continue
+            if response.status == 206:
+                return response
+            if response.status < 500:
+                raise self._refusal(name, response, "HTTP 206, the range that was asked for")
+            why = f"HTTP {response.status}"
         raise InputError("the transfer broke", where=f"{self.shown}/{name}", got=why, fix="run the same command again")
 
-    def _size_once(self, name: str) -> int:
-        with self._asked(name, 0, 1) as response:
-            total = response.headers.get("content-range", "").rpartition("/")[2]
-            if response.status_code >= 500:
-                raise _Broken(f"HTTP {response.status_code}")
-            if response.status_code != 206 or not total.isascii() or not total.isdigit() or len(total) > 15:
-                raise self._refusal(name, response, "an answer to a range with the size of the file")
-            return int(total)
+    async def _answer(self, name: str, span: str) -> Response:
+        """Ask once, and where that leads."""
+        _, here, elsewhere = self._lines
+        headers = {"range": span, "accept-encoding": "identity"}
+        url = f"{self._base}/{name}" + (f"?{self._query}" if self._query else "")
+        response = await here.exchange(url, headers=headers)
+        for _ in range(MOST_REDIRECTS):
+            if response.status not in REDIRECTS:
+                break
+            parts = self._led_to(name, url, response)
+            url, host, asked, tls_name = urlunsplit(parts), parts.hostname or "", parts, None
+            if (
+                host != self._host
+            ):  # asked at the address that was looked at: the name could mean another one a moment later
+                address, tls_name = public_address(host), host
+                if address is None:
+                    raise self._refusal(name, response, "a redirect to a public address")
+                port = f":{parts.port}" if parts.port else ""
+                asked = parts._replace(netloc=(f"[{address}]" if ":" in address else address) + port)
+            about = headers | {"host": parts.netloc}
+            response = await elsewhere.exchange(urlunsplit(asked), headers=about, tls_name=tls_name)
+        return response
 
-    def _read_once(self, name: str, start: int, length: int) -> bytes:
-        import httpx
+    def _led_to(self, name: str, url: str, response: Response) -> SplitResult:
+        """Give where a redirect leads, without user and password."""
+        try:
+            parts = parts_of(urljoin(url, response.headers.get("location", "")))
+        except (InputError, ValueError):
+            raise self._refusal(name, response, "a redirect to an http(s) address") from None
+        if self._base.startswith("https:") and parts.scheme != "https":
+            raise self._refusal(name, response, "an answer over https, as the address says")
+        return parts._replace(netloc=parts.netloc.rpartition("@")[2], fragment="")
 
-        with self._asked(name, start, length) as response:
-            wanted = f"bytes {start}-{start + length - 1}/"
-            if response.status_code >= 500:
-                raise _Broken(f"HTTP {response.status_code}")
-            if response.status_code != 206 or not response.headers.get("content-range", "").startswith(wanted):
-                raise self._refusal(name, response, f"HTTP 206 with {wanted}...")
-            parts, found = [], 0
-            try:
-                for part in response.iter_raw(CHUNK):  # as sent: a coding would let a small answer unpack to anything
-                    found += len(part)
-                    if found > length:
-                        raise InputError(
-                            "the other side sent more than was asked for",
-                            where=f"{self.shown}/{name}",
-                            expected=f"{length} bytes",
-                        )
-                    parts.append(part)
-            except httpx.HTTPError as error:
-                raise _Broken(type(error).__name__) from None
-        if found < length:
-            raise _Broken(f"{found} of {length} bytes")
-        return b"".join(parts)
-
-    def _asked(self, name: str, start: int, length: int) -> Any:
-        """Ask for a range; a context that gives the response before its body."""
-        import httpx
-
-        if self._client is None:
-            self._client = httpx.Client(timeout=TIMEOUT_S, follow_redirects=True, max_redirects=MOST_REDIRECTS)
-        headers = {"range": f"bytes={start}-{start + length - 1}", "accept-encoding": "identity"}
-        address = f"{self._base}/{name}" + (f"?{self._query}" if self._query else "")
-
-        @contextlib.contextmanager
-        def asked() -> Iterator[Any]:
-            try:
-                with self._client.stream("GET", address, headers=headers) as response:
-                    if self._base.startswith("https:") and response.url.scheme != "https":
-                        raise self._refusal(name, response, "an answer over https, as the address says")
-                    yield response
-            except (httpx.HTTPError, httpx.InvalidURL) as error:
-                raise _Broken(type(error).__name__) from None  # its words may hold the address
-
-        return asked()
-
-    def _refusal(self, name: str, response: Any, expected: str) -> InputError:
+    def _refusal(self, name: str, response: Response, expected: str) -> InputError:
         coding = response.headers.get("content-encoding")
-        got = f"HTTP {response.status_code}" + (f", {coding}" if coding else "")
+        place = without_secrets(response.headers.get("location", ""))[:80]
+        got = f"HTTP {response.status}" + (f", {coding}" if coding else "") + (f" to {place}" if place else "")
         return InputError("not what was asked for", where=f"{self.shown}/{name}", got=got, expected=expected)
 
 
-class _Broken(Exception):
-    """A transfer that may work when it is tried again."""
+def parts_of(address: str) -> SplitResult:
+    """Give the parts of an http(s) address.
+
+    Raises:
+        InputError: it is none.
+    """
+    try:
+        parts = urlsplit(address)
+        if parts.scheme not in ("http", "https") or not parts.hostname or parts.port == 0:
+            raise ValueError
+    except ValueError:
+        raise InputError("no such address", where=without_secrets(address), expected="http(s)://HOST/...") from None
+    return parts
+
+
+def public_address(host: str) -> str | None:
+    """Give an address of a host; None where one of its addresses is private, or it has none."""
+    try:
+        found = [
+            str(entry[4][0]).partition("%")[0] for entry in socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+        ]
+    except (OSError, ValueError):  # ValueError: a name that none can be
+        return None
+    known = [ipaddress.ip_address(one) for one in found]
+    known = [getattr(one, "ipv4_mapped", None) or one for one in known]
+    return found[0] if known and all(one.is_global and not one.is_multicast for one in known) else None
 
 
 class FsspecRemote:
@@ -266,10 +301,9 @@ class FsspecRemote:
                 ) from None
             try:
                 system, root = url_to_fs(self._address)
-            except (ValueError, ImportError, OSError) as error:
-                raise InputError(
-                    "no such address", where=self.shown, got=type(error).__name__, expected="what fsspec opens"
-                ) from None
+            except Exception as error:  # each file system has its own
+                got = type(error).__name__
+                raise InputError("no such address", where=self.shown, got=got, expected="what fsspec opens") from None
             self._opened = system, str(root).rstrip("/")
         return self._opened
 

@@ -62,7 +62,7 @@ from release.transfer.remote import CHUNK, Remote, RemoteFile, open_remote, publ
 from release.verify.findings import Verified
 from release.verify.verify import verify
 
-MOST_RECORD_BYTES = 256_000_000  # some 400 bytes a flight
+MOST_RECORD_BYTES = 64_000_000  # some 400 bytes a flight
 
 
 class Choice(Config):
@@ -113,13 +113,9 @@ def fetch_record(remote: Remote, expected: str | None) -> tuple[ReleaseRecord, b
 def _small_file(remote: Remote, name: str) -> bytes:
     size = remote.size(name)
     if size > MOST_RECORD_BYTES:
-        raise InputError(
-            "too large a record",
-            where=f"{remote.shown}/{name}",
-            got=f"{size} bytes",
-            expected=f"at most {MOST_RECORD_BYTES}",
-        )
-    return remote.read(name, 0, size)
+        where, got = f"{remote.shown}/{name}", f"{size} bytes"
+        raise InputError("too large a record", where=where, got=got, expected=f"at most {MOST_RECORD_BYTES}")
+    return RemoteFile(remote, name, size).read()
 
 
 def _check_shards(record: ReleaseRecord, where: str) -> None:
@@ -449,7 +445,7 @@ def _not_kept(report: Verified, where: str) -> VerifyError:
 
 def _copy_records(remote: Remote, folder: Path, record: bytes) -> None:
     for name in ONE_FILE_EACH:
-        write_bytes(folder / name, record if name == RECORD else remote.read(name, 0, remote.size(name)))
+        write_bytes(folder / name, record if name == RECORD else _small_file(remote, name))
 
 
 def _copy_signature(remote: Remote, folder: Path) -> None:
