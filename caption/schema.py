@@ -321,6 +321,9 @@ class CaptionConfig(Config):
         le=5,
         description="asks that name what was wrong with an answer of the right structure, before its window is dropped",
     )
+    stop_after_dropped: MayDiffer[int] = Field(
+        50, ge=0, description="end the run when none of the first so many answered windows is accepted; 0: never"
+    )
     mirror_asks: int = Field(2, ge=1, le=10, description="asks for the Chinese mirror until the pair is consistent")
     limit: MayDiffer[int | None] = Field(None, ge=1, description="caption at most this many windows; empty takes all")
 

@@ -62,12 +62,13 @@ def test_what_is_exported_is_what_ships(tmp_path):
     assert CliRunner().invoke(app, ["caption", "prompts", "--check", str(folder)]).exit_code == 0
     (folder / "user_zh.txt").unlink()  # as after a kill
     assert CliRunner().invoke(app, ["caption", "prompts", "--export", str(folder)]).exit_code == 0
-    edit(folder / "user_en.txt", "$speed", "${speed}")
+    for name in ("user_en", "system_zh"):
+        edit(folder / f"{name}.txt", "the" if name == "user_en" else "1", "2")
     (folder / "user_zh.txt").unlink()
     again = CliRunner().invoke(app, ["caption", "prompts", "--export", str(folder)])
     assert not (folder / "user_zh.txt").exists()
     assert isinstance(again.exception, ConfigError)
-    assert "are there already" in str(again.exception)
+    assert "got system_zh.txt, user_en.txt" in str(again.exception)
 
 
 WRONG = [

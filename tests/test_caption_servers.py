@@ -338,6 +338,7 @@ LISTS: dict[str, tuple] = {
     "an error": (page(500, "broken"), "HTTP 500 broken"),
     "401 that quotes the key": (page(401, "bad key sk-very-secret"), "refuses the key; got HTTP 401 bad key ***"),
     "names of wrong types": (page(200, json.dumps({"data": [{"id": 7}, {"id": "a\x1b[2J"}, "b", {"id": "x" * 999}, {"id": MODEL}]})), None),
+    "one name that cannot be": (page(200, json.dumps({"data": [{"id": "a\x1b[2J"}]})), "lists no model by a name that can be asked for"),
     "ten thousand models": (page(200, json.dumps({"data": [{"id": f"m{i}"} for i in range(10_000)]})), "has several models; got 10000 models"),
     "nested deeply": (page(200, "[" * 100_000), "no list of models here"),
     "a body of 20 MB": (page(200, " " * 20_000_000), "no list of models here"),
@@ -427,8 +428,9 @@ def test_a_proxy_that_cannot_be_used_is_one_line(tree, tmp_path, monkeypatch, pr
         {"prompt_tokens": -5000, "completion_tokens": -500},
         {"prompt_tokens": 0, "completion_tokens": 0},
         {"prompt_tokens": -(10**30)},
+        {"prompt_tokens": 1, "completion_tokens": 1},  # of fifteen pictures
     ],
-    ids=["negative", "zero", "huge"],
+    ids=["negative", "zero", "huge", "one"],
 )
 def test_a_budget_holds_where_the_servers_count_cannot_be(tmp_path, usage):
     """By our own count, which the journal marks; and running it again does not spend the budget twice."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import shutil
 import socket
 from contextlib import nullcontext
@@ -13,6 +14,7 @@ import pytest
 from teacher_server import MODEL, TeacherServer, is_mirror, kept_answers
 from typer.testing import CliRunner
 
+from caption.run.reasons import REASONS, meaning_of
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from cosfly.chat.client import KEY_VARIABLE
@@ -23,6 +25,7 @@ from cosfly.errors import CosflyError, NothingKept, ResumeError, TeacherError
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
 
+ROOT = Path(__file__).resolve().parents[1]
 ENDPOINT = {"max_tries": 4, "backoff_s": 0.02, "max_backoff_s": 0.05, "timeout_s": 0.5, "concurrency": 4}
 
 
@@ -79,10 +82,46 @@ DROPPING_FAULTS = [
 def test_a_lasting_fault_drops_windows_with_its_reason(tree, tmp_path, fault, reason):
     cfg = {"limit": 2, "repair": {"hard_conflict": "keep"}}
     server = TeacherServer(lambda number, body: fault, decision=lambda body: "ascend")
-    with server, pytest.raises(NothingKept, match=f"2 dropped .{reason} 2"):
+    with (
+        server,
+        pytest.raises(
+            NothingKept, match=rf"captions\.jsonl: .*2 dropped .{reason} 2.*; mend .*\({re.escape(meaning_of(reason))}"
+        ),
+    ):
         run(settings(server.url, **cfg), tree, tmp_path / "out")
     windows = report_of(tmp_path / "out")["windows"]
     assert windows == {"input": 2, "kept": 0, "dropped": {reason: 2}, "failed": {}}
+
+
+def test_a_hopeless_teacher_is_stopped_and_its_commonest_reasons_are_explained(tree, tmp_path):
+    """Of its first answers none is accepted; a teacher of whom one was is not stopped, and a setting goes on."""
+    cfg = {"stop_after_dropped": 3, "endpoint": {"concurrency": 1}, "repair": {"hard_conflict": "keep"}}
+    server = TeacherServer(lambda number, body: "short", decision=lambda body: "ascend")
+    with (
+        server,
+        pytest.raises(TeacherError, match=r"none of the first 3 answers.*3 structure_.*\(no answer had the fields"),
+    ):
+        run(settings(server.url, **cfg), tree, tmp_path / "out")
+    server = TeacherServer(lambda number, body: "short", decision=lambda body: "ascend")
+    with server, pytest.raises(NothingKept):
+        run(settings(server.url, **cfg | {"stop_after_dropped": 0}), tree, tmp_path / "out")
+    num = report_of(tmp_path / "out")["windows"]["input"]
+    assert num > 3
+    with TeacherServer(lambda number, body: "short" if number > 20 else None, decision=lambda body: "ascend") as server:
+        run(settings(server.url, **cfg), tree, tmp_path / "one")
+    assert report_of(tmp_path / "one")["windows"]["kept"] > 0
+
+
+def test_every_code_of_a_dropped_window_is_explained_in_one_table():
+    """The documents' table is the messages' one, and holds every code that the ways of writing and the window loop give."""
+    docs = (ROOT / "docs" / "captions.md").read_text("utf-8")
+    rows = dict(re.findall(r"^\| `([a-z_]+)(?:\.\.\.)?` \| (.+) \|$", docs, re.MULTILINE))
+    assert {code: rows.get(code) for code in REASONS} == REASONS
+    sources = [path.read_text("utf-8") for path in (ROOT / "caption").rglob("*.py") if path.name != "reasons.py"]
+    codes = {
+        code for text in sources for code in re.findall(r"\"((?:slots|claims|conflict|regeneration)_[a-z_]+)\"", text)
+    }
+    assert {code for code in codes if code not in REASONS} <= {"slots_", "claims_"}
 
 
 @pytest.mark.parametrize("writing", ["slots", "claims", "prose"])

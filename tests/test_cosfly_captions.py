@@ -138,10 +138,12 @@ def test_captions_round_trip_and_errors_name_the_line(tmp_path):
         list(read_captions(tmp_path / "nowhere.jsonl"))
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_no_caption_holds_what_is_no_number(value):
-    with pytest.raises(ValidationError, match="depth_range_m"):
-        make_caption("Town01", "trajectory_1", "ORI", 4, depth_range_m=value)
+@pytest.mark.parametrize(
+    ("name", "value"), [("depth_range_m", float("nan")), ("depth_range_m", float("inf")), ("picture_px", (2**64, 36))]
+)
+def test_no_caption_holds_what_is_no_number(name, value):
+    with pytest.raises(ValidationError, match=name):
+        make_caption("Town01", "trajectory_1", "ORI", 4, **{name: value})
 
 
 @given(st.text(alphabet="高度 ab{}t0，。é1я%", max_size=24))

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from caption.run.flights import Allotted
 from caption.run.progress import Display
+from caption.run.reasons import explained
 from caption.run.window_loop import caption_window
 from caption.schema import CaptionConfig, Window
 from caption.teachers.judge import open_judge
@@ -26,7 +27,7 @@ from cosfly.chat.answers import AnswerBook
 from cosfly.chat.budget import BudgetSpent
 from cosfly.chat.contract import NoAnswer, Troubles
 from cosfly.errors import CosflyError, InputError, TeacherError
-from cosfly.products.captions import Caption, Usage, write_captions
+from cosfly.products.captions import Caption, Usage, read_captions, write_captions
 from cosfly.products.places import flight_of
 from cosfly.work.console import SECONDS_BETWEEN_LINES
 from cosfly.work.stage_folder import Failed, StageFolder, Tally, read_failures, write_failures
@@ -81,6 +82,7 @@ class Asking:
         self.most_open = in_flight + WAITING_WINDOWS
         self.was_whole = was_whole
         self.failed_in_row = 0
+        self.dropped: Counter[str] | None = Counter()  # of the windows that were asked; None once one was accepted
 
     async def run(self, allotted: list[Allotted]) -> Asked:
         """Ask about every window that has no answer yet.
@@ -133,6 +135,8 @@ class Asking:
         try:
             for flight in allotted:
                 if flight.part(self.stage.path).exists():
+                    if self.dropped is not None and _has_accepted(flight.part(self.stage.path)):
+                        self.dropped = None
                     self.asked.flights.kept += 1
                     self.display.skip(guesses[flight.name])
                     continue
@@ -204,6 +208,7 @@ class Asking:
             flight.captions.append(caption)
             self._note_refusal(caption)
             self.failed_in_row = 0
+            self._note_outcome(caption)
             self.display.finish(caption, time.monotonic() - begun_s)
 
     def _note_refusal(self, caption: Caption) -> None:
@@ -213,6 +218,27 @@ class Asking:
             self.quarantine.pop(sample_id, None)
         else:
             self.quarantine[sample_id] = Failed(id=sample_id, code=str(caption.drop_reason), message=refusal)
+
+    def _note_outcome(self, caption: Caption) -> None:
+        """End the run where nothing of what a teacher answered first is accepted: the rest would be no better.
+
+        Raises:
+            TeacherError: it is so.
+        """
+        if caption.status == "accepted":
+            self.dropped = None
+        most = self.cfg.stop_after_dropped if self.cfg.teacher_kind in ("endpoint", "vllm") else 0
+        if self.dropped is None or not most or not caption.attempts:
+            return
+        self.dropped[str(caption.drop_reason)] += 1
+        if self.dropped.total() >= most:
+            raise TeacherError(
+                f"none of the first {most} answers was accepted",
+                where=self.cfg.teacher,
+                got=explained(self.dropped),
+                fix=f"read {self.stage.path / ANSWERS}/*.jsonl, ask `cosfly caption doctor`, or go on with "
+                "--set caption.stop_after_dropped=0",
+            )
 
     def _leave_out(self, flight: _OpenFlight, failure: Failed) -> None:
         flight.has_gap = True
@@ -263,6 +289,10 @@ async def _some_done(running: set[asyncio.Task]) -> set[asyncio.Task]:
     for task in done:
         task.result()  # raises what ends the run
     return pending
+
+
+def _has_accepted(part: Path) -> bool:
+    return any(caption.status == "accepted" for caption in read_captions(part))
 
 
 def common_causes(failures: list[Failed]) -> str:

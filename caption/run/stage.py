@@ -17,6 +17,7 @@ from caption.run.asking import ANSWERS, Asked, Asking, common_causes, read_quara
 from caption.run.flights import PARTS, Allotted, allot, named_flights, parts_of, restore_parts
 from caption.run.ledger import Ledger
 from caption.run.own_files import keep_own_files, own_files, package_files
+from caption.run.reasons import explained
 from caption.run.report import write_page
 from caption.run.window_loop import caption_prepared, prepare
 from caption.schema import CaptionConfig, Window
@@ -111,6 +112,9 @@ def _run(
     if not is_whole:
         _tell_what_is_left(cfg, asked, tally)
         return out / PRODUCT
+    if not tally.kept:
+        fix = f"mend what is dropped ({explained(tally.dropped)}), or change the settings and choose another --out"
+        raise stage.nothing_kept(tally, where=out / PRODUCT, fix=fix)
     outputs = [out / PRODUCT, out / REPORT, out / PAGE, *sorted((out / ANSWERS).glob("*.jsonl")), *keep_own_files(out)]
     stage.finish(outputs, tally, flights=asked.flights.model_dump(), limit=cfg.limit if is_cut else None)
     if not is_cut:

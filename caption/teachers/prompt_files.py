@@ -124,9 +124,8 @@ def export_prompts(folder: Path) -> list[Path]:
     refuse_links(folder)
     there = [name for name, text in texts.items() if _is_another(folder / f"{name}{SUFFIX}", text)]
     if there:
-        raise ConfigError(
-            "prompts are there already", where=folder, got=f"{len(there)} of them: {there[0]}{SUFFIX}", fix="choose another folder"
-        )  # fmt: skip
+        names = ", ".join(f"{name}{SUFFIX}" for name in there)
+        raise ConfigError("prompts of another text are there", where=folder, got=names, fix="choose another folder")
     paths = [folder / f"{name}{SUFFIX}" for name in texts]
     for path, text in zip(paths, texts.values(), strict=True):
         write_bytes(path, text.encode())

@@ -310,7 +310,9 @@ class ChatClient:
             self.model = wanted or names[0]
             self.model_entry = entries[names.index(self.model)]
             return
-        listed = ", ".join(names[:8]) or "none"
+        if not names:
+            raise self.error("the endpoint lists no model by a name that can be asked for", fix="give --model")
+        listed = ", ".join(names[:8])
         raise self.error(
             "the endpoint does not have this model" if wanted else "the endpoint has several models",
             got=wanted or f"{len(names)} models",

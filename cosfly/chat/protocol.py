@@ -26,6 +26,8 @@ ENDED = (
 MOST_NAME = 256  # characters of a name that is kept: of a model, of why an answer ended
 BYTES_PER_TOKEN = 3  # a low guess: a budget that counts with it is kept
 PIXELS_PER_TOKEN = 28 * 28  # of common vision encoders
+# What no tokenizer and no vision encoder gets below: a count that is smaller is none.
+MOST_BYTES_PER_TOKEN, LEAST_PER_PICTURE = 16, 16
 
 
 def check_url(url: str) -> None:
@@ -222,26 +224,32 @@ def _usage(value: Any, request: Request, message: dict[str, Any]) -> tuple[Usage
     if all(found.get(name) is None for name in names):
         return None, ()
     said = [text for text in (final_text(message), *map(message.get, THOUGHT_FIELDS)) if isinstance(text, str)]
-    least: dict[CountName, int] = {"prompt_tokens": 1, "completion_tokens": min(1, _tokens(said))}
+    texts, pictures = _asked(request)
+    least: dict[CountName, int] = {
+        "prompt_tokens": max(1, _least_tokens(texts) + LEAST_PER_PICTURE * len(pictures)),
+        "completion_tokens": max(min(1, _tokens(said)), _least_tokens(said)),
+    }
     wrong = tuple(name for name in names if not _is_count(found.get(name), least[name]))
     if not wrong:
         return Usage(**{name: found[name] for name in names}), ()
-    ours = {"prompt_tokens": _prompt_tokens(request), "completion_tokens": _tokens(said)}
+    pixels = (_num_pixels(picture) for picture in pictures if "prompt_tokens" in wrong)
+    asked = max(1, _tokens(texts)) + sum(-(-number // PIXELS_PER_TOKEN) for number in pixels)
+    ours = {"prompt_tokens": asked, "completion_tokens": _tokens(said)}
     return Usage(**{name: ours[name] if name in wrong else found[name] for name in names}), wrong
 
 
 def _is_count(value: Any, least: int) -> bool:
-    """Tell whether this can be a number of tokens: of what is there it is not 0."""
+    """Tell whether this can be a number of tokens."""
     return type(value) is int and least <= value <= MOST_TOKENS
 
 
-def _prompt_tokens(request: Request) -> int:
-    """Count the tokens of a request."""
-    parts: list[dict[str, Any]] = []
+def _asked(request: Request) -> tuple[list[str], list[str]]:
+    """Give the texts and the pictures (data URLs) of a request."""
+    texts, pictures = list[str](), list[str]()
     for content in (asked["content"] for asked in request.messages):
-        parts += [{"text": content}] if isinstance(content, str) else content
-    pixels = [_num_pixels(part["image_url"]["url"]) for part in parts if "image_url" in part]
-    return max(1, _tokens([part.get("text", "") for part in parts])) + sum(-(-n // PIXELS_PER_TOKEN) for n in pixels)
+        for part in [{"text": content}] if isinstance(content, str) else content:
+            (pictures.append(part["image_url"]["url"]) if "image_url" in part else texts.append(part.get("text", "")))
+    return texts, pictures
 
 
 def _num_pixels(data_url: str) -> int:
@@ -253,6 +261,11 @@ def _num_pixels(data_url: str) -> int:
 
 def _tokens(texts: list[str]) -> int:
     return -(-sum(len(text.encode()) for text in texts) // BYTES_PER_TOKEN)
+
+
+def _least_tokens(texts: list[str]) -> int:
+    """Give fewer tokens than texts can have; white space counts for nothing, since a token may hold a line of it."""
+    return sum(len("".join(text.split()).encode()) for text in texts) // MOST_BYTES_PER_TOKEN
 
 
 def read_models(response: Response) -> list[dict[str, Any]] | None:

@@ -159,6 +159,9 @@ class KeyframeRecord(BaseModel):
     missed: int
 
 
+Pixels = Annotated[int, Field(ge=1, le=1 << 20)]
+
+
 class Claim(BaseModel):
     """One thing that a sentence states.
 
@@ -261,7 +264,7 @@ class Caption(BaseModel):
     future: list[int]
     prompt: dict[str, Prompt]  # language -> prompt, with PICTURES_MARK
     prompt_hash: str  # of what the teacher was asked
-    picture_px: tuple[int, int]  # (width, height) of a picture that was sent, which pixel values refer to
+    picture_px: tuple[Pixels, Pixels]  # (width, height) of a picture that was sent, which pixel values refer to
     depth_range_m: float | None = None  # dark end of the depth pictures; None: none was sent
     teacher: TeacherRecord
     usage: Usage  # of the teacher, all asks
