@@ -587,3 +587,13 @@ def test_the_rule_teacher_compares_where_the_targets_mean_and_last_step_agree(me
     )
     texts = [text for ways in describe(facts) for both in ways for text in both]
     assert any("{comparison:speed}" in text for text in texts) is is_compared
+
+
+@pytest.mark.parametrize("name", ["distance", "speed", "altitude"])
+def test_the_rule_teacher_says_of_no_series_that_it_varies_from_a_value_to_the_same(name):
+    series = {"distance": "distance_m", "speed": "speed_mps", "altitude": "altitude_m"}[name]
+    for values, varies in (((20.0, 20.0, 21.0, 20.6, 20.0), False), ((20.0, 20.0, 21.0, 20.6, 20.1), True)):
+        facts = dataclasses.replace(FOLLOW, **{series: values})
+        texts = [text for ways in describe(facts) for both in ways for text in both if f"{{{name}}}" in text]
+        assert len(texts) >= 2
+        assert any(f"{{trend:{name}}}" in text for text in texts) is varies

@@ -117,8 +117,9 @@ def _position(f: Facts) -> tuple[Both, ...]:
 
 def _course(f: Facts, name: str, en: str, zh: str, plain: tuple[Both, ...], first: int = 0) -> tuple[Both, ...]:
     """State how a quantity went; `plain` where it stayed, or where its first value is not known."""
-    trend = word_of(f, f"trend:{name}")
-    if trend in (None, "steady") or QUANTITIES[name].read(f)[first] is None:
+    trend, values = word_of(f, f"trend:{name}"), QUANTITIES[name].read(f)
+    is_back = trend == "mixed" and values[first] == values[-1]  # "varies, from 20.0 m at t0 to 20.0 m now" says nothing
+    if trend in (None, "steady") or values[first] is None or is_back:
         return plain
     mixed, directed = _courses(name, en, zh, first)
     return mixed if trend == "mixed" else directed

@@ -320,7 +320,8 @@ class StageFolder:
             where=where or self.path,
             got=f"{tally}; the first failure: {failures[0].message}" if failures else str(tally),
             expected=expected,
-            fix=fix or "mend what failures.jsonl and items.jsonl there name, or change the settings and choose another --out",
+            fix=fix
+            or "mend what failures.jsonl and items.jsonl there name, or change the settings and choose another --out",
         )
 
 
