@@ -246,7 +246,7 @@ def _is_count(value: Any, least: int) -> bool:
 def _asked(request: Request) -> tuple[list[str], list[str]]:
     """Give the texts and the pictures (data URLs) of a request."""
     contents = [message["content"] for message in request.messages]
-    parts = [part for one in contents for part in ([{"text": one}] if isinstance(one, str) else one)]
+    parts: list[dict] = [part for one in contents for part in ([{"text": one}] if isinstance(one, str) else one)]
     texts = [part.get("text", "") for part in parts if "image_url" not in part]
     pictures = [part["image_url"]["url"] for part in parts if "image_url" in part]
     return texts, pictures
