@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from specimens_planning import WORLDS, scenario_of, town_of, walk_along
 
-from cosfly.planners import foresight
+from cosfly.planners import foresight, smoothing
 from cosfly.planners.contract import PlanConfig, load_planner
 from cosfly.planners.stage import make_scenario, plan_flight
 from cosfly.space import flight_metrics, kernels
@@ -144,10 +144,10 @@ def test_where_no_way_is_fast_enough_there_is_none():
 @pytest.mark.parametrize("dt_s", [0.5, 0.2])
 def test_the_band_is_that_of_the_squared_derivatives(num, dt_s):
     points = np.random.default_rng(num).normal(size=num)
-    band = foresight.smoothness_band(num, dt_s)
+    band = smoothing.smoothness_band(num, dt_s)
     full = sum(np.diag(band[k, : num - k], -k) for k in range(min(4, num)))
     full = full + full.T - np.diag(np.diag(full))
-    weights = (foresight.VELOCITY_S2, foresight.ACCELERATION_S4, foresight.JERK_S6)
+    weights = (smoothing.VELOCITY_S2, smoothing.ACCELERATION_S4, smoothing.JERK_S6)
     expected = sum(w * (np.diff(points, n=k + 1) ** 2).sum() / dt_s ** (2 * k + 2) for k, w in enumerate(weights))
     assert points @ full @ points == pytest.approx(expected)
 
@@ -155,11 +155,11 @@ def test_the_band_is_that_of_the_squared_derivatives(num, dt_s):
 def test_waypoints_are_unsafe_that_are_near_or_at_the_ends_of_a_bad_step():
     box = kernels.obstacle_index(town_of(((0, 0, 20), (2, 2, 20))))
     points = np.array([[-30, 9, 20], [-26, 9, 20], [-4, 0, 20], [4, 9, 20], [8, 9, 20], [8, -9, 20.0]])
-    found = foresight.unsafe(points, box, 3.0, 5.0)
+    found = smoothing.unsafe(points, box, 3.0, 5.0)
     np.testing.assert_array_equal(found, [False, True, True, True, True, True])
-    np.testing.assert_array_equal(foresight.unsafe(points[3:5], box, 3.0, 5.0), [False, False])
+    np.testing.assert_array_equal(smoothing.unsafe(points[3:5], box, 3.0, 5.0), [False, False])
     through = np.array([[-6.0, 0, 20], [6.0, 0, 20]])
-    np.testing.assert_array_equal(foresight.unsafe(through, box, 3.0, 50.0), [True, True])
+    np.testing.assert_array_equal(smoothing.unsafe(through, box, 3.0, 50.0), [True, True])
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -167,9 +167,9 @@ def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
     obstacles = random_town(seed)
     scenario = straight_scenario(obstacles, 60.0)
     raw = foresight.search_flight(scenario, foresight.make_lattice(scenario, climbing=False), obstacles, CFG, 3.0)
-    points, facts = foresight.smooth_flight(raw, scenario, obstacles, CFG, 3.0)
+    points, facts = smoothing.smooth_flight(raw, scenario, obstacles, CFG, 3.0)
     assert facts["smooth"]
-    assert not foresight.unsafe(points, obstacles, 3.0, CFG.speed_max_mps * scenario.dt_s).any()
+    assert not smoothing.unsafe(points, obstacles, 3.0, CFG.speed_max_mps * scenario.dt_s).any()
     assert (points[:, 2] >= 20.0).all()
     seen, seen_raw = (kernels.visibility(obstacles, flight, scenario.targets_m).mean() for flight in (points, raw))
     assert seen >= seen_raw - 0.01
@@ -180,11 +180,11 @@ def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
 def test_a_raw_flight_that_cannot_be_smoothed_is_flown_as_it_is(monkeypatch):
     scenario, obstacles = scenario_of("tower_midway")
     raw = foresight.search_flight(scenario, foresight.make_lattice(scenario, climbing=False), obstacles, CFG, 3.0)
-    monkeypatch.setattr(foresight, "unsafe", lambda points, *rest: np.ones(len(points), dtype=bool))
-    points, facts = foresight.smooth_flight(raw, scenario, obstacles, CFG, 3.0)
+    monkeypatch.setattr(smoothing, "unsafe", lambda points, *rest: np.ones(len(points), dtype=bool))
+    points, facts = smoothing.smooth_flight(raw, scenario, obstacles, CFG, 3.0)
     np.testing.assert_array_equal(points, raw)
     assert not facts["smooth"]
-    assert facts["rounds"] == foresight.ROUNDS_MAX
+    assert facts["rounds"] == smoothing.ROUNDS_MAX
 
 
 # --- whole flights ----------------------------------------------------------------------------------------------------

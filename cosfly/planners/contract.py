@@ -143,14 +143,6 @@ class TrackAStarConfig(Config):
     weight_safety: float = Field(8.0, ge=0, description="weight of the squared intrusion into influence_m")
     weight_smoothness: float = Field(0.15, ge=0, description="weight of the squared change of the move, in voxels")
     influence_m: float = Field(8.0, gt=0, description="obstacles nearer than this add to the safety term, m")
-    shortcut_frames: int = Field(12, ge=0, description="longest run replaced by a straight line, frames; 0: none")
-    elastic_iterations: int = Field(30, ge=0, description="iterations of the elastic band at most; 0: none")
-    elastic_step: float = Field(0.35, gt=0, le=1, description="step towards the middle of the neighbours")
-    elastic_step_min: float = Field(0.02, gt=0, le=1, description="a step that is not valid is halved down to this")
-    anchor_visibility: float = Field(0.999, ge=0, le=1, description="visibility above this counts as full")
-    visibility_loss_point: float = Field(0.05, ge=0, le=1, description="visibility that one change may cost a frame")
-    visibility_loss_frame: float = Field(0.10, ge=0, le=1, description="visibility that smoothing may cost a frame")
-    visibility_loss_mean: float = Field(0.05, ge=0, le=1, description="mean visibility that smoothing may cost")
 
 
 class PlanConfig(Config):
