@@ -1,4 +1,6 @@
-"""Maps of one's own: tables and GeoJSON of boxes in the forms that people write, and what is wrong with others, all at once."""
+"""Maps of one's own: tables and GeoJSON of boxes in the forms that people write, and what is wrong with others, all at
+once.
+"""
 
 import json
 import re
@@ -32,7 +34,8 @@ FORMS = {
     ),
     "half sizes and radians": (
         "id,kind,x,y,z,half_x,half_y,half_z,yaw_rad\n"
-        "7,Buildings,10,20,4,6,4,4,0.5235987755982988\n8,Vegetation,40,-5,3,2,2,3,0\n9,Roads,25,0,-0.15,45,3.5,0.15,0\n",
+        "7,Buildings,10,20,4,6,4,4,0.5235987755982988\n"
+        "8,Vegetation,40,-5,3,2,2,3,0\n9,Roads,25,0,-0.15,45,3.5,0.15,0\n",
         {},
     ),
     "foot and top": (
@@ -41,12 +44,14 @@ FORMS = {
         {},
     ),
     "heights over the ground, own names": (
-        "id,type,x,y,length,width,height,yaw,note\n7,house,10,20,12,8,8,30,a\n8,tree,40,-5,4,4,6,0,b\n9,road,25,0,90,7,,0,c\n",
+        "id,type,x,y,length,width,height,yaw,note\n7,house,10,20,12,8,8,30,a\n"
+        "8,tree,40,-5,4,4,6,0,b\n9,road,25,0,90,7,,0,c\n",
         {"types": {"house": "Buildings", "tree": "Vegetation", "road": "Roads"}, "ignore": ["note"]},
     ),
     "centimetres of a left-handed engine": (
         "id,type,x,y,z,extent_x,extent_y,extent_z,yaw\n"
-        "7,Buildings,1000,-2000,400,600,400,400,-30\n8,Vegetation,4000,500,300,200,200,300,0\n9,Roads,2500,0,-15,4500,350,15,0\n",
+        "7,Buildings,1000,-2000,400,600,400,400,-30\n"
+        "8,Vegetation,4000,500,300,200,200,300,0\n9,Roads,2500,0,-15,4500,350,15,0\n",
         {"metres_per_unit": 0.01, "left_handed": True},
     ),
 }  # fmt: skip
@@ -102,7 +107,9 @@ def test_outlines_and_points_of_geojson(tmp_path):
 
 
 def test_longitude_and_latitude_become_metres(tmp_path):
-    """A degree of latitude at 52 degrees north is 111,267 m on the ellipsoid, one of longitude 68,677 m (tables of WGS 84)."""
+    """A degree of latitude at 52 degrees north is 111,267 m on the ellipsoid, one of longitude 68,677 m (tables of WGS
+    84).
+    """
     ring = [[4.0, 52.0], [4.001, 52.0], [4.001, 52.001], [4.0, 52.001], [4.0, 52.0]]
     box_map = loaded(tmp_path, collection(feature("Polygon", [ring], type="Buildings", height=9)), ".geojson")
     size = sorted(box_map.half_extents[0, :2] * 2)
@@ -160,21 +167,30 @@ def test_a_map_far_from_the_origin_is_moved_there_and_says_so(tmp_path):
 @pytest.mark.parametrize(
     ("text", "settings", "words"),
     [
-        (PLAIN.replace("Vegetation", "vegetable").replace("Roads", "roads"), {}, r"line 3: unknown type 'vegetable' \(did you mean 'Vegetation'\?\); line 4: unknown type 'roads' \(did you mean 'Roads'\?\); expected types are Roads.*2 to mend"),
-        (PLAIN.replace(",yaw_deg", ",yaw_dge"), {}, r"column 'yaw_dge' has no meaning here \(did you mean 'yaw_deg'\?\).*maps\.boxes\.ignore"),
-        (PLAIN.replace("type,x", "note,x"), {"ignore": ["note"]}, r"no column for type \(type, category, kind, class\)"),
+        (PLAIN.replace("Vegetation", "vegetable").replace("Roads", "roads"), {},
+         r"line 3: unknown type 'vegetable' \(did you mean 'Vegetation'\?\); "
+         r"line 4: unknown type 'roads' \(did you mean 'Roads'\?\); expected types are Roads.*2 to mend"),
+        (PLAIN.replace(",yaw_deg", ",yaw_dge"), {},
+         r"column 'yaw_dge' has no meaning here \(did you mean 'yaw_deg'\?\).*maps\.boxes\.ignore"),
+        (PLAIN.replace("type,x", "note,x"), {"ignore": ["note"]},
+         r"no column for type \(type, category, kind, class\)"),
         (PLAIN.replace("height,yaw_deg", "height,half_z"), {}, "height twice, whole and half"),
         (PLAIN.replace("height,yaw_deg", "height,center_z"), {}, "2 columns are the z: z, center_z"),
         (PLAIN.replace(",12,8,8,30", ",12,8,8"), {}, "line 2: 8 cells, where the first line has 9"),
-        (PLAIN.replace("12,8,8,30", '"12,5",8,8,30'), {}, r"length is not a finite number: '12,5'; write a decimal point"),
-        (PLAIN.replace("12,8,8,30", "-12,8,8,30").replace("4,4,6,0", "4,4,nan,0"), {}, r"line 2: length is not more than 0: -12 m; line 3: height is not a finite number: 'nan'"),
+        (PLAIN.replace("12,8,8,30", '"12,5",8,8,30'), {},
+         r"length is not a finite number: '12,5'; write a decimal point"),
+        (PLAIN.replace("12,8,8,30", "-12,8,8,30").replace("4,4,6,0", "4,4,nan,0"), {},
+         r"line 2: length is not more than 0: -12 m; line 3: height is not a finite number: 'nan'"),
         (PLAIN.replace("7,Buildings", "8,Buildings"), {}, "id 8 occurs 2 times"),
         (PLAIN.replace("7,Buildings", "x,Buildings"), {}, "id 'x' is not a whole number"),
         (PLAIN.replace(",10,20,4", ",1000,200000000,4"), {}, r"are these centimetres\?.*metres_per_unit=0\.01"),
         (PLAIN.replace("12,8,8,30", "12,8,800,30"), {}, r"too high: are these centimetres\?.*usually 800 m"),
-        ("x,y,length,type\n1,2,3,Buildngs\n1,zz,3,Buildings\n", {}, r"no column for width .*; line 2: unknown type 'Buildngs'.*; line 3: y is not .*3 to mend"),
-        (PLAIN.replace(",width,height", ",note,height"), {"ignore": ["note"]}, r"csv: no column for width \(width, size_y, half_width, half_y, extent_y\)$"),
-        (PLAIN.replace(",", ";"), {}, r"line 1: the columns are not parted by commas|parted by commas.*line 1.*expected commas, where ; stand"),
+        ("x,y,length,type\n1,2,3,Buildngs\n1,zz,3,Buildings\n", {},
+         r"no column for width .*; line 2: unknown type 'Buildngs'.*; line 3: y is not .*3 to mend"),
+        (PLAIN.replace(",width,height", ",note,height"), {"ignore": ["note"]},
+         r"csv: no column for width \(width, size_y, half_width, half_y, extent_y\)$"),
+        (PLAIN.replace(",", ";"), {},
+         r"line 1: the columns are not parted by commas|parted by commas.*line 1.*expected commas, where ; stand"),
         (PLAIN.replace(",", "\t"), {}, r"commas, where tabs stand"),
         ("", {}, r"holds no boxes; got nothing after the first line; expected a box a line.*docs/files\.md"),
         (PLAIN + "\"a", {}, "not a table"),
@@ -188,20 +204,28 @@ def test_all_that_is_wrong_with_a_table_is_told(tmp_path, text, settings, words)
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (collection(feature("LineString", [[0, 0], [1, 1]], type="Walls")), "feature 1: a geometry that has no place here, LineString; there are Point"),
-        (collection(feature("Polygon", [[[0, 0], [9, 0]]], type="Walls")), "feature 1: its coordinates are not places: at least four finite"),
-        (collection(feature("Polygon", [[[0, 0], [9, "x"], [9, 9], [0, 0]]], type="Walls")), "not places: at least four"),
-        (collection(feature("Polygon", [[[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]], type="Buildings", height=3)), r"feature 1: the outline crosses itself: Self-intersection\[4\.5 4\.5\]"),
-        (collection(feature("Point", [5, 5], type="Vegetation", height=3)), "feature 1: neither length nor half_length"),
-        (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 0]]], type="Buildings")), "feature 1: neither height nor half_height"),
-        (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 9]]], type="Buildings", height=3)), "the last the first again"),
+        (collection(feature("LineString", [[0, 0], [1, 1]], type="Walls")),
+         "feature 1: a geometry that has no place here, LineString; there are Point"),
+        (collection(feature("Polygon", [[[0, 0], [9, 0]]], type="Walls")),
+         "feature 1: its coordinates are not places: at least four finite"),
+        (collection(feature("Polygon", [[[0, 0], [9, "x"], [9, 9], [0, 0]]], type="Walls")),
+         "not places: at least four"),
+        (collection(feature("Polygon", [[[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]], type="Buildings", height=3)),
+         r"feature 1: the outline crosses itself: Self-intersection\[4\.5 4\.5\]"),
+        (collection(feature("Point", [5, 5], type="Vegetation", height=3)),
+         "feature 1: neither length nor half_length"),
+        (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 0]]], type="Buildings")),
+         "feature 1: neither height nor half_height"),
+        (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 9]]], type="Buildings", height=3)),
+         "the last the first again"),
         (
             collection(
                 {**feature("LineString", [[0, 0], [1, 1]], type="Walls"), "id": "way/7"},
                 feature("Point", [5, 5], type="Vegetation", name="old oak", height="tall"),
                 feature("Point", [5, 5], type="house", levels=3, length=4, width=4, height=6),
             ),
-            r"properties: column 'levels' has no meaning.*feature 1 \(way/7\): a geometry.*feature 2 \(old oak\): height is not a finite number: 'tall'"
+            r"properties: column 'levels' has no meaning.*feature 1 \(way/7\): a geometry.*feature 2 \(old oak\): "
+            r"height is not a finite number: 'tall'"
             r".*feature 3: unknown type 'house'.*expected columns .*types are .*4 to mend",
         ),
         (json.dumps({"type": "Topology"}), "not GeoJSON"),
@@ -223,9 +247,11 @@ def town_table(*rows: str, yaw: str = "yaw_deg", houses: list[str] = HOUSES) -> 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (town_table(houses=[re.sub(r"\d+$", lambda deg: f"{np.radians(int(deg[0])):.3f}", row) for row in HOUSES]), "all 22 yaws lie within 1.4 degrees.*yaw_rad"),
+        (town_table(houses=[re.sub(r"\d+$", lambda deg: f"{np.radians(int(deg[0])):.3f}", row) for row in HOUSES]),
+         "all 22 yaws lie within 1.4 degrees.*yaw_rad"),
         (town_table(*[HOUSES[3]] * 20), "20 of 45 boxes repeat another exactly"),
-        (town_table(*(f"Buildings,10,10,12,8,{5 + 0.1 * k},0" for k in range(150))), "150 of 175 buildings have their middle at x 10, y 10"),
+        (town_table(*(f"Buildings,10,10,12,8,{5 + 0.1 * k},0" for k in range(150))),
+         "150 of 175 buildings have their middle at x 10, y 10"),
         (town_table(), ""),
         (town_table(*("Buildings,7,7,4,4,3,5", "Buildings,17,7,4,4,3,5", "Buildings,27,7,4,4,3,2"), houses=[]), ""),
     ],

@@ -1,4 +1,6 @@
-"""Trees of somebody else: some of their flights, one of their tracks, flights behind links, several trees; to captions and a release."""
+"""Trees of somebody else: some of their flights, one of their tracks, flights behind links, several trees; to captions
+and a release.
+"""
 
 from __future__ import annotations
 
@@ -115,7 +117,8 @@ def test_a_linked_tree_goes_all_the_way(tree, tmp_path):
     call("caption", "--data", mine, "--out", tmp_path / "caption", "--set", "workers=1")
     call(
         "release", "build", "--data", mine, "--captions", tmp_path / "caption/captions.jsonl", "--inspect",
-        tmp_path / "inspect/inspect.json", "--out", tmp_path / "release", "--set", "release.licence=cc-by-4.0", "--set", "workers=1",
+        tmp_path / "inspect/inspect.json", "--out", tmp_path / "release", "--set", "release.licence=cc-by-4.0",
+        "--set", "workers=1",
     )  # fmt: skip
     report = verify(tmp_path / "release", level="rows", reader=read_released)
     assert report.is_ok, str(report)
@@ -160,8 +163,11 @@ def test_a_training_set_takes_some_flights(tree, tmp_path):
     assert counts["kept"] + sum(counts["dropped"].values()) == counts["input"]
 
 
-@pytest.mark.parametrize("words", [["caption", "--out", "out"], ["inspect", "--out", "out"], ["gallery", "--out", "out"],
-                                   ["render", "sample", "--out", "out.png"], ["caption", "compare-strategies", "--out", "out"]])  # fmt: skip
+@pytest.mark.parametrize(
+    "words",
+    [["caption", "--out", "out"], ["inspect", "--out", "out"], ["gallery", "--out", "out"],
+     ["render", "sample", "--out", "out.png"], ["caption", "compare-strategies", "--out", "out"]],
+)  # fmt: skip
 def test_two_trees_are_refused_with_words_where_one_is_taken(tree, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(app, [*words, "--data", str(tree), "--data", "another"])

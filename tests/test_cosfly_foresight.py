@@ -16,7 +16,7 @@ CFG = PlanConfig()
 
 
 def random_town(seed):
-    """Forty turned boxes round the origin, some taller than a drone flies, none on the x axis, where the walker goes."""
+    """Forty turned boxes round the origin, some taller than a drone flies, none where the walker goes."""
     rng = np.random.default_rng(seed)
     side = np.where(rng.random(40) < 0.5, -1.0, 1.0)
     centers = np.column_stack([rng.uniform(-70, 90, 40), side * rng.uniform(16, 60, 40), rng.uniform(0, 15, 40)])
@@ -218,7 +218,9 @@ def test_an_orbit_without_room_is_flown_as_far_as_there_is_room():
 
 
 def test_it_changes_sides_before_a_row_of_trees_hides_the_walker():
-    """Canopies along the right of the second half of a walk whose wished place, right of the walker, they would hide it from."""
+    """Canopies along the right of the second half of a walk whose wished place, right of the walker, they would hide it
+    from.
+    """
     canopies = [((x, -6, 6), (4.5, 2.5, 5.5)) for x in range(40, 101, 8)]
     obstacles = kernels.obstacle_index(town_of(*canopies))
     scenario = make_scenario(walk_along("w", [(0, 0), (90, 0)]), obstacles, CFG)

@@ -1,4 +1,6 @@
-"""The map's header owns the ground's height: a whole town lifted by 2 m gives the same walks, flights and pictures, 2 m higher."""
+"""The map's header owns the ground's height: a whole town lifted by 2 m gives the same walks, flights and pictures, 2 m
+higher.
+"""
 
 from dataclasses import replace
 

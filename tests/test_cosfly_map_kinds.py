@@ -34,7 +34,9 @@ def counted_from(shell: list, first: int) -> list:
 
 
 def city() -> Model:
-    """CityJSON 2.0: a building whose part has the walls, a second house, a road; all of them objects of the first level or parts."""
+    """CityJSON 2.0: a building whose part has the walls, a second house, a road; all of them objects of the first level
+    or parts.
+    """
     house, shell = prism(100.0, 50.0, 14.0)
     other, _ = prism(120.0, 50.0, 8.0)
     road = [[80_000, 40_000, 2000], [140_000, 40_000, 2000], [140_000, 46_000, 2000], [80_000, 46_000, 2000]]
@@ -107,7 +109,9 @@ def with_an_outline(model: Model) -> Model:
 
 
 def with_a_template(model: Model, version: str) -> Model:
-    """The second house stands as a template's instance: twice the size of a template a fourth as large, from its own low corner."""
+    """The second house stands as a template's instance: twice the size of a template a fourth as large, from its own
+    low corner.
+    """
     model = copy.deepcopy(model) if version >= "1.1" else in_metres(model, version)
     model["version"] = version
     _, shell = prism(0.0, 0.0, 0.0)

@@ -57,7 +57,8 @@ def test_a_town_has_what_the_passes_and_the_walks_need(seed):
     town = load_map(MapsConfig(), seed=seed)
     kinds = set(town.counts())
     assert kinds >= {
-        "Roads", "Sidewalks", "Terrain", "RoadLines", "Buildings", "Vegetation", "Poles", "TrafficLight", "TrafficSigns",
+        "Roads", "Sidewalks", "Terrain", "RoadLines", "Buildings", "Vegetation", "Poles", "TrafficLight",
+        "TrafficSigns",
         "Car", "Truck", "Static", "Fences", "Water",
     }  # fmt: skip
     tops = boxes_of(town, "Buildings").maxs[:, 2]
@@ -484,7 +485,8 @@ def change(model: dict, path: str, value) -> None:
         ("CityObjects", {"a": {"type": "Road", "geometry": [{"type": ["MultiSurface"]}]}}, "'no_geometry': 1"),
         ("CityObjects/house/geometry", 3, "CityObjects.house.geometry: not a list of geometries"),
         ("CityObjects/house/geometry/0/boundaries", [[[["a"]]]], "house.geometry[0].boundaries surface 0: not a ring"),
-        ("CityObjects/road/geometry/0/boundaries", [[[8, 9, 99]]], "road.geometry[0].boundaries surface 0: no such vertex; got 99"),
+        ("CityObjects/road/geometry/0/boundaries", [[[8, 9, 99]]],
+         "road.geometry[0].boundaries surface 0: no such vertex; got 99"),
         ("CityObjects/road/geometry/0/boundaries", 5, "road.geometry[0].boundaries: not nested as its type says"),
         ("vertices/8", [10**9, 0, 0], "vertices: the map is too wide"),
         ("vertices/8", [10**400, 0, 0], "vertices[8][0]: the city model holds a number"),

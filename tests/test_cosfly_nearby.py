@@ -1,4 +1,6 @@
-"""Remembered boxes give the answers of the index; the band solver those of a library; a flight does not depend on the memory."""
+"""Remembered boxes give the answers of the index; the band solver those of a library; a flight does not depend on the
+memory.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,6 @@
-"""Metrics on analytic curves, MuCO's terms against plain versions, whole flights over hand-made maps, and the plan stage."""
+"""Metrics on analytic curves, MuCO's terms against plain versions, whole flights over hand-made maps, and the plan
+stage.
+"""
 
 import contextlib
 import json
@@ -285,7 +287,9 @@ def test_the_loss_never_rises_and_the_flight_is_safe(world):
 
 
 def papers_losses(points, problem, obstacles, cfg, num_steps):
-    """The paper's outer loop, slowly: central differences of the whole loss, capped steps, the projection, whatever the loss does."""
+    """The paper's outer loop, slowly: central differences of the whole loss, capped steps, the projection, whatever the
+    loss does.
+    """
     points, low = points.copy(), problem.altitudes[0, 0]
     losses, num_infeasible = [sum(plain_terms(points, problem, obstacles).values())], 0
 
@@ -313,7 +317,9 @@ def papers_losses(points, problem, obstacles, cfg, num_steps):
 
 @pytest.mark.parametrize("world", ["corner", "tower_midway"])
 def test_the_papers_optimizer_is_the_one_that_is_printed(world):
-    """It overshoots, goes on all the same, over infeasible trajectories too, and gives the last feasible one, not converged."""
+    """It overshoots, goes on all the same, over infeasible trajectories too, and gives the last feasible one, not
+    converged.
+    """
     scenario, obstacles = scenario_of(world)
     scenario = first_points(scenario, 16)
     problem = muco.make_problem(scenario, CFG)
@@ -328,7 +334,9 @@ def test_the_papers_optimizer_is_the_one_that_is_printed(world):
 
 
 def test_the_papers_optimizer_goes_on_after_an_infeasible_step():
-    """A drone hardly faster than the walker: jumps of half a metre break the speed limit at the end that stays in its place."""
+    """A drone hardly faster than the walker: jumps of half a metre break the speed limit at the end that stays in its
+    place.
+    """
     scenario, obstacles = scenario_of("empty")
     scenario = first_points(scenario, 16)
     problem = muco.make_problem(scenario, CFG)._replace(step_max_m=0.7)

@@ -61,9 +61,11 @@ def test_a_thing_under_another_id_is_told_but_for_ground(kind, num_renamed, is_f
 
 
 def test_points_come_out_in_a_picture_of_another_size():
-    """A wall at 20 m, seen from 20 m to the side by a camera of half as many pixels: what lies beyond its edges is not seen."""
+    """A wall at 20 m, seen from 20 m to the side by a camera of half as many pixels: what lies beyond its edges is not
+    seen.
+    """
     wall = building_at(20.0)
-    halved = View(wall.depth[::2, ::2].copy(), wall.instance[::2, ::2].copy(), np.eye(3), np.array([-20.0, 0.0, 0.0]))  # fmt: skip
+    halved = View(wall.depth[::2, ::2].copy(), wall.instance[::2, ::2].copy(), np.eye(3), np.array([-20.0, 0.0, 0.0]))
     found = compare_views(wall, halved, CAMERA, CAMERA / 2.0)
     columns, rows = ((np.arange(num) + 0.5) * size // num for num, size in ((COLUMNS, 160), (GRID_ROWS, 90)))
     s, t = (columns + 0.5) / 2.0 + 40.0, (rows + 0.5) / 2.0

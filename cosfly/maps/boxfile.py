@@ -35,7 +35,8 @@ from cosfly.work.config import Config
 
 log = logging.getLogger(__name__)
 
-# What a table may call its columns, and GeoJSON its properties. Sizes are before turning: length along the yaw's direction.
+# What a table may call its columns, and GeoJSON its properties. Sizes are before turning: length along the yaw's
+# direction.
 NAMES: dict[str, tuple[str, ...]] = {
     "x": ("x", "center_x", "centre_x"),
     "y": ("y", "center_y", "centre_y"),
@@ -121,7 +122,7 @@ class WrongRow(Exception):
 
 
 class _Row(NamedTuple):
-    """One row or feature: what its columns say, by field; `outline` of a feature that has one, in metres; what is `wrong` with it already."""
+    """One row or feature: its columns by field, its outline in metres, and what is wrong with it already."""
 
     where: str
     values: Mapping[str, Any]
@@ -150,7 +151,8 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
     rows = list(readers[suffix](cfg, path))
     if not rows:
         raise InputError(
-            "the map holds no boxes", where=path, got="nothing after the first line" if suffix == ".csv" else "no features",
+            "the map holds no boxes", where=path,
+            got="nothing after the first line" if suffix == ".csv" else "no features",
             expected="a box a line, or a feature each; docs/files.md has examples",
         )  # fmt: skip
     boxes, ids, places = BoxList(), list[Any](), dict[str, list[str]]()
@@ -196,7 +198,8 @@ def _read_ours(cfg: BoxesConfig, path: Path) -> BoxMap:
     if cfg.types or cfg.ignore or cfg.metres_per_unit != 1.0 or cfg.left_handed or cfg.ground_z_m:
         raise ConfigError(
             "boxes_3d.json has its own types, metres, axes and ground", where="maps.boxes",
-            got=", ".join(sorted(cfg.model_fields_set - {"path", "name", "licence", "credits", "tool"})), fix="leave these settings out, or give a .csv",
+            got=", ".join(sorted(cfg.model_fields_set - {"path", "name", "licence", "credits", "tool"})),
+            fix="leave these settings out, or give a .csv",
         )  # fmt: skip
     return read_boxes(path)
 
@@ -226,7 +229,7 @@ def _check_heights(box_map: BoxMap, path: Path) -> None:
         foot_m, is_ours = np.median(box_map.mins[:, 2]), path.suffix.lower() == ".json"
         raise InputError(
             "all that stands lies below the ground", where=path,
-            got=f"{len(tops_m)} boxes, the highest ends {-tops_m.max():.6g} m below it", expected="boxes above the ground",
+            got=f"{len(tops_m)} boxes, the highest ends {-tops_m.max():.6g} m below it", expected="boxes above it",
             fix=f"mend ground_z_m of the header, or z; most feet are at {foot_m:.6g} m" if is_ours
             else f"mend z, or tell where the ground is: --set maps.boxes.ground_z_m={foot_m:.6g}",
         )  # fmt: skip
@@ -244,7 +247,7 @@ def _told(box_map: BoxMap, cfg: BoxesConfig, path: Path) -> BoxMap:
             "the map is too wide, or its buildings too high: are these centimetres?", where=path,
             got=f"{' x '.join(f'{size:.6g}' for size in high - low)} m, buildings of usually {usual_m:.6g} m",
             expected=f"at most {WIDEST_M / 1000:g} km, and less than {TALL_M:g} m",
-            fix="write all of the file in metres; of a table --set maps.boxes.metres_per_unit=0.01 divides positions and sizes by 100",
+            fix="write all of the file in metres, or scale a table: --set maps.boxes.metres_per_unit=0.01",
         )  # fmt: skip
     given = cfg.model_dump(include=cfg.model_fields_set & {"name", "licence", "credits"})
     source = MapSource(tool=cfg.tool or box_map.header.source.tool or "boxes", file=path.name)
@@ -273,9 +276,9 @@ def _table_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
                 fields, problems = _fields(names, cfg)
                 if len(names) == 1 and (mark := next((mark for mark in ";\t|" if mark in names[0]), "")):
                     raise InputError(
-                        "the columns are not parted by commas", where=f"{path}: line {lines.line_num}", got=repr(names[0][:80]),
-                        expected=f"commas, where {'tabs' if mark == chr(9) else mark} stand, and a point in decimal numbers",
-                        fix="export the table as CSV with commas",
+                        "the columns are not parted by commas", where=f"{path}: line {lines.line_num}",
+                        got=repr(names[0][:80]), fix="export the table as CSV with commas",
+                        expected=f"commas, where {'tabs' if mark == chr(9) else mark} stand, and decimal points",
                     )  # fmt: skip
                 problems += [
                     f"no column for {f} ({', '.join(NAMES[f])})" for f in ("x", "y", "type") if f not in fields
@@ -321,7 +324,7 @@ def _feature_rows(cfg: BoxesConfig, path: Path) -> Iterator[_Row]:
 
 
 def _projection(rings: list[np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
-    """Give what turns coordinates, (n, 2), into metres: nothing; or, where a whole map is within 2 units, the plane that touches the Earth in its middle."""
+    """Give what turns coordinates, (n, 2), into metres: of degrees, the plane that touches the Earth."""
     places = np.concatenate(rings) if rings else np.zeros((1, 2))
     low, high = places.min(axis=0), places.max(axis=0)
     if (high - low).max() > DEGREES_AT_MOST or (np.abs(places) > [180.0, 90.0]).any():
@@ -345,9 +348,8 @@ def _fields(names: Sequence[str], cfg: BoxesConfig) -> tuple[list[str | None], l
         ]  # fmt: skip
     for field, count in Counter(field for field in fields if field).items():
         if count > 1:
-            problems.append(
-                f"{count} columns are the {field}: {', '.join(n for n, f in zip(names, fields, strict=True) if f == field)}"
-            )
+            alike = ", ".join(n for n, f in zip(names, fields, strict=True) if f == field)
+            problems.append(f"{count} columns are the {field}: {alike}")
     return fields, problems
 
 
@@ -465,7 +467,7 @@ def _size_of(metres: Mapping[str, float], name: str) -> float:
 
 
 def _span_of(metres: Mapping[str, float], kind: str, ground_m: float) -> tuple[float, float]:
-    """Give the lowest and highest point, m: of low and high, of the middle and a height, or of a height over the ground; raises WrongRow."""
+    """Give the lowest and highest point, m, of what a row says of its heights; raises WrongRow."""
     has_height = "height" in metres or "half_height" in metres
     if "high" in metres:
         if has_height or "z" in metres:

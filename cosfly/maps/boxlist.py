@@ -1,4 +1,4 @@
-"""A growing list of boxes that ends as a BoxMap: what every map source writes into. Upright boxes, turned about z only."""
+"""A growing list of upright boxes that ends as a BoxMap: what every map source writes into."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
 """A seeded town with the box census of a large simulator town: as many boxes of each kind, over the same ground.
 
-It exists to measure with: a crown is a cloud of about 148 boxes and a house some touching parts, as simulators export them, so that
-simplification and planning meet the numbers that the paper reports. It does not imitate the place. Streets run on a grid of
-6 x 5 blocks; four blocks are parks, two are squares, the others hold three by three houses with alleys between.
+It exists to measure with: a crown is a cloud of about 148 boxes and a house some touching parts, as simulators export
+them, so that simplification and planning meet the numbers that the paper reports. It does not imitate the place.
+Streets run on a grid of 6 x 5 blocks; four blocks are parks, two are squares, the others hold three by three houses
+with alleys between.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from cosfly.work.chance import rng_for
 
 # tab:box_categories: boxes of each kind before simplification, 65,614 together.
 CENSUS = {
-    "Vegetation": 62_581, "Poles": 880, "Buildings": 781, "Static": 667, "Other": 287, "Fences": 148, "TrafficSigns": 147,
-    "TrafficLight": 62, "Walls": 34, "Terrain": 23, "RailTrack": 4,
+    "Vegetation": 62_581, "Poles": 880, "Buildings": 781, "Static": 667, "Other": 287, "Fences": 148,
+    "TrafficSigns": 147, "TrafficLight": 62, "Walls": 34, "Terrain": 23, "RailTrack": 4,
 }  # fmt: skip
 SIZE_M = (619.0, 506.0)
 NUM_BLOCKS = (6, 5)

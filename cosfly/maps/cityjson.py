@@ -1,10 +1,12 @@
-"""A CityJSON city model (0.8 to 2.0, one document or a text sequence, plain or gzipped): polygons become oriented boxes.
+"""A CityJSON city model (0.8 to 2.0, one document or a text sequence, plain or gzipped): polygons become oriented
+boxes.
 
-One box round an object can be hundreds of metres wide, so everything is cut up: solids into rectangles that cover their footprint,
-surfaces into thin slabs that never stand in anybody's way, walls along their course. Vegetation is a surface in such models, with the
-heights of its canopy in the vertices: it becomes a lawn, and trees where it rises well over the ground.
-The middle of the map becomes the origin, and the usual height of its roads z = 0; `header.offset_m` leads back. Ground that is nearly
-flat is made so; ground that slopes is kept as a grid of heights, from its terrain or the feet of its buildings, and what is not a solid follows it.
+One box round an object can be hundreds of metres wide, so everything is cut up: solids into rectangles that cover their
+footprint, surfaces into thin slabs that never stand in anybody's way, walls along their course. Vegetation is a surface
+in such models, with the heights of its canopy in the vertices: it becomes a lawn, and trees where it rises well over
+the ground. The middle of the map becomes the origin, and the usual height of its roads z = 0; `header.offset_m` leads
+back. Ground that is nearly flat is made so; ground that slopes is kept as a grid of heights, from its terrain or the
+feet of its buildings, and what is not a solid follows it.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ from cosfly.work.config import Config
 log = logging.getLogger(__name__)
 
 SLAB_M = 0.3
-# Surfaces that people stand on as the source has them. Not water, which lies lower than its banks, nor green, whose vertices are its canopy.
+# Surfaces that people stand on as the source has them. Not water, which lies lower than its banks, nor green, whose
+# vertices are its canopy.
 TERRAIN_KINDS = ("Roads", "Sidewalks", "Ground", "Terrain", "RailTrack")
 RISE_SHARES = (2, 98)  # percentiles: a few stray vertices do not tilt a town
 TOLD_RISE_M = 1.0  # less than this is kerbs and steps: made flat without a word
@@ -170,7 +173,7 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
 
 
 def _over_ground(item: CityObject, ground: Ground) -> CityObject:
-    """An object with heights over the ground under each vertex; solids keep their own, or their roofs would slope too."""
+    """An object with heights over the ground under each vertex; solids keep theirs, or their roofs would slope."""
     if item.rule.form == "solid":
         return item
     rings = [[r - np.outer(ground.height_at(r), [0.0, 0.0, 1.0]) for r in surface] for surface in item.surfaces]
@@ -183,8 +186,9 @@ def _centred(objects: list[CityObject], path: Path) -> tuple[list[CityObject], n
     low, high = corners.min(axis=0), corners.max(axis=0)
     if not (high - low <= 20_000).all():
         raise InputError(
-            "the map is too wide or too high", where=f"{path}: vertices", got=" x ".join(f"{size:.6g}" for size in high - low) + " m",
-            expected="at most 20 km", fix="cut a part out, or mend the stray vertex",
+            "the map is too wide or too high", where=f"{path}: vertices",
+            got=" x ".join(f"{size:.6g}" for size in high - low) + " m", expected="at most 20 km",
+            fix="cut a part out, or mend the stray vertex",
         )  # fmt: skip
     roads = [item.corners() for item in objects if item.rule.kind in ("Roads", "Sidewalks")]
     ground = np.median(np.concatenate(roads)[:, 2]) if roads else np.percentile(corners[:, 2], 5)
@@ -204,7 +208,8 @@ def _facets(item: CityObject) -> list[Facet]:
     facets = []
     for surface in item.surfaces:
         ring = surface[0]
-        # Newell's normal: right for any planar ring, whatever its first three corners are. (np.cross is slow on short rings.)
+        # Newell's normal: right for any planar ring, whatever its first three corners are. (np.cross is slow on short
+        # rings.)
         after = np.concatenate([ring[1:], ring[:1]])
         normal = (ring[:, [1, 2, 0]] * after[:, [2, 0, 1]] - ring[:, [2, 0, 1]] * after[:, [1, 2, 0]]).sum(axis=0)
         if abs(normal[2]) <= STEEP * np.linalg.norm(normal) or abs(normal[2]) < 1e-6:
@@ -224,9 +229,11 @@ def _facets(item: CityObject) -> list[Facet]:
 def _add_solid(
     boxes: BoxList, cfg: CityJsonConfig, item: CityObject, footprint, ground: Ground
 ) -> tuple[Any, Mesh | None]:
-    """Add a building as upright boxes from its lowest ground (or below it) to its top; gives the union of their outlines, and what is drawn.
+    """Add a building as upright boxes from its lowest ground (or below it) to its top; gives the union of their
+    outlines, and what is drawn.
 
-    A box is as high as what is drawn in it: nothing of a spire, which the plainer geometry leaves out, stands out of what planners know.
+    A box is as high as what is drawn in it: nothing of a spire, which the plainer geometry leaves out, stands out of
+    what planners know.
     """
     z = item.corners()[:, 2]
     low = min(float(z.min()), float(ground.height_at(item.corners()).min()))
@@ -286,7 +293,8 @@ def canopy_heights(item: CityObject, facets: list[Facet], cell_m: float) -> tupl
     """Rasterise the heights of a surface: the highest corner in each cell, and the surface over the cell's middle.
 
     Returns:
-        heights (nx, ny) m, 0 where there is nothing; the indices (2,) of the first cell, whose low corner is at index * cell_m.
+        heights (nx, ny) m, 0 where there is nothing; the indices (2,) of the first cell, whose low corner is at index *
+        cell_m.
     """
     bounds = np.array([facet.polygon.bounds for facet in facets])
     corners = item.corners()

@@ -1,8 +1,10 @@
-"""Reading CityJSON: from the file to objects with a rule and with surfaces in world coordinates. No geometry is judged here.
+"""Reading CityJSON: from the file to objects with a rule and with surfaces in world coordinates. No geometry is judged
+here.
 
-Versions 0.8 to 2.0, one document or a text sequence (CityJSONSeq: the document first, then one feature a line). What differs between them:
-until 1.0 `transform` may be missing (vertices are metres then) and `lod` is a number; `parent` became `parents` in 0.9, `members` of a group
-`children` in 1.1; in a sequence every feature has its own vertices. Sources: cityjson.org, the specifications and their change logs.
+Versions 0.8 to 2.0, one document or a text sequence (CityJSONSeq: the document first, then one feature a line). What
+differs between them: until 1.0 `transform` may be missing (vertices are metres then) and `lod` is a number; `parent`
+became `parents` in 0.9, `members` of a group `children` in 1.1; in a sequence every feature has its own vertices.
+Sources: cityjson.org, the specifications and their change logs.
 """
 
 from __future__ import annotations
@@ -66,7 +68,8 @@ RULES = (
 class CityObject(NamedTuple):
     """One object: its surfaces as rings of world vertices; ring 0 of a surface is its outline, others are holes.
 
-    surfaces: of the plainest geometry with a height, which boxes are made of; detailed: of the most detailed one of a solid, which is drawn.
+    surfaces: of the plainest geometry with a height, which boxes are made of; detailed: of the most detailed one of a
+    solid, which is drawn.
     """
 
     object_id: str
@@ -273,7 +276,7 @@ def _templates(model: dict, path: Path) -> _Templates:
 def _surfaces(
     geometries: Any, vertices: np.ndarray, templates: _Templates, where: str
 ) -> tuple[list[list[np.ndarray]], list[list[np.ndarray]], float]:
-    """The surfaces of the geometry with the lowest level of detail from 1 up, as boxes need no more; of the one with the highest; the former's level."""
+    """The surfaces of the plainest geometry with a height, those of the most detailed one, the former's level."""
     if not isinstance(geometries, list) or not all(isinstance(g, dict) for g in geometries):
         raise InputError("not a list of geometries", where=where, got=type(geometries).__name__)
     placed = [_placed(g, vertices, templates, f"{where}[{k}]") for k, g in enumerate(geometries)]
@@ -298,7 +301,7 @@ def _surfaces_of(geometry: dict, corners: np.ndarray, where: str) -> list[list[n
 
 
 def _placed(geometry: dict, vertices: np.ndarray, templates: _Templates, where: str) -> tuple[dict, np.ndarray]:
-    """A geometry and the vertices that it counts in; an instance gives its template, moved to where the instance stands."""
+    """A geometry and the vertices that it counts in; an instance gives its template, moved to its place."""
     if geometry.get("type") != "GeometryInstance":
         return geometry, vertices
     number, anchor = geometry.get("template"), geometry.get("boundaries")

@@ -70,8 +70,9 @@ def cover(
 ) -> list[Rectangle]:
     """Cover a polygon, holes left out, with oriented rectangles.
 
-    A piece is done when its rectangle's longer side is at most `min_size_m`, or at most `max_size_m` and the piece fills it to
-    `min_fill`. Else it is cut across the longer side, at the share (and, with more than one share given, across the side) that leaves the least empty area.
+    A piece is done when its rectangle's longer side is at most `min_size_m`, or at most `max_size_m` and the piece
+    fills it to `min_fill`. Else it is cut across the longer side, at the share (and, with more than one share given,
+    across the side) that leaves the least empty area.
 
     Args:
         polygon: valid. shares: where to try to cut, from 0 to 1 along a side.

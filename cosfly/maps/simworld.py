@@ -1,9 +1,10 @@
 """A SimWorld city: the world file of its generator, with the table of asset sizes.
 
-The source is Unreal's: centimetres, left-handed, y to the right, yaw clockwise; it is converted here and nowhere else. A box stands
-with its foot at the node's location, its size is the table's full size times the node's scale. What the source does not hold:
-street furniture has placeholder cubes in the size table, so ASSETS gives plausible sizes (counted as `default`); roads have no size,
-so carriageway and pavement come from what stands beside them (counted as `road`). `header.extent_sources` holds the counts.
+The source is Unreal's: centimetres, left-handed, y to the right, yaw clockwise; it is converted here and nowhere else.
+A box stands with its foot at the node's location, its size is the table's full size times the node's scale. What the
+source does not hold: street furniture has placeholder cubes in the size table, so ASSETS gives plausible sizes (counted
+as `default`); roads have no size, so carriageway and pavement come from what stands beside them (counted as `road`).
+`header.extent_sources` holds the counts.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ MAP_MARGIN_M = 10.0
 
 
 class Asset(NamedTuple):
-    """What one family of assets is: its kind, and its full size (x, y, z in m) where the size table has a placeholder."""
+    """One family of assets: its kind, and its full size (3,) m where the size table has a placeholder."""
 
     pattern: str
     kind: str
@@ -75,7 +76,7 @@ class SimWorldConfig(Config):
     world: Path | None = Field(None, description="world file, progen_world.json")
     sizes: list[Path] = Field(
         [],
-        description="asset size table or a list; the first that knows an asset counts; none: Bbox.json beside the world",
+        description="asset size table or a list, the first with an asset counts; none: Bbox.json beside the world",
     )
     tool: str = Field("SimWorld city generator", description="tool and version that made the world, for the records")
     licence: LicenceId = Field(
@@ -104,7 +105,7 @@ class SimWorldConfig(Config):
             if not path.is_file():
                 raise InputError(
                     "there is no asset size table", where=path, expected="SimWorld's Bbox.json",
-                    fix=f"--set maps.simworld.sizes=FILE (now {'beside the world' if not self.sizes else f'entry {number}'})",
+                    fix=f"--set maps.simworld.sizes=FILE (now {f'entry {number}' if self.sizes else 'beside it'})",
                 )  # fmt: skip
         return {"world": self.world, **{f"sizes_{k}": path for k, path in enumerate(self.size_tables())}}
 
@@ -257,7 +258,7 @@ def _unknown(cfg: SimWorldConfig, node: _Node, what: str) -> int:
         to_size, to_kinds = "a size table that has it to maps.simworld.sizes", "it to ASSETS in cosfly/maps/simworld.py"
         raise InputError(
             f"an asset without a {what}", where=f"{cfg.world}: {node.id}.instance_name", got=node.instance_name,
-            fix=f"add {to_size if what == 'size' else to_kinds}, or leave such assets out with --set maps.simworld.unknown=drop",
+            fix=f"add {to_size if what == 'size' else to_kinds}, or leave such out: --set maps.simworld.unknown=drop",
         )  # fmt: skip
     log.warning("%s: %s has no %s and is left out", node.id, node.instance_name, what)
     return 1
@@ -271,8 +272,9 @@ def _add_node(boxes: BoxList, cfg: SimWorldConfig, node: _Node, asset: Asset, si
     size = size * [scale.x, scale.y, scale.z]
     if not LEAST_M <= size.min() <= size.max() <= LARGEST:
         raise InputError(
-            "the size of an object cannot be", where=f"{cfg.world}: {node.id}", got=f"{size.tolist()} m, of size and scale",
-            expected=f"{LEAST_M:g} m or more", fix="mend its scale, or its asset's size in the table",
+            "the size of an object cannot be", where=f"{cfg.world}: {node.id}",
+            got=f"{size.tolist()} m, of size and scale", expected=f"{LEAST_M:g} m or more",
+            fix="mend its scale, or its asset's size in the table",
         )  # fmt: skip
     foot = location.z * M_PER_CM
     low = 0.0 if 0 < foot <= cfg.stand_m else foot
@@ -287,8 +289,8 @@ def _add_node(boxes: BoxList, cfg: SimWorldConfig, node: _Node, asset: Asset, si
 def _centerlines(cfg: SimWorldConfig, nodes: list[_Node]) -> list[Centerline]:
     """Centre lines in world metres, from the road pieces: a location is a piece's middle, x its direction.
 
-    The roads.json beside a world is not read: in the city that SimWorld ships it holds 7 roads, two of them nowhere in the world,
-    and the world holds 10.
+    The roads.json beside a world is not read: in the city that SimWorld ships it holds 7 roads, two of them nowhere in
+    the world, and the world holds 10.
     """
     lines = []
     for node in nodes:
@@ -311,8 +313,8 @@ def _distances_m(points: np.ndarray, lines: list[Centerline]) -> np.ndarray:
 def _half_widths(boxes: BoxList, lines: list[Centerline]) -> tuple[float, float]:
     """Half the carriageway's width, and the distance of the fronts from the centre line, m.
 
-    Both are what nearly all objects keep clear of (tenth percentile): fronts from the nearest points of buildings, the kerb from the
-    middles of street furniture.
+    Both are what nearly all objects keep clear of (tenth percentile): fronts from the nearest points of buildings, the
+    kerb from the middles of street furniture.
     """
     box_map = boxes.box_map()
     kinds = np.array([KIND_NAMES[int(kind)] for kind in box_map.kinds])

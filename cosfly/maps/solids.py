@@ -30,7 +30,7 @@ def solid_mesh(surfaces: list[list[np.ndarray]], foot_m: float) -> Mesh | None:
 
 
 def top_within(mesh: Mesh, rectangle: Rectangle, otherwise: float) -> float:
-    """Height of the highest triangle that may lie over a rectangle, as its bounds in the rectangle's axes tell; `otherwise` where none does."""
+    """Height of the highest triangle whose bounds meet a rectangle; `otherwise` where none does."""
     yaw = np.radians(rectangle.yaw_deg)
     axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
     flat, half = (mesh.corners_m[..., :2] - rectangle.center) @ axes.T, np.array(rectangle.size) / 2.0 - EDGE_M
@@ -45,7 +45,8 @@ def _founded(ring: np.ndarray, lowest: float, foot_m: float) -> np.ndarray:
 
 
 def triangles_of(rings: list[np.ndarray]) -> np.ndarray:
-    """Cut a surface, rings of (n, 3), into triangles that turn as its outline does, (k, 3, 3). Corners are the surface's own where it is valid.
+    """Cut a surface, rings of (n, 3), into triangles that turn as its outline does, (k, 3, 3). Corners are the
+    surface's own where it is valid.
 
     Where an outline crosses itself, its valid parts are taken, and new corners lie in the surface's plane.
     """

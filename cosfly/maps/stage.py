@@ -1,4 +1,4 @@
-"""Stage 1: a map of boxes from one of several sources. Each source is a module with `load(its settings, seed) -> BoxMap`."""
+"""Stage 1: a map of boxes. Each source is a module with `load(its settings, seed) -> BoxMap`."""
 
 from __future__ import annotations
 

@@ -1,8 +1,10 @@
-"""A seeded town: streets on a grid, lawns, and blocks of one kind each, from market to skyscrapers; perhaps a river with bridges.
+"""A seeded town: streets on a grid, lawns, and blocks of one kind each, from market to skyscrapers; perhaps a river
+with bridges.
 
-It is made to be planned and rendered, not to imitate one place. Every block draws from its own random generator, so that
-one block does not change with another. Heights: pavements at z = 0; carriageways, lawns and paint a few centimetres lower, so that
-no two surfaces share a plane. A few boxes lie below the ground or inside others, as in maps that simulators export.
+It is made to be planned and rendered, not to imitate one place. Every block draws from its own random generator, so
+that one block does not change with another. Heights: pavements at z = 0; carriageways, lawns and paint a few
+centimetres lower, so that no two surfaces share a plane. A few boxes lie below the ground or inside others, as in maps
+that simulators export.
 """
 
 from __future__ import annotations
@@ -42,8 +44,8 @@ MIN_BLOCK_M = 34.0  # below this no block type finds room
 DASH_M, DASH_GAP_M = 3.0, 6.0
 RAILING_M = 0.2
 
-# What a preset sets; a setting that is given as well wins. Towns of other plan, density and height: what is learnt in one is not yet
-# known to hold in another.
+# What a preset sets; a setting that is given as well wins. Towns of other plan, density and height: what is learnt in
+# one is not yet known to hold in another.
 PRESETS: dict[str, dict[str, Any]] = {
     "small_town": {},
     "town10": {},
@@ -52,8 +54,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "blocks": {"courtyard": 0.6, "towers": 0.2, "square": 0.1, "park": 0.1},
     },
     "old_town": {
-        "size_m": 270.0, "num_blocks": 4, "street_m": 12.0, "boulevard_m": 15.0, "unevenness": 0.12, "parked_share": 0.1,
-        "tree_share": 0.3, "blocks": {"lanes": 0.75, "square": 0.15, "market": 0.1},
+        "size_m": 270.0, "num_blocks": 4, "street_m": 12.0, "boulevard_m": 15.0, "unevenness": 0.12,
+        "parked_share": 0.1, "tree_share": 0.3, "blocks": {"lanes": 0.75, "square": 0.15, "market": 0.1},
     },
     "towers": {
         "size_m": 340.0, "num_blocks": 3, "street_m": 26.0, "boulevard_m": 40.0, "unevenness": 0.1,
@@ -64,7 +66,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "blocks": {"park": 0.45, "meadow": 0.35, "houses": 0.2},
     },
     "campus": {
-        "size_m": 310.0, "num_blocks": 3, "street_m": 15.0, "boulevard_m": 28.0, "unevenness": 0.15, "parked_share": 0.15,
+        "size_m": 310.0, "num_blocks": 3, "street_m": 15.0, "boulevard_m": 28.0, "unevenness": 0.15,
+        "parked_share": 0.15,
         "blocks": {"campus": 0.6, "meadow": 0.2, "square": 0.2},
     },
     "village": {
@@ -88,8 +91,8 @@ class SyntheticConfig(Config):
     name: str = Field("SynthTown", min_length=1, description="map name, the head of the playback tree's folder names")
     preset: str = Field(
         "small_town",
-        description="kind of town, which sets what is not given below (a name in PRESETS); town10: as many boxes of each kind as the "
-        "paper's town, over 619 x 506 m, and the fields below count for nothing",
+        description="kind of town, which sets what is not given below (a name in PRESETS); town10: the paper's town in "
+        "boxes of each kind, over 619 x 506 m, where the fields below count for nothing",
     )
     size_m: float = Field(280.0, ge=80.0, le=4000.0, description="side of the square town, m")
     num_blocks: int = Field(3, ge=1, le=60, description="building blocks along each side")
@@ -134,7 +137,7 @@ class SyntheticConfig(Config):
         side *= (1.0 - self.unevenness) / (1.0 + self.unevenness)  # the narrowest that chance can give
         if side < MIN_BLOCK_M:
             raise ValueError(
-                f"a block would be {side:.1f} m wide, at least {MIN_BLOCK_M:.0f} m are needed: raise size_m or lower num_blocks"
+                f"a block would be {side:.1f} m wide, less than {MIN_BLOCK_M:.0f} m: raise size_m or lower num_blocks"
             )
         return self
 
@@ -165,7 +168,7 @@ class Strip:
 
 @dataclass(frozen=True)
 class Streets:
-    """All streets, low to high. rows: those along x; columns: those along y. river: the row that is water, if there is one."""
+    """All streets, low to high: rows along x, columns along y; river: the row that is water, if there is one."""
 
     rows: list[Strip]
     columns: list[Strip]

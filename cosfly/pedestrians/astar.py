@@ -1,8 +1,9 @@
 """The shortest way over a grid of free cells: exact A* with octile costs and no corner cutting.
 
-A straight step costs 1, a diagonal one sqrt 2, and a diagonal step needs both straight neighbours free (sec:step3). Path costs are
-kept as two whole numbers, straight and diagonal steps, so that equal costs compare as equal whatever the order of
-the steps: the result is the true optimum, not the optimum up to rounding, and ties break the same way everywhere.
+A straight step costs 1, a diagonal one sqrt 2, and a diagonal step needs both straight neighbours free (sec:step3).
+Path costs are kept as two whole numbers, straight and diagonal steps, so that equal costs compare as equal whatever the
+order of the steps: the result is the true optimum, not the optimum up to rounding, and ties break the same way
+everywhere.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Where cars can drive: the lanes of a map's straight roads, and the curves from lane to lane at its junctions.
 
-A map knows its roads as boxes alone. A box of Roads that is longer than wide is a street; streets that cross, or that reach each
-other over road, meet in a junction. Maps whose roads are patches have no lanes, and nobody drives there.
+A map knows its roads as boxes alone. A box of Roads that is longer than wide is a street; streets that cross, or that
+reach each other over road, meet in a junction. Maps whose roads are patches have no lanes, and nobody drives there.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ IsFree = Callable[[np.ndarray], bool]  # can a car drive through all of these pl
 
 @dataclass(frozen=True)
 class Street:
-    """A straight carriageway: its middle line from start_m along a unit direction, both (2,); its box ends at 0 and length_m."""
+    """A straight carriageway from start_m along a unit direction, both (2,); its box ends at 0 and length_m."""
 
     start_m: np.ndarray
     direction: np.ndarray
@@ -48,7 +48,7 @@ class Street:
 
 @dataclass
 class Lane:
-    """One way between two junctions: points_m (k, 2); onward: lanes that it leads to, each with the curve there, (j, 2)."""
+    """One way between two junctions: points_m (k, 2); onward: lanes that it leads to, with the curves there, (j, 2)."""
 
     points_m: np.ndarray
     onward: list[tuple[int, np.ndarray]] = field(default_factory=list)
@@ -135,7 +135,7 @@ class Junction:
 
 
 def _junctions(streets: list[Street]) -> tuple[list[Junction], list[list[tuple[float, int]]]]:
-    """Junctions, and for each street its stations in order: (m along it, junction), -1 for an end that meets nothing."""
+    """Junctions, and the stations of each street in order: (m along it, junction), -1 for an end that meets nothing."""
     junctions: list[Junction] = []
     stations: list[dict[int, float]] = [{} for _ in streets]
     for (i, one), (j, two) in combinations(enumerate(streets), 2):
@@ -179,7 +179,7 @@ class _Way:
         return self.last[1] >= 0 and after.first[1] == self.last[1] and not is_back
 
     def line(self, junctions: list[Junction], is_free: IsFree) -> np.ndarray | None:
-        """Its lane, on the right, as far from the middle as nothing stands there, (k, 2) m; None where something always does."""
+        """Its lane, on the right, as far from the middle as nothing stands there, (k, 2) m; None if blocked."""
         sign = np.sign(self.last[0] - self.first[0])
         (start, end) = (
             along + toward * sign * (junctions[number].width_m / 2.0 + BEFORE_CURVE_M if number >= 0 else 3.0)
@@ -207,7 +207,7 @@ def _meeting(one: Street, two: Street) -> tuple[float, float] | None:
 
 
 def _in_line(one: Street, two: Street) -> tuple[float, float]:
-    """Where the gap between two streets in one line has its middle, m along each; infinity where they are not in one line."""
+    """Where the gap between two streets in one line has its middle, m along each; else infinity."""
     ends = np.array([(two.at(along) - one.start_m) @ one.direction for along in (0.0, two.length_m)])
     beside_m = abs(_cross(one.direction, two.start_m - one.start_m))
     if beside_m > SAME_PLACE_M or (ends.min() < one.length_m and ends.max() > 0.0):

@@ -1,7 +1,9 @@
-"""Who else moves while a walk lasts: people on routes of their own, and cars along lanes, all clear of the walker and of each other.
+"""Who else moves while a walk lasts: people on routes of their own, and cars along lanes, all clear of the walker and
+of each other.
 
-One after the other is placed: the walker is there already, then the people, then the cars. Who would meet somebody waits a little way
-before; whom waiting does not help is drawn anew, and after some tries left out. So there may be fewer than the settings ask for.
+One after the other is placed: the walker is there already, then the people, then the cars. Who would meet somebody
+waits a little way before; whom waiting does not help is drawn anew, and after some tries left out. So there may be
+fewer than the settings ask for.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ CHORD_M = 1.0  # a car's heading is that of a piece of its way, so long ahead an
 
 @dataclass(frozen=True)
 class Course:
-    """What one does: kind of BUILDS; the way, (k, 2) m, with its stops; limits_mps (k,), the speeds where nobody is in the way."""
+    """What one does: kind of BUILDS, way with its stops, limits_mps (k,): the speeds where nobody is in the way."""
 
     kind: str
     way: Way
@@ -124,7 +126,7 @@ def without_meeting(course: Course, time_s: np.ndarray, there: list[Other], heig
 
 
 def draw_stroll(walk: Walk, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator) -> Course | None:
-    """Draw a person's route near a walk, at a pace of the settings, there and back for as long as the walk lasts; None without a goal."""
+    """Draw a person's route near a walk, there and back for as long as the walk lasts; None without a goal."""
     cells = ground.grid.cells_at(walk.polyline_m[rng.integers(len(walk.polyline_m))])
     start = sample_goal(ground.parts, (int(cells[0]), int(cells[1])), 0.0, cfg.others_reach_m / cfg.resolution_m, rng)
     limits = cfg.min_distance_m / cfg.resolution_m, cfg.max_distance_m / cfg.resolution_m

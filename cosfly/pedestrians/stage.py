@@ -1,13 +1,15 @@
 """Stage `pedestrians`: walks over the free ground of a simplified map (Step 3 of the paper, sec:step3).
 
-Grid, projection, inflation, connectivity, sampling, A* and report follow each other as in the paper. Speed follows the literal
-formulas on the A* polyline, one waypoint per cell, so that curvature slows a walk in the one or two steps next to a corner only:
-means of 1.05 to 1.17 m/s at a cruising speed of 1.2 where streets run along the axes, 0.83 m/s in an old town that lies askew
-(22 corners in 100 m). Leaving collinear waypoints out first would carry a corner's low speed over the straight piece behind it
-(0.92 instead of 1.07 m/s on the same 40 routes of a test town).
+Grid, projection, inflation, connectivity, sampling, A* and report follow each other as in the paper. Speed follows the
+literal formulas on the A* polyline, one waypoint per cell, so that curvature slows a walk in the one or two steps next
+to a corner only:
+means of 1.05 to 1.17 m/s at a cruising speed of 1.2 where streets run along the axes, 0.83 m/s in an old town that lies
+askew (22 corners in 100 m). Leaving collinear waypoints out first would carry a corner's low speed over the straight
+piece behind it (0.92 instead of 1.07 m/s on the same 40 routes of a test town).
 
-Two guards of ours are on by default, and a setting turns each off: `ground` keeps walks on what the map knows as ground (a city
-model is empty, not free, outside its data), `max_detour` gives up ends that are near each other only across a canal.
+Two guards of ours are on by default, and a setting turns each off: `ground` keeps walks on what the map knows as ground
+(a city model is empty, not free, outside its data), `max_detour` gives up ends that are near each other only across a
+canal.
 
 This module simplifies no map and knows nothing of drones. How people walk is in walking.py.
 """
@@ -49,7 +51,8 @@ from cosfly.work.stage_folder import Resume, StageFolder, result_of
 from cosfly.work.store import write_bytes, write_json
 
 # --- overview ---------------------------------------------------------------------------------------------------------
-# The pedestrian stage from above: obstacles, region of interest, usable ground and every walk, for a look before going on.
+# The pedestrian stage from above: obstacles, region of interest, usable ground and every walk, for a look before going
+# on.
 
 
 LONGER_SIDE_PX = 1600
@@ -270,7 +273,7 @@ def report(ground: WalkableGround, paths: list[Walk], retries: list[dict[str, in
 
 
 def _write_companies(path: Path, lines: list[dict], header: dict, cfg: PedestriansConfig) -> dict[str, dict[str, int]]:
-    """Write `others.json`; count who was wanted and who found a place, by kind, and tell in the log of which kind some are missing."""
+    """Write `others.json`; count who was wanted and who found a place, by kind, and warn if some are missing."""
     companies = [Company.from_json(line, f"{path.parent}: items.jsonl") for line in lines]
     write_others(path, companies, header)
     counts = {}
@@ -293,7 +296,8 @@ def run(
     resume: Resume = "if-same",
     roi: Path | None = None,
 ) -> Path:
-    """Read `step2_simplified.json` (and a region of interest), write `path.json`, a report and `paths.png`; with others, `others.json`.
+    """Read `step2_simplified.json` (and a region of interest), write `path.json`, a report and `paths.png`; with
+    others, `others.json`.
 
     Args:
         roi: `roi_polygon.json`; None lets people walk on the whole map.

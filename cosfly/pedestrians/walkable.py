@@ -1,6 +1,7 @@
 """Where people can walk on a map, and which cells serve as the ends of a walk (sec:step3).
 
-The settings of the pedestrian stage; its grid, projection, inflation and connectivity. The arithmetic on cells is in grid.py.
+The settings of the pedestrian stage; its grid, projection, inflation and connectivity. The arithmetic on cells is in
+grid.py.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ from cosfly.work.config import Config
 log = logging.getLogger(__name__)
 
 PAVED_KINDS = frozenset(KINDS[name] for name in ("Roads", "Sidewalks", "Ground"))
-# Surfaces of a map without paved ones are trusted down to this share of its free cells: below, they are lawns between unnamed streets.
+# Surfaces of a map without paved ones are trusted down to this share of its free cells: below, they are lawns between
+# unnamed streets.
 SURFACE_SHARE_MIN = 0.5
 OFF_GROUND_SHARE_MAX = 0.1  # a flyover and a few stray kerbs are no slope
 ROI_SHARE_MIN = 0.5  # of a region of interest that lies on the map: below, it is hardly of this map
@@ -66,8 +68,8 @@ class PedestriansConfig(Config):
     )
     ground: Literal["anywhere", "surfaces", "paved"] = Field(
         "surfaces",
-        description="where people walk: anywhere in the map's bounds, on any ground box (anywhere, where a map has no streets "
-        "and ground boxes under less than half of it), or on streets and squares",
+        description="where people walk: anywhere in the map's bounds, on any ground box (anywhere, where a map has no "
+        "streets and ground boxes under less than half of it), or on streets and squares",
     )
     cruise_speed_mps: float = Field(1.2, gt=0, description="speed on straight ground, m/s")
     curvature_gain_m: float = Field(5.0, ge=0, description="alpha of eq:speed, m: how much corners slow; 0 is off")
@@ -92,8 +94,8 @@ class PedestriansConfig(Config):
         DT_S,
         ge=0.05,
         le=5,
-        description="time step of walks, and with them of flights, frames and windows (dt), s; counts of frames (caption.window, "
-        "plan.muco.low_visibility_frames) and the thresholds of caption.label over a window's future are for 0.5",
+        description="time step of walks, and with them of flights, frames and windows (dt), s; counts of frames "
+        "(caption.window, plan.muco.low_visibility_frames) and the thresholds of caption.label are for 0.5",
     )
 
     @property
@@ -131,8 +133,10 @@ class PedestriansConfig(Config):
 class WalkableGround:
     """Where people may walk.
 
-    grid: the obstacles before inflation. inflated: after it. parts: (ny, nx) int32, equal numbers where a walk from one cell
-    to the other exists, 0 where nobody walks: obstacles, outside the region of interest, steep ground, small components.
+    grid: the obstacles before inflation. inflated: after it. parts: (ny, nx) int32, equal numbers where a walk from one
+    cell
+    to the other exists, 0 where nobody walks: obstacles, outside the region of interest, steep ground, small
+    components.
     heights: of the ground.
     """
 
@@ -181,9 +185,9 @@ def walkable_ground(
 ) -> WalkableGround:
     """Find the ground that the settings allow walks on.
 
-    Components are 8-connected, as in the paper, and those below `min_component_cells` are left out. A walk that never cuts a
-    corner cannot pass between two cells that touch by a corner only, so an 8-connected component may hold several parts; both
-    ends of a walk are to be drawn from one part, and then a route always exists.
+    Components are 8-connected, as in the paper, and those below `min_component_cells` are left out. A walk that never
+    cuts a corner cannot pass between two cells that touch by a corner only, so an 8-connected component may hold
+    several parts; both ends of a walk are to be drawn from one part, and then a route always exists.
 
     Args:
         where, roi_where: the files to name in an error.
@@ -232,7 +236,7 @@ def _count(mask: np.ndarray) -> int:
 
 
 def _steep(ground: Ground, grid: OccupancyGrid) -> np.ndarray | None:
-    """Tell which cells have ground in their middle that is too steep to walk on, (ny, nx) bool; None where the ground is flat."""
+    """Tell which cells are too steep to walk on, (ny, nx) bool; None where the ground is flat."""
     if ground.is_flat:
         return None
     columns, rows = np.meshgrid(*(np.arange(size) for size in grid.size))
@@ -241,13 +245,16 @@ def _steep(ground: Ground, grid: OccupancyGrid) -> np.ndarray | None:
 
 
 def _surface(box_map: BoxMap, ground: str, grid: OccupancyGrid, free: np.ndarray) -> np.ndarray | None:
-    """Tell where there is ground as the settings want it; None for everywhere, also if the map does not say where its ground is.
+    """Tell where there is ground as the settings want it; None for everywhere, also if the map does not say where its
+    ground is.
 
-    It does not if it has no ground boxes, or neither streets nor squares and other ground under a small part of it only. What lies
-    outside a city model's data has no obstacles either: without ground boxes below, nobody could tell it from a square.
+    It does not if it has no ground boxes, or neither streets nor squares and other ground under a small part of it
+    only. What lies outside a city model's data has no obstacles either: without ground boxes below, nobody could tell
+    it from a square.
 
     Args:
-        ground: `anywhere` in the map's bounds; over any ground box (`surfaces`); over PAVED_KINDS only (`paved`). free: (ny, nx) bool.
+        ground: `anywhere` in the map's bounds; over any ground box (`surfaces`); over PAVED_KINDS only (`paved`). free:
+            (ny, nx) bool.
     """
     if ground == "anywhere":
         return None
@@ -255,8 +262,8 @@ def _surface(box_map: BoxMap, ground: str, grid: OccupancyGrid, free: np.ndarray
     num_off, num_all = _count(lies_off_ground(box_map, GROUND_KINDS)), _count(box_map.is_any_of(GROUND_KINDS))
     if num_off > OFF_GROUND_SHARE_MAX * num_all:
         log.warning(
-            "%s: %d of %d ground boxes lie more than %g m over or under the ground of its header: nobody walks there. Does it slope? "
-            "Then the header needs heights (ground)",
+            "%s: %d of %d ground boxes lie more than %g m over or under the ground of its header: nobody walks there. "
+            "Does it slope? Then the header needs heights (ground)",
             box_map.name, num_off, num_all, SURFACE_REACH_M,
         )  # fmt: skip
     if found is None:
@@ -268,8 +275,8 @@ def _surface(box_map: BoxMap, ground: str, grid: OccupancyGrid, free: np.ndarray
     num_found, num_free = _count(found & free), _count(free)
     if paved is None and num_found < SURFACE_SHARE_MIN * num_free:
         log.warning(
-            "%s has no boxes of Roads, Sidewalks or Ground, and other ground under %d of %d free cells only: people walk wherever "
-            "nothing stands",
+            "%s has no boxes of Roads, Sidewalks or Ground, and other ground under %d of %d free cells only: people "
+            "walk wherever nothing stands",
             box_map.name, num_found, num_free,
         )  # fmt: skip
         return None
@@ -298,7 +305,7 @@ def _parts_of_large_components(
 
 
 def _check_roi(roi: Roi, box_map: BoxMap, where: str | Path) -> str:
-    """Warn if most of a region lies outside the map; gives a remark if more would lie inside with x and y changed over."""
+    """Warn if most of a region lies outside the map; gives a remark if x and y look changed over."""
     low, high = box_map.bounds()
     region, bounds = roi.region(), shapely.box(*low[:2], *high[:2])
     inside, turned = (

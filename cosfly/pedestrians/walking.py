@@ -57,8 +57,8 @@ def speed_profile(
         curvatures: (k,) 1/m.
         curvature_gain_m: alpha; jitter: beta.
     Returns:
-        (k,) m/s within the range, whose lower end is never below SLOWEST_SPEED_MPS. With the defaults eq:speed gives at least
-        0.067 m/s (a right angle of two 0.5 m steps), so that the guard changes nothing.
+        (k,) m/s within the range, whose lower end is never below SLOWEST_SPEED_MPS. With the defaults eq:speed gives at
+        least 0.067 m/s (a right angle of two 0.5 m steps), so that the guard changes nothing.
     """
     unrest = 1.0 + jitter * rng.uniform(-1.0, 1.0, size=len(curvatures))
     speeds_mps = cruise_speed_mps / (1.0 + curvature_gain_m * curvatures) * unrest
@@ -87,8 +87,8 @@ def resample(
     its length over the mean of its speeds. The last sample is the goal, reached within the last step.
 
     Args:
-        polyline_m: (k, 2) m, k at least 2, no two neighbours equal; speeds_mps: (k,); times_s: (k,) from arrival_times, which
-            knows no stops; stops_s: (k,) how long the person stands at each waypoint, whose speed is 0 there.
+        polyline_m: (k, 2) m, k at least 2, no two neighbours equal; speeds_mps: (k,); times_s: (k,) from arrival_times,
+            which knows no stops; stops_s: (k,) how long the person stands at each waypoint, whose speed is 0 there.
     Returns:
         time_s (n,) = 0, step, 2 step ...; positions_m (n, 2); speeds_mps (n,).
     """
@@ -100,7 +100,7 @@ def resample(
 def sample(
     polyline_m: np.ndarray, speeds_mps: np.ndarray, times_s: np.ndarray, stops_s: np.ndarray, time_s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Give positions (n, 2) and speeds (n,) at any times, (n,) s, of a timed polyline as `resample` takes it; after its end, the end."""
+    """Give positions (n, 2) and speeds (n,) at any times, (n,) s, of a timed polyline; after its end, the end."""
     now_s = np.minimum(time_s - stood_s(time_s, times_s, stops_s), times_s[-1])
     piece = np.clip(np.searchsorted(times_s, now_s, side="right") - 1, 0, len(times_s) - 2)
     duration_s = times_s[piece + 1] - times_s[piece]
@@ -120,7 +120,8 @@ def stood_s(time_s: np.ndarray, times_s: np.ndarray, stops_s: np.ndarray) -> np.
 
 
 # --- paces ------------------------------------------------------------------------------------------------------------
-# At which pace people go: one row a profile, and what it makes of a route: the way that is walked, and where it stands still.
+# At which pace people go: one row a profile, and what it makes of a route: the way that is walked, and where it stands
+# still.
 #
 # Arithmetic on polylines; walking.py gives the way its times.
 
@@ -132,7 +133,8 @@ STOP_GAP_MIN = 2  # waypoints from one stop to the next: between two neighbours 
 class Pace:
     """One profile; ranges are drawn from evenly.
 
-    hurries: cruises at `hurry_speed_mps`. stop_every_m: way from one stop to the next, none without. stop_s: how long a stop is.
+    hurries: cruises at `hurry_speed_mps`. stop_every_m: way from one stop to the next, none without. stop_s: how long a
+    stop is.
     turn_at: share of the route at which the person turns, never without; back: share of that way that is walked back.
     """
 
@@ -154,7 +156,7 @@ PACES = {
 
 @dataclass(frozen=True)
 class Way:
-    """What a pace makes of a route: polyline_m (k, 2); stops_s (k,), how long the person stands at each waypoint, 0 at most."""
+    """What a pace makes of a route: polyline_m (k, 2); stops_s (k,), how long the person stands at each waypoint."""
 
     polyline_m: np.ndarray
     stops_s: np.ndarray
@@ -170,7 +172,7 @@ class Way:
 
 
 def take_pace(route_m: np.ndarray, pace: Pace, rng: np.random.Generator) -> Way:
-    """Go a route, (k, 2) m, at a pace. Nobody stops at its ends; a route without a waypoint between them is gone as it is."""
+    """Go a route, (k, 2) m, at a pace. Nobody stops at its ends; two points are gone as they are."""
     if len(route_m) < 3:
         return Way.without_stops(route_m)
     turn = len(route_m) - 1

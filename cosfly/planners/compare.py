@@ -1,10 +1,10 @@
 """The planners side by side on the same walks: `cosfly plan compare` (app:three_axis_eval).
 
-The paper's axes, as its table's figures have them: visibility is the mean; path efficiency is the shortest mean length of a planner
-without collisions over the planner's own; smoothness is 1 / (1 + jerk RMS); safety is (1 - collision fraction) * clamp(least
-clearance / 5 m); each from the planner's means over all walks. "Blocked" is what is not visible, of all rays.
-Any two or more planners can be compared: the first is the one that the others are held against. Only walks that all of them fly are
-compared; the others are counted by the planner that failed.
+The paper's axes, as its table's figures have them: visibility is the mean; path efficiency is the shortest mean length
+of a planner without collisions over the planner's own; smoothness is 1 / (1 + jerk RMS); safety is (1 - collision
+fraction) * clamp(least clearance / 5 m); each from the planner's means over all walks. "Blocked" is what is not
+visible, of all rays. Any two or more planners can be compared: the first is the one that the others are held against.
+Only walks that all of them fly are compared; the others are counted by the planner that failed.
 """
 
 from __future__ import annotations
@@ -94,7 +94,8 @@ def axis_scores(means: dict[str, dict[str, float]]) -> dict[str, dict[str, float
 def axis_differences(
     figures: dict[str, list[dict[str, float]]], rng: np.random.Generator
 ) -> dict[str, dict[str, dict]]:
-    """Give the first planner's axis scores less each other's, with the 95 % interval over walks drawn with replacement (Efron 1979).
+    """Give the first planner's axis scores less each other's, with the 95 % interval over walks drawn with replacement
+    (Efron 1979).
 
     Args:
         figures: planner -> figures of the same walks in the same order.
@@ -147,8 +148,8 @@ def summarize(flights: dict[str, list[DroneTrace]], rng: np.random.Generator) ->
     Args:
         flights: planner -> traces, the same walks in the same order, at least one. rng: draws walks for intervals.
     Returns:
-        The tables of `compare.json`. `deltas`, `axis_differences` and `win_rates` are by the other planner: the first's less
-        its own, the first's wins.
+        The tables of `compare.json`. `deltas`, `axis_differences` and `win_rates` are by the other planner: the first's
+        less its own, the first's wins.
     """
     first, *others = flights
     figures = {planner: [flight_figures(trace) for trace in traces] for planner, traces in flights.items()}
@@ -227,7 +228,8 @@ def run(
     watch: Watch = Watch(),
     resume: Resume = "if-same",
 ) -> Path:
-    """Reads a simplified map and `path.json`, writes `compare.json`, each planner's flights and three pictures; gives the first.
+    """Reads a simplified map and `path.json`, writes `compare.json`, each planner's flights and three pictures; gives
+    the first.
 
     A walk that a planner cannot fly is dropped with that planner's name, one that none can is a failure.
 
@@ -293,7 +295,7 @@ def _flights_of(planner: str, shared: list[Kept], out: Path) -> list[DroneTrace]
 
 
 def _left_out(records: list[ItemRecord]) -> list[dict[str, str]]:
-    """Walks that are not compared, with the reason of the planner that failed; of a walk that none flies, the first one's."""
+    """Walks that are not compared, with the planners that failed and their reasons."""
     rows = []
     for record in records:
         if isinstance(record, Failed):
@@ -356,7 +358,7 @@ def draw_overlay(box_map: BoxMap, walks: list[Walk], flights: dict[str, list[Dro
 
 
 def draw_series(walks: list[Walk], flights: dict[str, list[DroneTrace]]) -> bytes:
-    """Draw altitude above the walk and visibility over time: every flight thin, the mean of those still flying thick."""
+    """Draw altitude above the walk and visibility over time: flights thin, the mean of those still flying thick."""
     ground = [walk.positions_m[:, 2] for walk in walks]
     altitudes = {p: [t.positions_m[:, 2] - g for t, g in zip(ts, ground, strict=True)] for p, ts in flights.items()}
     seen = {planner: [trace.visibility for trace in traces] for planner, traces in flights.items()}
@@ -375,7 +377,7 @@ def draw_series(walks: list[Walk], flights: dict[str, list[DroneTrace]]) -> byte
 
 
 def _panel(picture, frame, title, bounds, end_s, times, values) -> None:
-    """Draw one axis. frame: left, top, right, bottom, px. bounds: low, high. times, values: planner -> one row per flight."""
+    """Draw one axis. frame: left, top, right, bottom, px. bounds: low, high. times, values: planner -> flights."""
     left, top, right, bottom = frame
 
     def pixels(t, v) -> np.ndarray:
@@ -490,7 +492,8 @@ class _Comparison(BaseModel):
         planners, figures, axes = list(self.means), {name for name, _, _ in FIGURES}, {*AXES, "mean"}
         for table, names, rows in (
             (self.means, planners, figures), (self.deltas, planners[1:], figures), (self.axes, planners, axes),
-            (self.axis_differences, planners[1:], axes), (self.win_rates, planners[1:], set()), (self.timings, planners, set()),
+            (self.axis_differences, planners[1:], axes), (self.win_rates, planners[1:], set()),
+            (self.timings, planners, set()),
         ):  # fmt: skip
             if list(table) != names:
                 raise ValueError(f"tables of different planners: {names} and {list(table)}")

@@ -4,9 +4,9 @@ A planner is one function, named in PLANNERS, with the signature
 
     plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan
 
-It gives one drone position for each target position, keeps to the shared settings (tab:drone_params), draws chance from `rng` only,
-and raises NoPathError where it finds nothing. `tests/test_planners_contract.py` holds every entry of PLANNERS to that.
-Compiled code is imported by the planners alone: settings are read without it.
+It gives one drone position for each target position, keeps to the shared settings (tab:drone_params), draws chance from
+`rng` only, and raises NoPathError where it finds nothing. `tests/test_planners_contract.py` holds every entry of
+PLANNERS to that. Compiled code is imported by the planners alone: settings are read without it.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class MucoConfig(Config):
     track_distance_m: float = Field(
         28.0,
         gt=0,
-        description="wanted slant distance to the target (through the air, not over ground), m; of muco alone: foresight keeps "
+        description="wanted slant distance to the target, through the air, m; of muco alone: foresight keeps "
         "plan.behind_distance_m over ground and plan.altitude_preferred_m",
     )
     weight_tracking: float = Field(2.0, ge=0, description="weight of (distance - track_distance_m)^2")
@@ -102,8 +102,8 @@ class MucoConfig(Config):
     )
     step: Literal["newton", "paper"] = Field(
         "newton",
-        description="newton: band-matrix step, shortened until the loss falls; paper: the paper's optimizer as it is printed, "
-        "plain steps along finite differences whatever the loss does",
+        description="newton: band-matrix step, shortened until the loss falls; paper: the paper's optimizer as it is "
+        "printed, plain steps along finite differences whatever the loss does",
     )
     difference_m: float = Field(0.5, gt=0, description="half width of the difference window, m")
     learning_rate: float = Field(0.05, gt=0, description="of the paper's step; the newton step has none")
@@ -146,7 +146,7 @@ class TrackAStarConfig(Config):
 
 
 class PlanConfig(Config):
-    """Settings of step 4, shared by all planners (tab:drone_params); altitudes count from the ground under the walker."""
+    """Settings of step 4, for all planners (tab:drone_params); altitudes count from the ground under the walker."""
 
     planner: str = Field("foresight", description="which planner flies: foresight, muco or track_astar")
     safety_distance_m: float = Field(SAFETY_DISTANCE_M, gt=0, description="nominal distance to obstacles, m")
@@ -159,7 +159,7 @@ class PlanConfig(Config):
     behind_distance_m: float = Field(
         20.0,
         gt=0,
-        description="horizontal distance to the target, m: wanted all along by foresight, at the start by muco and track_astar",
+        description="horizontal distance to the target, m: wanted all along by foresight, at the start by the others",
     )
     speed_max_mps: float = Field(10.0, gt=0, description="greatest speed between two waypoints, m/s")
     heading_smoothing_s: float = Field(
@@ -221,14 +221,17 @@ class PlanConfig(Config):
 
 @dataclass(frozen=True)
 class Wish:
-    """What a flight should be at each of n waypoints, all (n,); a planner comes as near as boxes, speed and sight allow.
+    """What a flight should be at each of n waypoints, all (n,); a planner comes as near as boxes, speed and sight
+    allow.
 
-    heading_rad: the walker's smoothed direction, continuous. bearing_rad: where the drone stands as seen from the walker,
-    counter-clockwise from the heading: 0 in front, pi behind. distance_m: slant distance to the hip point; ground_distance_m: in
-    the plane. pitch_rad: downward pitch of the view. Two of the three would do, but the paper's do not agree with each other.
+    heading_rad: the walker's smoothed direction, continuous. bearing_rad: where the drone stands as seen from the
+    walker, counter-clockwise from the heading: 0 in front, pi behind. distance_m: slant distance to the hip point;
+    ground_distance_m: in the plane. pitch_rad: downward pitch of the view. Two of the three would do, but the paper's
+    do not agree with each other.
     altitude_m: above the ground under the walker; altitude_min_m and altitude_max_m are bounds, which a flight keeps.
-    keeps_sight: bool, whether the walker is to be seen; elsewhere a planner gives up nothing for it. any_bearing: the paper's way,
-    to whose planners the bearing is a beginning and a weak wish; elsewhere the bearing and the altitude are what the flight is for.
+    keeps_sight: bool, whether the walker is to be seen; elsewhere a planner gives up nothing for it. any_bearing: the
+    paper's way, to whose planners the bearing is a beginning and a weak wish; elsewhere the bearing and the altitude
+    are what the flight is for.
     """
 
     heading_rad: np.ndarray
@@ -257,7 +260,8 @@ class Wish:
 class Scenario:
     """What a planner gets to know; n >= 2 waypoints, dt_s apart.
 
-    targets_m: (n, 3) hip points. ground_m: (n,) height of the ground below each. wish: what the flight should be at each.
+    targets_m: (n, 3) hip points. ground_m: (n,) height of the ground below each. wish: what the flight should be at
+    each.
     """
 
     path_id: str

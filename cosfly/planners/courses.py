@@ -35,7 +35,7 @@ WAY_ROUND = 0.2  # of that is the price of half the way round the walker from th
 def wish_of(
     names: list[str], scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator
 ) -> Wish:
-    """Give the wish of a flight whose parts, equally long, have these styles; the scenario's own wish is that of `follow`."""
+    """Give the wish of a flight of equally long parts in these styles; the wish of `follow` is the scenario's own."""
     num, paper = len(scenario.targets_m), scenario.wish
     course, paces_mps = np.empty((num, 3)), np.full(num, APART_MPS)
     cuts = np.linspace(0, num, len(names) + 1).round().astype(int).tolist()
@@ -54,7 +54,7 @@ def wish_of(
 def without_jumps(
     course: np.ndarray, scenario: Scenario, cfg: PlanConfig, paces_mps: np.ndarray | float = APART_MPS
 ) -> Wish:
-    """Make a wish of a course, (n, 3): steps become ways at the speeds above, those of the distance at paces_mps; corners are rounded."""
+    """Make a wish of a course, (n, 3): steps become ways at the speeds above and paces_mps, corners are rounded."""
     num, dt_s, paper = len(course), scenario.dt_s, scenario.wish
 
     def followed(values: np.ndarray, speeds_mps: np.ndarray | float) -> np.ndarray:
@@ -193,7 +193,8 @@ def smoothed_headings(targets_m: np.ndarray, smoothing_s: float, dt_s: float = D
     """Walking direction of each point, radians, continuous, smoothed over time by a Gaussian.
 
     Args:
-        targets_m: (n, 3), n >= 2. smoothing_s: standard deviation; 0 takes the direction as it is. dt_s: between points.
+        targets_m: (n, 3), n >= 2. smoothing_s: standard deviation; 0 takes the direction as it is. dt_s: between
+            points.
     Returns:
         (n,). A walker who stands keeps the direction before; one who never moves faces east.
     """

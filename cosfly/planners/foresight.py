@@ -1,8 +1,8 @@
 """Foresight: choose for the whole walk at once the places that see it, then smooth without losing sight.
 
-MuCO improves a flight where it is, so it stays on the blind side of a row of trees; TA*+Smooth sees both sides, but flies from voxel
-to voxel. Here dynamic programming over rings round the wished place finds the sides, with a tenth of the places, and a
-least-squares flight follows them as closely as sight and safety ask for.
+MuCO improves a flight where it is, so it stays on the blind side of a row of trees; TA*+Smooth sees both sides, but
+flies from voxel to voxel. Here dynamic programming over rings round the wished place finds the sides, with a tenth of
+the places, and a least-squares flight follows them as closely as sight and safety ask for.
 """
 
 from __future__ import annotations
@@ -37,19 +37,21 @@ from cosfly.work.compiled import njit
 
 NUM_AZIMUTHS = 36
 BETWEEN_KEYS_S, BETWEEN_KEYS_CLIMBING_S = 1.5, 3.0  # the latter lets the drone climb from one of CLIMBS to the next
-# Azimuths between one key frame and the next, against those that the wish turns by: climbing, an orbit without room can stand still.
+# Azimuths between one key frame and the next, against those that the wish turns by: climbing, an orbit without room can
+# stand still.
 MAX_TURN, MAX_TURN_CLIMBING = 2, 6
 
-# Rings as (steps outwards, steps up) from the wished place. Who is hidden below canopies is seen from farther off, who is hidden behind
-# a house from above; CLIMBS lead over what blocks the way.
+# Rings as (steps outwards, steps up) from the wished place. Who is hidden below canopies is seen from farther off, who
+# is hidden behind a house from above; CLIMBS lead over what blocks the way.
 RINGS = ((-1, 0), (0, 0), (1, 0), (2, 0), (3, 0), (4, 0), (-1, 1), (0, 1))
 CLIMBS = ((0, 2), (1, 4), (2, 7), (2, 11))
 # Of the wished distance; farther apart, the drone could not change rings between keys.
 STEP_OUT_SHARE, STEP_OUT_MAX_M = 0.3, 8.0
 STEP_UP_M = 7.0
 
-# Costs of a place, in units of "the walker hidden for one key frame" = 1. Ways off are squared parts of the wished distance. Where the
-# bearing and the altitude are what the flight is for, 64 degrees off are as dear as the hidden walker.
+# Costs of a place, in units of "the walker hidden for one key frame" = 1. Ways off are squared parts of the wished
+# distance. Where the bearing and the altitude are what the flight is for, 64 degrees off are as dear as the hidden
+# walker.
 BEARING_COST, ANY_BEARING_COST = 0.8, 0.007  # per rad^2 off the wished bearing; where any will do
 HIGH_COST, ANY_BEARING_HIGH_COST = 3.2, 0.8
 NEAR_COST, FAR_COST = 0.1, 0.03
@@ -81,7 +83,8 @@ def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
     wish, targets, num = scenario.wish, scenario.targets_m, len(scenario.targets_m)
     stride = max(1, round((BETWEEN_KEYS_CLIMBING_S if climbing else BETWEEN_KEYS_S) / scenario.dt_s))
     frames = np.unique(np.append(np.arange(0, num, stride), num - 1))
-    # Between key frames the flight is straight while the ground may rise and fall: a key frame keeps the bounds of all around it.
+    # Between key frames the flight is straight while the ground may rise and fall: a key frame keeps the bounds of all
+    # around it.
     around, ground_m = 2 * stride + 1, scenario.ground_m
     least_z = maximum_filter1d(ground_m + wish.altitude_min_m, around, mode="nearest")[frames, None]
     greatest_z = minimum_filter1d(ground_m + wish.altitude_max_m, around, mode="nearest")[frames, None]
@@ -119,9 +122,9 @@ def _links(rings: np.ndarray) -> np.ndarray:
 # --- search -----------------------------------------------------------------------------------------------------------
 # The cheapest sequence of places that sees the walker: dynamic programming over the key frames of a lattice.
 #
-# Each key frame is looked from once, before any way is known, so the way is the best of all, and it leaves a place before the walker
-# is hidden from there. What it costs to fly a metre is the same in one stride as in several: a jump from ring to ring is what smoothing
-# makes a gentle change of.
+# Each key frame is looked from once, before any way is known, so the way is the best of all, and it leaves a place
+# before the walker is hidden from there. What it costs to fly a metre is the same in one stride as in several: a jump
+# from ring to ring is what smoothing makes a gentle change of.
 
 
 WAY_COST = 0.02  # of a metre, where "the walker hidden for one key frame" = 1
@@ -178,9 +181,11 @@ def boxes_aloft(obstacles: BoxIndex, targets_m: np.ndarray, lattice: Lattice) ->
 
 @njit(cache=True)
 def _survey(places, targets, index, aloft, clearance_m, reach_m, gaps, hidden):
-    """Write the distance of each place to the nearest box, at most `reach_m`, and the hidden share of the walker, both (m, c).
+    """Write the distance of each place to the nearest box, at most `reach_m`, and the hidden share of the walker, both
+    (m, c).
 
-    Places nearer than `clearance_m` keep what stands in `hidden`. aloft: rows of the boxes of `index` within `reach_m` of places.
+    Places nearer than `clearance_m` keep what stands in `hidden`. aloft: rows of the boxes of `index` within `reach_m`
+    of places.
     """
     near = np.empty(len(aloft), dtype=np.int64)
     for key in range(len(places)):
@@ -210,7 +215,8 @@ def _survey(places, targets, index, aloft, clearance_m, reach_m, gaps, hidden):
 def _cheapest(places, own, gaps, longest_m, index, clearance_m, links, num_azimuths, max_turn, way_cost):
     """Give the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
 
-    places: (m, c, 3), c = rings * azimuths. own: (m, c) cost of a place. gaps: (m, c) m. longest_m: (m,) move into each key frame.
+    places: (m, c, 3), c = rings * azimuths. own: (m, c) cost of a place. gaps: (m, c) m. longest_m: (m,) move into each
+    key frame.
     links: (rings, r) rings that may be come from, the first -1 ends the list.
     """
     num_keys, num_places, one = len(places), places.shape[1], np.empty(1, dtype=np.int64)
@@ -238,7 +244,8 @@ def _cheapest(places, own, gaps, longest_m, index, clearance_m, links, num_azimu
                     guess = cost[key - 1, b] + way_cost * length
                     if guess >= best or length > longest_m[key]:
                         continue
-                    # Distance changes by at most a metre per metre: where both ends are freer than this, so is the line.
+                    # Distance changes by at most a metre per metre: where both ends are freer than this, so is the
+                    # line.
                     is_close = gaps[key, c] + gaps[key - 1, b] - length < 2.0 * clearance_m
                     if is_close and collect_hits(index, u, v, w, x, y, z, clearance_m, one) > 0:
                         continue
@@ -265,7 +272,8 @@ def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.rando
 
 
 def raw_flight(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> tuple[np.ndarray, str, float]:
-    """Give the flight to be smoothed, its kind (`wished`, `search` or `climbing search`), and the clearance that it keeps, m.
+    """Give the flight to be smoothed, its kind (`wished`, `search` or `climbing search`), and the clearance that it
+    keeps, m.
 
     Where the wished places are free and see all that they are to see, nothing is searched.
 

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from cosfly.space.kernels import BoxIndex
 
 
-# A flight holds its style where the walker sees it within this angle of the wished place and within this ratio of its distance.
+# A flight holds its style where the walker sees it within this angle of the wished place and within this ratio of its
+# distance.
 HELD_DEG, HELD_RATIO, HELD_SHARE = 25.0, 1.4, 0.7
 
 POINTS_LEAST = 4  # of a part
@@ -101,7 +102,8 @@ def why_not_held(intent: Intent, scenario: Scenario, positions_m: np.ndarray, se
 
 
 # --- mission ----------------------------------------------------------------------------------------------------------
-# `return_home`: an order of the mission ends the pursuit; the drone breaks off, turns away and flies to where it started.
+# `return_home`: an order of the mission ends the pursuit; the drone breaks off, turns away and flies to where it
+# started.
 
 
 BREAKS_OFF_S = 4.0
@@ -111,7 +113,7 @@ PURSUIT_LEAST = 1 / 3  # of the flight
 
 
 def wish_of_mission(wish: Wish, scenario: Scenario, cfg: PlanConfig, rng: np.random.Generator) -> tuple[Wish, Mission]:
-    """End a flight's wish with the way home. The order comes so late that the rest of the walk is just enough for it."""
+    """End a flight's wish with the way home; the order comes so late that the rest of the walk is just enough."""
     places, dt_s = wish.places_m(scenario.targets_m, scenario.ground_m), scenario.dt_s
     home_m, breaks_off = places[0], round(BREAKS_OFF_S / dt_s)
     first = int(len(places) * PURSUIT_LEAST)
@@ -159,7 +161,8 @@ def _seen_from_the_walker(wish: Wish, scenario: Scenario, places: np.ndarray, at
 
 
 # --- camera -----------------------------------------------------------------------------------------------------------
-# Where the camera looks: at the target; on the way home where the drone flies; and where nobody is seen, where it was lost.
+# Where the camera looks: at the target; on the way home where the drone flies; and where nobody is seen, where it was
+# lost.
 
 
 TURNS_S = 0.8  # standard deviation of the smoothing of a turn while it searches

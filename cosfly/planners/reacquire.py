@@ -1,7 +1,8 @@
 """`reacquire`: the walker disappears behind a house or a tree, the drone searches and finds again.
 
-It begins low and away, where the map hides the walker for a while (a place is looked for, by chance), and goes on as before for a
-moment; then it climbs and swings behind the walker's last way until it sees. Judged by what came of it, not by the mean of sight.
+It begins low and away, where the map hides the walker for a while (a place is looked for, by chance), and goes on as
+before for a moment; then it climbs and swings behind the walker's last way until it sees. Judged by what came of it,
+not by the mean of sight.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ FREE_SHARE = 1.0  # of the wished places that keep the safety distance
 
 
 def screens_of(box_map: BoxMap) -> BoxIndex:
-    """Index what hides a person for certain: the obstacles, but of a crown's box only what its ellipsoid fills whatever the direction."""
+    """Index what hides a person for certain: the obstacles, but of a crown's box only the box within its ellipsoid."""
     from cosfly.space.kernels import obstacle_index
 
     is_crown = box_map.is_any_of({KINDS["Vegetation"]})
@@ -67,7 +68,7 @@ def wish_of_reacquire(
 
 
 def _watching(scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
-    """Draw a course, (n, 3), before the loss: at a bearing of the walker, or along the walker's own way and late, round its corners."""
+    """Draw a course, (n, 3), before the loss: at a bearing of the walker, or late along the walker's own way."""
     targets, heading_rad = scenario.targets_m, scenario.wish.heading_rad
     apart_m, altitude_m = rng.uniform(*HIDING.ground_distance_m), rng.uniform(*HIDING.altitude_m)
     bearing, is_late = rng.uniform(-np.pi, np.pi), rng.random() < LATE_SHARE

@@ -1,4 +1,4 @@
-"""Who sees the target: what can hide it, sorted by direction once a layer, so that thousands of looks test a few boxes each."""
+"""Who sees the target: what can hide it, sorted by direction once a layer, so that a look tests a few boxes."""
 
 from __future__ import annotations
 
@@ -37,8 +37,9 @@ ROUNDING = 1e-6
 class Horizon(NamedTuple):
     """What can hide one target, by direction. m boxes near it.
 
-    counts: (NUM_SECTORS,), lists: (NUM_SECTORS, m) boxes that reach into each sector. near: (m,) m, horizontal distance less the
-    rays' spread. slopes: (m,) a ray that rises more than this per horizontal metre passes above. steepest: (NUM_SECTORS,).
+    counts: (NUM_SECTORS,), lists: (NUM_SECTORS, m) boxes that reach into each sector. near: (m,) m, horizontal distance
+    less the rays' spread. slopes: (m,) a ray that rises more than this per horizontal metre passes above. steepest:
+    (NUM_SECTORS,).
     """
 
     boxes: np.ndarray
@@ -53,9 +54,10 @@ class Horizon(NamedTuple):
 def make_horizon(index, target, reach_m, least_slope):
     """Sort the boxes round a target by direction, so that a look from above tests the few that can hide it.
 
-    Good for looks from within `reach_m` in the plane, from places that rise at least `least_slope` per horizontal metre above the
-    lowest foot: lower boxes are left out. A ray that starts at height `low` or above and ends d away at p_z has risen to low + (p_z - low) t at the share t of its way,
-    and it is no nearer to a box at horizontal distance r than t = (r - FOOT_SIDE_M) / d.
+    Good for looks from within `reach_m` in the plane, from places that rise at least `least_slope` per horizontal metre
+    above the lowest foot: lower boxes are left out. A ray that starts at height `low` or above and ends d away at p_z
+    has risen to low + (p_z - low) t at the share t of its way, and it is no nearer to a box at horizontal distance r
+    than t = (r - FOOT_SIDE_M) / d.
     """
     boxes, near, slopes, spans = _boxes_round(index, target, reach_m, least_slope)
     counts = np.zeros(NUM_SECTORS, dtype=np.int64)
@@ -74,7 +76,7 @@ def make_horizon(index, target, reach_m, least_slope):
 
 @njit(cache=True)
 def _boxes_round(index, target, reach_m, least_slope):
-    """Give the boxes within `reach_m` that are steep enough, their horizontal distance, slope, and span of azimuth (2,), first <= last."""
+    """Give the boxes in reach that are steep enough, their distance, slope, and span of azimuth (2,), first <= last."""
     boxes = np.empty(len(index.rows), dtype=np.int64)
     near, slopes, spans, num = np.empty(len(boxes)), np.empty(len(boxes)), np.empty((len(boxes), 2)), 0
     if len(index.rows) == 0:
@@ -125,7 +127,7 @@ def _span(rows, target, distance_m):
 
 @njit(cache=True, inline="always")
 def look(index, horizon, target, x, y, z):
-    """Give the five-ray visibility of the horizon's target from a point above it: that of `kernels.visibility`, sooner."""
+    """Give the five-ray visibility of the horizon's target from a point above it, as `kernels.visibility` does."""
     dx, dy = x - target[0], y - target[1]
     away, rise = np.sqrt(dx * dx + dy * dy), z - target[2] - FOOT_LOW_M
     sector = int(np.floor(np.arctan2(dy, dx) / (2.0 * np.pi) * NUM_SECTORS)) % NUM_SECTORS
@@ -147,7 +149,7 @@ def look(index, horizon, target, x, y, z):
 
 @njit(cache=True)
 def _blocked_rays(rows, box, x, y, z, target, blocked):
-    """Add to the bits of `blocked` the rays to a target that touch a box: the point and the hip turned into its frame once."""
+    """Add to the bits of `blocked` the rays to a target that touch a box."""
     tx, ty, tz = target[0], target[1], target[2]
     if min(x, tx - FOOT_SIDE_M) > rows[box, HIGH_X] or max(x, tx + FOOT_SIDE_M) < rows[box, LOW_X]:
         return blocked

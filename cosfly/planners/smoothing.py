@@ -1,8 +1,8 @@
 """Smoothing that keeps what a raw flight sees: least squares, drawn to it where it loses sight or comes too near.
 
-The smoothed flight p of a raw flight r minimises the sum over waypoints of pull (p - r)^2 + velocity^2 + acceleration^2 +
-jerk^2, each with its weight: one band system, the same for x, y and z. Waypoints that see less than their raw ones are
-pulled harder, up to a limit, and those that come too near a box or fly too fast without one, until none is left.
+The smoothed flight p of a raw flight r minimises the sum over waypoints of pull (p - r)^2 + velocity^2 + acceleration^2
++ jerk^2, each with its weight: one band system, the same for x, y and z. Waypoints that see less than their raw ones
+are pulled harder, up to a limit, and those that come too near a box or fly too fast without one, until none is left.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from scipy.ndimage import gaussian_filter1d
 from cosfly.planners.contract import PlanConfig, Scenario
 from cosfly.space.kernels import BoxIndex, segments_hit, signed_distances, visibility
 
-# Weights of the squared distance to the raw flight: where any bearing will do; where the wished one counts, and there at wished places,
-# whose halts are part of what is wished; at most for the sake of sight.
+# Weights of the squared distance to the raw flight: where any bearing will do; where the wished one counts, and there
+# at wished places, whose halts are part of what is wished; at most for the sake of sight.
 PULL_ANY_BEARING, PULL, PULL_AS_WISHED, PULL_FOR_SIGHT_MAX, PULL_RISE = 0.2, 20.0, 1000.0, 300.0, 4.0
 AS_WISHED_M = 0.5  # from the wished place
 # Weights of squared derivatives with respect to time: that of velocity draws the flight tight.
@@ -79,7 +79,7 @@ def smoothness_band(num_points: int, dt_s: float) -> np.ndarray:
 
 
 def unsafe(points: np.ndarray, obstacles: BoxIndex, clearance_m: float, step_max_m: float) -> np.ndarray:
-    """Tell which waypoints are too near a box, or begin or end a step that is too long or leads through one, (n,) bool."""
+    """Tell which waypoints are too near a box, or at an end of a step too long or through one, (n,) bool."""
     found = signed_distances(obstacles, points, clearance_m)[0] < clearance_m - ROUNDING_M
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1) > step_max_m * (1.0 + ROUNDING_M)
     steps |= segments_hit(obstacles, points[:-1], points[1:])

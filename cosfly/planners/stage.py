@@ -74,7 +74,8 @@ def make_scenario(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig) -> Scenario:
 def plan_flight(
     walk: Walk, obstacles: BoxIndex, cfg: PlanConfig, seed: int, screens: BoxIndex | None = None
 ) -> DroneTrace:
-    """Plan, measure and check one flight in a style drawn for it; in that of the paper instead where it fails and the settings say so.
+    """Plan, measure and check one flight in a style drawn for it; in that of the paper instead where it fails and the
+    settings say so.
 
     Args:
         screens: the obstacles that hide a person for certain, for a search; None: all do.
@@ -101,7 +102,7 @@ def plan_flight(
 
 
 def style_rng(walk: Walk, seed: int) -> np.random.Generator:
-    """Give the generator of a flight's style. Walks of other maps have the same ids, so the place where it begins is in it."""
+    """Give the generator of a flight's style, by the walk's begin too: walks of other maps have the same ids."""
     x_m, y_m = np.round(walk.positions_m[0, :2], 2) + 0.0
     return rng_for(seed, "style", f"{walk.path_id}/{x_m:.2f}/{y_m:.2f}")
 
@@ -121,7 +122,8 @@ def _fly(
     if is_too_near or segments_hit(obstacles, positions[:-1], positions[1:]).any():
         raise NoPathError(
             f"planner {cfg.planner} found no flight that is free of collisions", where=walk.path_id,
-            got=f"a least clearance of {clearances.min():.2f} m", expected=f"{cfg.relaxed_safety_m:g} m and no segment in a box",
+            got=f"a least clearance of {clearances.min():.2f} m",
+            expected=f"{cfg.relaxed_safety_m:g} m and no segment in a box",
         )  # fmt: skip
     seen, judged = visibility(obstacles, positions, targets), intent.wish.keeps_sight
     seen_past_screens = visibility(screens, positions, targets) if intent.searches else seen
@@ -248,7 +250,7 @@ def _facts(box_map: BoxMap, traces: list[DroneTrace], records: list[Kept | Dropp
 
 
 def _styles_flown(traces: list[DroneTrace]) -> dict:
-    """Count the parts of kept flights by style, and the flights whose style the map did not hold; nothing where all follow."""
+    """Count the parts of kept flights by style, and those that the map did not hold; nothing where all follow."""
     styled = [trace for trace in traces if trace.segments or trace.instead_of]
     if not styled:
         return {}

@@ -1,7 +1,9 @@
-"""The table of styles: how the drone stands to the walker while a part of a flight lasts, and which decisions that shows.
+"""The table of styles: how the drone stands to the walker while a part of a flight lasts, and which decisions that
+shows.
 
-A row is data; `courses.py` makes a wish of it, and a new row needs no code. Labels come from the motion that was flown, not from the
-style. Two styles are more than a row: `reacquire` looks for a place where the walker disappears, `return_home` ends with a mission.
+A row is data; `courses.py` makes a wish of it, and a new row needs no code. Labels come from the motion that was flown,
+not from the style. Two styles are more than a row: `reacquire` looks for a place where the walker disappears,
+`return_home` ends with a mission.
 """
 
 from __future__ import annotations
@@ -20,10 +22,12 @@ Range = tuple[float, float]  # a value is drawn evenly from it for each part of 
 class Style:
     """One row. Distances are in the plane, altitudes above the ground under the walker.
 
-    bearing_deg: of the drone as seen from the walker, counter-clockwise from the walking direction: 0 in front, 180 behind;
-    None: where the part before ended, anywhere at the beginning; either_side: half of them are mirrored. The values with `end` are reached at the end of the part, None: as at its beginning.
-    round_mps: speed round the walker, positive counter-clockwise. hop_s: the drone stands still, and so often takes a new place, of which
-    the bearing is that of the halt's beginning. pace_mps: how fast the distance changes on the way there.
+    bearing_deg: of the drone as seen from the walker, counter-clockwise from the walking direction: 0 in front, 180
+    behind; None: where the part before ended, anywhere at the beginning; either_side: half of them are mirrored. The
+    values with `end` are reached at the end of the part, None: as at its beginning.
+    round_mps: speed round the walker, positive counter-clockwise. hop_s: the drone stands still, and so often takes a
+    new place, of which the bearing is that of the halt's beginning. pace_mps: how fast the distance changes on the way
+    there.
     purpose: what it is for, in the words of the decisions.
     """
 
@@ -39,8 +43,8 @@ class Style:
     pace_mps: Range = (4.0, 4.0)
 
 
-# Distances and heights keep the slant distance from 10 to 60 m. Nearer than some 8 m in the plane, a low drone would have to fly faster
-# round a bend than it can.
+# Distances and heights keep the slant distance from 10 to 60 m. Nearer than some 8 m in the plane, a low drone would
+# have to fly faster round a bend than it can.
 TABLE: dict[str, Style] = {
     "orbit_left": Style(("circle_left",), (8.0, 20.0), (8.0, 24.0), round_mps=(-6.0, -4.0)),
     "orbit_right": Style(("circle_right",), (8.0, 20.0), (8.0, 24.0), round_mps=(4.0, 6.0)),
@@ -58,7 +62,8 @@ TABLE: dict[str, Style] = {
     "sink": Style(("descend",), (10.0, 22.0), (50.0, 55.0), (135.0, 225.0), altitude_end_m=(8.0, 14.0)),
     "hold": Style(("hover",), (10.0, 18.0), (8.0, 25.0), (-18.0, 18.0), hop_s=(9.0, 15.0), pace_mps=(1.5, 3.0)),
     "stop_and_go": Style(
-        ("speed_up", "slow_down", "hover"), (12.0, 24.0), (8.0, 13.0), (178.0, 182.0), hop_s=(5.0, 6.5), pace_mps=(2.5, 3.5)
+        ("speed_up", "slow_down", "hover"), (12.0, 24.0), (8.0, 13.0), (178.0, 182.0),
+        hop_s=(5.0, 6.5), pace_mps=(2.5, 3.5),
     ),
     "top": Style(("track_straight",), (4.0, 8.0), (44.0, 59.0), (150.0, 210.0)),
 }  # fmt: skip

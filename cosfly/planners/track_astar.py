@@ -1,14 +1,16 @@
 """TA*+Smooth: a search for sight on a time-layered voxel grid, then smoothing (subsec:appendix_planner_tastar).
 
-The search is the paper's. The smoothing is smoothing.py, as for foresight, and not the paper's shortcuts and elastic band.
+The search is the paper's. The smoothing is smoothing.py, as for foresight, and not the paper's shortcuts and elastic
+band.
 
-The state is a voxel and a time. A layer lasts as many frames as the drone needs at its speed limit to reach all 26 neighbours of a
-voxel (two, with the paper's settings), so that no direction is dearer than another; frames between layers are interpolated. All
-states of a layer have the same way to go in time, so a best-first order by cost alone with a beam per layer is the whole search:
+The state is a voxel and a time. A layer lasts as many frames as the drone needs at its speed limit to reach all 26
+neighbours of a voxel (two, with the paper's settings), so that no direction is dearer than another; frames between
+layers are interpolated. All states of a layer have the same way to go in time, so a best-first order by cost alone with
+a beam per layer is the whole search:
 there is no heuristic to add. The paper names the five weights but not the terms; the terms are these, per layer:
 
-    tracking    distance to the ring round the target at the wished distance and altitude, in voxels; to the wished place on it
-                where the wish is not that of the paper, to which any bearing will do
+    tracking    distance to the ring round the target at the wished distance and altitude, in voxels; to the wished
+                place on it where the wish is not that of the paper, to which any bearing will do
     visibility  1 - five-ray visibility
     path        length of the move, in voxels
     safety      (1 - clearance / influence)^2 below the influence distance; below the safety distance a voxel is closed
@@ -65,8 +67,8 @@ class Voxels(NamedTuple):
 class Costs(NamedTuple):
     """Weights and lengths of the search; weights: (5,), places below.
 
-    ring_m, least_z, preferred_z, greatest_z: (m,) of each layer. wished: (m, 2) place in the plane that is wished at each layer, NaN
-    where any on the ring will do. sight: (m,) weight of the blocked part of the rays. start: (3,).
+    ring_m, least_z, preferred_z, greatest_z: (m,) of each layer. wished: (m, 2) place in the plane that is wished at
+    each layer, NaN where any on the ring will do. sight: (m,) weight of the blocked part of the rays. start: (3,).
     """
 
     weights: np.ndarray
@@ -83,7 +85,8 @@ class Costs(NamedTuple):
 
 @njit(cache=True)
 def search_layers(targets, reaches_m, voxels, costs, index, beam, corridor_m):
-    """Give the cell of each layer, (m,), all -1 if there is no way; the cost of the way; the number of places looked from.
+    """Give the cell of each layer, (m,), all -1 if there is no way; the cost of the way; the number of places looked
+    from.
 
     targets: (m, 3) hip points of the layers. reaches_m: (m,) longest move into each layer.
     """
@@ -100,8 +103,8 @@ def search_layers(targets, reaches_m, voxels, costs, index, beam, corridor_m):
             num = _first_layer(targets[0], voxels, costs, index, corridor_m, best, came_from, came_by, touched)
         else:
             num = _expand(
-                cells[layer - 1, :size], cost_before, move_before, layer, reaches_m[layer], lengths, bends, voxels, costs, index,
-                best, came_from, came_by, touched,
+                cells[layer - 1, :size], cost_before, move_before, layer, reaches_m[layer], lengths, bends, voxels,
+                costs, index, best, came_from, came_by, touched,
             )  # fmt: skip
         chosen, total, seen = _choose(touched[:num], best, targets[layer], layer, voxels, costs, index, beam)
         num_seen += seen
@@ -134,7 +137,7 @@ def _move_tables(size):
 
 @njit(cache=True)
 def _first_layer(target, voxels, costs, index, corridor_m, best, came_from, came_by, touched):
-    """Put the free cells within the corridor of the first target into `touched`; they cost the way from the plain start."""
+    """Put the free cells round the first target into `touched`; they cost the way from the plain start."""
     num_y, num_z, num = voxels.shape[1], voxels.shape[2], 0
     for ix in range(voxels.shape[0]):
         for iy in range(num_y):
@@ -169,7 +172,7 @@ def _expand(
     came_by,
     touched,
 ):
-    """Put the cells that can be reached into `touched`, the cheapest way there into `best`, `came_from` and `came_by`."""
+    """Put the cells that can be reached into `touched`, the cheapest way there into `best`, `came_from`, `came_by`."""
     num_x, num_y, num_z, num = voxels.shape[0], voxels.shape[1], voxels.shape[2], 0
     for b in range(len(sources)):
         cell = sources[b]
@@ -327,7 +330,8 @@ def search_flight(
     voxels = make_voxels(scenario, cfg)
     stride = frames_per_layer(cfg, scenario.dt_s)
     frames = np.unique(np.append(np.arange(0, len(targets), stride), len(targets) - 1))
-    # Between layers the flight is straight while the ground may rise and fall: a layer keeps the bounds of all frames around it.
+    # Between layers the flight is straight while the ground may rise and fall: a layer keeps the bounds of all frames
+    # around it.
     around, ground_m = 2 * stride + 1, scenario.ground_m
 
     def highest(altitudes_m: np.ndarray) -> np.ndarray:
@@ -375,8 +379,8 @@ def make_voxels(scenario: Scenario, cfg: PlanConfig) -> Voxels:
     num_z = np.floor((greatest_z.max() - least_z.min()) / settings.voxel_height_m + 1e-9) + 1
     if num_xy.prod() * num_z > MAX_CELLS:
         raise NoPathError(
-            "the walk is too long for the voxel grid", where=scenario.path_id, got=f"{num_xy.prod() * num_z:.0f} voxels",
-            expected=f"at most {MAX_CELLS}", fix="raise track_astar.voxel_m",
+            "the walk is too long for the voxel grid", where=scenario.path_id,
+            got=f"{num_xy.prod() * num_z:.0f} voxels", expected=f"at most {MAX_CELLS}", fix="raise track_astar.voxel_m",
         )  # fmt: skip
     shape = np.array([*num_xy, num_z], dtype=np.int64)
     size = np.array([settings.voxel_m, settings.voxel_m, settings.voxel_height_m])

@@ -1,10 +1,11 @@
-"""The passes of Step 2: fewer boxes that keep the layout of obstacles (sec:step2): merge, crop_tree, crop_below_ground, prune_nested.
+"""The passes of Step 2: fewer boxes that keep the layout of obstacles (sec:step2): merge, crop_tree, crop_below_ground,
+prune_nested.
 
-Two rules of the paper lose more than they should on real maps, so each has a guard, on by default, that a setting turns off.
-*merge* replaces a cluster by its enclosing axis-aligned box: rows of houses that stand askew would swallow the street between them,
-so a cluster that fills too little of that box is halved until its parts fill enough (`min_fill`, `min_canopy_fill`; 0 is the
-paper's rule).
-*crop_tree* keeps the full footprint below the cut, so that nobody walks below a tree, although that is what the cut is for:
+Two rules of the paper lose more than they should on real maps, so each has a guard, on by default, that a setting turns
+off. *merge* replaces a cluster by its enclosing axis-aligned box: rows of houses that stand askew would swallow the
+street between them, so a cluster that fills too little of that box is halved until its parts fill enough (`min_fill`,
+`min_canopy_fill`; 0 is the paper's rule). *crop_tree* keeps the full footprint below the cut, so that nobody walks
+below a tree, although that is what the cut is for:
 `trunk: stem` leaves stems instead (`trunk: full` is the paper's rule). The report holds the walkable area of both.
 
 The paper's SimWorld runs simplify otherwise (app:simworld:step3); its variants are settings: `merge_by: center`,
@@ -35,7 +36,7 @@ FILL_CELLS = 64  # a cluster's fill is measured on at most FILL_CELLS x FILL_CEL
 
 
 class MergeRule(NamedTuple):
-    """How boxes of one kind are merged: largest gap on every axis, m, and least share of the merged footprint that is covered."""
+    """How boxes of a kind are merged: largest gap on every axis, m; least share of the merged footprint covered."""
 
     gap_m: float
     min_fill: float
@@ -46,8 +47,8 @@ def merge(
 ) -> BoxMap:
     """Replace clusters of neighbours of one kind by enclosing axis-aligned boxes; what is alone keeps its rotation.
 
-    A cluster whose members, gaps of CLOSED_GAP_M between them closed, cover less than `min_fill` of the enclosing footprint is
-    halved at the median of its longer side, again and again; a `min_fill` of 0 never halves.
+    A cluster whose members, gaps of CLOSED_GAP_M between them closed, cover less than `min_fill` of the enclosing
+    footprint is halved at the median of its longer side, again and again; a `min_fill` of 0 never halves.
 
     Args:
         rules: kind -> rule; other kinds stay.
@@ -286,8 +287,8 @@ class Simplified:
 def simplify(box_map: BoxMap, cfg: SimplifyConfig) -> Simplified:
     """Apply the passes in the paper's order.
 
-    The result's header gains `passes`, with settings and counts. Ids: a merged box takes its smallest member's, a tree's canopy keeps
-    its own, stems and trunks get the smallest numbers that the input does not use.
+    The result's header gains `passes`, with settings and counts. Ids: a merged box takes its smallest member's, a
+    tree's canopy keeps its own, stems and trunks get the smallest numbers that the input does not use.
     """
     passes = [("input", box_map.counts())]
     feet = _feet(box_map, cfg) if _has_stems(cfg) else None
@@ -322,7 +323,7 @@ def _merge_rules(cfg: SimplifyConfig) -> dict[int, MergeRule]:
 
 
 def _merge_groups(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
-    """Groups that never merge with each other, (n,). With stems, bushes and hedges must not vanish below the cut of a tree."""
+    """Groups that never merge, (n,): with stems, bushes and hedges must not vanish below the cut of a tree."""
     if not _has_stems(cfg):
         return np.zeros(len(box_map), dtype=bool)
     return box_map.maxs[:, 2] > _ground_z_m(box_map) + cfg.cut_height_m
@@ -361,7 +362,8 @@ def crop_tree(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray, feet: 
     Boxes wholly below the cut (bushes, hedges) and wholly above it stay as they are, so a second pass changes nothing.
 
     Args:
-        used_ids: ids that new boxes may not take. feet: (k, 4) stems to stand below the canopies; None: full footprints.
+        used_ids: ids that new boxes may not take. feet: (k, 4) stems to stand below the canopies; None: full
+            footprints.
     Source: sec:step2, "Crop tree operation"; stems are ours.
     """
     ground_z_m = _ground_z_m(box_map)
@@ -397,10 +399,12 @@ def crop_tree(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray, feet: 
 
 
 def crop_tree_adaptive(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarray) -> BoxMap:
-    """Cut vegetation that is higher than `adaptive_height_m` into a stem below `split_z_m` and pieces no higher than that above.
+    """Cut vegetation that is higher than `adaptive_height_m` into a stem below `split_z_m` and pieces no higher than
+    that above.
 
-    The paper names three numbers and their purpose, tall trees in shorter pieces that do not block the walking grid from afar, but
-    no rule; this is ours. The stem is one cell wide. The lowest piece above the cut keeps the id; without one, the stem does.
+    The paper names three numbers and their purpose, tall trees in shorter pieces that do not block the walking grid
+    from afar, but no rule; this is ours. The stem is one cell wide. The lowest piece above the cut keeps the id;
+    without one, the stem does.
 
     Args:
         used_ids: ids that new boxes may not take.
@@ -475,8 +479,8 @@ def crop_below_ground(box_map: BoxMap, *, clip: bool = False) -> BoxMap:
 def prune_nested(box_map: BoxMap, tolerance_m: float) -> BoxMap:
     """Drop boxes that lie inside another of the same kind; of equal boxes the one with the smallest id stays.
 
-    Inside means: all corners of the axis-aligned bounds in the other box as it is turned. For unturned boxes that is the paper's
-    rule (sec:step2); for turned ones it never drops a box that sticks out of a turned one's empty corners.
+    Inside means: all corners of the axis-aligned bounds in the other box as it is turned. For unturned boxes that is
+    the paper's rule (sec:step2); for turned ones it never drops a box that sticks out of a turned one's empty corners.
     """
     keep = np.ones(len(box_map), dtype=bool)
     mins, maxs = box_map.mins, box_map.maxs

@@ -1,4 +1,4 @@
-"""Stage `simplify`: the passes of passes.py over one map, a report of what they cost in walkable ground, and a picture of it."""
+"""Stage `simplify`: the passes over one map, a report of what they cost in walkable ground, and a picture."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ log = logging.getLogger(__name__)
 def cross_validate(raw: BoxMap, simplified: BoxMap) -> dict:
     """Compare two maps on the pedestrian-height grid of Step 3: cell agreement, IoU, and the walkable area of each.
 
-    The walkable area counts cells that stay free after the safety radius; its largest part is what paths are sampled from.
+    The walkable area counts cells that stay free after the safety radius; its largest part is what paths are sampled
+    from.
     """
     grid = empty_grid(raw)
     before, after = (occupancy(m, like=grid) for m in (raw, simplified))
@@ -67,7 +68,7 @@ def _compare_trunks(raw: BoxMap, cfg: SimplifyConfig) -> dict:
 
 
 def run(cfg: SimplifyConfig, maps: Path, out: Path, *, resume: Resume = "if-same") -> Path:
-    """Reads `boxes_3d.json`; writes `step2_simplified.json`, `simplify_report.json` and the before/after `simplify.png`."""
+    """Reads `boxes_3d.json`; writes `step2_simplified.json`, `simplify_report.json` and `simplify.png`."""
     stage = StageFolder.open(out, "simplify", config=cfg, inputs={"maps": maps}, seed=0, resume=resume)
     product = out / "step2_simplified.json"
     if stage.is_complete:

@@ -1,4 +1,4 @@
-"""Figures of a flight: dynamics by discrete differentiation, distances, visibility (sec:step6). Used by planners and inspect."""
+"""Figures of a flight: dynamics by discrete differentiation, distances, visibility (sec:step6)."""
 
 from __future__ import annotations
 

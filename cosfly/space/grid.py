@@ -1,8 +1,8 @@
 """The ground as cells: which ones a person can stand on, and which of those hang together.
 
 Boxes become occupied cells (Step 3 of the paper), occupied cells grow by a safety radius, a region of interest cuts out
-what is left, and connected parts of it are labelled. Nothing here samples or searches; see the rooms `pedestrians` and `simplify`.
-Arrays are indexed [y_index, x_index]; cell (x_index, y_index) covers one square of `resolution_m`.
+what is left, and connected parts of it are labelled. Nothing here samples or searches; see the rooms `pedestrians` and
+`simplify`. Arrays are indexed [y_index, x_index]; cell (x_index, y_index) covers one square of `resolution_m`.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class OccupancyGrid:
         return self.occupied.shape[1], self.occupied.shape[0]
 
     def cells_at(self, points_m: np.ndarray) -> np.ndarray:
-        """Give (..., 2) int64 x and y indices of (..., 2) world points: floor((x - x_min) / resolution). May lie outside."""
+        """Give (..., 2) int64 x and y indices of (..., 2) world points, which may lie outside."""
         origin = np.array([self.x_min_m, self.y_min_m])
         return np.floor((np.asarray(points_m, dtype=np.float64)[..., :2] - origin) / self.resolution_m).astype(np.int64)
 
@@ -88,8 +88,9 @@ def empty_grid(box_map: BoxMap, resolution_m: float = RESOLUTION_M) -> Occupancy
 def blocks_walking(box_map: BoxMap, *, height_m: float = HUMAN_HEIGHT_M) -> np.ndarray:
     """Tell which boxes stand in a person's way, (n,) bool.
 
-    A box does if it reaches into the interval from the ground to `height_m` above it; touching an end of the interval does not
-    count. Where the ground slopes, the interval is that of all the ground under the box. Surfaces (GROUND_KINDS) never do; water does whatever its height, for nobody walks on it.
+    A box does if it reaches into the interval from the ground to `height_m` above it; touching an end of the interval
+    does not count. Where the ground slopes, the interval is that of all the ground under the box. Surfaces
+    (GROUND_KINDS) never do; water does whatever its height, for nobody walks on it.
     """
     mins, maxs = box_map.mins, box_map.maxs
     lowest, highest = box_map.ground.range_under(mins, maxs)
@@ -106,12 +107,13 @@ def occupancy(
 ) -> OccupancyGrid:
     """Mark the cells that boxes stand on.
 
-    The rule is conservative: a cell is occupied if the part of a box between the ground and `height_m` covers any of its area,
-    however little (more than TOUCH_M deep). Boxes are rasterised exactly as they are turned, not as their axis-aligned bounds.
+    The rule is conservative: a cell is occupied if the part of a box between the ground and `height_m` covers any of
+    its area, however little (more than TOUCH_M deep). Boxes are rasterised exactly as they are turned, not as their
+    axis-aligned bounds.
 
     Args:
-        like: take this grid's cells instead of the map's own bounds (its occupied cells and `resolution_m` are ignored), so
-            that two maps can be compared; what lies outside is left out.
+        like: take this grid's cells instead of the map's own bounds (its occupied cells and `resolution_m` are
+            ignored), so that two maps can be compared; what lies outside is left out.
     Returns:
         a grid, (ny, nx).
     Source: Step 3 of the paper (sec:step3).
@@ -126,7 +128,7 @@ def occupancy(
 
 
 def lies_off_ground(box_map: BoxMap, kinds: Collection[int]) -> np.ndarray:
-    """Tell which boxes of some kinds have their top more than SURFACE_REACH_M over or under the ground under their middle, (n,) bool."""
+    """Tell which boxes of some kinds have their top more than SURFACE_REACH_M off the ground below, (n,) bool."""
     over_m = box_map.maxs[:, 2] - box_map.ground.height_at(box_map.centers)
     return box_map.is_any_of(kinds) & (np.abs(over_m) > SURFACE_REACH_M)
 
@@ -197,8 +199,9 @@ def _slice_points(corners, box, low, high, points):  # pragma: no cover (compile
 def _fill_hull(points, count, touch, occupied):  # pragma: no cover (compiled)
     """Mark the cells that the convex hull of the first `count` points (k, 2), in cells, overlaps.
 
-    The part of a convex shape inside one row of cells spans one interval of x, and exactly the cells that meet the interval
-    overlap the shape. The ends of the interval lie on points or on lines between two of them, so the hull is never built.
+    The part of a convex shape inside one row of cells spans one interval of x, and exactly the cells that meet the
+    interval overlap the shape. The ends of the interval lie on points or on lines between two of them, so the hull is
+    never built.
     """
     num_y = len(occupied)
     bottom, top = np.inf, -np.inf
@@ -248,8 +251,8 @@ def compare(one: OccupancyGrid, other: OccupancyGrid) -> tuple[float, float]:
 def inflate(grid: OccupancyGrid, radius_m: float) -> OccupancyGrid:
     """Grow the occupied cells by an exact disc.
 
-    A cell becomes occupied if its centre lies within `radius_m` of the centre of an occupied one: at 0.5 m cells, 0.5 m adds
-    the four straight neighbours, and 1.0 m is the circular element of two cells of app:simworld:step4.
+    A cell becomes occupied if its centre lies within `radius_m` of the centre of an occupied one: at 0.5 m cells, 0.5 m
+    adds the four straight neighbours, and 1.0 m is the circular element of two cells of app:simworld:step4.
 
     Raises:
         ValueError: the radius is negative.
@@ -278,8 +281,8 @@ def connected_parts(free: np.ndarray, connectivity: int) -> tuple[np.ndarray, np
     """Label connected free cells.
 
     Args:
-        free: (ny, nx) bool; connectivity: 8 (the paper's components) or 4. A search that never cuts a corner moves exactly
-            within 4-connected parts: each of its diagonal steps has two straight ones beside it.
+        free: (ny, nx) bool; connectivity: 8 (the paper's components) or 4. A search that never cuts a corner moves
+            exactly within 4-connected parts: each of its diagonal steps has two straight ones beside it.
     Returns:
         labels (ny, nx) int32, 0 where not free; sizes (num_labels,) int64 in cells, sizes[0] = 0.
     """

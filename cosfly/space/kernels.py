@@ -1,8 +1,8 @@
 """Compiled geometry of many oriented boxes: distance, outward normal, blocked segments, five-ray visibility.
 
-`BoxIndex` sorts boxes into square cells of the xy plane, so that a query looks at the few boxes near it. Functions whose
-names say `..._box` or that take single coordinates are for other compiled code; those that take arrays check their arguments.
-Nothing here runs in parallel: the stages spread items over processes.
+`BoxIndex` sorts boxes into square cells of the xy plane, so that a query looks at the few boxes near it. Functions
+whose names say `..._box` or that take single coordinates are for other compiled code; those that take arrays check
+their arguments. Nothing here runs in parallel: the stages spread items over processes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ RAY_SPREAD_M = 0.8  # the longest of the offsets
 CORNER = 3.0**0.5  # so many times what a turned box grows by, its corners come out of its extent at most
 
 
-# Columns of BoxIndex.rows; u, v, w are the axes of a box's own frame: x = XU u + XV v + XW w + CENTER_X. Places in BoxIndex.grid.
+# Columns of BoxIndex.rows; u, v, w are the axes of a box's own frame: x = XU u + XV v + XW w + CENTER_X. Places in
+# BoxIndex.grid.
 CENTER_X, CENTER_Y, CENTER_Z, HALF_X, HALF_Y, HALF_Z, XU, XV, XW, YU, YV, YW, ZU, ZV, ZW = range(15)
 LOW_X, LOW_Y, LOW_Z, HIGH_X, HIGH_Y, HIGH_Z = range(15, 21)
 ORIGIN_X, ORIGIN_Y, CELL = range(3)
@@ -37,8 +38,8 @@ ORIGIN_X, ORIGIN_Y, CELL = range(3)
 class BoxIndex(NamedTuple):
     """Oriented boxes and the cells that hold them; k boxes.
 
-    rows: (k, 21) m, one box in three cache lines: centre, half extents, world_from_box row by row, low and high corner of the
-    axis-aligned bounds. grid: (3,) low corner of cell (0, 0) and cell size, m. shape: (2,) cells along x and y.
+    rows: (k, 21) m, one box in three cache lines: centre, half extents, world_from_box row by row, low and high corner
+    of the axis-aligned bounds. grid: (3,) low corner of cell (0, 0) and cell size, m. shape: (2,) cells along x and y.
     starts: (cells + 1,) and members: (m,): cell c = ix * shape[1] + iy holds members[starts[c]:starts[c + 1]].
     """
 
@@ -58,7 +59,8 @@ def index_boxes(
     """Sort boxes into cells.
 
     Args:
-        centers, half_extents: (k, 3) m. rotations: (k, 3, 3) world_from_box. cell_m: wanted cell size, grown if the map is vast.
+        centers, half_extents: (k, 3) m. rotations: (k, 3, 3) world_from_box. cell_m: wanted cell size, grown if the map
+            is vast.
     Raises:
         ValueError: a shape is wrong, a number is not finite, or a half extent is negative.
     """
@@ -85,7 +87,8 @@ def index_boxes(
 def obstacle_index(box_map: BoxMap) -> BoxIndex:
     """Index the boxes of a map that a drone can hit or that can hide a person (NO_OBSTACLE_KINDS left out).
 
-    Ground that slopes is among them, as solid boxes after the map's own: a hillside can be flown into, and can hide somebody.
+    Ground that slopes is among them, as solid boxes after the map's own: a hillside can be flown into, and can hide
+    somebody.
     """
     solid = box_map.select(~box_map.is_any_of(NO_OBSTACLE_KINDS))
     boxes = solid.centers, solid.half_extents, rotation_matrices(np.radians(solid.rotations_deg))
@@ -120,7 +123,8 @@ def _fill_cells(first, last, shape):
 # --- one box ----------------------------------------------------------------------------------------------------------
 
 
-# Single numbers of a row are read, not slices: a slice costs two atomic reference counts, more than the arithmetic around it.
+# Single numbers of a row are read, not slices: a slice costs two atomic reference counts, more than the arithmetic
+# around it.
 
 
 @njit(cache=True, inline="always")
@@ -197,7 +201,7 @@ def clip(origin, direction, half, enter, leave):
 
 @njit(cache=True, inline="always")
 def touches(rows, box, a, b, c, u, v, w, inflate_m):
-    """Tell whether a segment in a box's frame touches the box grown by `inflate_m` (slab method, Kay and Kajiya 1986)."""
+    """Tell whether a segment in a box's frame touches the box grown by `inflate_m` (slabs, Kay and Kajiya 1986)."""
     enter, leave = clip(a, u - a, rows[box, HALF_X] + inflate_m, 0.0, 1.0)
     enter, leave = clip(b, v - b, rows[box, HALF_Y] + inflate_m, enter, leave)
     enter, leave = clip(c, w - c, rows[box, HALF_Z] + inflate_m, enter, leave)
@@ -231,7 +235,8 @@ def nearest_box(index, x, y, z, reach_m):
     if len(index.rows) == 0:
         return best, best_box
     num_x, num_y = index.shape[0], index.shape[1]
-    # The grid is convex: the distance from the nearest point of the grid is a lower bound of the distance from outside it.
+    # The grid is convex: the distance from the nearest point of the grid is a lower bound of the distance from outside
+    # it.
     gx = min(max((x - index.grid[ORIGIN_X]) / index.grid[CELL], 0.0), float(num_x))
     gy = min(max((y - index.grid[ORIGIN_Y]) / index.grid[CELL], 0.0), float(num_y))
     cx, cy = min(int(gx), num_x - 1), min(int(gy), num_y - 1)

@@ -1,7 +1,9 @@
-"""One frame seen from another: points of a depth image carried through both poses into the next picture, and what is found there.
+"""One frame seen from another: points of a depth image carried through both poses into the next picture, and what is
+found there.
 
-What stands still has the depth that the poses give it from both places, and the same instance. So depth, masks, poses, intrinsics and times
-bear witness against each other, whatever a file says of them. Colours say nothing: light, weather, zoom and renderers change them.
+What stands still has the depth that the poses give it from both places, and the same instance. So depth, masks, poses,
+intrinsics and times bear witness against each other, whatever a file says of them. Colours say nothing: light, weather,
+zoom and renderers change them.
 """
 
 from __future__ import annotations
@@ -19,17 +21,20 @@ LEAST_SHIFTED = 12  # points of a thing
 SHARED_ID = 65534  # of several things: docs/files.md
 MOVING = np.zeros(256, np.bool_)  # kinds of pixels that may be elsewhere in the next frame
 MOVING[[12, 13, 14, 15, 16, 17, 18, 19, 21]] = True  # people, riders, vehicles, what is dynamic (CARLA 0.9.16)
-# Kinds of surfaces that people and cars stand on, and water. Maps lay them on each other in one plane (two roads at their crossing), where a
-# renderer's rounding decides pixel by pixel whose id shows: of these the kind alone tells what is seen.
+# Kinds of surfaces that people and cars stand on, and water. Maps lay them on each other in one plane (two roads at
+# their crossing), where a renderer's rounding decides pixel by pixel whose id shows: of these the kind alone tells what
+# is seen.
 FLAT = np.zeros(256, np.bool_)
 FLAT[[1, 2, 10, 23, 24, 25, 27]] = True
-# Depth of a surface that is seen slantwise changes within a pixel; half a pixel of a 45 degree slope at 50 m and 500 px is 0.05 m.
+# Depth of a surface that is seen slantwise changes within a pixel; half a pixel of a 45 degree slope at 50 m and 500 px
+# is 0.05 m.
 TOLERANCE_SHARE, TOLERANCE_M = 0.02, 0.1
 
 
 @dataclass(frozen=True)
 class View:
-    """A frame. depth (h, w) float32 m; instance (h, w, 3) uint8 as in `instance.png`, or (0, 0, 3) where there is none; rotation:
+    """A frame. depth (h, w) float32 m; instance (h, w, 3) uint8 as in `instance.png`, or (0, 0, 3) where there is none;
+    rotation:
     world_from_camera (3, 3); position_m (3,).
     """
 
@@ -41,12 +46,12 @@ class View:
 
 @dataclass(frozen=True)
 class Agreement:
-    """What became of the points. seen: those that lie in the other picture; of them have the depth that stands there (agree), lie behind
-    it (hidden), or before it, where nothing is (through). same: of those that agree, the same instance, of flat ground the same kind. planes: of
-    those that agree, on planes there; error: median of these, as a share of the depth; error_flat, error_standing: of those of them that are ground and
-    that are not; NaN: too few.
-    shifted: points of one thing that is farther there, as most of it is; renamed: of one that has its depth there and another id, as most of
-    it has; 0 where there is none.
+    """What became of the points. seen: those that lie in the other picture; of them have the depth that stands there
+    (agree), lie behind it (hidden), or before it, where nothing is (through). same: of those that agree, the same
+    instance, of flat ground the same kind. planes: of those that agree, on planes there; error: median of these, as a
+    share of the depth; error_flat, error_standing: of those of them that are ground and that are not; NaN: too few.
+    shifted: points of one thing that is farther there, as most of it is; renamed: of one that has its depth there and
+    another id, as most of it has; 0 where there is none.
     """
 
     seen: int
@@ -68,7 +73,8 @@ def compare_views(
     """Carry the grid's points of one frame into another.
 
     Args:
-        intrinsics: (4,) fx, fy, cx, cy of both. others_intrinsics: those of the other, where the camera zoomed between them.
+        intrinsics: (4,) fx, fy, cx, cy of both. others_intrinsics: those of the other, where the camera zoomed between
+            them.
     """
     intrinsics = intrinsics.astype(np.float64)
     others = intrinsics if others_intrinsics is None else others_intrinsics.astype(np.float64)
@@ -78,8 +84,8 @@ def compare_views(
     )
     seen, agree, hidden, through, same = counts.tolist()
     return Agreement(
-        seen, agree, hidden, through, same, len(errors), _error_of(errors), _error_of(errors[~standing]), _error_of(errors[standing]),
-        _most_of_one(firm, moved), _most_of_one(firm, renamed),
+        seen, agree, hidden, through, same, len(errors), _error_of(errors), _error_of(errors[~standing]),
+        _error_of(errors[standing]), _most_of_one(firm, moved), _most_of_one(firm, renamed),
     )  # fmt: skip
 
 
@@ -95,7 +101,7 @@ def median_of(values: np.ndarray) -> float:
 
 
 def _most_of_one(firm: np.ndarray, odd: np.ndarray) -> int:
-    """Give the points of the thing that is odd at most points. firm, odd: ids at points well inside one thing, as it should be and not."""
+    """Give the points of the thing most of whose points are odd. firm, odd: ids at points well inside one thing."""
     if len(odd) < LEAST_SHIFTED:
         return 0
     counts = np.bincount(odd, minlength=SHARED_ID + 1)
@@ -106,9 +112,10 @@ def _most_of_one(firm: np.ndarray, odd: np.ndarray) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, moving, flat):  # type: ignore[no-untyped-def]
-    """Counts (5,), errors (k,) and which of them are of no flat ground; of points among nothing but their own thing its id, of those with its depth
-    and of those that are farther; of points with its depth among nothing but one other thing their own id."""
+def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, moving, flat):  # type: ignore
+    """Counts (5,), errors (k,) and which of them are of no flat ground; of points among nothing but their own thing its
+    id, of those with its depth and of those that are farther; of points with its depth among nothing but one other
+    thing their own id."""
     height, width = depth_a.shape
     others_height, others_width = depth_b.shape
     has_ids = inst_a.shape[0] > 0 and inst_b.shape[0] > 0
@@ -164,7 +171,7 @@ def _carry(depth_a, inst_a, depth_b, inst_b, intrinsics, others, turn, shift, mo
 
 @njit(cache=True, nogil=True)
 def _carried_point(u, v, d, intrinsics, others, turn, shift):  # type: ignore[no-untyped-def]
-    """Where the middle of pixel (u, v), at depth d, comes out in the other picture: px, px, and its depth there, m; NaN px where nearer than NEAR_M."""
+    """Where the middle of pixel (u, v) at depth d comes out in the other picture, px, and its depth, m; or NaN."""
     x, y = (u + 0.5 - intrinsics[2]) / intrinsics[0] * d, (v + 0.5 - intrinsics[3]) / intrinsics[1] * d
     z = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * d + shift[2]
     if z < NEAR_M:
@@ -176,8 +183,9 @@ def _carried_point(u, v, d, intrinsics, others, turn, shift):  # type: ignore[no
 
 @njit(cache=True, nogil=True)
 def _around(depth, instance, row, column, z, inst_a, v, u, has_ids, moving, flat):  # type: ignore[no-untyped-def]
-    """What nine pixels say of a point at depth z, of the thing at (v, u) of `inst_a`: least distance in depth, least depth beyond it; is it nearer than all;
-    does one show its thing, or a surface that may show in its place; does none show who moves; do all show its thing; do all show one."""
+    """What nine pixels say of a point at depth z, of the thing at (v, u) of `inst_a`: least distance in depth, least
+    depth beyond it; is it nearer than all; does one show its thing, or a surface that may show in its place; does none
+    show who moves; do all show its thing; do all show one."""
     best, least, is_through, is_same, is_free, is_whole, is_one = 1e9, 1e9, True, not has_ids, True, has_ids, has_ids
     for y in range(row - 1, row + 2):
         for x in range(column - 1, column + 2):

@@ -1,4 +1,5 @@
-"""Steps 2 to 4: times of simplification, walks and planners, the flights' quality, each beside a library: scipy's Dijkstra and L-BFGS-B, shapely's tree.
+"""Steps 2 to 4: times of simplification, walks and planners, the flights' quality, each beside a library: scipy's
+Dijkstra and L-BFGS-B, shapely's tree.
 
 python tests/benchmarks/bench_planning.py [--maps a b c] [--planners muco ...]
 """
@@ -185,9 +186,11 @@ def measure(scene: Scene, planner: str, cfg: PlanConfig) -> list:
         facts.append((len(p), seen, clearance_m, hits, smooth, metrics.length_m(p), accel, jerk))
     table, all_ms = np.array(facts, dtype=float), np.array(times)
     return [
-        scene.name, planner, len(scene.obstacles.rows), f"{len(facts)} + {failed}", round(table[:, 0].mean()), float(all_ms.mean()),
+        scene.name, planner, len(scene.obstacles.rows), f"{len(facts)} + {failed}", round(table[:, 0].mean()),
+        float(all_ms.mean()),
         float(np.percentile(all_ms, 95)), float(all_ms.max()), f"{table[:, 1].mean():.3f}", f"{table[:, 1].min():.3f}",
-        f"{table[:, 2].min():.2f}", int(table[:, 3].sum()), f"{int(table[:, 4].sum())} of {len(facts)}", float(table[:, 5].mean()),
+        f"{table[:, 2].min():.2f}", int(table[:, 3].sum()), f"{int(table[:, 4].sum())} of {len(facts)}",
+        float(table[:, 5].mean()),
         f"{table[:, 6].mean():.2f} / {table[:, 7].mean():.2f}",
     ]  # fmt: skip
 
@@ -195,7 +198,8 @@ def measure(scene: Scene, planner: str, cfg: PlanConfig) -> list:
 def compare_with_scipy(scene: Scene, cfg: PlanConfig) -> list:
     """The same loss, start and bounds for both; times of the optimisation alone.
 
-    The rule that takes low-visibility runs out of the gradient is no part of the loss and is off for both; the last column has MuCO with it.
+    The rule that takes low-visibility runs out of the gradient is no part of the loss and is off for both; the last
+    column has MuCO with it.
     """
     rows, without_rule = [], cfg.muco.model_copy(update={"low_visibility_frames": 1_000_000})
     for scenario in scene.scenarios:
@@ -215,7 +219,8 @@ def compare_with_scipy(scene: Scene, cfg: PlanConfig) -> list:
         ]
         peer_ms, peer = scenes.cpu_ms(
             lambda f=first, call=loss_and_gradient, b=bounds: minimize(
-                call, f[1:-1].reshape(-1), jac=True, method="L-BFGS-B", bounds=b, options={"maxiter": 3000, "maxfun": 6000}
+                call, f[1:-1].reshape(-1), jac=True, method="L-BFGS-B", bounds=b,
+                options={"maxiter": 3000, "maxfun": 6000}
             )
         )  # fmt: skip
         rows.append(
@@ -231,8 +236,10 @@ def compare_with_scipy(scene: Scene, cfg: PlanConfig) -> list:
         )
     table = np.array(rows)
     return [
-        scene.name, float(table[:, 0].mean()), float(table[:, 1].mean()), f"{table[:, 1].mean() / table[:, 0].mean():.1f}",
-        f"{np.median(table[:, 2]):.3f}", f"{table[:, 2].max():.3f}", f"{int((table[:, 2] <= 1.05).sum())} of {len(table)}",
+        scene.name, float(table[:, 0].mean()), float(table[:, 1].mean()),
+        f"{table[:, 1].mean() / table[:, 0].mean():.1f}",
+        f"{np.median(table[:, 2]):.3f}", f"{table[:, 2].max():.3f}",
+        f"{int((table[:, 2] <= 1.05).sum())} of {len(table)}",
         float(table[:, 3].mean()), float(table[:, 4].mean()), float(table[:, 5].mean()),
         f"{int((table[:, 6] <= 1.05).sum())} of {len(table)}, {table[:, 6].max():.3f}",
     ]  # fmt: skip
@@ -253,7 +260,8 @@ def main() -> None:
         rows += [measure(scene, planner, cfg) for scene in found]
     print()
     names = [
-        "map", "planner", "obstacles", "flights + failed", "points", "mean ms", "p95 ms", "max ms", "visibility", "worst",
+        "map", "planner", "obstacles", "flights + failed", "points", "mean ms", "p95 ms", "max ms", "visibility",
+        "worst",
         "clearance, m", "collisions", "smooth", "length, m", "acceleration / jerk, RMS",
     ]  # fmt: skip
     scenes.print_table("planning, start included", names, rows)

@@ -1,8 +1,10 @@
 """MuCO's loss, compiled: every term with its gradient and a positive semi-definite model of its curvature.
 
-Loss of a trajectory p_0 .. p_{n-1} (subsec:appendix_planner_muco): sums over waypoints of seven weighted terms plus the altitude
-and pitch regularisers. Where the paper leaves a choice, it is made here and said at the term. The curvature is Gauss-Newton:
-a square w r^2 with dr/dp = a adds 2 w a a^T. It is kept as a band matrix, because a term couples at most four neighbours.
+Loss of a trajectory p_0 .. p_{n-1} (subsec:appendix_planner_muco): sums over waypoints of seven weighted terms plus the
+altitude and pitch regularisers. Where the paper leaves a choice, it is made here and said at the term. The curvature is
+Gauss-Newton:
+a square w r^2 with dr/dp = a adds 2 w a a^T. It is kept as a band matrix, because a term couples at most four
+neighbours.
 """
 
 from __future__ import annotations
@@ -25,14 +27,17 @@ from cosfly.space.kernels import (
 from cosfly.work.compiled import int64, njit
 
 # --- window of frames -------------------------------------------------------------------------------------------------
-# What the five rays see from a waypoint and its neighbours half a metre away: the difference window of MuCO's visibility term.
+# What the five rays see from a waypoint and its neighbours half a metre away: the difference window of MuCO's
+# visibility term.
 
 
 @njit(cache=True)
 def window_rays(rows, boxes, num_boxes, x, y, z, step_m, tx, ty, tz, free):
-    """Put `free_rays` of a point and of its six neighbours at +-step_m into `free`, (7,): middle, -x, +x, -y, +y, -z, +z.
+    """Put `free_rays` of a point and of its six neighbours at +-step_m into `free`, (7,): middle, -x, +x, -y, +y, -z,
+    +z.
 
-    From (x, y, z) to (tx, ty, tz): the same tests as seven calls of `free_rays`, but each box sees each of the twelve ends of the rays once.
+    From (x, y, z) to (tx, ty, tz): the same tests as seven calls of `free_rays`, but each box sees each of the twelve
+    ends of the rays once.
     """
     blocked = np.zeros((7, 5), dtype=np.bool_)
     ends, feet = np.empty((7, 3)), np.empty((5, 3))
@@ -82,9 +87,10 @@ THIRD_DIFFERENCE = np.array([-1.0, 3.0, -3.0, 1.0])
 class Problem(NamedTuple):
     """What stays fixed during one optimisation; n waypoints.
 
-    targets: (n, 3) m, hip points. views_rad: (n,) wished azimuth of the view. distances: (n,) m, wished. weights: (7,) in the order
-    of TERM_NAMES. altitudes: (n, 3) least, preferred, greatest z of each waypoint in the world, m. pitches_rad: (n, 3) lower edge of the
-    band, wished, upper edge. keeps_sight: (n,) bool, whether a waypoint has a visibility term. bearing_weight: of the view's azimuth.
+    targets: (n, 3) m, hip points. views_rad: (n,) wished azimuth of the view. distances: (n,) m, wished. weights: (7,)
+    in the order of TERM_NAMES. altitudes: (n, 3) least, preferred, greatest z of each waypoint in the world, m.
+    pitches_rad: (n, 3) lower edge of the band, wished, upper edge. keeps_sight: (n,) bool, whether a waypoint has a
+    visibility term. bearing_weight: of the view's azimuth.
     altitude_weights: (4,) below the least, above the preferred, oscillation, beneath the preferred.
     """
 
@@ -111,9 +117,10 @@ class State(NamedTuple):
     """What one evaluation writes; made once, used again.
 
     terms: (9,) the loss by term. gradient, visibility_gradient: (n, 3), the first without the second.
-    band: (BAND_ROWS, 3 n) the lower band of the curvature. visibility: (n,) five-ray visibility. rough: (n,) share of each
-    waypoint in the terms that have kinks and stairs, visibility and safety.
-    blockers: (k,) room for box numbers. contacts: (n, 3) unit normal of the obstacle that a waypoint touches, else zero.
+    band: (BAND_ROWS, 3 n) the lower band of the curvature. visibility: (n,) five-ray visibility. rough: (n,) share of
+    each waypoint in the terms that have kinks and stairs, visibility and safety.
+    blockers: (k,) room for box numbers. contacts: (n, 3) unit normal of the obstacle that a waypoint touches, else
+    zero.
     nearby: boxes remembered from earlier evaluations; states may share them.
     """
 
@@ -131,8 +138,9 @@ class State(NamedTuple):
 def make_state(num_points: int, num_boxes: int) -> State:
     """Give empty room for evaluations."""
     return State(
-        np.zeros(len(TERM_NAMES)), np.zeros((num_points, 3)), np.zeros((num_points, 3)), np.zeros((BAND_ROWS, 3 * num_points)),
-        np.zeros(num_points), np.zeros(num_points), np.zeros(num_boxes, dtype=np.int64), np.zeros((num_points, 3)),
+        np.zeros(len(TERM_NAMES)), np.zeros((num_points, 3)), np.zeros((num_points, 3)),
+        np.zeros((BAND_ROWS, 3 * num_points)), np.zeros(num_points), np.zeros(num_points),
+        np.zeros(num_boxes, dtype=np.int64), np.zeros((num_points, 3)),
         nothing_nearby(num_points),
     )  # fmt: skip
 
@@ -149,8 +157,8 @@ def evaluate(points, problem, index, masked, state):
     """Fill `state` for a trajectory and give its loss.
 
     Args:
-        points: (n, 3) m. masked: (n,) bool, waypoints in a low-visibility run: their visibility and view-angle terms stay in
-            the loss but out of gradient and curvature.
+        points: (n, 3) m. masked: (n,) bool, waypoints in a low-visibility run: their visibility and view-angle terms
+            stay in the loss but out of gradient and curvature.
     """
     state.terms.fill(0.0)
     state.gradient.fill(0.0)
@@ -167,8 +175,8 @@ def evaluate(points, problem, index, masked, state):
 # --- terms of one waypoint --------------------------------------------------------------------------------------------
 
 
-# These functions run over many waypoints each, with arrays taken out of their tuples first: handing a tuple of arrays on costs an
-# atomic count for each array, which for one waypoint is more than the arithmetic.
+# These functions run over many waypoints each, with arrays taken out of their tuples first: handing a tuple of arrays
+# on costs an atomic count for each array, which for one waypoint is more than the arithmetic.
 
 
 @njit(cache=True, inline="always")
@@ -220,8 +228,9 @@ def point_terms(points, begin, end, problem, index, masked, state):
                 if gap < problem.safety_m + 0.01:
                     contacts[i, 0], contacts[i, 1], contacts[i, 2] = nx, ny, nz
 
-        # View angle: deviations, in radians, of the downward pitch from the wished (the paper: 45 degrees) and of the view's azimuth
-        # (the walking direction). Straight above the target both lose their meaning: a floor of one metre keeps their derivatives finite.
+        # View angle: deviations, in radians, of the downward pitch from the wished (the paper: 45 degrees) and of the
+        # view's azimuth (the walking direction). Straight above the target both lose their meaning: a floor of one
+        # metre keeps their derivatives finite.
         flat = max(np.sqrt(dx * dx + dy * dy), 1.0)
         pitch, square = np.arctan2(dz, flat), flat * flat + dz * dz
         px, py, pz = -dz * dx / flat / square, -dz * dy / flat / square, flat / square
@@ -245,9 +254,9 @@ def point_terms(points, begin, end, problem, index, masked, state):
 
 @njit(cache=True)
 def visibility_terms(points, problem, index, masked, state):
-    """(1 - V)^2 of every waypoint, V the five-ray fraction averaged over the difference window: the waypoint and its six
-    neighbours at +-difference_m. The raw fraction is a staircase; the average rises in steps of 1/35 and the central
-    difference over the same window is its slope.
+    """(1 - V)^2 of every waypoint, V the five-ray fraction averaged over the difference window: the waypoint and its
+    six neighbours at +-difference_m. The raw fraction is a staircase; the average rises in steps of 1/35 and the
+    central difference over the same window is its slope.
     """
     # Any ray of the window stays within this of the middle ray, at its foot and at its head.
     spread = max(RAY_SPREAD_M, problem.difference_m)
@@ -374,8 +383,9 @@ def _add_lengths(points, begin, end, weight, state):
 def difference_gradient(points, problem, index, masked, state, gradient):
     """The paper's gradient: central differences of +-difference_m of the terms that a waypoint takes part in.
 
-    Altitudes stay within their bounds, or the penalty below the least altitude would lift every waypoint that flies at it.
-    Writes `gradient` (n, 3), without the visibility term, whose own gradient is a difference already; `state` is overwritten.
+    Altitudes stay within their bounds, or the penalty below the least altitude would lift every waypoint that flies at
+    it. Writes `gradient` (n, 3), without the visibility term, whose own gradient is a difference already; `state` is
+    overwritten.
     """
     state.contacts.fill(0.0)
     for i in range(len(points)):

@@ -1,8 +1,9 @@
 """MuCO: one trajectory, optimised as a whole against seven terms (subsec:appendix_planner_muco).
 
-The paper's plain gradient step overshoots with its own weights: 0.05 times a curvature of several hundred is far beyond two, so its
-waypoints end up jumping to and fro by the step cap. The default step here solves the band system of the Gauss-Newton model instead,
-caps it per waypoint, projects, and is shortened until the loss falls; `step: paper` is the paper's optimizer as it is printed.
+The paper's plain gradient step overshoots with its own weights: 0.05 times a curvature of several hundred is far beyond
+two, so its waypoints end up jumping to and fro by the step cap. The default step here solves the band system of the
+Gauss-Newton model instead, caps it per waypoint, projects, and is shortened until the loss falls; `step: paper` is the
+paper's optimizer as it is printed.
 """
 
 from __future__ import annotations
@@ -19,15 +20,17 @@ from cosfly.space.kernels import RAY_SPREAD_M, BoxIndex, collect_hits, free_rays
 from cosfly.work.compiled import njit
 
 # --- start ------------------------------------------------------------------------------------------------------------
-# Where a flight begins its life: at the wished places where that works, else the best of a coarse search round the walker.
+# Where a flight begins its life: at the wished places where that works, else the best of a coarse search round the
+# walker.
 #
 # The wished places (the paper: 20 m behind the walker and as high) end up inside towers and behind corners. Pushing
-# each waypoint out of a tower on its own would put neighbours on opposite sides of it; the search here chooses places that can be
-# reached from each other: dynamic programming over time, places on rings round the target, edges that keep their distance to boxes.
+# each waypoint out of a tower on its own would put neighbours on opposite sides of it; the search here chooses places
+# that can be reached from each other: dynamic programming over time, places on rings round the target, edges that keep
+# their distance to boxes.
 
 
-# Places tried round the target: NUM_AZIMUTHS on each ring. The first ring is the normal one, the second steeper (into canyons);
-# the others climb over what blocks the way and are tried only where the first two do not suffice.
+# Places tried round the target: NUM_AZIMUTHS on each ring. The first ring is the normal one, the second steeper (into
+# canyons); the others climb over what blocks the way and are tried only where the first two do not suffice.
 STEEP_RADIUS, STEEP_CLIMB_M = 0.6, 6.0
 NUM_CLIMBS = 5
 NUM_AZIMUTHS = 18
@@ -50,12 +53,14 @@ def search_start(
     Args:
         climbing: also try places higher than the normal and the steep ring.
     Returns:
-        (n, 3), straight between key frames, every point and segment `clearance_m` from all boxes; None if there is none.
+        (n, 3), straight between key frames, every point and segment `clearance_m` from all boxes; None if there is
+        none.
     """
     targets_m = problem.targets
     stride = max(1, round(BETWEEN_KEYS_S / problem.dt_s))
     keys = np.unique(np.append(np.arange(0, len(targets_m), stride), len(targets_m) - 1))
-    # Between key frames the flight is straight while the ground may rise and fall: a key frame keeps the bounds of all around it.
+    # Between key frames the flight is straight while the ground may rise and fall: a key frame keeps the bounds of all
+    # around it.
     around = 2 * stride + 1
     preferred_m = maximum_filter1d(problem.altitudes[:, PREFERRED], around, mode="nearest")[keys]
     greatest_m = minimum_filter1d(problem.altitudes[:, GREATEST], around, mode="nearest")[keys]
@@ -95,8 +100,8 @@ def _rings(distances_m: np.ndarray, preferred_m: np.ndarray, greatest_m: np.ndar
 def _search(places, targets, times, extra, sight, index, clearance_m, speed_max_mps):
     """Give the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
 
-    places: (m, c, 3), c = rings * azimuths. targets: (m, 3). times: (m,) s. extra: (rings, azimuths) cost of a place whatever
-    is seen from it. sight: (m,) bool, whether what is seen counts.
+    places: (m, c, 3), c = rings * azimuths. targets: (m, 3). times: (m,) s. extra: (rings, azimuths) cost of a place
+    whatever is seen from it. sight: (m,) bool, whether what is seen counts.
     """
     num_keys, num_places, num_azimuths = len(places), places.shape[1], extra.shape[1]
     blockers, one = np.empty(len(index.rows), dtype=np.int64), np.empty(1, dtype=np.int64)
@@ -208,7 +213,8 @@ def make_problem(scenario: Scenario, cfg: PlanConfig) -> Problem:
 def start_trajectory(
     scenario: Scenario, problem: Problem, obstacles: BoxIndex, cfg: PlanConfig
 ) -> tuple[np.ndarray, str]:
-    """Give a feasible trajectory to start from and its kind: `behind`, the wished places, or `search` where they are blocked or blind.
+    """Give a feasible trajectory to start from and its kind: `behind`, the wished places, or `search` where they are
+    blocked or blind.
 
     Raises:
         NoPathError: neither is feasible.

@@ -1,7 +1,9 @@
-"""What an optimiser remembers between iterations: for each waypoint, the few boxes that can matter to it while it stays near a place.
+"""What an optimiser remembers between iterations: for each waypoint, the few boxes that can matter to it while it stays
+near a place.
 
-A waypoint moves half a metre an iteration, so the boxes round it and between it and its target are the same for several. Answers do
-not depend on what is remembered: a waypoint that has left its place, or has too many boxes round it, is looked up in the index.
+A waypoint moves half a metre an iteration, so the boxes round it and between it and its target are the same for
+several. Answers do not depend on what is remembered: a waypoint that has left its place, or has too many boxes round
+it, is looked up in the index.
 """
 
 from __future__ import annotations
@@ -21,8 +23,9 @@ ROOM = 32  # boxes that are remembered for a waypoint; a list longer than this i
 class Nearby(NamedTuple):
     """Remembered boxes of n waypoints.
 
-    anchors: (n, 3) m, where the boxes were looked up; infinite where nothing is remembered. around, on_view: (n, ROOM) boxes within
-    reach of the waypoint, and across the view of its target. num_around, num_on_view: (n,) how many, -1 for more than ROOM.
+    anchors: (n, 3) m, where the boxes were looked up; infinite where nothing is remembered. around, on_view: (n, ROOM)
+    boxes within reach of the waypoint, and across the view of its target. num_around, num_on_view: (n,) how many, -1
+    for more than ROOM.
     """
 
     anchors: np.ndarray

@@ -1,8 +1,9 @@
 """MuCO's step, compiled: the feasible region, the projection onto it, and the search for a step that lowers the loss.
 
-The curvature that `loss.evaluate` leaves in `State.band` is solved as a band; the step is capped, projected and evaluated, all in
-one compiled call: a call from Python unpacks some forty arrays, which takes as long as a third of an evaluation. Loops stand where
-NumPy's whole-array forms would do, because the compiler takes seconds for each form that checks shapes.
+The curvature that `loss.evaluate` leaves in `State.band` is solved as a band; the step is capped, projected and
+evaluated, all in one compiled call: a call from Python unpacks some forty arrays, which takes as long as a third of an
+evaluation. Loops stand where NumPy's whole-array forms would do, because the compiler takes seconds for each form that
+checks shapes.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ class Rules(NamedTuple):
 def hold_bounds(points, problem, contacts, band, gradient):
     """Take out of gradient and curvature, in place, what would lead straight out of the feasible region.
 
-    A waypoint at the least or greatest altitude that is drawn beyond it keeps its z; one that touches an obstacle and is
-    drawn into it may only slide along it. Ends of the trajectory are for the caller to leave out.
+    A waypoint at the least or greatest altitude that is drawn beyond it keeps its z; one that touches an obstacle and
+    is drawn into it may only slide along it. Ends of the trajectory are for the caller to leave out.
     """
     for i in range(len(points)):
         normal = contacts[i]
@@ -102,8 +103,8 @@ def try_step(points, steps, scale, cap_m, as_a_whole, problem, index, masked, st
     """Cap, project and evaluate one trial step of the interior waypoints.
 
     Args:
-        points: (n, 3) m, kept. steps: (n - 2, 3) m. scale: share of it that is taken. cap_m: longest move of a waypoint; longer ones
-            are shortened each on its own, or all by the same factor (as_a_whole).
+        points: (n, 3) m, kept. steps: (n - 2, 3) m. scale: share of it that is taken. cap_m: longest move of a
+            waypoint; longer ones are shortened each on its own, or all by the same factor (as_a_whole).
         state, trial: written, what `evaluate` fills and the projected trajectory.
     Returns:
         the trial's loss, infinity if it is not feasible, and whether the step was capped.
@@ -135,15 +136,15 @@ def move(points, steps, scale, cap_m, as_a_whole, trial):
 def descend(points, problem, index, rules, states, history):
     """Improve a feasible trajectory, which is overwritten; its ends stay.
 
-    The visibility term is a staircase that the model does not see: where its slope leads nowhere, the step is tried without it,
-    and for 1, 2, 4 ... REST_MAX iterations it is not tried again.
+    The visibility term is a staircase that the model does not see: where its slope leads nowhere, the step is tried
+    without it, and for 1, 2, 4 ... REST_MAX iterations it is not tried again.
 
     Args:
-        points: (n, 3) m, n >= 3. states: two of `make_state`, written. history: (iterations_max + 1,) the loss before each
-            iteration and after the last, written.
+        points: (n, 3) m, n >= 3. states: two of `make_state`, written. history: (iterations_max + 1,) the loss before
+            each iteration and after the last, written.
     Returns:
-        the best trajectory (n, 3), its state, which waypoints are masked (n,), how many iterations and evaluations it took, and
-        a number in STOP_REASONS.
+        the best trajectory (n, 3), its state, which waypoints are masked (n,), how many iterations and evaluations it
+        took, and a number in STOP_REASONS.
     """
     now, spare = states
     damping, trial = np.zeros(len(points)), np.empty_like(points)
@@ -158,7 +159,8 @@ def descend(points, problem, index, rules, states, history):
         if rest == 0 and now.visibility_gradient.any():
             slope = _scaled_sum(smooth, now.visibility_gradient, 1.0)
             found, tried = newton_step(
-                points, loss, slope, damping, int64(TRIES_WITH_VISIBILITY), rules, problem, index, masked, now, spare, trial
+                points, loss, slope, damping, int64(TRIES_WITH_VISIBILITY), rules, problem, index, masked, now, spare,
+                trial,
             )  # fmt: skip
             num_tried += tried
             rest, next_rest = (next_rest, min(2 * next_rest, REST_MAX)) if found == np.inf else (0, 1)
@@ -182,10 +184,12 @@ def descend(points, problem, index, rules, states, history):
 
 @njit(cache=True)
 def descend_as_the_paper(points, problem, index, rules, states, history):
-    """The paper's optimizer: plain gradient steps by finite differences, capped per waypoint and projected, whatever the loss does.
+    """The paper's optimizer: plain gradient steps by finite differences, capped per waypoint and projected, whatever
+    the loss does.
 
-    A projection that cannot make the trajectory feasible stops nothing; later steps may. Converged when |change of the loss| is less
-    than the tolerance, which is absolute here. Arguments and results as of `descend`; the trajectory is the last feasible one.
+    A projection that cannot make the trajectory feasible stops nothing; later steps may. Converged when |change of the
+    loss| is less than the tolerance, which is absolute here. Arguments and results as of `descend`; the trajectory is
+    the last feasible one.
     """
     now, spare = states
     best, trial, gradient = points.copy(), points.copy(), np.empty_like(points)
@@ -217,7 +221,7 @@ def descend_as_the_paper(points, problem, index, rules, states, history):
 
 @njit(cache=True)
 def mask(points, problem, index, rules, masked, state):
-    """Give the waypoints in low-visibility runs, (n,); the loss does not change with them, gradient and model in `state` do."""
+    """Give the waypoints in low-visibility runs, (n,); gradient and model in `state` change with them, not the loss."""
     found = low_visibility_runs(state.visibility, rules.low_visibility, rules.low_visibility_frames)
     for i in range(len(found)):
         if found[i] != masked[i]:
@@ -252,13 +256,13 @@ def low_visibility_runs(fractions, threshold, frames):
 def newton_step(points, loss, gradient, damping, num_tries, rules, problem, index, masked, now, spare, trial):
     """Look for a step against `gradient` that lowers the loss.
 
-    A trial that fails only for what the rough terms of some waypoints rose by is solved again with these damped; any other failure
-    shortens the step, first as a whole where single waypoints were capped: a capped step may be no descent, because neighbours
-    move apart.
+    A trial that fails only for what the rough terms of some waypoints rose by is solved again with these damped; any
+    other failure shortens the step, first as a whole where single waypoints were capped: a capped step may be no
+    descent, because neighbours move apart.
 
     Args:
-        points: (n, 3) m, kept. loss, now: its loss and state. gradient: (n, 3), changed. damping: (n,) of single waypoints,
-            Levenberg's way, changed if a step is found.
+        points: (n, 3) m, kept. loss, now: its loss and state. gradient: (n, 3), changed. damping: (n,) of single
+            waypoints, Levenberg's way, changed if a step is found.
         spare, trial: written, state and (n, 3) places of the last trial.
     Returns:
         the loss of the trial, infinity if none lowers it, and how many were tried.
@@ -328,7 +332,8 @@ def project(points, problem, index, begin, end, nearby):
     """Bring waypoints [begin, end) into the feasible region in place and tell whether the whole trajectory is feasible.
 
     Order as in the paper: altitude clamp, cap of the step from the waypoint before, push-out. Feasible means: no step
-    longer than the cap, every clearance at least the relaxed floor, and no segment between waypoints that touches a box.
+    longer than the cap, every clearance at least the relaxed floor, and no segment between waypoints that touches a
+    box.
     """
     step_max = problem.step_max_m
     anchors, around, num_around, rows = nearby.anchors, nearby.around, nearby.num_around, index.rows
