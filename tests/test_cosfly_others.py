@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from cosfly.errors import InputError
 from cosfly.pedestrians.lanes import lanes_of
-from cosfly.pedestrians.others import CAR_FORWARD_MPS2, Course, and_back, braked, company_of
+from cosfly.pedestrians.others import CAR_FORWARD_MPS2, Trip, and_back, braked, company_of
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, run, walkable_ground
 from cosfly.pedestrians.walking import PACES, speeds_at, take_pace
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, write_boxes
@@ -58,7 +58,7 @@ def test_who_walks_there_and_back_gets_on_between_any_two_stops(name, num_waypoi
     for seed in range(60):
         rng = np.random.default_rng(seed)
         way = take_pace(line, PACES[name], rng)
-        course = Course(PERSON, way, speeds_at(way, PACES[name], cfg, rng))
+        course = Trip(PERSON, way, speeds_at(way, PACES[name], cfg, rng))
         for _ in range(3):
             course = and_back(course)
             along_m = course.along_m(np.linspace(0.0, 3000.0, 50))

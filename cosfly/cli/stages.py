@@ -13,7 +13,7 @@ from cosfly.cli.options import STAGE, Job, Sets, takes
 
 app = typer.Typer()
 
-Simplified = Annotated[Path, Option(help="Simplified map: step2_simplified.json.")]
+Simplification = Annotated[Path, Option(help="Simplification map: step2_simplified.json.")]
 Traces = Annotated[Path, Option(help="Flights: drone_trace.json.")]
 
 
@@ -108,7 +108,7 @@ app.add_typer(render_app, name="render")
 def render(
     job: Job,
     map_: options.Map,
-    simplified: Simplified,
+    simplified: Simplification,
     traces: Traces,
     out: options.Out,
     others: Annotated[Path | None, Option(help="Who else moves: others.json, beside path.json.")] = None,

@@ -10,7 +10,7 @@ from typer import Option
 
 from cosfly.cli import options
 from cosfly.cli.options import STAGE, Job, takes
-from cosfly.cli.stages import Simplified, Traces
+from cosfly.cli.stages import Simplification, Traces
 
 ABOUT = "Compare depth formats, levels of zoom and weathers on the same frames and flights."
 app = typer.Typer(no_args_is_help=True, help=ABOUT)
@@ -79,7 +79,7 @@ def study_weather(
 def study_zoom(
     job: Job,
     map_: options.Map,
-    simplified: Simplified,
+    simplified: Simplification,
     traces: Traces,
     out: options.Out,
     flights: Annotated[int | None, Option(show_default="50", help="Flights at most.")] = None,

@@ -32,7 +32,7 @@ NESTING = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2
 Form = Literal["solid", "wall", "surface", "green"]
 
 
-class Rule(NamedTuple):
+class ObjectRule(NamedTuple):
     """What objects of a CityJSON type are; with an attribute, only those whose value matches."""
 
     type: str
@@ -44,24 +44,26 @@ class Rule(NamedTuple):
 
 # The first rule that matches decides. Attribute values are those of the Dutch register BGT, as 3dfier writes them.
 RULES = (
-    Rule("Building*", "Buildings", "solid"),
-    Rule("Bridge*", "Bridge", "surface"),
-    Rule("Tunnel*", "Other", "surface"),
-    Rule("Road", "Sidewalks", "surface", "function", "voet*"),
-    Rule("Road", "Roads", "surface"),
-    Rule("TransportSquare", "Sidewalks", "surface"),
-    Rule("Railway", "RailTrack", "surface"),
-    Rule("Water*", "Water", "surface"),
-    Rule("LandUse", "Ground", "surface", "bgt_fysiekvoorkomen", "*verharding"),
-    Rule("LandUse", "Terrain", "surface"),
-    Rule("PlantCover", "Terrain", "green"),
-    Rule("SolitaryVegetationObject", "Vegetation", "solid"),
-    Rule("TINRelief", "Terrain", "surface"),
-    Rule("GenericCityObject", "Walls", "surface", "bgt_type", "kademuur"),  # a quay's edge is flush with the street
-    Rule("*GenericCityObject", "Walls", "wall", "bgt_type", "muur"),
-    Rule("*GenericCityObject", "Static", "wall"),
-    Rule("CityFurniture", "Static", "solid"),
-    Rule("OtherConstruction", "Static", "solid"),
+    ObjectRule("Building*", "Buildings", "solid"),
+    ObjectRule("Bridge*", "Bridge", "surface"),
+    ObjectRule("Tunnel*", "Other", "surface"),
+    ObjectRule("Road", "Sidewalks", "surface", "function", "voet*"),
+    ObjectRule("Road", "Roads", "surface"),
+    ObjectRule("TransportSquare", "Sidewalks", "surface"),
+    ObjectRule("Railway", "RailTrack", "surface"),
+    ObjectRule("Water*", "Water", "surface"),
+    ObjectRule("LandUse", "Ground", "surface", "bgt_fysiekvoorkomen", "*verharding"),
+    ObjectRule("LandUse", "Terrain", "surface"),
+    ObjectRule("PlantCover", "Terrain", "green"),
+    ObjectRule("SolitaryVegetationObject", "Vegetation", "solid"),
+    ObjectRule("TINRelief", "Terrain", "surface"),
+    ObjectRule(
+        "GenericCityObject", "Walls", "surface", "bgt_type", "kademuur"
+    ),  # a quay's edge is flush with the street
+    ObjectRule("*GenericCityObject", "Walls", "wall", "bgt_type", "muur"),
+    ObjectRule("*GenericCityObject", "Static", "wall"),
+    ObjectRule("CityFurniture", "Static", "solid"),
+    ObjectRule("OtherConstruction", "Static", "solid"),
 )
 
 
@@ -73,7 +75,7 @@ class CityObject(NamedTuple):
     """
 
     object_id: str
-    rule: Rule
+    rule: ObjectRule
     surfaces: list[list[np.ndarray]]
     detailed: list[list[np.ndarray]]
 
@@ -164,7 +166,7 @@ def _has_parts(value: dict, part: _Part) -> bool:
     return any(isinstance(name, str) and name in part.objects for name in names)
 
 
-def rule_of(object_type: str, attributes: dict) -> Rule | None:
+def rule_of(object_type: str, attributes: dict) -> ObjectRule | None:
     """Find what an object is. Extension types (a leading +) count as their base name."""
     for rule in RULES:
         if fnmatchcase(object_type.removeprefix("+"), rule.type) and (

@@ -42,7 +42,7 @@ CHORD_M = 1.0  # a car's heading is that of a piece of its way, so long ahead an
 
 
 @dataclass(frozen=True)
-class Course:
+class Trip:
     """What one does: kind of BUILDS, way with its stops, limits_mps (k,): the speeds where nobody is in the way."""
 
     kind: str
@@ -67,7 +67,7 @@ class Course:
         line = np.column_stack([self.way.along_m, np.zeros(len(speeds_mps))])
         return sample(line, speeds_mps, arrival_times(line, speeds_mps), self.way.stops_s, time_s)[0][:, 0]
 
-    def waiting(self, before_m: float) -> Course:
+    def waiting(self, before_m: float) -> Trip:
         """The same with a stop of WAIT_S, or a longer one, at least KEEP_BACK_M before a place of the way."""
         at = max(0, int(np.searchsorted(self.way.along_m, before_m - KEEP_BACK_M[self.kind], side="right")) - 1)
         near = slice(max(0, at - STOP_GAP_MIN + 1), at + STOP_GAP_MIN)
@@ -111,7 +111,7 @@ def company_of(
     return Company(walk.path_id, there[1:])
 
 
-def without_meeting(course: Course, time_s: np.ndarray, there: list[Other], heights: Ground) -> Other | None:
+def without_meeting(course: Trip, time_s: np.ndarray, there: list[Other], heights: Ground) -> Other | None:
     """Move along a course and wait for those who are there already; None where that does not help."""
     for _ in range(MOST_WAITS + 1):
         other = course.moved(time_s, heights)
@@ -125,7 +125,7 @@ def without_meeting(course: Course, time_s: np.ndarray, there: list[Other], heig
     return None
 
 
-def draw_stroll(walk: Walk, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator) -> Course | None:
+def draw_stroll(walk: Walk, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator) -> Trip | None:
     """Draw a person's route near a walk, there and back for as long as the walk lasts; None without a goal."""
     cells = ground.grid.cells_at(walk.polyline_m[rng.integers(len(walk.polyline_m))])
     start = sample_goal(ground.parts, (int(cells[0]), int(cells[1])), 0.0, cfg.others_reach_m / cfg.resolution_m, rng)
@@ -138,13 +138,13 @@ def draw_stroll(walk: Walk, ground: WalkableGround, cfg: PedestriansConfig, rng:
     pace = PACES[draw_by_share(cfg.pace, rng)]
     way = take_pace(ground.grid.centers_of(route), pace, rng)
     speeds_mps = speeds_at(way, pace, cfg, rng) * rng.uniform(*OWN_SPEED)
-    course = Course("Pedestrians", way, speeds_mps)
+    course = Trip("Pedestrians", way, speeds_mps)
     while course.along_m(walk.time_s[-1:])[0] >= course.way.along_m[-1]:
         course = and_back(course)
     return course
 
 
-def and_back(course: Course) -> Course:
+def and_back(course: Trip) -> Trip:
     """The same, and back to its start after a stop: at its end, or where it stops just before."""
     way = course.way
     stops_s = np.concatenate([way.stops_s, way.stops_s[-2::-1]])
@@ -155,7 +155,7 @@ def and_back(course: Course) -> Course:
     return replace(course, way=back, limits_mps=np.concatenate([course.limits_mps, course.limits_mps[-2::-1]]))
 
 
-def draw_drive(walk: Walk, lanes: list[Lane], cfg: PedestriansConfig, rng: np.random.Generator) -> Course | None:
+def draw_drive(walk: Walk, lanes: list[Lane], cfg: PedestriansConfig, rng: np.random.Generator) -> Trip | None:
     """Draw a drive that begins near a walk and lasts as long, or up to a dead end; None where no lane is near."""
     place_m = walk.polyline_m[rng.integers(len(walk.polyline_m))]
     near = [k for k, lane in enumerate(lanes) if lane.distance_m(place_m) < cfg.others_reach_m]
@@ -178,4 +178,4 @@ def draw_drive(walk: Walk, lanes: list[Lane], cfg: PedestriansConfig, rng: np.ra
     curvatures = np.maximum(menger_curvature(way.polyline_m), 1e-6)
     limits_mps = np.minimum(CAR_SPEED_MPS * rng.uniform(*OWN_SPEED), np.sqrt(CAR_SIDEWAYS_MPS2 / curvatures))
     limits_mps[-1] = 0.0
-    return Course("Car", way, limits_mps)
+    return Trip("Car", way, limits_mps)

@@ -138,7 +138,7 @@ RETRY_REASONS = ("no_goal", "detour")
 
 
 @dataclass(frozen=True)
-class MadeWalk:
+class WalkResult:
     """A walk and what it took: pairs of ends given up by reason, and the seconds of the steps."""
 
     walk: Walk
@@ -146,7 +146,7 @@ class MadeWalk:
     seconds: dict[str, float]
 
 
-def make_walk(path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator) -> MadeWalk:
+def make_walk(path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator) -> WalkResult:
     """Make one walk: draw its ends, find the route, take it at a pace, sample it.
 
     Raises:
@@ -157,7 +157,7 @@ def make_walk(path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng:
     route_m, retries = _draw_route(path_id, ground, cfg, rng, clock)
     with clock("report"):
         walk = walk_along(path_id, route_m, ground.heights, cfg, rng, pace_rng)
-    return MadeWalk(walk, retries, clock.seconds)
+    return WalkResult(walk, retries, clock.seconds)
 
 
 def walk_along(
@@ -207,7 +207,7 @@ def _draw_route(
     )
 
 
-class _Made(BaseModel):
+class _WalkRecord(BaseModel):
     """What the journal holds of a walk."""
 
     path: dict[str, Any]
@@ -326,7 +326,7 @@ def run(
     )
     if not finished.kept:
         raise stage.nothing_kept(finished.tally)
-    results = [result_of(record, _Made) for record in finished.kept]
+    results = [result_of(record, _WalkRecord) for record in finished.kept]
     paths = [Walk.from_json(result.path, f"{out}: items.jsonl") for result in results]
     for result in results:
         for step, taken_s in result.seconds.items():

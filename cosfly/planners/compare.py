@@ -277,7 +277,7 @@ def run(
     return product
 
 
-class _Compared(BaseModel):
+class _FlightsOfWalk(BaseModel):
     """What the journal holds of a walk, by planner."""
 
     flights: dict[str, dict[str, Any]]
@@ -288,7 +288,7 @@ class _Compared(BaseModel):
 def _flights_of(planner: str, shared: list[Kept], out: Path) -> list[DroneTrace]:
     return [
         DroneTrace.from_json(
-            result_of(record, _Compared).flights.get(planner) or {}, f"{out}/items.jsonl: {record.id}: {planner}"
+            result_of(record, _FlightsOfWalk).flights.get(planner) or {}, f"{out}/items.jsonl: {record.id}: {planner}"
         )
         for record in shared
     ]
@@ -302,7 +302,8 @@ def _left_out(records: list[ItemRecord]) -> list[dict[str, str]]:
             rows.append({"id": record.id, "planner": "all", "message": record.message})
         elif isinstance(record, Dropped):
             rows += [
-                {"id": record.id, "planner": k, "message": v} for k, v in result_of(record, _Compared).errors.items()
+                {"id": record.id, "planner": k, "message": v}
+                for k, v in result_of(record, _FlightsOfWalk).errors.items()
             ]
     return rows
 
@@ -311,7 +312,7 @@ def _timings(shared: list[Kept], planners: Sequence[str]) -> dict[str, dict[str,
     """Planning times over the compared walks: they differ from run to run, so they stand in the manifest alone."""
     table = {}
     for name in planners:
-        times_ms = np.array([result_of(record, _Compared).times_ms.get(name, 0.0) for record in shared])
+        times_ms = np.array([result_of(record, _FlightsOfWalk).times_ms.get(name, 0.0) for record in shared])
         table[name] = {"mean_ms": round(float(times_ms.mean()), 1), "max_ms": round(float(times_ms.max()), 1)}
     return table
 

@@ -277,14 +277,14 @@ class SimplifyConfig(Config):
 
 
 @dataclass(frozen=True)
-class Simplified:
+class Simplification:
     """A simplified map and what each pass left: (name of the pass, boxes by kind), the first entry is the input."""
 
     box_map: BoxMap
     passes: list[tuple[str, dict[str, int]]]
 
 
-def simplify(box_map: BoxMap, cfg: SimplifyConfig) -> Simplified:
+def simplify(box_map: BoxMap, cfg: SimplifyConfig) -> Simplification:
     """Apply the passes in the paper's order.
 
     The result's header gains `passes`, with settings and counts. Ids: a merged box takes its smallest member's, a
@@ -312,7 +312,7 @@ def simplify(box_map: BoxMap, cfg: SimplifyConfig) -> Simplified:
         "simplify": cfg.model_dump(mode="json", exclude={"picture_px"}),
     }
     header = box_map.header.model_copy(update=told)
-    return Simplified(replace(result, header=header, meshes=Meshes()), passes)
+    return Simplification(replace(result, header=header, meshes=Meshes()), passes)
 
 
 def _merge_rules(cfg: SimplifyConfig) -> dict[int, MergeRule]:

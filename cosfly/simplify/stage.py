@@ -11,7 +11,7 @@ from cosfly.errors import InputError
 from cosfly.look.topview import TopView, add_caption, draw_map, png_bytes
 from cosfly.products.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.products.kinds import SURFACE_KINDS
-from cosfly.simplify.passes import Simplified, SimplifyConfig, simplify
+from cosfly.simplify.passes import Simplification, SimplifyConfig, simplify
 from cosfly.space.grid import blocks_walking, compare, connected_parts, empty_grid, inflate, occupancy
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import write_bytes, write_json
@@ -40,7 +40,7 @@ def cross_validate(raw: BoxMap, simplified: BoxMap) -> dict:
     return facts
 
 
-def report(raw: BoxMap, result: Simplified, cfg: SimplifyConfig) -> dict:
+def report(raw: BoxMap, result: Simplification, cfg: SimplifyConfig) -> dict:
     """Give the content of `simplify_report.json`."""
     return {
         "schema": REPORT_SCHEMA,
