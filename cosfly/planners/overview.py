@@ -41,8 +41,8 @@ def draw_flights(box_map: BoxMap, walks: list[Walk], traces: list[DroneTrace]) -
     for trace in traces:
         _draw_flight(picture, trace, view.pixels(trace.positions_m), view.pixels(trace.targets_m))
     num_dropped = sum(trace.drop_reason is not None for trace in traces)
-    flown = f"{len(traces)} flights (blue: sees, red: hidden), {num_dropped} dropped"
-    return png_bytes(add_caption(picture, f"{box_map.name}: {len(walks)} walks (dark), {flown}"))
+    flights = f"{len(traces)} flights (blue: sees, red: hidden), {num_dropped} dropped"
+    return png_bytes(add_caption(picture, f"{box_map.name}: {len(walks)} walks (dark), {flights}"))
 
 
 def _draw_flight(picture: np.ndarray, trace: DroneTrace, drone: np.ndarray, target: np.ndarray) -> None:
