@@ -93,11 +93,7 @@ def mine(tmp_path_factory) -> Path:
 def whole(tmp_path_factory, mine) -> Path:
     """The whole way with it: a map to a release."""
     out = tmp_path_factory.mktemp("own") / "run"
-    more = [
-        f"caption.actions={mine}",
-        "caption.repair.soft_conflict=repair",
-        "release.num_frames=20",
-    ]
+    more = [f"caption.actions={mine}", "caption.repair.soft_conflict=repair", "release.num_frames=20"]
     pipeline.run(load(RunConfig, None, [*TINY, *more]), out)
     return out
 

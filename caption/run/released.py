@@ -64,11 +64,7 @@ def _mission_of(caption: ShownCaption) -> str | None:
 
 
 def _window(
-    shown: ShownFlight,
-    frames: tuple[ObservedFrame, ...],
-    caption: ShownCaption,
-    rows: list[int],
-    mission: str | None,
+    shown: ShownFlight, frames: tuple[ObservedFrame, ...], caption: ShownCaption, rows: list[int], mission: str | None
 ) -> ObservedWindow:
     flight = shown.flight
     return ObservedWindow(

@@ -80,11 +80,7 @@ async def caption_window(
 
 
 async def caption_prepared(
-    prepared: Prepared,
-    teacher: Teacher,
-    cfg: CaptionConfig,
-    judge: Judge | None = None,
-    reader: Reader | None = None,
+    prepared: Prepared, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None, reader: Reader | None = None
 ) -> Caption:
     """Caption a window that is prepared; as `caption_window`."""
     window, terms, question = prepared.window, prepared.terms, prepared.question

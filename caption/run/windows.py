@@ -108,11 +108,7 @@ def frames_of(flight: Flight) -> tuple[ObservedFrame, ...]:
 
 
 def _observe(
-    flight: Flight,
-    frames: tuple[ObservedFrame, ...],
-    span: slice,
-    folders: list[Path],
-    files: list[frozenset[str]],
+    flight: Flight, frames: tuple[ObservedFrame, ...], span: slice, folders: list[Path], files: list[frozenset[str]]
 ) -> ObservedWindow:
     """Take the observed frames out of a flight: nothing of what follows stays reachable."""
     return ObservedWindow(

@@ -145,13 +145,7 @@ def judge_text(
 
 
 def _judge_sentence(
-    name: str,
-    text: str,
-    claims: Sequence[Claim],
-    decision: str,
-    facts: Facts,
-    cfg: EvidenceConfig,
-    language: Language,
+    name: str, text: str, claims: Sequence[Claim], decision: str, facts: Facts, cfg: EvidenceConfig, language: Language
 ) -> Judged:
     about = cfg if read_stated(text, language).is_approximate else None
     states, problems = set[str](), list[str]()

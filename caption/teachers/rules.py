@@ -207,28 +207,19 @@ def _pace(side: int, f: Facts, c: Cues) -> Both | None:
 def _steady(f: Facts, c: Cues) -> Both | None:
     if not f.is_visible_now or word_of(f, "side:offset_x") != "centred" or abs(c.last_turn_deg) >= 1.0:
         return None
-    return (
-        "The target is {side:offset_x} in the image.",
-        "目标在画面中{side:offset_x}。",
-    )
+    return ("The target is {side:offset_x} in the image.", "目标在画面中{side:offset_x}。")
 
 
 def _lost(f: Facts, c: Cues) -> Both | None:
     if f.is_visible_now:
         return None
-    return (
-        "The target is {visibility}, so the tracking needs a change.",
-        "目标{visibility}，因此需要应对。",
-    )
+    return ("The target is {visibility}, so the tracking needs a change.", "目标{visibility}，因此需要应对。")
 
 
 def _standing(f: Facts, c: Cues) -> Both | None:
     if word_of(f, "target_motion") != "standing":
         return None
-    return (
-        "The target {target_motion}, so there is nothing to follow.",
-        "目标{target_motion}，因此不需跟踪。",
-    )
+    return ("The target {target_motion}, so there is nothing to follow.", "目标{target_motion}，因此不需跟踪。")
 
 
 _ORDERS: dict[str, Both] = {

@@ -54,12 +54,7 @@ def _walk(f: Facts) -> tuple[Both, ...]:
     if f.target_speed_mps is None:
         return ()
     if word_of(f, "target_motion") == "standing":
-        return (
-            (
-                "The target {target_motion} ({mean:target_speed}).",
-                "目标{target_motion}（{mean:target_speed}）。",
-            ),
-        )
+        return (("The target {target_motion} ({mean:target_speed}).", "目标{target_motion}（{mean:target_speed}）。"),)
     if f.target_turn_deg is not None and abs(f.target_turn_deg) >= BEND_DEG:
         return (
             (
@@ -199,12 +194,7 @@ def _more(f: Facts) -> tuple[Both, ...]:
     """Give statements of which a caption makes one."""
     found: list[Both] = []
     if f.travelled_m:
-        found.append(
-            (
-                "Over the window the drone has flown {travelled}.",
-                "在观测窗口内无人机飞行了 {travelled}。",
-            )
-        )
+        found.append(("Over the window the drone has flown {travelled}.", "在观测窗口内无人机飞行了 {travelled}。"))
         found.append(("The drone's heading is {heading}.", "无人机的航向为 {heading}。"))
     if word_of(f, "target_motion") == "walking" and word_of(f, "target_travelled") is not None:
         found.append(

@@ -33,10 +33,7 @@ _OTHER = {
     ),
 }
 _RISES = {"up": 1, "down": -1}
-_ENDS = {
-    "en": re.compile(r"\bfrom\b[^,;.]{0,24}$", re.I),
-    "zh": re.compile(r"[从由自][^，；。]{0,12}$"),
-}
+_ENDS = {"en": re.compile(r"\bfrom\b[^,;.]{0,24}$", re.I), "zh": re.compile(r"[从由自][^，；。]{0,12}$")}
 _TO = {
     "en": re.compile(r"[^,;]{0,12}\b(?:to|down to|up to)\b[^,;\d]{0,16}", re.I),
     "zh": re.compile(r"[^，；\d]{0,10}[到至为][^，；\d]{0,6}"),

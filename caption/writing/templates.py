@@ -18,15 +18,7 @@ from typing import Literal, NamedTuple
 
 from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
-from caption.truth.references import (
-    ANGLES,
-    MOTIONS,
-    QUANTITIES,
-    Quantity,
-    Reference,
-    Series,
-    parse_reference,
-)
+from caption.truth.references import ANGLES, MOTIONS, QUANTITIES, Quantity, Reference, Series, parse_reference
 from caption.writing.contract import Refused
 from caption.writing.earned import is_earned
 from caption.writing.outside import SLOT_MARK, check_outside, decisions_named, decisions_opposed, states_beside
