@@ -1,7 +1,7 @@
 """Types and settings of the caption stage.
 
-`ObservedWindow` is all that a teacher may know: it has no future. `FutureMotion` is what the label and the verdict come from.
-Only `windows.py` makes them, and nothing that builds a prompt takes a `FutureMotion`.
+`ObservedWindow` is all that a teacher may know: it has no future. `FutureMotion` is what the label and the verdict come
+from. Only `windows.py` makes them, and nothing that builds a prompt takes a `FutureMotion`.
 """
 
 from __future__ import annotations
@@ -37,8 +37,9 @@ Judgement = Literal["ACCEPT_ALTERNATIVE", "FIX_LABEL", "REJECT_REGEN"]
 class ObservedFrame:
     """What was known at one frame, in plain numbers; windows share it, so what is worked out of it is worked out once.
 
-    position_m, target_m (x, y, z), the target's NaN where unknown; rotation_deg: pitch, yaw, roll; target_uv (u, v) px and target_bbox
-    (left, top, right, bottom) px of what is seen of the target (where a tree does not say, of its projected 3D box), NaN where unknown;
+    position_m, target_m (x, y, z), the target's NaN where unknown; rotation_deg: pitch, yaw, roll; target_uv (u, v) px
+    and target_bbox (left, top, right, bottom) px of what is seen of the target (where a tree does not say, of its
+    projected 3D box), NaN where unknown;
     visibility: score, NaN where unknown.
     """
 
@@ -62,8 +63,9 @@ def observed_frames(*columns: np.ndarray) -> tuple[ObservedFrame, ...]:
 class ObservedWindow:
     """The observed frames t0..t(n-1) of one sample, oldest first; the last is the current one. Right-handed axes.
 
-    indices: of the n frames in their flight. mission: what the drone knows at the current frame of an order that ends the pursuit, its
-    kind (MISSION_KINDS), None before; frame_folders: n folders; frame_files: the names that each holds.
+    indices: of the n frames in their flight. mission: what the drone knows at the current frame of an order that ends
+    the pursuit, its kind (MISSION_KINDS), None before; frame_folders: n folders; frame_files: the names that each
+    holds.
     """
 
     sample_id: str
@@ -160,8 +162,8 @@ class LabelConfig(Config):
         0.25,
         ge=0,
         lt=1,
-        description="a decision of which the flight shows less than this share of its threshold is contradicted (turns: only by a "
-        "turn to the other side); 0: only by the opposite motion",
+        description="a decision of which the flight shows less than this share of its threshold is contradicted "
+        "(turns: only by a turn to the other side); 0: only by the opposite motion",
     )
 
     @model_validator(mode="after")
@@ -183,7 +185,8 @@ class EvidenceConfig(Config):
     relative: float = Field(0.02, ge=0, le=1, description="share of the measured value, where that is more")
     drop: bool | None = Field(
         None,
-        description="drop a sample whose text contradicts a measured value; empty: where slots, claims or a reader say what it states",
+        description="drop a sample whose text contradicts a measured value; empty: where slots, claims or a reader say "
+        "what it states",
     )
 
 
@@ -246,8 +249,8 @@ class RepairConfig(Config):
     )
     soft_conflict: Treatment = Field(
         "keep",
-        description="another decision than the label that the flight does not contradict, where no judge is asked: keep, "
-        "repair (ask again) or drop",
+        description="another decision than the label that the flight does not contradict, where no judge is asked: "
+        "keep, repair (ask again) or drop",
     )
     strategy: Strategy = Field(
         "anchored",
@@ -262,17 +265,20 @@ class RepairConfig(Config):
 
 
 class StudentConfig(Config):
-    """A student as a teacher: behind a server or in vLLM, asked as it was taught (caption/teachers/students.py), or by its predictions."""
+    """A student as a teacher: behind a server or in vLLM, asked as it was taught (caption/teachers/students.py), or by
+    its predictions."""
 
     folder: Path | None = Field(
         None,
-        description="what `distill train` or `distill merge` wrote; it decides windows, pictures, prompts and sampling. Empty: the teacher is none",
+        description="what `distill train` or `distill merge` wrote; it decides windows, pictures, prompts and "
+        "sampling. Empty: the teacher is none",
     )
     max_new_tokens: int = Field(MAX_ANSWER_TOKENS, ge=1, description="longest answer, tokens")
     constrained: bool = Field(False, description="hold its answers to their JSON schema")
     run: str | None = Field(
         None,
-        description="of student:PATH, predictions for several trees: the one whose windows are captioned, as the training set names it",
+        description="of student:PATH, predictions for several trees: the one whose windows are captioned, as the "
+        "training set names it",
     )
 
     def recorded(self) -> dict[str, Any]:
@@ -290,16 +296,18 @@ class CaptionConfig(Config):
     )
     writing: Writing = Field(
         "slots",
-        description="how a teacher writes. slots: it names facts, their values are filled in; claims: plain text beside a list of "
-        "what it states; prose: plain text, read afterwards",
+        description="how a teacher writes. slots: it names facts, their values are filled in; claims: plain text "
+        "beside a list of what it states; prose: plain text, read afterwards",
     )
     prompts: Path | None = Field(
         None,
-        description="folder with prompts of yours in the place of those that ship; `cosfly caption prompts --export DIR` writes one to begin with",
+        description="folder with prompts of yours in the place of those that ship; `cosfly caption prompts --export "
+        "DIR` writes one to begin with",
     )
     actions: Path | None = Field(
         None,
-        description="file with a closed set of actions of yours in the place of the one that ships: tokens, names in both languages, what the "
+        description="file with a closed set of actions of yours in the place of the one that ships: tokens, names in "
+        "both languages, what the "
         "motion implies and contradicts; `cosfly caption actions --export FILE` writes one to begin with",
     )
     flights: FlightChoice = Field(FlightChoice(), description="which flights of the tree")
@@ -383,6 +391,7 @@ class CaptionConfig(Config):
         return self.window.num_frames * (1 if self.image.layout == "tiled" else len(self.image.modalities))
 
     def recorded(self) -> dict[str, Any]:
-        """Where a teacher is asked does not decide what it says, so its kind is put on record; of own files their digests stand beside."""
+        """Where a teacher is asked does not decide what it says, so its kind is put on record; of own files their
+        digests stand beside."""
         own = {name: "own" if getattr(self, name) else None for name in ("prompts", "actions")}
         return super().recorded() | {"teacher": self.teacher_kind} | own

@@ -1,7 +1,8 @@
 """Asks a teacher that takes its time (an endpoint, an engine) about all flights, from one process.
 
-Windows go out in order of flight and time, a bounded number at once, across the borders of flights. A flight is written when its
-last window is done. Windows without an answer, and those that the server refused, sit in `quarantine.jsonl` until a later run gets one.
+Windows go out in order of flight and time, a bounded number at once, across the borders of flights. A flight is written
+when its last window is done. Windows without an answer, and those that the server refused, sit in `quarantine.jsonl`
+until a later run gets one.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ WAITING_WINDOWS = 16
 
 @dataclass
 class Asked:
-    """What came of a run: flights, windows without an answer, flights not begun, and why it stopped early (None: not)."""
+    """What came of a run: flights, windows without an answer, flights not begun, and why it stopped early (None:
+    not)."""
 
     flights: Tally
     unanswered: list[Failed] = field(default_factory=list)
@@ -212,7 +214,8 @@ class Asking:
             self.display.finish(caption, time.monotonic() - begun_s)
 
     def _note_refusal(self, caption: Caption) -> None:
-        """Keep a window that the server refused, or had no room for, for `--retry-failed`; its caption is dropped all the same."""
+        """Keep a window that the server refused, or had no room for, for `--retry-failed`; its caption is dropped all
+        the same."""
         refusal, sample_id = caption.checks.refusal, caption.sample_id
         if refusal is None or caption.status == "accepted":
             self.quarantine.pop(sample_id, None)

@@ -1,7 +1,7 @@
 """What chance would give on the same windows: shares of a run mean little without it.
 
-Most decisions that a flight does not contradict are no conflict, so a teacher that guesses has much of its work accepted. All
-figures here are expectations, worked out from counts; nothing is drawn.
+Most decisions that a flight does not contradict are no conflict, so a teacher that guesses has much of its work
+accepted. All figures here are expectations, worked out from counts; nothing is drawn.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class ChanceReport(BaseModel):
     """A run's first answers beside what chance gives.
 
     random_decisions: every action equally often. shuffled_decisions: the run's own decisions dealt to its windows anew.
-    one_decision: the best single one, `decision`, for every window. distinct_texts: language -> texts that differ in more than
-    their numbers, of the windows that have an answer. warnings: what is no better than chance.
+    one_decision: the best single one, `decision`, for every window. distinct_texts: language -> texts that differ in
+    more than their numbers, of the windows that have an answer. warnings: what is no better than chance.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -125,8 +125,8 @@ class ChanceCounts:
         noise = 2.0 * math.sqrt(shuffled.consistent * (1.0 - shuffled.consistent) / n)
         if first.consistent <= shuffled.consistent + noise:
             found.append(
-                f"the decisions are no better than chance: {100 * first.consistent:.1f} % of {n:,} agree with the flight, "
-                f"{100 * shuffled.consistent:.1f} % would if the same decisions were dealt at random"
+                f"the decisions are no better than chance: {100 * first.consistent:.1f} % of {n:,} agree with the "
+                f"flight, {100 * shuffled.consistent:.1f} % would if the same decisions were dealt at random"
             )
         elif first.consistent <= constant.consistent:
             found.append(

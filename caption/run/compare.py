@@ -1,8 +1,8 @@
 """`compare-strategies`: the four ways of re-generation on the same conflicts.
 
-Reads a playback tree, writes `compare_strategies.json` and, for an endpoint, its journal of answers. Nothing of it enters a
-data set. The distance of a repaired text from the first answer stands for naturalness: what a model says freely is
-natural, and the further a constraint moves it, the less it is.
+Reads a playback tree, writes `compare_strategies.json` and, for an endpoint, its journal of answers. Nothing of it
+enters a data set. The distance of a repaired text from the first answer stands for naturalness: what a model says
+freely is natural, and the further a constraint moves it, the less it is.
 """
 
 from __future__ import annotations
@@ -77,7 +77,8 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
     Args:
         conflicts: stop looking after so many.
     Raises:
-        ConfigError: the captions are a file's. InputError: no conflict was found. TeacherError: the endpoint cannot be used.
+        ConfigError: the captions are a file's. InputError: no conflict was found. TeacherError: the endpoint cannot be
+        used.
     """
     if cfg.caption_file is not None:
         raise ConfigError("captions of a file cannot be asked for again", where="--teacher", got=cfg.teacher)

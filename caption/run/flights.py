@@ -1,7 +1,7 @@
 """The flights of a run: their names, their share of a limit, their windows, and their part files.
 
-A finished flight is a part file `parts/<name>.jsonl`. A flight that a limit cuts is `parts/<name>.<windows>.cut`, which another
-limit does not take for finished; one in which a window has no answer yet is `parts/<name>.gap`.
+A finished flight is a part file `parts/<name>.jsonl`. A flight that a limit cuts is `parts/<name>.<windows>.cut`, which
+another limit does not take for finished; one in which a window has no answer yet is `parts/<name>.gap`.
 """
 
 from __future__ import annotations
@@ -81,7 +81,8 @@ def named_flights(data: Path, choice: FlightChoice = ALL_FLIGHTS) -> list[tuple[
     """Give (flight id, folder) in the order of the product.
 
     Raises:
-        InputError: none is chosen, or two flights have one place below two folders, so their samples could not be told apart.
+        InputError: none is chosen, or two flights have one place below two folders, so their samples could not be told
+        apart.
     """
     folders = find_flights(data, choice)
     ids = flight_ids([place_of(folder) for folder in folders])
@@ -90,7 +91,8 @@ def named_flights(data: Path, choice: FlightChoice = ALL_FLIGHTS) -> list[tuple[
 
 
 def allot(flights: list[tuple[str, Path]], cfg: CaptionConfig) -> tuple[list[Allotted], bool]:
-    """Say which windows of each flight `limit` leaves, independent of the order of work; and whether it leaves any out."""
+    """Say which windows of each flight `limit` leaves, independent of the order of work; and whether it leaves any
+    out."""
     if cfg.limit is None:
         return [Allotted(name, folder) for name, folder in flights], False
     left = cfg.limit
@@ -123,7 +125,8 @@ def parts_of(stage_path: Path, allotted: list[Allotted], with_gaps: bool) -> lis
 
 
 def restore_parts(stage_path: Path, product: Path, allotted: Sequence[Allotted]) -> None:
-    """Cut the product of a stage that was finished into its parts again, so that a run that goes on keeps what it holds.
+    """Cut the product of a stage that was finished into its parts again, so that a run that goes on keeps what it
+    holds.
 
     A flight of which any part stands there is left as it is: the product may hold only a share of it.
     """

@@ -1,7 +1,7 @@
 """`cosfly caption --plan`: calls, tokens, time and money of a run, with a range, from a few trial windows.
 
-The trial windows are real ones, spread over the flights, asked exactly as the run will ask them; their answers stay in the
-journal, so the run does not ask them again.
+The trial windows are real ones, spread over the flights, asked exactly as the run will ask them; their answers stay in
+the journal, so the run does not ask them again.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ CONFIDENCE = 0.9
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure of the whole run: expected, and a range that holds it with 90 % if the trial windows are like the others."""
+    """A figure of the whole run: expected, and a range that holds it with 90 % if the trial windows are like the
+    others."""
 
     low: float
     expected: float
@@ -131,7 +132,8 @@ def _scaled(
     cost = Estimate(*(cfg.budget.cost(getattr(prompt, name), getattr(completion, name)) for name in which))
     per_window = estimate(seconds).scaled(num_windows)
     in_flight = (cfg.endpoint if cfg.teacher_kind == "endpoint" else cfg.reader).concurrency
-    # At best every slot works as fast as in the trial; at worst the server is no faster than it was with the trial's windows.
+    # At best every slot works as fast as in the trial; at worst the server is no faster than it was with the trial's
+    # windows.
     time_s = Estimate(
         per_window.low / in_flight, per_window.expected / in_flight, per_window.high / min(len(captions), in_flight)
     )
@@ -156,7 +158,8 @@ def _num_calls(caption: Caption, cfg: CaptionConfig) -> int:
 
 
 def estimate(values: Sequence[float]) -> Estimate:
-    """Give the mean and its Student confidence interval, not below 0; of one value the interval is 0 to twice the value."""
+    """Give the mean and its Student confidence interval, not below 0; of one value the interval is 0 to twice the
+    value."""
     array = np.asarray(values, dtype=np.float64)
     mean = float(array.mean())
     if len(array) == 1:

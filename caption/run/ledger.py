@@ -89,12 +89,14 @@ class CaptionReport(_Record):
     def warnings(self) -> list[str]:
         """What a person must know before the captions are used."""
         refused = [
-            f"{self.windows.dropped[reason]} windows were dropped: {reason} ({words}); --retry-failed asks about them again"
+            f"{self.windows.dropped[reason]} windows were dropped: {reason} ({words}); --retry-failed asks about them "
+            f"again"
             for reason, words in self.refusals.items()
         ]
         own = set(actions_in_use().tokens) - set(shipped_actions().tokens)
         never = [
-            f"{token}, an action of yours, was the label of no window; `cosfly caption actions --check FILE` may tell why"
+            f"{token}, an action of yours, was the label of no window; `cosfly caption actions --check FILE` may tell "
+            f"why"
             for token in sorted(own)
             if self.labels and token not in self.labels
         ]
@@ -109,7 +111,8 @@ class CaptionReport(_Record):
 
 
 class Shelf:
-    """Keeps some captions of every kind for a person to read: those of the smallest hash, whatever the order they come in."""
+    """Keeps some captions of every kind for a person to read: those of the smallest hash, whatever the order they come
+    in."""
 
     def __init__(self, per_kind: int = NUM_CARDS) -> None:
         self.per_kind = per_kind

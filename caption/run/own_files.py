@@ -1,5 +1,5 @@
-"""What a run puts in the place of files that ship: its prompts and actions. Read before anything is asked, in use while a block runs,
-copied beside the captions, so that whoever reads them later knows."""
+"""What a run puts in the place of files that ship: its prompts and actions. Read before anything is asked, in use while
+a block runs, copied beside the captions, so that whoever reads them later knows."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ def _own_actions(cfg: CaptionConfig) -> ActionSet | None:
     lacking = [token for token in DECIDES if token not in actions.tokens]
     if cfg.teacher_kind == "rules" and lacking:
         raise ConfigError(
-            "the rule teacher decides what this set of actions does not hold", where=cfg.actions, got=", ".join(lacking),
+            "the rule teacher decides what this set of actions does not hold", where=cfg.actions,
+            got=", ".join(lacking),
             fix="keep these, or have another teacher asked (--teacher)",
         )  # fmt: skip
     return actions

@@ -110,8 +110,10 @@ class Display:
     def left_s(self) -> float | None:
         """Seconds to go; None before the first window is finished.
 
-        By Little's law the rate is the number of windows in work, which are half done on average, over the time that one takes. The
-        mean rate since the start would count the time in which none could be finished yet: it is ten times too low at first.
+        By Little's law the rate is the number of windows in work, which are half done on average, over the time that
+        one takes. The
+        mean rate since the start would count the time in which none could be finished yet: it is ten times too low at
+        first.
         """
         if self.num_done >= self.total:
             return 0.0

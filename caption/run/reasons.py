@@ -1,4 +1,5 @@
-"""Why a window is dropped: the codes of `drop_reason` and what each means, for messages and the table of docs/captions.md."""
+"""Why a window is dropped: the codes of `drop_reason` and what each means, for messages and the table of
+docs/captions.md."""
 
 from __future__ import annotations
 
@@ -6,19 +7,22 @@ from collections.abc import Mapping
 
 # Code, or its beginning up to the underscore -> what it means. The longest that fits counts.
 REASONS = {
-    "order_to_come": "the mission's order comes in the window's future, so nothing that was seen tells of it; nobody was asked",
+    "order_to_come": "the mission's order comes in the window's future, so nothing that was seen tells of it; nobody "
+    "was asked",
     "missing_frame": "a picture of the window is missing; nobody was asked",
     "unreadable_frame": "a picture of the window cannot be read",
     "refused_": "the server refused the request, as the word behind says; see `checks.refusal`",
     "engine": "the vLLM engine refused the request",
-    "structure_": "no answer had the fields that were asked for, in structure_asks asks; the word behind says what was wrong with the last",
+    "structure_": "no answer had the fields that were asked for, in structure_asks asks; the word behind says what was "
+    "wrong with the last",
     "regeneration_context_full": "prompt and answer fill the server's context: raise it, or send smaller pictures",
     "structure_context_full": "prompt and answer fill the server's context: raise it, or send smaller pictures",
     "hard_conflict": "the flight contradicts the decision (caption.repair.hard_conflict=drop)",
     "soft_conflict": "the decision is not the label (caption.repair.soft_conflict=drop)",
     "conflict_without_label": "the decision is in conflict, and geometry has no label to anchor a repair to",
     "conflict_not_repairable": "the decision of a given caption is in conflict, and its writer cannot be asked again",
-    "regeneration_failed": "no answer of caption.repair.max_asks asks had a decision without conflict and a text that leads to it",
+    "regeneration_failed": "no answer of caption.repair.max_asks asks had a decision without conflict and a text that "
+    "leads to it",
     "decision_against_reasoning": "the text comes to another action than the decision",
     "evidence": "the text contradicts what was measured; see `checks.evidence`",
     "not_in_file": "the file of captions or predictions has none for this window",

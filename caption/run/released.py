@@ -1,7 +1,7 @@
 """Released captions against the flight that they are released with: prompt, texts, label and verdict, all made anew.
 
-A reader for `cosfly release verify`, which gives a flight as its rows show it. What the rows do not show (the frames after a window,
-where a stride left them out) is not judged.
+A reader for `cosfly release verify`, which gives a flight as its rows show it. What the rows do not show (the frames
+after a window, where a stride left them out) is not judged.
 """
 
 from __future__ import annotations
@@ -106,7 +106,8 @@ def _difference(found: str, wanted: str) -> str:
 
 
 def _text_lies(window: ObservedWindow, caption: ShownCaption, cfg: EvidenceConfig) -> list[Lie]:
-    """Texts must be what their templates give, each sentence of the state that its evidence gives, and the same in both languages."""
+    """Texts must be what their templates give, each sentence of the state that its evidence gives, and the same in both
+    languages."""
     facts = measure_facts(window, caption.picture_px)
     # A decision outside the closed set is found by release verify itself; no template can be filled with it.
     is_judged = (

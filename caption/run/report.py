@@ -1,4 +1,5 @@
-"""`report.html`: one self-contained page of a captioning run that a person can read. Made from the report's counts and some samples."""
+"""`report.html`: one self-contained page of a captioning run that a person can read. Made from the report's counts and
+some samples."""
 
 from __future__ import annotations
 
@@ -48,11 +49,13 @@ def page_html(
     teacher = report.teacher
     verdicts = [("First answers", report.verdicts_of_first_answers), ("Accepted captions", report.verdicts_of_accepted)]
     return page(
-        "caption/run/report.html", title=name, style=STYLE, report=report, meanings=VERDICTS, states=STATES, language_names=LANGUAGE_NAMES,
+        "caption/run/report.html", title=name, style=STYLE, report=report, meanings=VERDICTS, states=STATES,
         who=f"teacher: {teacher.kind}, model {teacher.model}" if teacher else "teacher: none, model unknown",
-        is_rules=teacher is not None and teacher.kind == "rules", tiles=_tiles(report), verdicts=verdicts, share=_share, chance=_chance(report),
-        confusion=_confusion(report.confusion), repairs=_repairs(report), checks=_checks(report), cost=_cost(report, budget),
-        lengths=[_histogram(language, field, found) for language, fields in report.lengths.items() for field, found in fields.items()],
+        is_rules=teacher is not None and teacher.kind == "rules", tiles=_tiles(report), verdicts=verdicts, share=_share,
+        language_names=LANGUAGE_NAMES, chance=_chance(report), confusion=_confusion(report.confusion),
+        repairs=_repairs(report), checks=_checks(report),
+        cost=_cost(report, budget),
+        lengths=[_histogram(language, *one) for language, fields in report.lengths.items() for one in fields.items()],
         cards=[_card(caption, folders) for caption in cards],
     )  # fmt: skip
 
@@ -108,8 +111,8 @@ def _histogram(language: str, field: str, histogram: Histogram) -> dict[str, Any
     step = 280.0 / max(8, len(shown))
     bars = [
         {
-            "x": round(i * step, 1), "y": round(100 - 92 * count / max(shown), 1), "width": round(max(1.0, step - 1.5), 1),
-            "height": round(92 * count / max(shown), 1),
+            "x": round(i * step, 1), "y": round(100 - 92 * count / max(shown), 1),
+            "width": round(max(1.0, step - 1.5), 1), "height": round(92 * count / max(shown), 1),
             "title": f"{(first + i) * width} to {(first + i + 1) * width - 1} characters: {count}",
         }
         for i, count in enumerate(shown)

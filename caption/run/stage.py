@@ -57,8 +57,10 @@ def run(
 
     Args:
         data: playback tree, ours or of the public layout.
-        workers: processes of a teacher that asks nobody, without a judge; requests in flight are `endpoint.concurrency`.
-        retry_failed: ask only about the windows that stand in `quarantine.jsonl`: without an answer, or refused by the server.
+        workers: processes of a teacher that asks nobody, without a judge; requests in flight are
+        `endpoint.concurrency`.
+        retry_failed: ask only about the windows that stand in `quarantine.jsonl`: without an answer, or refused by the
+        server.
     Returns:
         `captions.jsonl`.
     Raises:
@@ -230,7 +232,8 @@ def make_worker(cfg: CaptionConfig, stage_path: Path, seed: int) -> Work:
 async def caption_in_order(windows: Iterable[Window], teacher: Teacher, cfg: CaptionConfig, part: Path) -> int:
     """Caption the windows of a flight in order, and write their part; gives how many there are.
 
-    A caption is kept as its line: a hundred times fewer objects, through which the garbage collector would go again and again.
+    A caption is kept as its line: a hundred times fewer objects, through which the garbage collector would go again and
+    again.
     """
     lines: list[bytes] = []
     rest = iter(windows)

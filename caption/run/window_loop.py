@@ -1,7 +1,8 @@
 """The bounded ask-verify loop of one window.
 
-Every window ends in one outcome: accepted, dropped for a reason, or failed because the teacher did not answer. A decision that
-the flight contradicts is asked for again, by default anchored to the true one; the record says so for ever.
+Every window ends in one outcome: accepted, dropped for a reason, or failed because the teacher did not answer. A
+decision that the flight contradicts is asked for again, by default anchored to the true one; the record says so for
+ever.
 """
 
 from __future__ import annotations
@@ -54,7 +55,8 @@ class Prepared(NamedTuple):
 
 
 def prepare(windows: Sequence[Window], teacher: Teacher, cfg: CaptionConfig) -> list[Prepared]:
-    """Measure windows and write their questions: each step for all of them, while the processor's caches hold its code."""
+    """Measure windows and write their questions: each step for all of them, while the processor's caches hold its
+    code."""
     terms = [terms_of(teacher, window.observed.sample_id, cfg) for window in windows]
     questions = [make_question(w.observed, cfg.image, t.writing) for w, t in zip(windows, terms, strict=True)]
     hashes = [prompt_hash(question) for question in questions]
@@ -70,7 +72,8 @@ async def caption_window(
     """Caption one window.
 
     Args:
-        judge: asked about conflicts; None: none is. reader: asked what prose states that came without claims; None: none is.
+        judge: asked about conflicts; None: none is. reader: asked what prose states that came without claims; None:
+        none is.
     Raises:
         NoAnswer: the teacher gave none, and asking again later may help.
         TeacherError: no window will get one.
@@ -270,7 +273,8 @@ class _Loop:
         return answer.reason if answer.complaint else f"structure_{answer.reason}"
 
     async def _answer(self, question: Question) -> Draft | Refused:
-        """Ask, and while the answer is refused for what it says ask for a correction. A wrong structure has no complaint."""
+        """Ask, and while the answer is refused for what it says ask for a correction. A wrong structure has no
+        complaint."""
         taken: Draft | None = None  # which its writer is asked to better
         earlier = question.correction.number if question.correction else 0
         for number in range(self.cfg.correction_asks + 1):
@@ -317,9 +321,9 @@ class _Loop:
     async def _is_rejected(self, question: Question) -> bool:
         """Ask the judge whether an answer in conflict must be asked for again.
 
-        A hard conflict stays one whatever the judge says. A soft one is kept only where the judge accepts it: what it rejects or
-        what cannot be read as a judgement is asked for again. A label that the judge would put in the decision's place is
-        put there only where the text does not state another decision.
+        A hard conflict stays one whatever the judge says. A soft one is kept only where the judge accepts it: what it
+        rejects or what cannot be read as a judgement is asked for again. A label that the judge would put in the
+        decision's place is put there only where the text does not state another decision.
         """
         assert self.english is not None
         assert self.judge is not None
@@ -341,7 +345,8 @@ class _Loop:
         return verdict != "ACCEPT_ALTERNATIVE" or self.verdict == "HARD_CONFLICT"
 
     def _states_decision(self, fixed: Draft, before: Coc, facts: Facts) -> bool:
-        """Tell whether the text states the decision that it was written for, so that another one would make it a lie."""
+        """Tell whether the text states the decision that it was written for, so that another one would make it a
+        lie."""
         if load_glossary().actions[before.flight_decision]["en"] in before.reasoning_trace.lower():
             return True
         judged = self.way.judge(fixed, facts, self.cfg.evidence, "en")
@@ -412,7 +417,8 @@ class _Loop:
         return None if problem is None else f"bilingual_{problem}"
 
     def _translated(self, english: Draft, chinese: Draft) -> Draft | Refused:
-        """Hold what was asked for as a translation against its source; templates have been, and what was given is nobody's translation."""
+        """Hold what was asked for as a translation against its source; templates have been, and what was given is
+        nobody's translation."""
         if self.terms.is_given or not self.terms.is_translated or chinese.template is not None:
             return chinese
         found = check_translation(english.coc, chinese.coc)

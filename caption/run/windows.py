@@ -70,8 +70,8 @@ def choose_keyframes(labels: list[str | None], stride: int) -> dict[int, Keyfram
     """Choose the windows at which the label changes, the first one, and each `stride`-th after a chosen one.
 
     Returns:
-        index -> {reason: start | change | stride, skipped: windows left out up to the next chosen one, missed: changes of
-        the label among them, counted anew from the labels}.
+        index -> {reason: start | change | stride, skipped: windows left out up to the next chosen one, missed: changes
+        of the label among them, counted anew from the labels}.
     """
     chosen: dict[int, KeyframeRecord] = {}
     last = -1
@@ -132,7 +132,8 @@ def known_of(mission: Mission | None, frame: int) -> str | None:
 
 
 def order_comes_within(mission: Mission | None, current: int, future_frames: int) -> bool:
-    """Tell whether an order of which nobody knows at frame `current` moves the drone after it: no label could be told from what is seen."""
+    """Tell whether an order of which nobody knows at frame `current` moves the drone after it: no label could be told
+    from what is seen."""
     return mission is not None and current < mission.at_frame <= current + future_frames
 
 
@@ -163,9 +164,10 @@ def cut_future(flight: Flight, motion: LabelMotion, current: int, future_frames:
 
 # --- the motion that labels come from ---------------------------------------------------------------------------------
 
-# Offsets that are drawn anew for every frame are no manoeuvre, so a label made of them is noise. The clean motion of a perturbed flight is
-# that of its twin (`ORI`); without one, what was recorded is taken off: the shifts of drone and person, the turn of the view, and the aim
-# that followed the shifts (cosfly/render/perturbation.py). Visibility is no part of it: what was seen was seen from where the camera was.
+# Offsets that are drawn anew for every frame are no manoeuvre, so a label made of them is noise. The clean motion of a
+# perturbed flight is that of its twin (`ORI`); without one, what was recorded is taken off: the shifts of drone and
+# person, the turn of the view, and the aim that followed the shifts (cosfly/render/perturbation.py). Visibility is no
+# part of it: what was seen was seen from where the camera was.
 
 
 @dataclass(frozen=True)
@@ -202,7 +204,8 @@ def label_motion(flight: Flight, twin: Flight | None = None) -> LabelMotion:
         return as_flown(twin, "twin")
     positions_m = flight.positions_m - flight.drone_offsets_m
     targets_m = flight.targets_m - flight.target_offsets_m
-    # A frame without a shift was not aimed anew, whether or not its target is known. An unknown shift (NaN) counts as one.
+    # A frame without a shift was not aimed anew, whether or not its target is known. An unknown shift (NaN) counts as
+    # one.
     is_shifted = (flight.drone_offsets_m != 0).any(axis=1) | (flight.target_offsets_m != 0).any(axis=1)
     aimed_deg = np.degrees(look_at(flight.positions_m, flight.targets_m)[1] - look_at(positions_m, targets_m)[1])
     yaw_deg = flight.rotations_deg[:, 1] - flight.rotation_offsets_deg[:, 1] - np.where(is_shifted, aimed_deg, 0.0)

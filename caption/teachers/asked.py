@@ -1,4 +1,5 @@
-"""A model that is asked beside the teacher, a judge or a reader: its most likely answer, kept as a teacher's is, within the same budget."""
+"""A model that is asked beside the teacher, a judge or a reader: its most likely answer, kept as a teacher's is, within
+the same budget."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """`cosfly caption doctor URL`: what an endpoint can really do, found by trying, before a run pays for it.
 
-Servers answer 200 to much that they ignore: a schema, images, a limit. Each check therefore asks for something whose effect shows
-in the answer or in the token count.
+Servers answer 200 to much that they ignore: a schema, images, a limit. Each check therefore asks for something whose
+effect shows in the answer or in the token count.
 """
 
 from __future__ import annotations
@@ -78,7 +78,8 @@ def examine_endpoint(
 
 @dataclass(frozen=True)
 class Probe:
-    """What one request gave, read without trust, since any field may be of another kind than it should be. `value` is the decoded body of a 200, else None and `detail` tells why; refusal: what the server meant."""
+    """What one request gave, read without trust, since any field may be of another kind than it should be. `value` is
+    the decoded body of a 200, else None and `detail` tells why; refusal: what the server meant."""
 
     value: dict[str, Any] | None
     detail: str
@@ -146,7 +147,7 @@ def read_probe(response: Response, request: Request, client: ChatClient, seconds
     return Probe(value, "", seconds)
 
 
-# --- the examination ---------------------------------------------------------------------------------------------------
+# --- the examination --------------------------------------------------------------------------------------------------
 
 
 class _Examination:
@@ -265,8 +266,8 @@ class _Examination:
         self._add(
             "JSON schema",
             "warning",
-            f"accepted and ignored: asked for {{animal: {ODD_WORD}}}, got {probe.text.strip()[:40]!r}; answers are parsed "
-            "from plain text, an anchored decision is not enforced",
+            f"accepted and ignored: asked for {{animal: {ODD_WORD}}}, got {probe.text.strip()[:40]!r}; answers are "
+            f"parsed from plain text, an anchored decision is not enforced",
         )
 
     async def _image(self) -> bool:
@@ -308,7 +309,8 @@ class _Examination:
         self._add(
             "images per prompt",
             "unusable",
-            f"{low}, our prompts hold {self.num_images} ({refusal}); raise the server's limit (vLLM: --limit-mm-per-prompt "
+            f"{low}, our prompts hold {self.num_images} ({refusal}); raise the server's limit (vLLM: "
+            f"--limit-mm-per-prompt "
             f"'{{\"image\": {self.num_images}}}'), or set image.layout=tiled or fewer image.modalities",
         )
         return False
@@ -316,7 +318,10 @@ class _Examination:
     def _dropped(self, probe: Probe, count: int) -> str:
         """Some servers drop images beyond a limit in silence: the token count shows it. Gives the finding, or ""."""
         if self.tokens_per_image and probe.prompt_tokens and probe.prompt_tokens < 0.8 * count * self.tokens_per_image:
-            return f"{count} images took {probe.prompt_tokens} tokens, one takes {self.tokens_per_image}: some were dropped"
+            return (
+                f"{count} images took {probe.prompt_tokens} tokens, one takes {self.tokens_per_image}: some were "
+                f"dropped"
+            )
         return ""
 
     async def _largest_prompt(self) -> bool:
@@ -372,8 +377,10 @@ class _Examination:
         self._add(
             "reads prose",
             "ok" if is_good else "warning" if check.num_claims else "unusable",
-            f"{check.num_claims / check.num_sentences:.1f} claims a sentence in both readings, {check.num_flagged} of {check.num_true} true captions "
-            f"flagged, {check.num_unreadable} of {check.num_requests} answers without claims; measure it: cosfly caption reader-check",
+            f"{check.num_claims / check.num_sentences:.1f} claims a sentence in both readings, {check.num_flagged} of "
+            f"{check.num_true} true captions "
+            f"flagged, {check.num_unreadable} of {check.num_requests} answers without claims; measure it: cosfly "
+            f"caption reader-check",
         )
 
     async def _written(self, messages: list[dict], schema: dict) -> tuple[str, bool] | None:

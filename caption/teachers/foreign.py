@@ -1,7 +1,8 @@
-"""Captions of somebody else: a JSON-lines file in a teacher's place (`--teacher file:PATH`), or what a student answered (`student:PATH`).
+"""Captions of somebody else: a JSON-lines file in a teacher's place (`--teacher file:PATH`), or what a student answered
+(`student:PATH`).
 
-One line a window: sample_id, en {three fields}; where its writer has them, zh {three fields}, claims, therefore. Or `predictions.jsonl`.
-Nothing can be asked for again. A window without a line is dropped.
+One line a window: sample_id, en {three fields}; where its writer has them, zh {three fields}, claims, therefore. Or
+`predictions.jsonl`. Nothing can be asked for again. A window without a line is dropped.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ class ForeignCaption(BaseModel):
 
 @dataclass(frozen=True)
 class Terms:
-    """How a window is answered. fields: of the answer beyond the paper's three. is_given: it can be asked for once only. is_translated: the
-    Chinese is made from the English, not from the window."""
+    """How a window is answered. fields: of the answer beyond the paper's three. is_given: it can be asked for once
+    only. is_translated: the Chinese is made from the English, not from the window."""
 
     writing: Writing
     fields: tuple[str, ...]
@@ -105,7 +106,8 @@ class FileTeacher:
 
 
 class StudentTeacher:
-    """Answers with a student's predictions, as it wrote them: what does not parse is refused as a teacher's answer is."""
+    """Answers with a student's predictions, as it wrote them: what does not parse is refused as a teacher's answer
+    is."""
 
     def __init__(self, path: Path, run: str | None, seed: int) -> None:
         self._answers = read_student(path, run)

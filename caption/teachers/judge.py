@@ -1,7 +1,7 @@
 """Phase 4, optional: a language model judges conflicts between a decision and the label; geometry keeps the last word.
 
-A judgement that cannot be read is `unjudged`, never an acceptance. Judgements are kept as a teacher's answers are, and count in the
-same budget. `check_judge` measures a judge on a small gold set before its verdicts are used.
+A judgement that cannot be read is `unjudged`, never an acceptance. Judgements are kept as a teacher's answers are, and
+count in the same budget. `check_judge` measures a judge on a small gold set before its verdicts are used.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ _MEANINGS: dict[Judgement, str] = {
 
 @dataclass(frozen=True)
 class Case:
-    """One conflict: the flight data as the teacher read them but for its pictures, its answer, and the true decision (None: not known)."""
+    """One conflict: the flight data as the teacher read them but for its pictures, its answer, and the true decision
+    (None: not known)."""
 
     sample_id: str
     flight: str
@@ -65,7 +66,8 @@ def judge_schema(order: Sequence[Judgement] = JUDGEMENTS) -> dict:
 
 
 def parse_judgement(text: str, finish_reason: str | None = None) -> tuple[str, str]:
-    """Read (verdict, reason); a text whose last object does not hold one of the three verdicts and a reason is `unjudged`."""
+    """Read (verdict, reason); a text whose last object does not hold one of the three verdicts and a reason is
+    `unjudged`."""
     found = find_object(text, ("verdict", "reason"), finish_reason)
     if found.value is None:
         return UNJUDGED, found.reason or ""
@@ -107,7 +109,8 @@ async def open_judge(
     budget: Budget | None = None,
     troubles: Troubles | None = None,
 ) -> AsyncIterator[Judge | None]:
-    """Connect to the judge that the settings name; None where they name none. Arguments and errors as of `open_models`."""
+    """Connect to the judge that the settings name; None where they name none. Arguments and errors as of
+    `open_models`."""
     if cfg.url is None:
         yield None
         return
@@ -121,8 +124,8 @@ async def open_judge(
 def gold_conflicts() -> list[tuple[Case, Judgement]]:
     """Give conflicts of the first gold set with their right judgements, as many of each.
 
-    A true caption for another decision than the label is an acceptable alternative; with one thing in it made false it must be
-    written anew; a true caption for the label of which only the decision was changed has the wrong label field.
+    A true caption for another decision than the label is an acceptable alternative; with one thing in it made false it
+    must be written anew; a true caption for the label of which only the decision was changed has the wrong label field.
     """
     found: dict[Judgement, list[Case]] = {judgement: [] for judgement in JUDGEMENTS}
     for caption in read_gold():
@@ -152,9 +155,10 @@ def _gold_case(caption: GoldCaption, answer: Coc, kind: str) -> Case:
         f"Yaw against the first frame: [{listed('yaw_deg')}] deg (positive to the left).\n"
         f"Horizontal distance to the target: [{listed('distance_m')}] m, in 3D: [{listed('slant_m')}] m.\n"
         f"Target ground speed: {facts.target_speed_mps} m/s, change of its direction: {facts.target_turn_deg} deg.\n"
-        f"Target's box: widths [{listed('box_width_px')}], heights [{listed('box_height_px')}] px; its offset from the image centre: "
-        f"[{listed('offset_x_px')}] px to the right, [{listed('offset_y_px')}] px down, of {facts.width_px} x {facts.height_px}.\n"
-        f"Visibility: [{', '.join(facts.visibility)}]."
+        f"Target's box: widths [{listed('box_width_px')}], heights [{listed('box_height_px')}] px; its offset from the "
+        f"image centre: "
+        f"[{listed('offset_x_px')}] px to the right, [{listed('offset_y_px')}] px down, of {facts.width_px} x "
+        f"{facts.height_px}.\nVisibility: [{', '.join(facts.visibility)}]."
     )
     return Case(f"gold_{caption.id}_{kind}_frame_00000", flight, answer, caption.label)
 

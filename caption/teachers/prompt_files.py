@@ -1,6 +1,7 @@
 """The prompt files: those that ship, or a folder of somebody's own (`caption.prompts`), which is held against them.
 
-Each file begins with a line `# version: ...`; the rest is the prompt, with `$slots` for what is filled in and `$$` for a dollar sign.
+Each file begins with a line `# version: ...`; the rest is the prompt, with `$slots` for what is filled in and `$$` for
+a dollar sign.
 """
 
 from __future__ import annotations
@@ -55,8 +56,10 @@ def own_prompts(folder: Path | None) -> dict[str, str] | None:
         log.error("%s", problem)
     if problems:
         raise ConfigError(
-            "these prompts cannot be used", where=folder, got=problems[0] + (f", and {len(problems) - 1} more" if problems[1:] else ""),
-            expected="the files and slots of those that ship", fix=f"{len(problems)} to mend; cosfly caption prompts --export DIR writes those that ship",
+            "these prompts cannot be used", where=folder,
+            got=problems[0] + (f", and {len(problems) - 1} more" if problems[1:] else ""),
+            expected="the files and slots of those that ship",
+            fix=f"{len(problems)} to mend; cosfly caption prompts --export DIR writes those that ship",
         )  # fmt: skip
     return found
 
@@ -133,5 +136,6 @@ def export_prompts(folder: Path) -> list[Path]:
 
 
 def _is_another(path: Path, text: str) -> bool:
-    """Tell whether something else stands where a text is to be written; the text itself may, of an export that was killed."""
+    """Tell whether something else stands where a text is to be written; the text itself may, of an export that was
+    killed."""
     return path.exists() and not (path.is_file() and read_text(path) == text)

@@ -1,4 +1,5 @@
-"""Prompts: versioned text files (prompt_files.py) filled with the facts of one observed window, and the pictures that go with them.
+"""Prompts: versioned text files (prompt_files.py) filled with the facts of one observed window, and the pictures that
+go with them.
 
 Nothing here takes the future. Every caption records the hash of what was asked.
 """
@@ -35,12 +36,14 @@ class Correction:
 
 @dataclass(frozen=True)
 class Question:
-    """What a teacher is asked about one window: the facts for those who compute, prompts and pictures for those who look.
+    """What a teacher is asked about one window: the facts for those who compute, prompts and pictures for those who
+    look.
 
     prompts: with a mark where the sentence about the pictures goes; `asked` has the sentence for these pictures.
-    decision: None for a free answer, else the decision that the answer must hold (anchored). rejected: the decision of an
-    earlier answer that did not fit, named as a hint. ask: counts the asks of the
-    same kind, so that each has its own sampling seed and journal key. correction: an answer to this question that was not taken.
+    decision: None for a free answer, else the decision that the answer must hold (anchored). rejected: the decision of
+    an earlier answer that did not fit, named as a hint. ask: counts the asks of the
+    same kind, so that each has its own sampling seed and journal key. correction: an answer to this question that was
+    not taken.
     """
 
     window: ObservedWindow
@@ -71,7 +74,8 @@ def system_prompt(language: Language) -> str:
 
 @in_place.kept()
 def way_prompt(writing: Writing, decision: str | None = None) -> str:
-    """Give the system prompt of a way of writing; a decision is a hard constraint (the anchored strategy of sec:appendix_e)."""
+    """Give the system prompt of a way of writing; a decision is a hard constraint (the anchored strategy of
+    sec:appendix_e)."""
     prompt = read_prompt(way_of(writing).system).substitute(actions=", ".join(action_tokens()))
     return prompt if decision is None else f"{prompt}\n{decision_words(decision)}"
 
@@ -183,8 +187,8 @@ def _target_text(frame: ObservedFrame) -> str:
 def question_messages(question: Question, encoder: FrameSource) -> tuple[list[dict], list[str]]:
     """Give the chat messages of a question and the digests of its pictures.
 
-    The pictures come first, oldest first, each frame under its name, then the flight data: windows of one flight share the
-    system prompt as a prefix and four of five frames as identical pictures.
+    The pictures come first, oldest first, each frame under its name, then the flight data: windows of one flight share
+    the system prompt as a prefix and four of five frames as identical pictures.
     """
     content: list[dict] = []
     digests: list[str] = []

@@ -1,8 +1,10 @@
-"""Reads somebody else's prose into claims: language models say what each sentence states, geometry says whether that is true.
+"""Reads somebody else's prose into claims: language models say what each sentence states, geometry says whether that is
+true.
 
-A reader sees the sentences alone, no facts. Two readings are made of each text, by two models or by one that is asked in two orders;
-only what both say is judged. Each claim quotes the words it stands for, which must occur; a sentence is proved only if the quotes hold
-every numeral and every measurable word of it. `check_reader` measures a reader on the gold set before it is believed.
+A reader sees the sentences alone, no facts. Two readings are made of each text, by two models or by one that is asked
+in two orders; only what both say is judged. Each claim quotes the words it stands for, which must occur; a sentence is
+proved only if the quotes hold every numeral and every measurable word of it. `check_reader` measures a reader on the
+gold set before it is believed.
 """
 
 from __future__ import annotations
@@ -53,7 +55,8 @@ SCHEMA = {
 
 
 def reader_messages(coc: Coc, facts: Facts, order: int) -> list[dict]:
-    """Give the chat messages of a reading; of the facts only the number of frames is told. order: 1 names all things backwards."""
+    """Give the chat messages of a reading; of the facts only the number of frames is told. order: 1 names all things
+    backwards."""
     quantities, sentences = list(QUANTITIES), [f"{name}: {text}" for name, text in sentences_of(coc)]
     if order:
         quantities, sentences = quantities[::-1], sentences[::-1]
@@ -72,8 +75,8 @@ def prompt_digest() -> str:
 
 
 def read_reading(text: str, finish_reason: str | None, coc: Coc, language: Language) -> list[Claim] | None:
-    """Read the claims of an answer; None where it is none. Left out are claims that are malformed, that quote what their sentence
-    does not hold, or whose number their quote does not hold."""
+    """Read the claims of an answer; None where it is none. Left out are claims that are malformed, that quote what
+    their sentence does not hold, or whose number their quote does not hold."""
     found = find_object(text, ("claims",), finish_reason).value
     if found is None or not isinstance(found.get("claims"), list):
         return None
@@ -125,7 +128,8 @@ def judge_reading(
     A claim that cannot be compared is the reader's fault and makes its sentence unread, not contradicted.
     """
     return [
-        _judge_sentence(name, text, [c for c in claims if c.sentence == name], coc.flight_decision, facts, cfg, language)
+        _judge_sentence(name, text, [c for c in claims if c.sentence == name], coc.flight_decision, facts, cfg,
+        language)
         for name, text in sentences_of(coc)
     ]  # fmt: skip
 
@@ -250,7 +254,8 @@ async def open_reader(
     budget: Budget | None = None,
     troubles: Troubles | None = None,
 ) -> AsyncIterator[Reader | None]:
-    """Connect to the reader that the settings name; None where they name none. Arguments and errors as of `open_models`."""
+    """Connect to the reader that the settings name; None where they name none. Arguments and errors as of
+    `open_models`."""
     if not cfg.urls:
         yield None
         return

@@ -1,7 +1,7 @@
 """The embedded rule teacher: deterministic, looks only at the facts measured on the observed frames.
 
-It decides from pixel offset, distances, speeds and visibility, and writes English and Chinese templates, filled as any other
-teacher's are. Wording varies with the sample. Its records say `kind: rules`; it is no model and sees no picture.
+It decides from pixel offset, distances, speeds and visibility, and writes English and Chinese templates, filled as any
+other teacher's are. Wording varies with the sample. Its records say `kind: rules`; it is no model and sees no picture.
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ def _slope_weights(count: int) -> tuple[list[float], float]:
 
 # What it decides by itself. Others it justifies where they are given.
 DECIDES = (
-    "return_to_home", "break_off", "search_to_reacquire_target", "hover", "yaw_left_to_follow", "yaw_right_to_follow", "ascend", "descend",
+    "return_to_home", "break_off", "search_to_reacquire_target", "hover", "yaw_left_to_follow", "yaw_right_to_follow",
+    "ascend", "descend",
     "speed_up", "slow_down", "track_straight",
 )  # fmt: skip
 

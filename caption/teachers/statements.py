@@ -1,7 +1,7 @@
 """Statements about a window in both languages: the critical components of the rule teacher.
 
-Each statement is a choice of wordings, each wording a sentence in English and in Chinese, templates with the same slots. A wording
-is offered only where the facts of its slots are known.
+Each statement is a choice of wordings, each wording a sentence in English and in Chinese, templates with the same
+slots. A wording is offered only where the facts of its slots are known.
 """
 
 from __future__ import annotations
@@ -62,7 +62,8 @@ def _walk(f: Facts) -> tuple[Both, ...]:
                 "目标以 {mean:target_speed}的速度{target_motion}并向{side:target_heading}转弯。",
             ),
             (
-                "The target {target_motion} at {mean:target_speed}, bending {change:target_heading} to the {side:target_heading}.",
+                "The target {target_motion} at {mean:target_speed}, bending {change:target_heading} to the "
+                "{side:target_heading}.",
                 "目标以 {mean:target_speed}的速度{target_motion}，并向{side:target_heading}转弯 {change:target_heading}。",
             ),
         )

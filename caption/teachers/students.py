@@ -1,6 +1,8 @@
-"""A student behind a server as a teacher (`--as-student FOLDER`): asked with the very prompts, pictures and sampling that it was taught with.
+"""A student behind a server as a teacher (`--as-student FOLDER`): asked with the very prompts, pictures and sampling
+that it was taught with.
 
-That is the paper's stage 3: flights that nobody labelled get their captions from a student, judged and marked like any other teacher's.
+That is the paper's stage 3: flights that nobody labelled get their captions from a student, judged and marked like any
+other teacher's.
 """
 
 from __future__ import annotations
@@ -35,12 +37,14 @@ from cosfly.products.captions import Language, Prompt
 
 
 def as_taught(cfg: CaptionConfig) -> CaptionConfig:
-    """Give the settings of a run that asks a student, from what its folder says: windows, pictures, way of writing and sampling.
+    """Give the settings of a run that asks a student, from what its folder says: windows, pictures, way of writing and
+    sampling.
 
     Where nobody is asked as a student they stay as they are.
 
     Raises:
-        InputError: the folder does not say what the student was taught. ConfigError: it was taught something that cannot be asked here.
+        InputError: the folder does not say what the student was taught. ConfigError: it was taught something that
+        cannot be asked here.
     """
     folder = cfg.student.folder
     if folder is None:
@@ -82,14 +86,17 @@ def check_prompts(taught: Taught, folder: Path) -> None:
     for language, prompt in taught.prompts.items():
         if prompt.system != system_prompt(language) or not _is_of_template(prompt.user, language, taught):
             raise ConfigError(
-                "the student was taught another version of the prompt", where=f"{folder}: {language}", got=prompt.user[:80],
-                fix="ask it with the prompts (caption.prompts) and the version of cosfly that captioned its training set, or train it anew",
+                "the student was taught another version of the prompt", where=f"{folder}: {language}",
+                got=prompt.user[:80],
+                fix="ask it with the prompts (caption.prompts) and the version of cosfly that captioned its training "
+                "set, or train it anew",
             )  # fmt: skip
 
 
 def _is_of_template(user: str, language: Language, taught: Taught) -> bool:
     told = {"num_frames": re.escape(str(taught.num_frames)), "pictures": "|".join(
-        re.escape(Pictures(look.views, look.size_px, "separate", look.depth_range_m).sentence(language)) for look in taught.looks
+        re.escape(Pictures(look.views, look.size_px, "separate",
+        look.depth_range_m).sentence(language)) for look in taught.looks
     )}  # fmt: skip
     pattern, end = "", 0
     template = read_prompt(f"user_{language}")

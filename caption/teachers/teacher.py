@@ -1,7 +1,7 @@
 """Teachers: who answers a `Question`.
 
-`RuleTeacher` is embedded and deterministic. `AskingTeacher` asks a language model through an engine (cosfly/chat); every answer
-is journaled before it is handed on.
+`RuleTeacher` is embedded and deterministic. `AskingTeacher` asks a language model through an engine (cosfly/chat);
+every answer is journaled before it is handed on.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ NUM_TRIALS = 2
 
 
 class Teacher(Protocol):
-    """`ask` answers in English, `mirror` gives the Chinese of an English answer; `complaint`: what was wrong with the last one."""
+    """`ask` answers in English, `mirror` gives the Chinese of an English answer; `complaint`: what was wrong with the
+    last one."""
 
     record: TeacherRecord
 
@@ -131,7 +132,8 @@ def sampling_seed(seed: int, sample_id: str, purpose: str) -> int:
 
 
 def first_budget(cfg: CaptionConfig, *counts: Counter[str]) -> Budget:
-    """Make the budget of a run; until an answer tells more, a request counts as 16 of the largest pictures and much text.
+    """Make the budget of a run; until an answer tells more, a request counts as 16 of the largest pictures and much
+    text.
 
     Args:
         counts: `totals` of each book of answers.
@@ -210,8 +212,8 @@ class AskingTeacher:
     async def _find_fault(self, question: Question, refused: NoAnswer) -> None:
         """Find out whether a refusal is the window's: then a trial prompt with pictures of the same kind is answered.
 
-        One trial answers for all that were refused before it, and later for those between which enough windows are answered: a server that
-        answers is not at fault. Two are tried, since a filter may stop one by chance.
+        One trial answers for all that were refused before it, and later for those between which enough windows are
+        answered: a server that answers is not at fault. Two are tried, since a filter may stop one by chance.
 
         Raises:
             TeacherError: it is the server's: both are refused alike.
@@ -237,7 +239,8 @@ class AskingTeacher:
         raise TeacherError(what, where=self.engine.where, got=refused.detail, fix=refused.fix or None)
 
     async def _try_scene(self, question: Question, scene: Scene) -> None:
-        """Ask about a made-up window, in the name of the question's: its tokens count, its answer is none of the run's."""
+        """Ask about a made-up window, in the name of the question's: its tokens count, its answer is none of the
+        run's."""
         trial = trial_question(question, self.all_cfg, scene)
         sample_id, purpose = question.window.sample_id, f"trial/{time.time_ns()}"  # never one that the book holds
         messages, digests = question_messages(trial, Drawn(trial.window, self.all_cfg.image))

@@ -1,6 +1,8 @@
-"""Trial windows: what a teacher can write, found by letting it write about flights that are made up and pictures that are drawn.
+"""Trial windows: what a teacher can write, found by letting it write about flights that are made up and pictures that
+are drawn.
 
-Three windows for each way of writing, asked as a run asks: freely, then with what was wrong, `correction_asks` times. The English alone.
+Three windows for each way of writing, asked as a run asks: freely, then with what was wrong, `correction_asks` times.
+The English alone.
 """
 
 from __future__ import annotations
@@ -35,7 +37,8 @@ Ask = Callable[[list[dict], dict], Awaitable[tuple[str, bool] | None]]
 
 @dataclass(frozen=True)
 class Scene:
-    """A made-up flight: of the drone its height, speed, climb and turn, of the person speed, and the frames in which it is hidden."""
+    """A made-up flight: of the drone its height, speed, climb and turn, of the person speed, and the frames in which it
+    is hidden."""
 
     name: str
     altitude_m: float

@@ -1,8 +1,11 @@
-"""The actions against geometry: how much of each a motion shows, by the rules of the set in use (cosfly/products/actions.yaml).
+"""The actions against geometry: how much of each a motion shows, by the rules of the set in use
+(cosfly/products/actions.yaml).
 
-The first line of its precedence in which an action is `implied` by the actual future gives the label: in it the action of which there is
-most, in units of its own threshold. A decision of which the future shows next to nothing is contradicted. `break_off` and
-`return_to_home` are orders of a mission: its metadata give them, geometry never does. Signs: left, up and forward are positive.
+The first line of its precedence in which an action is `implied` by the actual future gives the label: in it the action
+of which there is most, in units of its own threshold. A decision of which the future shows next to nothing is
+contradicted. `break_off` and
+`return_to_home` are orders of a mission: its metadata give them, geometry never does. Signs: left, up and forward are
+positive.
 """
 
 from __future__ import annotations
@@ -83,7 +86,8 @@ Measure = Callable[[Motion], float]
 class Table:
     """The rules of a set of actions with their thresholds put in.
 
-    implied: in order of precedence, groups of actions and how much there is of what makes each the label, from 1 on. shown: how much of an
+    implied: in order of precedence, groups of actions and how much there is of what makes each the label, from 1 on.
+    shown: how much of an
     action a motion shows, negative for its opposite, and what it must not fall below: less contradicts it.
     """
 

@@ -1,4 +1,5 @@
-"""Words that stand beside a number and turn it round: the side that it is on, the order of two values of one quantity."""
+"""Words that stand beside a number and turn it round: the side that it is on, the order of two values of one
+quantity."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ _LATER = re.compile(
 
 
 def denied_numbers(stated: Stated, said: Said) -> Iterator[str]:
-    """Yield the numbers whose claims are on the other side, or of frames in the other order, than the words beside them say."""
+    """Yield the numbers whose claims are on the other side, or of frames in the other order, than the words beside them
+    say."""
     for numeral in stated.numerals:
         pole = _side_of(numeral, stated)
         if pole is None:
@@ -54,7 +56,8 @@ def _has_side(claim: Claim, pole: Pole) -> bool:
 
 
 def _is_turned(first: Numeral, second: Numeral, said: Said) -> bool:
-    """Tell whether two numbers are values of one quantity at frames in the other order, by every reading of the claims."""
+    """Tell whether two numbers are values of one quantity at frames in the other order, by every reading of the
+    claims."""
     orders = [
         min(frames_of(one), default=0) < min(frames_of(other), default=0)
         for one in said.numbers

@@ -72,7 +72,8 @@ def _between(unit: str, facts: Facts) -> Iterator[float]:
 
 
 def _is_at_hour(hour: float, facts: Facts) -> bool:
-    """Tell whether the person was at an hour of the clock, by bearing or, where that is not known, by the side in the picture."""
+    """Tell whether the person was at an hour of the clock, by bearing or, where that is not known, by the side in the
+    picture."""
     angle = wrapped(-30.0 * (hour % 12))
     bearings = [bearing for bearing in facts.bearing_deg if bearing is not None]
     if bearings:

@@ -1,7 +1,7 @@
 """Claims: what a sentence states, in a form that can be compared exactly with the facts.
 
-A claim names a fact by its reference (references.py) and gives its value. Teachers that cannot write slots write claims beside
-their prose, a reader writes them for prose of others. One comparison serves both.
+A claim names a fact by its reference (references.py) and gives its value. Teachers that cannot write slots write claims
+beside their prose, a reader writes them for prose of others. One comparison serves both.
 """
 
 from __future__ import annotations
@@ -40,8 +40,9 @@ def judge_claims(
 ) -> list[Judged]:
     """Compare the claims of a text with the facts and with its own words; gives the state of every sentence, in order.
 
-    Observed claims are compared with the facts, predicted ones with the decision, hypothetical ones with the words alone. A
-    numeral or a word of an opposite without a claim must be true of the window, and proves nothing (coverage.py).
+    Observed claims are compared with the facts, predicted ones with the decision, hypothetical ones with the words
+    alone. A numeral or a word of an opposite without a claim must be true of the window, and proves nothing
+    (coverage.py).
     """
     sentences = list(sentences_of(coc))
     names = {name for name, _ in sentences}
@@ -121,7 +122,8 @@ def _compare(
 
 
 def references_of(claim: Claim) -> list[Reference]:
-    """Give the addresses that a claim names, [] where it names nothing that can be measured. A value at a span is one of each frame."""
+    """Give the addresses that a claim names, [] where it names nothing that can be measured. A value at a span is one
+    of each frame."""
     if claim.at is None or not claim.at.strip():
         reference = parse_reference(claim.quantity)
         return [reference] if reference else []

@@ -1,6 +1,7 @@
 """Whether a sentence says what its claims say: numerals, sides, courses, states.
 
-A numeral or an opposite without a claim was compared with nothing: it proves nothing, and is a problem where it is not true.
+A numeral or an opposite without a claim was compared with nothing: it proves nothing, and is a problem where it is not
+true.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ COMPARATIVES = frozenset(
 
 # Words, negated or not, that say that the person is seen, and that not all is.
 _SEEN = {
-    ("glimpsed", False), ("visible", False), ("full", False), ("partly", False), ("hidden", True), ("gone", True), ("partly", True),
+    ("glimpsed", False), ("visible", False), ("full", False), ("partly", False), ("hidden", True), ("gone", True),
+    ("partly", True),
 }  # fmt: skip
 _UNSEEN = {("hidden", False), ("gone", False), ("visible", True), ("glimpsed", True)}
 _PARTLY = {("partly", False), ("hidden", False), ("visible", False), ("full", True)}
@@ -60,7 +62,8 @@ def cover(
 ) -> Coverage:
     """Say what of a sentence neither a claim covers nor the facts bear out, and which claims it says the opposite of.
 
-    A word or a number without a claim is no problem where it is true of the window, unless a claim of its kind is missing in the
+    A word or a number without a claim is no problem where it is true of the window, unless a claim of its kind is
+    missing in the
     sentence: then it stands in the place of what was claimed.
 
     Args:
@@ -103,7 +106,8 @@ def _is_repeated(numeral: Numeral, in_place_of: Sequence[Claim], stated: Stated,
 
 
 def _is_said_otherwise(numeral: Numeral, missing: Sequence[Claim], said: Said) -> bool:
-    """Tell whether a number says what a missing claim says: "from 20.5 to 17 m" where the change is claimed, or the other way round."""
+    """Tell whether a number says what a missing claim says: "from 20.5 to 17 m" where the change is claimed, or the
+    other way round."""
     return any(
         same_size(numeral, one)
         for claim in missing
@@ -192,7 +196,8 @@ def _is_led(pole: Pole, said: Said, facts: Facts) -> bool | None:
 
 
 def _has_come(word: str, claim: Claim, facts: Facts) -> bool | None:
-    """Tell whether a quantity came up or down to its value at a frame, from the frame before or from the first; None: not known."""
+    """Tell whether a quantity came up or down to its value at a frame, from the frame before or from the first; None:
+    not known."""
     quantity = QUANTITIES.get(claim.quantity)
     if quantity is None or quantity.sides or claim.modality != "observed":
         return None
@@ -216,7 +221,8 @@ def _denies(pole: Pole, covers: set[str]) -> bool:
 
 
 def _covers_pace(pole: Pole, said: Said) -> bool:
-    """Tell whether claims cover "faster" or "slower": said of the target, a comparison of drone and target is the other way round."""
+    """Tell whether claims cover "faster" or "slower": said of the target, a comparison of drone and target is the other
+    way round."""
     other = {"faster": "slower", "slower": "faster"}
     if _OF_CHANGE.search(pole.word):
         return ("paced", pole.value) in said.poles

@@ -1,6 +1,8 @@
-"""What can be measured on an observed window: the series from which prompts, slots, claims and the reader of prose take every fact.
+"""What can be measured on an observed window: the series from which prompts, slots, claims and the reader of prose take
+every fact.
 
-Values are rounded here, once, as they are printed, so that text and check compare the same numbers. How a single fact is named and
+Values are rounded here, once, as they are printed, so that text and check compare the same numbers. How a single fact
+is named and
 looked up: references.py.
 """
 
@@ -24,17 +26,19 @@ PARTLY_BELOW = 0.7  # rendered score under which a visible person counts as part
 class Facts:
     """Measured series, oldest frame first; None where a value cannot be measured, () where a series was not.
 
-    Of the drone: speed_mps is |p_i - p_(i-1)| / dt in 3D; the oldest frame has no earlier one in the window, so its value is None
-    and the prompt prints 0.0, as the paper's sample does. altitude_m: world z. yaw_deg: against the oldest frame; heading_deg: in the
-    world, 0 along x, in (-180, 180]; both positive to the left. pitch_deg: of the camera. travelled_m, displacement_m: way and
-    straight line from the oldest frame.
-    Of the target: target_speed_mps is the mean over the window, target_speeds_mps each step's; target_turn_deg: change of its heading
-    between the first and the last step, target_headings_deg each step's, positive to the left; target_travelled_m: its way on the
-    ground from the oldest frame.
-    Between them: distance_m is horizontal, slant_m in 3D, height_over_target_m from the person's hip; bearing_deg: where the person
-    is, against the drone's heading, positive to the left; depression_deg: of the line of sight below the horizon.
+    Of the drone: speed_mps is |p_i - p_(i-1)| / dt in 3D; the oldest frame has no earlier one in the window, so its
+    value is None and the prompt prints 0.0, as the paper's sample does. altitude_m: world z. yaw_deg: against the
+    oldest frame; heading_deg: in the world, 0 along x, in (-180, 180]; both positive to the left. pitch_deg: of the
+    camera. travelled_m, displacement_m: way and straight line from the oldest frame.
+    Of the target: target_speed_mps is the mean over the window, target_speeds_mps each step's; target_turn_deg: change
+    of its heading between the first and the last step, target_headings_deg each step's, positive to the left;
+    target_travelled_m: its way on the ground from the oldest frame.
+    Between them: distance_m is horizontal, slant_m in 3D, height_over_target_m from the person's hip; bearing_deg:
+    where the person is, against the drone's heading, positive to the left; depression_deg: of the line of sight below
+    the horizon.
     mission: the kind of the order that ends the pursuit, once it stands.
-    In the picture of width_px x height_px, in its pixels: the target's box and its middle's offset from the image centre, positive to the right and down.
+    In the picture of width_px x height_px, in its pixels: the target's box and its middle's offset from the image
+    centre, positive to the right and down.
     """
 
     speed_mps: tuple[float | None, ...]
@@ -129,7 +133,8 @@ def _measure_frame(frame: ObservedFrame, camera_px: tuple[int, int], picture_px:
     """Measure what one frame tells.
 
     Returns:
-        altitude, pitch, heading, distance, slant, height over the target, bearing, depression, the box's width and height, its middle's
+        altitude, pitch, heading, distance, slant, height over the target, bearing, depression, the box's width and
+        height, its middle's
         offset to the right and down, the word for visibility: as the facts have them.
     """
     (x, y, z), (u, v, w), (pitch, heading, _) = frame.position_m, frame.target_m, frame.rotation_deg
@@ -151,7 +156,8 @@ def _measure_frame(frame: ObservedFrame, camera_px: tuple[int, int], picture_px:
 def _measure_picture(
     frame: ObservedFrame, camera_px: tuple[int, int], picture_px: tuple[int, int]
 ) -> tuple[int | None, ...]:
-    """Measure the target in the picture: its box's width and height, its offset from the middle to the right and down."""
+    """Measure the target in the picture: its box's width and height, its offset from the middle to the right and
+    down."""
     (width_px, height_px), (u, v) = picture_px, frame.target_uv
     x_scale, y_scale = width_px / camera_px[0], height_px / camera_px[1]
     left, top, right, bottom = frame.target_bbox
@@ -166,8 +172,8 @@ def _measure_step(before: ObservedFrame, after: ObservedFrame) -> tuple[Any, ...
     """Measure what happened between two frames.
 
     Returns:
-        time in s, turn in degrees, way in m, speed as the facts have it; of the target: (x, y) walked, way, speed, and as the facts have them speed
-        and heading.
+        time in s, turn in degrees, way in m, speed as the facts have it; of the target: (x, y) walked, way, speed, and
+        as the facts have them speed and heading.
     """
     step_s = after.time_s - before.time_s
     (x0, y0, _), (x1, y1, _) = before.target_m, after.target_m

@@ -224,7 +224,8 @@ def written_units(language: Language) -> dict[str, Unit]:
 
 @cache
 def words_beside(language: Language) -> dict[str, tuple[str, frozenset[str]]]:
-    """Give the words with which a sentence with slots may be proved: word -> kind, and the quantities that it speaks of."""
+    """Give the words with which a sentence with slots may be proved: word -> kind, and the quantities that it speaks
+    of."""
     beside, found = _file().beside, dict[str, tuple[str, frozenset[str]]]()
     for names, pair in (beside.kinds | beside.quantities).items():
         kind = names if names in beside.kinds else "aspect" if names in ("mean", "min", "max", "change") else "quantity"

@@ -1,8 +1,10 @@
-"""The gold set: captions of free prose that nobody of the project wrote, true to their windows, with errors planted one at a time.
+"""The gold set: captions of free prose that nobody of the project wrote, true to their windows, with errors planted one
+at a time.
 
-It measures what reads texts (readers, the rules for prose, the covering by claims) and gives `judge-check` its conflicts. A line holds
-the measured series of its window (`facts`), a true caption, in sets 1 and 2 what its writer says that its sentences claim, and `errors`:
-changes of one piece of a text, or of one claim's value, each of which makes the caption false.
+It measures what reads texts (readers, the rules for prose, the covering by claims) and gives `judge-check` its
+conflicts. A line holds
+the measured series of its window (`facts`), a true caption, in sets 1 and 2 what its writer says that its sentences
+claim, and `errors`: changes of one piece of a text, or of one claim's value, each of which makes the caption false.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ class PlantedError(BaseModel):
 
 
 class GoldCaption(BaseModel):
-    """A true caption with its planted errors. set: who wrote it, 1 to 18. label: the decision that its flight took; None: geometry cannot tell."""
+    """A true caption with its planted errors. set: who wrote it, 1 to 18. label: the decision that its flight took;
+    None: geometry cannot tell."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

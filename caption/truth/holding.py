@@ -1,4 +1,5 @@
-"""Whether somebody's value is true at an address: numbers to the digits they are written with, words with wide borders."""
+"""Whether somebody's value is true at an address: numbers to the digits they are written with, words with wide
+borders."""
 
 from __future__ import annotations
 

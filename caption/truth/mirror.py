@@ -1,7 +1,8 @@
 """Are the two languages of a caption one record?
 
-`check_mirror` holds for any pair of texts: same decision, each in its own script, compatible numbers, no opposite swapped. What was
-asked for as a translation must also have the same sentences and the glossary's terms (`check_translation`).
+`check_mirror` holds for any pair of texts: same decision, each in its own script, compatible numbers, no opposite
+swapped. What was asked for as a translation must also have the same sentences and the glossary's terms
+(`check_translation`).
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ def flight_numbers(facts: Facts) -> dict[str, list[Series]]:
 def check_mirror(english: Coc, chinese: Coc, flight: dict[str, list[Series]]) -> str | None:
     """Compare two languages of one sample; gives the reason of a mismatch, None where they agree.
 
-    Each number of one language must occur in the other, in the flight data, or be a difference of two such numbers of the
-    same unit. An opposite is flipped where one of its sides is lost and the other one gained in the translation.
+    Each number of one language must occur in the other, in the flight data, or be a difference of two such numbers of
+    the same unit. An opposite is flipped where one of its sides is lost and the other one gained in the translation.
 
     Args:
         flight: the window's numbers (`flight_numbers`).

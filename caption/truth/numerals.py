@@ -1,4 +1,5 @@
-"""Numerals in running text: digits, numbers in words, shares and multiples, hours of the clock, in English and Chinese."""
+"""Numerals in running text: digits, numbers in words, shares and multiples, hours of the clock, in English and
+Chinese."""
 
 from __future__ import annotations
 
@@ -21,9 +22,12 @@ Kind = Literal["number", "ratio", "clock", "one"]
 class Numeral:
     """A numeral of a text in our units. unit: a key of the lexicon's units, "" where none stands there.
 
-    number: a measured size. ratio: a share or a multiple ("half", "two thirds", "seven times"). clock: an hour. one: "a metre".
-    digits: after the point, as written. factor: from the unit that is written to ours, 1 where it is ours. is_negative: written with a minus. bound: 1 of "more than 20 m", -1 of "less than". is_about: written as approximate. about: drone | target, of whose speed
-    a multiple of the other's is said ("twice the walker's": drone). start: in the sentence.
+    number: a measured size. ratio: a share or a multiple ("half", "two thirds", "seven times"). clock: an hour. one: "a
+    metre".
+    digits: after the point, as written. factor: from the unit that is written to ours, 1 where it is ours. is_negative:
+    written with a minus. bound: 1 of "more than 20 m", -1 of "less than". is_about: written as approximate. about:
+    drone | target, of whose speed a multiple of the other's is said ("twice the walker's": drone). start: in the
+    sentence.
     """
 
     text: str
@@ -47,7 +51,10 @@ class Numeral:
 
 # --- numbers in words -------------------------------------------------------------------------------------------------
 
-_ONES = "zero one two three four five six seven eight nine ten eleven twelve thirteen fourteen fifteen sixteen seventeen eighteen nineteen"
+_ONES = (
+    "zero one two three four five six seven eight nine ten eleven twelve thirteen fourteen fifteen sixteen "
+    "seventeen eighteen nineteen"
+)
 _TENS = "twenty thirty forty fifty sixty seventy eighty ninety"
 _SMALL = {word: number for number, word in enumerate(_ONES.split())}
 _WORDS = {**_SMALL, **{word: 10 * number for number, word in enumerate(_TENS.split(), 2)}}
@@ -91,7 +98,8 @@ _ZH_TURNS = {
 
 _ONE = "|".join(sorted(_SMALL, key=len, reverse=True))
 _ENGLISH = (
-    rf"(?:(?:{'|'.join(_TENS.split())})(?:[- ](?:{_ONE}))?|(?:(?:{_ONE}|a) hundred(?: (?:and )?(?:(?:{'|'.join(_TENS.split())})"
+    rf"(?:(?:{'|'.join(_TENS.split())})(?:[- ](?:{_ONE}))?|(?:(?:{_ONE}|a) hundred(?: (?:and "
+    rf")?(?:(?:{'|'.join(_TENS.split())})"
     rf"(?:[- ](?:{_ONE}))?|{_ONE}))?)|half a dozen|(?:a|two) dozen|{_ONE}|a single|single)"
 )
 _CHINESE = "[零〇一二两三四五六七八九十百]"
@@ -146,7 +154,8 @@ _LESS: dict[str, tuple[re.Pattern[str], re.Pattern[str]]] = {
     "zh": (re.compile(r"(?:不到|不足|将近|接近|近|至多|小于|低于|<)\s*$"), re.compile(r"\s*(?:以内|以下|之内)")),
 }
 _ABOUT = re.compile(
-    r"(?:about|around|some|roughly|approximately|approx\.?|ca\.?|circa|nearly|almost|close to|just (?:under|over)|~|≈|约|大约|大概|将近|接近|近)\s*$",
+    r"(?:about|around|some|roughly|approximately|approx\.?|ca\.?|circa|nearly|almost|close to|just (?:under|over)|~|≈|约"
+    r"|大约|大概|将近|接近|近)\s*$",
     re.IGNORECASE,
 )
 _OR_SO = re.compile(r"\s*(?:or so|or thereabouts|give or take|左右|上下|来)")
@@ -160,7 +169,8 @@ _BY = re.compile(
     r"\b(?:by|up|down) (?:about |around |roughly |some |nearly |almost |just |only |over |under |a )*$", re.IGNORECASE
 )
 _MORE_OR_LESS = re.compile(
-    r"\s*(?:faster|slower|quicker|higher|lower|larger|smaller|bigger|taller|shorter|wider|narrower|longer|farther|further|closer|nearer|more than|less than|increase|decrease|growth|drop|reduction)\b",
+    r"\s*(?:faster|slower|quicker|higher|lower|larger|smaller|bigger|taller|shorter|wider|narrower|longer|farther"
+    r"|further|closer|nearer|more than|less than|increase|decrease|growth|drop|reduction)\b",
     re.IGNORECASE,
 )
 _ZH_BY = re.compile(
@@ -182,7 +192,8 @@ def _pattern(language: Language) -> re.Pattern[str]:
 
 
 def read_numerals(text: str, language: Language) -> list[Numeral]:
-    """Find the numerals of a text that measure something: no durations, no counts of frames, no small counts without a unit."""
+    """Find the numerals of a text that measure something: no durations, no counts of frames, no small counts without a
+    unit."""
     units = written_units(language)
     announced = _ANNOUNCED.search(text)
     found: list[Numeral] = []
@@ -259,16 +270,18 @@ def _english_numerals(unit: str, of_half: str, of_word: str) -> str:
     seen = r"[- ](?:hidden|occluded|covered|visible|obscured|concealed|blocked|screened)"
     part = r"(?:halfs?|halves|thirds?|quarters?|fourths?|fifths?|sixths?|eighths?|tenths?)"
     return (
-        rf"(?P<clock>(?:\d{{1,2}}|{_ONE})) ?o['’]?clock"
-        rf"|(?P<digits>{_DIGITS})(?:\s*[- ]?(?:{unit}))?"
+        rf"(?P<clock>(?:\d{{1,2}}|{_ONE})) ?o['’]?clock|(?P<digits>{_DIGITS})(?:\s*[- ]?(?:{unit}))?"
         rf"|\b(?P<one>a|a single|single) (?:met(?:re|er)|degree|pixel)s?\b(?! and a half)"
         rf"|\b(?P<unit_and_half>a) (?:met(?:re|er)|degree|pixel) and a half"
-        rf"|\bseconds? and a half\b|\bhalf[- ](?:a |an )?(?:second|step)s?\b|\b(?:first|second|last|latter|other|lower|upper|top|bottom|left|right|left-hand|right-hand) half\b"
+        rf"|\bseconds? and a half\b|\bhalf[- ](?:a |an )?(?:second|step)s?\b|\b(?:first|second|last|latter|other|lower"
+        rf"|upper|top|bottom|left|right|left-hand|right-hand) half\b"
         rf"|\bhalf (?:of )?the (?:picture|frame|image|window|clip|time)\b|\bdouble[- ]check\w*"
         rf"|\b(?P<half_unit>half an? )(?:{of_half})"
-        rf"|\b(?P<word>{ENGLISH_NUMBER})(?P<and_half> and a half)?[- ]+(?:{of_word})(?: (?P<cents>(?:{'|'.join(_TENS.split())})(?:[- ](?:{_ONE}))?)(?=\s*(?:[,.;:)]|$)))?"
+        rf"|\b(?P<word>{ENGLISH_NUMBER})(?P<and_half> and a half)?[- ]+(?:{of_word})(?: "
+        rf"(?P<cents>(?:{'|'.join(_TENS.split())})(?:[- ](?:{_ONE}))?)(?=\s*(?:[,.;:)]|$)))?"
         rf"|\b(?<!and )(?P<part>(?:(?:a|one|two|three|four) )?{part})\b(?!\s+{count})(?!{seen})"
-        rf"|\b(?P<turn>{'|'.join(sorted(_TURNS, key=len, reverse=True))})\b(?! (?:running|in a row|in succession|already|over)\b)"
+        rf"|\b(?P<turn>{'|'.join(sorted(_TURNS, key=len, reverse=True))})\b(?! (?:running|in a row|in succession"
+        rf"|already|over)\b)"
     )
 
 
@@ -277,10 +290,10 @@ def _chinese_numerals(unit: str, of_half: str, of_word: str) -> str:
         rf"(?P<clock>\d{{1,2}}|{_CHINESE}+)\s*点(?:钟|方向|方位|位置)"
         rf"|(?P<digits>{_DIGITS})\s*(?:个)?(?:{unit})?(?P<and_half>半(?![秒步帧]))?"
         rf"|(?P<share>{_CHINESE}+分之{_CHINESE}+)|(?P<tenth>[一二两三四五六七八九])成(?![为像功员不了])"
-        rf"|(?P<one>一)(?:个)?(?:像素|米|度)(?=都|也)"
-        rf"|半[秒步帧]|(?P<half_unit>半)个?(?:{of_half})"
+        rf"|(?P<one>一)(?:个)?(?:像素|米|度)(?=都|也)|半[秒步帧]|(?P<half_unit>半)个?(?:{of_half})"
         rf"|(?<![住挡])(?P<turn>{'|'.join(_ZH_TURNS)})"
-        rf"|(?<![第这那数几上])(?!(?<![到约仅了近有])一度)(?P<word>{CHINESE_NUMBER})个?(?:{of_word})(?:(?P<word_half>半(?![秒步帧]))|(?P<tenths>[一二三四五六七八九]{{1,2}})(?![{_COUNTED}]))?"
+        rf"|(?<![第这那数几上])(?!(?<![到约仅了近有])一度)(?P<word>{CHINESE_NUMBER})个?(?:{of_word})(?:(?P<word_half>半(?![秒步帧]))"
+        rf"|(?P<tenths>[一二三四五六七八九]{{1,2}})(?![{_COUNTED}]))?"
     )
 
 

@@ -42,7 +42,8 @@ _DECISIONS: dict[str, tuple[Pair, ...]] = {
 ACTION_WORDS = {
     "track_straight": "straight", "yaw_left_to_follow": "yaw", "yaw_right_to_follow": "yaw", "circle_left": "circle",
     "circle_right": "circle", "ascend": "ascend", "descend": "descend", "move_forward": "forward",
-    "move_backward": "backward", "strafe_left": "strafe", "strafe_right": "strafe", "slow_down": "slow", "speed_up": "fast",
+    "move_backward": "backward", "strafe_left": "strafe", "strafe_right": "strafe", "slow_down": "slow",
+    "speed_up": "fast",
     "search_to_reacquire_target": "search", "hover": "hover", "break_off": "leave", "return_to_home": "home",
 }  # fmt: skip
 

@@ -1,8 +1,9 @@
-"""Prose that comes without slots or claims: only the few rules that are hardly ever wrong are applied, and nothing is proved.
+"""Prose that comes without slots or claims: only the few rules that are hardly ever wrong are applied, and nothing is
+proved.
 
-A sentence is contradicted by a number with a unit that the window gives for nothing (so is a number in the wrong unit), by a course
-or a comparison that denies its own numbers, and by a plan for the other side than the decision. Everything else is unread: foreign
-prose is read into claims by a language model.
+A sentence is contradicted by a number with a unit that the window gives for nothing (so is a number in the wrong unit),
+by a course or a comparison that denies its own numbers, and by a plan for the other side than the decision. Everything
+else is unread: foreign prose is read into claims by a language model.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ MEASURED = ("m", "mps", "deg", "dps", "px")
 # What a rule, a plan or another text says need not be of this window.
 _OTHER = {
     "en": re.compile(
-        r"\b(?:article|section|paragraph|clause|rule|manual|regulation|handbook|guideline|limit|minimum|maximum|threshold|margin|if|would|could|"
+        r"\b(?:article|section|paragraph|clause|rule|manual|regulation|handbook|guideline|limit|minimum|maximum"
+        r"|threshold|margin|if|would|could|"
         r"should|will|must|may|might|within|than the \w+ limit|allow\w*|target of|goal|safe\w*|future|next)\b",
         re.I,
     ),
@@ -44,7 +46,8 @@ _TURN = {
 }
 _ASKED = {
     "en": re.compile(
-        rf"\b(?:should|must|needs? to|ought to|has to|best (?:move|choice|action|response|option)|therefore|hence)\b[^.;]{{0,40}}?{_TURN['en']}",
+        rf"\b(?:should|must|needs? to|ought to|has to|best (?:move|choice|action|response|option)|therefore"
+        rf"|hence)\b[^.;]{{0,40}}?{_TURN['en']}",
         re.I,
     ),
     "zh": re.compile(rf"(?:应|宜|需要|必须|因此|所以|最好)[^。；]{{0,16}}?{_TURN['zh']}"),

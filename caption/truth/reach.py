@@ -18,7 +18,8 @@ LEAST_SHARE = 0.005
 
 
 def never_labels(actions: ActionSet, cfg: LabelConfig, rng: np.random.Generator) -> list[str]:
-    """Say of each action that a motion can imply, and that is next to never the label, what stands in its way; orders are left out."""
+    """Say of each action that a motion can imply, and that is next to never the label, what stands in its way; orders
+    are left out."""
     motions = [measure(_made_up(rng)) for _ in range(NUM_MOTIONS)]
     implied, wins = Counter[str](), Counter[str]()
     taken: dict[str, Counter[str]] = defaultdict(Counter)
@@ -48,11 +49,15 @@ def _told(token: str, num_implied: int, num_wins: int, taken: Counter[str]) -> s
     others = (
         f", since others come first (above all {others}): put its line of precedence before theirs" if others else ""
     )
-    return f"{token}: {num_implied:,} of {NUM_MOTIONS:,} made-up motions imply it, and it is the label of {num_wins:,}{others}"
+    return (
+        f"{token}: {num_implied:,} of {NUM_MOTIONS:,} made-up motions imply it, and it is the label of "
+        f"{num_wins:,}{others}"
+    )
 
 
 def _made_up(rng: np.random.Generator) -> FutureMotion:
-    """Give a steady motion, of which each part is missing as often as not, and a person who walks along, elsewhere, or stands."""
+    """Give a steady motion, of which each part is missing as often as not, and a person who walks along, elsewhere, or
+    stands."""
     forward, left, up, turn_deg = rng.uniform((-3.0, -6.0, -4.0, -40.0), (8.0, 6.0, 4.0, 40.0)) * (rng.random(4) < 0.5)
     part = np.linspace(0.0, 1.0, STEPS + 1)[:, None]
     walked = ((forward, left), rng.uniform(-4.0, 4.0, 2), (0.0, 0.0))[rng.integers(3)]

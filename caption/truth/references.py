@@ -3,7 +3,8 @@
     distance@t4            the value at a frame; without `@` at the current one
     change:distance@t0-t4  last less first of a span; without `@` of the whole window. So too
     rate: (per second)  growth: (percent)  mean:  min:  max:  trend:  side:  comparison:
-    visibility@t2          a word instead of a number; framing: in the picture; walking: towards the drone, away or across
+    visibility@t2          a word instead of a number; framing: in the picture; walking: towards the drone, away or
+    across
 
 `look_up` gives the fact; whether somebody's value is true of it: holding.py.
 """
@@ -273,7 +274,8 @@ def _change(name: str, values: Sequence[float]) -> float:
 
 
 def trend_of(quantity: Quantity, values: Sequence[float]) -> str:
-    """Name the course of a series: one of TRENDS. A trend goes one way all along, or ends a steady band from where it began."""
+    """Name the course of a series: one of TRENDS. A trend goes one way all along, or ends a steady band from where it
+    began."""
     spread, change, band = max(values) - min(values), values[-1] - values[0], quantity.allowed_spread(values)
     if spread <= band:
         return "steady"
@@ -341,7 +343,8 @@ def _comparison(facts: Facts, frame: int | None) -> Fact | Missing:
 
 
 def speeds_of(facts: Facts, frame: int | None) -> list[tuple[float, float]]:
-    """Speeds of drone and target at a frame: the target's mean of the window, as the prompt gives it, or its step's, the likelier first."""
+    """Speeds of drone and target at a frame: the target's mean of the window, as the prompt gives it, or its step's,
+    the likelier first."""
     ours = facts.speed_mps[-1 if frame is None else frame]
     step = _at(facts.target_speeds_mps, -1 if frame is None else frame)
     means = [facts.target_speed_mps, step] if frame is None else [step, facts.target_speed_mps]
@@ -349,7 +352,8 @@ def speeds_of(facts: Facts, frame: int | None) -> list[tuple[float, float]]:
 
 
 def facts_meant(reference: Reference, facts: Facts) -> list[Fact]:
-    """Give the facts that a writer may mean by an address: where the target's speed is in it, that of the step and of the window."""
+    """Give the facts that a writer may mean by an address: where the target's speed is in it, that of the step and of
+    the window."""
     fact = look_up(reference, facts)
     found = [fact] if isinstance(fact, Fact) else []
     name = reference.quantity

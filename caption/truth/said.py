@@ -1,4 +1,5 @@
-"""What the claims of one sentence say: their numbers, the shares and multiples that follow, and the opposites that they stand for."""
+"""What the claims of one sentence say: their numbers, the shares and multiples that follow, and the opposites that they
+stand for."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ from itertools import combinations, permutations
 
 from caption.truth.borne_out import bears_out_number
 from caption.truth.facts import Facts
+from caption.truth.glossary import LANGUAGES
 from caption.truth.numerals import Numeral, numbers_in
 from caption.truth.poles import Pair, poles_between, poles_of, side_word
 from caption.truth.references import QUANTITIES, TURNING, Fact, look_up, parse_reference
@@ -61,8 +63,8 @@ class Said:
         units = [unit for unit, _ in kinds]
         self.compares = len(set(units)) < len(units) or any("comparison" in claim.quantity for claim in self.words)
         for text in self.scene:
-            for either in ("en", "zh"):
-                self.poles.update((p.dimension, p.value) for p in read_stated(text, either).poles)  # type: ignore[arg-type]
+            for either in LANGUAGES:
+                self.poles.update((pole.dimension, pole.value) for pole in read_stated(text, either).poles)
 
     def names_frames(self, pole: Pole) -> bool:
         """Tell whether a claim of visibility is of a frame that stands beside a word of it."""
@@ -117,7 +119,8 @@ class Said:
         return any("clock" in text or "点" in text or _number_in(text) == hour for text in self.scene)
 
     def _ratios(self, numeral: Numeral) -> list[float]:
-        """Give the shares and multiples that a numeral may be, by the claims: of a growth, of two speeds, of two values of a quantity."""
+        """Give the shares and multiples that a numeral may be, by the claims: of a growth, of two speeds, of two values
+        of a quantity."""
         found = [r for ratio in self._speed_ratios() for r in ways(ratio, numeral)]
         multiples = [1.0 + float(claim.value) / 100.0 for claim in self.numbers if claim.unit == "percent"]
         spanned = [claim for claim in self.numbers if claim.quantity.startswith("change:")]

@@ -59,7 +59,8 @@ def written_digits(value: float) -> int:
 
 
 def ways(ratio: float, numeral: Numeral) -> list[float]:
-    """Give a multiple of the drone's speed as a numeral may say it: of drone, target or either, and how much more or less that is."""
+    """Give a multiple of the drone's speed as a numeral may say it: of drone, target or either, and how much more or
+    less that is."""
     if not numeral.about or ratio <= 0:
         return both_ways(ratio, numeral)
     said = ratio if numeral.about == "drone" else 1.0 / ratio
@@ -67,7 +68,8 @@ def ways(ratio: float, numeral: Numeral) -> list[float]:
 
 
 def both_ways(ratio: float, numeral: Numeral | None = None) -> list[float]:
-    """Give the shares and multiples by which a multiple is told, from either side; only the differences where a numeral is one."""
+    """Give the shares and multiples by which a multiple is told, from either side; only the differences where a numeral
+    is one."""
     if ratio <= 0:
         return [abs(ratio), abs(1.0 - ratio)]
     differences = [abs(ratio - 1.0), abs(1.0 / ratio - 1.0)]

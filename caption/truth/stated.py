@@ -23,8 +23,9 @@ STATED_FILE = Path(__file__).with_name("stated.yaml")
 class Pole:
     """A word that takes one of several opposite values.
 
-    about: target | drone, of whom it is said, "" where that is not plain. is_compared: said against the other of the two ("faster
-    than the walker"). is_than: said against anything ("longer than the way"). is_scenery: beside a thing that stands about. is_plan: said of what is wanted ("to climb"); is_after_plan: somewhere after such a word.
+    about: target | drone, of whom it is said, "" where that is not plain. is_compared: said against the other of the
+    two ("faster than the walker"). is_than: said against anything ("longer than the way"). is_scenery: beside a thing
+    that stands about. is_plan: said of what is wanted ("to climb"); is_after_plan: somewhere after such a word.
     start: in the sentence. number: the numeral that it leads ("fell by 2 m"). frames: that its clause names.
     """
 
@@ -45,7 +46,8 @@ class Pole:
 
 @dataclass(frozen=True)
 class Stated:
-    """All of a sentence. text: it, as numerals and poles count its characters; frames: that it names; actions: what its words may argue for; named: those that they name alone."""
+    """All of a sentence. text: it, as numerals and poles count its characters; frames: that it names; actions: what its
+    words may argue for; named: those that they name alone."""
 
     text: str
     numerals: tuple[Numeral, ...]
@@ -82,7 +84,10 @@ class _StatedFile(Config):
 
 # --- reading ----------------------------------------------------------------------------------------------------------
 
-_FRAME = r"(?<![A-Za-z0-9])[tT]\s?[=_]?\s?[-−]?\d+(?![\d.]*\s?(?:m\b|s\b))|(?:\b[Ff]rames?|\b[Ss]teps?|第|#)[ _]?\d+(?![\d.]*\d)(?:\s?[-–]\s?\d+)?"
+_FRAME = (
+    r"(?<![A-Za-z0-9])[tT]\s?[=_]?\s?[-−]?\d+(?![\d.]*\s?(?:m\b|s\b))|(?:\b[Ff]rames?|\b[Ss]teps?|第|#)[ "
+    r"_]?\d+(?![\d.]*\d)(?:\s?[-–]\s?\d+)?"
+)
 _LIST_MARK = r"^\s*(?:[-*•]\s*)?\(?\d{1,2}[.):、）](?=\D)|[（(]\d{1,2}[)）]|(?<=[\s;；，,])\d\)(?=\s)|[①-⑨]|\b[23]-?D\b"
 SCENERY_CHARACTERS = 30  # from a thing to its side
 LED_CHARACTERS = 12  # from the end of "fell" to its number: "by about", "slightly by"
@@ -211,7 +216,8 @@ class Lexicon:
         return found
 
     def _whose_multiple(self, text: str, start: int, end: int) -> str:
-        """Tell whose speed is so many times that of the other, who is named beside it: after it in English, before it in Chinese."""
+        """Tell whose speed is so many times that of the other, who is named beside it: after it in English, before it
+        in Chinese."""
         if self.language == "en":
             near = re.split(r"[,;:.()]", text[end : end + 36])[0]
         else:
@@ -225,7 +231,8 @@ class Lexicon:
         return "target" if named == "drone" else "drone"
 
     def _about_whom(self, clause: str, rest: str, word: str) -> tuple[str, bool]:
-        """Tell of whom a word is said, and whether against the other: what stands after "than", else the clause's only subject."""
+        """Tell of whom a word is said, and whether against the other: what stands after "than", else the clause's only
+        subject."""
         if self.language == "en":
             than = "" if _OF_THE_OTHER.match(word) else r"than\s+"  # "outruns the walker"
             against = re.match(re.escape(word) + rf"\s+{than}(.{{0,24}})", rest, re.I)

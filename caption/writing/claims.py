@@ -1,7 +1,9 @@
-"""Claims: prose, and beside it a list of what each sentence states, which is compared with the facts and with the words.
+"""Claims: prose, and beside it a list of what each sentence states, which is compared with the facts and with the
+words.
 
-For teachers that cannot write slots. An answer is refused whose claims are not true, not of its text, or whose text holds
-a number or an opposite that is neither claimed nor true (caption/truth/coverage.py). The Chinese text is held against the same claims, sentence by sentence.
+For teachers that cannot write slots. An answer is refused whose claims are not true, not of its text, or whose text
+holds a number or an opposite that is neither claimed nor true (caption/truth/coverage.py). The Chinese text is held
+against the same claims, sentence by sentence.
 """
 
 from __future__ import annotations
@@ -167,8 +169,10 @@ def refuse_problems(judged: Sequence[Judged], draft: Draft) -> Refused | None:
         return None
     named = "; ".join(f"{name} {problem}" for name, problem in problems[:MAX_COMPLAINTS])
     complaint = (
-        f'Sentence by sentence: {named}. "uncovered" stands in the text without a claim of its sentence and is not true; "text says '
-        'otherwise": the sentence says the opposite of this claim; "text is not true": its words are not, whatever is claimed; "false" is not what was measured. Mend text and claims together.'
+        f'Sentence by sentence: {named}. "uncovered" stands in the text without a claim of its sentence and is not '
+        f'true; "text says '
+        'otherwise": the sentence says the opposite of this claim; "text is not true": its words are not, whatever is '
+        'claimed; "false" is not what was measured. Mend text and claims together.'
     )
     reason = _REASONS.get(problems[0][1].partition(":")[0], "claims_wrong")
     return Refused(reason, complaint, draft)

@@ -1,6 +1,7 @@
 """What a way of writing is: how a teacher states its reasons so that they can be held against the facts.
 
-The window loop asks, reads and records; what differs between slots, claims and prose stands behind `Way`, and WAYS names them.
+The window loop asks, reads and records; what differs between slots, claims and prose stands behind `Way`, and WAYS
+names them.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ DECISION_REASON = "decision_against_reasoning"
 class Draft:
     """A caption in one language: its plain text, and what that came from. therefore: of the English alone.
 
-    states: of its sentences, where making the text has told them. doubt: what its writer is asked to mend once, though it is taken as it stands.
+    states: of its sentences, where making the text has told them. doubt: what its writer is asked to mend once, though
+    it is taken as it stands.
     """
 
     coc: Coc
@@ -50,7 +52,8 @@ class Draft:
 class Refused:
     """An answer of the right structure that is not taken.
 
-    reason: a word that is counted. complaint: what is wrong and what is allowed, for who wrote it. draft: what could be read of it.
+    reason: a word that is counted. complaint: what is wrong and what is allowed, for who wrote it. draft: what could be
+    read of it.
     """
 
     reason: str
@@ -61,8 +64,8 @@ class Refused:
 class Way(Protocol):
     """One way of writing. All are stateless.
 
-    system, mirror_system: prompt files (`system` is asked in English). fields: further fields of an answer, name -> JSON schema, in
-    the order in which they stand between the texts and `therefore`.
+    system, mirror_system: prompt files (`system` is asked in English). fields: further fields of an answer, name ->
+    JSON schema, in the order in which they stand between the texts and `therefore`.
     """
 
     system: str
@@ -100,7 +103,7 @@ def refuse_decision(answer: Parsed) -> Refused | None:
     if decision == therefore:
         return None
     complaint = (
-        f'"therefore" says {therefore} and "flight_decision" says {decision}: both name the one action that your reasoning leads '
-        "to. Let the reasoning lead to the decision."
+        f'"therefore" says {therefore} and "flight_decision" says {decision}: both name the one action that your '
+        f"reasoning leads to. Let the reasoning lead to the decision."
     )
     return Refused(DECISION_REASON, complaint)

@@ -1,9 +1,10 @@
 """Whether a sentence with slots is proved: its words beside them are on a closed list and fit its slots.
 
-A slot is true by construction; what a sentence says with it is not. So each kind of word of the list has a rule here: the drone's values
-stand behind the drone and the person's behind the person, a value beside its name, a change or a mean beside a word that says so, what is not
-of now beside the name of its frame, a comparison between its two sides in their order, and nothing measured behind "should". A word that is
-not listed, or that does not fit, leaves the sentence unread.
+A slot is true by construction; what a sentence says with it is not. So each kind of word of the list has a rule here:
+the drone's values stand behind the drone and the person's behind the person, a value beside its name, a change or a
+mean beside a word that says so, what is not of now beside the name of its frame, a comparison between its two sides in
+their order, and nothing measured behind "should". A word that is not listed, or that does not fit, leaves the sentence
+unread.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ _MOTIONS = ("target_motion", "drone_motion", "walking")
 _STATES = ("visibility", "framing", *_MOTIONS)
 _OF_TARGET = ("target_speed", "target_heading", "target_travelled", "target_motion", "walking", *_IN_PICTURE)
 _OF_DRONE = (
-    "speed", "altitude", "climb_rate", "yaw", "yaw_rate", "heading", "pitch", "travelled", "displacement", "drone_motion",
+    "speed", "altitude", "climb_rate", "yaw", "yaw_rate", "heading", "pitch", "travelled", "displacement",
+    "drone_motion",
 )  # fmt: skip
 _NAMELESS = ("speed", "target_speed", *_STATES, *_IN_PICTURE)  # their unit tells what they are
 _SINCE_START = ("yaw", "travelled", "displacement", "target_travelled")  # counted from the first frame
@@ -152,7 +154,8 @@ class _Word:
         )
 
     def _from(self) -> bool:
-        """Tell whether the earliest value of a quantity follows, the others in their order; or a distance to somebody."""
+        """Tell whether the earliest value of a quantity follows, the others in their order; or a distance to
+        somebody."""
         if self.next.kind in _OTHER:
             last = self.last.reference
             return self.last.kind == "away" or (last is not None and last.quantity in ("distance", "walking"))
@@ -180,7 +183,8 @@ class _Word:
         return self._now() and all(_start(reference) is None for reference in self.spoken_of)
 
     def _frame(self) -> bool:
-        """Tell whether a value of this frame stands beside, or behind "from" and "since" one that is counted from it."""
+        """Tell whether a value of this frame stands beside, or behind "from" and "since" one that is counted from
+        it."""
         if self.last.kind in ("from", "since"):
             return any(_start(reference) == self.token.frame for reference in self.spoken_of)
         is_end = self.last.kind == "to"
@@ -205,7 +209,8 @@ class _Word:
         return any("turned" in one.names for one in self.beside)
 
     def _has_owner(self, reference: Reference) -> bool:
-        """Tell whether it stands behind its owner: last in its clause, else, where its name is anybody's, in the sentence."""
+        """Tell whether it stands behind its owner: last in its clause, else, where its name is anybody's, in the
+        sentence."""
         names = [one.names for one in self.beside if one.kind == "quantity" and reference.quantity in one.names]
         is_anybodys = not names or any(
             not name.isdisjoint(_OF_DRONE) and not name.isdisjoint(_OF_TARGET) for name in names
@@ -251,7 +256,8 @@ class _Word:
         return is_named or (bool(earlier) and reference.quantity in earlier[-1])
 
     def _has_date(self, reference: Reference) -> bool:
-        """Tell whether the frames of a value stand in its sentence where they are not the current one or the whole window."""
+        """Tell whether the frames of a value stand in its sentence where they are not the current one or the whole
+        window."""
         frames = {one.frame for one in (*self.earlier, *self.later) if one.kind == "frame"}
         end, start = self._end(reference), _start(reference)
         is_dated = end in (self.now, *frames) or (self.last.kind == "from" and not reference.aspect)

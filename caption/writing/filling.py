@@ -30,7 +30,10 @@ class Filler:
     def fill(self, sentence: Sentence, *, is_reasoning: bool = False) -> str | Refused:
         """Give the plain text of a sentence."""
         if is_reasoning and kin_of(self.decision) in sentence.opposed:
-            complaint = f'it argues against {self.decision}, and "flight_decision" says {self.decision}; let the reasoning lead to it'
+            complaint = (
+                f'it argues against {self.decision}, and "flight_decision" says {self.decision}; let the '
+                f"reasoning lead to it"
+            )
             return Refused(DECISION_REASON, complaint)
         if sentence.decisions:
             refused = self._check_decisions(sentence)
@@ -134,7 +137,8 @@ class Filler:
         return Refused(f"slots_{why}", f"{{{slot.name}}} {words[why]}")
 
     def _check_direction(self, number: Slot, words: Sequence[Slot]) -> Refused | None:
-        """Refuse a size beside directions of its quantity none of which is its own: those of other frames. All have been printed."""
+        """Refuse a size beside directions of its quantity none of which is its own: those of other frames. All have
+        been printed."""
         found = self._found
         value = (found.get(number.fact_key) or self._look_up(number))[0]
         assert not isinstance(value, str)

@@ -22,8 +22,8 @@ _SMALL = "zero|one|two|three|four|five|six|seven|eight|nine|ten"
 _VAGUE: dict[Language, re.Pattern[str]] = {
     "en": re.compile(
         r"\b(?:couple|few|several|many|some|hundreds|thousands|dozens?)\s+(?:of\s+)?(?:\w+\s+)?"
-        r"(?:k?met(?:re|er)s?|kilomet(?:re|er)s?|m/s|pixels?|px|degrees?|deg|percent|per\s?cent|feet|foot|yards?|knots?|mph|miles?|km|times)\b"
-        r"|\bzero\b",
+        r"(?:k?met(?:re|er)s?|kilomet(?:re|er)s?|m/s|pixels?|px|degrees?|deg|percent|per\s?cent|feet|foot|yards?|knots?"
+        r"|mph|miles?|km|times)\b|\bzero\b",
         re.IGNORECASE,
     ),
     "zh": re.compile(
@@ -33,7 +33,8 @@ _VAGUE: dict[Language, re.Pattern[str]] = {
 # Counts of frames and seconds are allowed up to what was observed.
 _COUNT: dict[Language, re.Pattern[str]] = {
     "en": re.compile(
-        rf"\b(\d+(?:\.\d+)?|{_SMALL}|half)(?:\s+an?|-)?[\s-]*(?:of\s+the\s+)?(?:last\s+|observed\s+|latest\s+|previous\s+|past\s+)*"
+        rf"\b(\d+(?:\.\d+)?|{_SMALL}|half)(?:\s+an?|-)?[\s-]*(?:of\s+the\s+)?(?:last\s+|observed\s+|latest\s+"
+        rf"|previous\s+|past\s+)*"
         r"(frames?|pictures?|images?|steps?|instants?|moments?|seconds?|s)\b",
         re.IGNORECASE,
     ),
@@ -102,10 +103,14 @@ _UNASKED = re.compile(
 
 
 def decisions_opposed(text: str) -> tuple[str, ...]:
-    """Give the decisions that an English sentence of a reasoning plainly argues against: "braking is the safe choice" against speed_up."""
+    """Give the decisions that an English sentence of a reasoning plainly argues against: "braking is the safe choice"
+    against speed_up."""
     if _UNASKED.search(text):
         return ()
-    asked = r"\b(?:should|must|shall|ought to|needs? to|best to)(?: \w+)? (?:{0})\b|^(?:{0})\b[^,;.]{{0,20}} is (?:the )?(?:safe|best|right|wise|only)"
+    asked = (
+        r"\b(?:should|must|shall|ought to|needs? to|best to)(?: \w+)? (?:{0})\b|^(?:{0})\b[^,;.]{{0,20}} is (?:the "
+        r")?(?:safe|best|right|wise|only)"
+    )
     return tuple(
         decision
         for words, against in _ASKED.values()
@@ -124,7 +129,8 @@ def _named() -> re.Pattern[str]:
     words = "|".join(re.escape(pair["en"]) for pair in load_glossary().actions.values())
     tokens = "|".join(token for token in action_tokens() if "_" in token)
     return re.compile(
-        r"\b(?:should|must|shall|needs? to|has to|have to|best to|decision (?:is|that follows is)(?: to)?|therefore,?)\s+(?:now\s+)?"
+        r"\b(?:should|must|shall|needs? to|has to|have to|best to|decision (?:is|that follows is)(?: to)?"
+        r"|therefore,?)\s+(?:now\s+)?"
         rf"(?P<words>{words})\b|\b(?P<token>{tokens})\b",
         re.IGNORECASE,
     )

@@ -1,7 +1,7 @@
 """Slots: the teacher names facts, their values are filled in from the flight, in both languages.
 
-Numbers, units, sides, trends and the mirror are right by construction. A sentence is proved if its words beside slots are known and
-fit them (earned.py); else it is unread.
+Numbers, units, sides, trends and the mirror are right by construction. A sentence is proved if its words beside slots
+are known and fit them (earned.py); else it is unread.
 """
 
 from __future__ import annotations
@@ -133,21 +133,25 @@ def _compare(english: Template, chinese: Coc, facts: Facts) -> Refused | None:
 # --- what a teacher is shown ------------------------------------------------------------------------------------------
 
 _SERIES = (
-    "speed", "altitude", "distance", "target_speed", "yaw", "pitch", "offset_x", "offset_y", "bearing", "box_width", "box_height",
+    "speed", "altitude", "distance", "target_speed", "yaw", "pitch", "offset_x", "offset_y", "bearing", "box_width",
+    "box_height",
 )  # fmt: skip
 _SPANNED = ("speed", "altitude", "distance", "target_speed", "box_height")  # shown with change and trend
 _NOW = (
-    "mean:target_speed", "target_travelled", "travelled", "displacement", "climb_rate", "slant", "height_over_target", "depression",
+    "mean:target_speed", "target_travelled", "travelled", "displacement", "climb_rate", "slant", "height_over_target",
+    "depression",
     "heading", "target_heading", "change:target_heading",
 )  # fmt: skip
 _WORDS = (
-    "target_motion", "drone_motion", "comparison:speed", "side:yaw", "side:target_heading", "side:bearing", "side:offset_x",
+    "target_motion", "drone_motion", "comparison:speed", "side:yaw", "side:target_heading", "side:bearing",
+    "side:offset_x",
     "side:offset_y", "box@t0", "box",
 )  # fmt: skip
 
 
 def fact_table(facts: Facts) -> str:
-    """Give the facts of a window with the names of their slots, as they are filled in; what is not known is left out."""
+    """Give the facts of a window with the names of their slots, as they are filled in; what is not known is left
+    out."""
     last = len(facts) - 1
     lines = []
     for name in _SERIES:

@@ -3,8 +3,9 @@
     The gap {trend:distance} from {distance@t0} to {distance}.     a reference of truth/references.py in braces
     {trending:distance}  {box@t4}  {decision}  {side:decision}     and what texts need beyond references
 
-A number is filled in with its unit, in the digits of the table of quantities. Where a slot of its sentence says what its sign means (a
-side, a trend) it is the size that is written. A word takes the form that the words before it ask for ("is increasing", "has increased").
+A number is filled in with its unit, in the digits of the table of quantities. Where a slot of its sentence says what
+its sign means (a side, a trend) it is the size that is written. A word takes the form that the words before it ask for
+("is increasing", "has increased").
 What may stand beside slots: outside.py.
 """
 
@@ -34,7 +35,8 @@ _WORDS = ("trend", "side", "comparison", "compared")
 # Other names of slots.
 _ALIASES = {
     "compare:drone_speed,target_speed": "comparison:speed", "compare:speed,target_speed": "comparison:speed",
-    "compare:target_speed,drone_speed": "compared:speed", "compare:target_speed,speed": "compared:speed", "side:target": "side:offset_x",
+    "compare:target_speed,drone_speed": "compared:speed", "compare:target_speed,speed": "compared:speed",
+    "side:target": "side:offset_x",
 }  # fmt: skip
 NEITHER = ("straight", "centred")
 _WITHOUT = ("visibility", "framing", "walking", *MOTIONS)  # a direction
@@ -46,9 +48,9 @@ Form = Literal[0, 1, 2, 3]  # of the glossary's slot_words: verb, after "is", af
 class Slot:
     """One slot. name: what is looked up, the same for every form of a word. needs_side: "straight" would not fit here.
 
-    is_size: a number whose direction another slot of its sentence says, so that it is written without its sign; or that other slot
-    where it is a side, which then is that of the number, however small. article: "a" before it, which becomes "an" by what is
-    filled in; "" where none stands there.
+    is_size: a number whose direction another slot of its sentence says, so that it is written without its sign; or that
+    other slot where it is a side, which then is that of the number, however small. article: "a" before it, which
+    becomes "an" by what is filled in; "" where none stands there.
     """
 
     name: str
@@ -84,7 +86,8 @@ class Slot:
 
     @cached_property
     def direction(self) -> str | None:
-        """Name the direction that this word states, or that the sign of this number means: in a sentence they must agree."""
+        """Name the direction that this word states, or that the sign of this number means: in a sentence they must
+        agree."""
         if self.reference is None or self.reference.quantity in _WITHOUT:
             return None
         aspect, quantity = self.reference.aspect, self.reference.quantity
@@ -111,8 +114,8 @@ class Place(NamedTuple):
     """A slot where it stands, and what is needed to fill it at a glance.
 
     fact_key: what it is looked up by. read, frame, form: the series of which it is a plain value,
-    its frame, and how that is written with its unit; None where it is something else. words: how each word that may be true is
-    written, but for those that ask for a closer look.
+    its frame, and how that is written with its unit; None where it is something else. words: how each word that may be
+    true is written, but for those that ask for a closer look.
     """
 
     fact_key: str
@@ -127,9 +130,10 @@ class Place(NamedTuple):
 class Sentence:
     """A sentence that may be filled.
 
-    pattern: its text for `%`, with a place for each of the slots. names: of the slots, sorted. sizes: the numbers without a sign, each
-    with the words that state its direction. state: proved or unread (earned.py); doubtful: its words for what a slot could say. decisions: that
-    its words come to, as they stand there. opposed: those that it argues against, were it of the reasoning.
+    pattern: its text for `%`, with a place for each of the slots. names: of the slots, sorted. sizes: the numbers
+    without a sign, each with the words that state its direction. state: proved or unread (earned.py); doubtful: its
+    words for what a slot could say. decisions: that its words come to, as they stand there. opposed: those that it
+    argues against, were it of the reasoning.
     """
 
     pattern: str
@@ -291,11 +295,13 @@ def _read_slot(written: str, before: str, after: str, language: Language) -> Slo
 
 
 _SPACE = re.compile(r"^ +(?=[\u4e00-\u9fff])")
-_ADVERBS = r"(?:\s+(?:now|still|also|currently|clearly|slowly|steadily|slightly|gently|only|just|already|both|gradually|again))*\s*$"
+_ADVERBS = (
+    r"(?:\s+(?:now|still|also|currently|clearly|slowly|steadily|slightly|gently|only|just|already|both|gradually"
+    r"|again))*\s*$"
+)
 _BE = re.compile(
-    r"(?:\b(?:is|are|was|were|be|been|being|keeps?|kept|remains?|stays?|seems?|appears?|looks?|an?|the|its|their|by|of)|'s)"
-    + _ADVERBS
-    + r"|\bwith\b[^,;.]*$|^\s*$",
+    r"(?:\b(?:is|are|was|were|be|been|being|keeps?|kept|remains?|stays?|seems?|appears?|looks?|an?|the|its|their|by|of)"
+    r"|'s)" + _ADVERBS + r"|\bwith\b[^,;.]*$|^\s*$",
     re.IGNORECASE,
 )
 _HAS = re.compile(r"\b(?:has|have|had|having)" + _ADVERBS, re.IGNORECASE)

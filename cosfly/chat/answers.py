@@ -1,9 +1,9 @@
 """Every answer, kept before anything is derived from it; nothing answered is asked twice.
 
-One folder keeps the answers of one asker, in one journal a flight: `answers/<flight>.jsonl`. One process writes it. An answer is
-handed to the system as it arrives, so a killed process loses none; a thread waits for the disk, once for all answers that arrived
-meanwhile. In memory are only flights that are being worked on. A flight that is done ends with a line of totals, so that a later
-start reads that line instead of a week of answers.
+One folder keeps the answers of one asker, in one journal a flight: `answers/<flight>.jsonl`. One process writes it. An
+answer is handed to the system as it arrives, so a killed process loses none; a thread waits for the disk, once for all
+answers that arrived meanwhile. In memory are only flights that are being worked on. A flight that is done ends with a
+line of totals, so that a later start reads that line instead of a week of answers.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ _PLAIN_NAME = re.compile(r"\w[\w.+-]*")
 
 
 def journal_name(flight: str) -> str:
-    """Give the file name of a flight's journal: its own name where that is a plain one, else one made from its digest."""
+    """Give the file name of a flight's journal: its own name where that is a plain one, else one made from its
+    digest."""
     is_plain = _PLAIN_NAME.fullmatch(flight) is not None and len(flight.encode()) <= 200
     return f"{flight if is_plain else f'flight-{sha256_bytes(flight.encode())}'}.jsonl"
 
@@ -49,8 +50,8 @@ Count = Annotated[int, Field(strict=True, ge=0, le=10**15)]  # of all runs into 
 class Answer(BaseModel):
     """A line of a journal: what an engine answered.
 
-    usage: empty where a server does not count. counted: counts of it that are ours. served_by: the model that answered, where the server
-    names another one than was asked for.
+    usage: empty where a server does not count. counted: counts of it that are ours. served_by: the model that answered,
+    where the server names another one than was asked for.
     """
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
@@ -237,7 +238,8 @@ class KeptAnswers:
     async def ask(self, request: Request, flight: str, sample_id: str, purpose: str) -> Reply:
         """
         Raises:
-            NoAnswer: there is none. BudgetSpent: one more request might pass a limit. TeacherError: none will be answered.
+            NoAnswer: there is none. BudgetSpent: one more request might pass a limit. TeacherError: none will be
+            answered.
         """
         key = answer_key(self.engine.model, request)
         lock = self._asking.setdefault(key, asyncio.Lock())

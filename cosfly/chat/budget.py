@@ -1,8 +1,8 @@
 """Tokens and money: what was used, and whether one more request may be sent.
 
-Counted over all runs into one folder, from the journal, so that running the same command again cannot spend the same budget
-twice. A request is let through only if it and all those in flight, each taken at the largest seen so far, still fit; until then it waits,
-and where it would not fit alone there is no more of the budget.
+Counted over all runs into one folder, from the journal, so that running the same command again cannot spend the same
+budget twice. A request is let through only if it and all those in flight, each taken at the largest seen so far, still
+fit; until then it waits, and where it would not fit alone there is no more of the budget.
 """
 
 from __future__ import annotations

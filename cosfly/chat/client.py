@@ -73,7 +73,8 @@ class EndpointConfig(Config):
     )
     extra_body: dict[str, Any] = Field(
         default_factory=dict,
-        description="further fields of the request, for instance chat_template_kwargs; null leaves one of the others out",
+        description="further fields of the request, for instance chat_template_kwargs; null leaves one of the others "
+        "out",
     )
 
     def request(self, messages: list[dict], digests: list[str], schema: dict, seed: int) -> Request:
@@ -241,10 +242,11 @@ class ChatClient:
         return refusal
 
     def _judge_schema(self, ask: _Ask) -> None:
-        """Learn from an answer whether the schema is what was refused: only a request that is answered without it tells.
+        """Learn from an answer whether the schema is what was refused: only a request that is answered without it
+        tells.
 
-        One refusal is enough where the server names the schema. Where the table does not know its words it takes SCHEMA_DOUBTS,
-        with no answer to a schema between them.
+        One refusal is enough where the server names the schema. Where the table does not know its words it takes
+        SCHEMA_DOUBTS, with no answer to a schema between them.
         """
         if ask.is_structured:
             self._num_doubts = 0
@@ -339,7 +341,8 @@ class ChatClient:
         return self.refusal(response) if entries is None else entries
 
     def read(self, response: Response, request: Request, *, is_structured: bool) -> Reply | Refusal | str:
-        """Give what a response says: a reply, what it refuses (some servers do so with status 200), or a word on what is wrong with it."""
+        """Give what a response says: a reply, what it refuses (some servers do so with status 200), or a word on what
+        is wrong with it."""
         if response.status != 200:
             return self.refusal(response)
         if response.is_cut:

@@ -21,8 +21,8 @@ MOST_TOKENS = 10_000_000  # of one answer: the longest context of any model that
 class Request:
     """One conversation and how it is sampled, in plain values.
 
-    messages: chat messages, pictures as data URLs. digests: sha256 of the pictures' bytes, in their order. schema: of the
-    answer. sampling: temperature, max_tokens, seed and whatever else stands in a request beside model and messages.
+    messages: chat messages, pictures as data URLs. digests: sha256 of the pictures' bytes, in their order. schema: of
+    the answer. sampling: temperature, max_tokens, seed and whatever else stands in a request beside model and messages.
     """
 
     messages: list[dict]
@@ -35,8 +35,9 @@ class Request:
 class Reply:
     """One answer. `structured` says how its shape was enforced: json_schema, plain, or native (written by rules).
 
-    usage: None where the server does not tell. finish_reason: the server's word, or CONTEXT_FULL. counted: counts of `usage` that
-    are ours, since the server's cannot be. model: who answered, as the server says. is_kept: it was given before, and kept.
+    usage: None where the server does not tell. finish_reason: the server's word, or CONTEXT_FULL. counted: counts of
+    `usage` that are ours, since the server's cannot be. model: who answered, as the server says. is_kept: it was given
+    before, and kept.
     """
 
     text: str
@@ -49,8 +50,8 @@ class Reply:
 
 
 class NoAnswer(Exception):
-    """A request got no answer; `cause` is a word for the tally, `detail` what was said. `is_final`: it was refused, so asking
-    the same again would not help. `fix`: what would."""
+    """A request got no answer; `cause` is a word for the tally, `detail` what was said. `is_final`: it was refused, so
+    asking the same again would not help. `fix`: what would."""
 
     def __init__(self, cause: str, detail: str, *, is_final: bool = False, fix: str = "") -> None:
         super().__init__(f"{cause}: {detail}")

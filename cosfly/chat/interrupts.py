@@ -17,8 +17,8 @@ AT_ONCE = b"error: interrupted at once; what was answered is kept: run the same 
 def run_until_interrupted(main: Coroutine[Any, Any, Result]) -> Result:
     """Run a coroutine to its end, as `asyncio.run` does.
 
-    The library's own second Ctrl-C breaks into what ends the tasks, which then speak of themselves for pages; journals bear an end at any
-    moment, so ours ends the process.
+    The library's own second Ctrl-C breaks into what ends the tasks, which then speak of themselves for pages; journals
+    bear an end at any moment, so ours ends the process.
 
     Raises:
         KeyboardInterrupt: after the first Ctrl-C, when everything is ended.

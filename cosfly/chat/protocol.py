@@ -120,8 +120,8 @@ def answer_key(model: str, request: Request) -> str:
 
 
 def read_body(content: bytes) -> Any:
-    """Read the JSON that a server sent, of which most fields are nobody's: a long number or a key that stands there twice costs no answer.
-    Half a surrogate pair, which no file can hold, becomes U+FFFD.
+    """Read the JSON that a server sent, of which most fields are nobody's: a long number or a key that stands there
+    twice costs no answer. Half a surrogate pair, which no file can hold, becomes U+FFFD.
 
     Raises:
         ValueError: it is no JSON, or nested deeper than can be read.
@@ -182,7 +182,8 @@ def _name(value: Any) -> str | None:
 def final_text(message: dict[str, Any]) -> str | None:
     """Give what a message says in the end, "" where it holds thoughts alone, None where it holds nothing.
 
-    That is its text, the arguments of the one function that it calls (a schema is served so by some), or why it refuses.
+    That is its text, the arguments of the one function that it calls (a schema is served so by some), or why it
+    refuses.
     """
     text = _joined(message.get("content"))
     if text:
@@ -218,7 +219,8 @@ def _objects(value: Any) -> list[dict[str, Any]]:
 
 
 def _usage(value: Any, request: Request, message: dict[str, Any]) -> tuple[Usage | None, tuple[CountName, ...]]:
-    """Read the counts of tokens; gives None where the server counts nothing, and the names of those that are ours since its cannot be."""
+    """Read the counts of tokens; gives None where the server counts nothing, and the names of those that are ours since
+    its cannot be."""
     found = value if isinstance(value, dict) else {}
     names = get_args(CountName)
     if all(found.get(name) is None for name in names):

@@ -1,8 +1,9 @@
 """What a server means when it refuses a request, from the words that it gives: one table for all servers.
 
-Servers agree on no codes: what one calls 400 another calls 422 or 500. The patterns are of what vLLM, SGLang, llama.cpp, TGI, LM Studio,
-LiteLLM, OpenAI and hosts like it say; tests/refusals.py holds their texts, and is where the next one is added. The table names a
-cause, and decides what no other window would fare better with. Who is at fault for the rest is found out by asking (teachers/trials.py).
+Servers agree on no codes: what one calls 400 another calls 422 or 500. The patterns are of what vLLM, SGLang,
+llama.cpp, TGI, LM Studio, LiteLLM, OpenAI and hosts like it say; tests/refusals.py holds their texts, and is where the
+next one is added. The table names a cause, and decides what no other window would fare better with. Who is at fault for
+the rest is found out by asking (teachers/trials.py).
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ MOST_CHARACTERS = 4000  # of a text that are searched: some servers send the req
 
 @dataclass(frozen=True)
 class Meaning:
-    """what: to say where the server is at fault. fix: what to do. ends_run: it is the server's fault, whatever was asked."""
+    """what: to say where the server is at fault. fix: what to do. ends_run: it is the server's fault, whatever was
+    asked."""
 
     what: str
     fix: str
@@ -46,7 +48,8 @@ MEANINGS: dict[Kind, Meaning] = {
     "schema": Meaning("the server refuses the JSON schema", "set endpoint.json_schema=false", False),
     "parameter": Meaning(
         "the server refuses a parameter of the request",
-        "set what it takes in endpoint (temperature, top_p, max_tokens, extra_body); null in extra_body leaves a field out",
+        "set what it takes in endpoint (temperature, top_p, max_tokens, extra_body); null in extra_body leaves a field "
+        "out",
         True,
     ),
     "model": Meaning("the server has no such model", "check --model and what is served", True),
@@ -60,22 +63,24 @@ _PATTERNS: tuple[tuple[Kind, str], ...] = (
     ("account", r"insufficient[_ ](quota|balance|credit|fund)|billing_hard_limit|credit balance is too low"),
     (
         "too_long",
-        r"context[_ ](length|size|window)|maximum model length|max_model_len|exceed_context|longer than the (maximum|model)"
+        r"context[_ ](length|size|window)|maximum model length|max_model_len|exceed_context|longer than the (maximum"
+        r"|model)"
         r"|prompt is too long|input length|max_new_tokens|max_tokens` or `max_completion_tokens|max_tokens is too large"
-        r"|max_tokens must be at least 1|`inputs` must have less than|input token count|maximum (allowed length|number of tokens)"
-        r"|(maximum|max)_?[_ ]sequence[_ ]length|max_num_tokens|session max length|max length exceeded|model token limit"
-        r"|input is too long|too many tokens",
+        r"|max_tokens must be at least 1|`inputs` must have less than|input token count|maximum (allowed length|number "
+        r"of tokens)"
+        r"|(maximum|max)_?[_ ]sequence[_ ]length|max_num_tokens|session max length|max length exceeded|model token "
+        r"limit|input is too long|too many tokens",
     ),
     (
         "num_images",
         r"at most \d+ (image|item)|too many images|image count \d+ exceeds|\d+ images, exceeding|too much media"
-        r"|images? .{0,60}(exceeds? (the )?(limit|maximum)|per (request|prompt|message))|encoder cache size|limit-mm-per-prompt"
-        r"|images? exceeds? max",
+        r"|images? .{0,60}(exceeds? (the )?(limit|maximum)|per (request|prompt|message))|encoder cache size"
+        r"|limit-mm-per-prompt|images? exceeds? max",
     ),
     (
         "no_vision",
-        r"not a multimodal model|mmproj|image input is not supported|(does|do)( not|n't) support (image|vision|multimodal)"
-        r"|support image input|image_url is only supported|unknown variant `?image_url|only supports? text"
+        r"not a multimodal model|mmproj|image input is not supported|(does|do)( not|n't) support (image|vision"
+        r"|multimodal)|support image input|image_url is only supported|unknown variant `?image_url|only supports? text"
         r"|invalid type: sequence, expected a string|cannot unmarshal array into .{0,80}content",
     ),
     (
@@ -92,24 +97,28 @@ _PATTERNS: tuple[tuple[Kind, str], ...] = (
     ),
     (
         "model",
-        r"\bmodel\b.{0,160}?(does not exist|not found|not exist|is not a valid|decommissioned|no longer (available|supported))"
-        r"|invalid model|model_not_found|no such model|is not a valid model|not available on this endpoint",
+        r"\bmodel\b.{0,160}?(does not exist|not found|not exist|is not a valid|decommissioned|no longer (available"
+        r"|supported))|invalid model|model_not_found|no such model|is not a valid model|not available on this endpoint",
     ),
     (
         "picture",
-        r"cannot identify image|(failed|unable) to (load|decode|process|open) (the )?image|invalid[_ ]image|unsupported image"
-        r"|could not process image|valid image|image (data|file) .{0,40}(corrupt|truncated|invalid)|image file is truncated|(illegal|invalid) base64",
+        r"cannot identify image"
+        r"|(failed|unable) to (load|decode|process|open) (the )?image|invalid[_ ]image|unsupported image"
+        r"|could not process image|valid image|image (data|file) .{0,40}(corrupt|truncated|invalid)|image file is "
+        r"truncated|(illegal|invalid) base64",
     ),
     (
         "content",
-        r"content[_ ](filter|management policy|policy)|data_?inspection|inappropriate content|safety|moderation|flagged",
+        r"content[_ ](filter|management policy|policy)|data_?inspection|inappropriate content|safety|moderation"
+        r"|flagged",
     ),
 )
 _TABLE = tuple((kind, re.compile(pattern, re.IGNORECASE | re.DOTALL)) for kind, pattern in _PATTERNS)
-# Statuses of a server that is busy or away, those above 511 Cloudflare's: whatever else their texts say, only an empty account is more
-# than that. 424 is what TGI says of a generation that broke.
+# Statuses of a server that is busy or away, those above 511 Cloudflare's: whatever else their texts say, only an empty
+# account is more than that. 424 is what TGI says of a generation that broke.
 AWAY = frozenset({408, 409, 424, 425, 429, 502, 503, 504, *range(520, 531)})
-# What a server says with 5xx of a schema that it does not take; that a grammar stands in its words does not tell it from one that broke.
+# What a server says with 5xx of a schema that it does not take; that a grammar stands in its words does not tell it
+# from one that broke.
 _REFUSES = r"unimplemented|unsupported|not support|invalid|unavailable|failed to (parse|compile|convert|initialize)"
 _NAMES = r"response_?format|schema|grammar"
 _SCHEMA_REFUSED = re.compile(
@@ -127,7 +136,8 @@ def kind_of(status: int, text: str) -> Kind:
     found = (kind for kind, pattern in _TABLE if pattern.search(text))
     kind: Kind = "account" if status == 402 else next(found, "unknown")
     if status >= 500 and kind == "content":
-        return "unknown"  # a filter refuses with 4xx; "safety" in the text of a server that failed is no verdict on the window
+        # a filter refuses with 4xx; "safety" in the text of a server that failed is no verdict on the window
+        return "unknown"
     if status >= 500 and kind == "schema" and not _SCHEMA_REFUSED.search(text):
         return "unknown"
     return "unknown" if status in AWAY and kind != "account" else kind

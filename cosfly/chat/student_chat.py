@@ -1,6 +1,7 @@
 """A student's chat: the one renderer for those who train it, run it, serve it and ask it.
 
-A student answers well only what it was taught, so its prompt, the order of its pictures and their pixels come from here alone.
+A student answers well only what it was taught, so its prompt, the order of its pictures and their pixels come from here
+alone.
 """
 
 from __future__ import annotations
@@ -101,7 +102,8 @@ TAUGHT, TAUGHT_SCHEMA, TAUGHT_VERSION = "cosfly_student.json", "cosfly.student",
 
 
 class Look(BaseModel):
-    """How frames were shown: their views in this order, (width, height) of each picture, and the dark end of those of depth."""
+    """How frames were shown: their views in this order, (width, height) of each picture, and the dark end of those of
+    depth."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -113,7 +115,8 @@ class Look(BaseModel):
 class Taught(BaseModel):
     """`cosfly_student.json`, beside a student's weights: what its chats looked like when it was taught.
 
-    prompts: of each language that it was taught, one of the questions, whose words tell the version of all. num_frames: of a window.
+    prompts: of each language that it was taught, one of the questions, whose words tell the version of all. num_frames:
+    of a window.
     looks: of all training samples, sorted. max_pixels: most that its image processor kept of a picture.
     """
 

@@ -1,9 +1,9 @@
 """How many requests may be in flight: additive increase, multiplicative decrease, below a ceiling.
 
-A run starts with a few and doubles every 1.5 s, and triples per round of answers where these come faster, until the server first says
-"busy" (429, 503); from then on it adds one per round and halves at every "busy". A server that is overloaded says so at once: it
-sees 8 requests before it can, and a failure of any other kind holds the growth back. A Retry-After holds all requests back, not only
-the one that was told.
+A run starts with a few and doubles every 1.5 s, and triples per round of answers where these come faster, until the
+server first says "busy" (429, 503); from then on it adds one per round and halves at every "busy". A server that is
+overloaded says so at once: it sees 8 requests before it can, and a failure of any other kind holds the growth back. A
+Retry-After holds all requests back, not only the one that was told.
 """
 
 from __future__ import annotations

@@ -49,7 +49,8 @@ class VllmEngine:
         """
         Args:
             sampling: whether a schema is enforced, and the sampling that is tried before the model is loaded.
-            num_images: most pictures of one request. settings: section that `vllm` and `endpoint` stand in, for messages.
+            num_images: most pictures of one request. settings: section that `vllm` and `endpoint` stand in, for
+            messages.
         Raises:
             InputError: not a model folder.
         """

@@ -41,8 +41,8 @@ class Response:
 class Connections:
     """A connection to each request in flight, each in a client of its own.
 
-    One pool of 64 connections looks through all of them at every request, and all at each of those, which takes longer than to
-    send fifteen pictures.
+    One pool of 64 connections looks through all of them at every request, and all at each of those, which takes longer
+    than to send fifteen pictures.
     """
 
     def __init__(self, key: str, *, timeout_s: float, most_bytes: int) -> None:
@@ -72,13 +72,14 @@ class Connections:
         *,
         tls_name: str | None = None,
     ) -> Response:
-        """Send one request, a POST where it has a content, and read its answer. Redirects are not followed: the key stays here.
+        """Send one request, a POST where it has a content, and read its answer. Redirects are not followed: the key
+        stays here.
 
         Args:
             tls_name: whose certificate is asked for, where the URL names an IP address.
         Raises:
-            TimeoutError: it was not all there in time, from the first byte sent to the last one read, however steadily it dripped.
-            httpx.RequestError: no connection, or it broke; or what came is not packed as it says.
+            TimeoutError: it was not all there in time, from the first byte sent to the last one read, however steadily
+            it dripped. httpx.RequestError: no connection, or it broke; or what came is not packed as it says.
         """
         method = "GET" if content is None else "POST"
         about = {"sni_hostname": tls_name} if tls_name else None
