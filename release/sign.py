@@ -19,7 +19,7 @@ from pydantic import Field
 from cosfly.errors import EnvironmentMissing, InputError, VerifyError
 from cosfly.reading.documents import read_model
 from cosfly.reading.files import read_bytes, sha256_file
-from cosfly.work.store import CHECKSUMS, read_checksums, write_model
+from cosfly.work.store import CHECKSUMS, read_checksums, remove_left, storage_errors, write_model
 from release.record import RECORD, Strict
 
 SIGNATURE = "signature.json"
@@ -124,6 +124,12 @@ def sign(folder: Path, key: Any) -> Path:
     value = Signature(algorithm="ed25519", signed_file="checksums.sha256", public_key=public, signature=made)
     write_model(folder / SIGNATURE, value, schema=SCHEMA, version=VERSION)
     return folder / SIGNATURE
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove what a kill in the middle of signing left beside the signature: verification finds it foreign."""
+    with storage_errors(folder):
+        remove_left(folder / SIGNATURE)
 
 
 def is_signed(folder: Path) -> bool:

@@ -137,8 +137,20 @@ def _served(place: Place) -> str:
     return address
 
 
+def _key(place: Place) -> Path:
+    from cryptography.hazmat.primitives import serialization
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+    path = place.root / "key.pem"
+    path.touch(mode=0o600)
+    pkcs8 = (serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    path.write_bytes(Ed25519PrivateKey.generate().private_bytes(*pkcs8))
+    return path
+
+
 INPUTS: dict[str, Callable[[Place], object]] = {
     "base": _base, "students": _students, "trained": _trained, "inferred": _inferred, "evaluated": _evaluated, "teacher": _teacher, "judge": _judge, "served": _served,
+    "key": _key,
 }  # fmt: skip
 
 TRAINING = [
@@ -210,6 +222,10 @@ COMMANDS: dict[str, list[list[str] | Callable[[Place, Path], None]]] = {
     "release export tree": [["release", "export", DATASET, "--format", "tree", "--out", "{out}", "--workers", "1"]],
     "release export webdataset": [["release", "export", DATASET, "--format", "webdataset", "--out", "{out}", "--workers", "1"]],
     "release export lerobot": [["release", "export", DATASET, "--format", "lerobot", "--out", "{out}", "--workers", "1"]],
+    "release sign": [
+        lambda place, out: copy_stage(place, out, "release"),
+        ["release", "sign", "{out}/dataset", "--key", "{key}", "--level", "structure", "--workers", "1"],
+    ],
     "release get": [["release", "get", "{served}", "--out", "{out}", "--workers", "1"]],
     "release get, a part": [["release", "get", "{served}", "--out", "{out}", "--workers", "1", "--modality", "rgb"]],
     "release stats": [["release", "stats", DATASET, "--out", "{out}"]],

@@ -70,9 +70,10 @@ def products(folder: Path) -> dict[str, str]:
 
 
 def begin(base: Path, out: Path, stage: str) -> Path:
-    """Copy the stages before `stage`."""
+    """Copy the stages before `stage`, and what makes of the folder a run."""
     for name in STAGES[: STAGES.index(stage)]:
         shutil.copytree(base / name, out / name)
+    shutil.copy(base / "run.yaml", out)
     return out
 
 

@@ -126,13 +126,14 @@ def release_sign(
     from release.record import release_folder
     from release.verify.verify import verify
 
-    private_key = sign.read_private_key(key)
-    report = verify(folder, level=level, reader=read_released, **manner_of_work(job.cfg))
+    private_key, release = sign.read_private_key(key), release_folder(folder)
+    sign.remove_unfinished(release)
+    report = verify(release, level=level, reader=read_released, **manner_of_work(job.cfg))
     typer.echo(str(report))
     if not report.is_ok:
         typer.echo("nothing was signed", err=True)
         raise typer.Exit(1)
-    typer.echo(sign.sign(release_folder(folder), private_key))
+    typer.echo(sign.sign(release, private_key))
 
 
 @app.command("stats")

@@ -56,7 +56,7 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
     partial = _partial(path)
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        _remove_left(path)
+        remove_left(path)
         try:
             with open(partial, "xb") as file:
                 yield file
@@ -73,7 +73,7 @@ def _partial(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}.partial")
 
 
-def _remove_left(path: Path) -> None:
+def remove_left(path: Path) -> None:
     """Remove what kills left under the temporary names of a file or folder: names of processes that are gone, and of
     this one."""
     begin = f".{path.name}."
@@ -249,7 +249,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     refuse_link(path)
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        _remove_left(path)
+        remove_left(path)
         partial.mkdir()
         try:
             yield partial
