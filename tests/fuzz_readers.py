@@ -110,7 +110,7 @@ from release.package.sources import Source
 from release.record import read_record
 from release.stats import stats
 from release.transfer import stage as get
-from release.transfer.stage import Choice
+from release.transfer.stage import Selection
 from release.verify.verify import verify
 from release.viewer import page as viewer
 from release.viewer.content import ViewerConfig
@@ -645,7 +645,7 @@ def _exported(root: Path, scratch: Path, format: str) -> None:
 
 
 def _fetched(dataset: Path, scratch: Path, **wanted: Any) -> None:
-    _stage(lambda: get.run(build(Choice, wanted, "x"), str(dataset), scratch / "get"), scratch / "get")
+    _stage(lambda: get.run(build(Selection, wanted, "x"), str(dataset), scratch / "get"), scratch / "get")
 
 
 def _released(root: Path, scratch: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from test_release_export import TWO_SPLITS, make_release
 from test_release_package import CFG, build, make_caption, make_inspection
 from typer.testing import CliRunner
 
@@ -123,6 +124,21 @@ def test_pictures_of_a_release_are_those_of_the_tree_that_it_is_exported_to(run,
     export(run, tmp_path / "d.json", "sharegpt", languages=["zh"])
     theirs = {s["id"]: s for s in json.loads((tmp_path / "d.json").read_text(encoding="utf-8"))}
     assert {s["id"]: s["conversations"] for s in samples} == {k: s["conversations"] for k, s in theirs.items()}
+
+
+def test_conversations_of_a_release_are_of_one_split(tmp_path):
+    release = make_release(tmp_path, **TWO_SPLITS)
+    with pytest.raises(InputError, match=r"captions of several splits; got train, validation; .*--split"):
+        export(release, tmp_path / "c.json", "llava")
+    assert not (tmp_path / "c.json").exists()
+    export(release, tmp_path / "all.jsonl", "jsonl")
+    lines = [json.loads(line) for line in (tmp_path / "all.jsonl").read_text(encoding="utf-8").splitlines()]
+    for split in ("train", "validation"):
+        words = ["export", "captions", str(release), "--format", "sharegpt", "--split", split, "--language", "en"]
+        done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / f"{split}.json")])
+        assert done.exit_code == 0, done.output
+        found = [sample["id"] for sample in json.loads((tmp_path / f"{split}.json").read_text(encoding="utf-8"))]
+        assert found == [f"{line['sample_id']}_en" for line in lines if line["split"] == split] != []
 
 
 def test_a_text_with_a_mark_for_pictures_is_left_out(run, tmp_path):

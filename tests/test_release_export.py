@@ -33,7 +33,7 @@ from cosfly.reading.arrays import parse_picture
 from cosfly.reading.files import sha256_file
 from cosfly.work.config import build as build_config
 from cosfly.work.store import CHECKSUMS, read_checksums
-from release.export.contract import FORMATS, ExportConfig, Facts, Files, Unit
+from release.export.contract import FORMATS, ExportConfig, ExportUnit, Files, FormatFacts
 from release.export.lerobot import merged, moves, runs_of, summarize, tiff_of_depth
 from release.export.source import ReleasedRows, Span, depth_npy, open_release, read_span, rows_of_flight, scan
 from release.export.stage import read_export
@@ -394,7 +394,7 @@ def test_a_folder_of_something_else_is_refused(dataset, tmp_path):
 
 def plan(release, flights, cfg):
     """A toy format, as docs/extending.md describes it: the poses of each flight as CSV."""
-    return [Unit(flight.name, len(flight), flights=(flight,)) for flight in flights]
+    return [ExportUnit(flight.name, len(flight), flights=(flight,)) for flight in flights]
 
 
 def write(release, unit, folder, cfg):
@@ -408,7 +408,7 @@ def write(release, unit, folder, cfg):
 def finish(release, units, written, folder, cfg):
     files = Files(folder)
     files.put("lines.txt", str(sum(one.facts["lines"] for one in written)).encode())
-    return Facts(version="1", codings={"pose": "CSV"}, how_to_open="open(...)", files=files.digests)
+    return FormatFacts(version="1", codings={"pose": "CSV"}, how_to_open="open(...)", files=files.digests)
 
 
 def test_a_format_of_your_own_takes_three_functions(dataset, tmp_path, monkeypatch):

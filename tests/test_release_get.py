@@ -38,14 +38,14 @@ from release.record import read_record
 from release.transfer import remote as remotes
 from release.transfer import stage
 from release.transfer.remote import FsspecRemote, HttpRemote, open_remote, without_secrets
-from release.transfer.stage import NOT_ASKED_FOR, Choice
+from release.transfer.stage import NOT_ASKED_FOR, Selection
 from release.transfer.stage import run as get
 from release.verify.verify import verify
 from specimens import make_playback_tree
 
 
-def choice(**wanted) -> Choice:
-    return build_config(Choice, wanted, "test")
+def choice(**wanted) -> Selection:
+    return build_config(Selection, wanted, "test")
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from test_release_package import all_bytes
 
 from cosfly.work.config import build
 from release.record import read_record
-from release.transfer.stage import Choice
+from release.transfer.stage import Selection
 from release.transfer.stage import run as get
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -31,8 +31,8 @@ PART = {"towns": ["Town01"], "splits": ["train"], "modalities": ["rgb"]}
 PART_WORDS = ["--town", "Town01", "--split", "train", "--modality", "rgb"]
 
 
-def choice(**wanted) -> Choice:
-    return build(Choice, wanted, "test")
+def choice(**wanted) -> Selection:
+    return build(Selection, wanted, "test")
 
 
 @pytest.fixture(scope="module")

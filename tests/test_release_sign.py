@@ -22,7 +22,7 @@ from cosfly.work.config import build as build_config
 from cosfly.work.store import CHECKSUMS, read_checksums, sha256_bytes, write_checksums, write_json
 from release.sign import PASSPHRASE, SIGNATURE, read_private_key, read_public_key, sign
 from release.transfer.push import pack
-from release.transfer.stage import Choice
+from release.transfer.stage import Selection
 from release.transfer.stage import run as get
 from release.verify.findings import Verified
 from release.verify.verify import verify
@@ -185,9 +185,9 @@ def test_nothing_is_signed_that_is_not_what_its_list_says(keys, dataset):
 def test_a_signature_travels_with_the_whole_release_and_not_with_a_part(keys, dataset, tmp_path):
     sign(dataset, read_private_key(keys / "pem"))
     assert SIGNATURE in pack(dataset).files
-    whole = get(Choice(), str(dataset), tmp_path / "whole")
+    whole = get(Selection(), str(dataset), tmp_path / "whole")
     assert findings(whole, keys / "pem.pub") == set()
-    part = get(build_config(Choice, {"splits": ["train"]}, "test"), str(dataset), tmp_path / "part")
+    part = get(build_config(Selection, {"splits": ["train"]}, "test"), str(dataset), tmp_path / "part")
     report = verify(part, level="structure", public_key=read_public_key(keys / "pem.pub"))
     assert errors(report) == {"signature"}
     assert "part" in str(report)

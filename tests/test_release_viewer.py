@@ -15,6 +15,7 @@ import pytest
 from browser import browser
 from hypothesis import given
 from hypothesis import strategies as st
+from release_tampering import forge
 from specimens_distill import WINDOW, make_caption
 from test_release_package import build as build_release
 from test_release_package import make_inputs
@@ -34,8 +35,8 @@ from release.record import read_record
 from release.stats import stats
 from release.viewer.content import (
     PATH_POINTS,
-    Shown,
     ViewerConfig,
+    ViewerPage,
     boxes_of,
     choose_flights,
     choose_frames,
@@ -268,6 +269,21 @@ def test_pictures_of_a_release_look_like_those_of_its_tree(dataset):
         assert (picture(row, file, record) == read_view(frame, view)).all()
 
 
+def test_words_and_boxes_that_no_release_has_are_shown_as_they_are(dataset, tmp_path):
+    def lie(rows):
+        for row in rows:
+            row["track"] = "third"
+            row["sentence_states_en"] = row["sentence_states_en"] and ["odd"] * len(row["sentence_states_en"])
+            row["target_bbox"] = row["target_bbox"] and dict.fromkeys(row["target_bbox"])
+
+    shown = data_of(run(forge(dataset, tmp_path / "forged", lie), tmp_path / "p.html", ViewerConfig()).read_text())
+    assert {flight["track"] for flight in shown["flights"]} == {"third"}
+    frames = [frame for flight in shown["flights"] for frame in flight["frames"]]
+    assert {frame["box"] for frame in frames} == {None}
+    captions = [frame["caption"] for frame in frames if frame["caption"]]
+    assert {sentence["state"] for caption in captions for sentence in caption["texts"]["en"]} <= {"odd", None}
+
+
 def test_a_page_keeps_its_size(run_folder, tmp_path):
     """Noise does not compress: with all pictures the page would have three times what it may."""
     tree = make_playback_tree(tmp_path / "tree", 1, 24, width_px=320, height_px=180)
@@ -326,7 +342,7 @@ def test_the_command_tells_the_size(run_folder, tmp_path):
 
 @given(st.text(max_size=60))
 def test_no_text_ends_the_data(text):
-    shown = Shown(title=text, kind="run", notes=[text], maps={}, flights=[])
+    shown = ViewerPage(title=text, kind="run", notes=[text], maps={}, flights=[])
     page = page_html(shown)
     assert len(re.findall(r"<script", page)) == 2
     assert data_of(page)["kind"] == "run"

@@ -248,10 +248,10 @@ def release_get(
     """Fetch a release, or some towns, splits, flights and pictures of it; only these travel, and are checked."""
     from cosfly.work.config import build
     from release.transfer import stage as get
-    from release.transfer.stage import Choice
+    from release.transfer.stage import Selection
 
     asked = {"towns": town, "splits": split, "flights": flight, "modalities": modality, "expected": digest}
-    choice = build(Choice, {name: value for name, value in asked.items() if value}, "the options")
+    choice = build(Selection, {name: value for name, value in asked.items() if value}, "the options")
     job.finish(get.run(choice, source, out, **job.manner, findings=findings), out)
 
 
@@ -309,6 +309,10 @@ def export_captions(
         Literal["all", "last"],
         Option(help="Pictures of a conversation: of all frames of the window, or of the last one alone."),
     ] = "all",
+    split: Annotated[
+        Literal["train", "validation", "test"] | None,
+        Option(help="Only this split of a release; conversations of one split go to one file."),
+    ] = None,
     overwrite: Annotated[bool, Option("--overwrite", help="Replace the file where there is one.")] = False,
 ) -> None:
     """Write the accepted captions to one file; pictures are named relative to the playback tree."""
@@ -316,5 +320,5 @@ def export_captions(
     from release.export.captions import export
 
     languages = LANGUAGES if language == "both" else [language]
-    told = export(source, out, format, languages=languages, shown=frames, overwrite=overwrite)
+    told = export(source, out, format, languages=languages, shown=frames, split=split, overwrite=overwrite)
     typer.echo(f"{out}: {told}")

@@ -21,12 +21,12 @@ from cosfly.products.captions import FIELDS, Caption, Language, Prompt, read_cap
 from cosfly.products.frames import FILE_NAMES, frame_name
 from cosfly.reading.files import check_stays_below
 from cosfly.work.store import atomic_file, dump_json, inside
-from release.columns import LANGUAGES
+from release.columns import LANGUAGES, SplitName
 from release.export.source import open_release, rows_of_flight, scan
 from release.export.tree import tree_folder
 
 FormatName = Literal["csv", "jsonl", "sharegpt", "llava"]
-Shown = Literal["all", "last"]
+ImageChoice = Literal["all", "last"]
 IMAGE = "<image>"  # where a picture goes, in ShareGPT and LLaVA alike; loaders count them
 MARKS = (IMAGE, "<video>", "<audio>")
 BOM = "\ufeff"  # without it spreadsheets read Chinese as something else
@@ -60,7 +60,7 @@ class CaptionLine:
     texts: dict[Language, dict[str, str]]
     prompts: dict[Language, Prompt]
 
-    def question(self, language: Language, shown: Shown) -> Prompt:
+    def question(self, language: Language, shown: ImageChoice) -> Prompt:
         """Give the prompt with the sentence about the pictures that are shown."""
         if shown == "last":
             return self.prompts[language].told(LAST[language].format(*self.picture_px))
@@ -178,7 +178,7 @@ def _of_row(row: dict[str, Any], flight: Any, images: list[str]) -> CaptionLine:
 
 
 @dataclass
-class Told:
+class CaptionTally:
     """What an export came to: samples written; captions and samples that were left out, by reason."""
 
     written: int = 0
@@ -195,28 +195,46 @@ def export(
     format: FormatName,
     *,
     languages: Collection[Language] = LANGUAGES,
-    shown: Shown = "all",
+    shown: ImageChoice = "all",
+    split: SplitName | None = None,
     overwrite: bool = False,
-) -> Told:
+) -> CaptionTally:
     """Write the accepted captions of a source to one file; a table or JSON lines have a row a window, the others a sample a window and language.
 
     Args:
         shown: pictures of a sample in ShareGPT and LLaVA: those of all frames, or of the last one alone.
-        overwrite: replace a file that stands at `out`.
+        split: the captions of this one alone. overwrite: replace a file that stands at `out`.
     Raises:
-        StorageError: something stands at `out`. InputError: there is nothing to read. NothingKept: no caption can go out.
+        StorageError: something stands at `out`. InputError: there is nothing to read, or conversations would mix splits.
+        NothingKept: no caption can go out.
     """
     if out.exists() and not (overwrite and out.is_file()):
         fix = "--overwrite replaces it, or choose another --out" if out.is_file() else "name a file in it"
         raise StorageError("there is a file already" if out.is_file() else "this is a folder", where=out, fix=fix)
-    told = Told()
-    lines = read_lines(source, told.left_out)
+    told = CaptionTally()
+    lines = _of_split(read_lines(source, told.left_out), split, format, told.left_out)
     wanted = [language for language in LANGUAGES if language in languages]
     with atomic_file(out) as file:
         WRITERS[format](file, lines, wanted, shown, told)
         if told.written == 0:
             raise NothingKept("no caption to export", where=source, got=str(told), expected="accepted captions")
     return told
+
+
+def _of_split(
+    lines: Iterable[CaptionLine], split: SplitName | None, format: FormatName, left_out: Counter[str]
+) -> Iterator[CaptionLine]:
+    """Leave other splits out; conversations have no place to say which split they are of."""
+    first = None
+    for line in lines:
+        if split not in (None, line.split):
+            left_out["another_split"] += 1
+            continue
+        first = line.split if first is None else first
+        if line.split != first and format in ("sharegpt", "llava"):
+            fix = "write a file for each: --split train, --split validation, --split test"
+            raise InputError("captions of several splits", where=line.sample_id, got=f"{first}, {line.split}", fix=fix)
+        yield line
 
 
 def _row(line: CaptionLine, languages: list[Language]) -> dict[str, Any]:
@@ -236,7 +254,9 @@ def _row(line: CaptionLine, languages: list[Language]) -> dict[str, Any]:
     return row
 
 
-def _csv(file: IO[bytes], lines: Iterable[CaptionLine], languages: list[Language], shown: Shown, told: Told) -> None:
+def _csv(
+    file: IO[bytes], lines: Iterable[CaptionLine], languages: list[Language], shown: ImageChoice, told: CaptionTally
+) -> None:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\r\n", quoting=csv.QUOTE_MINIMAL)
     file.write(BOM.encode())
@@ -257,14 +277,16 @@ def cell(value: Any) -> str:
     return f"'{text}" if isinstance(value, str) and text.lstrip(" ").startswith(FORMULA) else text
 
 
-def _jsonl(file: IO[bytes], lines: Iterable[CaptionLine], languages: list[Language], shown: Shown, told: Told) -> None:
+def _jsonl(
+    file: IO[bytes], lines: Iterable[CaptionLine], languages: list[Language], shown: ImageChoice, told: CaptionTally
+) -> None:
     for line in lines:
         file.write((dump_json(_row(line, languages)) + "\n").encode())
         told.written += 1
 
 
 def _sharegpt(
-    file: IO[bytes], lines: Iterable[CaptionLine], languages: list[Language], shown: Shown, told: Told
+    file: IO[bytes], lines: Iterable[CaptionLine], languages: list[Language], shown: ImageChoice, told: CaptionTally
 ) -> None:
     """As LLaMA-Factory reads it: roles in turns, human first; as many marks as `images`, which are joined to its media_dir."""
 
@@ -275,7 +297,9 @@ def _sharegpt(
     _write_array(file, _samples(lines, languages, shown, told, sample))
 
 
-def _llava(file: IO[bytes], lines: Iterable[CaptionLine], languages: list[Language], shown: Shown, told: Told) -> None:
+def _llava(
+    file: IO[bytes], lines: Iterable[CaptionLine], languages: list[Language], shown: ImageChoice, told: CaptionTally
+) -> None:
     """As LLaVA's trainers read it: `image` below its image folder, one name, or a list, which the first LLaVA does not take.
 
     It has no place for a system prompt, so that stands in front of the question.
@@ -296,7 +320,7 @@ Sample = Callable[[str, Prompt, list[str], str, str], dict[str, Any]]
 
 
 def _samples(
-    lines: Iterable[CaptionLine], languages: list[Language], shown: Shown, told: Told, sample: Sample
+    lines: Iterable[CaptionLine], languages: list[Language], shown: ImageChoice, told: CaptionTally, sample: Sample
 ) -> Iterator[dict[str, Any]]:
     for line in lines:
         for language in languages:
@@ -323,6 +347,6 @@ def _write_array(file: IO[bytes], samples: Iterable[dict[str, Any]]) -> None:
     file.write(b"\n]\n")
 
 
-WRITERS: dict[FormatName, Callable[[IO[bytes], Iterable[CaptionLine], list[Language], Shown, Told], None]] = {
+WRITERS: dict[FormatName, Callable[[IO[bytes], Iterable[CaptionLine], list[Language], ImageChoice, CaptionTally], None]] = {
     "csv": _csv, "jsonl": _jsonl, "sharegpt": _sharegpt, "llava": _llava,
 }  # fmt: skip

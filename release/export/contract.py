@@ -1,26 +1,25 @@
 """What a format of `cosfly release export` is: a module with three functions, and a row in FORMATS.
 
-    plan(release, flights, cfg) -> list[Unit]              the work, cut so that units can be done in any order by several processes
-    write(release, unit, folder, cfg) -> Written           one unit: its files, each whole or absent, below `folder`
-    finish(release, units, written, folder, cfg) -> Facts  what speaks of all units: indices, statistics; called once, in order of units
+    plan(release, flights, cfg) -> list[ExportUnit]              the work, cut so that units can be done in any order by several processes
+    write(release, unit, folder, cfg) -> UnitFiles           one unit: its files, each whole or absent, below `folder`
+    finish(release, units, written, folder, cfg) -> FormatFacts  what speaks of all units: indices, statistics; called once, in order of units
 
 The bytes of a unit depend on the release, the unit and the settings alone.
 """
 
 from __future__ import annotations
 
-import hashlib
 import importlib
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Literal, Protocol, cast
+from typing import Any, Literal, Protocol, cast
 
 from pydantic import BaseModel, Field
 
+from cosfly.reading.files import sha256_file
 from cosfly.work.config import Config
-from cosfly.work.store import atomic_file
+from cosfly.work.store import atomic_file, sha256_bytes
 from release.export.source import Release, ReleasedRows, Span
 
 FormatName = Literal["tree", "webdataset", "lerobot"]
@@ -43,7 +42,7 @@ class ExportConfig(Config):
 
 
 @dataclass(frozen=True)
-class Unit:
+class ExportUnit:
     """One piece of work. name: unique; frames: how many it has; spans or flights: its rows; extra: the format's own."""
 
     name: str
@@ -53,7 +52,7 @@ class Unit:
     extra: Any = None
 
 
-class Written(BaseModel):
+class UnitFiles(BaseModel):
     """What a unit left: its files (relative name -> sha256) and what the format wants to know of it afterwards."""
 
     files: dict[str, str]
@@ -61,7 +60,7 @@ class Written(BaseModel):
     facts: dict[str, Any] = {}
 
 
-class Facts(BaseModel):
+class FormatFacts(BaseModel):
     """What a format says of itself in `export.json`, and the files that `finish` wrote (relative name -> sha256)."""
 
     version: str
@@ -73,34 +72,23 @@ class Facts(BaseModel):
 
 
 class Format(Protocol):
-    def plan(self, release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[Unit]: ...
+    def plan(self, release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[ExportUnit]: ...
 
-    def write(self, release: Release, unit: Unit, folder: Path, cfg: ExportConfig) -> Written: ...
+    def write(self, release: Release, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> UnitFiles: ...
 
     def finish(
-        self, release: Release, units: Sequence[Unit], written: Sequence[Written], folder: Path, cfg: ExportConfig
-    ) -> Facts: ...
+        self,
+        release: Release,
+        units: Sequence[ExportUnit],
+        written: Sequence[UnitFiles],
+        folder: Path,
+        cfg: ExportConfig,
+    ) -> FormatFacts: ...
 
 
 def format_of(name: FormatName) -> Format:
     """Give the module of a format, loaded when it is asked for."""
     return cast(Format, importlib.import_module(FORMATS[name]))
-
-
-class HashedFile(io.RawIOBase):
-    """Counts and digests what is written through it; closing it leaves the file below open."""
-
-    def __init__(self, file: IO[bytes]) -> None:
-        self.file, self.digest, self.num_bytes = file, hashlib.sha256(), 0
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, data: Any) -> int:
-        self.digest.update(data)
-        self.num_bytes += len(data)
-        self.file.write(data)
-        return len(data)
 
 
 class Files:
@@ -113,13 +101,18 @@ class Files:
         """Write one file; give its sha256. listed: whether it stands in the record of the export."""
         with atomic_file(self.folder / name) as file:
             file.write(data)
-        return self.note(name, hashlib.sha256(data).hexdigest(), len(data), listed=listed)
+        return self._note(name, sha256_bytes(data), len(data), listed)
 
-    def note(self, name: str, digest: str, num_bytes: int, *, listed: bool = True) -> str:
+    def note(self, name: str) -> None:
+        """Put a file that stands there on record."""
+        path = self.folder / name
+        self._note(name, sha256_file(path), path.stat().st_size, True)
+
+    def _note(self, name: str, digest: str, num_bytes: int, listed: bool) -> str:
         if listed:
             self.digests[name] = digest
         self.num_bytes += num_bytes
         return digest
 
-    def written(self, **facts: Any) -> Written:
-        return Written(files=self.digests, bytes=self.num_bytes, facts=facts)
+    def written(self, **facts: Any) -> UnitFiles:
+        return UnitFiles(files=self.digests, bytes=self.num_bytes, facts=facts)

@@ -28,7 +28,7 @@ from cosfly.reading.arrays import parse_array, parse_picture
 from cosfly.work.runner import advance
 from cosfly.work.store import atomic_file, dump_json
 from release.columns import BOX, CAPTION_FIELDS, PICTURES, POINT, POSE, SPLIT_NAMES
-from release.export.contract import ExportConfig, Facts, Files, HashedFile, Unit, Written
+from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
 from release.export.source import (
     Release,
     ReleasedRows,
@@ -117,7 +117,7 @@ COLUMNS = ["pose", "visibility", "target_depth_m", *FLAGS, *TEXTS, *(column for 
 
 
 @dataclass(frozen=True)
-class Feature:
+class LeRobotFeature:
     """One feature of `info.json`."""
 
     dtype: str
@@ -149,26 +149,26 @@ class Feature:
         return value if self.shape == (1,) else {"feature": value, "length": self.shape[0], "_type": "Sequence"}
 
 
-def features_of(modalities: Collection[FrameFile], size_px: tuple[int, int]) -> dict[str, Feature]:
+def features_of(modalities: Collection[FrameFile], size_px: tuple[int, int]) -> dict[str, LeRobotFeature]:
     """Give the features of frames whose pictures are (width, height) px."""
     width, height = size_px
-    found: dict[str, Feature] = {}
+    found: dict[str, LeRobotFeature] = {}
     for file in modalities:
         if file == "depth":
             info = {"is_depth_map": True, "depth_unit": "m"}
-            found[CAMERAS[file]] = Feature("image", (height, width, 1), ("height", "width", "channels"), info)
+            found[CAMERAS[file]] = LeRobotFeature("image", (height, width, 1), ("height", "width", "channels"), info)
         else:
-            found[CAMERAS[file]] = Feature("image", (height, width, 3), ("height", "width", "channels"))
-    found[STATE] = Feature("float32", (len(POSE),), POSE)
-    found[ACTION] = Feature("float32", (len(MOVE),), MOVE)
-    found |= {name: Feature("float32", (len(members),), members) for name, (_, members) in VECTORS.items()}
-    found |= {name: Feature("float32", (1,)) for name in ("visibility", "target_depth_m")}
-    found |= {name: Feature("bool", (1,)) for name in (*FLAGS, "next.done")}
-    found |= {name: Feature("string", (1,)) for name in TEXTS}
-    return found | {name: Feature(dtype, (1,)) for name, dtype in DEFAULTS.items()}
+            found[CAMERAS[file]] = LeRobotFeature("image", (height, width, 3), ("height", "width", "channels"))
+    found[STATE] = LeRobotFeature("float32", (len(POSE),), POSE)
+    found[ACTION] = LeRobotFeature("float32", (len(MOVE),), MOVE)
+    found |= {name: LeRobotFeature("float32", (len(members),), members) for name, (_, members) in VECTORS.items()}
+    found |= {name: LeRobotFeature("float32", (1,)) for name in ("visibility", "target_depth_m")}
+    found |= {name: LeRobotFeature("bool", (1,)) for name in (*FLAGS, "next.done")}
+    found |= {name: LeRobotFeature("string", (1,)) for name in TEXTS}
+    return found | {name: LeRobotFeature(dtype, (1,)) for name, dtype in DEFAULTS.items()}
 
 
-def schema_of(features: dict[str, Feature]) -> pa.Schema:
+def schema_of(features: dict[str, LeRobotFeature]) -> pa.Schema:
     """Give the parquet schema, with what `datasets` wants to know in its metadata."""
     about = {"info": {"features": {name: feature.hub for name, feature in features.items()}}}
     return pa.schema(
@@ -253,7 +253,7 @@ def task_of(decision: str) -> str:
     return f"{FOLLOW_TASK} Now: {decision.replace('_', ' ')}." if decision else FOLLOW_TASK
 
 
-def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[Unit]:
+def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[ExportUnit]:
     """Number episodes and frames; a unit is a data file of whole flights.
 
     Raises:
@@ -266,7 +266,7 @@ def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> li
         raise InputError(
             "a decision outside the closed set", where=release.folder, got=", ".join(sorted(unknown))[:200]
         )
-    units: list[Unit] = []
+    units: list[ExportUnit] = []
     episode = index = 0
     for split in SPLIT_NAMES:
         groups: list[list[ReleasedRows]] = []
@@ -278,7 +278,7 @@ def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> li
         for group in groups:
             layout = Layout(split, len(units), episode, index, fps, size_px, tasks)
             frames = sum(map(len, group))
-            units.append(Unit(f"{split}-{len(units):06d}", frames, flights=tuple(group), extra=layout))
+            units.append(ExportUnit(f"{split}-{len(units):06d}", frames, flights=tuple(group), extra=layout))
             episode += sum(len(runs_of(flight)) for flight in group)
             index += frames
     return units
@@ -334,7 +334,7 @@ class Episode:
     index: int
 
 
-def _episodes(unit: Unit) -> Iterator[Episode]:
+def _episodes(unit: ExportUnit) -> Iterator[Episode]:
     number, index = unit.extra.episode, unit.extra.index
     for flight in unit.flights:
         for start, stop in runs_of(flight):
@@ -342,7 +342,7 @@ def _episodes(unit: Unit) -> Iterator[Episode]:
             number, index = number + 1, index + stop - start
 
 
-def write(release: Release, unit: Unit, folder: Path, cfg: ExportConfig) -> Written:
+def write(release: Release, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> UnitFiles:
     """Write the data files of a unit, and its part of the table of episodes."""
     layout: Layout = unit.extra
     features = features_of(release.modalities, layout.size_px)
@@ -356,7 +356,7 @@ def write(release: Release, unit: Unit, folder: Path, cfg: ExportConfig) -> Writ
 
 
 def _tables(
-    release: Release, episode: Episode, layout: Layout, features: dict[str, Feature], about: list[dict[str, Any]]
+    release: Release, episode: Episode, layout: Layout, features: dict[str, LeRobotFeature], about: list[dict[str, Any]]
 ) -> Iterator[pa.Table]:
     """Yield an episode's rows, a row group of the release at a time; at its end `about` has what the records say of it."""
     flight, n = episode.flight, episode.stop - episode.start
@@ -424,7 +424,7 @@ def _pixels(release: Release, row: dict[str, Any], file: FrameFile) -> np.ndarra
     return thinned(parse_picture(picture(row, file), where)[..., ::-1])
 
 
-def _column(values: Any, feature: Feature) -> Any:
+def _column(values: Any, feature: LeRobotFeature) -> Any:
     if feature.dtype == "string":
         return list(values)
     flat = pa.array(np.ascontiguousarray(values).reshape(-1))
@@ -442,14 +442,15 @@ def _write_parquet(files: Files, name: str, schema: pa.Schema, tables: Iterator[
     stored = {f"{CAMERAS[file]}.bytes" for file in ("rgb", "instance")}
     compression = {leaf: "none" if leaf in stored else "zstd" for leaf in leaves}
     texts = [field.name for field in schema if pa.types.is_string(field.type)]
-    with atomic_file(files.folder / name) as file:
-        hashed = HashedFile(file)
-        with pq.ParquetWriter(
-            hashed, schema, compression=compression, use_dictionary=texts, write_statistics=["episode_index"]
-        ) as writer:
-            for table in tables:
-                writer.write_table(table, row_group_size=len(table))
-    files.note(name, hashed.digest.hexdigest(), hashed.num_bytes)
+    with (
+        atomic_file(files.folder / name) as file,
+        pq.ParquetWriter(
+            file, schema, compression=compression, use_dictionary=texts, write_statistics=["episode_index"]
+        ) as writer,
+    ):
+        for table in tables:
+            writer.write_table(table, row_group_size=len(table))
+    files.note(name)
 
 
 def _write_episodes(files: Files, layout: Layout, about: list[dict[str, Any]]) -> None:
@@ -487,8 +488,8 @@ def _merge_all(stats: list[dict[str, Summary]]) -> dict[str, Summary]:
 
 
 def finish(
-    release: Release, units: Sequence[Unit], written: Sequence[Written], folder: Path, cfg: ExportConfig
-) -> Facts:
+    release: Release, units: Sequence[ExportUnit], written: Sequence[UnitFiles], folder: Path, cfg: ExportConfig
+) -> FormatFacts:
     """Write `meta/`."""
     layout: Layout = units[0].extra
     files, tasks = Files(folder), [task_of(decision) for decision in layout.tasks]
@@ -498,7 +499,7 @@ def finish(
     files.put("meta/tasks.parquet", _parquet_bytes(_tasks_table(tasks)))
     files.put("meta/info.json", dump_json(info, indent=4).encode())
     num_flights = sum(len(unit.flights) for unit in units)
-    return Facts(
+    return FormatFacts(
         version=VERSION,
         codings={
             file: depth_in_words(release.record.depth, "TIFF, the released numbers") if file == "depth" else "PNG, the released bytes"
@@ -518,7 +519,7 @@ def finish(
     )  # fmt: skip
 
 
-def _info(release: Release, units: Sequence[Unit], counts: list[int], cfg: ExportConfig) -> dict[str, Any]:
+def _info(release: Release, units: Sequence[ExportUnit], counts: list[int], cfg: ExportConfig) -> dict[str, Any]:
     layout: Layout = units[0].extra
     splits: dict[str, str] = {}
     total = 0

@@ -21,14 +21,14 @@ from cosfly.reading.documents import read_model
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.work.stage_folder import Resume, StageFolder, result_of
 from cosfly.work.store import CHECKSUMS, dump_json, inside, sha256_bytes, storage_errors, write_bytes, write_checksums
-from release.export.contract import ExportConfig, Facts, Unit, Written, format_of
+from release.export.contract import ExportConfig, ExportUnit, FormatFacts, UnitFiles, format_of
 from release.export.source import Release, open_release, scan
 from release.record import DepthCoding, ReleasedMap, Strict
 
 EXPORT_SCHEMA, EXPORT_VERSION = "cosfly.export", "1.1"
 
 
-class CameFrom(Strict):
+class SourceRelease(Strict):
     """The release that was exported. digest: of its content; record_sha256: of its release.json."""
 
     name: str
@@ -44,7 +44,7 @@ class ExportRecord(Strict):
     format: str
     format_version: str
     made_by: str
-    release: CameFrom
+    release: SourceRelease
     licence: str
     credits: str
     maps: list[ReleasedMap]
@@ -60,14 +60,14 @@ class ExportRecord(Strict):
     bytes: int
 
 
-def describe(release: Release, facts: Facts, cfg: ExportConfig, *, frames: int, num_bytes: int) -> ExportRecord:
+def describe(release: Release, facts: FormatFacts, cfg: ExportConfig, *, frames: int, num_bytes: int) -> ExportRecord:
     """Give the record of an export."""
     record = release.record
     return ExportRecord(
         format=cfg.format,
         format_version=facts.version,
         made_by=f"cosfly {cosfly.__version__}",
-        release=CameFrom(
+        release=SourceRelease(
             name=record.name, made_by=record.made_by, digest=record.content_digest, record_sha256=release.record_sha256
         ),
         licence=record.licence,
@@ -182,7 +182,7 @@ def run(
             "parts of the release could not be exported", where=out / "failures.jsonl", got=str(finished.tally),
             fix="mend what that file names (`cosfly release verify`) and run the same command again: only those are done again",
         )  # fmt: skip
-    written = [result_of(kept, Written) for kept in finished.kept]
+    written = [result_of(kept, UnitFiles) for kept in finished.kept]
     _check_parts(parts, written)
     _publish(release, units, written, parts, cfg)
     with storage_errors(product):
@@ -191,7 +191,9 @@ def run(
     return product
 
 
-def _publish(release: Release, units: list[Unit], written: list[Written], parts: Path, cfg: ExportConfig) -> None:
+def _publish(
+    release: Release, units: list[ExportUnit], written: list[UnitFiles], parts: Path, cfg: ExportConfig
+) -> None:
     """Write what speaks of the whole export."""
     facts = format_of(cfg.format).finish(release, units, written, parts, cfg)
     digests = {name: digest for one in written for name, digest in one.files.items()} | facts.files
@@ -204,7 +206,7 @@ def _publish(release: Release, units: list[Unit], written: list[Written], parts:
     write_checksums(parts, digests)
 
 
-def _check_parts(parts: Path, written: list[Written]) -> None:
+def _check_parts(parts: Path, written: list[UnitFiles]) -> None:
     """See that what was finished by an earlier run is still there."""
     missing = [name for one in written for name in one.files if not inside(parts, name).is_file()]
     if missing:

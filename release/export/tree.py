@@ -30,14 +30,14 @@ from cosfly.reading.files import sha256_file
 from cosfly.work.runner import advance
 from cosfly.work.store import CHECKSUMS, checksum_lines, write_model
 from release.columns import BOX, INTRINSICS, PICTURES, POINT, POSE, SCALAR_NAMES, matrices_of
-from release.export.contract import ExportConfig, Facts, Files, Unit, Written
+from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
 from release.export.source import Release, ReleasedRows, depth_in_words, depth_npy, picture, read_span, vectors
 
 VERSION = "drone_nav_traj_v7 7.0.0"
 Row = dict[str, Any]
 
 
-def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[Unit]:
+def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[ExportUnit]:
     """A unit is one flight.
 
     Raises:
@@ -60,7 +60,7 @@ def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> li
     for flight in flights:
         number = numbers.setdefault((flight.run, flight.town, flight.trajectory), len(numbers))
         folder = tree_folder(flight, has_runs)
-        units.append(Unit(flight.name, len(flight), flights=(flight,), extra=(folder.as_posix(), number)))
+        units.append(ExportUnit(flight.name, len(flight), flights=(flight,), extra=(folder.as_posix(), number)))
     return units
 
 
@@ -69,7 +69,7 @@ def tree_folder(flight: ReleasedRows, has_runs: bool) -> Path:
     return Path(flight.run if has_runs else "", flight.town, flight.trajectory, flight.variant)
 
 
-def write(release: Release, unit: Unit, folder: Path, cfg: ExportConfig) -> Written:
+def write(release: Release, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> UnitFiles:
     """Write one flight: its pictures, then trajectory.json, then the checksums of all."""
     (rows,), (place, number) = unit.flights, unit.extra
     files, digests, scalars = Files(folder), dict[str, str](), list[Row]()
@@ -94,8 +94,8 @@ def _rows(release: Release, flight: ReleasedRows) -> Iterator[Row]:
 
 
 def finish(
-    release: Release, units: Sequence[Unit], written: Sequence[Written], folder: Path, cfg: ExportConfig
-) -> Facts:
+    release: Release, units: Sequence[ExportUnit], written: Sequence[UnitFiles], folder: Path, cfg: ExportConfig
+) -> FormatFacts:
     """Write each town's `map.json`, and say which flights the strictest readers will miss something of."""
     towns = {(unit.extra[0].rpartition("/trajectory_")[0], unit.flights[0].town) for unit in units}
     maps = {entry.town: entry for entry in release.record.maps}
@@ -106,7 +106,7 @@ def finish(
         about = about or TownMap(name=town, licence=UNKNOWN_LICENCE, credits="")
         write_model(folder / place / TOWN_FILE, about, schema=TOWN_SCHEMA, version=TOWN_VERSION)
         files[f"{place}/{TOWN_FILE}"] = sha256_file(folder / place / TOWN_FILE)
-    return Facts(
+    return FormatFacts(
         version=VERSION,
         codings={
             file: depth_in_words(release.record.depth, FILE_NAMES[file])
@@ -123,7 +123,7 @@ def finish(
     )
 
 
-def _notes(units: Sequence[Unit], written: Sequence[Written]) -> Iterator[str]:
+def _notes(units: Sequence[ExportUnit], written: Sequence[UnitFiles]) -> Iterator[str]:
     yield (
         "Frames are counted from 0 as the layout asks; source.released_frames of trajectory.json says which frame of the flight each was. "
         "The layout has no captions: they stand in the release. meta.json and the order of missions are not in it."

@@ -12,14 +12,14 @@ import tarfile
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import Any
 
 from cosfly.errors import InputError
 from cosfly.products.frames import FrameFile
 from cosfly.work.runner import advance
 from cosfly.work.store import atomic_file, dump_json
 from release.columns import PICTURES, SPLIT_NAMES
-from release.export.contract import ExportConfig, Facts, Files, HashedFile, Unit, Written
+from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
 from release.export.source import PART, Release, ReleasedRows, Span, depth_in_words, picture, read_span
 
 MB = 1024 * 1024
@@ -28,7 +28,7 @@ ENDINGS: dict[FrameFile, str] = {"rgb": "rgb.png", "depth": "depth.npy", "instan
 PICTURE_COLUMNS = {column.name for column in PICTURES.values()}
 
 
-def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[Unit]:
+def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[ExportUnit]:
     """Cut each split into shards of about `shard_mb`; a unit is one shard."""
     units = []
     for split in SPLIT_NAMES:
@@ -44,11 +44,11 @@ def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> li
                 filled += bytes_per_frame * (span.stop - span.start)
         for number, spans in enumerate(groups):
             frames = sum(span.stop - span.start for span in spans)
-            units.append(Unit(f"{split}-{number:05d}", frames, spans=tuple(spans), extra=split))
+            units.append(ExportUnit(f"{split}-{number:05d}", frames, spans=tuple(spans), extra=split))
     return units
 
 
-def write(release: Release, unit: Unit, folder: Path, cfg: ExportConfig) -> Written:
+def write(release: Release, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> UnitFiles:
     """Write one shard.
 
     Raises:
@@ -56,19 +56,20 @@ def write(release: Release, unit: Unit, folder: Path, cfg: ExportConfig) -> Writ
     """
     files = Files(folder)
     name, keys = f"{unit.name}.tar", set[str]()
-    with atomic_file(folder / name) as file:
-        hashed = HashedFile(file)
-        with tarfile.open(fileobj=cast(IO[bytes], hashed), mode="w|", format=tarfile.GNU_FORMAT) as tar:
-            for span in unit.spans:
-                for row in read_span(release, span):
-                    key = row["sample_id"].replace(".", "_")  # a key ends at its first dot
-                    if key in keys or not PART.fullmatch(key):
-                        raise InputError("two frames of one name, or no name of a file", where=unit.name, got=key)
-                    keys.add(key)
-                    for ending, data in members(row, release):
-                        tar.addfile(_header(f"{key}.{ending}", len(data)), BytesIO(data))
-                    advance()
-    files.note(name, hashed.digest.hexdigest(), hashed.num_bytes)
+    with (
+        atomic_file(folder / name) as file,
+        tarfile.open(fileobj=file, mode="w|", format=tarfile.GNU_FORMAT) as tar,
+    ):
+        for span in unit.spans:
+            for row in read_span(release, span):
+                key = row["sample_id"].replace(".", "_")  # a key ends at its first dot
+                if key in keys or not PART.fullmatch(key):
+                    raise InputError("two frames of one name, or no name of a file", where=unit.name, got=key)
+                keys.add(key)
+                for ending, data in members(row, release):
+                    tar.addfile(_header(f"{key}.{ending}", len(data)), BytesIO(data))
+                advance()
+    files.note(name)
     return files.written()
 
 
@@ -92,8 +93,8 @@ def _header(name: str, size: int) -> tarfile.TarInfo:
 
 
 def finish(
-    release: Release, units: Sequence[Unit], written: Sequence[Written], folder: Path, cfg: ExportConfig
-) -> Facts:
+    release: Release, units: Sequence[ExportUnit], written: Sequence[UnitFiles], folder: Path, cfg: ExportConfig
+) -> FormatFacts:
     """Say how the shards are opened."""
     codings = {file: f"{ending}, the released bytes" for file, ending in endings(release).items()}
     if "depth" in codings:
@@ -106,7 +107,7 @@ def finish(
         for split in SPLIT_NAMES
         if any(u.extra == split for u in units)
     )
-    return Facts(
+    return FormatFacts(
         version=VERSION,
         codings={**codings, "json": "every other column of the release, one object"},
         notes=[f"Splits: {splits}. A key is the sample_id, dots replaced by _."],

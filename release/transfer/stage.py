@@ -65,7 +65,7 @@ from release.verify.verify import verify
 MOST_RECORD_BYTES = 64_000_000  # some 400 bytes a flight
 
 
-class Choice(Config):
+class Selection(Config):
     """What is wanted of a release; everything by default."""
 
     towns: tuple[str, ...] = Field((), description="towns; none named: all")
@@ -135,7 +135,7 @@ def _check_shards(record: ReleaseRecord, where: str) -> None:
         raise InputError("the record contradicts itself", where=f"{where}: shards", got="; ".join(wrong[:10]))
 
 
-def chosen_flights(record: ReleaseRecord, choice: Choice) -> list[ReleasedFlight]:
+def chosen_flights(record: ReleaseRecord, choice: Selection) -> list[ReleasedFlight]:
     """Give the flights that are wanted, each with its twin.
 
     Raises:
@@ -179,7 +179,7 @@ class _Asked(Config):
 
     source: str
     record_sha256: str
-    choice: Choice
+    choice: Selection
 
 
 class _Got(BaseModel):
@@ -354,7 +354,7 @@ def _copy_from(first: int, remote: Remote, shard: Shard, begun: Path) -> str:
 
 
 def run(
-    choice: Choice,
+    choice: Selection,
     address: str,
     out: Path,
     *,
@@ -416,7 +416,9 @@ def run(
     return dataset
 
 
-def _plan_of(record: ReleaseRecord, choice: Choice, flights: list[ReleasedFlight], address: str, shown: str) -> _Plan:
+def _plan_of(
+    record: ReleaseRecord, choice: Selection, flights: list[ReleasedFlight], address: str, shown: str
+) -> _Plan:
     there = record.settings.modalities
     return _Plan(
         address=address,
@@ -458,7 +460,7 @@ def _copy_signature(remote: Remote, folder: Path) -> None:
         write_bytes(folder / SIGNATURE, remote.read(SIGNATURE, 0, size))
 
 
-def _part_of(record: ReleaseRecord, choice: Choice, source: str) -> PartOf:
+def _part_of(record: ReleaseRecord, choice: Selection, source: str) -> PartOf:
     """Say of which release something is a part. The digest that was asked for is of that release, and no part of the choice."""
     chosen = choice.model_dump(mode="json", exclude={"expected"})
     return PartOf(name=record.name, content_digest=record.content_digest, source=source, choice=chosen)

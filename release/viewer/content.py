@@ -13,7 +13,7 @@ from cosfly.errors import InputError
 from cosfly.geometry import box_corners
 from cosfly.look.frame_views import View, small_jpeg
 from cosfly.products.boxes import BoxMap
-from cosfly.products.captions import Coc, Language, SentenceState
+from cosfly.products.captions import Coc, Language
 from cosfly.products.kinds import GROUND_KINDS, KIND_NAMES
 from cosfly.products.sentences import sentences_of
 from cosfly.work.config import Config
@@ -38,15 +38,15 @@ class ViewerConfig(Config):
     )
 
 
-class ShownSentence(BaseModel):
+class PageSentence(BaseModel):
     """A sentence of a caption and what the geometry says of it; None: nobody judged it."""
 
     field: str
     text: str
-    state: SentenceState | None
+    state: str | None
 
 
-class ShownCaption(BaseModel):
+class PageCaption(BaseModel):
     """A caption. facts: what the columns say of it; repair: how a rejected answer was mended; problems: what was found wrong; dropped: why it is
     not accepted."""
 
@@ -55,12 +55,12 @@ class ShownCaption(BaseModel):
     verdict: str | None
     repair: str | None
     facts: dict[str, str]
-    texts: dict[Language, list[ShownSentence]]
+    texts: dict[Language, list[PageSentence]]
     problems: list[str] = []
     dropped: str | None = None
 
 
-class ShownFrame(BaseModel):
+class PageFrame(BaseModel):
     """A frame. drone: x, y, z, m, and yaw, degrees; target: x, y, z, m; events: what became of its perturbation; facts: what else the columns
     say; box: of the person, xmin, ymin, xmax, ymax as shares of the picture; pictures: JPEG in base64."""
 
@@ -75,10 +75,10 @@ class ShownFrame(BaseModel):
     fov_deg: float
     box: tuple[float, float, float, float] | None = None
     pictures: dict[View, str] = {}
-    caption: ShownCaption | None = None
+    caption: PageCaption | None = None
 
 
-class ShownFlight(BaseModel):
+class PageFlight(BaseModel):
     """A flight. fovs_deg: the least and the greatest of its frames. group: what both tracks of a trajectory share; map: key of its map; result: of
     the inspection; paths from above."""
 
@@ -86,7 +86,7 @@ class ShownFlight(BaseModel):
     group: str
     map: str
     town: str
-    track: Literal["clean", "perturbed"]
+    track: str
     split: str | None
     result: str | None
     fovs_deg: tuple[float, float]
@@ -94,24 +94,24 @@ class ShownFlight(BaseModel):
     num_captions: int
     drone_path: list[Point2]
     target_path: list[Point2]
-    frames: list[ShownFrame]
+    frames: list[PageFrame]
 
 
-class ShownBox(BaseModel):
+class PageBox(BaseModel):
     """A box of the map from above: its kind and the corners of its footprint."""
 
     kind: str
     corners: list[Point2]
 
 
-class Shown(BaseModel):
+class ViewerPage(BaseModel):
     """The whole page. notes: what it leaves out, and where it comes from."""
 
     title: str
     kind: Literal["release", "run"]
     notes: list[str]
-    maps: dict[str, list[ShownBox]]
-    flights: list[ShownFlight]
+    maps: dict[str, list[PageBox]]
+    flights: list[PageFlight]
 
 
 # --- rows -------------------------------------------------------------------------------------------------------------
@@ -119,11 +119,11 @@ class Shown(BaseModel):
 TEXTS = {"C": "critical_components", "R": "reasoning_trace"}  # by the letter of a sentence's name
 
 
-def frame_of(row: Mapping[str, Any], pictures: dict[View, str], caption: ShownCaption | None) -> ShownFrame:
+def frame_of(row: Mapping[str, Any], pictures: dict[View, str], caption: PageCaption | None) -> PageFrame:
     """Give a frame of its row."""
-    pose, target, seen, box = row["pose"], row["target"], row["visibility"], row["target_bbox"]
+    pose, target, seen = row["pose"], row["target"], row["visibility"]
     x, y, z, yaw = (round(float(pose[name]), 2) for name in (*POINT, "yaw_deg"))
-    return ShownFrame(
+    return PageFrame(
         index=row["frame_index"],
         time_s=round(row["time_s"], 3),
         drone=(x, y, z, yaw),
@@ -133,19 +133,19 @@ def frame_of(row: Mapping[str, Any], pictures: dict[View, str], caption: ShownCa
         events=row["perturbation"] or None,
         facts=_facts(FRAME, row),
         fov_deg=round(row["fov_deg"], 1),
-        box=None if box is None else box_of([box[name] for name in BOX], row["width_px"], row["height_px"]),
+        box=box_of(row["target_bbox"], row["width_px"], row["height_px"]),
         pictures=pictures,
         caption=caption,
     )
 
 
-def caption_of(row: Mapping[str, Any]) -> ShownCaption:
+def caption_of(row: Mapping[str, Any]) -> PageCaption:
     """Give a caption of its columns."""
     texts = {}
     for language in LANGUAGES:
         coc = Coc(**{name: row[f"caption_{language}_{name}"] or "" for name in FIELDS})
-        texts[language] = shown_sentences(coc, row[f"sentence_states_{language}"])
-    return ShownCaption(
+        texts[language] = page_sentences(coc, row[f"sentence_states_{language}"])
+    return PageCaption(
         decision=row["decision"],
         label=row["label"],
         verdict=row["verdict"],
@@ -164,22 +164,21 @@ def _facts(columns: Sequence[Column], row: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def shown_sentences(coc: Coc, states: Sequence[str] | None) -> list[ShownSentence]:
+def page_sentences(coc: Coc, states: Sequence[str] | None) -> list[PageSentence]:
     """Give the sentences of an answer, each with its state; None where the states are those of another number of sentences."""
     named = list(sentences_of(coc))
-    known = states if states is not None and len(states) == len(named) else [None] * len(named)
+    known: Sequence[str | None] = states if states is not None and len(states) == len(named) else [None] * len(named)
     return [
-        ShownSentence.model_validate({"field": TEXTS[name[0]], "text": text, "state": state})
+        PageSentence(field=TEXTS[name[0]], text=text, state=state)
         for (name, text), state in zip(named, known, strict=True)
     ]
 
 
-def box_of(corners_px: Sequence[float], width_px: int, height_px: int) -> tuple[float, float, float, float] | None:
-    """Give a box, xmin, ymin, xmax, ymax px, as shares of the picture; None where it is not known."""
-    xmin, ymin, xmax, ymax = (
-        round(float(v) / max(1, size), 4) for v, size in zip(corners_px, (width_px, height_px) * 2, strict=True)
-    )
-    return None if not np.isfinite((xmin, ymin, xmax, ymax)).all() else (xmin, ymin, xmax, ymax)
+def box_of(box: Mapping[str, Any] | None, width_px: int, height_px: int) -> tuple[float, float, float, float] | None:
+    """Give a box, px, as shares of the picture; None where it is not known."""
+    corners = np.array([(box or {}).get(name) for name in BOX], np.float64) / np.maximum(1, (width_px, height_px) * 2)
+    xmin, ymin, xmax, ymax = corners.round(4).tolist()
+    return (xmin, ymin, xmax, ymax) if np.isfinite(corners).all() else None
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
@@ -188,7 +187,7 @@ FRAME_BYTES, FLIGHT_BYTES = 7_000, 14_000  # what a frame takes without pictures
 JPEG_QUALITY = 72
 
 
-class Pictures:
+class PagePictures:
     """Encodes pictures until the page is full, then every frame goes without; `left_out` and `unreadable` count frames."""
 
     def __init__(self, cfg: ViewerConfig, num_flights: int, num_frames: int) -> None:
@@ -287,7 +286,7 @@ def path_of(points_m: np.ndarray) -> list[Point2]:
     return [(round(float(known[k, 0]), 1), round(float(known[k, 1]), 1)) for k in spread(len(known), PATH_POINTS)]
 
 
-def boxes_of(box_map: BoxMap, near: Sequence[Point2]) -> list[ShownBox]:
+def boxes_of(box_map: BoxMap, near: Sequence[Point2]) -> list[PageBox]:
     """Give the footprints of the boxes of a map round some places, the largest ones, those that lie below others first."""
     places = np.array(near, dtype=np.float64).reshape(-1, 2)
     if not len(places):
@@ -302,7 +301,7 @@ def boxes_of(box_map: BoxMap, near: Sequence[Point2]) -> list[ShownBox]:
     return [_box(box_map, row) for row in rows[np.lexsort((tops, ~is_ground))]]
 
 
-def _box(box_map: BoxMap, row: int) -> ShownBox:
+def _box(box_map: BoxMap, row: int) -> PageBox:
     corners = box_corners(box_map.centers[row], box_map.half_extents[row], np.radians(box_map.rotations_deg[row, 1]))
     footprint = corners[[0, 2, 6, 4], :2].round(1).tolist()  # box_corners varies z fastest, then y, then x
-    return ShownBox(kind=KIND_NAMES[int(box_map.kinds[row])], corners=[(x, y) for x, y in footprint])
+    return PageBox(kind=KIND_NAMES[int(box_map.kinds[row])], corners=[(x, y) for x, y in footprint])

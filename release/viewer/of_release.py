@@ -22,11 +22,11 @@ from release.columns import PLACE, POINT, SHORT_NAMES
 from release.depth import depth_of
 from release.record import ReleaseRecord, read_record
 from release.viewer.content import (
-    Pictures,
-    Shown,
-    ShownFlight,
-    ShownFrame,
+    PageFlight,
+    PageFrame,
+    PagePictures,
     ViewerConfig,
+    ViewerPage,
     caption_of,
     choose_flights,
     choose_frames,
@@ -42,7 +42,7 @@ SCAN = [
 ]  # fmt: skip
 
 
-class Scanned:
+class FlightScan:
     """What the first pass keeps of a flight that is shown: its places, the captions' kinds, and where its rows stand."""
 
     def __init__(self, row: Mapping[str, Any]) -> None:
@@ -51,7 +51,7 @@ class Scanned:
         self.places: dict[int, tuple[list[float], list[float]]] = {}
         self.kinds: dict[int, tuple] = {}
         self.groups: dict[int, tuple[Path, int]] = {}
-        self.frames = list[ShownFrame]()
+        self.frames = list[PageFrame]()
 
     def add(self, row: Mapping[str, Any], shard: Path, group: int) -> None:
         """Take a row of the flight."""
@@ -67,7 +67,7 @@ class Scanned:
             self.kinds[index] = (row["verdict"], row["decision"])
 
 
-def show_release(dataset: Path, cfg: ViewerConfig) -> Shown:
+def show_release(dataset: Path, cfg: ViewerConfig) -> ViewerPage:
     """Reads a release folder, gives what the page shows of it.
 
     Raises:
@@ -80,22 +80,22 @@ def show_release(dataset: Path, cfg: ViewerConfig) -> Shown:
     notes.append("a release holds no map: the tracks are drawn without one")
     scanned = _scan(dataset, record, chosen)
     frames = {place: choose_frames(sorted(one.places), one.kinds, cfg.frames) for place, one in scanned.items()}
-    pictures = Pictures(cfg, len(scanned), sum(map(len, frames.values())))
+    pictures = PagePictures(cfg, len(scanned), sum(map(len, frames.values())))
     with progress_bar("viewer: frames", pictures.num_frames) as advance:
         for row in _rows(dataset, record, scanned, frames):
             scanned[place_of(row)].frames.append(_frame(row, record, pictures))
             advance(1)
     flights = [_flight(one) for one in scanned.values()]
-    return Shown(title=record.name, kind="release", notes=[*notes, *pictures.notes()], maps={}, flights=flights)
+    return ViewerPage(title=record.name, kind="release", notes=[*notes, *pictures.notes()], maps={}, flights=flights)
 
 
 def place_of(row: Mapping[str, Any]) -> Place:
     return tuple(row[name] for name in PLACE)
 
 
-def _scan(dataset: Path, record: ReleaseRecord, chosen: set[str]) -> dict[Place, Scanned]:
+def _scan(dataset: Path, record: ReleaseRecord, chosen: set[str]) -> dict[Place, FlightScan]:
     """Read the places of all rows, keep those of the chosen flights, in the rows' order."""
-    scanned: dict[Place, Scanned] = {}
+    scanned: dict[Place, FlightScan] = {}
     with progress_bar("viewer: rows", sum(shard.rows for shard in record.shards)) as advance:
         for shard in record.shards:
             path = dataset / shard.path
@@ -103,13 +103,13 @@ def _scan(dataset: Path, record: ReleaseRecord, chosen: set[str]) -> dict[Place,
             for group, rows in enumerate(row_lists(path, SCAN)):
                 for row in rows:
                     if "/".join(place_of(row)) in chosen:
-                        scanned.setdefault(place_of(row), Scanned(row)).add(row, path, group)
+                        scanned.setdefault(place_of(row), FlightScan(row)).add(row, path, group)
                 advance(len(rows))
     return scanned
 
 
 def _rows(
-    dataset: Path, record: ReleaseRecord, scanned: Mapping[Place, Scanned], frames: Mapping[Place, list[int]]
+    dataset: Path, record: ReleaseRecord, scanned: Mapping[Place, FlightScan], frames: Mapping[Place, list[int]]
 ) -> Iterator[dict[str, Any]]:
     """Read the chosen rows with their pictures; of the row groups those alone that hold one."""
     columns = [*SHORT_NAMES, *(COLUMNS[file].name for file in record.settings.modalities)]
@@ -129,7 +129,7 @@ def _rows(
             yield from rows
 
 
-def _frame(row: Mapping[str, Any], record: ReleaseRecord, pictures: Pictures) -> ShownFrame:
+def _frame(row: Mapping[str, Any], record: ReleaseRecord, pictures: PagePictures) -> PageFrame:
     views: Mapping[View, Callable[[], np.ndarray]] = {
         VIEW_OF[file]: partial(picture, row, file, record) for file in record.settings.modalities
     }
@@ -153,9 +153,9 @@ def picture(row: Mapping[str, Any], file: FrameFile, record: ReleaseRecord) -> n
     return segmentation_colors(coded[..., 2], coded[..., 1].astype(np.uint16) | coded[..., 0].astype(np.uint16) << 8)
 
 
-def _flight(scanned: Scanned) -> ShownFlight:
+def _flight(scanned: FlightScan) -> PageFlight:
     row, order = scanned.row, sorted(scanned.places)
-    return ShownFlight(
+    return PageFlight(
         name="/".join(place_of(row)),
         group="/".join(place_of(row)[:-1]),
         map=f"{row['run']}/{row['town']}",

@@ -22,13 +22,13 @@ from cosfly.products.review import read_settled
 from cosfly.work.console import progress_bar
 from release.columns import Placed, caption_values, scalar_row
 from release.viewer.content import (
-    Pictures,
-    Shown,
-    ShownBox,
-    ShownCaption,
-    ShownFlight,
-    ShownFrame,
+    PageBox,
+    PageCaption,
+    PageFlight,
+    PageFrame,
+    PagePictures,
     ViewerConfig,
+    ViewerPage,
     boxes_of,
     caption_of,
     choose_flights,
@@ -70,7 +70,7 @@ def _of_run(folder: Path, captions: Path | None) -> Tree:
     return Tree(folder_name(folder.absolute().name), folder / "render", captions or own_captions, inspected, boxes)
 
 
-def show_run(folder: Path, cfg: ViewerConfig, captions: Path | None = None) -> Shown:
+def show_run(folder: Path, cfg: ViewerConfig, captions: Path | None = None) -> ViewerPage:
     """Reads a run folder or a playback tree, gives what the page shows of it.
 
     Raises:
@@ -93,8 +93,8 @@ def show_run(folder: Path, cfg: ViewerConfig, captions: Path | None = None) -> S
         frames[tree, place] = choose_frames(range(num_frames), kinds.get((tree.run, _key(place)), {}), cfg.frames)
     texts = _texts(trees, {(tree.run, _key(place)): set(indices) for (tree, place), indices in frames.items()})
     results = _results(trees)
-    pictures = Pictures(cfg, len(frames), sum(map(len, frames.values())))
-    shown = list[ShownFlight]()
+    pictures = PagePictures(cfg, len(frames), sum(map(len, frames.values())))
+    shown = list[PageFlight]()
     with progress_bar("viewer: frames", pictures.num_frames) as advance:
         for (tree, place), indices in frames.items():
             flight, key = read_flight(place, strict=False), (tree.run, _key(place))
@@ -104,7 +104,9 @@ def show_run(folder: Path, cfg: ViewerConfig, captions: Path | None = None) -> S
                 advance(1)
             shown.append(one)
     maps = _maps(trees, shown)
-    return Shown(title=folder.absolute().name, kind="run", notes=[*notes, *pictures.notes()], maps=maps, flights=shown)
+    return ViewerPage(
+        title=folder.absolute().name, kind="run", notes=[*notes, *pictures.notes()], maps=maps, flights=shown
+    )
 
 
 def _key(folder: Path) -> Key:
@@ -150,9 +152,9 @@ def _results(trees: list[Tree]) -> dict[tuple[str, Key], str]:
     }
 
 
-def _flight(tree: Tree, flight: Flight, result: str | None, num_captions: int) -> ShownFlight:
+def _flight(tree: Tree, flight: Flight, result: str | None, num_captions: int) -> PageFlight:
     names = [name for name in (tree.run, flight.town, flight.trajectory) if name]
-    return ShownFlight(
+    return PageFlight(
         name="/".join([*names, flight.variant]),
         group="/".join(names),
         map=f"{tree.run}/{flight.town}",
@@ -169,7 +171,7 @@ def _flight(tree: Tree, flight: Flight, result: str | None, num_captions: int) -
     )
 
 
-def _frame(flight: Flight, index: int, caption: Caption | None, pictures: Pictures) -> ShownFrame:
+def _frame(flight: Flight, index: int, caption: Caption | None, pictures: PagePictures) -> PageFrame:
     folder = flight.frame_folder(index)
     views: Mapping[View, Callable[[], np.ndarray]] = {
         view: partial(read_view, folder, view) for view in VIEWS if frame_path(folder, VIEW_FILES[view]).exists()
@@ -179,7 +181,7 @@ def _frame(flight: Flight, index: int, caption: Caption | None, pictures: Pictur
     return frame_of(row, pictures.of_frame(views), None if caption is None else _caption(caption, row))
 
 
-def _caption(caption: Caption, row: Mapping[str, Any]) -> ShownCaption:
+def _caption(caption: Caption, row: Mapping[str, Any]) -> PageCaption:
     """Give a caption of a run, of which more is known than a release tells."""
     shown, repair = caption_of(row), caption.repair
     if repair is not None:
@@ -190,9 +192,9 @@ def _caption(caption: Caption, row: Mapping[str, Any]) -> ShownCaption:
     return shown
 
 
-def _maps(trees: list[Tree], flights: list[ShownFlight]) -> dict[str, list[ShownBox]]:
+def _maps(trees: list[Tree], flights: list[PageFlight]) -> dict[str, list[PageBox]]:
     """Read the boxes round the flights of each town, where the run has them."""
-    maps: dict[str, list[ShownBox]] = {}
+    maps: dict[str, list[PageBox]] = {}
     for tree in trees:
         for name in sorted({flight.map for flight in flights if flight.map.startswith(f"{tree.run}/")}):
             if tree.boxes is not None:

@@ -13,7 +13,7 @@ from cosfly.escaping import for_terminal
 from cosfly.look.page import page
 from cosfly.reading.files import read_text
 from cosfly.work.store import write_bytes
-from release.viewer.content import Shown, ViewerConfig
+from release.viewer.content import ViewerConfig, ViewerPage
 from release.viewer.of_release import show_release
 from release.viewer.of_run import show_run
 
@@ -34,7 +34,7 @@ def run(folder: Path, out: Path, cfg: ViewerConfig, captions: Path | None = None
     return out
 
 
-def page_html(shown: Shown) -> str:
+def page_html(shown: ViewerPage) -> str:
     """Give the page's text."""
     style, script = (read_text(Path(__file__).with_name(name)) for name in ("viewer.css", "viewer.js"))
     data = _printable(shown.model_dump(mode="json", exclude_defaults=False))
