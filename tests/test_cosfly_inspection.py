@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosfly.errors import NothingKept
+from cosfly.errors import InputError, NothingKept
 from cosfly.geometry import box_iou, mask_box
 from cosfly.inspection import frames
 from cosfly.inspection.files import check_recorded
@@ -44,6 +44,7 @@ from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
 from cosfly.space.kernels import obstacle_index, signed_distances
+from cosfly.work.journal import Journal
 from cosfly.work.store import CHECKSUMS, write_checksums, write_json
 from specimens import make_playback_tree, pack_depth
 
@@ -154,6 +155,36 @@ def test_packed_depth_is_judged_as_any_other(workplace):
     assert codes_of(found, cut)["broken_image"] == "error"
     where = {issue.where for flight in found.flights for issue in flight.issues if issue.severity == "error"}
     assert where == {f"{FRAME}/{name}"}
+
+
+FORGED = {
+    "a script for a picture": lambda r: r["view"].update(pictures=['" onerror="alert(1)', None, None]),
+    "two pictures": lambda r: r["view"]["pictures"].pop(),
+    "a curve cut short": lambda r: r["view"]["curves"]["speed_mps"].pop(),
+    "times cut short": lambda r: r["view"]["time_s"].pop(),
+    "bins cut short": lambda r: r["coverage"]["bins"]["height_m"].pop(),
+    "an axis less": lambda r: r["coverage"]["bins"].pop("height_m"),
+    "a figure that is no number": lambda r: r["record"]["metrics"].update(frames_full="many"),
+}
+
+
+def test_a_forged_line_of_the_journal_is_one_error(workplace, subtests):
+    """Of an inspection that was killed before its product: it goes on with the lines that are there."""
+    inspect(workplace)
+    (workplace / "out/manifest.json").unlink()
+    journal = workplace / "out/items.jsonl"
+    honest = list(Journal(journal).read())
+    for name, forge in FORGED.items():
+        with subtests.test(name):
+            journal.unlink()
+            with Journal(journal) as written:
+                for k, line in enumerate(honest):
+                    line = json.loads(json.dumps(line))
+                    if k == 1:
+                        forge(line["result"])
+                    written.append(line)
+            with pytest.raises(InputError, match=r"items\.jsonl: .*: result"):
+                inspect(workplace)
 
 
 def test_what_nothing_lists_is_not_asked_for(workplace):

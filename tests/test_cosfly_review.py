@@ -266,7 +266,7 @@ def test_a_page_of_hundreds_of_flights_is_bounded(product):
     kept = page.count('class="look"')
     assert 5 <= kept < 300
     assert f"{300 - kept} are without pictures" in page
-    assert cards(many, shown, 1000.0)[1] == 0
+    assert cards(many, shown, 1000.0)["left_out"] == 0
 
 
 def test_the_map_shows_both_ways(inspected):

@@ -22,8 +22,9 @@ from cosfly.work.store import CHECKSUMS, read_checksums, sha256_bytes
 def check_files(flight: Flight, report: Report) -> dict[int, FrameMeta | None]:
     """Check that every frame has its files, of the right size and type by their headers, and no frame stands alone.
 
-    A flight may lack a kind of file altogether that its checksums do not list, as one of somebody else does: `meta.json` is cosfly's own, and
-    public readers ask for `rgb.png` alone. One of cosfly's lacks what was not drawn (`render.modalities`).
+    A flight may lack a kind of file altogether that its checksums do not list, as one of somebody else does:
+    `meta.json` is cosfly's own, and public readers ask for `rgb.png` alone. One of cosfly's lacks what was not drawn
+    (`render.modalities`).
 
     Returns:
         of each frame that is complete so far its annotation, None in a tree without.
@@ -102,7 +103,7 @@ def _check_meta(flight: Flight, i: int, report: Report) -> FrameMeta | None:
 
 
 class Checksums:
-    """The digests that `checksums.sha256` lists, each compared once: of the bytes of a file that is read anyway, or at the end."""
+    """The digests that `checksums.sha256` lists, each compared once: with a file that is read anyway, or at the end."""
 
     def __init__(self, flight: Flight, report: Report, *, is_wanted: bool) -> None:
         self._flight, self._report = flight, report
@@ -142,7 +143,7 @@ def _listed(flight: Flight, report: Report) -> dict[str, str]:
 
 
 def check_recorded(flight: Flight, root: Path, recorded: Mapping[str, str], report: Report) -> None:
-    """Compare a flight's own records with the manifest of its tree, `recorded`: path in the tree -> sha256; empty without one."""
+    """Compare a flight's own records with its tree's manifest, `recorded`: path in the tree -> sha256."""
     assert flight.folder is not None
     for name in ("trajectory.json", CHECKSUMS) if recorded else ():
         path = flight.folder / name

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 TIME_TOLERANCE_S = 1e-3
 
 
-class Inspected(BaseModel):
+class InspectedFlight(BaseModel):
     """A flight's record, and what the report draws of it; so it stands in `items.jsonl`."""
 
     record: FlightInspection
@@ -60,7 +60,7 @@ def inspect_flight(
     obstacles: BoxIndex | None,
     cfg: InspectConfig,
     recorded: Mapping[str, str],
-) -> Inspected:
+) -> InspectedFlight:
     """Check one flight folder.
 
     Args:
@@ -68,7 +68,8 @@ def inspect_flight(
         box_map, obstacles: the map, and what of it is in the way; None where there is none.
         recorded: sha256 by path of what the tree's manifest lists; empty where it has none.
     Raises:
-        InputError: `trajectory.json`, or that of the clean flight beside it, cannot be read at all; names the file and the field.
+        InputError: `trajectory.json`, or that of the clean flight beside it, cannot be read at all; names the file and
+            the field.
     """
     report = Report()
     flight = _read(folder, report)
@@ -105,7 +106,7 @@ def inspect_flight(
         metrics={name: None if value is None else round(value, 4) for name, value in metrics.items()},
     )
     view = draw_flight(flight, _heights_m(flight), clearance_m, box_map, cfg.thumbnail_px)
-    return Inspected(record=record, view=view, coverage=coverage_of(flight))
+    return InspectedFlight(record=record, view=view, coverage=coverage_of(flight))
 
 
 def _digest(folder: Path) -> str | None:
@@ -152,8 +153,8 @@ def check_plan(trace: DroneTrace, cfg: InspectConfig, report: Report, metrics: d
 def check_surroundings(
     flight: Flight, obstacles: BoxIndex, cfg: InspectConfig, report: Report, metrics: dict[str, float | int | None]
 ) -> np.ndarray:
-    """Measure the poses of a flight against the map: clearance of the drone, five-ray visibility, a person in an obstacle; gives the
-    first, (n,) m.
+    """Measure the poses of a flight against the map: clearance of the drone, five-ray visibility, a person in an
+    obstacle; gives the first, (n,) m.
     """
     from cosfly.space.kernels import signed_distances, visibility
 
@@ -184,7 +185,8 @@ def check_shifts(flight: Flight, report: Report, metrics: dict[str, float | int 
     """Find the frames of a perturbed flight whose shift hides a target which the clean flight beside it shows.
 
     Raises:
-        InputError: that one cannot be read. A warning would stay in this flight's record when it is mended; a failure is done again.
+        InputError: that one cannot be read. A warning would stay in this flight's record when it is mended; a failure
+            is done again.
     """
     try:
         twin = read_twin(flight)
@@ -209,7 +211,8 @@ def is_shifted(flight: Flight) -> np.ndarray:
 def check_poses(flight: Flight, trace: DroneTrace, cfg: InspectConfig, report: Report) -> None:
     """Check that a flight, its recorded perturbation taken off, is the plan.
 
-    Where a perturbation shifted drone or person, the camera was aimed anew, so only the positions can be compared there.
+    Where a perturbation shifted drone or person, the camera was aimed anew, so only the positions can be compared
+    there.
     """
     if len(flight) < len(trace.time_s):
         got, expected = f"{len(flight)} frames", f"{len(trace.time_s)} planned points"

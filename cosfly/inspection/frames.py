@@ -1,7 +1,7 @@
 """Checks on the pictures of one flight: do they decode, and do they show what the poses and the frames before say?
 
-The inspection's eyes. It judges nothing: findings go into a Report, numbers into FrameNumbers; the thresholds that make a
-flight acceptable stand in flight.py.
+The inspection's eyes. It judges nothing: findings go into a Report, numbers into FrameNumbers; the thresholds that make
+a flight acceptable stand in flight.py.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from cosfly.errors import InputError
 from cosfly.geometry import box_corners, box_iou, mask_box, project, world_from_camera
 from cosfly.inspection.files import Checksums
-from cosfly.inspection.pixels import NUM_IDS, Look, Picture, look_at, unpack
+from cosfly.inspection.pixels import NUM_IDS, Picture, PixelFigures, look_at, unpack
 from cosfly.inspection.settings import InspectConfig
 from cosfly.products.frames import (
     DEPTH_NPY,
@@ -41,8 +41,9 @@ from cosfly.space.reprojection import Agreement, View, compare_views
 from cosfly.work.runner import advance
 
 # --- jumps ------------------------------------------------------------------------------------------------------------
-# Do the frames of a flight show one world? What stands still is carried from each frame into the next (`cosfly/space/reprojection.py`), and what
-# comes out otherwise than the poses say is a jump: something vanished, or another place.
+# Do the frames of a flight show one world? What stands still is carried from each frame into the next
+# (`cosfly/space/reprojection.py`), and what comes out otherwise than the poses say is a jump: something vanished, or
+# another place.
 
 
 NEAR_FRAMES = 2  # farther apart, more is hidden behind other things than is seen twice
@@ -52,7 +53,7 @@ USUAL_AGREE, ROUGH_ERROR = 0.8, 1e-3  # of the points; of planes, as a share of 
 
 @dataclass
 class Jumps:
-    """Compares depth and ids of each frame with the one before, through their poses. Colours say nothing: light, rain and zoom change them."""
+    """Compares depth and ids of successive frames through their poses; colours change with light, rain and zoom."""
 
     flight: Flight
     _before: tuple[int, View] | None = None
@@ -72,7 +73,7 @@ class Jumps:
         self._before = (i, view)
 
     def judge(self, cfg: InspectConfig, report: Report) -> int:
-        """Report the jumps; gives how many frames were judged: none where the depth of somebody else's flight is no world's."""
+        """Report the jumps; gives how many frames were judged: none of a foreign flight whose depth is no world's."""
         if not self.flight.is_ours and not self._is_one_world():
             return 0
         for i, pair in zip(self._frames, self._found, strict=True):
@@ -101,7 +102,7 @@ class Jumps:
 
 
 def others_told(flight: Flight, metas: Mapping[int, FrameMeta | None]) -> dict[int, OthersMeta]:
-    """Give what the annotations of frames tell of others, by frame; empty for a flight without, and for one of somebody else."""
+    """Give what the annotations of frames tell of others, by frame; empty for foreign flights."""
     if not flight.is_ours:
         return {}
     return {i: meta.others for i, meta in metas.items() if meta is not None and meta.others is not None}
@@ -241,13 +242,18 @@ def _ids_of(told: OthersMeta | None) -> np.ndarray:
     return ids
 
 
-def _check_surfaces(look: Look, where: str, cfg: InspectConfig, report: Report) -> None:
+def _check_surfaces(look: PixelFigures, where: str, cfg: InspectConfig, report: Report) -> None:
     """Say where a texture may be missing, and where surfaces fight for pixels."""
     if look.flat > cfg.flat_surface_max:
-        got = f"{look.flat:.1%} of the picture is a surface of one colour ({KIND_NAMES.get(look.flat_kind, look.flat_kind)})"
+        got = (
+            f"{look.flat:.1%} of the picture is a surface of one colour "
+            f"({KIND_NAMES.get(look.flat_kind, look.flat_kind)})"
+        )
         report.warn("missing_texture", f"{where}/rgb.png", got, f"at most {cfg.flat_surface_max:.1%}")
     if look.magenta > cfg.magenta_max:
-        report.warn("missing_texture", f"{where}/rgb.png", f"{look.magenta:.2%} magenta", f"at most {cfg.magenta_max:.2%}")  # fmt: skip
+        report.warn(
+            "missing_texture", f"{where}/rgb.png", f"{look.magenta:.2%} magenta", f"at most {cfg.magenta_max:.2%}"
+        )
     if look.fighting > cfg.z_fighting_max:
         got = f"{look.fighting:.3%} of the pixels alternate between two surfaces of one plane"
         report.warn("z_fighting", f"{where}/instance.png", got, f"at most {cfg.z_fighting_max:.3%}")
@@ -285,13 +291,13 @@ def _check_mask(
     flight: Flight,
     i: int,
     picture: Picture,
-    look: Look,
+    look: PixelFigures,
     left_out: np.ndarray,
     visibility_min: float,
     numbers: FrameNumbers,
     report: Report,
 ) -> None:
-    """Compare pedestrian pixels with the projected and the recorded box of the target, and their depth with the target's."""
+    """Compare pedestrian pixels with the target's projected and recorded box, and their depth with its own."""
     box = target_box(flight, i)
     visibility = flight.visibility[i]
     if np.isnan(box).any() or not visibility > 0:
@@ -312,7 +318,8 @@ def _check_mask(
     numbers.track_ious.append(box_iou(box, found))
     if flight.target_mask_bbox is not None:
         recorded = flight.target_mask_bbox[i]
-        # Between this part of the person and all pedestrian pixels: a pole in front cuts a person into parts. NaN is neither.
+        # Between this part of the person and all pedestrian pixels: a pole in front cuts a person into parts. NaN is
+        # neither.
         if not (_encloses(recorded, found) and _encloses(np.array(people), recorded)):
             place = f"trajectory.json: points[{i}].target.mask_bbox_2d"
             report.error("mask_disagrees", place, str(recorded.tolist()), f"the box of the pixels, {found.tolist()}")
@@ -324,7 +331,7 @@ def _check_mask(
 
 
 def _kinds_without(instance: np.ndarray, left_out: np.ndarray) -> np.ndarray:
-    """Give the kinds of pixels, (h, w); those of ids that are left out are NONE: the pedestrian who stays is the target."""
+    """Give the kinds of pixels, (h, w); those of ids left out are NONE: the pedestrian who stays is the target."""
     ids = instance[..., 1].astype(np.uint16) | (instance[..., 2].astype(np.uint16) << 8)
     return np.where(left_out[ids], KINDS["NONE"], instance[..., 0])
 
@@ -342,7 +349,7 @@ def target_box(flight: Flight, i: int) -> np.ndarray:
 
 
 def pedestrian_region(kinds: np.ndarray, box: np.ndarray) -> np.ndarray | None:
-    """Give the connected region of pedestrian pixels that shares most pixels with a box, (h, w) bool; None if none does."""
+    """Give the region of pedestrian pixels that shares most pixels with a box, (h, w) bool; None if none does."""
     is_person = (kinds == KINDS["Pedestrians"]).astype(np.uint8)
     if not is_person.any():
         return None

@@ -1,8 +1,10 @@
-"""All pixels of one frame, unpacked once and looked at once: what surfaces look like, which ids fight for them, where people are.
+"""All pixels of one frame, unpacked once and looked at once: what surfaces look like, which ids fight for them, where
+people are.
 
-It judges nothing. A missing texture shows in two ways: the magenta that engines paint in its stead, or a large surface whose pixels are
-all of one colour. Where two surfaces lie in one plane, rounding decides pixel by pixel which is drawn (Z-fighting): their ids
-alternate over a depth that runs on as that of one plane. It counts where it shows, in colours or in kinds.
+It judges nothing. A missing texture shows in two ways: the magenta that engines paint in its stead, or a large surface
+whose pixels are all of one colour. Where two surfaces lie in one plane, rounding decides pixel by pixel which is drawn
+(Z-fighting): their ids alternate over a depth that runs on as that of one plane. It counts where it shows, in colours
+or in kinds.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ SHARED_ID = 65534  # stands for all boxes beyond the ids that fit (docs/files.md
 MAGENTA_LEAST, MAGENTA_MOST = 200, 60  # red and blue at least, green at most; no light or haze makes that of a surface
 DARK = 16  # grey levels: below, night leaves one colour of many
 SHORTEST_RUN_PX = 3  # of an id: as much or less is a stripe that rounding made
-# Of a plane 1 / depth is linear in the picture, so that two surfaces fight only where both lie on that line; 1 cm at 30 m.
+# Of a plane 1 / depth is linear in the picture, so that two surfaces fight only where both lie on that line; 1 cm at 30
+# m.
 PLANE_SHARE = 3e-4
 GRAINLESS = 0.9  # share of equal neighbours on all other surfaces
 # Of red, green and blue together: more than the grain of one surface; two of one kind and colour fight unseen.
@@ -37,7 +40,7 @@ LEAST_PAIRS = 400  # neighbouring pixels of a surface, for a share of them to me
 
 @dataclass(frozen=True)
 class Picture:
-    """A frame's pictures. colours, instance: (h, w, 3) uint8; depth: (h, w) float32 m; depth and instance are empty where there is none."""
+    """A frame's pictures. colours, instance: (h, w, 3) uint8; depth: (h, w) float32 m; the last two may be empty."""
 
     colours: np.ndarray
     depth: np.ndarray
@@ -45,11 +48,12 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Look:
+class PixelFigures:
     """What the pixels of a frame show.
 
-    flat: share of the picture of the largest surface that is of one colour where others have grain, 0 of none; flat_kind: its kind. magenta, fighting: shares
-    of the picture. person_box: round all pixels of people, without those left out: (4,) xmin, ymin, xmax, ymax px; None: no such pixel.
+    flat: share of the picture of the largest surface that is of one colour where others have grain, 0 of none;
+    flat_kind: its kind. magenta, fighting: shares of the picture. person_box: round all pixels of people, without those
+    left out: (4,) xmin, ymin, xmax, ymax px; None: no such pixel.
     """
 
     flat: float
@@ -84,18 +88,21 @@ def _pixels(data: bytes, where: Path) -> np.ndarray:
     return np.ascontiguousarray(png.pixels()[..., :3])
 
 
-def look_at(picture: Picture, left_out: np.ndarray, flat_share: float) -> Look:
+def look_at(picture: Picture, left_out: np.ndarray, flat_share: float) -> PixelFigures:
     """Look at all pixels of a frame.
 
     Args:
-        left_out: (65536,) bool, ids of people who are not the target. flat_share: so many neighbours of one colour make a surface flat.
+        left_out: (65536,) bool, ids of people who are not the target. flat_share: so many neighbours of one colour make
+            a surface flat.
     """
     num_pixels = picture.colours.shape[0] * picture.colours.shape[1]
     if not picture.instance.size:
         red, green, blue = (picture.colours[..., k] for k in range(3))
         magenta = (red >= MAGENTA_LEAST) & (blue >= MAGENTA_LEAST) & (green <= MAGENTA_MOST)
-        return Look(0.0, 0, float(magenta.mean()), 0.0, None)
-    all_pairs, all_equal, all_bright, kinds, counts, box = _look(picture.colours, picture.instance, picture.depth, left_out)  # fmt: skip
+        return PixelFigures(0.0, 0, float(magenta.mean()), 0.0, None)
+    all_pairs, all_equal, all_bright, kinds, counts, box = _look(
+        picture.colours, picture.instance, picture.depth, left_out
+    )
     ids = np.unique(np.append(np.flatnonzero(all_pairs), 0))  # few of all; 0 also where there is none
     pairs, equal, bright = all_pairs[ids], all_equal[ids], all_bright[ids]
     candidates = (pairs >= LEAST_PAIRS) & (equal >= flat_share * pairs) & (bright >= DARK * pairs)
@@ -105,7 +112,7 @@ def look_at(picture: Picture, left_out: np.ndarray, flat_share: float) -> Look:
     is_judged = bool(candidates[largest]) and others_equal < GRAINLESS * others
     flat = float(pairs[largest]) / num_pixels if is_judged else 0.0
     person = None if box[2] < 0 else (int(box[0]), int(box[1]), int(box[2]), int(box[3]))
-    return Look(flat, int(kinds[ids[largest]]), counts[0] / num_pixels, counts[1] / num_pixels, person)
+    return PixelFigures(flat, int(kinds[ids[largest]]), counts[0] / num_pixels, counts[1] / num_pixels, person)
 
 
 @njit(cache=True, nogil=True)
@@ -147,7 +154,8 @@ def _pack(row, tones, codes, shades):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _look(colours, instance, depth, left_out):  # type: ignore[no-untyped-def]
-    """Of each id: pairs of neighbours in a row, those of one colour, sum of their green, its kind. Counts: magenta, fighting. Box of people."""
+    """Of each id: pairs of neighbours in a row, those of one colour, sum of their green, its kind. Counts: magenta,
+    fighting. Box of people."""
     height, width = instance.shape[:2]
     has_depth = depth.shape[0] > 0
     pairs, equal, bright = np.zeros(NUM_IDS, np.int64), np.zeros(NUM_IDS, np.int64), np.zeros(NUM_IDS, np.int64)
@@ -185,9 +193,17 @@ def _look(colours, instance, depth, left_out):  # type: ignore[no-untyped-def]
                 counts[0] += pink
             if has_depth:
                 # Runs 3, 2, 1 and this: A, B, A, B, of which the two in the middle are short.
-                if (code == id2 and id1 == id3 and begin - first1 <= SHORTEST_RUN_PX and first1 - first2 <= SHORTEST_RUN_PX
-                        and number != SHARED_ID and id1 >> 8 != SHARED_ID and _is_plane(depth, y, first2 - 1, y, begin)
-                        and _differs(colours, instance, y, first1 - 1, y, first1) and _differs(colours, instance, y, begin - 1, y, begin)):  # fmt: skip
+                if (
+                    code == id2
+                    and id1 == id3
+                    and begin - first1 <= SHORTEST_RUN_PX
+                    and first1 - first2 <= SHORTEST_RUN_PX
+                    and number != SHARED_ID
+                    and id1 >> 8 != SHARED_ID
+                    and _is_plane(depth, y, first2 - 1, y, begin)
+                    and _differs(colours, instance, y, first1 - 1, y, first1)
+                    and _differs(colours, instance, y, begin - 1, y, begin)
+                ):
                     counts[1] += begin - first1
                 id3, id2, id1 = id2, id1, code
                 first2, first1 = first1, begin
@@ -197,9 +213,18 @@ def _look(colours, instance, depth, left_out):  # type: ignore[no-untyped-def]
                 if ids[0, column] != codes[column]:
                     x, code = np.int64(column), np.int64(codes[column])  # type: ignore[assignment]
                     a, b = firsts[1, x], firsts[0, x]
-                    if (code == ids[1, x] and ids[0, x] == ids[2, x] and ids[2, x] >= 0 and y - b <= SHORTEST_RUN_PX and b - a <= SHORTEST_RUN_PX
-                            and code >> 8 != SHARED_ID and ids[0, x] >> 8 != SHARED_ID and _is_plane(depth, a - 1, x, y, x)
-                            and _differs(colours, instance, b - 1, x, b, x) and _differs(colours, instance, y - 1, x, y, x)):  # fmt: skip
+                    if (
+                        code == ids[1, x]
+                        and ids[0, x] == ids[2, x]
+                        and ids[2, x] >= 0
+                        and y - b <= SHORTEST_RUN_PX
+                        and b - a <= SHORTEST_RUN_PX
+                        and code >> 8 != SHARED_ID
+                        and ids[0, x] >> 8 != SHARED_ID
+                        and _is_plane(depth, a - 1, x, y, x)
+                        and _differs(colours, instance, b - 1, x, b, x)
+                        and _differs(colours, instance, y - 1, x, y, x)
+                    ):
                         counts[1] += y - b
                     ids[2, x], ids[1, x], ids[0, x] = ids[1, x], ids[0, x], code
                     firsts[2, x], firsts[1, x], firsts[0, x] = firsts[1, x], firsts[0, x], y

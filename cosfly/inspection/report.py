@@ -43,7 +43,6 @@ def report_html(name: str, inspection: Inspection, views: Mapping[str, FlightVie
         name: of the run. views: pictures and curves by flight folder, of which as many are shown as the page may hold.
     """
     order = sorted(inspection.flights, key=lambda f: (-RESULTS.index(f.result), f.folder))
-    rows, left_out = cards(order, views, page_mb)
     is_covered = inspection.coverage is not None and inspection.coverage.frames
     accepted = [flight for flight in inspection.flights if flight.result == "accepted"] or inspection.flights
     shown = [views[flight.folder].pictures[1] for flight in accepted if flight.folder in views]
@@ -52,12 +51,21 @@ def report_html(name: str, inspection: Inspection, views: Mapping[str, FlightVie
         for state in STATES
     }
     total = sum(counts.values())
-    states = [(state, counts[state], f"{counts[state] / total:.1%}", f"{paper:.0%}") for state, paper in STATES.items()] if total else []  # fmt: skip
+    states = [
+        (state, counts[state], f"{counts[state] / max(total, 1):.1%}", f"{paper:.0%}")
+        for state, paper in STATES.items()
+    ]
     return page(
-        "cosfly/inspection/report.html", title=name, style=STYLE, inspection=inspection, results=RESULTS, columns=COLUMNS, cards=rows,
-        left_out=left_out, page_mb=page_mb, pictures=[one for one in shown if one][:OPENING_PICTURES], states=states, num_perturbable=total,
+        "cosfly/inspection/report.html",
+        **cards(order, views, page_mb),
+        title=name,
+        inspection=inspection,
+        results=RESULTS,
+        pictures=[one for one in shown if one][:OPENING_PICTURES],
+        states=states,
+        num_perturbable=total,
         coverage=coverage_html(inspection.coverage) if is_covered and inspection.coverage else None,
-    )  # fmt: skip
+    )
 
 
 def cards(
@@ -65,8 +73,8 @@ def cards(
     views: Mapping[str, FlightView],
     page_mb: float,
     decisions: Mapping[str, Decision] | None = None,
-) -> tuple[list[str], int]:
-    """Give a row for each flight that opens, and how many of them have no pictures because the page would be too large.
+) -> dict[str, Any]:
+    """Give what pages show of flights: a row for each that opens, and how many lack pictures for the page's size.
 
     Args:
         decisions: those of flights that a person is to decide on; None where nobody is.
@@ -78,7 +86,7 @@ def cards(
             card, left_out = _card(flight, None, decisions), left_out + 1
         size += len(card)
         parts.append(card)
-    return parts, left_out
+    return {"style": STYLE, "columns": COLUMNS, "cards": parts, "left_out": left_out, "page_mb": page_mb}
 
 
 def _card(flight: FlightInspection, view: FlightView | None, decisions: Mapping[str, Decision] | None) -> str:
@@ -104,7 +112,10 @@ def _plot(name: str, view: FlightView) -> dict[str, Any] | None:
     parts, pen_is_down = [], False
     for at_s, value in zip(time_s, values, strict=True):
         if value is not None:
-            parts.append(f"{'L' if pen_is_down else 'M'}{(at_s - time_s[0]) * step:.1f} {PLOT_HEIGHT - 2.0 - (value - low) * scale:.1f}")  # fmt: skip
+            parts.append(
+                f"{'L' if pen_is_down else 'M'}{(at_s - time_s[0]) * step:.1f} "
+                f"{PLOT_HEIGHT - 2.0 - (value - low) * scale:.1f}"
+            )
         pen_is_down = value is not None
     return {
         "title": title,

@@ -1,4 +1,4 @@
-"""The review queue: `review.html` to look at and fill in, and what was decided put on record (`cosfly/products/review.py`)."""
+"""The review queue: `review.html` to fill in, and decisions put on record (`cosfly/products/review.py`)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.errors import InputError
-from cosfly.inspection.flight import Inspected
-from cosfly.inspection.report import COLUMNS, STYLE, cards
+from cosfly.inspection.flight import InspectedFlight
+from cosfly.inspection.report import cards
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.view import FlightView
 from cosfly.look.page import page, run_name
@@ -25,7 +25,7 @@ FILLED = "decisions.json"  # as the page saves it
 SCRIPT = read_text(Path(__file__).with_name("review.js"))
 
 
-class Filled(BaseModel):
+class ReviewForm(BaseModel):
     """What `review.html` saves: who decided what on which inspection (sha256 of `inspect.json`)."""
 
     model_config = ConfigDict(extra="forbid")
@@ -35,13 +35,13 @@ class Filled(BaseModel):
     choices: list[Choice]
 
 
-def read_filled(path: Path) -> Filled:
+def read_filled(path: Path) -> ReviewForm:
     """Read what `review.html` saved.
 
     Raises:
         InputError: names the file and the field.
     """
-    return read_model(path, Filled, schema=SCHEMA, version=VERSION, what="file of decisions")
+    return read_model(path, ReviewForm, schema=SCHEMA, version=VERSION, what="file of decisions")
 
 
 def take(inspected: Path, filled: Path) -> list[Decision]:
@@ -53,9 +53,12 @@ def take(inspected: Path, filled: Path) -> list[Decision]:
     found = read_filled(filled)
     if found.inspection != sha256_file(inspected):
         raise InputError(
-            "decisions on another inspection", where=filled, got=found.inspection[:12], expected=f"{sha256_file(inspected)[:12]}, {inspected}",
+            "decisions on another inspection",
+            where=filled,
+            got=found.inspection[:12],
+            expected=f"{sha256_file(inspected)[:12]}, {inspected}",
             fix="make review.html again with cosfly inspect review, and decide again",
-        )  # fmt: skip
+        )
     return add_decisions(inspected, found.choices, found.by)
 
 
@@ -71,13 +74,16 @@ def summary(inspected: Path) -> str:
     verdicts = [decisions[folder].verdict for folder in queue if folder in decisions]
     waiting = undecided(inspected)
     others = len(decisions.keys() - set(queue))
-    text = f"{len(queue)} flights in review: {verdicts.count('accepted')} accepted, {verdicts.count('rejected')} rejected, {len(waiting)} open"
+    text = (
+        f"{len(queue)} flights in review: {verdicts.count('accepted')} accepted, {verdicts.count('rejected')} "
+        f"rejected, {len(waiting)} open"
+    )
     text += f"; {others} others rejected" if others else ""
     return text + (f" ({', '.join(waiting[:3])}{', ...' if len(waiting) > 3 else ''})" if waiting else "")
 
 
 def write_page(inspected: Path) -> Path:
-    """Write `review.html` beside `inspect.json`: the flights in review, each to be accepted or rejected; give its path."""
+    """Write `review.html` beside `inspect.json`: each flight in review is to be accepted or rejected; give its path."""
     path = inspected.with_name("review.html")
     write_bytes(path, page_html(inspected).encode())
     return path
@@ -88,16 +94,13 @@ def page_html(inspected: Path) -> str:
     inspection = read_inspection(inspected)
     queue = [flight for flight in inspection.flights if flight.result == "review"]
     page_mb = float(inspection.settings.get("page_mb", InspectConfig().page_mb))
-    rows, left_out = cards(queue, _views(inspected), page_mb, read_decisions(inspected))
+    rows = cards(queue, _views(inspected), page_mb, read_decisions(inspected))
     data = {"schema": SCHEMA, "schema_version": VERSION, "inspection": sha256_file(inspected), "file": FILLED}
-    return page(
-        "cosfly/inspection/review.html", title=run_name(inspected.parent), style=STYLE, script=SCRIPT, columns=COLUMNS, cards=rows,
-        left_out=left_out, page_mb=page_mb, data=data,
-    )  # fmt: skip
+    return page("cosfly/inspection/review.html", title=run_name(inspected.parent), script=SCRIPT, data=data, **rows)
 
 
 def _views(inspected: Path) -> dict[str, FlightView]:
-    """Give pictures and curves of flights, which the stage keeps beside its product; empty where that was copied without."""
+    """Give pictures and curves of flights, which the stage keeps beside its product; empty where they are not there."""
     journal = Journal(inspected.with_name("items.jsonl"))
     records = (record for record in journal.read_as(read_item) if not isinstance(record, Failed))
-    return {record.id: result_of(record, Inspected).view for record in records}
+    return {record.id: result_of(record, InspectedFlight).view for record in records}

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from cosfly.products.places import FlightChoice
 from cosfly.space.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3, RELAXED_SAFETY_M
 from cosfly.work.config import Config
+
+Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class InspectConfig(Config):
@@ -19,13 +21,9 @@ class InspectConfig(Config):
         ACCEL_RMS_MAX_MPS2, gt=0, description="planned RMS acceleration above this rejects, m/s^2"
     )
     jerk_rms_max_mps3: float = Field(JERK_RMS_MAX_MPS3, gt=0, description="planned RMS jerk above this rejects, m/s^3")
-    smoothness_min: float = Field(
-        0.5, ge=0, le=1, description="smoothness score S below this goes to review; 0 turns the rule off"
-    )
-    five_ray_mean_min: float = Field(
+    smoothness_min: Share = Field(0.5, description="smoothness score S below this goes to review; 0 turns the rule off")
+    five_ray_mean_min: Share = Field(
         FIVE_RAY_MEAN_MIN,
-        ge=0,
-        le=1,
         description="mean five-ray visibility of the flight's poses below this rejects; 0 turns the rule off",
     )
     clearance_min_m: float = Field(
@@ -44,63 +42,51 @@ class InspectConfig(Config):
     )
     drone_speed_max_mps: float = Field(25.0, gt=0, description="a faster step between two frames is a teleport, m/s")
     target_speed_max_mps: float = Field(10.0, gt=0, description="the same for the person, m/s")
-    track_quality_min: float = Field(
-        0.25,
-        ge=0,
-        le=1,
-        description="mean IoU of projected box and mask below this goes to review; 0 turns the rule off",
+    track_quality_min: Share = Field(
+        0.25, description="mean IoU of projected box and mask below this goes to review; 0 turns the rule off"
     )
-    mask_visibility_min: float = Field(
-        0.5, ge=0, le=1, description="a frame at least this visible must show pedestrian pixels at the target's box"
+    mask_visibility_min: Share = Field(
+        0.5, description="a frame at least this visible must show pedestrian pixels at the target's box"
     )
-    invalid_depth_max: float = Field(
-        0.01, ge=0, le=1, description="share of invalid depth pixels above this in any frame goes to review"
+    invalid_depth_max: Share = Field(
+        0.01, description="share of invalid depth pixels above this in any frame goes to review"
     )
-    flat_surface_max: float = Field(
+    flat_surface_max: Share = Field(
         0.01,
         gt=0,
-        le=1,
-        description="a surface of one colour that fills more of a picture goes to review (a missing texture); drawn ones have grain, rounding "
-        "and light; 1 turns the rule off",
+        description="a surface of one colour that fills more of a picture goes to review (a missing texture); drawn "
+        "ones have grain, rounding and light; 1 turns the rule off",
     )
-    flat_pairs_min: float = Field(
+    flat_pairs_min: Share = Field(
         0.99,
         gt=0,
-        le=1,
-        description="a surface is of one colour where so many of its neighbouring pixels are equal; in renders of three maps at most 0.95 are",
+        description="a surface is of one colour where so many of its neighbouring pixels are equal; renders of three "
+        "maps have at most 0.95",
     )
-    magenta_max: float = Field(
+    magenta_max: Share = Field(
         1e-3,
-        ge=0,
-        le=1,
-        description="share of a picture in the magenta that engines paint for a texture that they miss; more goes to review; renders have none; "
-        "1 turns the rule off",
+        description="share of a picture in the magenta that engines paint for a missing texture; more goes to review; "
+        "renders have none; 1 turns the rule off",
     )
-    z_fighting_max: float = Field(
+    z_fighting_max: Share = Field(
         1e-3,
-        ge=0,
-        le=1,
-        description="share of pixels that alternate every 3 px or less between two surfaces in one plane, of other kinds or colours; more goes to "
-        "review; renders of three maps have at most 1.2e-4; 1 turns the rule off",
+        description="share of pixels that alternate every 3 px or less between two surfaces in one plane, of other "
+        "kinds or colours; more goes to review; renders of three maps have at most 1.2e-4; 1 turns the rule off",
     )
-    jump_gone_max: float = Field(
+    jump_gone_max: Share = Field(
         0.02,
-        ge=0,
-        le=1,
-        description="share of what stood still in the frame before and is looked through in this one; more goes to review; renders have 0; 1 "
-        "turns the rule off",
+        description="share of what stood still in the frame before and is looked through in this one; more goes to "
+        "review; renders have 0; 1 turns the rule off",
     )
-    jump_agree_min: float = Field(
+    jump_agree_min: Share = Field(
         0.5,
-        ge=0,
-        le=1,
-        description="share of what stood still that is where the poses put it, seen from the frame before; less goes to review (the rest is "
-        "hidden by what is nearer); renders have 0.8 and more; 0 turns the rule off",
+        description="share of what stood still that is where the poses put it, seen from the frame before; less goes "
+        "to review (the rest is hidden by what is nearer); renders have 0.8 and more; 0 turns the rule off",
     )
     thumbnail_px: int = Field(240, ge=32, le=640, description="width of the pictures in report.html, px")
     page_mb: float = Field(
         25.0,
         gt=0,
-        description="size of report.html, and of review.html, beyond which flights are listed without pictures, map and plots, accepted ones first, "
-        "MB; a flight takes 0.06",
+        description="size of report.html, and of review.html, beyond which flights are listed without pictures, map "
+        "and plots, accepted ones first, MB; a flight takes 0.06",
     )

@@ -1,7 +1,8 @@
 """Step 6, `cosfly inspect`: measure every flight, accept it, route it to a person, or reject it (sec:step6).
 
-Reads `step2_simplified.json`, `drone_trace.json` and the playback tree, writes `inspect.json` and a self-contained `report.html`. Changes nothing
-in the tree. The folder is not called `inspect`: a file of that name would hide the standard library's.
+Reads `step2_simplified.json`, `drone_trace.json` and the playback tree, writes `inspect.json` and a self-contained
+`report.html`. Changes nothing in the tree. The folder is not called `inspect`: a file of that name would hide the
+standard library's.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from collections import Counter
 from pathlib import Path
 
 from cosfly.errors import InputError
-from cosfly.inspection.flight import Inspected, inspect_flight, trace_id
+from cosfly.inspection.flight import InspectedFlight, inspect_flight, trace_id
 from cosfly.inspection.report import report_html
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.view import FlightView
@@ -71,10 +72,12 @@ def run(
     watch: Watch = Watch(),
     resume: Resume = "if-same",
 ) -> Path:
-    """Read the simplified map, the plans and the playback tree, write `inspect.json` and `report.html`; give the former's path.
+    """Read the simplified map, the plans and the playback tree, write `inspect.json` and `report.html`; give the
+    former's path.
 
     Args:
-        simplified, traces: `step2_simplified.json`, `drone_trace.json`; None for a tree of somebody else: nothing is held against them.
+        simplified, traces: `step2_simplified.json`, `drone_trace.json`; None for a tree of somebody else: nothing is
+            held against them.
     Raises:
         NothingKept: every flight was rejected; both files are there and say why.
     """
@@ -130,7 +133,7 @@ def assemble(
         if isinstance(outcome, Failed):
             flights.append(_unreadable(outcome, planned or [], data))
         else:
-            inspected = result_of(outcome, Inspected)
+            inspected = result_of(outcome, InspectedFlight)
             flights.append(inspected.record)
             views[outcome.id] = inspected.view
             if inspected.record.result == "accepted":
@@ -154,7 +157,7 @@ def _unreadable(outcome: Failed, planned: list[DroneTrace], data: Path) -> Fligh
 
 
 def _planned_id(folder: Path, planned: list[DroneTrace]) -> str | None:
-    """Name the plan of a flight whose inspection failed, which may be for its clean twin's sake; None where it cannot be read."""
+    """Name the plan of a flight whose inspection failed; None where it cannot be read."""
     try:
         found = trace_id(read_flight(folder, strict=False))
     except InputError:
@@ -163,7 +166,7 @@ def _planned_id(folder: Path, planned: list[DroneTrace]) -> str | None:
 
 
 def _with_twins_trace(flights: list[FlightInspection]) -> list[FlightInspection]:
-    """Give an unreadable flight the trace of its twin in the same trajectory folder, so that the funnel counts it there."""
+    """Give an unreadable flight the trace of its twin, so that the funnel counts it there."""
     known = {Path(flight.folder).parent: flight.trace_id for flight in flights if flight.trace_id is not None}
     return [
         flight.model_copy(update={"trace_id": flight.trace_id or known.get(Path(flight.folder).parent)})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, FiniteFloat, model_validator
 
 from cosfly.look.frame_views import small_jpeg, thumbnail
 from cosfly.look.topview import INK, PAPER, TopView, draw_dot, draw_line, draw_map, draw_text
@@ -28,12 +28,19 @@ JPEG = Annotated[str, Field(pattern=r"^[A-Za-z0-9+/=]*$")]
 
 
 class FlightView(BaseModel):
-    """Curves with gaps by their names in PLOTS, the first, middle and last frame, and the map, as JPEGs in base64; None of what there is not."""
+    """Curves with gaps by their names in PLOTS, the first, middle and last frame, and the map, as JPEGs in base64; None
+    of what there is not."""
 
-    time_s: list[float] = []
-    curves: dict[str, list[float | None]] = {}
-    pictures: list[JPEG | None] = [None, None, None]
+    time_s: list[FiniteFloat] = []
+    curves: dict[str, list[FiniteFloat | None]] = {}
+    pictures: list[JPEG | None] = Field([None, None, None], min_length=3, max_length=3)
     plan: JPEG | None = None
+
+    @model_validator(mode="after")
+    def _curves_have_their_times(self) -> FlightView:
+        if wrong := [name for name, values in self.curves.items() if len(values) != len(self.time_s)]:
+            raise ValueError(f"{wrong[0]} has {len(self.curves[wrong[0]])} values at {len(self.time_s)} times")
+        return self
 
 
 def draw_flight(
@@ -42,7 +49,8 @@ def draw_flight(
     """Give what a page shows of a flight.
 
     Args:
-        heights_m: (n,) of the drone over the person. clearance_m: (n,) to obstacles; None where there is no map. width_px: of the pictures.
+        heights_m: (n,) of the drone over the person. clearance_m: (n,) to obstacles; None where there is no map.
+            width_px: of the pictures.
     """
     rows = np.unique(np.linspace(0, len(flight) - 1, CURVE_POINTS).round().astype(int))
     speeds_mps = np.full(len(flight), np.nan)

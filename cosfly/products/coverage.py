@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, field_validator
 
 from cosfly.products.playback import Flight
 from cosfly.products.walks import TARGET_HEIGHT_M
@@ -81,6 +81,14 @@ class Coverage(BaseModel):
     times_of_day: dict[str, int] = {}
     skies: dict[str, int] = {}
 
+    @field_validator("bins")
+    @classmethod
+    def _are_those_of_the_axes(cls, bins: dict[str, list[int]]) -> dict[str, list[int]]:
+        found = {name: len(counts) for name, counts in bins.items()}
+        if found and found != (wanted := {name: axis.num_bins for name, axis in AXES.items()}):
+            raise ValueError(f"bins must be {wanted}, or none; got {found}")
+        return bins
+
     @classmethod
     def of(
         cls,
@@ -104,7 +112,8 @@ class Coverage(BaseModel):
     def total(cls, parts: Iterable[Coverage]) -> Coverage:
         """Add up the frames of many."""
         parts = list(parts)
-        bins = {name: np.sum([part.bins[name] for part in parts], axis=0).tolist() for name in AXES if parts}
+        counted = [part.bins for part in parts if part.bins]
+        bins = {name: np.sum([one[name] for one in counted], axis=0).tolist() for name in AXES if counted}
         named = {
             name: dict(sorted(sum((Counter(getattr(part, name)) for part in parts), Counter()).items()))
             for name in (*NAMED, "skies")

@@ -1,4 +1,4 @@
-"""`inspect.json`, the product of step 6: one record per flight and the funnel. Written by inspection, read by release."""
+"""`inspect.json`, the product of step 6: one record per flight and the funnel."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from cosfly.errors import InputError
 from cosfly.products.coverage import Coverage
@@ -28,7 +28,8 @@ class _Strict(BaseModel):
 class FlightInspection(_Strict):
     """What was found out about one flight. `folder` is relative to the playback tree; metrics are None where unknown.
 
-    sha256: of its files (`provenance.digest_of`), so that nobody takes another flight, or other pictures, for the one inspected.
+    sha256: of its files (`provenance.digest_of`), so that nobody takes another flight, or other pictures, for the one
+    inspected.
     """
 
     town: str
@@ -40,7 +41,7 @@ class FlightInspection(_Strict):
     trace_id: str | None
     result: Result
     issues: list[Issue]
-    metrics: dict[str, float | int | None]
+    metrics: dict[str, FiniteFloat | int | None]
     # By a person, after the inspection: `review.py` puts it in, `inspect.json` never holds it.
     decided: Literal["accepted", "rejected"] | None = Field(None, exclude=True)
 
@@ -86,7 +87,7 @@ class FlightFunnel(_Strict):
 
 
 class Funnel(_Strict):
-    """The way from planned trajectories to accepted flights (sec:step6); a trajectory is as good as its worst flight."""
+    """From planned trajectories to accepted flights (sec:step6); a trajectory is as good as its worst flight."""
 
     trajectories: TrajectoryFunnel
     flights: FlightFunnel
@@ -105,7 +106,8 @@ def count_trajectories(flights: list[FlightInspection], *, planned: bool) -> dic
     """Count rendered trajectories by the result of their worst flight: `rendered`, `accepted`, `review`, `rejected`.
 
     Args:
-        planned: by their plans, so that those without one count for none; else by their folders, as names of several runs may be the same.
+        planned: by their plans, so that those without one count for none; else by their folders, as names of several
+            runs may be the same.
     """
     results: dict[str, set[str]] = {}
     for flight in flights:
