@@ -45,7 +45,7 @@ from cosfly.render.gl import meshes as unit_meshes
 from cosfly.render.gl.figure import make_body
 from cosfly.render.gl.parts import Boxes, PartBuilder
 from cosfly.render.gl.scene import build_scene
-from cosfly.render.gl.view import View
+from cosfly.render.gl.view import CameraView
 from cosfly.render.person import NOBODY, cast_of, choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, in_frame, perturb
 from cosfly.render.settings import RenderConfig
@@ -86,7 +86,7 @@ def test_what_is_drawn_is_what_the_slow_way_finds():
         builder.add(boxes, 0, half, 0, (1.0, 1.0, 1.0), min_px=low_px, max_px=high_px, layer=layer)
     parts = builder.finish()
     pose = world_from_camera(np.array([10.0, -20.0, 40.0]), np.array([5.0, -25.0, 130.0]))
-    view = View(pose[:3, :3], pose[:3, 3], intrinsic_matrix(320, 180, 70.0), 320, 180)
+    view = CameraView(pose[:3, :3], pose[:3, 3], intrinsic_matrix(320, 180, 70.0), 320, 180)
     in_camera = (parts.object_centers - view.eye) @ view.world_from_camera
     size_px = view._size_px(in_camera, parts.object_radii)
     inside = (
@@ -246,9 +246,9 @@ def test_shadows_of_those_who_move_lie_in_their_rectangles(elevation_deg, monkey
         pose, intrinsic = pose_towards(eye, (2.0, -3.0, 0.0)), intrinsic_matrix(*LARGER, 90.0)
         frame = renderer.render(pose, intrinsic, walker, others)
         with monkeypatch.context() as patch:
-            patch.setattr(View, "rectangle_px", lambda *_: whole)
+            patch.setattr(CameraView, "rectangle_px", lambda *_: whole)
             expected = renderer.render(pose, intrinsic, walker, others)
-            patch.setattr(View, "rectangle_px", lambda *_: None)
+            patch.setattr(CameraView, "rectangle_px", lambda *_: None)
             without = renderer.render(pose, intrinsic, walker, others)
         assert (without.rgb != expected.rgb).any(axis=-1).sum() > 100, "shadows are seen"
         differs = np.abs(frame.rgb.astype(int) - expected.rgb).max(axis=-1)

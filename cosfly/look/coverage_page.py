@@ -1,4 +1,4 @@
-"""What a run covers, for people: histograms and tables as HTML, and as Markdown, beside the plain run that ships. Used by inspection and release."""
+"""What a run covers, for people: histograms and tables as HTML and Markdown, beside the plain run that ships."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TEMPLATE = "cosfly/look/templates/coverage.html"
 
 
 def coverage_html(coverage: Coverage) -> str:
-    """Give a grid of histograms, one an axis, with where 5 % to 95 % of the frames lie, and of tables, one for each kind of name."""
+    """Give histograms, one an axis, with where 5 % to 95 % of the frames lie, and a table for each kind of name."""
     plain = default_coverage()
     histograms = [
         _histogram(axis, coverage.bins.get(name, []), plain.bins[name])
@@ -29,14 +29,17 @@ def _title(axis: Axis) -> str:
 
 
 def _skies(frames: dict[str, int]) -> dict[str, Any] | None:
-    """Give a table of frames, weather by time of day: the 15 x 4 of the paper, and presets of somebody's own beside them."""
+    """Give a table of frames, weather by time of day: the paper's 15 x 4, and presets of somebody's own."""
     if not frames:
         return None
     counts = {tuple(name.split(PAIR)): count for name, count in frames.items()}
     weathers = [*WEATHERS, *sorted({weather for weather, _ in counts} - set(WEATHERS))]
     times = [*TIMES, *sorted({time for _, time in counts} - set(TIMES))]
     rows = [(weather, [counts.get((weather, time)) for time in times]) for weather in weathers]
-    note = f"{len(counts)} of {len(weathers) * len(times)} pairs; drawn uniformly, each preset is expected in {1 / len(weathers):.1%} of the flights"
+    note = (
+        f"{len(counts)} of {len(weathers) * len(times)} pairs; drawn uniformly, each preset is expected in "
+        f"{1 / len(weathers):.1%} of the flights"
+    )
     return {"times": times, "rows": rows, "note": note}
 
 
@@ -47,7 +50,8 @@ def ranges(coverage: Coverage) -> list[tuple[str, str, str]]:
 
 
 def shares(coverage: Coverage, kind: str) -> list[tuple[str, int, str, str]]:
-    """Give a row for each name of a kind of NAMED: name, frames, share of them, share in the plain run; empty where none is known."""
+    """Give a row for each name of a kind of NAMED: name, frames, share of them, share in the plain run; empty where
+    none is known."""
     counts, plain = getattr(coverage, kind), getattr(default_coverage(), kind)
     if not counts:
         return []
@@ -94,11 +98,15 @@ def _histogram(axis: Axis, counts: list[int], beside: list[int]) -> dict[str, An
     edges = [f"{axis.low + k * axis.step:g}" for k in range(last + 2)]
     bars = [
         {
-            "x": round((k - first) * step, 1), "y": y(share), "width": round(max(1.0, step - 1), 1), "height": round(HEIGHT_PX - y(share), 1),
+            "x": round((k - first) * step, 1),
+            "y": y(share),
+            "width": round(max(1.0, step - 1), 1),
+            "height": round(HEIGHT_PX - y(share), 1),
             "title": f"{edges[k]} to {edges[k + 1]} {axis.unit}: {100 * share:.1f} %",
         }
-        for k, share in enumerate(heights[0] if counts else []) if first <= k <= last
-    ]  # fmt: skip
+        for k, share in enumerate(heights[0] if counts else [])
+        if first <= k <= last
+    ]
     shown = [(k, share) for k, share in enumerate(heights[-1]) if first <= k <= last]
     line = " ".join(f"{(k - first + side) * step:.1f},{y(share)}" for k, share in shown for side in (0, 1))
     return {

@@ -1,6 +1,7 @@
 """Frames as pictures for a model or a person: one look for teachers, students, contact sheets and reports.
 
-`Pictures` says what a model is shown of each frame: the pictures and the sentence of its prompt come from the same values.
+`Pictures` says what a model is shown of each frame: the pictures and the sentence of its prompt come from the same
+values.
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ NUM_SHADES = 24
 class Pictures:
     """What a model is shown of each frame.
 
-    views: in this order; none where no picture is sent. layout: separate is one picture per view, tiled one per frame, the views
-    side by side from left to right. size_px: (width, height) of one view's picture, which pixel values of the prompt and of
-    the answer refer to.
+    views: in this order; none where no picture is sent. layout: separate is one picture per view, tiled one per frame,
+    the views side by side from left to right. size_px: (width, height) of one view's picture, which pixel values of the
+    prompt and of the answer refer to.
     """
 
     views: tuple[View, ...]
@@ -135,7 +136,7 @@ def _sentence(pictures: Pictures, language: Language) -> str:
 
 
 def frame_label(number: int) -> str:
-    """Give the text before the pictures of the window's frame `number`, for teachers and students: answers name frames so."""
+    """Give the text before the pictures of a window's frame: answers name frames so."""
     return f"t{number}:"
 
 
@@ -234,8 +235,8 @@ def small_jpeg(rgb: np.ndarray, width_px: int, jpeg_quality: int = 80) -> str:
 
 
 def _palette() -> np.ndarray:
-    """Muted tones, NUM_SHADES of each class, (29 * NUM_SHADES, 3): hues by golden-angle steps, low saturation, so that only the
-    pedestrians are vivid.
+    """Muted tones, NUM_SHADES of each class, (29 * NUM_SHADES, 3): hues by golden-angle steps, low saturation, so that
+    only the pedestrians are vivid.
     """
     hues = (np.arange(len(KINDS)) * 111) % 180
     hsv = np.stack([hues, np.full(len(KINDS), 70), np.full(len(KINDS), 150)], axis=-1).astype(np.uint8)

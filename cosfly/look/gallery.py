@@ -1,4 +1,4 @@
-"""Pictures of a playback tree for people: a contact sheet, a short animation of one flight, and one frame's four pictures."""
+"""Pictures of a playback tree for people: a contact sheet, an animation of one flight, one frame's four pictures."""
 
 from __future__ import annotations
 
@@ -62,10 +62,12 @@ def preview_gif(tree: Path, out_gif: Path, choice: FlightChoice = ALL_FLIGHTS) -
 
 
 def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map: BoxMap | None = None) -> str:
-    """Reads a frame of a playback tree, writes it as one PNG: colours, depth, instances, and boxes with ids and distances.
+    """Reads a frame of a playback tree, writes it as one PNG: colours, depth, instances, and boxes with ids and
+    distances.
 
     Args:
-        frame: its folder, as `frame_in` takes it; None: the frame of the first clean flight that shows most of the target.
+        frame: its folder, as `frame_in` takes it; None: the frame of the first clean flight that shows most of the
+            target.
         box_map: what was drawn, for a frame without `debug.png`.
     Returns:
         the frame's folder in the tree.
@@ -90,9 +92,11 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
         )  # fmt: skip
     panels = [rgb, read_view(folder, "depth"), read_view(folder, "segmentation"), debug]
     titles = (
-        f"RGB, {meta.camera.fov_deg:.0f} deg", f"depth, black: {DEPTH_RANGE_M:g} m and beyond", "instances, the target red",
+        f"RGB, {meta.camera.fov_deg:.0f} deg",
+        f"depth, black: {DEPTH_RANGE_M:g} m and beyond",
+        "instances, the target red",
         f"boxes, ids, distances; visibility {meta.target.visibility:.2f}",
-    )  # fmt: skip
+    )
     tiles = [add_caption(panel, title) for panel, title in zip(panels, titles, strict=True)]
     picture = np.vstack([np.hstack(tiles[:2]), np.hstack(tiles[2:])])
     write_bytes(out_png, rgb_bytes(picture))
@@ -112,7 +116,7 @@ def frame_in(tree: Path, frame: str | Path) -> Path:
 
 
 def best_frame(tree: Path, *names: str) -> Path:
-    """Give the folder of a frame of a tree that shows the target whole, of its first clean flight; it has files of these names."""
+    """Give the frame folder of a tree's first clean flight that shows most of the target and has these files."""
     folders = find_flights(tree)
     flight = read_flight(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
     frames = _frames_with(flight, *names)
@@ -195,7 +199,7 @@ def _gif(frames: list[Image.Image]) -> bytes:
 
 
 def _png_below(rgb: np.ndarray, most_bytes: int) -> bytes:
-    """Encode a picture, smaller if it would be too large, and with a palette, which costs little in a sheet of thumbnails."""
+    """Encode a picture, smaller if it would be too large, with a palette."""
     scale = 1.0
     while True:
         size = (round(rgb.shape[1] * scale), round(rgb.shape[0] * scale))

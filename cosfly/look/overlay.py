@@ -1,7 +1,8 @@
-"""What a frame's labels say, drawn over its colours: the 3D boxes of map, target and others, with ids and distances (`debug.png`).
+"""What a frame's labels say, drawn over its colours: the 3D boxes of map, target and others, with ids and distances
+(`debug.png`).
 
-Everything is projected again from `meta.json` and the map, nothing is taken from the picture's own shapes: where a line does not fit what is
-drawn under it, one of them is wrong.
+Everything is projected again from `meta.json` and the map, nothing is taken from the picture's own shapes: where a line
+does not fit what is drawn under it, one of them is wrong.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ class Overlay:
         return picture
 
     def _seen(self, ids: np.ndarray) -> list[_Box]:
-        """Give the boxes that take enough of the picture, ground left out, the largest last: their labels are on top."""
+        """Give the boxes that take enough of the picture, without ground, the largest last: labels on top."""
         found, counts = np.unique(ids, return_counts=True)
         pixels = dict(zip(found.tolist(), counts.tolist(), strict=True))
         seen = np.array([pixels.get(int(one), 0) for one in self.instance_ids.tolist()])

@@ -1,6 +1,8 @@
-"""HTML pages: templates of the rooms that write them, all on one base page with one style; they stand alone, without a network.
+"""HTML pages: templates of the rooms that write them, all on one base page with one style; they stand alone, without a
+network.
 
-Every text that a template prints is cut and escaped (autoescape); only markup of templates themselves, the style and the script are not.
+Every text that a template prints is cut and escaped (autoescape); only markup of templates themselves, the style and
+the script are not.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ def page(template: str, *, title: str, style: str = "", script: str = "", **valu
     """Give a page.
 
     Args:
-        template: its path from the folder of the packages. title: the name of what it shows. style, script: our own, beside the base page's.
+        template: its path from the folder of the packages. title: the name of what it shows. style, script: our own,
+            beside the base page's.
     """
     style = read_text(Path(__file__).with_name("templates") / "page.css") + style
     return _environment().get_template(template).render(
@@ -51,7 +54,8 @@ def run_name(folder: Path) -> str:
 
 
 def _policy(script: str) -> str:
-    """Let a page show itself and run the one script of ours, named by its hash: no other script, request or form, even where an escape fails."""
+    """Let a page show itself and run the one script of ours, named by its hash: no other script, request or form, even
+    where an escape fails."""
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     allowed = f"script-src 'sha256-{digest}'; " if script else ""
     return f"default-src 'none'; {allowed}img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
@@ -70,7 +74,7 @@ def _environment() -> Environment:
 
 
 def _printed(value: Any) -> Any:
-    """Cut texts and take control characters out of them before they are escaped; a value that is not known is a dash."""
+    """Cut texts and take control characters out before they are escaped; an unknown value is a dash."""
     if isinstance(value, str) and not isinstance(value, Markup):
         return for_terminal(value)
     return "–" if value is None else value

@@ -34,7 +34,7 @@ Color = Sequence[float]  # RGB, 0..255
 
 @dataclass(frozen=True)
 class TopView:
-    """A window of the world on a picture, north up. west_m, north_m: the place of pixel (0, 0). size_px: width, height."""
+    """A window of the world, north up. west_m, north_m: the place of pixel (0, 0). size_px: width, height."""
 
     west_m: float
     north_m: float
@@ -56,7 +56,7 @@ class TopView:
 
 
 def draw_map(box_map: BoxMap, view: TopView) -> np.ndarray:
-    """Draw a map from above, low boxes first, the higher (over ground that slopes) the lighter; (height, width, 3) uint8 RGB."""
+    """Draw a map from above, low boxes first, the higher the lighter; (height, width, 3) uint8 RGB."""
     picture = np.full((*view.size_px[::-1], 3), PAPER, dtype=np.uint8)
     tops = box_map.centers[:, 2] + box_map.half_extents[:, 2]
     if not box_map.ground.is_flat:
@@ -105,7 +105,7 @@ def draw_text(
     align: float = 0.0,
     halo: Color | None = None,
 ) -> int:
-    """Write text with its baseline at y: align 0 begins at x, 0.5 is centred, 1 ends there; a halo of 1 px. Gives the x where it ends."""
+    """Write text with its baseline at y: align 0 begins at x, 0.5 is centred, 1 ends there. Gives the x of its end."""
     width = cv2.getTextSize(text, FONT, scale, 1)[0][0]
     left, base = round(x - align * width), round(y)
     if halo is not None:  # of the same letters: thicker ones are a bold font in OpenCV 5, and wider

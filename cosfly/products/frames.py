@@ -1,7 +1,8 @@
-"""The files of one frame folder of the playback tree: rgb.png, depth, instance.png, meta.json, and what `meta.json` holds.
+"""The files of one frame folder of the playback tree: rgb.png, depth, instance.png, meta.json, and what `meta.json`
+holds.
 
-Depth is float32 and stands as `depth_float32.png`, packed without loss, or as `depth.npy`, as in the public layout. Readers
-ask `frame_path` for a file by its name in the public layout.
+Depth is float32 and stands as `depth_float32.png`, packed without loss, or as `depth.npy`, as in the public layout.
+Readers ask `frame_path` for a file by its name in the public layout.
 
 Axes inside the tree are CARLA's (left-handed); `tree_...` below take the project's right-handed values.
 """
@@ -172,13 +173,19 @@ class CameraMeta(_Group):
 def camera_meta(camera: Camera, near_m: float, far_m: float) -> CameraMeta:
     """Give what a frame says of its camera; clip planes in m."""
     return CameraMeta(
-        width=camera.width_px, height=camera.height_px, fov_deg=round(camera.fov_deg, 6),
-        focal_length_px=camera.focal_px, focal_length_35mm_mm=round(camera.focal_35mm_mm, 6), intrinsic=camera.intrinsic.tolist(), near_m=near_m, far_m=far_m,
-    )  # fmt: skip
+        width=camera.width_px,
+        height=camera.height_px,
+        fov_deg=round(camera.fov_deg, 6),
+        focal_length_px=camera.focal_px,
+        focal_length_35mm_mm=round(camera.focal_35mm_mm, 6),
+        intrinsic=camera.intrinsic.tolist(),
+        near_m=near_m,
+        far_m=far_m,
+    )
 
 
 class TargetMeta(_Group):
-    """The person in a frame: hip point, box and how much of it is seen; px where nothing else is said, null where there is none."""
+    """The person in a frame: hip point, box and how much of it is seen; px unless said, null where there is none."""
 
     world_location: TreePosition
     half_extents_m: tuple[float, float, float]
@@ -287,7 +294,7 @@ def public_name(name: str) -> str:
 
 
 def frame_path(frame: Path, name: str) -> Path:
-    """Give the path of a frame's file by its name in the public layout; of depth that of `depth_float32.png` where it has one."""
+    """Give the path of a frame's file by its name in the public layout; of depth the packed one where there is one."""
     packed = frame / DEPTH_PNG
     return packed if name == DEPTH_NPY and packed.exists() else frame / name
 
@@ -334,7 +341,8 @@ def read_depth(frame: Path) -> np.ndarray:
 
 
 def depth_values(data: bytes | memoryview, where: Path) -> np.ndarray:
-    """Give the numbers of a depth image's bytes, of either form, (h, w) float32 as `read_depth`; of a `.npy` without a copy.
+    """Give the numbers of a depth image's bytes, of either form, (h, w) float32 as `read_depth`; of a `.npy` without a
+    copy.
 
     Raises:
         InputError: it is no complete image of that type.

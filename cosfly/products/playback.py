@@ -5,8 +5,9 @@
         trajectory.json
         frames_playback/frame_00000/{rgb.png, depth_float32.png or depth.npy, instance.png, meta.json}
 
-Axes inside the tree are CARLA's (left-handed); they are converted here and for `meta.json` in frames.py, and everything else in the
-project sees the right-handed frame. Keys that we do not know are kept in `Flight.raw` and survive a read-write round trip.
+Axes inside the tree are CARLA's (left-handed); they are converted here and for `meta.json` in frames.py, and everything
+else in the project sees the right-handed frame. Keys that we do not know are kept in `Flight.raw` and survive a
+read-write round trip.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ from cosfly.work.store import write_json
 
 ORIGINAL = "ORI"  # the folder of a clean flight
 EVENTS = ("position", "rotation")  # of a frame of a perturbed flight; what became of them: docs/files.md
-# A frame of a perturbed flight by what was applied to it, and the shares of the paper, where each event has a chance of 0.6 (tab:augmentation_states).
+# A frame of a perturbed flight by what was applied to it, and the shares of the paper, where each event has a chance of
+# 0.6 (tab:augmentation_states).
 STATES = {"unperturbed": 0.16, "position only": 0.24, "rotation only": 0.24, "full": 0.36}
 DATASET_FORMAT = "cosfly_playback"  # of the flights that cosfly makes
 # What the record of a flight's presets may be called: the paper names it, no public file shows it.
@@ -60,15 +62,15 @@ class Flight:
     """One `trajectory.json`, n points, in right-handed axes.
 
     time_s (n,) strictly increasing; positions_m (n, 3); rotations_deg (n, 3) pitch, yaw, roll of the camera;
-    targets_m (n, 3) hip height, NaN where the file has none; target_uv (n, 2) px and target_bbox (n, 4) xmin, ymin, xmax, ymax
-    px of its projected 3D box, NaN where null; target_mask_bbox (n, 4) the same of the person's pixels, NaN where none is seen,
-    None where the file does not say; target_depth_m (n,) z-depth; target_in_view, target_visible (n,) bool (visible = occlusion-aware);
-    visibility (n,) rendered score in [0, 1], NaN where the file has none; is_perturbed (n,) bool;
-    drone_offsets_m, rotation_offsets_deg, target_offsets_m (n, 3): the perturbation applied to each point, zero where none,
-    NaN where the file has none for a perturbed point (public files say only that there was one).
-    segments, mission: the styles of its parts and the order that ended it, as its plan has them.
-    intrinsics: (n, 3, 3) of a camera that zooms, frame by frame, `camera` is that of the first; None where it is that of all. Who projects asks
-    `camera_at`.
+    targets_m (n, 3) hip height, NaN where the file has none; target_uv (n, 2) px and target_bbox (n, 4) xmin, ymin,
+    xmax, ymax px of its projected 3D box, NaN where null; target_mask_bbox (n, 4) the same of the person's pixels, NaN
+    where none is seen, None where the file does not say; target_depth_m (n,) z-depth; target_in_view, target_visible
+    (n,) bool (visible = occlusion-aware); visibility (n,) rendered score in [0, 1], NaN where the file has none;
+    is_perturbed (n,) bool; drone_offsets_m, rotation_offsets_deg, target_offsets_m (n, 3): the perturbation applied to
+    each point, zero where none, NaN where the file has none for a perturbed point (public files say only that there was
+    one). segments, mission: the styles of its parts and the order that ended it, as its plan has them. intrinsics: (n,
+    3, 3) of a camera that zooms, frame by frame, `camera` is that of the first; None where it is that of all. Who
+    projects asks `camera_at`.
     """
 
     town: str
@@ -129,7 +131,7 @@ class Flight:
 
     @cached_property
     def target_headings_deg(self) -> np.ndarray:
-        """Whither the person walks at each frame, (n,) counter-clockwise from east; NaN before the first step and where nobody is."""
+        """Whither the person walks, (n,) counter-clockwise from east; NaN before the first step and where nobody is."""
         frames = np.arange(len(self))
         ahead, behind = np.minimum(frames + HEADING_FRAMES, len(self) - 1), np.maximum(frames - HEADING_FRAMES, 0)
         steps = self.targets_m[ahead, :2] - self.targets_m[behind, :2]
@@ -149,7 +151,7 @@ class Flight:
 
     @property
     def weather(self) -> dict[str, str | None]:
-        """The presets of weather and time of day that the file names; None where it has no such record, as without injection."""
+        """The presets of weather and time of day that the file names; None where it has no such record."""
         told = (
             {"weather": self.raw["weather"]}
             if isinstance(self.raw.get("weather"), str)
@@ -184,7 +186,7 @@ class Flight:
         return self.folder / frame_name(index)
 
     def events(self, index: int) -> dict[str, str] | None:
-        """Give what became of a point's EVENTS (none, applied, or why the frame fell back); None where the file does not say."""
+        """Give what became of a point's EVENTS (none, applied, why it fell back); None where the file does not say."""
         points = self.raw.get("points", [])
         told = object_of(points[index], "perturbation") if index < len(points) else {}
         return {event: told[event] for event in EVENTS} if all(isinstance(told.get(e), str) for e in EVENTS) else None
@@ -207,7 +209,8 @@ class Flight:
 
 
 def _was_moved(offsets: tuple[np.ndarray, ...], told: object) -> bool | None:
-    """Tell whether any offset is not zero; where they are not known, what the file says of the first; None where it says nothing."""
+    """Tell whether any offset is not zero; where they are not known, what the file says of the first; None where it
+    says nothing."""
     if any((offset != 0).any() and not np.isnan(offset).any() for offset in offsets):
         return True
     if any(np.isnan(offset).any() for offset in offsets):
@@ -222,8 +225,8 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
     """Read one flight folder.
 
     Args:
-        strict: every rule of the layout must hold. Tolerant: older names and missing optional fields are accepted, and what
-            was let pass stands in `Flight.issues`; poses and times must be there and finite either way.
+        strict: every rule of the layout must hold. Tolerant: older names and missing optional fields are accepted, and
+            what was let pass stands in `Flight.issues`; poses and times must be there and finite either way.
     Raises:
         InputError: names the file, the point and the field.
     """
@@ -282,7 +285,7 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
 
 
 def write_flight(folder: Path, flight: Flight) -> None:
-    """Write `trajectory.json` into a folder. Unknown keys of `flight.raw` are kept, known ones are set from the arrays."""
+    """Write `trajectory.json` into a folder. Unknown keys of `flight.raw` are kept, known ones set from the arrays."""
     raw = copy.deepcopy(flight.raw)
     points = raw.pop("points", None) or raw.pop("waypoints", None) or [{} for _ in range(len(flight))]
     assert len(points) == len(flight), "raw points and columns differ in number"

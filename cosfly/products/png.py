@@ -1,7 +1,7 @@
 """PNG as playback trees and releases hold it: 8 bits, grey to RGBA, not interlaced (RFC 2083).
 
-Read: the checksums of chunks and stream and the number of bytes are always compared, so a picture that passes is whole; it is never unpacked to
-more than its header says. Filters are undone when pixels are wanted.
+Read: the checksums of chunks and stream and the number of bytes are always compared, so a picture that passes is whole;
+it is never unpacked to more than its header says. Filters are undone when pixels are wanted.
 
 Written, of three kinds: colours have texture, so each row is stored as the difference to the average of its left and
 upper neighbours. Instance masks have areas: their bytes stay as they are, and the packing finds the row above. Of depth
@@ -32,8 +32,8 @@ NOT_UNPACKED: Any = zlib.error  # its stub says that it is no class
 
 @dataclass
 class Png:
-    """An unpacked PNG: `lines` (h, 1 + w * channels) uint8, of each row its filter and its bytes as the filter left them. others: names of
-    the chunks that are no pixels (colours meant, words); num_behind: bytes behind its end."""
+    """An unpacked PNG: `lines` (h, 1 + w * channels) uint8, of each row its filter and its bytes as the filter left
+    them. others: names of the chunks that are no pixels (colours meant, words); num_behind: bytes behind its end."""
 
     width_px: int
     height_px: int
@@ -124,7 +124,8 @@ def _broken(where: object, got: str) -> InputError:
 
 
 def _chunks(data: bytes | memoryview, where: object) -> tuple[int, int, int, bytes, tuple[str, ...], int]:
-    """Walk through the chunks: width, height, colour type, the packed pixels, names of other chunks, bytes behind the end."""
+    """Walk through the chunks: width, height, colour type, the packed pixels, names of other chunks, bytes behind the
+    end."""
     if data[:8] != PNG_SIGNATURE or data[12:16] != b"IHDR" or len(data) < 33:
         raise InputError("not an image", where=str(where), got=f"{len(data)} bytes", expected="a PNG")
     width, height, depth, kind, packing, filters, interlace = struct.unpack_from(">IIBBBBB", data, 16)
@@ -161,7 +162,7 @@ def _nearest(left, up, corner):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _undone(lines, channels):  # type: ignore[no-untyped-def]
-    """Undo the filters of rows, (h, w * channels); a row leans on the one before it. A row of zeros stands before the first."""
+    """Undo the filters of rows, (h, w * channels); a row leans on the one before it, the first on zeros."""
     height, size = lines.shape[0], lines.shape[1] - 1
     found, nothing = np.empty((height, size), np.uint8), np.zeros(size, np.uint8)
     for y in range(height):

@@ -1,8 +1,9 @@
-"""`review.jsonl`: what people decided of flights that the inspection could not. Written by `cosfly inspect review`, read by whoever takes
-flights by their result.
+"""`review.jsonl`: what people decided of flights that the inspection could not. Written by `cosfly inspect review`,
+read by whoever takes flights by their result.
 
-It stands beside `inspect.json` and only grows: a decision is never changed, a later one of the same flight counts instead. Each names the
-inspection that it was made on by the digest of that file; on another one nobody decided anything.
+It stands beside `inspect.json` and only grows: a decision is never changed, a later one of the same flight counts
+instead. Each names the inspection that it was made on by the digest of that file; on another one nobody decided
+anything.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ Verdict = Literal["accepted", "rejected"]
 
 
 class Choice(BaseModel):
-    """What somebody says of one flight by its folder in the playback tree, or of a whole trajectory by that above its flights."""
+    """What somebody says of a flight by its folder in the playback tree, or of a trajectory by that above it."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -37,7 +38,8 @@ class Choice(BaseModel):
 
 
 class Decision(Choice):
-    """A line of `review.jsonl`. inspection: sha256 of `inspect.json`; sha256: of the flight's files, as that has it; at: UTC, ISO 8601."""
+    """A line of `review.jsonl`. inspection: sha256 of `inspect.json`; sha256: of the flight's files, as that has it;
+    at: UTC, ISO 8601."""
 
     inspection: str
     sha256: str | None
@@ -51,17 +53,20 @@ def read_decisions(inspected: Path) -> dict[str, Decision]:
     Args:
         inspected: path of `inspect.json`.
     Raises:
-        InputError: a line is damaged or cannot be used, or was decided on another inspection. The last, cut short by a kill, does not count.
+        InputError: a line is damaged or cannot be used, or was decided on another inspection. The last, cut short by a
+            kill, does not count.
     """
     path, digest = inspected.with_name(REVIEW), sha256_file(inspected)
     journal, found = Journal(path), dict[str, Decision]()
     for decision in journal.read_as(Decision.model_validate):
         if decision.inspection != digest:
             raise InputError(
-                "a decision on another inspection", where=f"{path}:{journal.line_num}",
-                got=f"{decision.folder}, {decision.verdict} by {decision.by} at {decision.at}", expected=f"decisions on {inspected}",
+                "a decision on another inspection",
+                where=f"{path}:{journal.line_num}",
+                got=f"{decision.folder}, {decision.verdict} by {decision.by} at {decision.at}",
+                expected=f"decisions on {inspected}",
                 fix=f"move {REVIEW} away and decide again with cosfly inspect review, or put that inspection back",
-            )  # fmt: skip
+            )
         found[decision.folder] = decision
     if journal.is_cut_short:
         log.warning("%s: the last decision was cut short by a kill and does not count: decide it again", path)
@@ -86,7 +91,10 @@ def undecided(inspected: Path) -> list[str]:
 
 def how_to_decide(folder: Path) -> str:
     """Say how a person decides the flights that an inspection, in `folder`, left in review."""
-    return f"cosfly inspect review --inspect {folder} makes a page to look at them; with --accept FLIGHT --by NAME --reason TEXT it accepts one"
+    return (
+        f"cosfly inspect review --inspect {folder} makes a page to look at them; with --accept FLIGHT --by NAME "
+        f"--reason TEXT it accepts one"
+    )
 
 
 def add_decisions(inspected: Path, choices: Iterable[Choice], by: str) -> list[Decision]:
@@ -105,9 +113,12 @@ def add_decisions(inspected: Path, choices: Iterable[Choice], by: str) -> list[D
         for flight in _chosen(choice, flights, inspected):
             if flight.result == "rejected" and choice.verdict == "accepted":
                 raise InputError(
-                    "a flight that breaks a rule cannot be accepted", where=flight.folder, got=flight.reason or "rejected",
-                    expected="a flight in review", fix="mend the flight, or change the threshold and inspect again",
-                )  # fmt: skip
+                    "a flight that breaks a rule cannot be accepted",
+                    where=flight.folder,
+                    got=flight.reason or "rejected",
+                    expected="a flight in review",
+                    fix="mend the flight, or change the threshold and inspect again",
+                )
             about = {"inspection": digest, "sha256": flight.sha256, "by": by, "at": at}
             decisions.append(Decision(**choice.model_dump() | {"folder": flight.folder}, **about))
     with Journal(inspected.with_name(REVIEW)) as journal:
@@ -126,13 +137,17 @@ def _chosen(choice: Choice, flights: list[FlightInspection], inspected: Path) ->
     if not found:
         known = ", ".join([flight.folder for flight in flights if flight.result == "review"][:3])
         raise InputError(
-            "no such flight", where=inspected, got=choice.folder, expected=f"the folder of a flight or of its trajectory, as {known}"
-        )  # fmt: skip
+            "no such flight",
+            where=inspected,
+            got=choice.folder,
+            expected=f"the folder of a flight or of its trajectory, as {known}",
+        )
     return found
 
 
 def read_settled(inspected: Path) -> Inspection:
-    """Read `inspect.json` with what people decided in it: results and the funnel of trajectories are those after review.
+    """Read `inspect.json` with what people decided in it: results and the funnel of trajectories are those after
+    review.
 
     Raises:
         InputError: as `read_inspection` and `read_decisions`.

@@ -1,6 +1,8 @@
-"""A caption as a release shows it, and what a reader of captions says of it: what `release verify` and `caption` exchange.
+"""A caption as a release shows it, and what a reader of captions says of it: what `release verify` and `caption`
+exchange.
 
-Release knows rows and pictures, caption knows what is true of a window; neither imports the other. The command line brings them together.
+Release knows rows and pictures, caption knows what is true of a window; neither imports the other. The command line
+brings them together.
 """
 
 from __future__ import annotations
@@ -19,9 +21,9 @@ from cosfly.products.playback import Flight
 class ShownCaption:
     """One caption of a flight. frame_index: its current frame; window: indices of what its prompt shows, as it says.
 
-    prompts, systems: user prompts by language and what stood before each, empty where none is shown. picture_px: (width, height).
-    states: by language, of its sentences, as its record says; empty where it does not say. evidence: what they follow from, as JSON; None
-    where it is not shown.
+    prompts, systems: user prompts by language and what stood before each, empty where none is shown. picture_px:
+    (width, height). states: by language, of its sentences, as its record says; empty where it does not say. evidence:
+    what they follow from, as JSON; None where it is not shown.
     """
 
     sample_id: str
@@ -42,10 +44,12 @@ class ShownCaption:
 
 @dataclass(frozen=True)
 class ShownFlight:
-    """A flight as far as it is released. flight: of the frames `frame_indices` (n,), in order, which may have gaps; styles: (n,).
+    """A flight as far as it is released. flight: of the frames `frame_indices` (n,), in order, which may have gaps;
+    styles: (n,).
 
     twin: the clean flight of a perturbed one, of the same frames; None where it is not released or shows others.
-    settings: the captions' own, as they are on record; empty: the defaults. prompts: their questions, where these do not ship.
+    settings: the captions' own, as they are on record; empty: the defaults. prompts: their questions, where these do
+    not ship.
     """
 
     flight: Flight

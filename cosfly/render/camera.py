@@ -1,4 +1,4 @@
-"""What a camera sees: which spheres at all; the target in the picture, its box and depth, and how much of it the depth image shows (sec:step6)."""
+"""What a camera sees: which spheres; the target, its box and depth, and how much of it is seen (sec:step6)."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count(
 class TargetView:
     """Where the target is in one frame.
 
-    uv: (2,) px of the hip point, NaN behind the camera. depth_m: z-depth of the hip point. box_px: (4,) xmin, ymin, xmax, ymax of
-    the projected box, not clipped, NaN where all of it is behind the camera. bbox_px: (4,) the same clipped to the image, NaN
-    where none of it is inside.
+    uv: (2,) px of the hip point, NaN behind the camera. depth_m: z-depth of the hip point. box_px: (4,) xmin, ymin,
+    xmax, ymax of the projected box, not clipped, NaN where all of it is behind the camera. bbox_px: (4,) the same
+    clipped to the image, NaN where none of it is inside.
     """
 
     uv: np.ndarray
@@ -92,9 +92,9 @@ def rendered_visibility(
 ) -> tuple[float, int]:
     """How much of the target a frame shows.
 
-    The score is the share of the target's projected 3D box that nothing hides: at each pixel centre the box's near side, computed,
-    is compared with the depth image; where the person itself was drawn the box is visible. What lies outside the image counts
-    as hidden.
+    The score is the share of the target's projected 3D box that nothing hides: at each pixel centre the box's near
+    side, computed, is compared with the depth image; where the person itself was drawn the box is visible. What lies
+    outside the image counts as hidden.
 
     Returns:
         Score in [0, 1], and the number of pixels of the person in the whole mask.
@@ -121,8 +121,8 @@ def _rays_to_box(
     """Look at the target's box through pixel centres.
 
     Returns:
-        how many rays enter the box, those outside the image included; and for each inside the image, (k,), the id of what was drawn
-        in front of the box, NOT_HIDDEN where that is nothing or the person.
+        how many rays enter the box, those outside the image included; and for each inside the image, (k,), the id of
+        what was drawn in front of the box, NOT_HIDDEN where that is nothing or the person.
     """
     nothing = 0, np.empty(0, np.int64)
     if not view.in_view:
@@ -144,12 +144,17 @@ def _rays_to_box(
 
 
 @njit(cache=True, nogil=True)
-def spheres_in_view(centers, radii, min_px, max_px, eye, turn, tangents, slants, focal_px):  # type: ignore[no-untyped-def]
-    """Find the spheres that a camera may see, whose radius on the image lies in [min_px, max_px): one pass over all that a map has.
+def spheres_in_view(  # type: ignore[no-untyped-def]
+    centers, radii, min_px, max_px, eye, turn, tangents, slants, focal_px
+):
+    """Find the spheres that a camera may see, whose radius on the image lies in [min_px, max_px): one pass over all
+    that a map has.
 
     Args:
-        centers: (k, 3) float32 m; radii, min_px, max_px: (k,) float32; eye: (3,) float32 m; turn: (3, 3) float32, world_from_camera.
-        tangents, slants: (2,) float64, of the widest angles to the sides and up: tangent, and 1 / cosine. focal_px: float.
+        centers: (k, 3) float32 m; radii, min_px, max_px: (k,) float32; eye: (3,) float32 m; turn: (3, 3) float32,
+            world_from_camera.
+        tangents, slants: (2,) float64, of the widest angles to the sides and up: tangent, and 1 / cosine. focal_px:
+            float.
     Returns:
         rows (n,) int64, in their order; (n,) float32 m, how far along the axis each begins.
     """

@@ -5,7 +5,7 @@ Any renderer draws the same things in the same places, so that depth, kinds and 
 - every box, or something of its kind that stays inside it, with its id of `instance_ids`; the person with PERSON_ID;
 - others that move, people and cars, each with the id that the caller gives it (`other_id`), nobody else's;
 - of a tree that is one box a stem, and foliage only from `crown_low` of `plants_of` up: people walk under it;
-- a ground plane of Terrain under everything (`ground_plane`), or, where the ground slopes, its triangles and the surfaces on it
+- a ground plane of Terrain under everything (`ground_plane`) or, on ground that slopes, its triangles and surfaces
   (draping.py) with the plane below their lowest place; and sky where nothing stands between NEAR_M and FAR_M;
 - of coplanar surfaces the one of the higher layer, and of one layer always the same one (draping.py).
 """
@@ -40,7 +40,8 @@ LAYERS = {"Terrain": 1, "Ground": 2, "Water": 2, "Roads": 3, "RailTrack": 4, "Ro
 STANDING_LAYER = 7
 LAWN_HALF_M = 0.2  # vegetation of a smaller half height is a lawn; it lies in the layer of road lines
 
-# What a box of vegetation is drawn as. Lawns, hedges and trunks fill their box, the others are round, the last two on a stem.
+# What a box of vegetation is drawn as. Lawns, hedges and trunks fill their box, the others are round, the last two on a
+# stem.
 LAWN, HEDGE, TRUNK, BUSH, CROWN, CONIFER, BROADLEAF = range(7)
 CONIFER_LOW = -0.78  # of a conifer's half height
 
@@ -72,8 +73,8 @@ class Clothes:
 
 @dataclass(frozen=True)
 class PosedPerson:
-    """One person of 1.8 m in one moment. hip_m (3,) world, the middle of the target's box, whose bottom the feet stand on;
-    phase_rad of the stride, two steps to a turn; swing from 0, standing, to 1, walking.
+    """One person of 1.8 m in one moment. hip_m (3,) world, the middle of the target's box, whose bottom the feet stand
+    on; phase_rad of the stride, two steps to a turn; swing from 0, standing, to 1, walking.
     """
 
     hip_m: np.ndarray
@@ -85,7 +86,7 @@ class PosedPerson:
 
 @dataclass(frozen=True)
 class PosedCar:
-    """One car in one moment: its box's middle center_m (3,) world, half_extents_m with x along the heading; seed in [0, 1) paints it."""
+    """One car in one moment: its box's middle (3,) world, half sizes, x along the heading; seed in [0, 1) paints it."""
 
     center_m: np.ndarray
     heading_rad: float
@@ -107,7 +108,8 @@ class PosedOther:
 
 
 class Renderer(Protocol):
-    """Draws frames of one map. `RENDERERS[name](box_map, width_px, height_px, look, num_others)` opens one; used from one thread.
+    """Draws frames of one map. `RENDERERS[name](box_map, width_px, height_px, look, num_others)` opens one; used from
+    one thread.
 
     num_others: ids of `other_id` that no box may have.
 
@@ -117,7 +119,8 @@ class Renderer(Protocol):
     device: str
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
-        """Get ready for a flight within these corners, (3,) each, in this weather or, without one, in the look: shadows and the like.
+        """Get ready for a flight within these corners, (3,) each, in this weather or, without one, in the look: shadows
+        and the like.
 
         Weather changes colours alone, never depth, kinds and ids.
 
@@ -152,15 +155,15 @@ def other_id(number: int) -> int:
 
 
 def has_own_ids(box_map: BoxMap, num_others: int = 0) -> bool:
-    """Tell whether the boxes' own ids can be their ids in `instance.png`: they lie in 1..MAX_BOX_ID, and none is an other's."""
+    """Tell whether boxes can keep their ids in `instance.png`: all in 1..MAX_BOX_ID, and none an other's."""
     return bool(((box_map.ids >= 1) & (box_map.ids <= MAX_BOX_ID - num_others)).all())
 
 
 def instance_ids(box_map: BoxMap, num_others: int = 0) -> np.ndarray:
     """Give every box its id for `instance.png`, (n,) uint16 in the map's order.
 
-    The boxes' own ids are used if they can be. Otherwise ids are counted from 1, first through the boxes that are not vegetation,
-    then through the vegetation, each in the map's order; boxes left over share SHARED_ID.
+    The boxes' own ids are used if they can be. Otherwise ids are counted from 1, first through the boxes that are not
+    vegetation, then through the vegetation, each in the map's order; boxes left over share SHARED_ID.
     """
     if has_own_ids(box_map, num_others):
         return box_map.ids.astype(np.uint16)
@@ -178,7 +181,7 @@ def scene_origin(box_map: BoxMap) -> np.ndarray:
 
 
 def plane_z_m(box_map: BoxMap) -> float:
-    """Height of the ground plane: the map's own figure, but never above a slab that covers it; the lowest height of ground that slopes."""
+    """Height of the ground plane: the map's own, never above a slab that covers it; on a slope the lowest height."""
     if not box_map.ground.is_flat:
         return float(box_map.ground.heights_m.min())
     tops = box_map.maxs[np.isin(box_map.kinds, list(GROUND_KINDS)), 2]
@@ -198,8 +201,8 @@ def plants_of(centers_m: np.ndarray, half_m: np.ndarray, seeds: np.ndarray) -> t
     Args:
         centers_m, half_m: (n, 3); seeds: (n,), `seeds_of` their ids.
     Returns:
-        forms (n,), LAWN .. BROADLEAF; crown_low (n,): where foliage begins, in units of the half height, -1 the box's bottom. What
-        is under it is a stem of `stem_radius_m` along the box's axis, and air.
+        forms (n,), LAWN .. BROADLEAF; crown_low (n,): where foliage begins, in units of the half height, -1 the box's
+        bottom. What is under it is a stem of `stem_radius_m` along the box's axis, and air.
     """
     hx, hy, hz = half_m.T
     wide, narrow = np.maximum(hx, hy), np.minimum(hx, hy)

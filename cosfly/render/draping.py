@@ -1,7 +1,8 @@
-"""Surfaces laid on ground that slopes: what both renderers draw in place of the flat ground plane and the flat slabs on it.
+"""Surfaces laid on ground that slopes: what both renderers draw in place of the flat ground plane and the flat slabs on
+it.
 
-The ground is its own triangles. Each surface is its box's outline cut out of them, so that it lies in the ground everywhere; which of
-several surfaces in one place is seen is the matter of their layers.
+The ground is its own triangles. Each surface is its box's outline cut out of them, so that it lies in the ground
+everywhere; which of several surfaces in one place is seen is the matter of their layers.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ MIN_HALF_EXTENT_M = 1e-3
 
 
 @dataclass(frozen=True)
-class Draped:
-    """Triangles on the ground, k of them: corners_m (k, 3, 3) world, counter-clockwise from above; rows (k,) of the map's boxes, or BARE_GROUND."""
+class DrapedSurfaces:
+    """Triangles on the ground, k of them: corners_m (k, 3, 3) world, counter-clockwise from above; rows (k,) of the
+    map's boxes, or BARE_GROUND."""
 
     corners_m: np.ndarray
     rows: np.ndarray
@@ -37,13 +39,13 @@ class Draped:
 
 
 def is_draped(box_map: BoxMap) -> np.ndarray:
-    """Tell which boxes are surfaces that lie on sloping ground, (n,) bool; a flyover's deck does not, and no box of a flat map."""
+    """Tell which boxes lie on sloping ground, (n,) bool: not a flyover's deck, and no box of a flat map."""
     if box_map.ground.is_flat:
         return np.zeros(len(box_map), dtype=bool)
     return box_map.is_any_of(DRAPED_KINDS) & ~lies_off_ground(box_map, DRAPED_KINDS)
 
 
-def drape(box_map: BoxMap) -> Draped:
+def drape(box_map: BoxMap) -> DrapedSurfaces:
     """Lay the ground and the surfaces of a map on its heights.
 
     Raises:
@@ -70,7 +72,7 @@ def drape(box_map: BoxMap) -> Draped:
         triangles = bare[np.concatenate([2 * cells, 2 * cells + 1])]
         pieces.append(_cut(triangles, frames[k], halves[k]))
         owners.append(np.full(len(pieces[-1]), row))
-    return Draped(np.concatenate(pieces), np.concatenate(owners))
+    return DrapedSurfaces(np.concatenate(pieces), np.concatenate(owners))
 
 
 def _cut(triangles: np.ndarray, frame: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -104,13 +106,14 @@ def _cut(triangles: np.ndarray, frame: np.ndarray, half: np.ndarray) -> np.ndarr
 # --- layers -----------------------------------------------------------------------------------------------------------
 # Which of several surfaces in one plane is seen: the higher layer of their kinds; of one layer always the same one.
 #
-# Two roads that cross at one height are one plane for a depth buffer: rounding would decide pixel by pixel whose paint and id show
-# (Z-fighting). So surfaces that overlap in one layer get tiers in it, as few as do.
+# Two roads that cross at one height are one plane for a depth buffer: rounding would decide pixel by pixel whose paint
+# and id show (Z-fighting). So surfaces that overlap in one layer get tiers in it, as few as do.
 
 
 SAME_HEIGHT_M = 0.005  # a layer moves the depth test by 3 mm at 30 m
 EDGE_M = 0.01  # surfaces that share no more than an edge do not fight
-MOST_TIERS = 8  # in a layer, as many as meet at a junction of SimWorld; float32 depth tells an eighth of one from the next at 50 m
+# in a layer, as many as meet at a junction of SimWorld; float32 depth tells an eighth of one from the next at 50 m
+MOST_TIERS = 8
 CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
@@ -124,7 +127,7 @@ def layers_of(box_map: BoxMap) -> np.ndarray:
 
 
 def _tiers(box_map: BoxMap, layers: np.ndarray) -> np.ndarray:
-    """Give each surface the lowest tier that no earlier one has that it overlaps, (n,) in [0, 1); beyond MOST_TIERS the highest."""
+    """Give each surface the lowest tier that is free of earlier ones, (n,) in [0, 1); beyond MOST_TIERS the highest."""
     tiers = np.zeros(len(box_map), dtype=int)
     for row, others in _overlaps(box_map, layers).items():  # in the map's order, so that those before have theirs
         free = np.setdiff1d(np.arange(MOST_TIERS), tiers[others])
@@ -133,7 +136,7 @@ def _tiers(box_map: BoxMap, layers: np.ndarray) -> np.ndarray:
 
 
 def _overlaps(box_map: BoxMap, layers: np.ndarray) -> dict[int, list[int]]:
-    """Give of surfaces, in order, the earlier ones that lie in the same layer, plane and place; those that overlap none are left out."""
+    """Give of surfaces that overlap others the earlier ones in the same layer, plane and place, in order."""
     rows = np.flatnonzero((layers < STANDING_LAYER) & ~box_map.rotations_deg[:, [0, 2]].any(axis=1))
     yaws = np.radians(box_map.rotations_deg[rows, 1])[:, None]
     x, y = np.moveaxis(np.maximum(box_map.half_extents[rows, None, :2] - EDGE_M, 0.0) * CORNERS, 2, 0)

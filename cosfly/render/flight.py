@@ -1,4 +1,4 @@
-"""One flight to one folder of the playback tree: draw, annotate, encode, write. PNG encoding runs beside the drawing."""
+"""One flight to one folder of the playback tree: draw, annotate, encode, write; encoding runs beside the drawing."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from cosfly.reading.files import sha256_file
 from cosfly.render.camera import TargetView, hidden_shares, rendered_visibility, view_target
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
 from cosfly.render.person import Cast, Gait
-from cosfly.render.perturbation import HIDDEN, STEP_UP_M, Perturbed, Poses, Surroundings
+from cosfly.render.perturbation import HIDDEN, STEP_UP_M, PerturbedTrack, Poses, Surroundings
 from cosfly.space.kernels import signed_distances
 from cosfly.work.runner import advance
 from cosfly.work.store import sha256_bytes, storage_errors, write_checksums, write_json
@@ -70,14 +70,14 @@ FRAMES_IN_FLIGHT = 6  # drawn but not written yet: bounds the memory (about 10 M
 
 @dataclass(frozen=True)
 class FlightScript:
-    """All that is drawn in one flight, n frames, before a pixel is drawn. cameras: of each frame. source: who planned it; segments, mission: what it was to be."""
+    """All that is drawn in one flight, n frames. cameras: of each frame. source: who planned it."""
 
     town: str
     trajectory: str
     variant: str
     cameras: tuple[Camera, ...]
     time_s: np.ndarray
-    perturbed: Perturbed
+    perturbed: PerturbedTrack
     gait: Gait
     clothes: Clothes
     others: Cast
@@ -90,8 +90,8 @@ class FlightScript:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """The target in one drawn frame: where its box is, the box of its pixels (4,), score and pixels as `rendered_visibility` gives."""
+class TargetSight:
+    """The target in one drawn frame: its box, the box of its pixels (4,), and what `rendered_visibility` gives."""
 
     view: TargetView
     mask_bbox_px: np.ndarray
@@ -114,7 +114,8 @@ class Writing:
 def render_flight(
     renderer: Renderer, script: FlightScript, folder: Path, writing: Writing, num_threads: int = 2
 ) -> Flight:
-    """Draw a flight into an (unfinished) folder: frames, `trajectory.json`, `perturbation_report.json`, `checksums.sha256`.
+    """Draw a flight into an (unfinished) folder: frames, `trajectory.json`, `perturbation_report.json`,
+    `checksums.sha256`.
 
     A shift that hides a target which is seen without it falls back: only the drawn frame can tell.
 
@@ -158,7 +159,9 @@ def render_flight(
     return flight
 
 
-def draw_frame(renderer: Renderer, script: FlightScript, i: int, poses: Poses, threshold: float) -> tuple[Frame, Seen]:
+def draw_frame(
+    renderer: Renderer, script: FlightScript, i: int, poses: Poses, threshold: float
+) -> tuple[Frame, TargetSight]:
     """Draw frame i from the given poses and see what shows of the target."""
     pose, target = world_from_camera(poses.positions_m[i], poses.rotations_deg[i]), poses.targets_m[i]
     camera = script.cameras[i]
@@ -173,14 +176,14 @@ def draw_frame(renderer: Renderer, script: FlightScript, i: int, poses: Poses, t
         ids = np.array([other.instance_id for other in others])
         hidden = hidden_shares(frame, target, view, pose, camera, ids)
         told = script.others.meta(i, frame, *hidden)
-    return frame, Seen(view, mask_box(frame.ids == PERSON_ID), score, num_px, is_visible, told)
+    return frame, TargetSight(view, mask_box(frame.ids == PERSON_ID), score, num_px, is_visible, told)
 
 
 # --- files of one frame -----------------------------------------------------------------------------------------------
 
 
 def _write_frame(folder: Path, name: str, frame: Frame, meta: FrameMeta, writing: Writing) -> dict[str, str]:
-    """Encode and write one frame; gives file name -> sha256. Runs beside the drawing: OpenCV and hashing release the lock."""
+    """Encode and write one frame, beside the drawing; gives file name -> sha256."""
     makers: dict[FrameFile, Callable[[], tuple[str, bytes]]] = {
         "rgb": lambda: (frames.FILE_NAMES["rgb"], frames.rgb_bytes(frame.rgb)),
         "depth": lambda: frames.depth_file(frame.depth, writing.depth_format),
@@ -203,7 +206,7 @@ def _write_frame(folder: Path, name: str, frame: Frame, meta: FrameMeta, writing
 # --- annotations ------------------------------------------------------------------------------------------------------
 
 
-def _annotation(script: FlightScript, i: int, seen: Seen) -> FrameMeta:
+def _annotation(script: FlightScript, i: int, seen: TargetSight) -> FrameMeta:
     perturbed, view = script.perturbed, seen.view
     return FrameMeta(
         index=i,
@@ -243,7 +246,7 @@ def _list_or_none(values: np.ndarray) -> list[float] | None:
     return None if np.isnan(values).any() else values.tolist()
 
 
-def _report(perturbed: Perturbed) -> dict:
+def _report(perturbed: PerturbedTrack) -> dict:
     """`perturbation_report.json`: how often each event happened, and how near the drone came to an obstacle."""
     outcomes = {event: Counter(state[event] for state in perturbed.states) for event in ("position", "rotation")}
     return {

@@ -1,4 +1,4 @@
-"""Which field of view each frame of a flight has: one level for all of it, or levels that change smoothly between its parts."""
+"""Which field of view each frame of a flight has: one level, or levels that change smoothly between its parts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ class ZoomConfig(Config):
 
     mode: Literal["fixed", "dynamic"] = Field(
         "fixed",
-        description="fixed: a flight keeps the level that it drew; dynamic: each of its parts draws one, and each frame's own "
+        description="fixed: a flight keeps the level that it drew; dynamic: each of its parts draws one, and each "
+        "frame's own "
         "intrinsics stand in its meta.json and its point of trajectory.json",
     )
     part_s: float = Field(
@@ -40,8 +41,8 @@ def cameras_of(
     """Give the camera of each frame of a flight.
 
     Args:
-        size_px: (width, height). first_deg: the level that the flight drew. fovs_deg: all levels. time_s: (n,). rng: draws those of the parts
-            after the first.
+        size_px: (width, height). first_deg: the level that the flight drew. fovs_deg: all levels. time_s: (n,). rng:
+            draws those of the parts after the first.
     """
     if zoom.mode == "fixed":
         return (Camera(*size_px, intrinsic_matrix(*size_px, first_deg)),) * len(time_s)

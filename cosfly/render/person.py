@@ -1,4 +1,4 @@
-"""The walking person in numbers, as every renderer is given it: the gait along a flight, and clothes drawn once for each flight."""
+"""The walking person in numbers, as every renderer is given it: the gait along a flight, and clothes."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ STRIDE_M = 1.35  # two steps
 SLOW_MPS = 0.7  # below this speed the swing shrinks, down to standing
 
 SHIRTS = np.array([
-    [0.55, 0.04, 0.04], [0.03, 0.16, 0.45], [0.62, 0.58, 0.50], [0.60, 0.36, 0.02], [0.03, 0.28, 0.14], [0.28, 0.05, 0.26],
-    [0.68, 0.14, 0.02], [0.02, 0.25, 0.30],
+    [0.55, 0.04, 0.04], [0.03, 0.16, 0.45], [0.62, 0.58, 0.50], [0.60, 0.36, 0.02], [0.03, 0.28, 0.14],
+    [0.28, 0.05, 0.26], [0.68, 0.14, 0.02], [0.02, 0.25, 0.30],
 ])  # fmt: skip
 TROUSERS = np.array(
     [[0.03, 0.05, 0.11], [0.03, 0.03, 0.035], [0.20, 0.16, 0.11], [0.10, 0.11, 0.12], [0.07, 0.10, 0.19]]
@@ -47,7 +47,7 @@ class Gait:
 
 
 def gait_of(targets_m: np.ndarray, time_s: np.ndarray) -> Gait:
-    """Read heading and stride from the target's positions, (n, 3), at times (n,). A standing person keeps the last heading."""
+    """Read heading and stride from positions, (n, 3), at times (n,). A standing person keeps the last heading."""
     n = len(targets_m)
     if n == 1:
         return Gait(np.zeros(1), np.zeros(1), np.zeros(1))

@@ -1,8 +1,9 @@
 """The perturbed track (app:dual_track): small random shifts of person, drone and view, frame by frame, with a way back.
 
-Each frame draws two independent events. *Position*: the person is shifted on the ground and the drone in space. *Rotation*: the
-camera looks at a point beside the person, at most theta_max off per axis. A shift that puts person or drone too near an obstacle,
-the person out of the picture or, once it is drawn, out of sight, is not made, and the frame says so.
+Each frame draws two independent events. *Position*: the person is shifted on the ground and the drone in space.
+*Rotation*: the camera looks at a point beside the person, at most theta_max off per axis. A shift that puts person or
+drone too near an obstacle, the person out of the picture or, once it is drawn, out of sight, is not made, and the frame
+says so.
 """
 
 from __future__ import annotations
@@ -54,7 +55,8 @@ class PerturbationConfig(Config):
     min_clearance_m: float = Field(
         SAFETY_DISTANCE_M,
         ge=0,
-        description="distance that a shifted drone keeps from obstacles, m; where the plan is nearer, as far as the plan",
+        description="distance that a shifted drone keeps from obstacles, m; where the plan is nearer, as far as the "
+        "plan",
     )
     frame_margin: float = Field(
         0.02, ge=0, lt=0.5, description="share of the image at each border where the person may not be"
@@ -63,7 +65,8 @@ class PerturbationConfig(Config):
 
 @dataclass(frozen=True)
 class Poses:
-    """What is drawn, n frames. positions_m, rotations_deg (pitch, yaw, roll), targets_m: (n, 3), the person's hip point.
+    """What is drawn, n frames. positions_m, rotations_deg (pitch, yaw, roll), targets_m: (n, 3), the person's hip
+    point.
 
     clearances_m: (n,) from the drone to the nearest obstacle, CLEARANCE_CAP_M at most.
     """
@@ -75,12 +78,13 @@ class Poses:
 
 
 @dataclass(frozen=True)
-class Perturbed:
+class PerturbedTrack:
     """The perturbed poses, and for each frame what happened.
 
-    drone_offsets_m, target_offsets_m, rotation_offsets_deg: (n, 3), zero where nothing was applied; the rotation offset is the
-    turn away from the person, after the camera was aimed at it anew. states: (n,) {"position", "rotation"}, each none | applied |
-    or the reason for falling back. unshifted: the same frames with their rotation events alone, which a shift falls back to.
+    drone_offsets_m, target_offsets_m, rotation_offsets_deg: (n, 3), zero where nothing was applied; the rotation offset
+    is the turn away from the person, after the camera was aimed at it anew. states: (n,) {"position", "rotation"}, each
+    none | applied | or the reason for falling back. unshifted: the same frames with their rotation events alone, which
+    a shift falls back to.
     """
 
     poses: Poses
@@ -88,10 +92,10 @@ class Perturbed:
     target_offsets_m: np.ndarray
     rotation_offsets_deg: np.ndarray
     states: list[dict[str, str]]
-    unshifted: Perturbed | None = None
+    unshifted: PerturbedTrack | None = None
 
     @classmethod
-    def nothing(cls, planned: Poses) -> Perturbed:
+    def nothing(cls, planned: Poses) -> PerturbedTrack:
         """The poses as they were planned."""
         n = len(planned.positions_m)
         states = [{"position": NONE, "rotation": NONE} for _ in range(n)]
@@ -115,7 +119,8 @@ class Perturbed:
 
 
 class Surroundings:
-    """What a shifted person or drone may touch: the obstacles, and the ground's height from the map's surfaces or heights. Made once for a map."""
+    """What a shifted person or drone may touch: the obstacles, and the ground's height from the map's surfaces or
+    heights. Made once for a map."""
 
     def __init__(self, box_map: BoxMap) -> None:
         self.obstacles, self._ground = obstacle_index(box_map), box_map.ground
@@ -126,14 +131,15 @@ class Surroundings:
         self._plane_m = plane_z_m(box_map)
 
     def surface_z_m(self, x_m: float, y_m: float, near_z_m: float) -> float:
-        """Top of the highest surface there within STEP_UP_M of `near_z_m`; `near_z_m` itself where there is none. On a slope, the ground."""
+        """Top of the highest surface there within STEP_UP_M of `near_z_m`; `near_z_m` itself where there is none. On a
+        slope, the ground."""
         if not self._ground.is_flat:
             return float(self._ground.height_at(np.array([[x_m, y_m]]))[0])
         over = self._slabs_at(x_m, y_m) & (np.abs(self._tops - near_z_m) <= STEP_UP_M)
         return float(self._tops[over].max()) if over.any() else near_z_m
 
     def below_ground_m(self, place_m: np.ndarray) -> float:
-        """How deep a place, (3,), lies in the ground, 0 where it does not: in a slab of it, under the lowest of it, or under a slope."""
+        """How deep a place, (3,), lies in the ground, 0 where it does not: in or under its slabs, or under a slope."""
         x_m, y_m, z_m = place_m.tolist()
         if not self._ground.is_flat:
             return max(0.0, float(self._ground.height_at(place_m[None])[0]) - z_m)
@@ -154,10 +160,10 @@ def perturb(
     cfg: PerturbationConfig,
     rng: np.random.Generator,
     others: Cast = NOBODY,
-) -> Perturbed:
-    """Perturb every frame of a flight, seen through its camera. The same number of random draws is used for every frame, whatever happens in it."""
-    unshifted = Perturbed.nothing(planned)
-    result = replace(Perturbed.nothing(planned), unshifted=unshifted)
+) -> PerturbedTrack:
+    """Perturb every frame of a flight, seen through its camera; each takes the same number of random draws."""
+    unshifted = PerturbedTrack.nothing(planned)
+    result = replace(PerturbedTrack.nothing(planned), unshifted=unshifted)
     draws = shift_draws(
         rng,
         person_radius_m=cfg.pedestrian_radius_m,
@@ -178,7 +184,7 @@ def perturb(
 
 
 def _shift(
-    result: Perturbed, planned: Poses, i: int, person_offset: np.ndarray, drone_offset: np.ndarray, camera: Camera,
+    result: PerturbedTrack, planned: Poses, i: int, person_offset: np.ndarray, drone_offset: np.ndarray, camera: Camera,
     surroundings: Surroundings, cfg: PerturbationConfig, others: Cast,
 ) -> str:  # fmt: skip
     """Apply one frame's position event and say so, or say why not."""
@@ -209,7 +215,7 @@ def _shift(
     return APPLIED
 
 
-def _turn(result: Perturbed, i: int, view_offset: np.ndarray, camera: Camera, cfg: PerturbationConfig) -> None:
+def _turn(result: PerturbedTrack, i: int, view_offset: np.ndarray, camera: Camera, cfg: PerturbationConfig) -> None:
     """Apply one frame's rotation event to whatever pose the frame has, or note why not."""
     drone, target = result.poses.positions_m[i], result.poses.targets_m[i]
     turn = wrap_deg(_aim_deg(drone, target + view_offset) - _aim_deg(drone, target))

@@ -1,8 +1,9 @@
-"""The second renderer, a cross-check of the default one: plain boxes, trees and a plain figure through trimesh and pyrender (EGL).
+"""The second renderer, a cross-check of the default one: plain boxes, trees and a plain figure through trimesh and
+pyrender (EGL).
 
-Slower by an order of magnitude and without shadows; what matters is that depth, kinds and ids are right. Each frame is drawn three
-times in pyrender's segmentation mode, with our own two shaders: tags, colours, and the float32 bits of the depth. The depth
-that pyrender itself gives comes from a multisampled 24-bit buffer and is wrong by centimetres at 30 m.
+Slower by an order of magnitude and without shadows; what matters is that depth, kinds and ids are right. Each frame is
+drawn three times in pyrender's segmentation mode, with our own two shaders: tags, colours, and the float32 bits of the
+depth. The depth that pyrender itself gives comes from a multisampled 24-bit buffer and is wrong by centimetres at 30 m.
 """
 
 from __future__ import annotations
@@ -32,9 +33,10 @@ SKY_COLOR = np.array([0.52, 0.64, 0.78])  # also the haze's, linear RGB like all
 AMBIENT = 0.45  # share of a surface's colour that the sky lights; the sun adds the rest to what faces it
 PLAIN_COLOR, STEM_COLOR = (0.42, 0.40, 0.37), (0.16, 0.11, 0.075)
 COLORS = {
-    "Roads": (0.11, 0.11, 0.115), "Sidewalks": (0.36, 0.345, 0.32), "Buildings": (0.50, 0.38, 0.29), "Vegetation": (0.09, 0.165, 0.04),
-    "Terrain": (0.105, 0.14, 0.045), "Ground": (0.24, 0.21, 0.16), "Water": (0.05, 0.12, 0.16), "RoadLines": (0.66, 0.66, 0.63),
-    "Car": (0.30, 0.05, 0.05), "Truck": (0.05, 0.10, 0.26), "Bus": (0.62, 0.44, 0.05), "Poles": (0.18, 0.18, 0.19),
+    "Roads": (0.11, 0.11, 0.115), "Sidewalks": (0.36, 0.345, 0.32), "Buildings": (0.50, 0.38, 0.29),
+    "Vegetation": (0.09, 0.165, 0.04), "Terrain": (0.105, 0.14, 0.045), "Ground": (0.24, 0.21, 0.16),
+    "Water": (0.05, 0.12, 0.16), "RoadLines": (0.66, 0.66, 0.63), "Car": (0.30, 0.05, 0.05),
+    "Truck": (0.05, 0.10, 0.26), "Bus": (0.62, 0.44, 0.05), "Poles": (0.18, 0.18, 0.19),
 }  # fmt: skip
 CAR_PAINTS = ((0.30, 0.05, 0.05), (0.05, 0.10, 0.26), (0.50, 0.50, 0.50), (0.04, 0.04, 0.045))
 
@@ -70,7 +72,7 @@ def _open_screen(width_px: int, height_px: int) -> Any:
 
 
 def _keep_display(platform: Any) -> None:
-    """Let closing end this context alone: pyrender would terminate the display, which all contexts of the process share."""
+    """Let closing end this context alone: pyrender would end the display, which all contexts share."""
     from OpenGL.EGL import eglDestroyContext
 
     platform.delete_context = lambda: eglDestroyContext(platform._egl_display, platform._egl_context)
@@ -171,7 +173,7 @@ def _tags(kinds: np.ndarray, ids: np.ndarray, layers: np.ndarray) -> np.ndarray:
 
 
 def _all_boxes(box_map: BoxMap, origin: np.ndarray, num_others: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles, colours and tags of every box and of the ground plane; crowns are ellipsoids, on stems that end in their middle."""
+    """Triangles, colours and tags of every box and the ground plane; crowns are ellipsoids, on stems."""
     import trimesh
 
     center, half = contract.ground_plane(box_map)

@@ -19,24 +19,28 @@ class RenderConfig(WeatherConfig):
 
     backend: Literal["gl", "pyrender"] = Field(
         "gl",
-        description="renderer; gl is OpenGL without a window, on a GPU or the CPU; pyrender is a plain and slow cross-check",
+        description="renderer; gl is OpenGL without a window, on a GPU or the CPU; pyrender is a plain and slow "
+        "cross-check",
     )
     width_px: int = Field(1280, ge=16, le=8192, description="image width, px")
     height_px: int = Field(720, ge=16, le=8192, description="image height, px")
     fovs_deg: tuple[float, ...] = Field(
         (110.0, 90.0, 60.0, 30.0),
         min_length=1,
-        description="levels of zoom: horizontal fields of view in (0, 180) degrees; one is drawn for each walk, and both its tracks keep it; a list of one fixes it",
+        description="levels of zoom: horizontal fields of view in (0, 180) degrees; one is drawn for each walk, and "
+        "both its tracks keep it; a list of one fixes it",
     )
     zoom: ZoomConfig = Field(ZoomConfig(), description="whether a flight changes its level")
     town: str | None = Field(
         None,
-        description="name of the town; null takes the map's. Its folder has `Town_` in front unless it begins with `Town`",
+        description="name of the town; null takes the map's. Its folder has `Town_` in front unless it begins with "
+        "`Town`",
     )
     first_timestamp: int | None = Field(
         None,
         ge=0,
-        description="flight k of the traces becomes trajectory_<first_timestamp + k>; null makes one of map, flights, seed and "
+        description="flight k of the traces becomes trajectory_<first_timestamp + k>; null makes one of map, "
+        "flights, seed and "
         "settings, so that flights of other maps and runs have other ids",
     )
     tracks: tuple[Literal["clean", "perturbed"], ...] = Field(

@@ -1,4 +1,4 @@
-"""Boxes that are drawn as meshes: what both renderers draw in their place. Planners, visibility and inspection know the boxes alone."""
+"""Boxes that are drawn as meshes: what both renderers draw in their place; everybody else knows the boxes alone."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from cosfly.products.boxes import BoxMap
 
 @dataclass(frozen=True)
 class Solids:
-    """Triangles of meshes in the world, k of them, each on its own: corners_m (k, 3, 3), counter-clockwise from outside; rows (k,) of the
-    boxes whose id and kind they show; colors (k, 3) linear RGB, NaN where the kind's own is taken; things (k,) ascending, a number for each
-    mesh that stands somewhere.
+    """Triangles of meshes in the world, k of them, each on its own: corners_m (k, 3, 3), counter-clockwise from
+    outside; rows (k,) of the boxes whose id and kind they show; colors (k, 3) linear RGB, NaN where the kind's own is
+    taken; things (k,) ascending, a number for each mesh that stands somewhere.
     """
 
     corners_m: np.ndarray

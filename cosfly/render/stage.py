@@ -28,7 +28,7 @@ from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, 
 from cosfly.render.flight import FlightScript, Writing, check_flight, render_flight
 from cosfly.render.lens import cameras_of
 from cosfly.render.person import NOBODY, Cast, cast_of, choose_clothes, gait_of
-from cosfly.render.perturbation import Perturbed, Poses, Surroundings, perturb
+from cosfly.render.perturbation import PerturbedTrack, Poses, Surroundings, perturb
 from cosfly.render.settings import RenderConfig
 from cosfly.render.weather import coverage_of, drawn_seed, read_pools, told_coverage, weather_of
 from cosfly.work.chance import rng_for
@@ -74,7 +74,7 @@ def script_flight(
     others: Cast = NOBODY,
     weather: WeatherRecord | None = None,
 ) -> FlightScript:
-    """Decide everything about one flight before a pixel is drawn. Both tracks of a trace share field of view, clothes and weather."""
+    """Decide everything about one flight. Both tracks of a trace share field of view, clothes and weather."""
     assert cfg.first_timestamp is not None, "`run` settles it"
     shared = rng_for(seed, "render", trace.path_id)
     fov_deg = float(cfg.fovs_deg[int(shared.integers(len(cfg.fovs_deg)))])
@@ -87,7 +87,7 @@ def script_flight(
         rng = rng_of_shifts(seed, trace.path_id)
         perturbed = perturb(planned, cameras, surroundings, cfg.perturbation, rng, others)
     else:
-        perturbed = Perturbed.nothing(planned)
+        perturbed = PerturbedTrack.nothing(planned)
     return FlightScript(
         town=town,
         trajectory=f"{TRAJECTORY}{cfg.first_timestamp + number}",
@@ -129,13 +129,14 @@ def run(
     resume: Resume = "if-same",
     others: Path | None = None,
 ) -> Path:
-    """Reads `boxes_3d.json` (drawn), `step2_simplified.json` (clearance), `drone_trace.json` and, where others move, `others.json`; writes
-    the playback tree.
+    """Reads `boxes_3d.json` (drawn), `step2_simplified.json` (clearance), `drone_trace.json` and, where others move,
+    `others.json`; writes the playback tree.
 
     Flights that the planner's prefilter dropped are not drawn; the manifest counts them. Gives the tree's root, `out`.
 
     Raises:
-        InputError: an input is missing or malformed. NothingKept: no flight is left to draw. EnvironmentMissing: no renderer here.
+        InputError: an input is missing or malformed. NothingKept: no flight is left to draw. EnvironmentMissing: no
+            renderer here.
     """
     inputs = {"boxes": boxes, "simplified": simplified, "traces": traces} | ({"others": others} if others else {})
     read_pools(cfg)  # presets that cannot be are told before anything is written
@@ -161,7 +162,7 @@ def run(
     ids_file = out / town / IDS_FILE
     write_json(ids_file, ids_record, indent=None)
     map_file = write_town_map(out / town, box_map.header)
-    made = [result_of(record, _Rendered) for record in finished.kept]
+    made = [result_of(record, _RenderedFlight) for record in finished.kept]
     outputs = [inside(out, one.folder) / name for one in made for name in ("trajectory.json", CHECKSUMS)]
     stage.finish(
         [*outputs, ids_file, map_file],
@@ -194,7 +195,7 @@ def _passed(stage: StageFolder, traces: list[DroneTrace]) -> list[tuple[int, Dro
     return passed
 
 
-def _weather_drawn(cfg: RenderConfig, made: list[_Rendered]) -> dict:
+def _weather_drawn(cfg: RenderConfig, made: list[_RenderedFlight]) -> dict:
     """What the manifest says of the weather of the trajectories, nothing in runs without."""
     if cfg.weather_mode == "off":
         return {}
@@ -209,7 +210,7 @@ def _weather_told(weather: WeatherRecord, seed: int) -> dict:
     return {"weather": weather.weather_name, "time_of_day": weather.tod_name, "weather_seed": seed}
 
 
-class _Rendered(BaseModel):
+class _RenderedFlight(BaseModel):
     """Of what the journal holds of a flight, what is read again."""
 
     folder: str
@@ -256,12 +257,12 @@ def num_others_of(companies: dict[str, Company]) -> int:
 def _names(
     stage: StageFolder, cfg: RenderConfig, map_name: str, traces: Path, others: Path | None, seed: int
 ) -> tuple[str, int]:
-    """Give the town's folder and the number of the first trajectory; a tree that was begun goes on with those it has."""
+    """Give the town's folder and the number of the first trajectory; a tree that was begun keeps its own."""
     numbers = {trace.path_id: number for number, trace in enumerate(read_traces(traces))}
     for record in stage.items():
         number = numbers.get(record.id.rpartition("/")[0])
         if isinstance(record, Kept) and number is not None:
-            place = place_of(Path(result_of(record, _Rendered).folder))
+            place = place_of(Path(result_of(record, _RenderedFlight).folder))
             return place.town, int(place.trajectory.removeprefix(TRAJECTORY)) - number
     town = town_folder(cfg.town or map_name)
     of_others = [] if others is None else [fingerprint(others)]
@@ -276,7 +277,7 @@ def _weather_seed(stage: StageFolder, cfg: RenderConfig) -> int:
     """Give the seed of the weather; a drawn one stays what it was when the tree was begun."""
     if cfg.weather_seed >= 0:
         return cfg.weather_seed
-    begun = (result_of(record, _Rendered).weather_seed for record in stage.items() if isinstance(record, Kept))
+    begun = (result_of(record, _RenderedFlight).weather_seed for record in stage.items() if isinstance(record, Kept))
     return next((seed for seed in begun if seed is not None), None) or drawn_seed()
 
 
@@ -286,7 +287,7 @@ def _check_ids(traces: list[DroneTrace], path: Path) -> None:
 
 
 def _ids_record(box_map: BoxMap, num_others: int) -> dict:
-    """Which box an id of `instance.png` stands for: rows of (instance id, box id); and which ids are those of others."""
+    """Which box an id of `instance.png` stands for, rows of (instance id, box id), and the ids of others."""
     ids = instance_ids(box_map, num_others)
     return {
         "schema": IDS_SCHEMA,

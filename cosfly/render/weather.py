@@ -1,4 +1,4 @@
-"""Which weather and time of day a flight has: preset pools, the three modes, the seed formula (app:weather). Settings of `render`."""
+"""Which weather and time of day a flight has: preset pools, modes, the seed formula (app:weather)."""
 
 from __future__ import annotations
 
@@ -29,11 +29,12 @@ MOST_SEED = 2**31  # of a seed that is drawn
 
 
 class WeatherConfig(Config):
-    """The six settings of weather. Off by default, as in the paper: pictures are those of `look`, and no record is written."""
+    """The six settings of weather. Off by default, as in the paper: pictures are of `look`, without a record."""
 
     weather_mode: Literal["off", "fixed", "random_per_path"] = Field(
         "off",
-        description="off: sun and air as `look` says; fixed: weather_name and tod_name for every flight; random_per_path: each "
+        description="off: sun and air as `look` says; fixed: weather_name and tod_name for every flight; "
+        "random_per_path: each "
         "trajectory draws both by weather_seed and its index, its two tracks alike",
     )
     weather_name: str | None = Field(None, description="preset of the weather in mode fixed", examples=[*WEATHERS])
@@ -46,7 +47,8 @@ class WeatherConfig(Config):
     )
     weather_seed: int = Field(
         DEFAULT_SEED,
-        description="seed of random_per_path; a negative one draws a seed, another for every run, which the records tell",
+        description="seed of random_per_path; a negative one draws a seed, another for every run, which the records "
+        "tell",
     )
 
     @field_validator("weather_mode", mode="before")
@@ -78,7 +80,7 @@ class WeatherConfig(Config):
         return self
 
     def recorded(self) -> dict[str, Any]:
-        """Give the settings that decide what is made. Without weather none of them does: runs of before go on, under their names."""
+        """Give the settings that decide what is made. Without weather none of them does."""
         settings, own = super().recorded(), WeatherConfig.model_fields
         return {name: value for name, value in settings.items() if name not in own or self.weather_mode != "off"}
 
@@ -114,7 +116,8 @@ def read_pools(cfg: WeatherConfig) -> Pools:
     """Read the files of presets that the settings name, or take the paper's.
 
     Raises:
-        ConfigError: a file is missing or malformed, or the named presets are not in it; tells all problems of both at once.
+        ConfigError: a file is missing or malformed, or the named presets are not in it; tells all problems of both at
+            once.
     """
     errors: list[ConfigError] = []
     pools: list[Mapping[str, Any]] = []
@@ -161,7 +164,7 @@ def drawn_seed() -> int:
 
 
 def weather_of(cfg: WeatherConfig, pools: Pools, path_index: int) -> WeatherRecord | None:
-    """Give the weather of a trajectory, None where the mode is off. `weather_seed` must not be negative: the stage settles it."""
+    """Give the weather of a trajectory, None where the mode is off. `weather_seed` is not negative."""
     if cfg.weather_mode == "off":
         return None
     if cfg.weather_mode == "fixed":
@@ -183,7 +186,7 @@ def _drawn(presets: Mapping[str, Any], rng: random.Random) -> str:
 
 
 def coverage_of(pools: Pools, drawn: Iterable[tuple[str, str]]) -> dict[str, Any]:
-    """Count trajectories by weather, by time of day and by both, beside what uniform draws give on average (app:weather:coverage)."""
+    """Count trajectories by weather, time of day and both, beside uniform draws (app:weather:coverage)."""
     pairs = Counter(drawn)
     num = pairs.total()
     by = {name: dict.fromkeys(presets, 0) for name, presets in vars(pools).items()}
@@ -203,6 +206,7 @@ def told_coverage(told: Mapping[str, Any]) -> str:
     seen = {name: sum(count > 0 for count in told[name].values()) for name in ("weathers", "times")}
     of = {name: len(told[name]) for name in seen}
     return (
-        f"{told['trajectories']} trajectories in {seen['weathers']} of {of['weathers']} weathers, {seen['times']} of {of['times']} times of "
+        f"{told['trajectories']} trajectories in {seen['weathers']} of {of['weathers']} weathers, "
+        f"{seen['times']} of {of['times']} times of "
         f"day, {len(told['pairs'])} of {of['weathers'] * of['times']} pairs"
     )

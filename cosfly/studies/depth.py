@@ -1,8 +1,9 @@
-"""Codes the depth of one frame in all the ways there are, decodes it, and compares: `depth_study.json`, `depth_study.md`, and a figure.
+"""Codes the depth of one frame in all the ways there are, decodes it, and compares: `depth_study.json`,
+`depth_study.md`, and a figure.
 
-Whole numbers of 8 to 16 bits share the frame's own range evenly, as the paper's table does. float16 and PNGs of millimetres are
-coded by the release's own coder. The truth is what the file holds: float32, whose rounding is then told as half the step between
-neighbouring numbers at the farthest pixel, or float64, against which float32 is measured.
+Whole numbers of 8 to 16 bits share the frame's own range evenly, as the paper's table does. float16 and PNGs of
+millimetres are coded by the release's own coder. The truth is what the file holds: float32, whose rounding is then told
+as half the step between neighbouring numbers at the farthest pixel, or float64, against which float32 is measured.
 """
 
 from __future__ import annotations
@@ -49,9 +50,9 @@ PROFILE_STEPS = 6.0  # of 8 bits: of more none is seen
 class CodingRow(BaseModel):
     """Figures of one coding, of the pixels that are neither sky nor invalid; errors against the truth, cm.
 
-    psnr_db: of the frame's range; null: no error. edges: Pearson correlation of Sobel gradients. kilobytes: of the frame as it lies in
-    memory or, of a PNG, as a file; deflated: after zlib at its default level. rounding_cm: of a truth that is float32 itself, its own
-    greatest rounding.
+    psnr_db: of the frame's range; null: no error. edges: Pearson correlation of Sobel gradients. kilobytes: of the
+    frame as it lies in memory or, of a PNG, as a file; deflated: after zlib at its default level. rounding_cm: of a
+    truth that is float32 itself, its own greatest rounding.
     """
 
     coding: str
@@ -68,7 +69,8 @@ class CodingRow(BaseModel):
 
 
 class Study(BaseModel):
-    """`depth_study.json`. share_measured: of the pixels, neither sky nor invalid. left_out: codings that have no number for these depths."""
+    """`depth_study.json`. share_measured: of the pixels, neither sky nor invalid. left_out: codings that have no number
+    for these depths."""
 
     frame: str
     width_px: int
@@ -123,7 +125,8 @@ def _truth(data: bytes, file: Path) -> np.ndarray:
     """Read depth, (h, w) m; what others write for a pixel without, NaN or infinity, becomes INVALID_DEPTH_M.
 
     Raises:
-        InputError: it is no array of this form, or of whole numbers, which may be millimetres as well as 256ths of a metre.
+        InputError: it is no array of this form, or of whole numbers, which may be millimetres as well as 256ths of a
+            metre.
     """
     if is_packed(data):
         truth = depth_values(data, file)
@@ -226,7 +229,8 @@ def entropy_bits(values: np.ndarray, low: float, high: float) -> float:
 
 
 def edge_correlation(values: np.ndarray, truth: np.ndarray, measured: np.ndarray) -> float:
-    """Give Pearson's correlation of the lengths of Sobel gradients, where the nine pixels under the filter are all measured; 1 where none are."""
+    """Give Pearson's correlation of the lengths of Sobel gradients, where the nine pixels under the filter are all
+    measured; 1 where none are."""
     inner = (
         cv2.erode(measured.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
         > 0
@@ -244,28 +248,33 @@ def markdown(study: Study) -> str:
     """Give the table of the study, as the paper prints it, with sizes after deflating."""
     buffer = io.StringIO()
     buffer.write(
-        f"Depth of `{study.frame}`, {study.width_px} x {study.height_px} px, {study.min_m:.2f} to {study.max_m:.2f} m, {study.share_measured:.1%} of the pixels "
+        f"Depth of `{study.frame}`, {study.width_px} x {study.height_px} px, {study.min_m:.2f} to "
+        f"{study.max_m:.2f} m, {study.share_measured:.1%} of the pixels "
         f"measured; errors against {study.truth}.\n\n"
-        "| coding | unique values | max error, cm | mean error, cm | RMSE, cm | PSNR, dB | entropy, bits | edge correlation | size, KB of 1,024 bytes | deflated, KB |\n"
+        "| coding | unique values | max error, cm | mean error, cm | RMSE, cm | PSNR, dB | entropy, bits | edge "
+        "correlation | size, KB of 1,024 bytes | deflated, KB |\n"
         "|---|---|---|---|---|---|---|---|---|---|\n"
     )
     for row in study.rows:
         psnr = "none wrong" if row.psnr_db is None else f"{row.psnr_db:.1f}"
         buffer.write(
-            f"| {row.coding} | {row.unique:,} | {row.max_cm:.4g} | {row.mean_cm:.4g} | {row.rmse_cm:.4g} | {psnr} | {row.entropy_bits:.2f} | "
+            f"| {row.coding} | {row.unique:,} | {row.max_cm:.4g} | {row.mean_cm:.4g} | {row.rmse_cm:.4g} | "
+            f"{psnr} | {row.entropy_bits:.2f} | "
             f"{row.edges:.6f} | {row.kilobytes:,.0f} | {row.deflated_kilobytes:,.0f} |\n"
         )
     for row in study.rows:
         if row.rounding_cm is not None:
             buffer.write(
-                f"\nThe truth is float32 itself, which rounds by at most {row.rounding_cm:.2g} cm at {study.max_m:.1f} m.\n"
+                f"\nThe truth is float32 itself, which rounds by at most {row.rounding_cm:.2g} cm at "
+                f"{study.max_m:.1f} m.\n"
             )
     for coding, reason in study.left_out.items():
         buffer.write(f"\nNot stored as {coding}: {reason}.\n")
     return buffer.getvalue()
 
 
-# --- the figure: what is seen of the frame in each coding, where the errors lie, and a row of pixels from the side --------
+# --- the figure: what is seen of the frame in each coding, where the errors lie, and a row of pixels from the side
+# --------
 
 
 def draw_study(
@@ -312,7 +321,7 @@ def _errors(title: str, values: np.ndarray, truth: np.ndarray, measured: np.ndar
 
 
 def steady_stretch(truth: np.ndarray, measured: np.ndarray) -> tuple[int, int, int]:
-    """Give row, first column and length of a stretch of measured pixels whose depth changes evenly, by about PROFILE_STEPS of 8 bits and slowly."""
+    """Give row, column and length of measured pixels whose depth changes evenly, by about PROFILE_STEPS of 8 bits."""
     known = truth[measured]
     step_m = float(known.max() - known.min()) / 255.0
     depth = np.where(measured, truth, np.nan).astype(np.float64)
@@ -331,7 +340,7 @@ def steady_stretch(truth: np.ndarray, measured: np.ndarray) -> tuple[int, int, i
 
 
 def _profile(truth: np.ndarray, measured: np.ndarray, decoded: dict[str, np.ndarray]) -> np.ndarray:
-    """Draw the depth along a stretch of a row: as it is, as a line, and over that in 8 and 10 bits, a step at each pixel."""
+    """Draw the depth along a stretch of a row: as it is, and over that in 8 and 10 bits, a step at each pixel."""
     y, x, length = steady_stretch(truth, measured)
     width, height = PANEL_PX
     panel = np.full((height, width, 3), 255, np.uint8)

@@ -1,4 +1,4 @@
-"""One view under every weather and time of day: the nine pictures of the paper's figure, and the sheet of all presets (app:weather)."""
+"""One view under every weather and time of day: the paper's nine pictures, and a sheet of all presets (app:weather)."""
 
 from __future__ import annotations
 
@@ -54,7 +54,8 @@ def run(
         trajectory: index of a flight of the traces; frame: of its clean track, None for the one that looks down least.
         advance: called for each picture that is drawn.
     Raises:
-        InputError: no such flight or frame, or an input is malformed. ConfigError: presets are malformed. EnvironmentMissing: no renderer.
+        InputError: no such flight or frame, or an input is malformed. ConfigError: presets are malformed.
+            EnvironmentMissing: no renderer.
     """
     pools, flights = read_pools(cfg), read_traces(traces)
     if not 0 <= trajectory < len(flights):

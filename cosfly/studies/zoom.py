@@ -1,8 +1,9 @@
 """`cosfly study zoom`: the same flights at every level of zoom (tab:zoom_eval), and optical against digital zoom.
 
-Every flight is flown clean at each level, so that differences are the lens's alone. What is measured of a frame: the size of the target's
-projected 3D box, its rendered visibility, and the IoU of that box with the box of the person's pixels (track quality). Means are taken over
-the frames of a flight that show some of the target, then over flights; the spread is over flights, and so are the intervals.
+Every flight is flown clean at each level, so that differences are the lens's alone. What is measured of a frame: the
+size of the target's projected 3D box, its rendered visibility, and the IoU of that box with the box of the person's
+pixels (track quality). Means are taken over the frames of a flight that show some of the target, then over flights; the
+spread is over flights, and so are the intervals.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ PAPER = {
     30: (68, 136, 52.1, 0.93),
 }  # tab:zoom_eval
 KERNELS = {"bilinear": cv2.INTER_LINEAR, "bicubic": cv2.INTER_CUBIC}
-# Structural similarity of Wang, Bovik, Sheikh and Simoncelli 2004: an 11 px Gaussian window of 1.5 px, and its two constants.
+# Structural similarity of Wang, Bovik, Sheikh and Simoncelli 2004: an 11 px Gaussian window of 1.5 px, and its two
+# constants.
 WINDOW_PX, SIGMA_PX, K1, K2 = 11, 1.5, 0.01, 0.03
 MOST_FLIGHTS = 4
 TILE_WIDTH_PX, PANEL_WIDTH_PX = 480, 960
@@ -56,8 +58,10 @@ class ZoomStudyConfig(RenderConfig):
     num_flights: int = Field(50, ge=1, description="flights, the first of the traces that the planner kept")
     every: int = Field(2, ge=1, description="every how many frames of a flight are drawn")
     magnifications: tuple[float, ...] = Field(
-        (2.0, 5.0), min_length=1, description="how many times digital zoom enlarges the middle of the widest level's picture"
-    )  # fmt: skip
+        (2.0, 5.0),
+        min_length=1,
+        description="how many times digital zoom enlarges the middle of the widest level's picture",
+    )
     fidelity_frames: int = Field(
         3, ge=1, description="frames of a flight at which optical and digital zoom are compared"
     )
@@ -80,7 +84,8 @@ class Level(BaseModel):
 
 
 class Studied(BaseModel):
-    """What the journal holds of a flight: by level, and by magnification and kernel. best_frame: shows most of the target at the widest level."""
+    """What the journal holds of a flight: by level, and by magnification and kernel. best_frame: shows most of the
+    target at the widest level."""
 
     levels: dict[str, Level]
     fidelity: dict[str, dict[str, dict[str, float]]]
@@ -102,8 +107,8 @@ def at_level(script: FlightScript, camera: Camera) -> FlightScript:
 
 @dataclass(frozen=True)
 class Fidelity:
-    """A digital picture against the optical one of the same view. psnr_db of all three channels; ssim of brightness; sharpness: its mean
-    squared gradient of brightness as a share of the optical one's, 1 where it is as sharp.
+    """A digital picture against the optical one of the same view. psnr_db of all three channels; ssim of brightness;
+    sharpness: its mean squared gradient of brightness as a share of the optical one's, 1 where it is as sharp.
     """
 
     psnr_db: float
@@ -127,7 +132,9 @@ def digital_zoom(rgb: np.ndarray, magnification: float, kernel: str) -> np.ndarr
     # Pixel (u, v) of the result samples the place that the same ray has in the wide picture; centres lie at + 0.5.
     offsets = [(side - 1) / 2.0 * (1.0 - 1.0 / magnification) for side in (width, height)]
     matrix = np.array([[1.0 / magnification, 0.0, offsets[0]], [0.0, 1.0 / magnification, offsets[1]]])
-    return cv2.warpAffine(rgb, matrix, (width, height), flags=KERNELS[kernel] | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
+    return cv2.warpAffine(
+        rgb, matrix, (width, height), flags=KERNELS[kernel] | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE
+    )
 
 
 def compare(digital: np.ndarray, optical: np.ndarray) -> Fidelity:
@@ -207,7 +214,9 @@ def _level(renderer: Renderer, script: FlightScript, cfg: ZoomStudyConfig) -> tu
 def _fidelity(renderer: Renderer, script: FlightScript, cfg: ZoomStudyConfig) -> dict[str, dict[str, dict[str, float]]]:
     """Compare optical with digital zoom at some frames of a flight: magnification -> kernel -> means of Fidelity."""
     frames = np.unique(np.linspace(0, len(script.time_s) - 1, cfg.fidelity_frames + 2).round().astype(int)[1:-1])
-    found: dict[str, dict[str, list[list[float]]]] = {f"{m:g}": {kernel: [] for kernel in KERNELS} for m in cfg.magnifications}  # fmt: skip
+    found: dict[str, dict[str, list[list[float]]]] = {
+        f"{m:g}": {kernel: [] for kernel in KERNELS} for m in cfg.magnifications
+    }
     names: list[str] = []
     for i in frames.tolist():
         pictures = optical_and_digital(renderer, script, i, cfg)
@@ -218,16 +227,17 @@ def _fidelity(renderer: Renderer, script: FlightScript, cfg: ZoomStudyConfig) ->
                 found[magnification][kernel].append(list(measured.values()))
     return {
         magnification: {
-            kernel: dict(zip(names, np.mean(rows, axis=0).round(4).tolist(), strict=True)) for kernel, rows in kernels.items()
+            kernel: dict(zip(names, np.mean(rows, axis=0).round(4).tolist(), strict=True))
+            for kernel, rows in kernels.items()
         }
         for magnification, kernels in found.items()
-    }  # fmt: skip
+    }
 
 
 def optical_and_digital(
     renderer: Renderer, script: FlightScript, i: int, cfg: ZoomStudyConfig
 ) -> dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Draw frame i: magnification -> the picture of a longer lens, and the digital ones of the widest level by kernel."""
+    """Draw frame i: magnification -> the picture of a longer lens, and the digital ones by kernel."""
     wide = camera_of(cfg, cfg.levels_deg[0])
     rgb = draw_frame(renderer, at_level(script, wide), i, script.perturbed.poses, 0.0)[0].rgb
     found = {}
@@ -253,7 +263,8 @@ def run(
     watch: Watch = Watch(),
     resume: Resume = "if-same",
 ) -> Path:
-    """Reads both maps and the flights, writes `zoom_study.json`, `zoom_levels.png` and `zoom_fidelity.png`; gives the first's path.
+    """Reads both maps and the flights, writes `zoom_study.json`, `zoom_levels.png` and `zoom_fidelity.png`; gives the
+    first's path.
 
     Raises:
         NothingKept: no flight could be drawn.
@@ -297,13 +308,19 @@ def summarize(studied: dict[str, Studied], cfg: ZoomStudyConfig, rng: np.random.
     for fov in cfg.levels_deg:
         flights = [one.levels[f"{fov:g}"] for one in studied.values()]
         camera = camera_of(cfg, fov)
-        levels.append({
-            "level": level_name(fov), "fov_deg": fov, "focal_length_px": round(camera.focal_px, 2),
-            "focal_length_35mm_mm": round(camera.focal_35mm_mm, 2), "flights": len(flights),
-            "flights_never_visible": sum(flight.frames_visible == 0 for flight in flights),
-            "frames": sum(flight.frames for flight in flights), "frames_visible": sum(flight.frames_visible for flight in flights),
-            **{name: spread([getattr(flight, name) for flight in flights], rng) for name in FIGURES},
-        })  # fmt: skip
+        levels.append(
+            {
+                "level": level_name(fov),
+                "fov_deg": fov,
+                "focal_length_px": round(camera.focal_px, 2),
+                "focal_length_35mm_mm": round(camera.focal_35mm_mm, 2),
+                "flights": len(flights),
+                "flights_never_visible": sum(flight.frames_visible == 0 for flight in flights),
+                "frames": sum(flight.frames for flight in flights),
+                "frames_visible": sum(flight.frames_visible for flight in flights),
+                **{name: spread([getattr(flight, name) for flight in flights], rng) for name in FIGURES},
+            }
+        )
     fidelity = {
         magnification: {
             kernel: {
@@ -321,21 +338,25 @@ def summarize(studied: dict[str, Studied], cfg: ZoomStudyConfig, rng: np.random.
 
 
 def spread(values: Sequence[float | None], rng: np.random.Generator) -> dict[str, float | None]:
-    """Give mean, standard deviation and the 95 % interval of the mean over flights drawn with replacement (Efron 1979), None without flights."""
+    """Give mean, deviation and the mean's 95 % interval over flights drawn with replacement (Efron 1979), or None."""
     known = np.array([value for value in values if value is not None])
     if not len(known):
         return dict.fromkeys(("mean", "std", "low", "high"))
     draws = known[rng.integers(len(known), size=(NUM_RESAMPLES, len(known)))].mean(axis=1)
     low, high = np.percentile(draws, INTERVAL_PERCENT)
     std = known.std(ddof=1) if len(known) > 1 else 0.0
-    return {name: round(float(v), 4) for name, v in (("mean", known.mean()), ("std", std), ("low", low), ("high", high))}  # fmt: skip
+    return {
+        name: round(float(v), 4) for name, v in (("mean", known.mean()), ("std", std), ("low", low), ("high", high))
+    }
 
 
 def text_rows(product: dict[str, Any]) -> list[list[str]]:
-    """Give tab:zoom_eval as rows of text: level, degrees, 35 mm, size, visibility, IoU; under a level of the paper what that has."""
+    """Give tab:zoom_eval as rows of text: level, degrees, 35 mm, size, visibility, IoU; under each the paper's."""
     rows = []
     for level in product["levels"]:
-        width, height, quality = (_cell(level[name], digits) for name, digits in (("width_px", 1), ("height_px", 1), ("track_quality", 3)))  # fmt: skip
+        width, height, quality = (
+            _cell(level[name], digits) for name, digits in (("width_px", 1), ("height_px", 1), ("track_quality", 3))
+        )
         lens = [level["level"], f"{level['fov_deg']:g}", f"{level['focal_length_35mm_mm']:.1f}"]
         rows.append([*lens, f"{width} x {height}", _cell(level["visibility"], 1, 100.0), quality])
         if paper := PAPER.get(round(level["fov_deg"], 3)):
@@ -349,7 +370,8 @@ def _cell(found: dict[str, float | None], digits: int, scale: float = 1.0) -> st
     return f"{scale * found['mean']:.{digits}f} ± {scale * found['std']:.{digits}f}"
 
 
-# --- pictures: flights by levels (fig:zoom_demo), optical beside digital zoom ---------------------------------------------
+# --- pictures: flights by levels (fig:zoom_demo), optical beside digital zoom
+# ---------------------------------------------
 
 
 def draw_levels(renderer: Renderer, shown: Sequence[tuple[FlightScript, int]], cfg: ZoomStudyConfig) -> bytes:
@@ -377,19 +399,28 @@ def draw_levels(renderer: Renderer, shown: Sequence[tuple[FlightScript, int]], c
 
 
 def draw_fidelity(renderer: Renderer, script: FlightScript, i: int, cfg: ZoomStudyConfig) -> bytes:
-    """Draw the widest picture with the part that is enlarged most, the digital enlargements of it, and what a longer lens shows; a PNG."""
+    """Draw the widest picture, digital enlargements of its middle, and what a longer lens shows; a PNG."""
     ready(renderer, script)
     wide = at_level(script, camera_of(cfg, cfg.levels_deg[0]))
     rgb = draw_frame(renderer, wide, i, script.perturbed.poses, 0.0)[0].rgb.copy()
     most = max(cfg.magnifications)
     optical, digital = optical_and_digital(renderer, script, i, cfg)[f"{most:g}"]
     (width, height), half = (cfg.width_px, cfg.height_px), 0.5 / most
-    corner, other = (round(width * (0.5 - half)), round(height * (0.5 - half))), (round(width * (0.5 + half)), round(height * (0.5 + half)))  # fmt: skip
+    corner, other = (
+        (round(width * (0.5 - half)), round(height * (0.5 - half))),
+        (round(width * (0.5 + half)), round(height * (0.5 + half))),
+    )
     cv2.rectangle(rgb, corner, other, BOX_COLOR, max(2, width // 400))
     panels = [(rgb, f"{cfg.levels_deg[0]:g} deg, 1.0x")]
     for kernel, picture in digital.items():
         found = compare(picture, optical)
-        panels.append((picture, f"digital {most:g}x, {kernel}: {found.psnr_db:.1f} dB, SSIM {found.ssim:.2f}, sharpness {found.sharpness:.2f}"))  # fmt: skip
+        panels.append(
+            (
+                picture,
+                f"digital {most:g}x, {kernel}: {found.psnr_db:.1f} dB, SSIM {found.ssim:.2f}, "
+                f"sharpness {found.sharpness:.2f}",
+            )
+        )
     panels.append((optical, f"optical {most:g}x"))
     tiles = [add_caption(_scaled(picture, PANEL_WIDTH_PX), title) for picture, title in panels]
     return rgb_bytes(np.vstack([np.hstack(tiles[:2]), np.hstack(tiles[2:])]))

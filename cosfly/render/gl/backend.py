@@ -25,7 +25,7 @@ from cosfly.render.gl.parts import PART
 from cosfly.render.gl.programs import Programs, open_context, packed, programs_of, set_uniform, sources
 from cosfly.render.gl.scene import build_scene
 from cosfly.render.gl.shade import Shade, shades_of
-from cosfly.render.gl.view import View
+from cosfly.render.gl.view import CameraView
 from cosfly.render.gl.weather_pass import WeatherPass, defines
 
 SHADOW_SIZE_PX, HEIGHT_SIZE_PX = 2560, 768
@@ -35,8 +35,9 @@ MAX_BONES = 6
 EDGE_LEVELS, EDGE_BLUR_PX = 5, 0.62
 MESH_STRIDE = 64
 SOFTWARE = "llvmpipe"  # draws on the processor, and interpolates where hardware snaps to a grid (scene.frag.glsl)
-# Triangles that llvmpipe may have taken and not drawn yet. It begins another list of them (36 MB) whenever one is full while the last is still being
-# drawn, and keeps every list for good: without this a process grows by a seventh over thousands of frames, on a loaded machine.
+# Triangles that llvmpipe may have taken and not drawn yet. It begins another list of them (36 MB) whenever one is full
+# while the last is still being drawn, and keeps every list for good: without this a process grows by a seventh over
+# thousands of frames, on a loaded machine.
 MOST_WAITING = 30_000
 PATTERN_M = 720.0  # common multiple of the patterns' sizes: the scene's origin modulo this keeps coordinates small
 ORIGIN_STEP_M = 2.0 * PATTERN_M  # a flight farther off than half of this has an origin of its own
@@ -72,7 +73,7 @@ class GlRenderer:
     # --- set-up ---
 
     def _use_look(self, define: str | None) -> None:
-        """Draw from now on with the programs of fair weather (None), or of one with such defines; each is made when first needed."""
+        """Draw from now on with the programs of fair weather (None), or of one with such defines."""
         if define not in self._looks:
             self._looks[define] = self._make_look(define)
         look = self._looks[define]
@@ -100,7 +101,7 @@ class GlRenderer:
         self._height.filter = (self.context.NEAREST, self.context.NEAREST)  # it is smooth already, and this is faster
 
     def _make_meshes(self) -> None:
-        """The vertices and triangles of every mesh, and an instance buffer for each; vertex arrays are made when needed."""
+        """Vertices and triangles of every mesh; vertex arrays are made when needed."""
         self._meshes = [
             (self.context.buffer(mesh.vertices.tobytes()), self.context.buffer(mesh.triangles.tobytes()))
             for mesh in meshes.all_meshes()
@@ -130,7 +131,7 @@ class GlRenderer:
     # --- what holds for a whole flight ---
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
-        """Compute sun shadows and sky openness for an area of the world, (3,) corners; once for each flight. Takes its weather."""
+        """Compute sun shadows and sky openness for an area of the world, (3,) corners, and take a flight's weather."""
         self._settle(np.asarray(low_m), np.asarray(high_m))
         low, high = np.asarray(low_m) - self.origin_m, np.asarray(high_m) - self.origin_m
         middle = (low + high) / 2.0
@@ -158,8 +159,8 @@ class GlRenderer:
     def _settle(self, low_m: np.ndarray, high_m: np.ndarray) -> None:
         """Keep the parts that a camera within these corners can see, counted from near it.
 
-        Of a city of kilometres that is little, and every frame looks through what is kept. Kilometres from its zero, single
-        precision is worth a millimetre.
+        Of a city of kilometres that is little, and every frame looks through what is kept. Kilometres from its zero,
+        single precision is worth a millimetre.
         """
         parts, zero = self.scene.parts, self.scene.origin_m
         outside = np.maximum(low_m - zero - parts.object_centers, parts.object_centers - (high_m - zero))
@@ -172,7 +173,7 @@ class GlRenderer:
     def _prepare_shadow(
         self, casting: np.ndarray, centers: np.ndarray, radii: np.ndarray, middle: np.ndarray, half: float
     ) -> None:
-        """Draw what casts shadows, rows of the parts and all solids, from the sun; centers, radii: of all of it near the middle."""
+        """Draw what casts shadows from the sun; centers, radii: of all of it near the middle."""
         sun = self._sun
         side = np.cross([0.0, 0.0, 1.0], sun)
         side /= np.linalg.norm(side)
@@ -240,7 +241,9 @@ class GlRenderer:
         """Draw one frame, as the contract says."""
         check_pose(camera_pose, intrinsic)
         body = None if person is None else make_body(person)
-        view = View(camera_pose[:3, :3], camera_pose[:3, 3] - self.origin_m, intrinsic, self.width_px, self.height_px)
+        view = CameraView(
+            camera_pose[:3, :3], camera_pose[:3, 3] - self.origin_m, intrinsic, self.width_px, self.height_px
+        )
         moving = [] if body is None else [placed(body, self.origin_m)]
         moving += draw_others(others, self.origin_m, view)
         bones = self._bones(body)
@@ -267,21 +270,22 @@ class GlRenderer:
                 self._set_person(body)
             for shade in shades:
                 self._draw_shaded(shade, bones, rows, moving)
-            # Clearing targets of mixed types leaves garbage: the sky's triangle writes all three wherever nothing stands.
+            # Clearing targets of mixed types leaves garbage: the sky's triangle writes all three wherever nothing
+            # stands.
             self.context.disable(self.context.CULL_FACE)
             self._sky.render(vertices=3)
             if self._weather is not None:
                 self._weather.draw_rain(self._lens(view) | frame_values)
             return self._read()
 
-    def _lens(self, view: View) -> dict[str, Any]:
+    def _lens(self, view: CameraView) -> dict[str, Any]:
         return {
             "lens": np.array([*np.diag(view.intrinsic)[:2], *view.intrinsic[:2, 2]]),
             "image_size": np.array([self.width_px, self.height_px]),
             "world_from_camera": view.world_from_camera,
         }
 
-    def _set_camera(self, programs: list[Any], view: View, frame_values: dict[str, Any]) -> None:
+    def _set_camera(self, programs: list[Any], view: CameraView, frame_values: dict[str, Any]) -> None:
         """Set what holds for a frame; frame_values: of the weather, in the place of the look's."""
         common = {
             **self._lens(view),
@@ -319,7 +323,7 @@ class GlRenderer:
     def _draw_shaded(
         self, shade: Shade, bones: np.ndarray, rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]
     ) -> None:
-        """Draw what lies in a rectangle once more, with the shadows of those who move. What is nearest is nearest again."""
+        """Draw what lies in a rectangle once more, with the shadows of those who move."""
         center, radius = shade.sphere()
         person = bones if shade.has_person else bones[:0]
         for name, count, most, capsules in (
@@ -339,7 +343,7 @@ class GlRenderer:
         self._image.scissor = None
 
     def _draw_scene(self, programs: list[Any], rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]) -> None:
-        """Draw standing things before the ground, near before far: what is hidden costs nothing. moving: records and meshes."""
+        """Draw standing things before the ground, near before far. moving: records and meshes."""
         records = np.concatenate([*(part for part, _ in moving), self._parts.records[rows]])
         groups = np.concatenate([*(_groups(part, mesh) for part, mesh in moving), self._groups[rows]])
         order = np.argsort(groups, kind="stable")

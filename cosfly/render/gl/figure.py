@@ -1,7 +1,7 @@
 """The figure of the walking person: proportions of 1.8 m, a walk cycle driven by the distance walked.
 
-It stays within the circle round the target's box (PERSON_HALF_EXTENTS_M): in mid-stride the tips of the shoes pass its sides by
-up to 12 cm.
+It stays within the circle round the target's box (PERSON_HALF_EXTENTS_M): in mid-stride the tips of the shoes pass its
+sides by up to 12 cm.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from cosfly.render.contract import LAYER_STEP, PERSON_ID, STANDING_LAYER, Clothe
 from cosfly.render.gl import meshes
 from cosfly.render.gl.parts import CLOTH, PART, Boxes, PartBuilder, tags
 from cosfly.render.gl.shapes import BUILDERS
-from cosfly.render.gl.view import View
+from cosfly.render.gl.view import CameraView
 
 HIP_SWING_RAD, ARM_SWING_RAD, KNEE_BEND_RAD = 0.25, 0.38, 0.65
 HIP_M, KNEE_M, ANKLE_M, SHOULDER_M = 0.93, 0.50, 0.085, 1.45
@@ -29,8 +29,8 @@ HIP_M, KNEE_M, ANKLE_M, SHOULDER_M = 0.93, 0.50, 0.085, 1.45
 class Body:
     """A posed figure as drawable parts, k of them and b bones.
 
-    records: (k,) parts.PART without centers; mesh: (k,); centers_m: (k, 3) world; bones_m: (b, 2, 3) world, the ends of the
-    capsules that cast the shadow; bone_radii_m: (b,); center_m: (3,) the hip point.
+    records: (k,) parts.PART without centers; mesh: (k,); centers_m: (k, 3) world; bones_m: (b, 2, 3) world, the ends of
+    the capsules that cast the shadow; bone_radii_m: (b,); center_m: (3,) the hip point.
     """
 
     records: np.ndarray
@@ -137,7 +137,8 @@ def _placed(figure: _Figure, feet_m: np.ndarray, heading_rad: float, hip_m: np.n
 
 
 # --- moving -----------------------------------------------------------------------------------------------------------
-# What moves, as drawable parts of one frame: the figures of people, cars, and the capsules that cast the shadows of others.
+# What moves, as drawable parts of one frame: the figures of people, cars, and the capsules that cast the shadows of
+# others.
 
 
 MOST_CAPSULES = 32  # as many as the shader has room for: the nearest to the camera
@@ -153,7 +154,9 @@ def placed(body: Body, origin_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return records, body.mesh
 
 
-def draw_others(others: Sequence[PosedOther], origin_m: np.ndarray, view: View) -> list[tuple[np.ndarray, np.ndarray]]:
+def draw_others(
+    others: Sequence[PosedOther], origin_m: np.ndarray, view: CameraView
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Give records and meshes of the others whom the camera may see."""
     found = []
     for other in others:
@@ -166,7 +169,7 @@ def draw_others(others: Sequence[PosedOther], origin_m: np.ndarray, view: View) 
     return found
 
 
-def _car(car: PosedCar, instance_id: int, center: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
+def _car(car: PosedCar, instance_id: int, center: np.ndarray, view: CameraView) -> tuple[np.ndarray, np.ndarray]:
     """A car of the same shape as those that a map has parked."""
     builder, turn = PartBuilder(), rotation_matrix(0.0, car.heading_rad, 0.0)
     half, ids = np.array(car.half_extents_m), np.array([instance_id], np.uint16)
@@ -178,8 +181,9 @@ def _car(car: PosedCar, instance_id: int, center: np.ndarray, view: View) -> tup
     return parts.records[rows], parts.mesh[rows]
 
 
-def capsules_of(others: Sequence[PosedOther], origin_m: np.ndarray, view: View) -> np.ndarray:
-    """Capsules of the others whose shadows the camera may see, relative to the origin, (k, 2, 4): from and radius, to and instance id.
+def capsules_of(others: Sequence[PosedOther], origin_m: np.ndarray, view: CameraView) -> np.ndarray:
+    """Capsules of the others whose shadows the camera may see, relative to the origin, (k, 2, 4): from and radius, to
+    and instance id.
 
     Every pixel asks every capsule, which costs more than all else that is drawn of others.
     """

@@ -1,6 +1,7 @@
 """Street lamps of a map: where they hang, and the light that they throw on the ground, as a map seen from above.
 
-A map without any is lit all the same, along its streets: by lamps that throw light and are not drawn, as no box stands for them.
+A map without any is lit all the same, along its streets: by lamps that throw light and are not drawn, as no box stands
+for them.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def lamps_of(parts: Parts) -> np.ndarray:
 
 
 def lamps_along_streets(box_map: BoxMap) -> np.ndarray:
-    """Places of lamps along the streets of a map that has none of its own, (n, 3) m, world: the largest street's first."""
+    """Places of lamps along the streets of a map without any, (n, 3) m, world: the largest street's first."""
     streets = box_map.select(box_map.is_any_of({KINDS[name] for name in STREETS}))
     half = streets.half_extents
     turns = rotation_matrices(np.radians(streets.rotations_deg))
@@ -61,8 +62,8 @@ def lamp_map(lamps: np.ndarray, middle: np.ndarray, half_m: float) -> tuple[np.n
     Args:
         lamps: (n, 3) m; middle: (2,) m; half_m: half the square's side.
     Returns:
-        (MAP_PX, MAP_PX, 2) float32: light on the ground, about 1 under a lamp, and the height of the lamps that give it;
-        (4,) low x, low y, 1 / side, 1 / side. The outermost pixels are dark, so that nothing beyond is lit.
+        (MAP_PX, MAP_PX, 2) float32: light on the ground, about 1 under a lamp, and the height of the lamps that give
+        it; (4,) low x, low y, 1 / side, 1 / side. The outermost pixels are dark, so that nothing beyond is lit.
     """
     low, pixel_m = middle[:2] - half_m, 2.0 * half_m / MAP_PX
     light = np.zeros((MAP_PX, MAP_PX))

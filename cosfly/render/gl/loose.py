@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from cosfly.render.gl.parts import LOOSE_VERTEX
-from cosfly.render.gl.view import View
+from cosfly.render.gl.view import CameraView
 
 
 @dataclass(frozen=True)
 class Loose:
     """Triangles by material. vertices: (3 k,) LOOSE_VERTEX, three to a triangle, relative to the scene's origin.
 
-    things: (k,) ascending, which thing each triangle belongs to; centers (n, 3) float64, radii (n,) of these. Without things all is always drawn.
+    things: (k,) ascending, which thing each triangle belongs to; centers (n, 3) float64, radii (n,) of these. Without
+    things all is always drawn.
     """
 
     vertices: dict[int, np.ndarray]
@@ -43,14 +44,14 @@ class LooseTriangles:
         self.see(None)
 
     def place(self, shift_m: np.ndarray) -> None:
-        """Count everything from another origin, (3,) relative to the scene's: single precision is best near its zero."""
+        """Count from another origin, (3,) relative to the scene's: single precision is best near its zero."""
         for material, buffer in self._buffers.items():
             vertices = self._loose.vertices[material].copy()
             vertices["center"] -= shift_m.astype(np.float32)
             buffer.write(vertices.tobytes())
         self.centers = (self._loose.centers - shift_m).astype(np.float32)
 
-    def see(self, view: View | None) -> None:
+    def see(self, view: CameraView | None) -> None:
         """Draw from now on what a camera may see, the nearest first; None: everything."""
         for material, firsts in self._firsts.items():
             seen = np.arange(len(self.centers)) if view is None else view.shown(self.centers, self.radii)

@@ -1,4 +1,5 @@
-"""Unit meshes that the built-in renderer instances: each fits into the cube [-1, 1]^3, so a part fits into its half sizes.
+"""Unit meshes that the built-in renderer instances: each fits into the cube [-1, 1]^3, so a part fits into its half
+sizes.
 
 Vertices are (n, 6) float32: position and unit normal. Triangles are (k, 3) int32, counter-clockwise seen from outside.
 """
@@ -15,12 +16,12 @@ BOX, BLOB_FINE, BLOB, BLOB_COARSE, CYLINDER, CONE, CABIN, ROUNDED, SPHERE, LIMB 
 
 
 @dataclass(frozen=True)
-class Mesh:
+class UnitMesh:
     vertices: np.ndarray
     triangles: np.ndarray
 
 
-def all_meshes() -> list[Mesh]:
+def all_meshes() -> list[UnitMesh]:
     """Give every mesh, in the order of the numbers above."""
     return [
         prism(1.0, 1.0),
@@ -36,7 +37,7 @@ def all_meshes() -> list[Mesh]:
     ]
 
 
-def prism(top_x: float, top_y: float) -> Mesh:
+def prism(top_x: float, top_y: float) -> UnitMesh:
     """A box whose top face is scaled by top_x and top_y; flat normals, 24 vertices."""
     corners = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], dtype=np.float64)
     corners[4:, 0] *= top_x
@@ -46,11 +47,11 @@ def prism(top_x: float, top_y: float) -> Mesh:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     vertices = np.concatenate([quads, np.repeat(normals[:, None], 4, axis=1)], axis=-1).reshape(-1, 6)
     triangles = 4 * np.repeat(np.arange(6), 2)[:, None] + np.tile([(0, 1, 2), (0, 2, 3)], (6, 1))
-    return Mesh(vertices.astype(np.float32), triangles.astype(np.int32))
+    return UnitMesh(vertices.astype(np.float32), triangles.astype(np.int32))
 
 
-def revolved(profile: list[tuple[float, float]], num_sides: int) -> Mesh:
-    """A profile of (radius, z), from the bottom up, turned about z; smooth round, sharp between the profile's segments."""
+def revolved(profile: list[tuple[float, float]], num_sides: int) -> UnitMesh:
+    """A profile of (radius, z), from the bottom up, turned about z; sharp between the profile's segments."""
     angles = np.arange(num_sides + 1) * 2.0 * np.pi / num_sides
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     vertices: list[list[float]] = []
@@ -65,10 +66,10 @@ def revolved(profile: list[tuple[float, float]], num_sides: int) -> Mesh:
             a = first + 2 * side
             triangles += [(a, a + 2, a + 3)] if r0 > 0 else []
             triangles += [(a, a + 3, a + 1)] if r1 > 0 else []
-    return Mesh(np.array(vertices, np.float32), np.array(triangles, np.int32))
+    return UnitMesh(np.array(vertices, np.float32), np.array(triangles, np.int32))
 
 
-def superquadric(exponent: float, num_sides: int, num_rings: int) -> Mesh:
+def superquadric(exponent: float, num_sides: int, num_rings: int) -> UnitMesh:
     """A rounded solid: exponent 1 is the sphere, towards 0 the cube."""
 
     def power(values: np.ndarray, e: float) -> np.ndarray:
@@ -88,18 +89,19 @@ def superquadric(exponent: float, num_sides: int, num_rings: int) -> Mesh:
     a = (ring * (num_sides + 1) + side).ravel()
     b = a + num_sides + 1
     triangles = np.concatenate([np.stack([a, a + 1, b + 1], 1), np.stack([a, b + 1, b], 1)])
-    return Mesh(np.hstack([surface(exponent), normals]).astype(np.float32), triangles.astype(np.int32))
+    return UnitMesh(np.hstack([surface(exponent), normals]).astype(np.float32), triangles.astype(np.int32))
 
 
-def blob(num_subdivisions: int) -> Mesh:
+def blob(num_subdivisions: int) -> UnitMesh:
     """An icosphere, dented inwards by a fixed smooth pattern: the outline of foliage. Radius at most 1."""
     golden = (1.0 + 5.0**0.5) / 2.0
     points = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0), (0, -1, golden), (0, 1, golden)]
     points += [(0, -1, -golden), (0, 1, -golden), (golden, 0, -1), (golden, 0, 1), (-golden, 0, -1), (-golden, 0, 1)]
     vertices = [np.array(p) / np.linalg.norm(p) for p in points]
     triangles = [
-        (0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6), (7, 1, 8),
-        (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1),
+        (0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6),
+        (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7),
+        (9, 8, 1),
     ]  # fmt: skip
     for _ in range(num_subdivisions):
         middles: dict[tuple[int, int], int] = {}
@@ -113,7 +115,7 @@ def blob(num_subdivisions: int) -> Mesh:
         np.sin(unit @ [4.1, 2.3, 1.7]) * np.sin(unit @ [-1.9, 4.7, 2.9]) + 0.6 * np.sin(unit @ [7.3, -6.1, 8.2])
     )
     radius = 1.0 - 0.24 * dents / dents.max()
-    return Mesh(np.hstack([unit * radius[:, None], unit]).astype(np.float32), np.array(triangles, np.int32))
+    return UnitMesh(np.hstack([unit * radius[:, None], unit]).astype(np.float32), np.array(triangles, np.int32))
 
 
 def _middle(vertices: list[np.ndarray], middles: dict[tuple[int, int], int], a: int, b: int) -> int:

@@ -1,5 +1,5 @@
-"""Drawable parts and how they are collected: one part is one unit mesh (meshes.py) with half sizes, a rotation, a colour and a
-material number that the shader knows. Knows nothing of OpenGL, nor of what things look like (shapes.py).
+"""Drawable parts and how they are collected: one part is one unit mesh (meshes.py) with half sizes, a rotation, a
+colour and a material number that the shader knows. Knows nothing of OpenGL, nor of what things look like (shapes.py).
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ FAR_PX, NEVER_PX = 14.0, 1e9  # an object of a smaller radius on the image is dr
 class Parts:
     """Drawable parts, k of them. Positions are relative to the scene's origin.
 
-    records: (k,) PART; mesh: (k,) mesh numbers; centers: (k, 3) float64, the records' centers before they were rounded; object_centers (k, 3), object_radii (k,): the whole object a part belongs to;
-    a part is drawn while the object's radius on the image lies in [min_px, max_px).
+    records: (k,) PART; mesh: (k,) mesh numbers; centers: (k, 3) float64, the records' centers before they were rounded;
+    object_centers (k, 3), object_radii (k,): the whole object a part belongs to; a part is drawn while the object's
+    radius on the image lies in [min_px, max_px).
     """
 
     records: np.ndarray
@@ -113,7 +114,8 @@ class PartBuilder:
         """Add one part to each box.
 
         Args:
-            half: (n, 3) or (3,) half sizes of the part, in its own axes; offset: (n, 3) from the box's centre, in box axes.
+            half: (n, 3) or (3,) half sizes of the part, in its own axes; offset: (n, 3) from the box's centre, in box
+                axes.
             turn: (3, 3) or (n, 3, 3) box_from_part; color: (n, 3) or (3,) linear RGB.
         """
         n = len(boxes)
@@ -134,10 +136,15 @@ class PartBuilder:
         records["bias"] = LAYER_STEP * (STANDING_LAYER if layer is None else layer + boxes.tiers)
         self._parts.append(
             Parts(
-                records, np.full(n, mesh, np.uint8), centers, boxes.centers.astype(np.float32),
-                np.linalg.norm(boxes.half, axis=1).astype(np.float32), np.full(n, min_px, np.float32), np.full(n, max_px, np.float32),
+                records,
+                np.full(n, mesh, np.uint8),
+                centers,
+                boxes.centers.astype(np.float32),
+                np.linalg.norm(boxes.half, axis=1).astype(np.float32),
+                np.full(n, min_px, np.float32),
+                np.full(n, max_px, np.float32),
             )
-        )  # fmt: skip
+        )
 
     def add_parts(self, parts: Parts) -> None:
         """Add what another builder made."""

@@ -1,4 +1,4 @@
-"""Programs of the default renderer: made of its shader files, one set for each kind of weather, and how their uniforms are set."""
+"""Programs of the default renderer: one set for each kind of weather, and how their uniforms are set."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def sources(vertex: tuple[str, ...], fragment: tuple[str, ...], define: str = ""
 
 @dataclass(frozen=True)
 class Programs:
-    """What fair weather, or one with such defines, is drawn with; materials and near_movers: one for each material, the latter with the shadows
-    of those who move; rain: None in fair weather.
+    """What fair weather, or one with such defines, is drawn with; materials and near_movers: one for each material, the
+    latter with the shadows of those who move; rain: None in fair weather.
     """
 
     materials: list[Any]
@@ -59,7 +59,7 @@ class Programs:
 
 
 def programs_of(context: Any, define: str | None, *, snaps: bool) -> Programs:
-    """Compile the programs of fair weather (None), or of one with such defines. snaps: for hardware (`depth_here` in scene.frag.glsl)."""
+    """Compile programs of fair weather (None), or of one with such defines. snaps: for hardware (scene.frag.glsl)."""
     of_sky = ("light.glsl", *(FAIR if define is None else WEATHER_SKY), "sky.frag.glsl")
     of_surfaces = ("light.glsl", *(FAIR if define is None else WEATHER_SCENE), "scene.frag.glsl")
     vertex, fragment = sources(
@@ -79,7 +79,7 @@ def programs_of(context: Any, define: str | None, *, snaps: bool) -> Programs:
 
 
 def packed(value: Any) -> Any:
-    """The bytes of an array as a uniform has them: matrices are given row by row and stored column by column; other values as they are."""
+    """The bytes of an array as a uniform has them, column by column; other values as they are."""
     return np.ascontiguousarray(value.T, dtype=np.float32).tobytes() if isinstance(value, np.ndarray) else value
 
 

@@ -1,4 +1,4 @@
-"""A map ready to be drawn: the parts of every box, a ground plane under everything, the surfaces on ground that slopes, and meshes."""
+"""A map ready to be drawn: the parts of every box, the ground plane, surfaces on ground that slopes, and meshes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from cosfly.render.contract import (
     scene_origin,
     seeds_of,
 )
-from cosfly.render.draping import Draped, drape, is_draped, layers_of
+from cosfly.render.draping import DrapedSurfaces, drape, is_draped, layers_of
 from cosfly.render.gl import meshes, parts
 from cosfly.render.gl.lamps import lamps_along_streets, lamps_of
 from cosfly.render.gl.loose import Loose
@@ -31,7 +31,8 @@ from cosfly.render.gl.shapes import BUILDERS, BUILDING_COLORS, PLAIN_COLORS, TIL
 from cosfly.render.solids import Solids, are_solids, solids_of
 
 # --- solids -----------------------------------------------------------------------------------------------------------
-# What meshes look like: walls with storeys and windows, flat roofs, tiles on those that slope; plain paint where a file tells colours.
+# What meshes look like: walls with storeys and windows, flat roofs, tiles on those that slope; plain paint where a file
+# tells colours.
 #
 # The shader draws patterns in the axes of a part, so every plane of a building becomes a part of its own.
 
@@ -42,7 +43,7 @@ THINNEST_M = 0.01
 
 
 def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.ndarray) -> Loose:
-    """Give the triangles of solids, seen from both sides, as a shader draws them. ids: (n,) of `instance.png`, of the map's boxes."""
+    """Give the triangles of solids, both sides, as a shader draws them. ids: (n,) of the map's boxes."""
     if not len(solids):
         return Loose.all_of({})
     normals, rows, kinds = solids.normals, solids.rows, box_map.kinds[solids.rows]
@@ -86,8 +87,8 @@ def _planes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Axes of the part that each triangle belongs to, (k, 3, 3) part_from_world, and which part that is, (k,).
 
-    A wall: x along it, y out, z up. A slope: x along its eaves, y out, z up the slope. A flat roof: turned as its house's largest wall, z up.
-    What is no house's: the box's.
+    A wall: x along it, y out, z up. A slope: x along its eaves, y out, z up the slope. A flat roof: turned as its
+    house's largest wall, z up. What is no house's: the box's.
     """
     normals, things = solids.normals, solids.things
     around = np.round(np.arctan2(normals[:, 1], normals[:, 0]) / SAME_ANGLE_RAD).astype(np.int64)
@@ -123,7 +124,8 @@ def _main_yaws(solids: Solids, is_wall: np.ndarray, around: np.ndarray) -> np.nd
 
 
 def _spans(local: np.ndarray, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Middle and half size, (k, 3) each, of all triangles of the part that a triangle belongs to; local: (k, 3, 3) corners in its axes."""
+    """Middle and half size, (k, 3) each, of all triangles of the part that a triangle belongs to; local: (k, 3, 3)
+    corners in its axes."""
     low = np.full((planes.max() + 1, 3), np.inf)
     high = -low
     np.minimum.at(low, planes, local.min(axis=1))
@@ -149,8 +151,8 @@ HAS_PAINT = 2.0  # seed of a road whose map brings its own lane markings; the sh
 class Scene:
     """A map ready to be drawn. origin_m: (3,) world position of the parts' zero; plane_z_m: the ground plane, world.
 
-    draped: the surfaces on `ground`, nothing where that is flat; solids: what stands for boxes that name meshes. lamps: (n, 3) relative to
-    the parts' zero, lamps of a map that has none among its parts.
+    draped: the surfaces on `ground`, nothing where that is flat; solids: what stands for boxes that name meshes. lamps:
+    (n, 3) relative to the parts' zero, lamps of a map that has none among its parts.
     """
 
     parts: Parts
@@ -215,8 +217,9 @@ def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
     return Scene(parts, origin, plane_z_m(box_map), box_map.ground, Loose.all_of(loose), standing, lamps)
 
 
-def _loose(draped: Draped, origin: np.ndarray, records: np.ndarray) -> dict[int, np.ndarray]:
-    """Vertices of draped triangles by material: each is placed in its own box's axes, which shaders draw lanes and kerbs in.
+def _loose(draped: DrapedSurfaces, origin: np.ndarray, records: np.ndarray) -> dict[int, np.ndarray]:
+    """Vertices of draped triangles by material: each is placed in its own box's axes, which shaders draw lanes and
+    kerbs in.
 
     Args:
         records: (n + 1,) PART of the map's boxes; the last is the bare ground's.

@@ -1,7 +1,7 @@
 """Where those who move may darken a picture: the person's and the others' shadows, as rectangles of pixels.
 
-Every pixel of a program that knows of shadows of movers pays for its loops, a third of a frame on a CPU, though they darken a
-hundredth of it. So the scene is drawn without them, and these rectangles once more with them.
+Every pixel of a program that knows of shadows of movers pays for its loops, a third of a frame on a CPU, though they
+darken a hundredth of it. So the scene is drawn without them, and these rectangles once more with them.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cosfly.geometry import box_corners
-from cosfly.render.gl.view import View
+from cosfly.render.gl.view import CameraView
 
 PERSON_REACH_M = 30.0**0.5  # the shader follows the person's shadow so far from the hip
 SHORTEST_CAR_M, HEADLIGHT_M, HEADLIGHT_ASIDE_M = 0.5, 26.0, 9.0  # as the shader has them: who is shorter walks
@@ -40,7 +40,7 @@ class Shade:
 
 
 def shades_of(
-    bones: np.ndarray, capsules: np.ndarray, sun: np.ndarray, view: View, has_headlights: bool = False
+    bones: np.ndarray, capsules: np.ndarray, sun: np.ndarray, view: CameraView, has_headlights: bool = False
 ) -> list[Shade]:
     """Give the rectangles of a frame; no two of them overlap.
 
@@ -79,7 +79,7 @@ def _darkened(capsules: np.ndarray, sun: np.ndarray, aside_m: float, longest_m: 
 
 
 def _lit(car: np.ndarray) -> np.ndarray:
-    """Corners of what the headlights of a car may light, (8, 3), none of a person; car: (1, 2, 4), back and front end."""
+    """Corners of what a car's headlights may light, (8, 3), none of a person; car: (1, 2, 4), back and front end."""
     back, front = car[0, :, :3]
     along = front - back
     if np.linalg.norm(along) < SHORTEST_CAR_M:

@@ -18,19 +18,21 @@ from cosfly.render.gl.parts import FAR_PX, Boxes, PartBuilder
 EDGE_GAP_M, MOST_EDGED = 0.05, 4000
 
 BUILDING_COLORS = np.array([
-    [0.46, 0.23, 0.16], [0.55, 0.31, 0.21], [0.66, 0.59, 0.47], [0.60, 0.57, 0.52], [0.73, 0.68, 0.58], [0.42, 0.40, 0.38],
-    [0.70, 0.54, 0.36], [0.50, 0.45, 0.40], [0.62, 0.46, 0.36], [0.78, 0.75, 0.69], [0.38, 0.43, 0.47], [0.52, 0.28, 0.20],
+    [0.46, 0.23, 0.16], [0.55, 0.31, 0.21], [0.66, 0.59, 0.47], [0.60, 0.57, 0.52], [0.73, 0.68, 0.58],
+    [0.42, 0.40, 0.38], [0.70, 0.54, 0.36], [0.50, 0.45, 0.40], [0.62, 0.46, 0.36], [0.78, 0.75, 0.69],
+    [0.38, 0.43, 0.47], [0.52, 0.28, 0.20],
 ])  # fmt: skip
 TILE_COLORS = np.array([
-    [0.34, 0.12, 0.065], [0.28, 0.11, 0.07], [0.10, 0.105, 0.115], [0.30, 0.15, 0.09], [0.15, 0.14, 0.135], [0.38, 0.16, 0.08],
+    [0.34, 0.12, 0.065], [0.28, 0.11, 0.07], [0.10, 0.105, 0.115], [0.30, 0.15, 0.09], [0.15, 0.14, 0.135],
+    [0.38, 0.16, 0.08],
 ])  # fmt: skip
 PLAIN_COLORS = np.array(
     [[0.35, 0.33, 0.30], [0.22, 0.27, 0.22], [0.40, 0.30, 0.20], [0.28, 0.29, 0.31], [0.45, 0.42, 0.36]]
 )
 BARK_COLOR = (0.16, 0.11, 0.075)
 CAR_COLORS = np.array([
-    [0.62, 0.63, 0.65], [0.05, 0.05, 0.06], [0.80, 0.80, 0.79], [0.36, 0.03, 0.03], [0.04, 0.09, 0.26], [0.23, 0.25, 0.27],
-    [0.10, 0.17, 0.13], [0.48, 0.40, 0.28],
+    [0.62, 0.63, 0.65], [0.05, 0.05, 0.06], [0.80, 0.80, 0.79], [0.36, 0.03, 0.03], [0.04, 0.09, 0.26],
+    [0.23, 0.25, 0.27], [0.10, 0.17, 0.13], [0.48, 0.40, 0.28],
 ])  # fmt: skip
 LEAF_COLORS = np.array(
     [[0.085, 0.165, 0.035], [0.11, 0.19, 0.045], [0.065, 0.135, 0.035], [0.15, 0.20, 0.05], [0.075, 0.155, 0.055]]
@@ -58,7 +60,8 @@ def _open_edges(boxes: Boxes, height_share: float, slack_m: float) -> np.ndarray
     """Tell beyond which edges no other box of the kind follows.
 
     Args:
-        height_share: where along the height to look, -1 the bottom, 1 the top; slack_m: how much higher or lower it may be.
+        height_share: where along the height to look, -1 the bottom, 1 the top; slack_m: how much higher or lower it may
+            be.
     Returns:
         (n,) numbers of bits -x, +x, -y, +y; no edge in vast maps, all edges of a box alone.
     """
@@ -165,7 +168,16 @@ def _wheels(builder: PartBuilder, boxes: Boxes, radius: np.ndarray, along: float
     for front in (-along, along):
         for side in (-1.0, 1.0):
             offset = np.column_stack([front * h[:, 0], side * (0.97 * h[:, 1] - thick), radius - h[:, 2]])
-            builder.add(boxes, meshes.CYLINDER, size, parts.RUBBER, (0.02, 0.02, 0.022), offset=offset, turn=_WHEEL_TURN, min_px=FAR_PX)  # fmt: skip
+            builder.add(
+                boxes,
+                meshes.CYLINDER,
+                size,
+                parts.RUBBER,
+                (0.02, 0.02, 0.022),
+                offset=offset,
+                turn=_WHEEL_TURN,
+                min_px=FAR_PX,
+            )
 
 
 def _cars(builder: PartBuilder, boxes: Boxes) -> None:

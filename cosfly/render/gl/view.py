@@ -14,7 +14,7 @@ SMALLEST_PX = 0.4  # an object whose radius on the image is below this is not dr
 
 
 @dataclass(frozen=True)
-class View:
+class CameraView:
     """A camera relative to the scene's origin: world_from_camera (3, 3), eye (3,), intrinsic (3, 3) px."""
 
     world_from_camera: np.ndarray
@@ -27,13 +27,20 @@ class View:
         """Rows of the parts to draw, nearest objects first."""
         tangents, slants = self._cone()
         rows, away = spheres_in_view(
-            parts.object_centers, parts.object_radii, np.maximum(parts.min_px, np.float32(SMALLEST_PX)), parts.max_px,
-            self.eye.astype(np.float32), np.ascontiguousarray(self.world_from_camera, np.float32), tangents, slants, float(self.intrinsic[0, 0]),
-        )  # fmt: skip
+            parts.object_centers,
+            parts.object_radii,
+            np.maximum(parts.min_px, np.float32(SMALLEST_PX)),
+            parts.max_px,
+            self.eye.astype(np.float32),
+            np.ascontiguousarray(self.world_from_camera, np.float32),
+            tangents,
+            slants,
+            float(self.intrinsic[0, 0]),
+        )
         return rows[np.lexsort((away, -parts.records["bias"][rows]))]
 
     def shown(self, centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
-        """Which of some spheres may be seen, the nearest first; centers: (n, 3), radii (n,) float32, relative to the scene's origin."""
+        """Which spheres may be seen, the nearest first; centers (n, 3), radii (n,) float32, from the scene's origin."""
         in_camera = self._in_camera(centers)
         seen = np.flatnonzero(self._is_inside(in_camera, radii) & (self._size_px(in_camera, radii) >= SMALLEST_PX))
         return seen[np.argsort((in_camera[:, 2] - radii)[seen], kind="stable")]
@@ -68,7 +75,7 @@ class View:
         return inside
 
     def _cone(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of the image's widest angle to each side, (2,): its tangent, and how much farther off than its radius a sphere's middle may be."""
+        """Of the image's widest angle to each side, (2,): tangent, and how many radii off a sphere's middle may be."""
         middle, size = self.intrinsic[:2, 2], np.array([self.width_px, self.height_px])
         tangents = np.maximum(middle, size - middle) / np.diag(self.intrinsic)[:2]
         return tangents, np.sqrt(1.0 + tangents**2)

@@ -1,6 +1,8 @@
-"""What weather adds to the default renderer: its uniforms, the map of street lamps, rain over the picture, the glow of lights.
+"""What weather adds to the default renderer: its uniforms, the map of street lamps, rain over the picture, the glow of
+lights.
 
-Programs of other than fair weather are made with what the weather needs (`programs`): who asks for no weather pays nothing for it. Nothing here writes depth, kinds or ids.
+Programs of other than fair weather are made with what the weather needs (`programs`): who asks for no weather pays
+nothing for it. Nothing here writes depth, kinds or ids.
 """
 
 from __future__ import annotations
@@ -20,8 +22,9 @@ from cosfly.render.gl.programs import set_uniform
 # --- atmosphere -------------------------------------------------------------------------------------------------------
 # The six knobs of weather as the uniforms of weather.glsl: colours of sun, sky, clouds and fog, and how much of each.
 #
-# Colours are linear and already balanced for the exposure that goes with them, as an eye or a camera does it: a night is some twenty
-# times darker here than a day, and not a million times. Between the altitudes of the tables they are interpolated.
+# Colours are linear and already balanced for the exposure that goes with them, as an eye or a camera does it: a night
+# is some twenty times darker here than a day, and not a million times. Between the altitudes of the tables they are
+# interpolated.
 
 
 CLEAR_HAZE_M = 620.0  # air without fog, as in Look.haze_m
@@ -37,39 +40,29 @@ MOON_DISC, SUN_DISC = 0.99993, 0.99955
 ALTITUDES_DEG = (-18.0, -6.0, 0.0, 6.0, 15.0, 42.0, 75.0)
 SUN_ALTITUDES_DEG = (SUN_IS_DOWN_DEG, 0.0, 6.0, 15.0, 42.0, 75.0)
 SUN_LIGHT = (
-    (0, 0, 0),
-    (1.25, 0.50, 0.16),
-    (1.9, 1.05, 0.50),
-    (2.25, 1.70, 1.12),
-    (2.35, 2.12, 1.75),
-    (2.45, 2.28, 1.98),
-)
+    (0, 0, 0), (1.25, 0.50, 0.16), (1.9, 1.05, 0.50), (2.25, 1.70, 1.12), (2.35, 2.12, 1.75), (2.45, 2.28, 1.98),
+)  # fmt: skip
 MOON_LIGHT = np.array([0.050, 0.062, 0.090])
 SKY_LIGHT = (
-    (0.017, 0.023, 0.042), (0.10, 0.12, 0.20), (0.25, 0.25, 0.37), (0.36, 0.39, 0.50), (0.42, 0.48, 0.62), (0.48, 0.56, 0.68),
-    (0.50, 0.58, 0.70),
+    (0.017, 0.023, 0.042), (0.10, 0.12, 0.20), (0.25, 0.25, 0.37), (0.36, 0.39, 0.50), (0.42, 0.48, 0.62),
+    (0.48, 0.56, 0.68), (0.50, 0.58, 0.70),
 )  # fmt: skip
 GROUND_LIGHT = (
-    (0.010, 0.012, 0.018), (0.05, 0.05, 0.08), (0.15, 0.13, 0.14), (0.20, 0.18, 0.16), (0.24, 0.22, 0.19), (0.27, 0.25, 0.22),
-    (0.29, 0.27, 0.24),
+    (0.010, 0.012, 0.018), (0.05, 0.05, 0.08), (0.15, 0.13, 0.14), (0.20, 0.18, 0.16), (0.24, 0.22, 0.19),
+    (0.27, 0.25, 0.22), (0.29, 0.27, 0.24),
 )  # fmt: skip
 HORIZON = (
-    (0.013, 0.018, 0.036), (0.20, 0.15, 0.19), (0.46, 0.34, 0.34), (0.66, 0.56, 0.50), (0.72, 0.73, 0.74), (0.66, 0.75, 0.84),
-    (0.64, 0.75, 0.86),
+    (0.013, 0.018, 0.036), (0.20, 0.15, 0.19), (0.46, 0.34, 0.34), (0.66, 0.56, 0.50), (0.72, 0.73, 0.74),
+    (0.66, 0.75, 0.84), (0.64, 0.75, 0.86),
 )  # fmt: skip
 ZENITH = (
-    (0.002, 0.004, 0.013), (0.04, 0.06, 0.15), (0.12, 0.17, 0.36), (0.17, 0.28, 0.53), (0.17, 0.33, 0.61), (0.16, 0.34, 0.66),
-    (0.15, 0.33, 0.67),
+    (0.002, 0.004, 0.013), (0.04, 0.06, 0.15), (0.12, 0.17, 0.36), (0.17, 0.28, 0.53), (0.17, 0.33, 0.61),
+    (0.16, 0.34, 0.66), (0.15, 0.33, 0.67),
 )  # fmt: skip
 SUN_GLOW = (
-    (0, 0, 0),
-    (0.50, 0.20, 0.10),
-    (1.15, 0.46, 0.14),
-    (0.9, 0.5, 0.22),
-    (0.6, 0.45, 0.28),
-    (0.5, 0.42, 0.3),
+    (0, 0, 0), (0.50, 0.20, 0.10), (1.15, 0.46, 0.14), (0.9, 0.5, 0.22), (0.6, 0.45, 0.28), (0.5, 0.42, 0.3),
     (0.5, 0.43, 0.32),
-)
+)  # fmt: skip
 # Of a sky that is all cloud: how bright, of what hue.
 COVERED_LEVEL = (0.030, 0.11, 0.33, 0.52, 0.72, 0.94, 1.0)
 COVERED_SKY, COVERED_GROUND = np.array([0.82, 0.86, 0.92]), np.array([0.37, 0.37, 0.36])
@@ -184,7 +177,8 @@ GLOW_WIDTHS_PX = ((5.0, 0.22), (19.0, 0.16))  # of a picture of 1280 px: width, 
 
 
 def defines(params: WeatherParams) -> str:
-    """Say what a weather's programs must know, as preprocessor lines: a CPU runs both sides of every branch, so what is not needed is left out."""
+    """Say what a weather's programs must know, as preprocessor lines: a CPU runs both sides of every branch, so what is
+    not needed is left out."""
     values = uniforms(params)
     casts = float(values["sun_light"].max()) > FAINT
     needs = {
@@ -213,8 +207,8 @@ class WeatherPass:
     def prepare(
         self, params: WeatherParams, parts: Parts, unseen_lamps: np.ndarray, middle: np.ndarray, half_m: float
     ) -> None:
-        """Get ready for a flight over a square round `middle`, relative to the zero of the parts, whose lamps are lit and mirrored in
-        puddles. unseen_lamps: (n, 3), of those that only throw light."""
+        """Get ready for a flight over a square round `middle`, relative to the zero of the parts, whose lamps are lit
+        and mirrored in puddles. unseen_lamps: (n, 3), of those that only throw light."""
         self._lamps = street_lamps.lamps_of(parts)
         lit = np.concatenate([self._lamps, unseen_lamps])
         self.values, self.sun_direction = uniforms(params), light_direction(params)
@@ -227,16 +221,22 @@ class WeatherPass:
         return bool(self.values["lights_on"] > 0.0)
 
     def frame_values(self, eye: np.ndarray, camera_pose: np.ndarray, person: PosedPerson | None) -> dict[str, Any]:
-        """Give the uniforms of one frame: those of the flight, those of the lamps near the camera, and where drops fall."""
+        """Give the uniforms of one frame: the flight's, lamps near the camera, and where drops fall."""
         lamps, count = street_lamps.nearest_lamps(self._lamps, eye)
         # Drops fall anew in each frame, and in the same places when it is drawn again.
         hip_m = np.zeros(3) if person is None else np.asarray(person.hip_m, dtype=np.float64)
         seen = np.ascontiguousarray(camera_pose, dtype=np.float64).tobytes() + hip_m.tobytes()
         return {
-            **self.values, "rain_phase": zlib.crc32(seen) % 9973 / 9973.0, "sun_direction": self.sun_direction, "lamp_area": self._lamp_area, "lamp_map": LAMP_UNIT, "lamps": lamps.T,
+            **self.values,
+            "rain_phase": zlib.crc32(seen) % 9973 / 9973.0,
+            "sun_direction": self.sun_direction,
+            "lamp_area": self._lamp_area,
+            "lamp_map": LAMP_UNIT,
+            "lamps": lamps.T,
             "num_lamps": count if self.has_lights and self.values["wetness"] > 0.0 else 0,
-            "lowest_other": MAX_BOX_ID - self._num_others + 1, "highest_other": MAX_BOX_ID,
-        }  # fmt: skip
+            "lowest_other": MAX_BOX_ID - self._num_others + 1,
+            "highest_other": MAX_BOX_ID,
+        }
 
     def use(self) -> None:
         self._lamp_map.use(LAMP_UNIT)
