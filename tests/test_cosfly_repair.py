@@ -1,12 +1,8 @@
-"""Journals that hold what cannot be used: each says which line, and `--repair` sets it aside for whatever command reads it."""
+"""Journals that hold what cannot be used: each says which line, and `--repair` sets it aside."""
 
 from __future__ import annotations
 
-import asyncio
-import json
-
 import pytest
-from teacher_server import TeacherServer, kept_answers
 from typer.testing import CliRunner
 
 from cosfly.app.repair import repair
@@ -17,42 +13,35 @@ from cosfly.work.journal import Journal
 from cosfly.work.stage_folder import StageFolder
 from specimens import make_playback_tree
 
-ANSWER = {"key": "k", "sample_id": "a_ORI_frame_00004", "purpose": "free/0", "model": "m", "text": "t", "usage": {"prompt_tokens": 10, "completion_tokens": 2},
-          "structured": "plain", "finish_reason": "stop", "latency_s": 1.0, "time": 5.0}  # fmt: skip
-# Lines of answers that are whole and cannot be used, as earlier versions kept them; and the field that is named.
-BROKEN_ANSWERS = {
-    "a usage of -10^30": (ANSWER | {"usage": {"prompt_tokens": -(10**30), "completion_tokens": 2}}, "usage.prompt_tokens"),
-    "a usage of 10^30": (ANSWER | {"usage": {"prompt_tokens": 10, "completion_tokens": 10**30}}, "usage.completion_tokens"),
-    "a usage of texts": (ANSWER | {"usage": {"prompt_tokens": "10"}}, "usage.prompt_tokens"),
-    "a usage that is a list": (ANSWER | {"usage": [10, 2]}, "usage"),
-    "no key": ({name: value for name, value in ANSWER.items() if name != "key"}, "key"),
-    "a text that is none": (ANSWER | {"text": None}, "text"),
-    "a reason that is none": (ANSWER | {"finish_reason": {"deep": 1}}, "finish_reason"),
-    "a negative time": (ANSWER | {"latency_s": -1.0}, "latency_s"),
-    "totals of -1": ({"totals": {"answers": 2, "prompt_tokens": -1, "completion_tokens": 4}}, "totals.prompt_tokens"),
-    "totals of 10^30": ({"totals": {"answers": 2, "prompt_tokens": 10**30, "completion_tokens": 4}}, "totals.prompt_tokens"),
-    "totals that are none": ({"totals": 7}, "totals"),
+ANSWER = {
+    "key": "k", "sample_id": "a_ORI_frame_00004", "purpose": "free/0", "model": "m", "text": "t",
+    "usage": {"prompt_tokens": 10, "completion_tokens": 2},
+    "structured": "plain", "finish_reason": "stop", "latency_s": 1.0, "time": 5.0,
 }  # fmt: skip
+# Lines of answers that are whole and cannot be used; the fuzzer knows more of them. And the field that is named.
+BROKEN_ANSWERS = [
+    (ANSWER | {"usage": {"prompt_tokens": 10, "completion_tokens": 10**30}}, "usage.completion_tokens"),
+    ({name: value for name, value in ANSWER.items() if name != "key"}, "key"),
+    ({"totals": {"answers": 2, "prompt_tokens": -1, "completion_tokens": 4}}, "totals.prompt_tokens"),
+]
 
 
-@pytest.mark.parametrize("name", BROKEN_ANSWERS)
-def test_a_journal_of_answers_says_which_line_cannot_be_used_and_repair_sets_it_aside(tmp_path, name):
-    record, field = BROKEN_ANSWERS[name]
-    folder = tmp_path / "answers"
-    with Journal(folder / "a_ORI.jsonl") as journal:
-        for line in (ANSWER, record, ANSWER | {"key": "l"}):
-            journal.append(line)
-    with pytest.raises(
-        InputError, match=rf"a_ORI.jsonl:2: a line that cannot be used; got {field}: .*--repair"
-    ) as caught:
-        AnswerBook(folder)
-    assert len(str(caught.value)) < 1000
-    assert repair(tmp_path) == 1
-    assert len((folder / "a_ORI.jsonl.aside").read_bytes().splitlines()) == 1
-    with AnswerBook(folder) as book:
-        assert book.totals == {"answers": 2, "prompt_tokens": 20, "completion_tokens": 4}
-        assert book.get("a_ORI", "l") == Answer(**ANSWER | {"key": "l"})
-    assert repair(tmp_path) == 0
+def test_a_journal_of_answers_says_which_line_cannot_be_used_and_repair_sets_it_aside(tmp_path):
+    for number, (record, field) in enumerate(BROKEN_ANSWERS):
+        folder = tmp_path / str(number) / "answers"
+        with Journal(folder / "a_ORI.jsonl") as journal:
+            for line in (ANSWER, record, ANSWER | {"key": "l"}):
+                journal.append(line)
+        words = rf"a_ORI.jsonl:2: a line that cannot be used; got {field}: .*--repair"
+        with pytest.raises(InputError, match=words) as caught:
+            AnswerBook(folder)
+        assert len(str(caught.value)) < 1000
+        assert repair(folder.parent) == 1
+        assert len((folder / "a_ORI.jsonl.aside").read_bytes().splitlines()) == 1
+        with AnswerBook(folder) as book:
+            assert book.totals == {"answers": 2, "prompt_tokens": 20, "completion_tokens": 4}
+            assert book.get("a_ORI", "l") == Answer(**ANSWER | {"key": "l"})
+        assert repair(folder.parent) == 0
 
 
 def test_a_repair_that_is_killed_leaves_no_stage_complete_that_lacks_a_line(tmp_path, monkeypatch):
@@ -91,16 +80,6 @@ def test_a_number_that_no_file_may_hold_makes_a_line_a_damaged_one(tmp_path):
     assert repair(tmp_path) == 1
 
 
-def test_an_answer_stands_in_the_journal_as_it_always_did(tmp_path):
-    async def put() -> None:
-        with AnswerBook(tmp_path) as book:
-            await book.put("a_ORI", Answer(**ANSWER))
-
-    asyncio.run(put())
-    first = (tmp_path / "a_ORI.jsonl").read_bytes().splitlines()[0]
-    assert first.partition(b" ")[2] == json.dumps(ANSWER, separators=(",", ":")).encode()
-
-
 def test_damaged_lines_are_set_aside_too_and_links_are_left_alone(tmp_path):
     stage = tmp_path / "run/one town/plan"
     with Journal(stage / "items.jsonl") as journal:
@@ -126,18 +105,7 @@ def test_damaged_lines_are_set_aside_too_and_links_are_left_alone(tmp_path):
     assert repair(tmp_path / "nowhere") == 0
 
 
-# Lines of items.jsonl that are whole and no record of an item.
-BROKEN_ITEMS = [
-    {},
-    {"id": 7, "status": "kept"},
-    {"id": "a", "status": "done"},
-    {"id": "a"},
-    {"status": "kept"},
-    {"id": "a", "status": "dropped"},
-]
-
-
-@pytest.mark.parametrize("record", BROKEN_ITEMS, ids=range(len(BROKEN_ITEMS)))
+@pytest.mark.parametrize("record", [{}, {"id": "a", "status": "dropped"}], ids=["empty", "without a reason"])
 def test_a_journal_of_items_says_which_line_cannot_be_used(tmp_path, record):
     with Journal(tmp_path / "items.jsonl") as journal:
         journal.append({"id": "a", "status": "kept"})
@@ -146,31 +114,6 @@ def test_a_journal_of_items_says_which_line_cannot_be_used(tmp_path, record):
         list(StageFolder(tmp_path, "plan", False).items())
     assert repair(tmp_path) == 1
     assert [item.id for item in StageFolder(tmp_path, "plan", False).items()] == ["a"]
-
-
-def test_a_run_with_an_answer_of_an_earlier_version_that_cannot_be_asks_for_that_one_alone(tmp_path):
-    tree, out = make_playback_tree(tmp_path / "tree", 1, 14, with_augmented=False), tmp_path / "out"
-    with TeacherServer(decision=lambda body: "hover") as server:
-        command = ["caption", "--teacher", server.url, "--data", str(tree), "--out", str(out), "--no-check"]
-        command += ["--set", "caption.image.max_side_px=32", "--set", "caption.repair.hard_conflict=keep"]
-        assert CliRunner().invoke(app, command).exit_code == 0
-        whole, asked = (out / "captions.jsonl").read_bytes(), len(server.bodies)
-        [path] = (out / "answers").iterdir()
-        records = kept_answers(out)
-        records[2]["usage"]["prompt_tokens"] = -(10**30)
-        path.unlink()
-        (out / "manifest.json").unlink()
-        (out / "captions.jsonl").unlink()
-        with Journal(path) as journal:
-            for record in records:
-                journal.append(record)
-        result = CliRunner().invoke(app, command)
-        assert isinstance(result.exception, InputError)
-        assert f"{path.name}:3: a line that cannot be used; got usage.prompt_tokens" in str(result.exception)
-        assert len(server.bodies) == asked
-        assert CliRunner().invoke(app, [*command, "--repair"]).exit_code == 0
-        assert len(server.bodies) == asked + 1
-    assert (out / "captions.jsonl").read_bytes() == whole
 
 
 def test_the_same_command_with_repair_goes_on_and_opens_a_finished_stage(tmp_path):

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -98,12 +99,12 @@ if __name__ == "__main__":
 """
 
 
-def start_program(folder: Path, **options) -> subprocess.Popen:
-    """Start a command whose two workers hang, and wait until they do."""
+def start_program(folder: Path, until: Sequence[str] = ("0.pid", "1.pid"), **options) -> subprocess.Popen:
+    """Start a command whose two workers hang, and wait until these files are there: else until they do."""
     program = folder / "program.py"
     program.write_text(PROGRAM.format(tests=str(Path(__file__).parent), folder=str(folder)))
     parent = subprocess.Popen([sys.executable, str(program)], **options)
-    wait_for(lambda: all((folder / name).exists() for name in ("0.pid", "1.pid")))
+    wait_for(lambda: all((folder / name).exists() for name in until))
     return parent
 
 
@@ -133,14 +134,18 @@ def test_workers_end_when_their_parent_is_killed(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc")
-def test_sigterm_ends_a_command_in_one_line(tmp_path):
-    process = start_program(
-        tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
-    )
-    os.killpg(process.pid, signal.SIGTERM)  # what a service manager does
+@pytest.mark.parametrize(
+    "until", [("s/stage.json",), ("0.pid", "1.pid")], ids=["while workers start", "while they work"]
+)
+@pytest.mark.parametrize(("number", "word"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")])
+def test_a_signal_ends_a_command_and_its_workers_in_one_line(tmp_path, until, number, word):
+    options: dict = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "start_new_session": True}
+    process = start_program(tmp_path, until, **options)
+    time.sleep(0.2)
+    os.killpg(process.pid, number)  # what a terminal and a service manager do
     text, _ = process.communicate(timeout=20)
-    assert process.returncode == 143
-    assert text.splitlines() == ["error: terminated; finished work is kept: run the same command again to continue"]
+    assert process.returncode == 128 + number
+    assert text.splitlines() == [f"error: {word}; finished work is kept: run the same command again to continue"]
 
 
 # --- telling how far it is --------------------------------------------------------------------------------------------

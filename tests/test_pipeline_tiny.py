@@ -2,7 +2,6 @@
 
 import contextlib
 import itertools
-import json
 import re
 import shutil
 import subprocess
@@ -32,11 +31,6 @@ from cosfly.work.config import load
 from cosfly.work.folder_lock import hold_folder
 from cosfly.work.stage_folder import read_failures
 from cosfly.work.store import read_checksums, write_checksums, write_json
-from distill.prepare import stage as prepare
-from distill.prepare.sources import Source as Prepared
-from distill.prepare.stage import PrepareConfig
-from release.package import stage as package
-from release.package.sources import Source
 from release.verify.verify import verify
 
 TINY = [
@@ -416,29 +410,6 @@ def test_a_flight_whose_records_were_changed_too_is_rejected(base, tmp_path):
     ]
 
 
-def test_captions_and_inspections_of_another_tree_are_refused(base, tmp_path):
-    """Another seed's tree has the same names: only its digests tell."""
-    other = shutil.copytree(base / "render", tmp_path / "run/render")
-    ids = next(other.glob("*/instance_ids.json"))
-    ids.write_text(ids.read_text() + " ")
-    manifest = read_json(other / "manifest.json")
-    entry = next(entry for entry in manifest["outputs"] if entry["path"].endswith(ids.name))
-    entry |= {"sha256": sha256_file(ids), "bytes": ids.stat().st_size}
-    write_json(other / "manifest.json", manifest)
-    captions, inspected = base / "caption/captions.jsonl", base / "inspect/inspect.json"
-    with pytest.raises(VerifyError, match=r"captions\.jsonl: it was made of another input 'data'"):
-        prepare.run(PrepareConfig(), [Prepared.of_files(other, captions)], tmp_path / "set")
-    with pytest.raises(VerifyError, match=r"captions\.jsonl: it was made of another input 'data'"):
-        package.run(package.ReleaseConfig(), [Source("x", other, captions, inspected)], tmp_path / "release")
-    shutil.copy(captions, tmp_path / "captions.jsonl")
-    with pytest.raises(VerifyError, match=r"inspect\.json: it was made of another input 'data'"):
-        package.run(
-            package.ReleaseConfig(), [Source("x", other, tmp_path / "captions.jsonl", inspected)], tmp_path / "release"
-        )
-    assert not (tmp_path / "set").exists()
-    assert not (tmp_path / "release").exists()
-
-
 def test_verify_on_the_command_line_names_the_file_before_anything_is_done(tampered):
     kinds = kinds_of(tampered)
     picture = next(paths for kind, paths in kinds.items() if kind.endswith("depth_floatN.png"))
@@ -458,34 +429,6 @@ def test_two_workers_give_the_same_products(base, tmp_path, stage):
     out = begin(base, tmp_path / "run", stage)
     work(tiny(workers=2), out, stage)
     assert products(out / stage) == products(base / stage)
-
-
-@pytest.mark.slow
-def test_a_damaged_frame_is_named_and_rejects_its_flight(base, tmp_path):
-    out = begin(base, tmp_path / "run", "inspect")
-    depth = find_flights(out / "render")[0] / "frames_playback/frame_00003/depth_float32.png"
-    depth.write_bytes(b"half")
-    work(tiny(), out, "inspect")
-    assert "frame_00003" in json.dumps(read_json(out / "inspect/inspect.json"))
-    counts = read_json(out / "inspect/manifest.json")["counts"]
-    assert counts["kept"] == 3
-    assert sum(counts["dropped"].values()) == 1
-
-
-@pytest.mark.slow
-def test_a_half_written_flight_is_a_counted_failure_that_can_be_mended(base, tmp_path):
-    out = begin(base, tmp_path / "run", "inspect")
-    trajectory = find_flights(out / "render")[0] / "trajectory.json"
-    whole = trajectory.read_bytes()
-    trajectory.write_bytes(whole[: len(whole) // 2])
-    work(tiny(), out, "inspect")
-    assert "trajectory.json" in (out / "inspect/failures.jsonl").read_text()
-    failed = read_json(out / "inspect/manifest.json")["counts"]["failed"]
-    assert sum(failed.values()) == 2, "the flight, and the perturbed one that is measured against it"
-    trajectory.write_bytes(whole)  # mended: the same command does the failed flight again
-    work(tiny(), out, "inspect")
-    assert read_json(out / "inspect/manifest.json")["counts"]["kept"] == 4
-    assert products(out / "inspect") == products(base / "inspect")
 
 
 @pytest.mark.slow
