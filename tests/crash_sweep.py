@@ -1,9 +1,10 @@
 """Every command that writes, killed at every point: which commands, with which inputs, and the sweep over their points.
 
-`python tests/crash_sweep.py` sweeps them all; names of commands after it, only these. --few: of each kind of point the first and the last.
---twice: killed again, at a random point, in the run that goes on. Exit code 1: something was wrong after a kill, or nothing was killed.
+`python tests/crash_sweep.py` sweeps them all; names of commands after it, only these. --few: of each kind of point the
+first and the last. --twice: killed again, at a random point, in the run that goes on. Exit code 1: something was wrong
+after a kill, or nothing was killed.
 
-It is a process of its own: what it kills are forks, and a fork of a process that has run others' threads (tests before it) may hang.
+It is a process of its own: what it kills are forks, and a fork of a process that has run others' threads may hang.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import argparse
 import importlib
 import json
 import pkgutil
+import shlex
 import shutil
 import tempfile
 import time
@@ -33,15 +35,16 @@ if TYPE_CHECKING:
     from teacher_server import TeacherServer
 
 TINY = (
-    "maps.synthetic.size_m=110", "maps.synthetic.num_blocks=1", "pedestrians.num_paths=1", "pedestrians.min_distance_m=8",
-    "pedestrians.max_distance_m=12", "render.width_px=160", "render.height_px=90", "render.fovs_deg=[60]", "caption.window.stride=4", "workers=1",
+    "maps.synthetic.size_m=110", "maps.synthetic.num_blocks=1", "pedestrians.num_paths=1",
+    "pedestrians.min_distance_m=8", "pedestrians.max_distance_m=12", "render.width_px=160", "render.height_px=90",
+    "'render.fovs_deg=[60]'", "caption.window.stride=4", "workers=1",
 )  # fmt: skip
-SETTINGS = [word for setting in TINY for word in ("--set", setting)]
 
 
 @dataclass
 class Place:
-    """Where a sweep works: `base` is a finished run, `students` what distillation begins with; servers end with the stack."""
+    """Where a sweep works: `base` is a finished run, `students` what distillation begins with; servers end with the
+    stack."""
 
     root: Path
     stack: ExitStack
@@ -56,8 +59,8 @@ class Place:
     def do(self, name: str, out: Path) -> Path:
         """Do the first command of a name."""
         first = COMMANDS[name][0]
-        assert isinstance(first, list)
-        words = [_filled(word, self, out) for word in first]
+        assert isinstance(first, str)
+        words = words_of(first, self, out)
         ended = run(lambda: command(words), out)
         assert ended.code == 0, ended.said
         return out
@@ -129,6 +132,15 @@ def _judge(place: Place) -> str:
     return server.url
 
 
+def _key(place: Place) -> Path:
+    from cryptography.hazmat.primitives import serialization
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+    form = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    (place.root / "key").write_bytes(Ed25519PrivateKey.generate().private_bytes(*form))
+    return place.root / "key"
+
+
 def _served(place: Place) -> str:
     from test_release_get import served
 
@@ -137,33 +149,30 @@ def _served(place: Place) -> str:
     return address
 
 
-def _key(place: Place) -> Path:
-    from cryptography.hazmat.primitives import serialization
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
-    path = place.root / "key.pem"
-    path.touch(mode=0o600)
-    pkcs8 = (serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
-    path.write_bytes(Ed25519PrivateKey.generate().private_bytes(*pkcs8))
-    return path
-
-
 INPUTS: dict[str, Callable[[Place], object]] = {
-    "base": _base, "students": _students, "trained": _trained, "inferred": _inferred, "evaluated": _evaluated, "teacher": _teacher, "judge": _judge, "served": _served,
-    "key": _key,
+    "base": _base, "students": _students, "trained": _trained, "inferred": _inferred, "evaluated": _evaluated,
+    "teacher": _teacher, "judge": _judge, "served": _served, "key": _key,
 }  # fmt: skip
 
-TRAINING = [
-    "--set", "distill.train.max_pixels=4096", "--set", "distill.train.device=cpu", "--set", "distill.train.max_steps=3", "--set",
-    "distill.train.samples_per_step=2", "--set", "distill.train.batch_size=2", "--set", "distill.train.save_every_steps=1", "--set",
-    "distill.train.data_workers=0", "--set", "distill.train.validation_answers=false", "--set", "distill.train.lora_rank=4",
-    "--set", "distill.train.keep_checkpoints=1",
-]  # fmt: skip
-MAPS, TRACES = "{base}/maps/boxes_3d.json", "{base}/plan/drone_trace.json"
-SIMPLE, WALKS, TREE = "{base}/simplify/step2_simplified.json", "{base}/pedestrians/path.json", "{base}/render"
-DATASET = "{base}/release/dataset"
-THREE = ["--map", MAPS, "--simplified", SIMPLE, "--traces", TRACES, *SETTINGS]
-TOWNS = "towns={one: {}, two: {maps: {synthetic: {parked_share: 0.0}}}}"
+TRAINING = (
+    "max_pixels=4096", "device=cpu", "max_steps=3", "samples_per_step=2", "batch_size=2", "save_every_steps=1",
+    "data_workers=0", "validation_answers=false", "lora_rank=4", "keep_checkpoints=1",
+)  # fmt: skip
+SHORT = {  # what commands have in common
+    "tiny": " ".join(f"--set {setting}" for setting in TINY),
+    "training": " ".join(f"--set distill.train.{setting}" for setting in TRAINING),
+    "maps": "{base}/maps/boxes_3d.json",
+    "simple": "{base}/simplify/step2_simplified.json",
+    "walks": "{base}/pedestrians/path.json",
+    "traces": "{base}/plan/drone_trace.json",
+    "tree": "{base}/render",
+    "release": "{base}/release/dataset",
+    "towns": "--set 'towns={one: {}, two: {maps: {synthetic: {parked_share: 0.0}}}}'",
+    "three": "--map {maps} --simplified {simple} --traces {traces} {tiny}",
+    "asked": "--teacher {teacher} --set caption.endpoint.concurrency=1 --no-check {tiny}",
+    "set": "--dataset {students}/set --data {students}/tree",
+    "small": "--set distill.infer.max_new_tokens=4 --set distill.infer.device=cpu --set distill.infer.max_pixels=4096",
+}
 FLIGHTS = "Town_SynthTown/trajectory_1593759126"  # of the walk that the seed gives
 
 
@@ -181,90 +190,105 @@ def lose_release(_: Place, out: Path) -> None:
     (out / "summary.json").unlink()
 
 
-# Commands by name; {out} is what is watched, other braces are INPUTS. Several: one after the other in the same folder; a function is what comes before.
-COMMANDS: dict[str, list[list[str] | Callable[[Place, Path], None]]] = {
-    "maps": [["maps", "--out", "{out}", *SETTINGS]],
-    "simplify": [["simplify", "--map", MAPS, "--out", "{out}", *SETTINGS]],
-    "pedestrians": [["pedestrians", "--map", SIMPLE, "--out", "{out}", *SETTINGS]],
+# Commands by name; {out} is what is watched, other braces are SHORT and INPUTS. Several: one after the other in the
+# same folder; a function is what comes before.
+COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
+    "maps": ["maps --out {out} {tiny}"],
+    "simplify": ["simplify --map {maps} --out {out} {tiny}"],
+    "pedestrians": ["pedestrians --map {simple} --out {out} {tiny}"],
     "pedestrians, more": [
-        ["pedestrians", "--map", SIMPLE, "--out", "{out}", *SETTINGS],
-        ["pedestrians", "--map", SIMPLE, "--out", "{out}", *SETTINGS, "--set", "pedestrians.num_paths=2"],
+        "pedestrians --map {simple} --out {out} {tiny}",
+        "pedestrians --map {simple} --out {out} {tiny} --set pedestrians.num_paths=2",
     ],
-    "plan": [["plan", "--map", SIMPLE, "--paths", WALKS, "--out", "{out}", *SETTINGS]],
-    "plan compare": [["plan", "compare", SIMPLE, WALKS, "--out", "{out}", *SETTINGS, "--planner", "foresight", "--planner", "track_astar"]],
-    "render": [["render", *THREE, "--out", "{out}", "--set", "render.width_px=64", "--set", "render.height_px=36"]],
-    "study weather": [["study", "weather", "--map", MAPS, "--traces", TRACES, "--out", "{out}", *SETTINGS]],
-    "study zoom": [["study", "zoom", *THREE, "--out", "{out}", "--every", "10"]],
-    "render sample": [["render", "sample", "--data", TREE, "--map", MAPS, "--out", "{out}/sample.png"]],
-    "gallery": [["gallery", "--data", TREE, "--out", "{out}"]],
-    "inspect": [["inspect", "--map", SIMPLE, "--traces", TRACES, "--data", TREE, "--out", "{out}", *SETTINGS]],
+    "plan": ["plan --map {simple} --paths {walks} --out {out} {tiny}"],
+    "plan compare": ["plan compare {simple} {walks} --out {out} {tiny} --planner foresight --planner track_astar"],
+    "render": ["render {three} --out {out} --set render.width_px=64 --set render.height_px=36"],
+    "study weather": ["study weather --map {maps} --traces {traces} --out {out} {tiny}"],
+    "study zoom": ["study zoom {three} --out {out} --every 10"],
+    "render sample": ["render sample --data {tree} --map {maps} --out {out}/sample.png"],
+    "gallery": ["gallery --data {tree} --out {out}"],
+    "inspect": ["inspect --map {simple} --traces {traces} --data {tree} --out {out} {tiny}"],
     "inspect review": [
         lambda place, out: copy_stage(place, out, "inspect"),
-        ["inspect", "review", "--inspect", "{out}", "--reject", FLIGHTS, "--by", "somebody", "--reason", "too near"],
+        f"inspect review --inspect {{out}} --reject {FLIGHTS} --by somebody --reason 'too near'",
     ],
-    "inspect review, page": [lambda place, out: copy_stage(place, out, "inspect"), ["inspect", "review", "--inspect", "{out}"]],
+    "inspect review, page": [
+        lambda place, out: copy_stage(place, out, "inspect"),
+        "inspect review --inspect {out}",
+    ],
     "pedestrians, repaired": [
         lambda place, out: copy_stage(place, out, "pedestrians", damaged="items.jsonl"),
-        ["pedestrians", "--map", SIMPLE, "--out", "{out}", *SETTINGS, "--set", "pedestrians.ground=paved", "--repair"],
+        "pedestrians --map {simple} --out {out} {tiny} --set pedestrians.ground=paved --repair",
     ],
-    "study depth": [["study", "depth", "--data", TREE, "--out", "{out}"]],
-    "caption": [["caption", "--data", TREE, "--out", "{out}", *SETTINGS]],
-    "caption, limited": [["caption", "--data", TREE, "--out", "{out}", "--limit", "2", *SETTINGS], ["caption", "--data", TREE, "--out", "{out}", *SETTINGS]],
-    "caption, served": [["caption", "--data", TREE, "--out", "{out}", "--teacher", "{teacher}", "--set", "caption.endpoint.concurrency=1", "--no-check", *SETTINGS]],
-    "caption, judged": [[
-        "caption", "--data", TREE, "--out", "{out}", "--teacher", "{teacher}", "--judge", "{judge}", "--set", "caption.endpoint.concurrency=1",
-        "--set", "caption.judge.concurrency=1", "--no-check", *SETTINGS,
-    ]],
-    "caption prompts": [["caption", "prompts", "--export", "{out}/prompts"]],
-    "caption actions": [["caption", "actions", "--export", "{out}/actions.yaml"]],
-    "compare-strategies": [["caption", "compare-strategies", "--data", TREE, "--out", "{out}", "--teacher", "{teacher}", "--conflicts", "2", *SETTINGS]],
-    "release build": [["release", "build", "{base}", "--out", "{out}", "--workers", "1"]],
-    "release export tree": [["release", "export", DATASET, "--format", "tree", "--out", "{out}", "--workers", "1"]],
-    "release export webdataset": [["release", "export", DATASET, "--format", "webdataset", "--out", "{out}", "--workers", "1"]],
-    "release export lerobot": [["release", "export", DATASET, "--format", "lerobot", "--out", "{out}", "--workers", "1"]],
+    "study depth": ["study depth --data {tree} --out {out}"],
+    "caption": ["caption --data {tree} --out {out} {tiny}"],
+    "caption, limited": [
+        "caption --data {tree} --out {out} --limit 2 {tiny}",
+        "caption --data {tree} --out {out} {tiny}",
+    ],
+    "caption, served": ["caption --data {tree} --out {out} {asked}"],
+    "caption, judged": [
+        "caption --data {tree} --out {out} {asked} --judge {judge} --set caption.judge.concurrency=1",
+    ],
+    "caption prompts": ["caption prompts --export {out}/prompts"],
+    "caption actions": ["caption actions --export {out}/actions.yaml"],
+    "compare-strategies": [
+        "caption compare-strategies --data {tree} --out {out} --teacher {teacher} --conflicts 2 {tiny}"
+    ],
+    "release build": ["release build {base} --out {out} --workers 1"],
+    "release export tree": ["release export {release} --format tree --out {out} --workers 1"],
+    "release export webdataset": ["release export {release} --format webdataset --out {out} --workers 1"],
+    "release export lerobot": ["release export {release} --format lerobot --out {out} --workers 1"],
     "release sign": [
-        lambda place, out: copy_stage(place, out, "release"),
-        ["release", "sign", "{out}/dataset", "--key", "{key}", "--level", "structure", "--workers", "1"],
+        lambda place, out: copy_stage(place, out, "release/dataset"),
+        "release sign {out} --key {key} --level structure",
     ],
-    "release get": [["release", "get", "{served}", "--out", "{out}", "--workers", "1"]],
-    "release get, a part": [["release", "get", "{served}", "--out", "{out}", "--workers", "1", "--modality", "rgb"]],
-    "release stats": [["release", "stats", DATASET, "--out", "{out}"]],
-    "release card": [["release", "card", DATASET, "--out", "{out}/card.md"]],
-    "release viewer": [["release", "viewer", DATASET, "--out", "{out}/viewer.html"]],
-    "export captions": [["export", "captions", "{base}", "--format", "csv", "--out", "{out}/captions.csv"]],
-    "tiny-student": [["distill", "tiny-student", "--out", "{out}/student"]],
-    "distill prepare": [["distill", "prepare", "--captions", "{students}/captions.jsonl", "--data", "{students}/tree", "--out", "{out}", "--set", "distill.prepare.unbound=accept"]],
-    "distill dual-track": [["distill", "dual-track", "--data", "{students}/tree", "--out", "{out}", "--set", "distill.dual_track.observed=2", "--set", "distill.dual_track.predicted=2"]],
-    "distill train": [["distill", "train", "--dataset", "{students}/set", "--data", "{students}/tree", "--student", "{students}/student", "--out", "{out}", *TRAINING]],
-    "distill infer": [[
-        "distill", "infer", "--dataset", "{students}/set", "--data", "{students}/tree", "--model", "{students}/student", "--out", "{out}",
-        "--set", "distill.infer.max_new_tokens=4", "--set", "distill.infer.device=cpu", "--set", "distill.infer.max_pixels=4096",
-    ]],
-    "distill merge": [["distill", "merge", "--model", "{students}/student", "--adapter", "{trained}/adapter", "--out", "{out}"]],
-    "distill floors": [["distill", "floors", "--dataset", "{students}/set", "--out", "{out}"]],
-    "distill evaluate": [["distill", "evaluate", "--dataset", "{students}/set", "--predictions", "{inferred}/predictions.jsonl", "--out", "{out}"]],
-    "distill report": [["distill", "report", "{evaluated}", "--out", "{out}"]],
-    "run": [["run", "quickstart", "--out", "{out}", *SETTINGS]],
-    "run, more": [["run", "quickstart", "--out", "{out}", *SETTINGS], ["run", "{out}", "--set", "pedestrians.num_paths=2"]],
-    "run, towns": [["run", "quickstart", "--out", "{out}", *SETTINGS, "--set", TOWNS]],
-    "run, towns, release": [["run", "quickstart", "--out", "{out}", *SETTINGS, "--set", TOWNS], lose_release, ["run", "{out}"]],
-}  # fmt: skip
+    "release get": ["release get {served} --out {out} --workers 1"],
+    "release get, a part": ["release get {served} --out {out} --workers 1 --modality rgb"],
+    "release stats": ["release stats {release} --out {out}"],
+    "release card": ["release card {release} --out {out}/card.md"],
+    "release viewer": ["release viewer {release} --out {out}/viewer.html"],
+    "export captions": ["export captions {base} --format csv --out {out}/captions.csv"],
+    "tiny-student": ["distill tiny-student --out {out}/student"],
+    "distill prepare": [
+        "distill prepare --captions {students}/captions.jsonl --data {students}/tree --out {out} "
+        "--set distill.prepare.unbound=accept"
+    ],
+    "distill dual-track": [
+        "distill dual-track --data {students}/tree --out {out} "
+        "--set distill.dual_track.observed=2 --set distill.dual_track.predicted=2"
+    ],
+    "distill train": ["distill train {set} --student {students}/student --out {out} {training}"],
+    "distill infer": ["distill infer {set} --model {students}/student --out {out} {small}"],
+    "distill merge": ["distill merge --model {students}/student --adapter {trained}/adapter --out {out}"],
+    "distill floors": ["distill floors --dataset {students}/set --out {out}"],
+    "distill evaluate": [
+        "distill evaluate --dataset {students}/set --predictions {inferred}/predictions.jsonl --out {out}"
+    ],
+    "distill report": ["distill report {evaluated} --out {out}"],
+    "run": ["run quickstart --out {out} {tiny}"],
+    "run, more": ["run quickstart --out {out} {tiny}", "run {out} --set pedestrians.num_paths=2"],
+    "run, towns": ["run quickstart --out {out} {tiny} {towns}"],
+    "run, towns, release": ["run quickstart --out {out} {tiny} {towns}", lose_release, "run {out}"],
+}
 
 
-def _filled(word: str, place: Place, out: Path) -> str:
+def words_of(text: str, place: Place, out: Path) -> list[str]:
+    """Give the words of a command of COMMANDS; inputs that it names are made."""
+    while found := [name for name in SHORT if f"{{{name}}}" in text]:
+        for name in found:
+            text = text.replace(f"{{{name}}}", SHORT[name])
     for name in INPUTS:
-        if f"{{{name}}}" in word:
-            word = word.replace(f"{{{name}}}", place.given(name))
-    return word.replace("{out}", str(out))
+        if f"{{{name}}}" in text:
+            text = text.replace(f"{{{name}}}", place.given(name))
+    return shlex.split(text.replace("{out}", str(out)))
 
 
 def works(name: str, place: Place) -> list[Callable[[], None]]:
     """Give the commands of a name, to be swept in the folder `out` of the place."""
     out = place.root / "out"
     return [
-        partial(given, place, out)
-        if callable(given)
-        else partial(command, [_filled(word, place, out) for word in given])
+        partial(given, place, out) if callable(given) else partial(command, words_of(given, place, out))
         for given in COMMANDS[name]
     ]
 
@@ -290,10 +314,8 @@ def main() -> None:
                 is_right = False
                 continue
             seconds = f"{time.monotonic() - begin_s:.0f} s"
-            print(
-                f"{name}: {swept.num_steps} steps, killed {swept.num_killed} times, {len(swept.wrong)} wrong, {seconds}",
-                flush=True,
-            )
+            counts = f"{swept.num_steps} steps, killed {swept.num_killed} times, {len(swept.wrong)} wrong"
+            print(f"{name}: {counts}, {seconds}", flush=True)
             print("".join(f"  {line}\n" for line in swept.wrong), end="", flush=True)
             is_right &= not swept.wrong and swept.num_killed > 0
     if not is_right:

@@ -1,7 +1,9 @@
-"""kill -9 at every point: a command is run in a process whose every step on the disk is counted, and the N-th one ends it and all its workers.
+"""kill -9 at every point: a command is run in a process whose every step on the disk is counted, and the N-th one ends
+it and all its workers.
 
-A step is what changes a folder that is watched: a file opened for writing, written to (half of the bytes go out first), cut or made safe,
-and a name made, changed, linked or removed. What a library writes without Python (parquet's rows, tensors) is one step, its name.
+A step is what changes a folder that is watched: a file opened for writing, written to (half of the bytes go out first),
+cut or made safe, and a name made, changed, linked or removed. What a library writes without Python (parquet's rows,
+tensors) is one step, its name.
 """
 
 from __future__ import annotations
@@ -47,7 +49,8 @@ class Step:
 
     @property
     def kind(self) -> tuple[str, str, str]:
-        """Steps of one kind differ in the numbers of their names alone; in a folder that has not its name yet, in the files too."""
+        """Steps of one kind differ in the numbers of their names alone; in a folder that has not its name yet, in the
+        files too."""
         path, partial, _ = self.path.partition(".partial/")
         return self.event, re.sub(r"[0-9a-f]{16,}|\d+", "#", path) + partial, self.place
 
@@ -58,7 +61,8 @@ class Step:
 
 @dataclass(frozen=True)
 class Moment:
-    """The n-th step of a kind, n from 1 on: how many others come between, as what workers tell of themselves, may differ."""
+    """The n-th step of a kind, n from 1 on: how many others come between, as what workers tell of themselves, may
+    differ."""
 
     kind: tuple[str, str, str]
     number: int
@@ -206,19 +210,22 @@ class _Forking:
 # --- what stands in a folder ------------------------------------------------------------------------------------------
 
 TIMES = re.compile(
-    rb'"(seconds\w*|peak_memory_mb|planning_ms\w*|times_ms|mean_ms|max_ms|latency_s|time|at|speed)": ?(\{[^}]*\}|"[^"]*"|[\d.]+)'
+    rb'"(seconds\w*|peak_memory_mb|planning_ms\w*|times_ms|mean_ms|max_ms|latency_s|time|at|speed)": ?'
+    rb'(\{[^}]*\}|"[^"]*"|[\d.]+)'
 )
 
 
 def contents(root: Path) -> dict[str, bytes]:
-    """Give what stands below a folder, without what is documented to differ: times, what happened to workers, broken lines."""
+    """Give what stands below a folder, without what is documented to differ: times, what happened to workers, broken
+    lines."""
     paths = [path for path in sorted(root.rglob("*")) if path.name != EVENTS and not path.name.endswith(ASIDE)]
     found = {path.relative_to(root).as_posix(): path for path in paths}
     return {name: b"a folder" if path.is_dir() else _plain(path) for name, path in found.items()}
 
 
 def _plain(path: Path) -> bytes:
-    """Give a file without times; of a journal each line once, in order, without its checksum, and no line of totals: it saves reading."""
+    """Give a file without times; of a journal each line once, in order, without its checksum, and no line of totals: it
+    saves reading."""
     data = path.read_bytes()
     if path.suffix == ".jsonl":
         lines = {TIMES.sub(b"", re.sub(rb"^[0-9a-f]{16} ", b"", line)) for line in data.splitlines()}
@@ -243,7 +250,8 @@ def differences(found: dict[str, bytes], expected: dict[str, bytes]) -> list[str
 def _first_difference(found: bytes, expected: bytes) -> str:
     """Show two contents from a little before the first byte on that differs."""
     place = max(next((k for k, (a, b) in enumerate(zip(found, expected, strict=False)) if a != b), len(found)) - 40, 0)
-    return f"{len(found)} bytes, not {len(expected)}, from {place} on {found[place : place + 80]!r}, not {expected[place : place + 80]!r}"
+    one, two = (text[place : place + 80] for text in (found, expected))
+    return f"{len(found)} bytes, not {len(expected)}, from {place} on {one!r}, not {two!r}"
 
 
 def called_complete(root: Path, wholes: list[Path]) -> list[str]:
@@ -294,10 +302,12 @@ class Swept:
 def sweep(
     works: list[Callable[[], object]], root: Path, *, few: bool = False, twice: bool = False, only: str = ".*"
 ) -> Swept:
-    """Kill a command at its steps, run it again after each, and compare what it made with what an undisturbed run makes.
+    """Kill a command at its steps, run it again after each, and compare what it made with what an undisturbed run
+    makes.
 
     Args:
-        works: commands that write into the folder `out` of `root`; the last is killed, where those before it have done their work.
+        works: commands that write into the folder `out` of `root`; the last is killed, where those before it have done
+            their work.
         few: at some of the steps, see `chosen`. twice: also the run that goes on is killed, at some step.
         only: a pattern of the paths at whose steps it is killed.
     """
@@ -350,7 +360,8 @@ def chosen(steps: list[Step], *, few: bool) -> list[Moment]:
     """Give the moments of the kills.
 
     Args:
-        few: of each kind the first and the last, and of a file that is written under another name only that it gets its own.
+        few: of each kind the first and the last, and of a file that is written under another name only that it gets its
+            own.
     """
     found = moments(steps)
     if not few:
