@@ -59,7 +59,8 @@ def held_by_another() -> Callable[[Path], contextlib.AbstractContextManager[subp
 
 @pytest.fixture(scope="session")
 def students(tmp_path_factory) -> Path:
-    """A playback tree, a training set and a tiny student, read by many tests; what a test writes has a folder of its own."""
+    """A playback tree, a training set and a tiny student, read by many tests; what a test writes has a folder of its
+    own."""
     from specimens_students import make_place
 
     return make_place(tmp_path_factory.mktemp("students"))

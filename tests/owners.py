@@ -1,4 +1,5 @@
-"""Environments of libraries that cannot share the tests' own: made once, kept in `.venv-owners/`, one for each list of pins.
+"""Environments of libraries that cannot share the tests' own: made once, kept in `.venv-owners/`, one for each list of
+pins.
 
 They see the packages of this environment (torch among them, which is large) behind their own.
 """
@@ -15,45 +16,32 @@ import pytest
 
 KEPT_IN = Path(__file__).resolve().parents[1] / ".venv-owners"
 UNREACHABLE = (
-    "NewConnectionError",
-    "ConnectTimeoutError",
-    "name resolution",
-    "Network is unreachable",
-    "Max retries exceeded",
+    *("NewConnectionError", "ConnectTimeoutError", "name resolution"),
+    *("Network is unreachable", "Max retries exceeded"),
 )
-
 _LIGHT = (
-    "draccus==0.10.0",
-    "mergedeep==1.3.4",
-    "typing-inspect==0.9.0",
-    "mypy_extensions==1.1.0",
-    "pyyaml-include==1.4.1",
-    "toml==0.10.2",
+    "draccus==0.10.0 mergedeep==1.3.4 typing-inspect==0.9.0 mypy_extensions==1.1.0 pyyaml-include==1.4.1 toml==0.10.2"
 )
 _OF_LEROBOT = (
-    *_LIGHT,
-    "torchvision==0.28.0",
-    "jsonlines==4.0.0",
-    "attrs==25.3.0",
-    "einops==0.8.1",
-    "termcolor==3.1.0",
-    "huggingface_hub==0.35.3",
+    "torchvision==0.28.0 jsonlines==4.0.0 attrs==25.3.0 einops==0.8.1 termcolor==3.1.0 huggingface_hub==0.35.3"
 )
 # LeRobot's own pins ask for another torch; what reads data sets works with ours, so the packages are named one by one.
-LEROBOT = ("lerobot==0.4.4", "datasets==4.4.1", "av==15.1.0", *_OF_LEROBOT)
+LEROBOT = ("lerobot==0.4.4", "datasets==4.4.1", "av==15.1.0", *_LIGHT.split(), *_OF_LEROBOT.split())
 
 # An S3 server, and what fsspec opens s3:// with; of the server only what its S3 part asks for.
 S3 = (
-    "s3fs==2026.9.0", "fsspec==2026.9.0", "aiobotocore==3.10.0", "aioitertools==0.13.0", "botocore==1.43.117", "boto3==1.43.117",
-    "s3transfer==0.19.3", "jmespath==1.1.0", "wrapt==2.5.2", "aiohttp==3.14.5", "multidict==7.2.1", "yarl==1.25.1", "frozenlist==1.8.0",
-    "aiosignal==1.4.0", "aiohappyeyeballs==2.7.1", "propcache==0.5.4", "attrs==26.1.0",
-    "moto==5.2.5", "Werkzeug==3.1.9", "Flask==3.1.3", "flask-cors==6.0.5", "blinker==1.9.0", "itsdangerous==2.2.0", "xmltodict==1.0.4",
-    "responses==0.26.3", "py-partiql-parser==0.6.3", "cryptography==50.0.2", "cffi==2.1.1",
+    "s3fs==2026.9.0", "fsspec==2026.9.0", "aiobotocore==3.10.0", "aioitertools==0.13.0", "botocore==1.43.117",
+    "boto3==1.43.117", "s3transfer==0.19.3", "jmespath==1.1.0", "wrapt==2.5.2", "aiohttp==3.14.5",
+    "multidict==7.2.1", "yarl==1.25.1", "frozenlist==1.8.0", "aiosignal==1.4.0", "aiohappyeyeballs==2.7.1",
+    "propcache==0.5.4", "attrs==26.1.0", "moto==5.2.5", "Werkzeug==3.1.9", "Flask==3.1.3", "flask-cors==6.0.5",
+    "blinker==1.9.0", "itsdangerous==2.2.0", "xmltodict==1.0.4", "responses==0.26.3", "py-partiql-parser==0.6.3",
+    "cryptography==50.0.2", "cffi==2.1.1",
 )  # fmt: skip
 
 
 def python_with(pins: tuple[str, ...]) -> Path:
-    """Give the interpreter of an environment with these packages; skips the test only where no registry can be reached."""
+    """Give the interpreter of an environment with these packages; skips the test only where no registry can be
+    reached."""
     name = hashlib.sha256("\n".join([sys.version, *pins]).encode()).hexdigest()[:16]
     folder = KEPT_IN / name
     python = folder / "bin" / "python"

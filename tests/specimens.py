@@ -1,7 +1,7 @@
 """Small playback trees for tests: a walking person, a drone that follows, and every file of every frame.
 
-Images are painted by a plain NumPy ray caster (a ground plane, some boxes, the person), so the pictures, depths, ids, boxes
-and visibilities agree with the poses in `trajectory.json`.
+Images are painted by a plain NumPy ray caster (a ground plane, some boxes, the person), so the pictures, depths, ids,
+boxes and visibilities agree with the poses in `trajectory.json`.
 """
 
 from __future__ import annotations
@@ -165,7 +165,8 @@ def _walk(num_points: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _follow(targets: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Drone positions (n, 3) and rotations (n, 3) deg: some 12 m behind and 8 m above, with a lag, looking at the person."""
+    """Drone positions (n, 3) and rotations (n, 3) deg: some 12 m behind and 8 m above, with a lag, looking at the
+    person."""
     n = len(targets)
     bearing = rng.uniform(-np.pi, np.pi)
     altitude = 8.0 + 1.5 * np.sin(np.arange(n) * 0.35 + rng.uniform(0.0, 6.0))
@@ -184,7 +185,8 @@ def _follow(targets: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, 
 
 
 def _scene(targets: np.ndarray, positions: np.ndarray, rng: np.random.Generator) -> Scene:
-    """A few buildings beside the walk and one wall that hides the person for some frames in the middle of the flight."""
+    """A few buildings beside the walk and one wall that hides the person for some frames in the middle of the
+    flight."""
     centers, halves, colors, kinds = [], [], [], []
     for _ in range(6):
         angle, distance_m = rng.uniform(-np.pi, np.pi), rng.uniform(25.0, 45.0)

@@ -1,7 +1,8 @@
-"""A tree as other people write the public layout, by a writer that knows nothing of cosfly: plain JSON, Pillow and NumPy.
+"""A tree as other people write the public layout, by a writer that knows nothing of cosfly: plain JSON, Pillow and
+NumPy.
 
-Boolean perturbation flags, a clock that starts late, RGBA pictures, no meta.json, frames without a target, axes and projection of
-its own (left-handed: x forward, y right, z up, yaw clockwise).
+Boolean perturbation flags, a clock that starts late, RGBA pictures, no meta.json, frames without a target, axes and
+projection of its own (left-handed: x forward, y right, z up, yaw clockwise).
 """
 
 from __future__ import annotations
@@ -64,7 +65,8 @@ def _header(variant: str, is_clean: bool, k: int, points: list[dict]) -> dict:
 
 
 def _motion(num_points: int, k: int, is_clean: bool) -> tuple[list[dict], list[tuple[float, float, float]]]:
-    """A person who walks and turns, a drone 12 m behind and 8 m above that looks at it, shaken in the perturbed flight."""
+    """A person who walks and turns, a drone 12 m behind and 8 m above that looks at it, shaken in the perturbed
+    flight."""
     noise = np.random.default_rng([k, 5])
     poses, people = [], []
     x = y = 10.0 * k

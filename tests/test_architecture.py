@@ -15,7 +15,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("cosfly", "caption", "distill", "release")
 STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")  # a folder each
-# From the ground up: a room may import what stands before it, and itself; stages do not import each other, nor do siblings.
+# From the ground up: a room may import what stands before it, and itself; stages do not import each other, nor do
+# siblings.
 ROOMS = ("root", "reading", "work", "products", "space", "look", "chat", "stages", "siblings", "app", "cli")
 ASSEMBLY = ("app", "studies")  # what may know all stages and siblings
 HEAVY = {
@@ -73,7 +74,8 @@ def _imports(name: str, path: Path, top_level_only: bool) -> set[str]:
 
 
 def room(name: str) -> str:
-    """Where a module stands: one of ROOMS, of which `root` has the errors, the escaping and the geometry that all others know."""
+    """Where a module stands: one of ROOMS, of which `root` has the errors, the escaping and the geometry that all
+    others know."""
     package, _, rest = name.partition(".")
     first = rest.partition(".")[0]
     if package != "cosfly":
@@ -161,8 +163,10 @@ def test_compiled_functions_share_one_cache():
 
 
 # Names that read what stands on disk, or text that stood there. Only the gate calls them: it knows what a file may do.
-READING = {"open", "read_bytes", "read_text", "load", "loads", "safe_load", "full_load", "fromfile", "memmap", "imread", "imdecode",
-           "decompress", "ParquetFile", "read_table", "read_metadata", "load_file", "genfromtxt", "loadtxt"}  # fmt: skip
+READING = {
+    *("open", "read_bytes", "read_text", "load", "loads", "safe_load", "full_load", "fromfile", "memmap", "imread"),
+    *("imdecode", "decompress", "ParquetFile", "read_table", "read_metadata", "load_file", "genfromtxt", "loadtxt"),
+}
 ALLOWED_TO_READ = {
     ("cosfly.work.folder_lock", "open"),  # a lock, opened to be written
     ("cosfly.work.stage_events", "read_bytes"),  # /proc, whose files have no size
@@ -242,8 +246,10 @@ def test_no_drawers_for_everything():
 
 
 def test_help_is_instant():
-    """No stage, no kernel, no image library is loaded to print help; the bound on time is generous, the one on modules not."""
-    program = "import sys; sys.argv = ['cosfly', '--help']; from cosfly.cli import main\ntry: main()\nexcept SystemExit: pass\nprint('LOADED', *sorted(sys.modules))"
+    """No stage, no kernel, no image library is loaded to print help; the bound on time is generous, the one on modules
+    not."""
+    program = "import sys; sys.argv = ['cosfly', '--help']; from cosfly.cli import main\ntry: main()\n"
+    program += "except SystemExit: pass\nprint('LOADED', *sorted(sys.modules))"
     start_s = time.monotonic()
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert time.monotonic() - start_s < 5

@@ -55,7 +55,8 @@ def test_tables_are_those_of_the_paper():
 
 
 def test_what_lost_workers_had_done_is_counted_and_left_out(tmp_path):
-    """A worker dies after its third step: the item is done again, and the steps are told in the manifest and in the table of stages."""
+    """A worker dies after its third step: the item is done again, and the steps are told in the manifest and in the
+    table of stages."""
     items = [Item("a", "once-die", num_steps=3), Item("b", num_steps=3)]
     folder = stage_in(tmp_path)
     finished = run_items(folder, items, make_counting_worker, (tmp_path,), workers=1, watch=Watch(heartbeat_s=0.2))

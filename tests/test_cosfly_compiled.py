@@ -20,7 +20,8 @@ def test_a_caller_sees_a_change_of_what_it_calls(tmp_path):
     for name in ("__init__.py", "work/__init__.py", "work/compiled.py"):
         shutil.copy(Path(cosfly.__file__).parent / name, package / name)
     (package / "upper.py").write_text(
-        "from cosfly.work.compiled import njit\nfrom cosfly.lower import f\n\n\n@njit(cache=True)\ndef g(x):\n    return f(x)\n"
+        "from cosfly.work.compiled import njit\nfrom cosfly.lower import f\n\n\n"
+        "@njit(cache=True)\ndef g(x):\n    return f(x)\n"
     )
     env = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     env |= {"PYTHONPATH": str(package.parent), "XDG_CACHE_HOME": str(tmp_path / "cache")}
@@ -41,8 +42,9 @@ def test_a_caller_sees_a_change_of_what_it_calls(tmp_path):
 def test_compiling_is_told_once_and_loading_is_not(tmp_path):
     """Two functions in a new cache: one line; the second process loads them and says nothing."""
     (tmp_path / "two.py").write_text(
-        "import logging\nlogging.basicConfig(level=logging.INFO, format='%(message)s')\nfrom cosfly.work.compiled import njit\n\n\n"
-        "@njit(cache=True)\ndef f(x):\n    return x + 1\n\n\n@njit(cache=True)\ndef g(x):\n    return x - 1\n\n\nf(1), g(1), f(1.5)\n"
+        "import logging\nlogging.basicConfig(level=logging.INFO, format='%(message)s')\n"
+        "from cosfly.work.compiled import njit\n\n\n@njit(cache=True)\ndef f(x):\n    return x + 1\n\n\n"
+        "@njit(cache=True)\ndef g(x):\n    return x - 1\n\n\nf(1), g(1), f(1.5)\n"
     )
     env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     said = [

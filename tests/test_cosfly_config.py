@@ -45,7 +45,8 @@ def test_all_problems_at_once_with_the_nearest_name(tmp_path):
 
 
 def test_what_is_wrong_across_settings_is_told_beside_what_is_wrong_with_one():
-    over = ["pedestrians.min_distance_m=200", "pedestrians.min_speed_mps=9", "pedestrians.num_pahts=3", "towns={a: {sed: 1}, b: {sed: 2}}"]  # fmt: skip
+    over = ["pedestrians.min_distance_m=200", "pedestrians.min_speed_mps=9", "pedestrians.num_pahts=3"]
+    over += ["towns={a: {sed: 1}, b: {sed: 2}}"]
     with pytest.raises(ConfigError) as caught:
         load(RunConfig, None, over)
     text = str(caught.value)
@@ -138,7 +139,7 @@ def test_where_no_name_is_near_the_known_ones_are_listed():
         load(Outer, None, ["plan.xyz=3"])
 
 
-# --- the settings explained --------------------------------------------------------------------------------------------
+# --- the settings explained -------------------------------------------------------------------------------------------
 
 
 def test_every_setting_is_explained_once_with_its_value():

@@ -37,7 +37,8 @@ except KeyboardInterrupt:
 
 
 def interrupted(*words: str) -> tuple[int, list[str], str]:
-    """Interrupt a process when it asks, and if it hangs again when it ends: its status, what it said and complained of."""
+    """Interrupt a process when it asks, and if it hangs again when it ends: its status, what it said and complained
+    of."""
     with subprocess.Popen(
         [sys.executable, "-X", "dev", "-c", CHILD, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:

@@ -49,7 +49,8 @@ def test_the_name_brings_nothing_heavy():
 def test_a_flight_is_the_one_of_the_stages(town, flight, tmp_path):
     boxes = maps_stage.run(MapsConfig(synthetic=TOWN), tmp_path / "maps", seed=4)  # type: ignore[arg-type]
     simplified = simplify_stage.run(SimplifyConfig(), boxes, tmp_path / "simplify")
-    walks = pedestrians_stage.run(PedestriansConfig(num_paths=1, **WALK), simplified, tmp_path / "walks", seed=4)  # type: ignore[arg-type]
+    walking = PedestriansConfig.model_validate({"num_paths": 1, **WALK})
+    walks = pedestrians_stage.run(walking, simplified, tmp_path / "walks", seed=4)
     (made,) = read_traces(plan_stage.run(PlanConfig(planner="muco"), simplified, walks, tmp_path / "plan", seed=4))
     for name in ("time_s", "positions_m", "targets_m", "rotations_deg"):
         assert_allclose(getattr(flight, name), getattr(made, name), atol=1e-3)
@@ -102,7 +103,7 @@ def test_files_and_sources_are_loaded(town, tmp_path):
             for way in ("abc", [[0, 0, 0]], [[0, "a"], [1, 2]], [[0, 0], [9, 9], [9, 9]])
         ],
         (lambda: cosfly.render_frames(cosfly.load_map(**TOWN), [0, 0, 9]), InputError, "nobody says where to look"),
-        (lambda: cosfly.render_frames(cosfly.load_map(**TOWN), [0, 9], [0, 0, 0]), InputError, "position_m: not places"),
+        (lambda: cosfly.render_frames(cosfly.load_map(**TOWN), [0, 9], [0, 0, 0]), InputError, "position_m: not place"),
         (lambda: cosfly.plan(cosfly.load_map(**TOWN), planer="muco"), ConfigError, "plan: planer: unknown setting"),
     ],
 )  # fmt: skip

@@ -96,8 +96,8 @@ def test_captions_of_another_tree_are_refused(run):
     with pytest.raises(VerifyError, match=r"captions\.jsonl: it was made of another input 'data'.*given: .*other"):
         provenance.checked_inputs(inputs_of(run) | {"data": other})
     captions = make(run / "c2", "caption", {"captions.jsonl": "c"}, data=other) / "captions.jsonl"
-    two = {f"{k}.{name}": path for k, (data, c) in enumerate([(run / "render", run / "caption/captions.jsonl"), (other, captions)])
-           for name, path in (("data", data), ("captions", c))}  # fmt: skip
+    two = {"0.data": run / "render", "0.captions": run / "caption/captions.jsonl"}
+    two |= {"1.data": other, "1.captions": captions}
     provenance.checked_inputs(two)
     with pytest.raises(VerifyError, match="another input 'data'"):
         provenance.checked_inputs(two | {"0.captions": captions})

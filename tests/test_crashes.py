@@ -83,7 +83,8 @@ def test_killed_commands_go_on(asked):
 
 
 def test_every_command_that_writes_is_in_the_sweep():
-    """But for those that only tell, send to a hub, or measure: a measurement that was broken off is not gone on with."""
+    """But for those that only tell, send to a hub, or measure: a measurement that was broken off is not gone on
+    with."""
     told = {
         "list",
         "show",

@@ -1,5 +1,6 @@
-"""Every command of the documentation runs, page after page in one folder, as somebody would who reads along. Small settings stand in the place of
-large ones, servers of the tests in that of a teacher's and a release's, and what a reader brings (a map, a public tree, a student) is made beforehand.
+"""Every command of the documentation runs, page after page in one folder, as somebody would who reads along. Small
+settings stand in the place of large ones, servers of the tests in that of a teacher's and a release's, and what a
+reader brings (a map, a public tree, a student) is made beforehand.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ QUICKSTART = "run quickstart --out runs/quickstart"  # what `make quickstart` do
 # What no machine of the tests can do, or another test does: words of the command, and why.
 NOT_HERE = {
     "vllm serve ": "a server of real weights, on an accelerator; the teacher's server of the tests stands in for it",
-    "torchrun --nproc-per-node 8": "eight accelerators; the command behind it runs here in one process, tests/test_distill_train_ranks.py starts two",
+    "torchrun --nproc-per-node 8": "eight accelerators; the command runs here in one process, and in two in "
+    "tests/test_distill_train_ranks.py",
     "make quickstart": "it installs first; what it runs then is QUICKSTART",
     "make test": "that is this",
     "make fuzz": "an hour; tests/test_fuzz.py begins it",
@@ -54,9 +56,9 @@ NOT_HERE = {
     "chromium --headless": "a browser; tests/browser.py drives one for the pages that run a script",
     "hf://datasets/": "a hub is asked; tests/test_release_get.py reads the same through fsspec from elsewhere",
     "--repo OWNER/NAME --yes": "a hub is written to; tests/test_release_push.py sends to one of its own",
-    "--teacher vllm:": "vLLM needs an accelerator; tests/test_caption_vllm.py holds its engine to its documented interface",
+    "--teacher vllm:": "vLLM needs an accelerator; tests/test_caption_vllm.py holds its engine to the documents",
     "--engine vllm": "the same",
-    "--out work/students-captions": "of a random student nothing is kept; docs/distillation.md has the same with a student that answers",
+    "--out work/students-captions": "of a random student nothing is kept; docs/distillation.md has one that answers",
 }
 
 
@@ -70,12 +72,18 @@ SMALL = {
     "pedestrians": _set("pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25"),
     "render": _set("render.width_px=160", "render.height_px=90"),
     "distill train": _set(
-        "distill.train.max_steps=2", "distill.train.max_pixels=4096", "distill.train.samples_per_step=2", "distill.train.batch_size=1",
-        "distill.train.validation_samples=2", "distill.train.validation_answers=false", "distill.train.data_workers=0",
+        *("distill.train.max_steps=2", "distill.train.max_pixels=4096", "distill.train.samples_per_step=2"),
+        *("distill.train.batch_size=1", "distill.train.validation_samples=2", "distill.train.data_workers=0"),
+        "distill.train.validation_answers=false",
     ),
-    "distill infer": _set("distill.infer.max_samples=2", "distill.infer.max_new_tokens=8", "distill.infer.max_pixels=4096"),
-    "distill evaluate": _set("distill.evaluate.resamples=100", "distill.evaluate.bertscore.en.layer=2", "distill.evaluate.bertscore.zh.layer=2"),
-}  # fmt: skip
+    "distill infer": _set(
+        *("distill.infer.max_samples=2", "distill.infer.max_new_tokens=8", "distill.infer.max_pixels=4096")
+    ),
+    "distill evaluate": _set(
+        *("distill.evaluate.resamples=100", "distill.evaluate.bertscore.en.layer=2"),
+        "distill.evaluate.bertscore.zh.layer=2",
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -114,7 +122,10 @@ class Place:
 
 
 # What tells that a folder is one command's, so that it may go before the next command makes it.
-MADE = ("stage.json", "export.json", "release.json", "report.json", "system_en.txt", "cosfly_student.json", "config.json")  # fmt: skip
+MADE = (
+    *("stage.json", "export.json", "release.json", "report.json"),
+    *("system_en.txt", "cosfly_student.json", "config.json"),
+)
 
 
 def copy_of(path: str) -> Callable[[Path, Path], object]:
@@ -135,7 +146,8 @@ def _table(root: Path, target: Path) -> None:
 
 def _geojson(root: Path, target: Path) -> None:
     ring = [[0, 0], [40, 0], [40, 30], [0, 30], [0, 0]]
-    house = {"type": "Feature", "properties": {"type": "Buildings", "height": 9}, "geometry": {"type": "Polygon", "coordinates": [ring]}}  # fmt: skip
+    shape = {"type": "Polygon", "coordinates": [ring]}
+    house = {"type": "Feature", "properties": {"type": "Buildings", "height": 9}, "geometry": shape}
     target.write_text(json.dumps({"type": "FeatureCollection", "features": [house]}))
 
 
@@ -202,7 +214,8 @@ def answer(body: dict) -> tuple[int, dict] | None:
     text = json.dumps(body)
     if "REJECT_REGEN" in text:
         verdict = json.dumps({"verdict": "FIX_LABEL", "reason": "the text argues for the label"})
-        return 200, {"choices": [{"message": {"role": "assistant", "content": verdict}, "finish_reason": "stop"}], "usage": {"prompt_tokens": 9, "completion_tokens": 9}}  # fmt: skip
+        choice = {"message": {"role": "assistant", "content": verdict}, "finish_reason": "stop"}
+        return 200, {"choices": [choice], "usage": {"prompt_tokens": 9, "completion_tokens": 9}}
     return None if "flight_decision" in text else patient()(body)
 
 
@@ -234,7 +247,8 @@ def test_what_cannot_run_here_is_in_the_documents():
 
 @pytest.fixture
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Items are worked on in this process, since each worker takes seconds to begin; `bench` measures workers, and keeps them."""
+    """Items are worked on in this process, since each worker takes seconds to begin; `bench` measures workers, and
+    keeps them."""
     in_processes = runner._in_processes
 
     def work(stage: StageFolder, items: Sequence[Item], start: Any, workers: int, watch: Watch, progress: Any) -> Any:

@@ -83,12 +83,13 @@ def test_the_licence_of_the_map_reaches_the_card(base):
 
 def test_what_the_release_would_refuse_is_refused_before_the_run_begins(tmp_path):
     (tmp_path / "town.csv").write_text("type,x,y,length,width\nBuildings,1,1,4,4\n")
+    city = {"maps.source": "cityjson", "maps.cityjson.path": "/nowhere.json"}
     town = {"maps.source": "boxes", "maps.boxes.path": str(tmp_path / "town.csv"), "maps.boxes.licence": "mit"}
     for changes, error, words in (
-        ({"maps.source": "cityjson", "maps.cityjson.path": "/nowhere.json"}, ConfigError, r"release\.licence.*cityjson: unknown"),
-        ({"render.modalities": "[rgb]"}, ConfigError, r"render\.modalities.*no depth, no instance.*release\.modalities=\[rgb\]"),
+        (city, ConfigError, r"release\.licence.*cityjson: unknown"),
+        ({"render.modalities": "[rgb]"}, ConfigError, r"no depth, no instance.*release\.modalities=\[rgb\]"),
         (town, InputError, "neither height nor half_height"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(error, match=words):
             pipeline.run(tiny(**changes), tmp_path / "runs/mine")
         assert [path.name for path in tmp_path.iterdir()] == ["town.csv"]

@@ -1,7 +1,7 @@
 """What a server means when it refuses a request, from the words that it gives: one table for all servers.
 
 Servers agree on no codes: what one calls 400 another calls 422 or 500. The patterns are of what vLLM, SGLang,
-llama.cpp, TGI, LM Studio, LiteLLM, OpenAI and hosts like it say; tests/refusals.py holds their texts, and is where the
+llama.cpp, TGI, LM Studio, LiteLLM, OpenAI and hosts like it say; tests/refusals.tsv holds their texts, and is where the
 next one is added. The table names a cause, and decides what no other window would fare better with. Who is at fault for
 the rest is found out by asking (teachers/trials.py).
 """
