@@ -112,8 +112,7 @@ def test_pictures_that_a_kill_left_as_they_were_before_the_stages_are_drawn_agai
     """All stages are complete, and nobody wrote the summary of these."""
     run = begin(base, tmp_path / "run", "release")
     shutil.copytree(base / "release", run / "release")
-    for name in ("run.yaml", "preview.gif"):
-        shutil.copy(base / name, run)
+    shutil.copy(base / "preview.gif", run)
     (run / "contact_sheet.png").write_bytes(b"of one walk less")
     pipeline.run(tiny(), run)
     assert (run / "contact_sheet.png").read_bytes() == (base / "contact_sheet.png").read_bytes()
@@ -135,7 +134,6 @@ def test_a_run_is_shown_and_listed(base):
 def test_a_run_that_stopped_is_shown_as_it_stands(base, tmp_path):
     """Its render was cut off after one flight: what is done is told, and how to go on."""
     run = begin(base, tmp_path / "run", "inspect")
-    shutil.copy(base / "run.yaml", run)
     (run / "render/manifest.json").unlink()
     lines = (run / "render/items.jsonl").read_text().splitlines(keepends=True)
     (run / "render/items.jsonl").write_text(lines[0])
@@ -271,7 +269,6 @@ def test_running_again_changes_nothing(base):
 
 def test_other_settings_are_refused_by_name_and_nothing_is_touched(base, tmp_path, caplog):
     out = begin(base, tmp_path / "run", "plan")
-    shutil.copy(base / "run.yaml", out)
     before = (out / "run.yaml").read_bytes()
     caplog.set_level("INFO")
     with pytest.raises(ResumeError, match=r"num_paths was 2, is 1"):  # more are added, fewer are not
@@ -294,6 +291,7 @@ def test_a_stage_folder_that_is_a_link_is_refused_before_anything_is_done(base, 
 
 def test_a_second_run_in_the_same_folder_is_refused(base, tmp_path, held_by_another):
     out = begin(base, tmp_path / "run", "plan")
+    (out / "run.yaml").unlink()
     with held_by_another(out) as other, pytest.raises(ResumeError, match=f"another process .* process {other.pid} "):
         pipeline.run(tiny(), out)
     assert not (out / "run.yaml").exists()
