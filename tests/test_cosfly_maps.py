@@ -571,14 +571,6 @@ def test_stage_writes_the_same_bytes_and_resumes(tmp_path: Path):
     assert read_boxes(product).header.source.seed == 5
 
 
-def test_stage_notices_a_changed_world(tmp_path: Path):
-    cfg = MapsConfig(source="simworld", simworld=write_world(tmp_path, node("BP_Building_01_C", 0, 0)))
-    run(cfg, tmp_path / "out")
-    write_world(tmp_path, node("BP_Building_01_C", 100, 0))
-    with pytest.raises(ResumeError, match="input world"):
-        run(cfg, tmp_path / "out")
-
-
 def test_the_overview_is_north_up():
     boxes = BoxList()
     boxes.add_span("Terrain", (0, 0), (100, 100), -1, 0)

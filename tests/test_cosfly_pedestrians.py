@@ -5,14 +5,13 @@ import cv2
 import numpy as np
 import pytest
 
-from cosfly.errors import ConfigError, CosflyError, NoPathError, NothingKept
+from cosfly.errors import ConfigError, NoPathError, NothingKept
 from cosfly.geometry import DT_S
 from cosfly.pedestrians.astar import find_route
 from cosfly.pedestrians.stage import (
     PedestriansConfig,
     WalkableGround,
     make_walk,
-    report,
     run,
     sample_goal,
     sample_start,
@@ -368,10 +367,6 @@ def test_bad_settings_are_config_errors(settings, words):
         build(PedestriansConfig, settings, "test.yaml")
 
 
-def test_every_setting_is_described():
-    assert all(setting.description for setting in PedestriansConfig.model_fields.values())
-
-
 # --- the stage --------------------------------------------------------------------------------------------------------
 
 
@@ -393,22 +388,6 @@ def test_the_stage_writes_paths_report_and_picture(map_file, tmp_path):
     picture = cv2.imread(str(tmp_path / "out" / "paths.png"))
     assert picture.shape[1] == 1600
     assert len(np.unique(picture[::7, ::7].reshape(-1, 3), axis=0)) > 5
-
-
-def products(folder: Path) -> dict[str, bytes]:
-    return {name: (folder / name).read_bytes() for name in ("path.json", "pedestrians_report.json", "paths.png")}
-
-
-def test_one_and_two_workers_and_a_second_run_give_the_same_bytes(map_file, tmp_path):
-    cfg = PedestriansConfig(num_paths=6)
-    run(cfg, map_file, tmp_path / "one")
-    run(cfg, map_file, tmp_path / "two", workers=2)
-    run(cfg, map_file, tmp_path / "other", seed=1)
-    assert products(tmp_path / "one") == products(tmp_path / "two")
-    assert products(tmp_path / "one") != products(tmp_path / "other")
-    written_ns = (tmp_path / "one" / "path.json").stat().st_mtime_ns
-    assert run(cfg, map_file, tmp_path / "one") == tmp_path / "one" / "path.json"
-    assert (tmp_path / "one" / "path.json").stat().st_mtime_ns == written_ns
 
 
 def test_fewer_paths_are_the_first_of_more(map_file, tmp_path):
@@ -443,24 +422,6 @@ def test_no_path_at_all_is_an_error_after_the_records_are_written(tmp_path):
         run(PedestriansConfig(num_paths=3, min_distance_m=60), tmp_path / "map.json", tmp_path / "out")
     assert len((tmp_path / "out" / "failures.jsonl").read_text().splitlines()) == 3
     assert not (tmp_path / "out" / "manifest.json").exists()
-
-
-def test_a_region_off_the_map_is_an_error_that_names_its_file(map_file, tmp_path):
-    roi = write_roi(tmp_path / "roi.json", [[1000, 1000], [1100, 1000], [1100, 1100]])
-    with pytest.raises(CosflyError, match=r"roi\.json.*no walkable cell") as caught:
-        run(PedestriansConfig(), map_file, tmp_path / "out", roi=roi)
-    assert "\n" not in str(caught.value)
-
-
-def test_the_report_sums_up_its_lines():
-    cfg = PedestriansConfig()
-    ground = walkable_ground(town(), cfg)
-    walks = [make_walk(f"p{k}", ground, cfg, np.random.default_rng(k)) for k in range(3)]
-    retries = [{"no_goal": 0, "detour": 2}, {"no_goal": 1, "detour": 0}, {"no_goal": 0, "detour": 1}]
-    total = report(ground, [w.walk for w in walks], retries, {})["total"]
-    assert total["retries"] == {"no_goal": 1, "detour": 3}
-    assert total["cells"] == sum(len(w.walk.polyline_m) for w in walks)
-    assert total["mean_speed_mps"] == pytest.approx(total["length_m"] / total["duration_s"], abs=1e-4)
 
 
 def test_simworld_gives_twenty_of_twenty(shared_data, tmp_path):

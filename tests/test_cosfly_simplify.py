@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosfly.errors import ConfigError, InputError, ResumeError
+from cosfly.errors import InputError, ResumeError
 from cosfly.products.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.simplify.passes import (
@@ -366,21 +366,6 @@ def test_the_whole_keeps_its_books(seed, paper):
     after_crop, after_ground = (sum(counts.values()) for _, counts in result.passes[2:4])
     assert sum(result.passes[1][1].values()) <= len(boxes)
     assert after_ground <= after_crop
-
-
-def test_simplifying_is_deterministic_and_leaves_its_input_alone():
-    boxes = random_map(5, 100)
-    before = boxes.centers.copy()
-    one, two = (simplify(boxes, SimplifyConfig()).box_map for _ in range(2))
-    np.testing.assert_array_equal(one.centers, two.centers)
-    np.testing.assert_array_equal(boxes.centers, before)
-
-
-def test_settings_name_their_problems():
-    with pytest.raises(ConfigError, match=r"min_fill.*less than or equal to 1"):
-        build(SimplifyConfig, {"min_fill": 2}, "x")
-    with pytest.raises(ConfigError, match=r"merge_gap_m\.Vegetatoin.*Vegetation"):
-        build(SimplifyConfig, {"merge_gap_m": {"Vegetatoin": 2}}, "x")
 
 
 def test_a_kind_is_not_merged_when_its_gap_is_null():

@@ -16,15 +16,7 @@ from cosfly.planners.courses import wish_of
 from cosfly.planners.intent import draw_intent
 from cosfly.planners.reacquire import finds_again, screens_of
 from cosfly.planners.stage import make_scenario, plan_flight, run, style_rng
-from cosfly.planners.styles import (
-    ALTITUDE_LEAST_M,
-    FOLLOW,
-    HIDING,
-    NAMES,
-    REACQUIRE,
-    RETURN_HOME,
-    TABLE,
-)
+from cosfly.planners.styles import ALTITUDE_LEAST_M, FOLLOW, HIDING, NAMES, REACQUIRE, RETURN_HOME, TABLE
 from cosfly.products.boxes import MapHeader, make_box_map, write_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.products.segments import Mission, read_mission, read_segments
