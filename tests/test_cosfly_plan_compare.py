@@ -236,16 +236,3 @@ def test_what_is_no_comparison(inputs, tmp_path, names, words):
     result = CliRunner().invoke(app, ["plan", "compare", *map(str, inputs), "--out", str(tmp_path / "out"), *given])
     assert isinstance(result.exception, ConfigError)
     assert words in str(result.exception)
-
-
-@pytest.mark.parametrize("missing", ["--map", "--paths", "--out"])
-def test_the_stage_command_still_needs_its_options(missing):
-    given = {"--map": "m", "--paths": "p", "--out": "o"}
-    del given[missing]
-    result = CliRunner().invoke(app, ["plan", *[word for pair in given.items() for word in pair]])
-    assert result.exit_code == 2
-    assert missing in result.output
-
-
-def test_a_comparison_needs_map_and_paths():
-    assert CliRunner().invoke(app, ["plan", "compare"]).exit_code == 2

@@ -70,28 +70,16 @@ class BoxesConfig(Config):
     """Boxes of one's own."""
 
     name: str = Field("Boxes", min_length=1, description="map name, the head of the playback tree's folder names")
-    path: Path | None = Field(
-        None, description="boxes_3d.json, .csv or .geojson; what columns may be called: docs/files.md"
-    )
-    types: dict[str, str] = Field(
-        {}, description="names of the file -> types of cosfly, for instance {house: Buildings}"
-    )
-    ignore: list[str] = Field(
-        [], description="columns or properties that are not read; ['*']: all that have no meaning here"
-    )
+    path: Path | None = Field(None, description="boxes_3d.json, .csv or .geojson; names of columns: docs/files.md")
+    types: dict[str, str] = Field({}, description="names of the file -> types of cosfly, as in {house: Buildings}")
+    ignore: list[str] = Field([], description="columns or properties not read; ['*']: all without a meaning here")
     metres_per_unit: float = Field(
-        1.0, gt=0.0, description="metres of one unit of the file: 0.01 for centimetres, as Unreal has them"
+        1.0, gt=0.0, description="metres of a unit of the file: 0.01 for Unreal's centimetres"
     )
-    left_handed: bool = Field(
-        False, description="y points to the right of x and yaw turns clockwise, as in CARLA and Unreal"
-    )
+    left_handed: bool = Field(False, description="y is right of x, yaw turns clockwise, as in CARLA and Unreal")
     ground_z_m: float = Field(0.0, description="height of the flat ground, in the file's coordinates, m")
-    outline_fill: float = Field(
-        0.9, gt=0.0, le=1.0, description="share of each box that an outline, which is no rectangle, fills"
-    )
-    outline_piece_m: float = Field(
-        3.0, gt=0.0, description="pieces of an outline of at most this length are not cut again, m"
-    )
+    outline_fill: float = Field(0.9, gt=0.0, le=1.0, description="least share of each box that an outline fills")
+    outline_piece_m: float = Field(3.0, gt=0.0, description="pieces of an outline this short are not cut again, m")
     licence: LicenceId = Field(
         UNKNOWN_LICENCE, description="licence of the boxes, as the hub spells it (cc-by-4.0); goes into every release"
     )
@@ -101,13 +89,9 @@ class BoxesConfig(Config):
     @field_validator("types")
     @classmethod
     def _types_are_known(cls, types: dict[str, str]) -> dict[str, str]:
-        wrong = [
-            f"{name}: there is no type {kind!r}{nearest(kind, TYPES)}"
-            for name, kind in types.items()
-            if kind not in TYPES
-        ]
-        if wrong:
-            raise ValueError(f"{'; '.join(wrong)}; there are {', '.join(TYPES)}")
+        if wrong := {name: kind for name, kind in types.items() if kind not in TYPES}:
+            told = [f"{name}: there is no type {kind!r}{nearest(kind, TYPES)}" for name, kind in wrong.items()]
+            raise ValueError(f"{'; '.join(told)}; there are {', '.join(TYPES)}")
         return types
 
     def inputs(self) -> dict[str, Path]:
@@ -143,10 +127,7 @@ def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
         return _told(_read_ours(cfg, path), cfg, path)
     if suffix not in readers:
         raise InputError(
-            "not a kind of map that is known",
-            where=path,
-            got=path.suffix or "no suffix",
-            expected=".json, .csv or .geojson",
+            "an unknown kind of map", where=path, got=path.suffix or "no suffix", expected=".json, .csv or .geojson"
         )
     rows = list(readers[suffix](cfg, path))
     if not rows:
@@ -356,11 +337,8 @@ def _fields(names: Sequence[str], cfg: BoxesConfig) -> tuple[list[str | None], l
 def _ids(given: list[Any], path: Path) -> np.ndarray:
     """Give the ids of the rows, which must be whole numbers, each once."""
     texts = [str(value) for value in given]
-    problems = [
-        f"id {text!r} is not a whole number below 2^63"
-        for text in texts
-        if not (text.isascii() and text.isdecimal() and int(text) < 2**63)
-    ]
+    wrong = [text for text in texts if not (text.isascii() and text.isdecimal() and int(text) < 2**63)]
+    problems = [f"id {text!r} is not a whole number below 2^63" for text in wrong]
     problems += [f"id {text} occurs {count} times" for text, count in Counter(texts).items() if count > 1]
     if problems:
         raise InputError.of_all(problems, where=path)
@@ -436,11 +414,8 @@ def _kind(values: Mapping[str, Any], types: Mapping[str, str]) -> str:
     if kind not in TYPES:
         alike = {known.lower(): known for known in [*KINDS, *types]}
         close = get_close_matches(name.lower(), alike, n=1)
-        raise WrongRow(
-            f"unknown type {name[:40]!r}" + (f" (did you mean {alike[close[0]]!r}?)" if close else "")
-            if name
-            else "no type"
-        )
+        meant = f" (did you mean {alike[close[0]]!r}?)" if close else ""
+        raise WrongRow(f"unknown type {name[:40]!r}{meant}" if name else "no type")
     return kind
 
 

@@ -62,26 +62,18 @@ class CityJsonConfig(Config):
     credits: str = Field("", description="who must be named: the model's makers, one sentence or more")
     tool: str = Field("CityJSON", description="tool and version that made the file, for the records")
     solids: bool = Field(
-        True,
-        description="draw solids with their own roofs and walls (meshes.glb); planners keep to the boxes either way",
+        True, description="draw solids with their own roofs and walls (meshes.glb); planners keep to the boxes"
     )
-    solid_fill: float = Field(
-        0.9, gt=0.0, le=1.0, description="share of each box of a building that its footprint fills"
-    )
+    solid_fill: float = Field(0.9, gt=0.0, le=1.0, description="share of a building's boxes that its footprint fills")
     solid_piece_m: float = Field(3.0, gt=0.0, description="building pieces of at most this length are not cut again, m")
     wall_fill: float = Field(0.6, gt=0.0, le=1.0, description="share of each box of a wall that the wall fills")
     wall_piece_m: float = Field(1.0, gt=0.0, description="wall pieces of at most this length are not cut again, m")
-    wall_max_m: float = Field(
-        2.5, gt=0.0, description="highest wall, m: laser heights of walls often belong to trees above them"
-    )
+    wall_max_m: float = Field(2.5, gt=0.0, description="highest wall, m: laser heights are often of trees above")
     surface_fill: float = Field(0.8, gt=0.0, le=1.0, description="share of each slab that its surface fills")
     surface_piece_m: float = Field(2.0, gt=0.0, description="slabs of at most this length are not cut again, m")
     surface_max_m: float = Field(60.0, gt=0.0, description="longer slabs are cut however full they are, m")
     water_fill: float = Field(
-        0.97,
-        gt=0.0,
-        le=1.0,
-        description="the same for water, which is an obstacle and must not spill over quays and bridges",
+        0.97, gt=0.0, le=1.0, description="the same for water, an obstacle that must not spill over quays and bridges"
     )
     water_piece_m: float = Field(1.5, gt=0.0, description="slabs of water of at most this length are not cut again, m")
     canopy_m: float = Field(2.5, gt=0.0, description="green that rises higher than this over the ground is a tree, m")
@@ -89,12 +81,8 @@ class CityJsonConfig(Config):
     canopy_cell_m: float = Field(2.0, gt=0.2, description="raster cell of canopies, m")
     crown_cells: int = Field(3, ge=1, description="cells along a tree's side at most")
     ground_cell_m: float = Field(4.0, ge=0.5, le=100.0, description="cell of the heights of ground that slopes, m")
-    flat_within_m: float = Field(
-        3.0, ge=0.0, description="ground that rises by less than this over the whole map is made flat, m"
-    )
-    crown_min_m: float = Field(
-        3.6, gt=0.0, description="least width of a crown, m: a street tree's plot is smaller than its crown"
-    )
+    flat_within_m: float = Field(3.0, ge=0.0, description="ground that rises less over the whole map is made flat, m")
+    crown_min_m: float = Field(3.6, gt=0.0, description="least width of a crown, m: a street tree's plot is smaller")
 
     def inputs(self) -> dict[str, Path]:
         if self.path is None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -307,19 +307,14 @@ def _placed(geometry: dict, vertices: np.ndarray, templates: _Templates, where: 
     if geometry.get("type") != "GeometryInstance":
         return geometry, vertices
     number, anchor = geometry.get("template"), geometry.get("boundaries")
-    if type(number) is not int or not 0 <= number < len(templates.geometries):
+    if not _is_index(number, len(templates.geometries)):
         raise InputError(
             "no such template",
             where=f"{where}.template",
             got=repr(number)[:40],
-            expected=f"0 to {len(templates.geometries) - 1}",
+            expected=f"below {len(templates.geometries)}",
         )
-    if (
-        not isinstance(anchor, list)
-        or len(anchor) != 1
-        or type(anchor[0]) is not int
-        or not 0 <= anchor[0] < len(vertices)
-    ):
+    if not (isinstance(anchor, list) and len(anchor) == 1 and _is_index(anchor[0], len(vertices))):
         raise InputError(
             "no place for a template", where=f"{where}.boundaries", got=repr(anchor)[:40], expected="one vertex index"
         )
@@ -334,6 +329,10 @@ def _placed(geometry: dict, vertices: np.ndarray, templates: _Templates, where: 
     if not isinstance(template, dict):
         raise InputError("not a geometry", where=f"{where}.template", got=type(template).__name__, expected="an object")
     return template, templates.vertices @ matrix[:3, :3].T + matrix[:3, 3] + vertices[anchor[0]]
+
+
+def _is_index(value: Any, count: int) -> TypeGuard[int]:
+    return type(value) is int and 0 <= value < count
 
 
 def _list(value: Any, where: str) -> list:

@@ -75,13 +75,10 @@ class SimWorldConfig(Config):
     name: str = Field("SimWorld", min_length=1, description="map name, the head of the playback tree's folder names")
     world: Path | None = Field(None, description="world file, progen_world.json")
     sizes: list[Path] = Field(
-        [],
-        description="asset size table or a list, the first with an asset counts; none: Bbox.json beside the world",
+        [], description="asset size table or a list, the first with an asset counts; none: Bbox.json beside the world"
     )
     tool: str = Field("SimWorld city generator", description="tool and version that made the world, for the records")
-    licence: LicenceId = Field(
-        "apache-2.0", description="licence of the world, as the hub spells it; goes into every release"
-    )
+    licence: LicenceId = Field("apache-2.0", description="licence, as the hub spells it; goes into every release")
     credits: str = Field("SimWorld, maitrix-org and contributors", description="who must be named: the world's makers")
     road_length_m: float = Field(200.0, gt=0.0, description="length of a road piece, m: the generator's default")
     unknown: Literal["error", "drop"] = Field(

@@ -33,9 +33,7 @@ SOURCES: dict[str, Callable[[Any, int], BoxMap]] = {
 class MapsConfig(Config):
     """Where the map comes from."""
 
-    source: Literal["synthetic", "simworld", "cityjson", "boxes"] = Field(
-        "synthetic", description="which source to read"
-    )
+    source: Literal["synthetic", "simworld", "cityjson", "boxes"] = Field("synthetic", description="what to read")
     synthetic: SyntheticConfig = Field(default_factory=SyntheticConfig, description="the seeded town")
     simworld: SimWorldConfig = Field(default_factory=SimWorldConfig, description="a SimWorld world with asset sizes")
     cityjson: CityJsonConfig = Field(default_factory=CityJsonConfig, description="a CityJSON city model")

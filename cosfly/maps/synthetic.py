@@ -25,7 +25,7 @@ from cosfly.maps.town_blocks import (
     BLOCKS,
     LAWN_TOP_M,
     PAINT_TOP_M,
-    PAVEMENT_TOP_M,
+    PAVED_TOP_M,
     ROAD_TOP_M,
     SLAB_M,
     WATER_TOP_M,
@@ -102,17 +102,12 @@ class SyntheticConfig(Config):
         0.0, ge=0.0, le=0.5, description="how much the sides of blocks differ: share of the mean side; 0: all alike"
     )
     blocks: dict[str, float] = Field(
-        {},
-        description="share of each kind of block (a name in BLOCKS); none: a park, a square, the rest built up in turn",
+        {}, description="share of each kind of block (a name in BLOCKS); none: a park, a square, the rest built up"
     )
-    river_m: float = Field(
-        0.0, ge=0.0, le=120.0, description="width of a river with quays in place of a boulevard, m; 0: none"
-    )
+    river_m: float = Field(0.0, ge=0.0, le=120.0, description="width of a river in place of a boulevard, m; 0: none")
     verge_m: float = Field(10.0, ge=4.0, description="lawn round the town, m")
     parked_share: float = Field(0.4, ge=0.0, le=1.0, description="share of parking places that are taken; 0 for none")
-    tree_share: float = Field(
-        0.85, ge=0.0, le=1.0, description="share of street tree places that are planted; 0 for none"
-    )
+    tree_share: float = Field(0.85, ge=0.0, le=1.0, description="share of street tree places planted; 0 for none")
 
     @model_validator(mode="before")
     @classmethod
@@ -244,10 +239,10 @@ def _surfaces(boxes: BoxList, cfg: SyntheticConfig, streets: Streets) -> None:
     for a, b in itertools.pairwise(columns):
         for c, d in itertools.pairwise(rows):
             kerbs = (a.road[1], c.road[1]), (b.road[0], d.road[0])
-            ring(boxes, "Sidewalks", *kerbs, (a.high_m, c.high_m), (b.low_m, d.low_m), PAVEMENT_TOP_M)
+            ring(boxes, "Sidewalks", *kerbs, (a.high_m, c.high_m), (b.low_m, d.low_m), PAVED_TOP_M)
     ring(
         boxes, "Sidewalks", (columns[0].low_m, rows[0].low_m), (columns[-1].high_m, rows[-1].high_m), first, last,
-        PAVEMENT_TOP_M,
+        PAVED_TOP_M,
     )  # fmt: skip
 
 
@@ -262,7 +257,7 @@ def _river(boxes: BoxList, cfg: SyntheticConfig, streets: Streets, river: Strip)
     for strip in streets.columns:
         boxes.add_span("Roads", (strip.road[0], low), (strip.road[1], high), ROAD_TOP_M - SLAB_M, ROAD_TOP_M)
         for side, kerb, edge in ((-1, strip.road[0], strip.low_m), (1, strip.road[1], strip.high_m)):
-            boxes.add_span("Sidewalks", (min(kerb, edge), low), (max(kerb, edge), high), -SLAB_M, PAVEMENT_TOP_M)
+            boxes.add_span("Sidewalks", (min(kerb, edge), low), (max(kerb, edge), high), -SLAB_M, PAVED_TOP_M)
             railing = edge - side * RAILING_M
             boxes.add_span("Fences", (min(railing, edge), low), (max(railing, edge), high), -SLAB_M, 1.1)
 

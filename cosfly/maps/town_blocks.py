@@ -7,7 +7,7 @@ import numpy as np
 from cosfly.maps.boxlist import BoxList
 
 # Tops of the surfaces, m. Two centimetres apart at least: a depth buffer tells them apart at 300 m.
-PAVEMENT_TOP_M, LAWN_TOP_M, PAINT_TOP_M, ROAD_TOP_M, BASE_TOP_M = 0.0, -0.02, -0.03, -0.06, -0.12
+PAVED_TOP_M, LAWN_TOP_M, PAINT_TOP_M, ROAD_TOP_M, BASE_TOP_M = 0.0, -0.02, -0.03, -0.06, -0.12
 WATER_TOP_M = 0.05  # over the ground, so that it is an obstacle: nobody walks on a pond
 SLAB_M = 0.3
 
@@ -56,7 +56,7 @@ def point(axis: int, along: float, across: float) -> tuple[float, float]:
 
 
 def _ground(boxes: BoxList, kind: str, low: np.ndarray, high: np.ndarray) -> None:
-    top = PAVEMENT_TOP_M if kind == "Sidewalks" else LAWN_TOP_M
+    top = PAVED_TOP_M if kind == "Sidewalks" else LAWN_TOP_M
     boxes.add_span(kind, low, high, top - SLAB_M, top)
 
 
@@ -64,9 +64,9 @@ def _park(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Gene
     """Lawns between two crossing paths, a pond with a stone rim, groves, a hedge with openings."""
     middle = (low + high) / 2
     lane = 2.0
-    boxes.add_span("Sidewalks", (low[0], middle[1] - lane), (high[0], middle[1] + lane), -SLAB_M, PAVEMENT_TOP_M)
+    boxes.add_span("Sidewalks", (low[0], middle[1] - lane), (high[0], middle[1] + lane), -SLAB_M, PAVED_TOP_M)
     for a, b in ((low[1], middle[1] - lane), (middle[1] + lane, high[1])):
-        boxes.add_span("Sidewalks", (middle[0] - lane, a), (middle[0] + lane, b), -SLAB_M, PAVEMENT_TOP_M)
+        boxes.add_span("Sidewalks", (middle[0] - lane, a), (middle[0] + lane, b), -SLAB_M, PAVED_TOP_M)
         boxes.add_span("Terrain", (low[0], a), (middle[0] - lane, b), LAWN_TOP_M - SLAB_M, LAWN_TOP_M)
         boxes.add_span("Terrain", (middle[0] + lane, a), (high[0], b), LAWN_TOP_M - SLAB_M, LAWN_TOP_M)
     pond = np.array([middle + np.array((3.5, 3.5)), high - 3.5])
@@ -196,13 +196,8 @@ def _lanes(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Gen
             is_passage = at <= passage < at + width
             if not is_passage:
                 _between(boxes, (at, base), (at + width, base + depth), -1.0, height)
-                _between(
-                    boxes,
-                    (at + 0.2, base + depth * 0.28),
-                    (at + width - 0.2, base + depth * 0.72),
-                    height,
-                    height + ridge,
-                )
+                low_y, high_y = base + depth * 0.28, base + depth * 0.72
+                _between(boxes, (at + 0.2, low_y), (at + width - 0.2, high_y), height, height + ridge)
             at += width if not is_passage else lane
         if row == gap_row:
             bench(boxes, 0, passage, base - lane / 2 if row else base + depth + lane / 2, rng)
@@ -238,7 +233,7 @@ def _campus(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Ge
     library = (high[0] - size[0] * 0.14, middle[1])
     boxes.add("Buildings", library, size * (0.2, 0.26), -1.0, rng.uniform(14.0, 22.0), rng.uniform(-12.0, 12.0))
     for y in (middle[1] - size[1] * 0.16, middle[1] + size[1] * 0.16):
-        boxes.add_span("Sidewalks", (low[0], y - 1.5), (high[0] - size[0] * 0.28, y + 1.5), -SLAB_M, PAVEMENT_TOP_M)
+        boxes.add_span("Sidewalks", (low[0], y - 1.5), (high[0] - size[0] * 0.28, y + 1.5), -SLAB_M, PAVED_TOP_M)
         bench(boxes, 0, low[0] + size[0] * 0.3, y + 2.4, rng)
     for _ in range(6):
         place = rng.uniform(low + size * (0.06, 0.3), low + size * (0.66, 0.7))
@@ -259,13 +254,8 @@ def _farm(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Gene
     for x in np.arange(low[0] + size[0] * 0.56, high[0] - 3.0, 6.5):
         for y in np.arange(low[1] + 4.0, low[1] + size[1] * 0.55, 6.5):
             if rng.random() < 0.9:
-                tree(
-                    boxes,
-                    np.array([x, y]) + rng.uniform(-0.5, 0.5, 2),
-                    rng.uniform(2.4, 3.4),
-                    rng.uniform(3.5, 5.0),
-                    rng,
-                )
+                place = np.array([x, y]) + rng.uniform(-0.5, 0.5, 2)
+                tree(boxes, place, rng.uniform(2.4, 3.4), rng.uniform(3.5, 5.0), rng)
     wall = low[1] + size[1] * 0.66
     for a, b in ((0.52, 0.72), (0.8, 1.0)):  # with a gate
         boxes.add_span("Walls", (low[0] + size[0] * a, wall - 0.3), (low[0] + size[0] * b, wall + 0.3), -0.2, 1.0)
@@ -296,7 +286,7 @@ def _meadow(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Ge
     """Open grass with a path along it, two groves and a pavilion: room for a drone to circle."""
     _ground(boxes, "Terrain", low, high)
     size, middle = high - low, (low + high) / 2
-    boxes.add_span("Sidewalks", (low[0], middle[1] - 1.5), (high[0], middle[1] + 1.5), -SLAB_M, PAVEMENT_TOP_M)
+    boxes.add_span("Sidewalks", (low[0], middle[1] - 1.5), (high[0], middle[1] + 1.5), -SLAB_M, PAVED_TOP_M)
     for corner in (low + size * (0.18, 0.2), low + size * (0.8, 0.8)):
         for _ in range(4):
             tree(boxes, corner + rng.uniform(-5.0, 5.0, 2), rng.uniform(4.0, 6.0), rng.uniform(7.0, 12.0), rng)

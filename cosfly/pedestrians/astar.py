@@ -116,11 +116,8 @@ def _push(heap_key, heap_cell, size, total, to_go, cell):  # pragma: no cover (c
     if size == len(heap_cell):
         grown_key, grown_cell = np.empty((2 * size, 2)), np.empty(2 * size, dtype=np.int64)
         for k in range(size):
-            grown_key[k, TOTAL], grown_key[k, TO_GO], grown_cell[k] = (
-                heap_key[k, TOTAL],
-                heap_key[k, TO_GO],
-                heap_cell[k],
-            )
+            grown_key[k, TOTAL], grown_key[k, TO_GO] = heap_key[k, TOTAL], heap_key[k, TO_GO]
+            grown_cell[k] = heap_cell[k]
         heap_key, heap_cell = grown_key, grown_cell
     place = size
     while place > 0:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from cosfly.errors import nearest
+from cosfly.errors import NoPathError, nearest
 from cosfly.geometry import DT_S
 from cosfly.planners.styles import NAMES
 from cosfly.products.segments import FOLLOW
@@ -93,9 +93,7 @@ class MucoConfig(Config):
     )
     influence_m: float = Field(8.0, gt=0, description="obstacles nearer than this add to the safety term, m")
     pitch_deg: float = Field(45.0, gt=0, lt=90, description="wanted downward pitch of the camera, degrees")
-    pitch_band_deg: tuple[float, float] = Field(
-        (30.0, 60.0), description="pitch outside this band costs extra, degrees"
-    )
+    pitch_band_deg: tuple[float, float] = Field((30.0, 60.0), description="pitch outside costs extra, degrees")
     low_visibility: float = Field(0.3, ge=0, le=1, description="visibility below this is low")
     low_visibility_frames: int = Field(
         20, ge=1, description="so many low frames in a row take visibility and view angle out of the gradient"
@@ -110,16 +108,11 @@ class MucoConfig(Config):
     step_cap_m: float = Field(0.5, gt=0, description="longest move of a waypoint in one iteration, m")
     iterations_max: int = Field(1500, ge=0, description="iterations at most")
     tolerance: float = Field(
-        1e-5,
-        gt=0,
-        description="converged when the loss changes by less than this: a part of it (newton), or as it is (paper)",
+        1e-5, gt=0, description="converged when the loss changes by less: a part of it (newton), or as it is (paper)"
     )
     pushes_max: int = Field(10, ge=1, description="pushes out of obstacles per waypoint and projection, at most")
     start_visibility: float = Field(
-        0.95,
-        ge=0,
-        le=1,
-        description="search for a better start when flying plainly behind sees less than this; 0: never",
+        0.95, ge=0, le=1, description="search for a better start when flying plainly behind sees less; 0: never"
     )
 
     @model_validator(mode="after")
@@ -150,26 +143,19 @@ class PlanConfig(Config):
 
     planner: str = Field("foresight", description="which planner flies: foresight, muco or track_astar")
     safety_distance_m: float = Field(SAFETY_DISTANCE_M, gt=0, description="nominal distance to obstacles, m")
-    relaxed_safety_m: float = Field(
-        RELAXED_SAFETY_M, gt=0, description="distance that must be kept where the nominal one cannot, m"
-    )
+    relaxed_safety_m: float = Field(RELAXED_SAFETY_M, gt=0, description="distance kept where the nominal one cannot, m")
     altitude_min_m: float = Field(20.0, gt=0, description="least altitude, m")
     altitude_preferred_m: float = Field(20.0, gt=0, description="preferred altitude, m")
     altitude_max_m: float = Field(100.0, gt=0, description="greatest altitude, m")
     behind_distance_m: float = Field(
-        20.0,
-        gt=0,
-        description="horizontal distance to the target, m: wanted all along by foresight, at the start by the others",
+        20.0, gt=0, description="horizontal distance to the target, m: for foresight all along, for others at the start"
     )
     speed_max_mps: float = Field(10.0, gt=0, description="greatest speed between two waypoints, m/s")
     heading_smoothing_s: float = Field(
         4.0, ge=0, description="standard deviation of the smoothing of the walking direction, s; 0: none"
     )
     five_ray_mean_min: float = Field(
-        FIVE_RAY_MEAN_MIN,
-        ge=0,
-        le=1,
-        description="drop a flight whose mean five-ray visibility is below this; 0: never",
+        FIVE_RAY_MEAN_MIN, ge=0, le=1, description="drop a flight whose mean five-ray visibility is lower; 0: never"
     )
     accel_rms_max_mps2: float = Field(
         ACCEL_RMS_MAX_MPS2, gt=0, description="drop a flight of greater RMS acceleration, m/s^2"
@@ -184,8 +170,7 @@ class PlanConfig(Config):
         0.0, ge=0, description="length of the parts of a flight that draw a style each, about, s; 0: one style a flight"
     )
     styles_fallback: Literal["drop", "follow"] = Field(
-        "drop",
-        description="a style that the map cannot hold: drop the flight, or fly follow instead; counted either way",
+        "drop", description="a style that the map cannot hold: drop the flight, or fly follow instead; counted"
     )
     muco: MucoConfig = Field(default_factory=MucoConfig, description="the MuCO optimiser")
     track_astar: TrackAStarConfig = Field(default_factory=TrackAStarConfig, description="TA*+Smooth")
@@ -269,6 +254,34 @@ class Scenario:
     ground_m: np.ndarray
     wish: Wish
     dt_s: float = DT_S
+
+    def key_frames(self, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Give every stride-th frame and the last, and the least, preferred and greatest z at each, all (m,).
+
+        Between key frames a flight is straight while the ground may rise and fall: a key frame keeps the bounds of all
+        frames around it.
+        """
+        from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+        frames = np.unique(np.append(np.arange(0, len(self.targets_m), stride), len(self.targets_m) - 1))
+        least, preferred = (
+            maximum_filter1d(self.ground_m + altitudes_m, 2 * stride + 1, mode="nearest")[frames]
+            for altitudes_m in (self.wish.altitude_min_m, self.wish.altitude_m)
+        )
+        highest_m = self.ground_m + self.wish.altitude_max_m
+        return frames, least, preferred, minimum_filter1d(highest_m, 2 * stride + 1, mode="nearest")[frames]
+
+    def between(self, frames: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """Give the flight that is straight between places at key frames, (m, 3): (n, 3)."""
+        every = np.arange(len(self.targets_m))
+        return np.stack([np.interp(every, frames, places[:, axis]) for axis in range(3)], axis=1)
+
+    def no_way(self, what: str, floor_m: float) -> NoPathError:
+        """Give the error of a planner that finds nothing. floor_m: distance to boxes that it keeps at least."""
+        low_m, high_m = self.wish.altitude_min_m.min(), self.wish.altitude_max_m.max()
+        expected = f"places from {low_m:g} to {high_m:g} m up, {floor_m:g} m from all boxes"
+        fix = "is the walk roofed over? raise plan.altitude_max_m or leave the path out"
+        return NoPathError(what, where=self.path_id, expected=expected, fix=fix)
 
 
 @dataclass(frozen=True)

@@ -89,10 +89,10 @@ def _best_course(
     """Draw the parameters of a part until its places see the walker and are free, or take the best of DRAWS; (k, 3)."""
     from cosfly.space.kernels import signed_distances, visibility
 
-    targets_m, heading_rad = scenario.targets_m[part], scenario.wish.heading_rad[part]
+    targets_m = scenario.targets_m[part]
     best, best_score = np.empty(0), -np.inf
     for _ in range(DRAWS):
-        course = _course(style, targets_m, heading_rad, before, scenario.dt_s, rng)
+        course = _course(style, scenario, part, before, rng)
         places = places_of(course, targets_m, scenario.ground_m[part])
         is_near = signed_distances(obstacles, places, cfg.safety_distance_m)[0] < cfg.safety_distance_m
         score = float(visibility(obstacles, places, targets_m).mean()) - float(is_near.mean())
@@ -106,14 +106,10 @@ def _best_course(
 
 
 def _course(
-    style: Style,
-    targets_m: np.ndarray,
-    heading_rad: np.ndarray,
-    before: float | None,
-    dt_s: float,
-    rng: np.random.Generator,
+    style: Style, scenario: Scenario, part: slice, before: float | None, rng: np.random.Generator
 ) -> np.ndarray:
     """Draw the course of one part, (k, 3). before: azimuth where the part before ended."""
+    targets_m, heading_rad, dt_s = scenario.targets_m[part], scenario.wish.heading_rad[part], scenario.dt_s
     seconds = np.arange(len(targets_m)) * dt_s
     apart_m = _even(style.ground_distance_m, style.ground_distance_end_m, EVEN_APART_MPS, seconds, rng)
     altitude_m = _even(style.altitude_m, style.altitude_end_m, EVEN_CLIMB_MPS, seconds, rng)

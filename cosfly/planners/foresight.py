@@ -10,9 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from cosfly.errors import NoPathError
 from cosfly.planners.contract import Plan, PlanConfig, Scenario
 from cosfly.planners.sight import FOOT_LOW_M, look, make_horizon
 from cosfly.planners.smoothing import smooth_flight, unsafe
@@ -80,19 +78,15 @@ def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
     Args:
         climbing: with places far above the wished ones, at fewer key frames.
     """
-    wish, targets, num = scenario.wish, scenario.targets_m, len(scenario.targets_m)
+    wish, targets = scenario.wish, scenario.targets_m
     stride = max(1, round((BETWEEN_KEYS_CLIMBING_S if climbing else BETWEEN_KEYS_S) / scenario.dt_s))
-    frames = np.unique(np.append(np.arange(0, num, stride), num - 1))
-    # Between key frames the flight is straight while the ground may rise and fall: a key frame keeps the bounds of all
-    # around it.
-    around, ground_m = 2 * stride + 1, scenario.ground_m
-    least_z = maximum_filter1d(ground_m + wish.altitude_min_m, around, mode="nearest")[frames, None]
-    greatest_z = minimum_filter1d(ground_m + wish.altitude_max_m, around, mode="nearest")[frames, None]
+    frames, least_z, _, greatest_z = scenario.key_frames(stride)
+    least_z, greatest_z = least_z[:, None], greatest_z[:, None]
     rings = np.array(RINGS + CLIMBS if climbing else RINGS, dtype=np.float64)
     distances_m, grounds_m = wish.distance_m[frames, None], wish.ground_distance_m[frames, None]
     steps_m = np.minimum(STEP_OUT_SHARE * distances_m, STEP_OUT_MAX_M)
     radii_m = np.maximum(grounds_m + rings[:, 0] * steps_m, grounds_m / 2.0)
-    z = np.maximum((ground_m + wish.altitude_m)[frames, None] + STEP_UP_M * rings[:, 1], least_z)
+    z = np.maximum((scenario.ground_m + wish.altitude_m)[frames, None] + STEP_UP_M * rings[:, 1], least_z)
     z = np.minimum(z, np.maximum(greatest_z, least_z))
     turns = np.arange(NUM_AZIMUTHS) * (2.0 * np.pi / NUM_AZIMUTHS)
     angles = wish.view_rad[frames, None, None] + np.pi + turns
@@ -160,8 +154,7 @@ def search_flight(
     )
     if chosen[0] < 0:
         return None
-    path, every = places[np.arange(len(frames)), chosen], np.arange(len(scenario.targets_m))
-    return np.stack([np.interp(every, frames, path[:, axis]) for axis in range(3)], axis=1)
+    return scenario.between(frames, places[np.arange(len(frames)), chosen])
 
 
 def boxes_aloft(obstacles: BoxIndex, targets_m: np.ndarray, lattice: Lattice) -> BoxIndex:
@@ -169,12 +162,8 @@ def boxes_aloft(obstacles: BoxIndex, targets_m: np.ndarray, lattice: Lattice) ->
     rows, aside_m = obstacles.rows, lattice.radius_max_m + REACH_M
     (low_x, low_y), (high_x, high_y) = targets_m[:, :2].min(axis=0) - aside_m, targets_m[:, :2].max(axis=0) + aside_m
     keep = rows[:, HIGH_Z] >= lattice.places_m[:, :, 0, 2].min() - REACH_M
-    keep &= (
-        (rows[:, HIGH_X] >= low_x)
-        & (rows[:, LOW_X] <= high_x)
-        & (rows[:, HIGH_Y] >= low_y)
-        & (rows[:, LOW_Y] <= high_y)
-    )
+    keep &= (rows[:, HIGH_X] >= low_x) & (rows[:, LOW_X] <= high_x)
+    keep &= (rows[:, HIGH_Y] >= low_y) & (rows[:, LOW_Y] <= high_y)
     rows = rows[keep]
     return index_boxes(rows[:, :3], rows[:, 3:6], rows[:, 6:15].reshape(-1, 3, 3), cell_m=2.0 * REACH_M)
 
@@ -289,10 +278,4 @@ def raw_flight(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> tupl
         found = search_flight(scenario, make_lattice(scenario, climbing=climbing), obstacles, cfg, clearance_m)
         if found is not None:
             return found, "climbing search" if climbing else "search", clearance_m
-    low_m, high_m = scenario.wish.altitude_min_m.min(), scenario.wish.altitude_max_m.max()
-    raise NoPathError(
-        "no free places lead along this walk",
-        where=scenario.path_id,
-        expected=f"places from {low_m:g} to {high_m:g} m up, {relaxed_m:g} m from all boxes",
-        fix="is the walk roofed over? raise altitude_max_m or leave the path out",
-    )
+    raise scenario.no_way("no free places lead along this walk", relaxed_m)

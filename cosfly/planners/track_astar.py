@@ -24,7 +24,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from cosfly.errors import NoPathError
 from cosfly.geometry import DT_S
@@ -157,20 +156,7 @@ def _first_layer(target, voxels, costs, index, corridor_m, best, came_from, came
 
 @njit(cache=True)
 def _expand(
-    sources,
-    cost_before,
-    move_before,
-    layer,
-    reach_m,
-    lengths,
-    bends,
-    voxels,
-    costs,
-    index,
-    best,
-    came_from,
-    came_by,
-    touched,
+    sources, cost_before, moved, layer, reach_m, lengths, bends, voxels, costs, index, best, came_from, came_by, touched
 ):
     """Put the cells that can be reached into `touched`, the cheapest way there into `best`, `came_from`, `came_by`."""
     num_x, num_y, num_z, num = voxels.shape[0], voxels.shape[1], voxels.shape[2], 0
@@ -182,11 +168,8 @@ def _expand(
             if lengths[move] > reach_m + 1e-9 or not (0 <= jx < num_x and 0 <= jy < num_y and 0 <= jz < num_z):
                 continue
             there = (jx * num_y + jy) * num_z + jz
-            cost = (
-                cost_before[b]
-                + costs.weights[PATH] * lengths[move] / voxels.size[0]
-                + costs.weights[SMOOTHNESS] * bends[move_before[b], move]
-            )
+            cost = cost_before[b] + costs.weights[PATH] * lengths[move] / voxels.size[0]
+            cost += costs.weights[SMOOTHNESS] * bends[moved[b], move]
             if cost >= best[there] or not voxels.columns[jx, jy]:
                 continue
             if not _is_in_bounds(voxels.low[2] + jz * voxels.size[2], costs, layer):
@@ -307,13 +290,7 @@ def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.rando
             raw, facts = found
             points, smoothing = smooth_flight(raw, scenario, obstacles, cfg, safety_m)
             return Plan(points, {"safety_m": safety_m, **facts, **smoothing})
-    low_m, high_m = scenario.wish.altitude_min_m.min(), scenario.wish.altitude_max_m.max()
-    raise NoPathError(
-        "no free voxels lead along this walk",
-        where=scenario.path_id,
-        expected=f"places from {low_m:g} to {high_m:g} m up, {cfg.relaxed_safety_m:g} m from all boxes",
-        fix="is the walk roofed over? raise altitude_max_m or leave the path out",
-    )
+    raise scenario.no_way("no free voxels lead along this walk", cfg.relaxed_safety_m)
 
 
 def search_flight(
@@ -329,21 +306,13 @@ def search_flight(
     settings, targets, wish = cfg.track_astar, scenario.targets_m, scenario.wish
     voxels = make_voxels(scenario, cfg)
     stride = frames_per_layer(cfg, scenario.dt_s)
-    frames = np.unique(np.append(np.arange(0, len(targets), stride), len(targets) - 1))
-    # Between layers the flight is straight while the ground may rise and fall: a layer keeps the bounds of all frames
-    # around it.
-    around, ground_m = 2 * stride + 1, scenario.ground_m
-
-    def highest(altitudes_m: np.ndarray) -> np.ndarray:
-        return maximum_filter1d(ground_m + altitudes_m, around, mode="nearest")[frames]
-
-    preferred_z, places = highest(wish.altitude_m), wish.places_m(targets, ground_m)[frames, :2]
+    frames, least_z, preferred_z, greatest_z = scenario.key_frames(stride)
+    places = wish.places_m(targets, scenario.ground_m)[frames, :2]
     costs = Costs(
         weights=np.array([getattr(settings, f"weight_{name}") for name in WEIGHTS]),
         ring_m=wish.ground_distance_m[frames], wished=np.full_like(places, np.nan) if wish.any_bearing else places,
         sight=settings.weight_visibility * wish.keeps_sight[frames],
-        least_z=highest(wish.altitude_min_m), preferred_z=preferred_z,
-        greatest_z=minimum_filter1d(ground_m + wish.altitude_max_m, around, mode="nearest")[frames],
+        least_z=least_z, preferred_z=preferred_z, greatest_z=greatest_z,
         influence_m=settings.influence_m, safety_m=safety_m, start=np.array([*places[0], preferred_z[0]]),
     )  # fmt: skip
     reaches_m = np.diff(frames, prepend=frames[0]) * scenario.dt_s * cfg.speed_max_mps
@@ -353,10 +322,8 @@ def search_flight(
     if cells[0] < 0:
         return None
     places = voxels.low + np.stack(np.unravel_index(cells, tuple(voxels.shape)), axis=1) * voxels.size
-    every = np.arange(len(targets))
-    raw = np.stack([np.interp(every, frames, places[:, axis]) for axis in range(3)], axis=1)
     sizes = {"num_layers": len(frames), "num_cells": len(voxels.clearances), "states_seen": int(num_seen)}
-    return raw, {**sizes, "cost": float(cost)}
+    return scenario.between(frames, places), {**sizes, "cost": float(cost)}
 
 
 def frames_per_layer(cfg: PlanConfig, dt_s: float = DT_S) -> int:

@@ -236,21 +236,14 @@ class SimplifyConfig(Config):
 
     merge: bool = Field(True, description="replace clusters of neighbouring boxes by one box")
     merge_by: Literal["gap", "center"] = Field(
-        "gap",
-        description="neighbours: boxes with gaps below merge_gap_m on every axis, or with centres so near (SimWorld)",
+        "gap", description="neighbours: boxes with gaps below merge_gap_m on every axis, or centres so near (SimWorld)"
     )
     merge_gap_m: MergeGaps = Field(default_factory=MergeGaps, description="neighbourhood by kind")
     min_fill: float = Field(
-        0.85,
-        ge=0.0,
-        le=1.0,
-        description="share of a merged box's footprint that its members must cover; 0: the paper's rule",
+        0.85, ge=0.0, le=1.0, description="least share of a merged footprint that members cover; 0: the paper's rule"
     )
     min_canopy_fill: float = Field(
-        0.5,
-        ge=0.0,
-        le=1.0,
-        description="the same for vegetation, whose round crowns never fill a box; 0: the paper's rule",
+        0.5, ge=0.0, le=1.0, description="the same for vegetation: round crowns never fill a box; 0: the paper's rule"
     )
     crop_tree: bool = Field(True, description="split vegetation into trunk and lifted canopy")
     crop_strategy: Literal["fixed", "adaptive"] = Field(
@@ -258,9 +251,7 @@ class SimplifyConfig(Config):
     )
     cut_height_m: float = Field(2.0, gt=0.0, description="height over the ground of the split, m")
     lift_m: float = Field(0.5, ge=0.0, description="how far the canopy is lifted over the cut, m")
-    trunk: Literal["stem", "full"] = Field(
-        "stem", description="below the cut: stems, or the full footprint as in the paper"
-    )
+    trunk: Literal["stem", "full"] = Field("stem", description="below the cut: stems, or full footprints (paper)")
     stem_radius_m: float = Field(0.25, gt=0.0, description="half width of a stem, m")
     split_z_m: float = Field(5.0, gt=0.0, description="adaptive: height over the ground of the lowest cut, m")
     adaptive_height_m: float = Field(5.0, gt=0.0, description="adaptive: vegetation higher than this is cut, m")
@@ -271,9 +262,7 @@ class SimplifyConfig(Config):
     )
     prune_nested: bool = Field(True, description="drop boxes inside another of the same kind")
     nested_tolerance_m: float = Field(0.01, ge=0.0, description="how far a nested box may stick out, m")
-    picture_px: int = Field(
-        1000, ge=200, le=8000, description="longer side of each half of the before/after picture, px"
-    )
+    picture_px: int = Field(1000, ge=200, le=8000, description="longer side of each half of the picture, px")
 
 
 @dataclass(frozen=True)

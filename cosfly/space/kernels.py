@@ -93,11 +93,9 @@ def obstacle_index(box_map: BoxMap) -> BoxIndex:
     solid = box_map.select(~box_map.is_any_of(NO_OBSTACLE_KINDS))
     boxes = solid.centers, solid.half_extents, rotation_matrices(np.radians(solid.rotations_deg))
     ground = box_map.ground
-    return (
-        index_boxes(*boxes)
-        if ground.is_flat
-        else index_boxes(*map(np.concatenate, zip(boxes, ground.slabs(), strict=True)))
-    )
+    if ground.is_flat:
+        return index_boxes(*boxes)
+    return index_boxes(*map(np.concatenate, zip(boxes, ground.slabs(), strict=True)))
 
 
 @njit(cache=True)

@@ -9,11 +9,10 @@ paper's optimizer as it is printed.
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
+from scipy.ndimage import gaussian_filter1d
 
-from cosfly.errors import NoPathError
-from cosfly.planners.contract import MucoConfig, Plan, PlanConfig, Scenario, Wish
-from cosfly.planners.muco.loss import GREATEST, PREFERRED, TERM_NAMES, Problem, make_state
+from cosfly.planners.contract import MucoConfig, Plan, PlanConfig, Scenario
+from cosfly.planners.muco.loss import TERM_NAMES, Problem, make_state
 from cosfly.planners.muco.nearby import nothing_nearby
 from cosfly.planners.muco.step import STOP_REASONS, Rules, descend, descend_as_the_paper, is_feasible, project
 from cosfly.space.kernels import RAY_SPREAD_M, BoxIndex, collect_hits, free_rays, nearest_box, visibility
@@ -46,7 +45,7 @@ MOVE_COST, MOVE_SCALE_MPS = 0.25, 3.0  # (speed / scale)^2
 
 
 def search_start(
-    problem: Problem, wish: Wish, index: BoxIndex, cfg: PlanConfig, *, climbing: bool, clearance_m: float
+    problem: Problem, scenario: Scenario, index: BoxIndex, cfg: PlanConfig, *, climbing: bool, clearance_m: float
 ) -> np.ndarray | None:
     """Find a free trajectory that sees the target well, by dynamic programming over key frames.
 
@@ -56,14 +55,8 @@ def search_start(
         (n, 3), straight between key frames, every point and segment `clearance_m` from all boxes; None if there is
         none.
     """
-    targets_m = problem.targets
-    stride = max(1, round(BETWEEN_KEYS_S / problem.dt_s))
-    keys = np.unique(np.append(np.arange(0, len(targets_m), stride), len(targets_m) - 1))
-    # Between key frames the flight is straight while the ground may rise and fall: a key frame keeps the bounds of all
-    # around it.
-    around = 2 * stride + 1
-    preferred_m = maximum_filter1d(problem.altitudes[:, PREFERRED], around, mode="nearest")[keys]
-    greatest_m = minimum_filter1d(problem.altitudes[:, GREATEST], around, mode="nearest")[keys]
+    targets_m, wish = problem.targets, scenario.wish
+    keys, _, preferred_m, greatest_m = scenario.key_frames(max(1, round(BETWEEN_KEYS_S / problem.dt_s)))
     rings = _rings(wish.ground_distance_m[keys], preferred_m, greatest_m, climbing)
     azimuths = np.arange(NUM_AZIMUTHS) * (2.0 * np.pi / NUM_AZIMUTHS)
     angles = problem.views_rad[keys, None, None] + np.pi + azimuths[None, None, :]
@@ -80,9 +73,7 @@ def search_start(
     chosen = _search(places, targets_m[keys], keys * problem.dt_s, extra, sight, index, clearance_m, cfg.speed_max_mps)
     if chosen[0] < 0:
         return None
-    path = places[np.arange(len(keys)), chosen]
-    frames = np.arange(len(targets_m))
-    return np.stack([np.interp(frames, keys, path[:, axis]) for axis in range(3)], axis=1)
+    return scenario.between(keys, places[np.arange(len(keys)), chosen])
 
 
 def _rings(distances_m: np.ndarray, preferred_m: np.ndarray, greatest_m: np.ndarray, climbing: bool) -> np.ndarray:
@@ -179,6 +170,7 @@ def make_problem(scenario: Scenario, cfg: PlanConfig) -> Problem:
     shift = wish.pitch_rad - np.radians(muco.pitch_deg)
     low, high = (edge + shift for edge in np.radians(muco.pitch_band_deg))
     bounds = (wish.altitude_min_m, wish.altitude_m, wish.altitude_max_m)
+    beneath = 0.0 if wish.any_bearing else muco.weight_beneath
     return Problem(
         targets=np.ascontiguousarray(scenario.targets_m),
         views_rad=wish.view_rad,
@@ -187,14 +179,7 @@ def make_problem(scenario: Scenario, cfg: PlanConfig) -> Problem:
         altitudes=scenario.ground_m[:, None] + np.stack(bounds, axis=1),
         keeps_sight=wish.keeps_sight,
         bearing_weight=muco.weight_view_angle if wish.any_bearing else muco.weight_bearing,
-        altitude_weights=np.array(
-            [
-                muco.weight_below,
-                muco.weight_above,
-                muco.weight_oscillation,
-                0.0 if wish.any_bearing else muco.weight_beneath,
-            ]
-        ),
+        altitude_weights=np.array([muco.weight_below, muco.weight_above, muco.weight_oscillation, beneath]),
         pitches_rad=np.stack([low, wish.pitch_rad, high], axis=1),
         influence_m=muco.influence_m,
         difference_m=muco.difference_m,
@@ -227,18 +212,12 @@ def start_trajectory(
         return plain, "behind"
     safety_m, relaxed_m = cfg.safety_distance_m, cfg.relaxed_safety_m
     for climbing, clearance_m in ((False, safety_m), (True, safety_m), (True, relaxed_m)):
-        found = search_start(problem, scenario.wish, obstacles, cfg, climbing=climbing, clearance_m=clearance_m)
+        found = search_start(problem, scenario, obstacles, cfg, climbing=climbing, clearance_m=clearance_m)
         if found is not None and is_feasible(found, problem, obstacles, nothing_nearby(len(found))):
             return _rounded_off(found, problem, obstacles), "search"
     if plain_is_free:
         return plain, "behind"
-    low_m, high_m = scenario.wish.altitude_min_m.min(), scenario.wish.altitude_max_m.max()
-    raise NoPathError(
-        "no free drone trajectory round this walk",
-        where=scenario.path_id,
-        expected=f"places from {low_m:g} to {high_m:g} m up, {cfg.relaxed_safety_m:g} m from all boxes",
-        fix="is the walk roofed over? raise altitude_max_m or leave the path out",
-    )
+    raise scenario.no_way("no free drone trajectory round this walk", cfg.relaxed_safety_m)
 
 
 def _rounded_off(found: np.ndarray, problem: Problem, obstacles: BoxIndex) -> np.ndarray:
@@ -262,13 +241,7 @@ def optimize(start: np.ndarray, problem: Problem, obstacles: BoxIndex, cfg: Muco
         (n, 3) and the solver's facts: iterations, loss at start and end and by term, why it stopped, the loss history.
     """
     points, history = np.array(start, dtype=np.float64), np.zeros(cfg.iterations_max + 1)
-    rules = Rules(
-        learning_rate=cfg.learning_rate,
-        step_cap_m=cfg.step_cap_m,
-        tolerance=cfg.tolerance,
-        low_visibility=cfg.low_visibility,
-        low_visibility_frames=cfg.low_visibility_frames,
-    )
+    rules = Rules(*(getattr(cfg, name) for name in Rules._fields))
     state, spare = (make_state(len(points), len(obstacles.rows)) for _ in range(2))
     spare = spare._replace(nearby=state.nearby)
     # A flight of two points has nothing to move; only its loss is wanted.
