@@ -19,8 +19,8 @@ import pytest
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 PATIENCE_S = 60.0
 FLAGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking", "--hide-scrollbars",
-    "--disable-dev-shm-usage", "--remote-debugging-pipe",
+    "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
+    "--hide-scrollbars", "--disable-dev-shm-usage", "--remote-debugging-pipe",
 )  # fmt: skip
 
 
@@ -33,7 +33,8 @@ def chromium() -> str:
 
 
 class Page:
-    """One tab. requests: the addresses of all that was asked for; said: what the page wrote to its console, errors too."""
+    """One tab. requests: the addresses of all that was asked for; said: what the page wrote to its console, errors
+    too."""
 
     def __init__(self, to_browser: int, from_browser: int) -> None:
         self.pipes = (to_browser, from_browser)

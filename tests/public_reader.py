@@ -1,7 +1,7 @@
 """The strictest reader of the public layout, by its demands alone: whatever it refuses, other people's loaders refuse.
 
-The demands were gathered from the design's contract of the layout and from what public loaders of the release check. It knows
-nothing of cosfly's reader.
+The demands were gathered from the design's contract of the layout and from what public loaders of the release check. It
+knows nothing of cosfly's reader.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""`cosfly study depth`: the paper's table where it can be worked out by hand, codings that come back, frames that have nothing to study."""
+"""`cosfly study depth`: the paper's table where it can be worked out by hand, codings that come back, frames that have
+nothing to study."""
 
 from __future__ import annotations
 
@@ -36,6 +37,9 @@ def ramp(dtype: type, shape: tuple[int, int] = (72, 128)) -> np.ndarray:
     return np.random.default_rng(0).permutation(values).reshape(shape).astype(dtype)
 
 
+BITS_OF = {"8-bit": 8, "10-bit": 10, "12-bit": 12, "16-bit": 16}
+
+
 def rows_of(study: Study) -> dict:
     return {row.coding: row for row in study.rows}
 
@@ -50,11 +54,13 @@ def rows_of(study: Study) -> dict:
     ],
 )
 def test_depths_spread_evenly_give_the_papers_errors(tmp_path, coding, max_cm, mean_cm, rmse_cm, psnr_db):
-    """Its scene is nearly so: half a step at most, a quarter of one on average; what it prints is within 3 % of that."""
+    """Its scene is nearly so: half a step at most, a quarter of one on average; what it prints is within 3 % of
+    that."""
     np.save(tmp_path / "depth.npy", ramp(np.float64, (360, 640)))
     row = rows_of(run(tmp_path / "depth.npy", tmp_path / "out"))[coding]
     assert (row.max_cm, row.mean_cm, row.rmse_cm) == pytest.approx((max_cm, mean_cm, rmse_cm), rel=0.03)
     assert row.psnr_db == pytest.approx(psnr_db, abs=0.3)
+    assert row.kilobytes == pytest.approx(360 * 640 * BITS_OF[coding] / 8 / 1024), "as the paper's column counts them"
 
 
 def test_float32_against_float64(tmp_path):
@@ -143,8 +149,8 @@ def test_the_profile_is_where_steps_are_seen():
 
 @pytest.mark.parametrize(
     "values",
-    [np.full((4, 5), 7, np.float32), np.full((4, 5), 1000, np.float32), np.full((4, 5), np.nan, np.float32), np.ones((4, 5), np.int32),
-     np.linspace(-1, 1, 20, dtype=np.float32).reshape(4, 5)],
+    [np.full((4, 5), 7, np.float32), np.full((4, 5), 1000, np.float32), np.full((4, 5), np.nan, np.float32),
+     np.ones((4, 5), np.int32), np.linspace(-1, 1, 20, dtype=np.float32).reshape(4, 5)],
     ids=["one_depth", "sky", "nan", "integers", "negative"],
 )  # fmt: skip
 def test_a_frame_without_anything_to_study_is_one_error(tmp_path, values):

@@ -54,7 +54,8 @@ def test_only_the_pedestrian_is_vivid():
 
 
 def test_the_middle_is_cut_out_wherever_the_person_is(tmp_path):
-    """A third of the width and of the height, in the size that the whole picture has in the prompt; where its size is that, to the bit."""
+    """A third of the width and of the height, in the size that the whole picture has in the prompt; where its size is
+    that, to the bit."""
     rgb = np.random.default_rng(0).integers(0, 255, (90, 150, 3), dtype=np.uint8)
     Image.fromarray(rgb).save(tmp_path / "rgb.png")
     middle = Pictures(("middle",), (50, 30))

@@ -129,7 +129,8 @@ def test_clean_flights_are_accepted(workplace):
 
 
 def test_what_a_tree_was_never_to_have_is_not_missing(workplace):
-    """Colours alone were drawn (`render.modalities`): the checksums list nothing else. Files that they list were lost."""
+    """Colours alone were drawn (`render.modalities`): the checksums list nothing else. Files that they list were
+    lost."""
     lost, never = find_flights(workplace / "tree")[:2]
     for folder in (lost, never):
         for path in [*folder.rglob("depth.npy"), *folder.rglob("instance.png")]:
@@ -188,7 +189,8 @@ def test_a_forged_line_of_the_journal_is_one_error(workplace, subtests):
 
 
 def test_what_nothing_lists_is_not_asked_for(workplace):
-    """A flight of cosfly's whose own files somebody took away, as one of somebody else has none: annotations, checksums, fields of ours."""
+    """A flight of cosfly's whose own files somebody took away, as one of somebody else has none: annotations,
+    checksums, fields of ours."""
     tree = workplace / "tree"
     for path in [*tree.rglob("meta.json"), *tree.rglob(CHECKSUMS)]:
         path.unlink()
@@ -230,8 +232,16 @@ def test_plan_rules(change, code, severity):
     positions = np.zeros((n, 3))
     positions[:, 0] = np.arange(n) + change.get("positions", 0.0) * (np.arange(n) % 2)  # a zigzag along the way
     trace = DroneTrace(
-        "p", "muco", np.arange(n) * 0.5, positions, np.zeros((n, 3)), positions, np.full(n, 0.9), np.ones(n), drop_reason=change.get("drop_reason"),
-    )  # fmt: skip
+        "p",
+        "muco",
+        np.arange(n) * 0.5,
+        positions,
+        np.zeros((n, 3)),
+        positions,
+        np.full(n, 0.9),
+        np.ones(n),
+        drop_reason=change.get("drop_reason"),
+    )
     report = Report()
     check_plan(trace, InspectConfig(), report, {})
     assert {issue.code: issue.severity for issue in report.issues}.get(code) == severity
@@ -467,14 +477,20 @@ TO_REVIEW = {
     "missing_texture magenta": lambda f: paint(f, (240, 20, 240), grain=True),
     "z_fighting": let_fight,
     "temporal_jump gone": lambda f: edit_depth(f / FRAME / "depth.npy", lambda d: at_upper_left(d, 60.0)),
-    "temporal_jump near": lambda f: edit_depth(f / FRAME / "depth.npy", lambda d: np.where(d < 900, 0.8 * d, d).astype("f4")),
-    "invalid_depth": lambda f: edit_depth(f / FRAME / "depth.npy", lambda d: np.where(np.arange(len(d))[:, None] < 5, 0, d).astype("f4")),
-    "shorter_than_planned": lambda f: edit(f, lambda t: (t["points"].pop(), t["points"][-1]["nav_waypoint"].update(t1_world=None))),
+    "temporal_jump near": lambda f: edit_depth(
+        f / FRAME / "depth.npy", lambda d: np.where(d < 900, 0.8 * d, d).astype("f4")
+    ),
+    "invalid_depth": lambda f: edit_depth(
+        f / FRAME / "depth.npy", lambda d: np.where(np.arange(len(d))[:, None] < 5, 0, d).astype("f4")
+    ),
+    "shorter_than_planned": lambda f: edit(
+        f, lambda t: (t["points"].pop(), t["points"][-1]["nav_waypoint"].update(t1_world=None))
+    ),
     "never_visible": lambda f: edit(f, lambda t: [p["target"].update(visible=False) for p in t["points"]]),
     "track_quality": lambda f: [edit_image(f / frame_name(i) / "instance.png", slimmer) for i in range(NUM_POINTS)],
     "stray_frame": lambda f: shutil.copytree(f / frame_name(0), f / frame_name(99)),
     "no_trace": lambda f: edit(f, lambda t: t["source"].update(scenario_id="another")),
-}  # fmt: skip
+}
 
 
 def slimmer(image: np.ndarray) -> np.ndarray:
@@ -554,8 +570,8 @@ def test_every_check_has_a_planted_defect():
     sources = "".join(path.read_text() for path in Path(frames.__file__).parent.glob("*.py"))
     codes = set(re.findall(r"report\.(?:error|warn)\(\s*\"(\w+)\"", sources)) | {"collision", "clearance"}
     elsewhere = {
-        "acceleration", "jerk", "smoothness", "prefiltered", "collision", "clearance", "five_ray_visibility", "hidden_by_shift",
-        "no_twin", "unreadable", "not_of_this_tree",
+        "acceleration", "jerk", "smoothness", "prefiltered", "collision", "clearance", "five_ray_visibility",
+        "hidden_by_shift", "no_twin", "unreadable", "not_of_this_tree",
     }  # fmt: skip
     planted = {name.split()[0] for name in (*DEFECTS, *TO_REVIEW)}
     assert not planted & elsewhere
@@ -762,10 +778,13 @@ def test_the_page_stands_alone_and_shows_every_flight(workplace):
     assert "&lt;b&gt;&amp;" in page
     for record in found.flights:
         assert record.trajectory in page
+    funnel = page.partition("<h2>Funnel</h2>")[2].partition("<h2>")[0]
+    assert funnel.count("<span>accepted</span>") == 1, "of flights, as everywhere on the page"
 
 
 def test_the_four_states_of_perturbed_frames_are_counted_beside_the_papers_shares(workplace):
-    """Of two perturbed flights of 10 frames: two with neither offset, one shifted alone, two turned alone, the others both."""
+    """Of two perturbed flights of 10 frames: two with neither offset, one shifted alone, two turned alone, the others
+    both."""
     for number, flight in enumerate(sorted((workplace / "tree").glob("*/*/aug_001"))):
 
         def change(record: dict, number: int = number) -> None:
@@ -783,8 +802,11 @@ def test_the_four_states_of_perturbed_frames_are_counted_beside_the_papers_share
         r'<td>([a-z ]+)</td><td class="n">(\d+)</td><td class="n">([\d.]+)%</td><td class="n">(\d+)%</td>', section
     )
     assert rows == [
-        ("unperturbed", "2", "10.0", "16"), ("position only", "11", "55.0", "24"), ("rotation only", "2", "10.0", "24"), ("full", "5", "25.0", "36"),
-    ]  # fmt: skip
+        ("unperturbed", "2", "10.0", "16"),
+        ("position only", "11", "55.0", "24"),
+        ("rotation only", "2", "10.0", "24"),
+        ("full", "5", "25.0", "36"),
+    ]
 
 
 def test_progress_is_told_by_frames(tmp_path, monkeypatch):

@@ -68,7 +68,12 @@ def test_the_targets_box_stands_where_its_corners_are(trees):
     corners = box_corners(flight.targets_m[1], np.array(PERSON_HALF_EXTENTS_M))
     pose = world_from_camera(flight.positions_m[1], flight.rotations_deg[1])
     uv, _ = project(corners, pose, flight.camera_at(1).intrinsic)
-    near = [np.abs(drawn[round(v) - 1 : round(v) + 2, round(u) - 1 : round(u) + 2].astype(int) - TARGET_COLOR).sum(axis=2).min() for u, v in uv]  # fmt: skip
+    near = [
+        np.abs(drawn[round(v) - 1 : round(v) + 2, round(u) - 1 : round(u) + 2].astype(int) - TARGET_COLOR)
+        .sum(axis=2)
+        .min()
+        for u, v in uv
+    ]
     assert max(near) < 120  # antialiased, one pixel wide; another colour is farther
     again = Overlay(street(), instance_ids(street())).draw(read_rgb(frame), read_instance(frame)[1], meta)
     np.testing.assert_array_equal(again, drawn)

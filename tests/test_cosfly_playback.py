@@ -202,7 +202,8 @@ def test_older_names_are_read_tolerantly(clean, tmp_path):
 
 
 def test_the_known_answer_of_the_public_release(clean, tmp_path):
-    """trajectory_1777083733: points 0 to 1 differ by (-3.123, -2.072, -1.600) m/s (CARLA axes) and -3.13 deg over 0.5 s."""
+    """trajectory_1777083733: points 0 to 1 differ by (-3.123, -2.072, -1.600) m/s (CARLA axes) and -3.13 deg over 0.5
+    s."""
 
     def change(value):
         first, second = (p["drone_pose"] for p in value["points"][:2])

@@ -1,4 +1,5 @@
-"""The PNG reader and writer against libraries', on pictures of every filter, packing and number of channels; and what damage does."""
+"""The PNG reader and writer against libraries', on pictures of every filter, packing and number of channels; and what
+damage does."""
 
 from __future__ import annotations
 

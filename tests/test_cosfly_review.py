@@ -144,7 +144,8 @@ def test_what_cannot_be_decided(product):
 
 def test_the_command_decides_and_says_what_is_open(product):
     first, second, third, _ = folders_of(product)
-    ask = lambda *words: CliRunner().invoke(app, ["inspect", "review", "--inspect", str(product.parent), *words])  # noqa: E731
+    command = ["inspect", "review", "--inspect", str(product.parent)]
+    ask = lambda *words: CliRunner().invoke(app, [*command, *words])  # noqa: E731
     assert ask("--accept", first).exit_code == 2, "who, and why?"
     done = ask("--accept", first, "--accept", second, "--reject", third, "--by", "Bo", "--reason", "steady")
     assert done.exit_code == 0, done.output
@@ -206,13 +207,17 @@ def test_flights_that_wait_are_told_with_the_way_out(inspected, product, caplog)
 
 @pytest.mark.slow
 def test_what_the_page_saves_is_what_the_command_takes(product):
-    """A person fills it in: one accepted, one rejected with markup in the reason, one without a reason, which stops it."""
+    """A person fills it in: one accepted, one rejected with markup in the reason, one without a reason, which stops
+    it."""
     page_path = review.write_page(product)
     with browser(product.parent / "profile") as page:
         page.open(page_path)
         page.run("document.getElementById('by').value = 'Dee'")
-        page.run("const parts = [...document.querySelectorAll('.choice')]; parts.slice(0, 3).forEach((p, k) => "
-                 "{ p.querySelectorAll('input[type=radio]')[k % 2].click(); p.querySelector('.reason').value = ['fine', '<b>bad</b>', ''][k]; })")  # fmt: skip
+        page.run(
+            "const parts = [...document.querySelectorAll('.choice')]; parts.slice(0, 3).forEach((p, k) => "
+            "{ p.querySelectorAll('input[type=radio]')[k % 2].click(); p.querySelector('.reason').value = "
+            "['fine', '<b>bad</b>', ''][k]; })"
+        )
         page.run("document.getElementById('save').click()")
         assert "without a reason" in page.run("document.getElementById('state').textContent")
         page.run(

@@ -112,7 +112,8 @@ def test_other_folders_are_not_found_by_the_public_reader(ours, tmp_path):
         read_public(tmp_path / "tree")
 
 
-# --- names --------------------------------------------------------------------------------------------------------------
+# --- names
+# --------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -136,7 +137,8 @@ def test_ids_are_plain_where_they_can_be_and_longer_where_they_must():
         flight_ids([one, one])
 
 
-# --- quirks of trees ----------------------------------------------------------------------------------------------------
+# --- quirks of trees
+# ----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -262,7 +264,8 @@ def test_the_clean_twin_is_found_by_what_it_says_it_is(tmp_path, variants):
         read_twin(shaken)
 
 
-# --- the whole way of a foreign tree ------------------------------------------------------------------------------------
+# --- the whole way of a foreign tree
+# ------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,5 @@
-"""cosfly/render/lens.py: levels of zoom, changes between them, and who reads the camera of a frame; what cannot be drawn."""
+"""cosfly/render/lens.py: levels of zoom, changes between them, and who reads the camera of a frame; what cannot be
+drawn."""
 
 from __future__ import annotations
 
@@ -69,11 +70,6 @@ def test_names_of_levels():
 def test_a_field_of_view_outside_0_to_180_is_an_error(fov):
     with pytest.raises(ConfigError, match=r"fovs_deg"):
         build(RenderConfig, {"fovs_deg": [90.0, fov]}, "test")
-
-
-@pytest.mark.parametrize("fov", [0.1, 1.0, 175.0, 179.0])
-def test_any_field_of_view_inside_is_taken(fov):
-    assert build(RenderConfig, {"fovs_deg": [fov]}, "test").fovs_deg == (fov,)
 
 
 # --- changes ----------------------------------------------------------------------------------------------------------
@@ -200,7 +196,12 @@ def test_the_inspection_projects_with_each_frames_camera(zoomed_tree, tmp_path):
     """Its pixels, boxes and masks agree; with the first frame's camera for all they do not."""
     tree, (_, simplified, traces) = zoomed_tree
     cfg = InspectConfig(clearance_min_m=0.0, smoothness_min=0.0, jerk_rms_max_mps3=1e3, accel_rms_max_mps2=1e3)
-    codes = [issue.code for flight in read_inspection(inspection.run(cfg, simplified, traces, tree, tmp_path / "a")).flights for issue in flight.issues if issue.severity == "error"]  # fmt: skip
+    codes = [
+        issue.code
+        for flight in read_inspection(inspection.run(cfg, simplified, traces, tree, tmp_path / "a")).flights
+        for issue in flight.issues
+        if issue.severity == "error"
+    ]
     assert codes == []
     for folder in find_flights(tree):
         flight = read_flight(folder)
@@ -235,10 +236,6 @@ IN_A_SLAB = moved(circling(4, "path_003"), "targets_m", 1, (0.0, 0.0, 0.05))
 def test_what_cannot_be_drawn_is_named(trace, words):
     with pytest.raises(RenderError, match=words):
         check_flight(trace, Surroundings(street()))
-
-
-def test_what_can_be_drawn_passes():
-    check_flight(circling(20), Surroundings(street()))
 
 
 @needs_gl

@@ -102,11 +102,10 @@ def test_levels_are_the_settings_from_wide_to_long():
 def studied(tmp_path_factory) -> tuple[Path, str]:
     folder = tmp_path_factory.mktemp("study")
     boxes, simplified, traces = write_inputs(folder / "inputs", [circling(6), circling(5, "path_002"), IN_THE_WALL])
-    result = CliRunner().invoke(app, [
-        "study", "zoom", "--map", str(boxes), "--simplified", str(simplified), "--traces", str(traces), "--out", str(folder / "out"),
-        "--every", "2", "--workers", "0", "--set", "max_failed=1", "--set", f"render.fovs_deg={LEVELS}", "--set", "render.width_px=640",
-        "--set", "render.height_px=360",
-    ])  # fmt: skip
+    words = f"study zoom --map {boxes} --simplified {simplified} --traces {traces} --out {folder / 'out'} --every 2"
+    settings = f"max_failed=1 render.fovs_deg={LEVELS} render.width_px=640 render.height_px=360".replace(", ", ",")
+    sets = [word for setting in settings.split() for word in ("--set", setting)]
+    result = CliRunner().invoke(app, [*words.split(), "--workers", "0", *sets])
     assert result.exit_code == 0, result.output
     return folder / "out", result.output
 

@@ -1,7 +1,8 @@
-"""One contract for every renderer of the table: depth and ids against computed rays, sky, person, repeatability, a whole flight.
+"""One contract for every renderer of the table: depth and ids against computed rays, sky, person, repeatability, a
+whole flight.
 
-Tolerance between processes: the default renderer gives identical bytes on one machine and driver; other machines may differ by
-one level of colour in 0.5 % of the pixels, and by 5 mm of depth away from silhouettes.
+Tolerance between processes: the default renderer gives identical bytes on one machine and driver; other machines may
+differ by one level of colour in 0.5 % of the pixels, and by 5 mm of depth away from silhouettes.
 """
 
 from __future__ import annotations
@@ -263,7 +264,8 @@ FAR_OFF_M = np.array([50_000.137, -50_000.291, 0.0])  # no whole numbers, which 
 def test_depth_of_the_default_renderer_to_a_fifth_of_a_millimetre(
     software, least_m, most_m, bound_m, offset_m, monkeypatch
 ):
-    """At 30 m and at 500 m, on slanted faces too; where the map reaches to a box a hundred kilometres off; and as on hardware that snaps."""
+    """At 30 m and at 500 m, on slanted faces too; where the map reaches to a box a hundred kilometres off; and as on
+    hardware that snaps."""
     monkeypatch.setattr("cosfly.render.gl.backend.SOFTWARE", software)
     near = [(least_m + 5.37, 12.3 * k, 3.1) for k in range(-2, 3)]
     far = [(k, y, 10.0) for k, y in ((most_m - 50.0, -80.0), (most_m - 45.0, 0.0), (most_m - 60.0, 90.0))]
@@ -460,7 +462,8 @@ def test_a_whole_flight_has_the_annotations_of_the_default_renderer(renderer_nam
 
 
 def _same_person(ids: np.ndarray, expected: np.ndarray, px_per_m: float) -> None:
-    """The masks of two figures lie in the same place: middles within 0.15 m, borders within 0.3 m: one bends its knees."""
+    """The masks of two figures lie in the same place: middles within 0.15 m, borders within 0.3 m: one bends its
+    knees."""
     masks = [np.argwhere(image == PERSON_ID) for image in (ids, expected)]
     np.testing.assert_allclose(masks[0].mean(axis=0), masks[1].mean(axis=0), atol=0.15 * px_per_m)
     for border in (np.min, np.max):

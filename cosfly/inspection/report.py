@@ -45,7 +45,9 @@ def report_html(name: str, inspection: Inspection, views: Mapping[str, FlightVie
     order = sorted(inspection.flights, key=lambda f: (-RESULTS.index(f.result), f.folder))
     is_covered = inspection.coverage is not None and inspection.coverage.frames
     accepted = [flight for flight in inspection.flights if flight.result == "accepted"] or inspection.flights
-    shown = [views[flight.folder].pictures[1] for flight in accepted if flight.folder in views]
+    shown = [
+        views[flight.folder].pictures[1] for flight in sorted(accepted, key=lambda f: f.track) if flight.folder in views
+    ]
     counts = {
         state: sum(int(flight.metrics.get(f"frames_{state.replace(' ', '_')}") or 0) for flight in inspection.flights)
         for state in STATES

@@ -3,9 +3,10 @@
     cosfly run quickstart --out work/bench -s pedestrians.num_paths=4
     python tests/benchmarks/bench_inspection.py work/bench
 
-`ours` and `plain` take turns, frame by frame, so that other programs slow both: the plain way reads each file for its checksum and
-again to decode it, decodes with OpenCV, and asks NumPy one question after the other. What compiles is run before. The last lines are
-whole inspections of the run by two workers, on the clock: what they need with their start, and while they are at work.
+`ours` and `plain` take turns, frame by frame, so that other programs slow both: the plain way reads each file for its
+checksum and again to decode it, decodes with OpenCV, and asks NumPy one question after the other. What compiles is run
+before. The last lines are whole inspections of the run by two workers, on the clock: what they need with their start,
+and while they are at work.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from cosfly.inspection.pixels import NUM_IDS, look_at, unpack
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
 from cosfly.products.flights import find_flights
-from cosfly.products.frames import FILE_NAMES, read_depth, read_instance, read_meta, read_rgb
+from cosfly.products.frames import FILE_NAMES, frame_path, read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.playback import Flight, read_flight
 from cosfly.reading.files import read_bytes, sha256_file
 from cosfly.space.reprojection import View, compare_views
@@ -54,13 +55,20 @@ class Parts:
 def ours(flight: Flight, i: int, before: View | None, parts: Parts) -> View:
     """What the inspection does with a frame."""
     folder = flight.frame_folder(i)
-    files = parts.time("ours: read", lambda: {name: read_bytes(folder / name) for name in FILE_NAMES.values()})
+    paths = [frame_path(folder, name) for name in FILE_NAMES.values()]
+    files = parts.time("ours: read", lambda: {path.name: read_bytes(path) for path in paths})
     parts.time("ours: sha256", lambda: [sha256_bytes(data) for data in files.values()])
     parts.time("ours: annotation", lambda: read_meta(folder))
     picture = parts.time("ours: unpack", lambda: unpack(files, folder))
     parts.time("ours: all pixels at once", lambda: look_at(picture, NOBODY, 0.99))
-    parts.time("ours: small picture, range of depth", lambda: (
-        cv2.resize(picture.colours[::SMALL_ROWS], SMALL_PX, interpolation=cv2.INTER_AREA), picture.depth.min(), picture.depth.max()))  # fmt: skip
+    parts.time(
+        "ours: small picture, range of depth",
+        lambda: (
+            cv2.resize(picture.colours[::SMALL_ROWS], SMALL_PX, interpolation=cv2.INTER_AREA),
+            picture.depth.min(),
+            picture.depth.max(),
+        ),
+    )
     return parts.time("ours: against the frame before", lambda: _compare(flight, i, picture, before))
 
 
@@ -76,7 +84,7 @@ def _compare(flight: Flight, i: int, picture: Any, before: View | None) -> View:
 def plain(flight: Flight, i: int, parts: Parts) -> None:
     """The checks that need no other frame, in the plain way."""
     folder = flight.frame_folder(i)
-    parts.time("plain: read, sha256", lambda: [sha256_file(folder / name) for name in FILE_NAMES.values()])
+    parts.time("plain: read, sha256", lambda: [sha256_file(frame_path(folder, name)) for name in FILE_NAMES.values()])
     parts.time("plain: annotation", lambda: read_meta(folder))
     parts.time(
         "plain: read, crc32", lambda: [zlib.crc32(read_bytes(folder / name)) for name in ("rgb.png", "instance.png")]
@@ -84,8 +92,16 @@ def plain(flight: Flight, i: int, parts: Parts) -> None:
     rgb = parts.time("plain: decode colours", lambda: read_rgb(folder))
     kinds, ids = parts.time("plain: decode instances", lambda: read_instance(folder))
     depth = parts.time("plain: read depth", lambda: read_depth(folder))
-    parts.time("plain: small picture, range of depth", lambda: (
-        cv2.resize(rgb, SMALL_PX, interpolation=cv2.INTER_AREA), np.isfinite(depth).all(), depth.min(), depth.max(), (depth == 0).mean()))  # fmt: skip
+    parts.time(
+        "plain: small picture, range of depth",
+        lambda: (
+            cv2.resize(rgb, SMALL_PX, interpolation=cv2.INTER_AREA),
+            np.isfinite(depth).all(),
+            depth.min(),
+            depth.max(),
+            (depth == 0).mean(),
+        ),
+    )
     parts.time("plain: surfaces", lambda: plain_surfaces(rgb, kinds, ids))
     parts.time("plain: person", lambda: mask_box(kinds == 12))
 
@@ -130,9 +146,12 @@ def main() -> None:
             ]
             run(InspectConfig(), *inputs, Path(scratch) / "inspect", workers=2)
             whole_s = time.monotonic() - begin_s
-            busy_s = sum(event.seconds or 0.0 for event in read_events(Path(scratch) / "inspect") if event.event == "item_done")  # fmt: skip
+            busy_s = sum(
+                event.seconds or 0.0 for event in read_events(Path(scratch) / "inspect") if event.event == "item_done"
+            )
         print(
-            f"the stage by two workers: {num_frames} frames in {whole_s:.1f} s with start and page; at work {1e3 * busy_s / num_frames:.2f} ms"
+            f"the stage by two workers: {num_frames} frames in {whole_s:.1f} s with start and page; at work "
+            f"{1e3 * busy_s / num_frames:.2f} ms"
             f" a frame of one, {2 * num_frames / busy_s:.0f} frames/s of two"
         )
 

@@ -1,4 +1,5 @@
-"""Rendering: where a frame's processor time goes, frames/s to disk, a map of 62,640 boxes, memory over thousands of frames.
+"""Rendering: where a frame's processor time goes, frames/s to disk, a map of 62,640 boxes, memory over thousands of
+frames.
 
     python tests/benchmarks/bench_render.py parts                          # one process, no workers
     python tests/benchmarks/bench_render.py disk --workers 2               # the stage as it is used
@@ -6,8 +7,9 @@
     python tests/benchmarks/bench_render.py tiles                          # the SimWorld city 12 x 12
     python tests/benchmarks/bench_render.py memory --frames 5000
 
-1280x720, all files, the synthetic town and the SimWorld city, flights of the default planner; `disk` at 90 degrees, one flight a process.
-On a machine with a GPU the same commands use it (the device is printed); `bench_render_workers.py` is made for a host of many cores.
+1280x720, all files, the synthetic town and the SimWorld city, flights of the default planner; `disk` at 90 degrees, one
+flight a process. On a machine with a GPU the same commands use it (the device is printed); `bench_render_workers.py` is
+made for a host of many cores.
 """
 
 from __future__ import annotations
@@ -145,7 +147,7 @@ def parts(folder: Path, num_frames: int) -> tuple[str, list[Any]]:
             contents = [
                 measured.of("PNG of colours", frames.rgb_bytes)(frame.rgb),
                 measured.of("PNG of kinds and ids", frames.instance_bytes)(frame.kinds, frame.ids),
-                measured.of("depth as .npy", frames.depth_bytes)(frame.depth),
+                measured.of("depth packed", frames.depth_file)(frame.depth, "png"),
             ]
             for k, data in enumerate(contents):
                 measured.of("hash", flight.sha256_bytes)(data)
@@ -159,7 +161,7 @@ def parts(folder: Path, num_frames: int) -> tuple[str, list[Any]]:
         "read back, soften, split",
         "PNG of colours",
         "PNG of kinds and ids",
-        "depth as .npy",
+        "depth packed",
         "hash",
         "write",
     )
@@ -170,7 +172,8 @@ def parts(folder: Path, num_frames: int) -> tuple[str, list[Any]]:
 
 
 def to_disk(folder: Path, out: Path, workers: int, num_points: int, checkout: Path | None) -> list[float]:
-    """Draw and write a flight with each of some processes at once, as the stage's workers do. Gives frames, CPU ms a frame, frames/s."""
+    """Draw and write a flight with each of some processes at once, as the stage's workers do. Gives frames, CPU ms a
+    frame, frames/s."""
     columns = ("time_s", "positions_m", "rotations_deg", "targets_m", "visibility", "clearances_m")
     traces = read_traces(folder / FILES[1])
     every = [np.linspace(0, len(trace.time_s) - 1, num_points).astype(int) for trace in traces]
@@ -219,7 +222,8 @@ def compared(ours: Path, theirs: Path) -> str:
         for a, b in zip(frames.read_instance(ours / p), frames.read_instance(theirs / p), strict=True)
     )
     return (
-        f"{len(found)} frames: SSIM {np.mean(similar):.4f}, lowest {min(similar):.4f}; depth {'equal' if same_depth else 'DIFFERS'}, "
+        f"{len(found)} frames: SSIM {np.mean(similar):.4f}, lowest {min(similar):.4f}; depth "
+        f"{'equal' if same_depth else 'DIFFERS'}, "
         f"kinds and ids {'equal' if same_ids else 'DIFFER'}"
     )
 

@@ -1,14 +1,14 @@
 """Frames/s to disk by the number of workers, and what bounds them: made for a machine with a GPU and many cores.
 
-    python tests/benchmarks/bench_render_workers.py --inputs work/render --make          # once, anywhere: maps and flights
-    python tests/benchmarks/bench_render_workers.py --inputs work/render --workers 1 4 8 16
-    python tests/benchmarks/bench_render_workers.py --inputs work/render --maps town --workers 16 --pinned --seconds 10
+    python tests/benchmarks/bench_render_workers.py --inputs work/render --make          # once, anywhere: maps and
+    flights python tests/benchmarks/bench_render_workers.py --inputs work/render --workers 1 4 8 16 python
+    tests/benchmarks/bench_render_workers.py --inputs work/render --maps town --workers 16 --pinned --seconds 10
 
-1280x720, colours, depth, instances, annotation and digests of every frame, by the code that the stage runs. The workers are started
-once; then, for each number, so many draw flights for `--seconds`, and what they finished within that time counts. Milliseconds are
-those of one worker; drawing, reading back and looking come one after the other, encoding and writing run beside them in two threads.
-The 60 seconds that it takes on 16 cores are half start and half measurement. Files go to `--out`, and each flight is deleted when it
-is finished.
+1280x720, colours, depth, instances, annotation and digests of every frame, by the code that the stage runs. The workers
+are started once; then, for each number, so many draw flights for `--seconds`, and what they finished within that time
+counts. Milliseconds are those of one worker; drawing, reading back and looking come one after the other, encoding and
+writing run beside them in two threads. The 60 seconds that it takes on 16 cores are half start and half measurement.
+Files go to `--out`, and each flight is deleted when it is finished.
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ class Over(Exception):
 
 @dataclass
 class Spans:
-    """What took how long, in the threads of one worker: (name, end, seconds on the clock, processor seconds of that thread)."""
+    """What took how long, in the threads of one worker: (name, end, seconds on the clock, processor seconds of that
+    thread)."""
 
     found: list[tuple[str, float, float, float]] = field(default_factory=list)
 
@@ -95,7 +96,7 @@ def instrumented(renderer: Any, spans: Spans) -> None:
     flights._write_frame = spans.of("write_frame", flights._write_frame)
     frames.rgb_bytes = spans.of("PNG of colours", frames.rgb_bytes)
     frames.instance_bytes = spans.of("PNG of ids", frames.instance_bytes)
-    frames.depth_bytes = spans.of("depth", frames.depth_bytes)
+    frames.depth_file = spans.of("depth", frames.depth_file)
     flights.sha256_bytes = spans.of("hash", flights.sha256_bytes)
 
 
@@ -174,7 +175,8 @@ def gpu_busy() -> str:
 
 
 def measured(talks: list[Connection], seconds: float) -> tuple[list[Any], dict[str, float], dict[str, float]]:
-    """Let these workers draw. Gives a row of the first table; milliseconds a frame by part, on the clock and of processor time."""
+    """Let these workers draw. Gives a row of the first table; milliseconds a frame by part, on the clock and of
+    processor time."""
     begin_s = time.monotonic() + 2 * LEAD_S
     for talk in talks:
         talk.send((begin_s, begin_s + seconds))

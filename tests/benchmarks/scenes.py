@@ -1,4 +1,5 @@
-"""What the benchmarks measure on, and how: three maps, walks over them, CPU times, tables. Writes nothing into the repository."""
+"""What the benchmarks measure on, and how: three maps, walks over them, CPU times, tables. Writes nothing into the
+repository."""
 
 from __future__ import annotations
 
@@ -90,12 +91,14 @@ def cpu_ms(function: Callable[[], Any]) -> tuple[float, Any]:
 
 
 def one_thread_and_machine() -> None:
-    """Say what is measured on; hold BLAS to one thread: its others spin on after a call, and count for what is timed next."""
+    """Say what is measured on; hold BLAS to one thread: its others spin on after a call, and count for what is timed
+    next."""
     threadpool_limits(1)
     lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     print(
-        f"{len(models)} cores of {models[0] if models else 'an unknown processor'}; times are CPU times of one process\n"
+        f"{len(models)} cores of {models[0] if models else 'an unknown processor'}; times are CPU times of one "
+        f"process\n"
     )
 
 
