@@ -57,10 +57,7 @@ def use_limits(chosen: Limits) -> None:
 
 def over_limit(name: str, where: object, got: str, unit: str = "") -> InputError:
     """Give the error of what is over one of the limits; it says how to raise it."""
-    return InputError(
-        f"over the limit reading.{name}",
-        where=str(where),
-        got=got,
-        expected=f"at most {getattr(_limits, name):,}{unit}",
-        fix=f"if you trust the file, raise it with --set reading.{name}=...",
-    )
+    most = getattr(_limits, name)
+    fix = f"if you trust the file, raise it, for instance to ten times as much: --set reading.{name}={10 * most}"
+    what, expected = f"over the limit reading.{name}", f"at most {most:,}{unit}"
+    return InputError(what, where=str(where), got=got, expected=expected, fix=fix)

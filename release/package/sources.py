@@ -238,6 +238,7 @@ def choose_licence(licence: str | None, maps: list[tuple[str, str]]) -> str:
         raise ConfigError(
             "nobody says under which licence this may be released", where="release.licence",
             got=", ".join(f"{name}: {one}" for name, one in maps),
-            expected="a licence identifier as the hub spells it", fix="--set release.licence=... (cc-by-4.0, apache-2.0, ...)",
+            expected="a licence identifier as the hub spells it",
+            fix="give yours, for instance --set release.licence=cc-by-4.0",
         )  # fmt: skip
     return chosen
