@@ -13,7 +13,7 @@ import inspect
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, ParamSpec, Self, TypeVar, overload
+from typing import Any, Literal, ParamSpec, Self, TypeVar, get_args, get_origin, overload
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -33,25 +33,37 @@ from cosfly.work.store import atomic_file, write_bytes, write_model
 
 RECORD, RECORD_SCHEMA, VERSION = "training_set.json", "cosfly.training_set", "3.0"
 PAGE = "README.md"
-# Rows of a row group. One look at a sample, in an order drawn by lot, decodes them; the footer, of which a reader and the writer hold
-# all, grows by the groups.
+# Rows of a row group. One look at a sample, in an order drawn by lot, decodes them; the footer, of which a reader and
+# the writer hold all, grows by the groups.
 ROWS_AT_ONCE = 1000
 
 
-class Sample(BaseModel):
-    """One sample: what the student sees, and what it should answer."""
-
+class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+
+class SplitMember(_Strict):
+    """Of any kind of sample, what says whose it is."""
+
     sample_id: str  # unique in the set
-    language: Language
     run: str  # the tree that its flight stands in
-    window_id: str  # of its window in that tree, as its captions name it
     town: str
     trajectory: str
     variant: str
     walk: str  # whom it follows: samples of one walk are in one split
-    window: tuple[int, ...]  # indices of the frames, oldest first
+    window: tuple[int, ...]  # indices of the frames of its pictures, oldest first
+
+    @property
+    def key(self) -> str:
+        """Unique name of the sample."""
+        return self.sample_id
+
+
+class Sample(SplitMember):
+    """One sample: what the student sees, and what it should answer."""
+
+    language: Language
+    window_id: str  # of its window in the tree of its run, as its captions name it
     views: tuple[View, ...]  # the pictures of each frame, in this order
     picture_px: tuple[int, int]  # (width, height) of each, which pixel values of prompt and answer refer to
     depth_range_m: float  # dark end of depth pictures
@@ -66,7 +78,6 @@ class Sample(BaseModel):
 
     @property
     def key(self) -> str:
-        """Unique name of the sample: window and language."""
         return f"{self.sample_id}/{self.language}"
 
     @property
@@ -89,23 +100,18 @@ class Sample(BaseModel):
         return [f"{frame}/{VIEW_FILES[view]}" for frame in self.frames for view in self.views]
 
 
-# --- the record -------------------------------------------------------------------------------------------------------
-
-
-class SourceTree(BaseModel):
-    """A playback tree that samples name frames of: the name of its run, and its fingerprint (cosfly/work/provenance.py)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class SourceTree(_Strict):
+    """A playback tree that samples name frames of: its run and its fingerprint (cosfly/work/provenance.py)."""
 
     run: str
     sha256: str
 
 
-class TrainingSet(BaseModel):
-    """`training_set.json`. samples: of each split; systems: the system prompts, which samples name by their place; actions: the closed set of
-    the answers' decisions, null for the one that ships."""
+class TrainingSet(_Strict):
+    """`training_set.json`. samples: of each split. systems: the system prompts, which samples name by their place.
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    actions: the closed set of the answers' decisions, null for the one that ships.
+    """
 
     split_by: Literal["walk", "town"]
     trees: list[SourceTree]
@@ -156,17 +162,15 @@ def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
         run = run_of.get(fingerprint(path))
         if run is None:
             raise InputError(
-                "the training set was not made of this playback tree", where=path, got=f"fingerprint {fingerprint(path)}",
+                "the training set was not made of this playback tree", where=path, got=fingerprint(path),
                 expected=", ".join(f"{tree.run}: {tree.sha256}" for tree in record.trees),
                 fix="give the trees that it was made of as they were then, or prepare it anew from this one",
             )  # fmt: skip
         trees[run] = path
-    missing = [tree.run for tree in record.trees if tree.run not in trees]
-    if missing:
-        raise InputError(
-            "a playback tree of the training set is not given", where=dataset, got=", ".join(map(str, data)) or "none",
-            expected=f"also --data of the runs {', '.join(missing)}", fix="give --data once for each of its trees",
-        )  # fmt: skip
+    if missing := [tree.run for tree in record.trees if tree.run not in trees]:
+        words, fix = "a playback tree of the training set is not given", "give --data once for each of its trees"
+        expected = f"also --data of the runs {', '.join(missing)}"
+        raise InputError(words, where=dataset, got=", ".join(map(str, data)) or "none", expected=expected, fix=fix)
     return {tree.run: trees[tree.run] for tree in record.trees}
 
 
@@ -175,23 +179,26 @@ def tree_inputs(trees: Mapping[str, Path]) -> dict[str, Path]:
     return {f"{number}.data" if len(trees) > 1 else "data": tree for number, tree in enumerate(trees.values(), 1)}
 
 
-# --- splits -----------------------------------------------------------------------------------------------------------
+def arrow_type(of: Any) -> pa.DataType:
+    """Give the type of a column that holds values of a field: text, float, a tuple of one of them, or nothing."""
+    if (parts := get_args(of)) and get_origin(of) is not Literal:
+        first = parts[0]
+        if get_origin(of) is tuple:
+            return pa.list_(pa.field("element", arrow_type(first)))
+        return arrow_type(first)  # or None
+    return {int: pa.int32(), float: pa.float64()}.get(of, pa.string())
 
-_STRINGS = ("sample_id", "language", "run", "window_id", "town", "trajectory", "variant", "walk")
-COLUMNS = pa.schema([
-    *(pa.field(name, pa.string(), nullable=False) for name in _STRINGS),
-    pa.field("window", pa.list_(pa.field("element", pa.int32())), nullable=False),
-    pa.field("views", pa.list_(pa.field("element", pa.string())), nullable=False),
-    pa.field("picture_px", pa.list_(pa.field("element", pa.int32())), nullable=False),
-    pa.field("depth_range_m", pa.float64(), nullable=False),
-    pa.field("system", pa.int32(), nullable=False),  # of the record's system prompts
-    *(pa.field(name, pa.string(), nullable=False) for name in ("prompt", "answer", "decision")),
-    pa.field("label", pa.string()),
-    pa.field("contradicted", pa.list_(pa.field("element", pa.string()))),
-    pa.field("proved", pa.float64()),
-    pa.field("repair", pa.string()),
-    pa.field("weight", pa.float64(), nullable=False),
-])  # fmt: skip
+
+def columns_of(model: type[SplitMember], **changed: pa.DataType) -> pa.Schema:
+    """Give the columns of a file of samples: their fields, and where a file holds something else its type."""
+    types = {name: field.annotation for name, field in model.model_fields.items()}
+    return pa.schema([
+        pa.field(name, changed.get(name, arrow_type(of)), nullable=type(None) in get_args(of))
+        for name, of in types.items()
+    ] + [pa.field(name, of, nullable=False) for name, of in changed.items() if name not in types])  # fmt: skip
+
+
+COLUMNS = columns_of(Sample, prompt=pa.string(), system=pa.int32())  # system: number of one of the record's
 
 
 def split_path(dataset: Path, split: str) -> Path:
@@ -200,7 +207,8 @@ def split_path(dataset: Path, split: str) -> Path:
 
 
 class Samples(Sequence[Sample]):
-    """The samples of a split: any by its number, all in a stream. Holds a few row groups; a process that it is sent to opens its own."""
+    """The samples of a split: any by its number, all in a stream. Holds a few row groups; a process that it is sent to
+    opens its own."""
 
     def __init__(self, dataset: Path, split: Split) -> None:
         record = read_training_set(dataset)
@@ -237,13 +245,15 @@ def open_split(dataset: Path, split: Split) -> Samples:
     """Open a split.
 
     Raises:
-        InputError: there is no training set, or it is of an earlier version. Reading a sample: names the file, the row and the field.
+        InputError: there is no training set, or it is of an earlier version. Reading a sample: names the file, the row
+            and the field.
     """
     return Samples(dataset, split)
 
 
 class SplitFiles:
-    """Rows to one parquet file a split, one by one; of each split at most a row group waits in memory. paths: what was written."""
+    """Rows to one parquet file a split, one by one; of each split at most a row group waits in memory. paths: what was
+    written."""
 
     def __init__(self, out: Path, columns: pa.Schema) -> None:
         self.out, self._columns, self._stack = out, columns, contextlib.ExitStack()
@@ -325,7 +335,8 @@ def _page(record: TrainingSet) -> bytes:
     return page_of(
         "Training set",
         record.samples,
-        f"No two splits share a {record.split_by}. `system` is the place of a sample's system prompt in `systems` of `{RECORD}`,\n"
-        f"`prompt` its question, `answer` what it should say; its pictures are frames `window` of the playback trees of\n"
+        f"No two splits share a {record.split_by}. `system` is the place of a sample's system prompt in `systems` of\n"
+        f"`{RECORD}`, `prompt` its question, `answer` what it should say; its pictures are frames `window` of the\n"
+        "playback trees of\n"
         f"{json.dumps([tree.run for tree in record.trees], ensure_ascii=False)}, which are not part of it.\n",
     )

@@ -1,7 +1,8 @@
 """Captioned windows for training code of one's own: frames, facts, caption, from a playback tree, a run or a release.
 
-`Windows` needs no torch and gives NumPy arrays; `WindowDataset` the same as tensors. Both are map-style data sets, pickle, and
-open their files anew in each process, so they go into a `DataLoader` with workers as they are. Right-handed axes, as in a release.
+`Windows` needs no torch and gives NumPy arrays; `WindowDataset` the same as tensors. Both are map-style data sets,
+pickle, and open their files anew in each process, so they go into a `DataLoader` with workers as they are. Right-handed
+axes, as in a release.
 """
 
 from __future__ import annotations
@@ -16,14 +17,15 @@ from typing import Any, Protocol, TypedDict, get_args
 import cv2
 import numpy as np
 import pyarrow as pa
+from pydantic import BaseModel
 
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, nearest
 from cosfly.look.frame_views import VIEW_FILES, Pictures, read_view, scaled_size
-from cosfly.products.captions import FIELDS, Caption, Language, Prompt, read_captions
+from cosfly.products.captions import FIELDS, Language, Prompt, read_captions
 from cosfly.products.frames import frame_name
 from cosfly.products.playback import Flight, read_flight
 from cosfly.reading.arrays import parse_picture
-from cosfly.reading.documents import read_object
+from cosfly.reading.documents import read_object, validated
 from cosfly.reading.files import check_stays_below
 from cosfly.reading.tables import TableRows, open_table, rows_of
 from cosfly.work.store import inside
@@ -58,7 +60,7 @@ class WindowPlace:
 
 @dataclass(frozen=True)
 class ReadWindow:
-    """What a source knows of a window. pictures: of its frames, each (h, w, 3). size_px: (width, height) of a picture as the teacher saw it."""
+    """What a source knows of a window. pictures: of its frames, (h, w, 3). size_px: (width, height) for the teacher."""
 
     pictures: list[np.ndarray]
     facts: dict[str, np.ndarray]
@@ -85,18 +87,14 @@ def open_source(source: Path, captions: Path | None, language: Language, split: 
         if (folder / "release.json").is_file():
             return _Release(folder, language, split)
     if split is not None:
-        raise ConfigError(
-            "only a release has splits", where=source, got=f"split={split!r}",
-            fix="build one of it: cosfly release build",
-        )  # fmt: skip
+        fix = "build one of it: cosfly release build"
+        raise ConfigError("only a release has splits", where=source, got=f"split={split!r}", fix=fix)
     if captions is None and (source / "render").is_dir():
         source, captions = source / "render", source / "caption/captions.jsonl"
         check_stays_below(captions, captions.parent)
     if captions is None:
-        raise InputError(
-            "neither a release nor a run folder", where=source, expected="release.json, or render/ and caption/ in it",
-            fix="of a playback tree give the captions too: Windows(tree, captions)",
-        )  # fmt: skip
+        fix = "of a playback tree give the captions too: Windows(tree, captions)"
+        raise InputError("neither a release nor a run folder", where=source, fix=fix)
     return _Tree(source, captions, language)
 
 
@@ -105,11 +103,8 @@ def _prompt(text: Prompt, size_px: tuple[int, int], language: Language) -> dict[
     return {"system": told.system, "user": told.user}
 
 
-# --- a playback tree --------------------------------------------------------------------------------------------------
-
-
 class _Tree:
-    """A playback tree and its captions, whose texts stay in memory (some 4 kB a window; a release reads them when they are asked for)."""
+    """A playback tree and its captions, whose texts stay in memory: some 4 kB a window."""
 
     def __init__(self, tree: Path, captions: Path, language: Language) -> None:
         self.tree, self.captions, self.language = tree, captions, language
@@ -129,14 +124,11 @@ class _Tree:
             elif not whole[folder].issuperset(caption.window):
                 left_out["missing_frame"] += 1
             else:
-                flight = (self.run, *folder.parts[-3:])
                 prompt = _prompt(caption.prompt[self.language], caption.picture_px, self.language)
-                where = folder, prompt, self._texts(caption), caption.picture_px
+                texts = getattr(caption, self.language).model_dump()
+                texts |= {"label": caption.label or "", "verdict": caption.verdict or ""}
+                flight, where = (self.run, *folder.parts[-3:]), (folder, prompt, texts, caption.picture_px)
                 yield WindowPlace(caption.sample_id, flight, tuple(caption.window), where)
-
-    def _texts(self, caption: Caption) -> dict[str, str]:
-        answer = getattr(caption, self.language).model_dump()
-        return {**answer, "label": caption.label or "", "verdict": caption.verdict or ""}
 
     def read(self, place: WindowPlace) -> ReadWindow:
         folder, prompt, caption, size_px = place.where
@@ -165,27 +157,26 @@ def facts_of(flight: Flight, window: Sequence[int]) -> dict[str, np.ndarray]:
     """
     if max(window) >= len(flight):
         raise InputError("a caption of a frame that is not in its flight", where=flight.folder, got=str(max(window)))
-    at = list(window)
-    cameras = np.array([flight.camera_at(i).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]] for i in at])
-    mask = flight.target_mask_bbox
-    values = {
-        "time_s": flight.time_s[at],
+    at, mask = list(window), flight.target_mask_bbox
+    values: dict[str, Any] = {
         "pose": np.hstack([flight.positions_m[at], flight.rotations_deg[at]]),
-        "intrinsics": cameras,
+        "intrinsics": [flight.camera_at(i).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]] for i in at],
         "target": flight.targets_m[at],
-        "target_uv": flight.target_uv[at],
-        "target_bbox": flight.target_bbox[at],
         "target_mask_bbox": np.full((len(at), 4), np.nan) if mask is None else mask[at],
-        "target_depth_m": flight.target_depth_m[at],
-        "visibility": flight.visibility[at],
     }
-    flags = {"target_in_view": flight.target_in_view[at], "target_visible": flight.target_visible[at]}
-    return {name: np.array(value, dtype=np.float64) for name, value in values.items()} | {
-        name: np.array(value, dtype=bool) for name, value in flags.items()
-    }
+    values |= {name: getattr(flight, name)[at] for name in FACTS if name not in values}
+    return {name: np.array(values[name], dtype=bool if name in FLAGS else np.float64) for name in FACTS}
 
 
-# --- a release --------------------------------------------------------------------------------------------------------
+class _Shard(BaseModel):
+    path: str
+    split: str
+
+
+class _Record(BaseModel):
+    """What is read of `release.json`."""
+
+    shards: list[_Shard]
 
 
 class _Release:
@@ -193,20 +184,13 @@ class _Release:
 
     def __init__(self, folder: Path, language: Language, split: str | None) -> None:
         self.folder, self.language = folder, language
-        record = read_object(folder / "release.json", what="release", tree=folder)
-        shards = record.get("shards")
-        if not isinstance(shards, list) or not all(
-            isinstance(s, dict) and isinstance(s.get("path"), str) and isinstance(s.get("split"), str) for s in shards
-        ):
-            raise InputError(
-                "not the record of a release", where=folder / "release.json", expected="shards with path and split"
-            )
-        splits = sorted({shard["split"] for shard in shards})
+        path = folder / "release.json"
+        shards = validated(_Record, read_object(path, what="release", tree=folder), path).shards
+        splits = sorted({shard.split for shard in shards})
         if split is not None and split not in splits:
-            raise ConfigError(
-                f"no such split{nearest(split, splits)}", where=folder, got=split, expected=", ".join(splits)
-            )
-        self._names = [shard["path"] for shard in shards if split in (None, shard["split"])]
+            near, expected = nearest(split, splits), ", ".join(splits)
+            raise ConfigError(f"no such split{near}", where=folder, got=split, expected=expected)
+        self._names = [shard.path for shard in shards if split in (None, shard.split)]
         texts = [f"caption_{language}_{field}" for field in FIELDS]
         prompts = [f"system_{language}", f"prompt_{language}"]
         self._columns = ["image", *FACTS, *texts, *prompts, "caption_picture_px", "label", "verdict"]
@@ -230,10 +214,9 @@ class _Release:
                 elif row["caption_window"]:
                     left_out[f"no_{self.language}"] += 1
             for flight, sample_id, window in captioned:
-                if all(index in rows[flight] for index in window):
-                    yield WindowPlace(
-                        sample_id, flight, window, (shard, tuple(rows[flight][index] for index in window))
-                    )
+                if rows[flight].keys() >= set(window):
+                    where = shard, tuple(rows[flight][index] for index in window)
+                    yield WindowPlace(sample_id, flight, window, where)
                 else:
                     left_out["missing_frame"] += 1
 
@@ -255,16 +238,12 @@ class _Release:
 
 # Types of the columns that are read: all others are texts.
 TYPES: dict[str, pa.DataType] = {
-    name: pa.bool_()
-    if name in FLAGS
-    else pa.float64()
-    if members == ("",)
-    else pa.struct([(m, pa.float64()) for m in members])
-    for name, members in FACTS.items()
-} | {
+    **{name: pa.struct([(m, pa.float64()) for m in members]) for name, members in FACTS.items() if len(members) > 1},
+    **{name: pa.float64() for name, members in FACTS.items() if len(members) == 1},
+    **dict.fromkeys(FLAGS, pa.bool_()),
+    **dict.fromkeys(("caption_window", "caption_picture_px"), pa.list_(pa.field("element", pa.int32()))),
     "image": pa.struct([("bytes", pa.binary()), ("path", pa.string())]),
     "frame_index": pa.int32(),
-    **dict.fromkeys(("caption_window", "caption_picture_px"), pa.list_(pa.field("element", pa.int32()))),
 }
 
 
@@ -276,11 +255,9 @@ def _check_columns(path: Path, tree: Path, wanted: Sequence[str]) -> None:
     """
     with open_table(path, tree=tree) as table:
         found = {field.name: field.type for field in table.schema_arrow}
-    if wrong := [name for name in wanted if found.get(name) != TYPES.get(name, pa.string())]:
-        raise InputError(
-            "columns are missing or of another type", where=path, got=", ".join(wrong)[:200],
-            fix="build the release with this version of cosfly, or get it with --modality rgb",
-        )  # fmt: skip
+    if wrong := ", ".join(name for name in wanted if found.get(name) != TYPES.get(name, pa.string())):
+        fix = "build the release with this version of cosfly, or get it with --modality rgb"
+        raise InputError("columns are missing or of another type", where=path, got=wrong[:200], fix=fix)
 
 
 def _picture(row: Mapping[str, Any], where: str) -> np.ndarray:
@@ -299,12 +276,13 @@ def _column(rows: Sequence[Mapping[str, Any]], name: str, members: tuple[str, ..
     return np.array([[(row[name] or nothing)[member] for member in members] for row in rows], dtype=np.float64)
 
 
-class Window(TypedDict):
+class WindowData(TypedDict):
     """One window of k frames.
 
-    flight: run/town/trajectory/variant. window: (k,) int64, frames of the flight, the caption's own last. frames: (k, 3, h, w) uint8 RGB.
-    facts: FACTS of window_sources.py, (k, members) or (k,) float64, NaN where it is not known; FLAGS (k,) bool; pixels are those of the unscaled frame.
-    prompt: system and user. caption: the three texts, `label` and `verdict`; "" where there is none.
+    flight: run/town/trajectory/variant. window: (k,) int64, frames of the flight, the caption's own last. frames: (k,
+    3, h, w) uint8 RGB. facts: FACTS, (k, members) or (k,) float64, NaN where it is not known;
+    FLAGS (k,) bool; pixels are those of the unscaled frame. prompt: system and user. caption: the three texts, `label`
+    and `verdict`; "" where there is none.
     """
 
     sample_id: str
@@ -316,15 +294,18 @@ class Window(TypedDict):
     caption: dict[str, str]
 
 
-class Windows(Sequence[Window]):
+class Windows(Sequence[WindowData]):
     """The accepted captions of a source with the frames that they were made of, in the order of the source.
 
     Args:
-        source: a release (or its `dataset/`), a run folder, or a playback tree; then `captions` names its captions.jsonl.
+        source: a release (or its `dataset/`), a run folder, or a playback tree; then `captions` names its
+            captions.jsonl.
         language: of prompt and caption. split: of a release `train`, `validation` or `test`; None takes all.
-        max_side_px: frames are scaled down to this longest side; None takes the size that pixels in prompt and caption refer to.
+        max_side_px: frames are scaled down to this longest side; None takes the size that pixels in prompt and caption
+            refer to.
     Raises:
-        ConfigError: an option that is none. InputError: nothing to read, or not readable; a picture, when its window is read.
+        ConfigError: an option that is none. InputError: nothing to read, or not readable; a picture, when its window is
+            read.
     """
 
     def __init__(
@@ -334,40 +315,35 @@ class Windows(Sequence[Window]):
         if language not in get_args(Language):
             raise ConfigError("not a language of captions", got=str(language), expected=", ".join(get_args(Language)))
         if max_side_px is not None and max_side_px < 1:
-            raise ConfigError(
-                "not a size of a picture", where="max_side_px", got=str(max_side_px), expected="1 or more"
-            )
+            raise ConfigError("not a size of a picture", where="max_side_px", got=max_side_px, expected="1 or more")
         self.max_side_px = max_side_px
         self._source = open_source(Path(source), None if captions is None else Path(captions), language, split)
         self.left_out = Counter[str]()  # captions that give no window, by reason
         self._places = list(self._source.places(self.left_out))
         if not self._places:
-            why = ", ".join(f"{reason} {count}" for reason, count in self.left_out.items())
-            raise InputError(
-                "no window to learn from", where=source, got=why or "no captions",
-                expected=f"accepted captions in {language!r} whose frames are there",
-            )  # fmt: skip
+            why = ", ".join(f"{reason} {count}" for reason, count in self.left_out.items()) or "no captions"
+            expected = f"accepted captions in {language!r} whose frames are there"
+            raise InputError("no window to learn from", where=source, got=why, expected=expected)
 
     def __len__(self) -> int:
         return len(self._places)
 
-    def __getitem__(self, index: int) -> Window:  # type: ignore[override]  # one window at a time
+    def __getitem__(self, index: int) -> WindowData:  # type: ignore[override]  # one window at a time
         place = self._places[index]
         read = self._source.read(place)
         sizes = {picture.shape for picture in read.pictures}
         if len(sizes) != 1:
             raise InputError("frames of one window differ in size", where=place.sample_id, got=str(sorted(sizes)))
-        small = [_scaled(picture, self.max_side_px or max(read.size_px)) for picture in read.pictures]
-        return Window(
+        height_px, width_px = read.pictures[0].shape[:2]
+        size = scaled_size(width_px, height_px, self.max_side_px or max(read.size_px))
+        frames = read.pictures
+        if size != (width_px, height_px):
+            frames = [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in frames]
+        return WindowData(
             sample_id=place.sample_id, flight="/".join(place.flight), window=np.array(place.window, dtype=np.int64),
-            frames=np.ascontiguousarray(np.stack(small).transpose(0, 3, 1, 2)), facts=read.facts, prompt=read.prompt, caption=read.caption,
+            frames=np.ascontiguousarray(np.stack(frames).transpose(0, 3, 1, 2)), facts=read.facts, prompt=read.prompt,
+            caption=read.caption,
         )  # fmt: skip
-
-
-def _scaled(picture: np.ndarray, max_side_px: int | None) -> np.ndarray:
-    height_px, width_px = picture.shape[:2]
-    size = scaled_size(width_px, height_px, max_side_px)
-    return picture if size == (width_px, height_px) else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
 
 class WindowDataset(Windows):
@@ -383,4 +359,5 @@ class WindowDataset(Windows):
 
         window = super().__getitem__(index)
         facts = {name: torch.from_numpy(value) for name, value in window["facts"].items()}
-        return {**window, "facts": facts, **{name: torch.from_numpy(window[name]) for name in ("window", "frames")}}  # type: ignore[literal-required]
+        arrays = {"window": window["window"], "frames": window["frames"]}
+        return {**window, "facts": facts, **{name: torch.from_numpy(array) for name, array in arrays.items()}}

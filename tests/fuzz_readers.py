@@ -87,7 +87,7 @@ from distill.prepare import dual_track
 from distill.prepare import stage as prepare
 from distill.prepare.dual_track import RECORD as TRACKS
 from distill.prepare.dual_track import read_track_samples
-from distill.prepare.sources import Source as Prepared
+from distill.prepare.sources import RunSource as Prepared
 from distill.prepare.stage import PrepareConfig
 from distill.schema import RECORD, open_split
 from distill.student import checkpoint

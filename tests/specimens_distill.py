@@ -15,7 +15,7 @@ from cosfly.products.splits import Split
 from cosfly.work.provenance import fingerprint
 from cosfly.work.store import write_json
 from distill.prepare import stage as prepare
-from distill.prepare.sources import Source
+from distill.prepare.sources import RunSource
 from distill.prepare.stage import PrepareConfig
 from distill.schema import Sample, SourceTree, TrainingSetWriter
 
@@ -77,7 +77,7 @@ def make_caption(town: str, trajectory: str, variant: str, frame: int, **changes
 def prepared(tree: Path, captions: Path, out: Path, *, seed: int = 0, **settings: Any) -> Path:
     """Make a training set of captions that no record binds to their tree."""
     cfg = PrepareConfig.model_validate({"unbound": "accept", **settings})
-    return prepare.run(cfg, [Source.of_files(tree, captions)], out, seed=seed)
+    return prepare.run(cfg, [RunSource.of_files(tree, captions)], out, seed=seed)
 
 
 def write_set(out: Path, splits: Mapping[Split, Iterable[Sample]], trees: Iterable[Path] = ()) -> Path:

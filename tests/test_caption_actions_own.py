@@ -49,7 +49,7 @@ from distill.evaluation import stage as evaluate
 from distill.evaluation.floors import write_floors
 from distill.inference import stage as infer
 from distill.prepare import stage as prepare
-from distill.prepare.sources import Source as Prepared
+from distill.prepare.sources import RunSource as Prepared
 from distill.prepare.stage import PrepareConfig
 from distill.schema import open_split, read_training_set
 from release.export import stage as export

@@ -24,7 +24,7 @@ from cosfly.products.places import FlightChoice, place_of
 from cosfly.products.playback import read_flight
 from cosfly.work.provenance import fingerprint
 from distill.prepare import stage as prepare
-from distill.prepare.sources import Source as Prepared
+from distill.prepare.sources import RunSource as Prepared
 from distill.prepare.stage import PrepareConfig
 from distill.schema import open_split
 from release.package.sources import NOT_CHOSEN

@@ -34,7 +34,7 @@ from cosfly.reading.documents import read_json
 from cosfly.work.stage_folder import read_failures
 from cosfly.work.store import write_json
 from distill.prepare import stage as prepare
-from distill.prepare.sources import Source as Prepared
+from distill.prepare.sources import RunSource as Prepared
 from distill.prepare.stage import PrepareConfig
 from distill.schema import SPLITS, open_split
 from release.package import stage as package

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cosfly.products.actions import action_tokens
-from distill.prepare.choice import Ranks, cost_of, keeps, limit_to
+from distill.prepare.choice import Balance, WindowRanks, balance_of, keeps, limit_to
 
 
 def windows_of(counts: dict[str, int]) -> list[tuple[str, str]]:
@@ -17,12 +17,17 @@ def windows_of(counts: dict[str, int]) -> list[tuple[str, str]]:
     return [(decision, f"{decision}_{i}") for decision, count in counts.items() for i in range(count)]
 
 
+def ranked(windows: list[tuple[str, str, str]], seed: int = 0) -> WindowRanks:
+    ranks = WindowRanks(seed)
+    for window in windows:
+        ranks.add(*window)
+    return ranks
+
+
 def balanced(windows: list[tuple[str, str]], ratio: float, seed: int = 0) -> list[tuple[str, str]]:
-    ranks = Ranks(seed)
-    for i, (decision, name) in enumerate(windows):
-        ranks.add(f"group_{i % 3}", decision, name)
-    cut = ranks.cut(ranks.flights, ratio)
-    return [(decision, name) for decision, name in windows if cut.keeps(decision, name)]
+    ranks = ranked([(f"group_{i % 3}", *window) for i, window in enumerate(windows)], seed)
+    last_rank = balance_of(ranks, ranks.flights, ratio).last_rank
+    return [window for window in windows if keeps(last_rank, seed, *window)]
 
 
 @given(
@@ -44,20 +49,15 @@ def test_stray_decisions_do_not_take_the_others_with_them():
 
 
 def test_the_cost_by_hand():
-    ranks = Ranks(0)
-    for decision, name in windows_of({"track_straight": 8, "hover": 2, "slow_down": 2}):
-        ranks.add("group", decision, name)
-    cost = cost_of(ranks.cut(["group"], 0.5), 12)
-    assert (cost.most_windows, cost.samples_left_out) == (2, 12)
-    assert cost.windows == {"hover": 2, "slow_down": 2, "track_straight": 8}
-    assert cost.windows_left_out == {"track_straight": 6}
-    # Before 1.5 ** (2 / 3) * 6 ** (1 / 3), then three of one size.
-    assert cost.effective_decisions == (pytest.approx(2.38, abs=0.01), 3.0)
-    assert set(cost.absent) == set(action_tokens()) - {"track_straight", "hover", "slow_down"}
-    assert "left 6 of 12 training windows out (12 samples), at most 2 a decision: hover 2 -> 2, " in str(cost)
-
-
-# --- so many and no more ----------------------------------------------------------------------------------------------
+    windows = windows_of({"track_straight": 8, "hover": 2, "slow_down": 2})
+    cost = balance_of(ranked([("group", *window) for window in windows]), ["group"], 0.5).cost(12)
+    # Effective decisions before: 1.5 ** (2 / 3) * 6 ** (1 / 3), then three of one size.
+    assert cost.pop("effective_decisions") == [pytest.approx(2.38, abs=0.01), 3.0]
+    assert set(cost.pop("absent")) == set(action_tokens()) - {"track_straight", "hover", "slow_down"}
+    assert cost == {
+        "ratio": 0.5, "most_windows": 2, "windows": {"hover": 2, "slow_down": 2, "track_straight": 8},
+        "windows_left_out": {"track_straight": 6}, "samples_left_out": 12,
+    }  # fmt: skip
 
 
 @given(
@@ -71,14 +71,11 @@ def test_a_limit_is_exact_and_each_decision_has_its_share_in_any_order(counts, p
     windows = [(f"flight_{i % 5}", *window) for i, window in enumerate(windows_of(counts))]
 
     def limited(windows: list[tuple[str, str, str]]) -> tuple[list, list, object]:
-        ranks = Ranks(seed)
-        for window in windows:
-            ranks.add(*window)
+        ranks = ranked(windows, seed)
         train = [flight for flight in ranks.flights if flight < "flight_2"]
-        cut = ranks.cut(train, ratio) if ratio and train else None
-        cuts = {flight: cut if flight in train else None for flight in ranks.flights}
-        left = [one for one in windows if (found := cuts[one[0]]) is None or found.keeps(*one[1:])]
-        limit = limit_to(ranks, int(part * len(left)), cuts)
+        balance = balance_of(ranks, train, ratio) if ratio and train else Balance(1.0, 1, {}, {})
+        left = [one for one in windows if one[0] not in train or keeps(balance.last_rank, seed, *one[1:])]
+        limit = limit_to(ranks, int(part * len(left)), train, balance)
         return [one for one in left if limit is None or keeps(limit, seed, *one[1:])], left, limit
 
     kept, left, limit = limited(windows)

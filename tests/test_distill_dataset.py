@@ -17,7 +17,7 @@ from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import write_captions
 from cosfly.products.splits import SPLITS
 from distill.prepare import stage
-from distill.prepare.sources import Source
+from distill.prepare.sources import RunSource
 from distill.prepare.splitting import check_no_leak
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import RECORD, Sample, open_split, resolve_trees, split_path
@@ -44,9 +44,6 @@ def sample_of(trajectory="trajectory_1", variant="ORI", frame=4, town="Town01", 
     return sample
 
 
-# --- leaks ------------------------------------------------------------------------------------------------------------
-
-
 def test_what_two_splits_share_is_found():
     one = sample_of()
     clean = {"train": [one, sample_of(language="zh"), sample_of(variant="aug_001")], "val": [sample_of("t2")]}
@@ -58,13 +55,10 @@ def test_what_two_splits_share_is_found():
         ([one], [sample_of("t2").model_copy(update={"walk": one.walk})], "walk", walk),  # another timestamp
         ([one], [sample_of("t2", town="Town01_Opt")], "town", town),
         ([one, sample_of(frame=6).model_copy(update={"walk": "elsewhere"})], [], "walk", "of two walks"),
-        ([one, sample_of(language="zh"), sample_of(language="zh")], [], "walk", "twice.*frame 4 of run/Town01/trajectory_1/ORI, language zh"),
+        ([one, *[sample_of(language="zh")] * 2], [], "walk", "twice.*frame 4 of run/Town01/trajectory_1/ORI, language zh"),
     ):  # fmt: skip
         with pytest.raises(VerifyError, match=words):
             check_no_leak({"train": train, "val": val}, split_by)
-
-
-# --- samples ----------------------------------------------------------------------------------------------------------
 
 
 def test_sample_holds_what_the_student_needs():
@@ -169,9 +163,6 @@ def test_a_student_may_get_text_alone_or_pictures_alone(asked, language):
         PrepareConfig(modalities=(), text_state=False)
 
 
-# --- run --------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("split_by", ["walk", "town"])
 def test_run_writes_leak_free_splits_and_counts_that_add_up(tree, captions, tmp_path, split_by):
     out = prepared(tree, captions, tmp_path / "set", split_by=split_by, too_few="fill")
@@ -244,16 +235,14 @@ def test_a_balanced_run_thins_train_alone_and_says_what_it_cost(tree, tmp_path, 
     assert (sum(cost["windows"].values()), cost["windows_left_out"]) == (24, {"track_straight": 4})
     assert cost["samples_left_out"] == 8
     assert manifest["splits"]["train"]["samples"] == 40
-    assert "balance left 4 of 24 training windows out (8 samples)" in caplog.text
+    assert "balance of train: " in caplog.text
+    assert "windows_left_out {'track_straight': 4}, samples_left_out 8" in caplog.text
 
 
 def test_run_refuses_a_tree_without_the_images(captions, tree, tmp_path):
     bare = make_playback_tree(tmp_path / "bare", num_flights=1, num_points=6, with_images=False)
     with pytest.raises(NothingKept, match=r"kept nothing.*missing_image 80.*--data"):
         prepared(bare, captions, tmp_path / "set")
-
-
-# --- several runs, walks, reading -------------------------------------------------------------------------------------
 
 
 def test_the_walk_of_a_flight_decides_its_split_and_not_its_name(tmp_path):
@@ -265,7 +254,7 @@ def test_the_walk_of_a_flight_decides_its_split_and_not_its_name(tmp_path):
         for folder in sorted(tree.glob(f"{town}/trajectory_*")):  # another second of the same walk
             folder.rename(folder.with_name(f"trajectory_{int(folder.name[11:]) + shift}"))
         make_captions(run / "captions.jsonl", tree)
-        runs.append(Source.of_files(tree, run / "captions.jsonl"))
+        runs.append(RunSource.of_files(tree, run / "captions.jsonl"))
     cfg = PrepareConfig(unbound="accept", val_fraction=0.25, test_fraction=0.25)
     out = stage.run(cfg, runs, tmp_path / "set")
     samples = {split: list(open_split(out, split)) for split in SPLITS}
@@ -298,7 +287,7 @@ def test_trees_that_a_set_was_not_made_of_are_refused_by_name(tree, captions, tm
 
 def test_captions_that_no_record_binds_to_their_tree_are_refused(tree, captions, tmp_path):
     with pytest.raises(VerifyError, match=r"no record says of which playback tree.*unbound=accept"):
-        stage.run(PrepareConfig(), [Source.of_files(tree, captions)], tmp_path / "set")
+        stage.run(PrepareConfig(), [RunSource.of_files(tree, captions)], tmp_path / "set")
 
 
 def test_frames_of_another_size_than_the_captions_say_are_left_out(tree, tmp_path):
@@ -323,9 +312,9 @@ def test_decisions_that_train_does_not_have_are_told(tree, tmp_path, caplog):
     plain = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "plain")
     tested = {sample.sample_id for sample in open_split(plain, "test")}
     odd = [
-        record.model_copy(update={lang: getattr(record, lang).model_copy(update={"flight_decision": "ascend"}) for lang in ("en", "zh")})
-        if record.sample_id in tested
-        else record
+        record.model_copy(update={
+            name: getattr(record, name).model_copy(update={"flight_decision": "ascend"}) for name in ("en", "zh")
+        }) if record.sample_id in tested else record
         for record in records
     ]  # fmt: skip
     write_captions(tmp_path / "captions.jsonl", odd)

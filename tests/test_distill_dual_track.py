@@ -1,4 +1,4 @@
-"""distill/prepare/dual_track.py, distill/tracks.py: windows over both tracks of a flight."""
+"""distill/prepare/dual_track.py: windows over both tracks of a flight."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from cosfly.cli import app
 from cosfly.products.playback import STATES, read_flight
 from cosfly.products.splits import SPLITS
 from cosfly.work.stage_folder import read_failures, read_manifest
@@ -46,9 +44,6 @@ def run(tree: Path, out: Path, **settings: object) -> Path:
     return dual_track.run(DualTrackConfig.model_validate({"too_few": "fill", **settings}), [tree], out)
 
 
-# --- how many windows -------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("num_frames", "expected"), [(9, []), (10, [0]), (12, [0]), (13, [0, 3]), (170, 54), (200, 64)]
 )
@@ -56,9 +51,6 @@ def test_the_papers_windows(num_frames, expected):
     """Windows of 10 frames, one every 3: (N - 10) / 3 + 1, which the paper calls 50 to 60 of 170 to 200 frames."""
     found = list(windows_of(num_frames, DualTrackConfig()))
     assert (len(found) if isinstance(expected, int) else found) == expected
-
-
-# --- what stands in them ----------------------------------------------------------------------------------------------
 
 
 def test_a_window_holds_both_tracks_frame_by_frame(tree, dataset):
@@ -100,17 +92,11 @@ def test_the_same_again_and_other_settings(tree, dataset, tmp_path):
     assert (len(one.observed_position_m), one.future, one.future_position_m) == (3, (), ())
 
 
-# --- states -----------------------------------------------------------------------------------------------------------
-
-
 def test_the_four_states_of_a_flight():
     flight, _ = make_flight(4, variant="aug_001")
     flight.drone_offsets_m[:] = [[0, 0, 0], [1, 0, 0], [0, 0, 0], [1, 0, 0]]
     flight.rotation_offsets_deg[:] = [[0, 0, 0], [0, 0, 0], [0, 1, 0], [0, 1, 0]]
     assert flight.states == list(STATES) == ["unperturbed", "position only", "rotation only", "full"]
-
-
-# --- what cannot be used ----------------------------------------------------------------------------------------------
 
 
 def test_a_bad_flight_stops_no_other(own_tree, tmp_path):
@@ -139,11 +125,3 @@ def test_windows_over_a_gap_are_left_out(own_tree, tmp_path):
     # Of the begins 0, 3, 6, 9, 12 those of 3, 6, 9 reach over the step from frame 11 to frame 12.
     assert read_manifest(out).facts["windows_left_out"] == {"uneven_steps": 3}
     assert sum(read_track_set(out).samples.values()) == 4 * 5 - 3
-
-
-def test_the_command(tree, tmp_path):
-    result = CliRunner().invoke(
-        app, ["distill", "dual-track", "--data", str(tree), "--out", str(tmp_path / "set"), "--set", "distill.dual_track.stride=5"]
-    )  # fmt: skip
-    assert result.exit_code == 0, result.output
-    assert read_track_set(tmp_path / "set").stride == 5

@@ -48,14 +48,14 @@ def distill_prepare(
 ) -> None:
     """Captions of one run or several to a training set with splits that share no walk."""
     from distill.prepare import stage as prepare
-    from distill.prepare.sources import Source
+    from distill.prepare.sources import RunSource
 
-    sources = [Source.of_run(folder) for folder in runs or []]
+    sources = [RunSource.of_run(folder) for folder in runs or []]
     if captions or data or not sources:
         trees = options.data_folders(data)
         if len(trees) != len(captions or []):
             raise typer.BadParameter("give --data and --captions, one of each for a tree, or run folders")
-        sources += [Source.of_files(*files) for files in zip(trees, captions or [], strict=True)]
+        sources += [RunSource.of_files(*files) for files in zip(trees, captions or [], strict=True)]
     job.begin(out, *(path for source in sources for path in (source.data, source.captions)))
     typer.echo(prepare.run(job.cfg.distill.prepare, sources, out, seed=job.cfg.seed, resume=job.resume))
 

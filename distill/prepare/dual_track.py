@@ -1,4 +1,4 @@
-"""`cosfly distill dual-track`: playback trees to windows over both tracks, to learn denoising and prediction from (app:dual_track).
+"""`cosfly distill dual-track`: windows over both tracks, to learn denoising and prediction from (app:dual_track).
 
 Needs neither captions nor torch. Memory grows by the flights' courses, not by their windows.
 """
@@ -13,45 +13,41 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import pyarrow as pa
 from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.errors import InputError, VerifyError
 from cosfly.geometry import step_s
 from cosfly.products.flights import find_flights, read_twin
-from cosfly.products.places import Place, flight_ids, folder_name, place_of, sample_id
+from cosfly.products.places import Place, flight_ids, place_of, sample_id
 from cosfly.products.playback import ORIGINAL, Flight, read_flight
-from cosfly.products.splits import SPLITS, Course, Split, assign_splits, town_family, walks_of
+from cosfly.products.splits import SPLITS, Course, Split, walks_of
 from cosfly.reading.documents import read_model, validated
 from cosfly.reading.tables import rows_of
 from cosfly.work.console import progress_bar
 from cosfly.work.provenance import fingerprint
 from cosfly.work.stage_folder import Failed, Resume, StageFolder, Tally, write_failures
 from cosfly.work.store import write_bytes, write_model
+from distill.prepare.sources import check_names, run_of
 from distill.prepare.splitting import SplitConfig, check_no_leak
-from distill.schema import PAGE, SourceTree, SplitFiles, page_of, split_path
+from distill.schema import PAGE, SourceTree, SplitFiles, SplitMember, columns_of, page_of, split_path, tree_inputs
 
+STAGE = "distill.dual_track"
 RECORD, RECORD_SCHEMA, VERSION = "tracks.json", "cosfly.track_windows", "1.0"
 AXES = "right-handed: metres, x east, y north, z up; degrees, yaw counter-clockwise from east, pitch nose-up"
+NO_TWIN, OTHER_FRAMES, SHORT = "no_clean_flight", "clean_flight_of_other_frames", "shorter_than_a_window"
+UNEVEN = "uneven_steps"
+STEP_TOLERANCE_S = 1e-3
 
 Vector = tuple[float, float, float]
 
 
-class TrackSample(BaseModel):
-    """One window: what was seen on the perturbed track, where drone and person really were then, and where they went.
+class TrackSample(SplitMember):
+    """One window: what was seen on the perturbed track, where drone and person really were, and where they went.
 
-    *_position_m, *_rotation_deg: the camera's x, y, z and pitch, yaw, roll; *_target_m: the person's hip point, None where nobody is.
+    *_position_m, *_rotation_deg: the camera's x, y, z and pitch, yaw, roll. *_target_m: the person's hip point, or
+    None. `window` are the observed frames; `sample_id` is that of a caption of the same frames.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    sample_id: str  # as a caption's of the same observed frames
-    run: str  # the tree that its flight stands in
-    town: str
-    trajectory: str
-    variant: str  # of the perturbed flight
-    walk: str  # whom it follows: windows of one walk are in one split
-    window: tuple[int, ...]  # indices of the observed frames, oldest first
     future: tuple[int, ...]  # of the frames to predict
     time_s: tuple[float, ...]  # of both
     states: tuple[str | None, ...]  # of the observed frames: STATES of cosfly/products/playback.py
@@ -65,28 +61,8 @@ class TrackSample(BaseModel):
     future_rotation_deg: tuple[Vector, ...]
     future_target_m: tuple[Vector | None, ...]
 
-    @property
-    def key(self) -> str:
-        return self.sample_id
 
-    @property
-    def language(self) -> str:
-        """None: there are no words in it."""
-        return ""
-
-
-_VECTORS = pa.list_(pa.field("element", pa.list_(pa.field("element", pa.float64()))))
-COLUMNS = pa.schema([
-    *(pa.field(name, pa.string(), nullable=False) for name in ("sample_id", "run", "town", "trajectory", "variant", "walk")),
-    *(pa.field(name, pa.list_(pa.field("element", pa.int32())), nullable=False) for name in ("window", "future")),
-    pa.field("time_s", pa.list_(pa.field("element", pa.float64())), nullable=False),
-    pa.field("states", pa.list_(pa.field("element", pa.string())), nullable=False),
-    *(
-        pa.field(f"{part}_{what}", _VECTORS, nullable=False)
-        for part in ("observed", "clean", "future")
-        for what in ("position_m", "rotation_deg", "target_m")
-    ),
-])  # fmt: skip
+COLUMNS = columns_of(TrackSample)
 
 
 class TrackSet(BaseModel):
@@ -103,17 +79,15 @@ class TrackSet(BaseModel):
     samples: dict[Split, int]
 
 
-def write_record(out: Path, record: TrackSet) -> list[Path]:
-    """Write the record and the page of a set whose splits stand; gives their paths."""
-    write_model(out / RECORD, record, schema=RECORD_SCHEMA, version=VERSION)
-    text = (
-        f"Windows of {record.observed} frames that were observed on a perturbed flight (`observed_*`), where drone and person really were in them\n"
-        f"(`clean_*`) and in the {record.predicted} frames after them (`future_*`); a window begins every {record.stride} frames. No two splits share\n"
-        f"a {record.split_by}. Axes: {record.axes}. The pictures are frames `window` of the playback trees of\n"
-        f"{json.dumps([tree.run for tree in record.trees], ensure_ascii=False)}, which are not part of it.\n"
-    )
-    write_bytes(out / PAGE, page_of("Windows over two tracks", record.samples, text))
-    return [out / RECORD, out / PAGE]
+def _page_of(record: TrackSet) -> bytes:
+    runs = json.dumps([tree.run for tree in record.trees], ensure_ascii=False)
+    return page_of(
+        "Windows over two tracks", record.samples,
+        f"Windows of {record.observed} frames that were observed on a perturbed flight (`observed_*`), where drone\n"
+        f"and person really were in them (`clean_*`) and in the {record.predicted} frames after (`future_*`); a window\n"
+        f"begins every {record.stride} frames. No two splits share a {record.split_by}. Axes: {record.axes}.\n"
+        f"The pictures are frames `window` of the playback trees of {runs}, which are not part of it.\n",
+    )  # fmt: skip
 
 
 def read_track_set(dataset: Path) -> TrackSet:
@@ -122,9 +96,8 @@ def read_track_set(dataset: Path) -> TrackSet:
     Raises:
         InputError: it is missing, of another version, or malformed.
     """
-    return read_model(
-        dataset / RECORD, TrackSet, schema=RECORD_SCHEMA, version=VERSION, what="set of windows", tree=dataset
-    )
+    path, what = dataset / RECORD, "set of windows"
+    return read_model(path, TrackSet, schema=RECORD_SCHEMA, version=VERSION, what=what, tree=dataset)
 
 
 def read_track_samples(dataset: Path, split: Split) -> Iterator[TrackSample]:
@@ -138,12 +111,6 @@ def read_track_samples(dataset: Path, split: Split) -> Iterator[TrackSample]:
     path = split_path(dataset, split)
     for number, row in enumerate(rows_of(path, COLUMNS.names, tree=dataset)):
         yield validated(TrackSample, row, f"{path}: row {number}")
-
-
-STAGE = "distill.dual_track"
-NO_TWIN, OTHER_FRAMES, SHORT = "no_clean_flight", "clean_flight_of_other_frames", "shorter_than_a_window"
-UNEVEN = "uneven_steps"
-STEP_TOLERANCE_S = 1e-3
 
 
 class DualTrackConfig(SplitConfig):
@@ -173,44 +140,36 @@ class _PairedFlight:
 
 
 def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
-    """Read playback trees; write windows by split (distill/tracks.py) into `out`, which is returned.
+    """Read playback trees; write windows by split into `out`, which is returned.
 
-    Of each perturbed flight with its clean one beside it, N frames, that is (N - length) // stride + 1 windows. Flights that cannot be
-    read are failures, which stop no others.
+    Of each perturbed flight with its clean one beside it, N frames, that is (N - length) // stride + 1 windows. Flights
+    that cannot be read are failures, which stop no others.
 
     Raises:
-        NothingKept: no flight gives a window. InputError: two trees are of one run, or there are too few walks to split.
+        NothingKept: no flight gives a window. InputError: two trees are of one run, or there are too few walks.
     """
-    runs = _runs(trees)
-    inputs = {f"{n}.data" if len(trees) > 1 else "data": tree for n, tree in enumerate(trees, 1)}
-    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
+    check_names([run_of(tree) for tree in trees])
+    runs = {run_of(tree): tree for tree in trees}
+    stage = StageFolder.open(out, STAGE, config=cfg, inputs=tree_inputs(runs), seed=seed, resume=resume)
     if stage.is_complete:
         return out
     # Two passes: the splits must be known before the first window is written.
     paired, courses, tally = _survey(stage, cfg, runs)
     walks = walks_of(courses)
-    split_of = _splits(cfg, paired, walks, seed)
+    fix = "give more flights, set a fraction to 0, or --set distill.dual_track.too_few=fill"
+    owners = cfg.assigned({flight.key for flight in paired}, walks, seed, "both tracks", fix)
     with SplitFiles(out, COLUMNS).writing() as files:
-        facts = _write(files, cfg, paired, walks, split_of)
-    trees_of = [SourceTree(run=name, sha256=fingerprint(tree)) for name, tree in runs.items()]
+        facts = _write(files, cfg, paired, walks, {key: split for key, (_, split) in owners.items()})
     record = TrackSet(
-        split_by=cfg.split_by, observed=cfg.observed, predicted=cfg.predicted, stride=cfg.stride, trees=trees_of, samples=files.counts,
-    )  # fmt: skip
-    written = [*files.paths, *write_record(out, record)]
+        **cfg.model_dump(include={"split_by", "observed", "predicted", "stride"}),
+        trees=[SourceTree(run=name, sha256=fingerprint(tree)) for name, tree in runs.items()],
+        samples=files.counts,
+    )
+    write_model(out / RECORD, record, schema=RECORD_SCHEMA, version=VERSION)
+    write_bytes(out / PAGE, _page_of(record))
     check_no_leak({split: read_track_samples(out, split) for split in SPLITS}, cfg.split_by)
-    stage.finish(written, tally, split_by=cfg.split_by, **facts)
+    stage.finish([*files.paths, out / RECORD, out / PAGE], tally, split_by=cfg.split_by, **facts)
     return out
-
-
-def _runs(trees: Sequence[Path]) -> dict[str, Path]:
-    """Name each tree by the folder that it stands in."""
-    runs = {folder_name(tree.absolute().parent.name): tree for tree in trees}
-    if len(runs) < len(trees):
-        raise InputError(
-            "two runs have one name", got=", ".join(str(tree) for tree in trees), expected="trees in folders of different names",
-            fix="rename the folder that one of the trees stands in",
-        )  # fmt: skip
-    return runs
 
 
 def _survey(
@@ -256,9 +215,7 @@ def _read_pair(folder: Path, cfg: DualTrackConfig) -> tuple[Flight, Flight] | st
         return OTHER_FRAMES
     if twin is None:
         return NO_TWIN
-    if not any(True for _ in windows_of(len(flight), cfg)):
-        return SHORT
-    return flight, twin
+    return (flight, twin) if windows_of(len(flight), cfg) else SHORT
 
 
 def windows_of(num_frames: int, cfg: DualTrackConfig) -> range:
@@ -266,44 +223,39 @@ def windows_of(num_frames: int, cfg: DualTrackConfig) -> range:
     return range(0, num_frames - cfg.length + 1, cfg.stride)
 
 
-def _splits(
-    cfg: DualTrackConfig, paired: Sequence[_PairedFlight], walks: Mapping[str, str], seed: int
-) -> dict[str, Split]:
-    """Give each flight's key its split; walks (or towns) are ranked as those of captions are."""
-    group_of = {
-        flight.key: town_family(flight.place.town) if cfg.split_by == "town" else walks[flight.key] for flight in paired
-    }
-    split_of = assign_splits(
-        group_of.values(), cfg.fractions, seed, too_few=cfg.too_few,
-        what="walks with both tracks" if cfg.split_by == "walk" else "towns with both tracks",
-        fix="give more flights, set a fraction to 0, or --set distill.dual_track.too_few=fill",
-    )  # fmt: skip
-    return {key: split_of[group] for key, group in group_of.items()}
-
-
 def _write(
-    files: SplitFiles, cfg: DualTrackConfig, paired: Sequence[_PairedFlight], walks: Mapping[str, str], split_of: Mapping[str, Split]
-) -> dict[str, Any]:  # fmt: skip
+    files: SplitFiles,
+    cfg: DualTrackConfig,
+    paired: Sequence[_PairedFlight],
+    walks: Mapping[str, str],
+    split_of: Mapping[str, Split],
+) -> dict[str, Any]:
     """Write the windows; gives the facts of the manifest: of each split, and how many windows were left out."""
-    facts: dict[str, dict[str, Any]] = {split: {"samples": 0, "flights": 0, "walks": set(), "observed_frames": Counter()} for split in SPLITS}  # fmt: skip
-    left_out = 0
+    flights, left_out = Counter[Split](), 0
+    states: dict[Split, Counter[str]] = {split: Counter() for split in SPLITS}
     with progress_bar(f"{STAGE}: writing", total=len(paired)) as advance:
         for found in paired:
             advance(1)
             pair = _read_pair(found.folder, cfg)
             assert isinstance(pair, tuple), "the flight was changed while it was read"
-            split, own = split_of[found.key], facts[split_of[found.key]]
-            own["flights"] += 1
-            own["walks"].add(walks[found.key])
+            split = split_of[found.key]
+            flights[split] += 1
             for sample in samples_of(found, *pair, walks[found.key], cfg):
                 if sample is None:
                     left_out += 1
                     continue
                 files.add(split, sample.model_dump(mode="json"))
-                own["samples"] += 1
-                own["observed_frames"].update(str(state) for state in sample.states)
-    for own in facts.values():
-        own["walks"], own["observed_frames"] = len(own["walks"]), dict(sorted(own["observed_frames"].items()))
+                states[split].update(map(str, sample.states))
+    of_walks = Counter(split for _, split in {(walks[found.key], split_of[found.key]) for found in paired})
+    facts = {
+        split: {
+            "samples": files.counts[split],
+            "flights": flights[split],
+            "walks": of_walks[split],
+            "observed_frames": dict(sorted(states[split].items())),
+        }
+        for split in SPLITS
+    }
     return {"splits": facts, "windows_left_out": {UNEVEN: left_out}}
 
 
@@ -311,26 +263,29 @@ def samples_of(
     found: _PairedFlight, flight: Flight, twin: Flight, walk: str, cfg: DualTrackConfig
 ) -> Iterator[TrackSample | None]:
     """Cut a pair of flights into windows; None for one whose frames are not evenly apart in time."""
-    step = step_s(flight.time_s)
+    step, place = step_s(flight.time_s), found.place
     for first in windows_of(len(flight), cfg):
-        seen, after = slice(first, first + cfg.observed), slice(first + cfg.observed, first + cfg.length)
+        now = first + cfg.observed
         time_s = flight.time_s[first : first + cfg.length]
         if len(time_s) > 1 and np.abs(np.diff(time_s) - step).max() > STEP_TOLERANCE_S:
             yield None
             continue
-        parts = {"observed": (flight, seen), "clean": (twin, seen), "future": (twin, after)}
-        vectors = {
-            f"{part}_{what}": _vectors(values[rows])
-            for part, (track, rows) in parts.items()
-            for what, values in (("position_m", track.positions_m), ("rotation_deg", track.rotations_deg), ("target_m", track.targets_m))
-        }  # fmt: skip
-        frames = range(first, first + cfg.length)
+        seen, after = slice(first, now), slice(now, first + cfg.length)
+        vectors: dict[str, Any] = {}
+        for part, track, rows in (("observed", flight, seen), ("clean", twin, seen), ("future", twin, after)):
+            vectors[f"{part}_position_m"] = _vectors(track.positions_m[rows])
+            vectors[f"{part}_rotation_deg"] = _vectors(track.rotations_deg[rows])
+            vectors[f"{part}_target_m"] = _vectors(track.targets_m[rows])
         yield TrackSample(
-            sample_id=sample_id(found.flight_id, frames[cfg.observed - 1]),
-            run=found.place.run, town=found.place.town, trajectory=found.place.trajectory, variant=found.place.variant, walk=walk,
-            window=tuple(frames[: cfg.observed]), future=tuple(frames[cfg.observed :]), time_s=tuple(time_s.tolist()),
-            states=tuple(flight.states[seen]), **vectors,
-        )  # fmt: skip
+            sample_id=sample_id(found.flight_id, now - 1),
+            **{name: getattr(place, name) for name in ("run", "town", "trajectory", "variant")},
+            walk=walk,
+            window=tuple(range(first, now)),
+            future=tuple(range(now, first + cfg.length)),
+            time_s=tuple(time_s.tolist()),
+            states=tuple(flight.states[seen]),
+            **vectors,
+        )
 
 
 def _vectors(rows: np.ndarray) -> tuple[Any, ...]:

@@ -1,9 +1,8 @@
-"""Whence a training set comes: runs with their playback trees and captions, and the flights that the captions are of."""
+"""Runs that a training set is made of, with their playback trees and captions, and the flights of these captions."""
 
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Source:
+class RunSource:
     """One run's part of a training set: its name, playback tree and captions."""
 
     run: str
@@ -34,72 +33,77 @@ class Source:
     captions: Path
 
     @classmethod
-    def of_run(cls, folder: Path) -> Source:
+    def of_run(cls, folder: Path) -> RunSource:
         """Take a run folder as `cosfly run` makes it.
 
         Raises:
             InputError: it is none.
         """
         if not (folder / "render").is_dir():
-            raise InputError(
-                "not a run folder", where=folder, expected="a folder with render/ and caption/",
-                fix="give --data and --captions where they stand elsewhere",
-            )  # fmt: skip
+            expected, fix = "render/ and caption/ in it", "give --data and --captions where they stand elsewhere"
+            raise InputError("not a run folder", where=folder, expected=expected, fix=fix)
         captions = folder / "caption/captions.jsonl"
         check_stays_below(captions, captions.parent)
         return cls.of_files(folder / "render", captions)
 
     @classmethod
-    def of_files(cls, data: Path, captions: Path) -> Source:
-        """Name a run by the folder that its tree stands in."""
-        return cls(folder_name(data.absolute().parent.name), data, captions)
+    def of_files(cls, data: Path, captions: Path) -> RunSource:
+        return cls(run_of(data), data, captions)
 
 
-def inputs_of(sources: Sequence[Source]) -> dict[str, Path]:
-    """Name what a stage reads: `data`, `captions`, `actions` where the captions are of a set of their own; of several runs with the run's number in front."""
-    return {
-        f"{number}.{name}" if len(sources) > 1 else name: path
-        for number, source in enumerate(sources, 1)
-        for name, path in (
-            ("data", source.data), ("captions", source.captions), ("actions", source.captions.with_name(OWN_ACTIONS)),
-        )
-        if name != "actions" or path.is_file()
-    }  # fmt: skip
+def inputs_of(sources: Sequence[RunSource]) -> dict[str, Path]:
+    """Name what a stage reads: `data`, `captions`, own `actions` where there are; of several runs with a number."""
+    inputs: dict[str, Path] = {}
+    for number, source in enumerate(sources, 1):
+        files = {"data": source.data, "captions": source.captions, "actions": source.captions.with_name(OWN_ACTIONS)}
+        if not files["actions"].is_file():
+            del files["actions"]
+        inputs |= {f"{number}.{name}" if len(sources) > 1 else name: path for name, path in files.items()}
+    return inputs
 
 
-def check_sources(sources: Sequence[Source], unbound: Literal["refuse", "accept"]) -> None:
-    """Check that runs can be told apart, and that their captions are on record as made of some tree; of which, the stage's folder checks.
+def run_of(tree: Path) -> str:
+    """Name the run of a playback tree by the folder that it stands in."""
+    return folder_name(tree.absolute().parent.name)
+
+
+def check_names(runs: Sequence[str]) -> None:
+    """Check that no two runs have one name.
+
+    Raises:
+        InputError: two have.
+    """
+    if len(set(runs)) < len(runs):
+        fix = "rename the folder that one of the trees stands in"
+        raise InputError("two runs have one name", got=", ".join(runs), fix=fix)
+
+
+def check_sources(sources: Sequence[RunSource], unbound: Literal["refuse", "accept"]) -> None:
+    """Check that runs can be told apart, and that captions are on record as made of a tree; the stage checks of which.
 
     Raises:
         InputError: two runs have one name. VerifyError: captions have no record of their tree.
     """
-    name, count = Counter(source.run for source in sources).most_common(1)[0]
-    if count > 1:
-        raise InputError(
-            "two runs have one name", got=f"{count} of {name}", expected="trees in folders of different names",
-            fix="rename the folder that one of the trees stands in",
-        )  # fmt: skip
+    check_names([source.run for source in sources])
     for source in sources:
         if was_made_of(source.captions, "data") is not None:
             continue
         if unbound == "refuse":
-            raise VerifyError(
-                "no record says of which playback tree these captions were made", where=source.captions,
-                got="no stage.json of cosfly caption beside them", expected="the folder that cosfly caption wrote",
-                fix="give the captions where they were made; if they are certainly of this tree: --set distill.prepare.unbound=accept",
-            )  # fmt: skip
+            words = "no record says of which playback tree these captions were made"
+            fix = "give the folder that cosfly caption wrote; if they are of it: --set distill.prepare.unbound=accept"
+            raise VerifyError(words, where=source.captions, got="no stage.json of cosfly caption beside them", fix=fix)
         log.warning("%s: taken for captions of %s, which no record says", source.captions, source.data)
-
-
-# --- flights ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class CaptionedFlight:
-    """A flight that captions are of. flight_id: unique among all runs, None for the captions' own. key: of its walk, before these
-    are known. size_px: (width, height) of its frames, None where it stands in no tree; num_frames: of them."""
+    """A flight that captions are of.
 
-    source: Source
+    flight_id: unique among all runs, None for the captions' own. key: of its walk, before these are known. num_frames,
+    size_px: of its frames, (width, height); None where it stands in no tree.
+    """
+
+    source: RunSource
     town: str
     trajectory: str
     variant: str
@@ -116,7 +120,6 @@ class CaptionedFlight:
         return self.source.data / self.town / self.trajectory / self.variant
 
     def is_chosen(self, choice: FlightChoice) -> bool:
-        """Tell whether a flight is one of those that are chosen."""
         return choice.names(f"{self.town}/{self.trajectory}/{self.variant}") and (
             len(choice.tracks) == len(TRACKS) or track_of(self.folder) in choice.tracks
         )
@@ -138,12 +141,12 @@ class CaptionedFlight:
 class Flights:
     """The flights of several trees by their names in captions, each read when it is first asked for."""
 
-    def __init__(self, sources: Sequence[Source]) -> None:
+    def __init__(self, sources: Sequence[RunSource]) -> None:
         self._ids = _ids_of(sources) if len(sources) > 1 else None
         self._found: dict[tuple[str, str, str, str], CaptionedFlight] = {}
         self._courses: list[Course] = []
 
-    def of(self, source: Source, caption: Caption) -> CaptionedFlight:
+    def of(self, source: RunSource, caption: Caption) -> CaptionedFlight:
         """Find the flight of a caption.
 
         Raises:
@@ -152,13 +155,12 @@ class Flights:
         names = (caption.town, caption.trajectory, caption.variant)
         key = (source.run, *names)
         if key not in self._found:
-            for name in names:
-                if name != Path(name).name or name in ("", ".", ".."):
-                    raise InputError("not a folder name", where=f"{source.captions}: {caption.sample_id}", got=name)
+            if bad := [name for name in names if name != Path(name).name or name in ("", ".", "..")]:
+                raise InputError("not a folder name", where=f"{source.captions}: {caption.sample_id}", got=bad[0])
             self._found[key] = self._read(source, inside(source.data, "/".join(names), beside=True))
         return self._found[key]
 
-    def _read(self, source: Source, folder: Path) -> CaptionedFlight:
+    def _read(self, source: RunSource, folder: Path) -> CaptionedFlight:
         town, trajectory, variant = folder.parts[-3:]  # the tree may have been converted since
         flight_id, size_px, num_frames = None, None, 0
         if (folder / "trajectory.json").exists():
@@ -171,12 +173,12 @@ class Flights:
         return CaptionedFlight(source, town, trajectory, variant, flight_id, size_px, num_frames)
 
     def walks(self) -> dict[str, str]:
-        """Tell the walks of the flights that were read since this was last asked, by their keys; what tells them is let go."""
+        """Tell the walks of the flights that were read since this was last asked, by key; what tells them is let go."""
         courses, self._courses = self._courses, []
         return walks_of(courses)
 
 
-def _ids_of(sources: Sequence[Source]) -> dict[Place, str]:
+def _ids_of(sources: Sequence[RunSource]) -> dict[Place, str]:
     places = [
         Place(source.run, *folder.relative_to(source.data).parts[-3:])
         for source in sources

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterable, Mapping
-from typing import Literal, Protocol
+from collections.abc import Collection, Iterable, Mapping
+from typing import Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from cosfly.errors import VerifyError
-from cosfly.products.splits import SPLITS, Split, town_family
+from cosfly.products.splits import SPLITS, Split, assign_splits, town_family
 from cosfly.work.config import Config
+from distill.schema import SplitMember
 
 
 class SplitConfig(Config):
@@ -19,13 +20,13 @@ class SplitConfig(Config):
 
     split_by: Literal["walk", "town"] = Field(
         "walk",
-        description="what may not be shared by two splits: all flights after one person on one way, or all builds of a town",
+        description="what splits may not share: all flights after one person on one way, or all builds of a town",
     )
     val_fraction: float = Field(0.1, ge=0, lt=1, description="share of walks (towns) for validation; 0: none")
     test_fraction: float = Field(0.1, ge=0, lt=1, description="share of walks (towns) for the test; 0: none")
     too_few: Literal["refuse", "fill"] = Field(
         "refuse",
-        description="with fewer walks (towns) than splits: refuse, or fill train, then val, and leave the rest empty",
+        description="with fewer walks (towns) than splits: refuse, or fill train, then val, and leave the rest",
     )
 
     @model_validator(mode="after")
@@ -39,32 +40,30 @@ class SplitConfig(Config):
         shares: dict[Split, float] = {"val": self.val_fraction, "test": self.test_fraction}
         return {split: shares[split] for split in SPLITS if shares.get(split)}
 
+    def assigned(
+        self, keys: Collection[str], walks: Mapping[str, str], seed: int, what: str, fix: str
+    ) -> dict[str, tuple[str, Split]]:
+        """Give each flight, by its key `run/town/trajectory`, its walk or town and the split that has all of this.
 
-class Placed(Protocol):
-    """Of any kind of sample, what says whose it is; `window` are the frames of its pictures."""
-
-    @property
-    def key(self) -> str: ...
-    @property
-    def run(self) -> str: ...
-    @property
-    def town(self) -> str: ...
-    @property
-    def trajectory(self) -> str: ...
-    @property
-    def variant(self) -> str: ...
-    @property
-    def walk(self) -> str: ...
-    @property
-    def window(self) -> tuple[int, ...]: ...
-    @property
-    def language(self) -> str: ...
+        Args:
+            walks: key -> walk. what: those with what are split; fix: what to do where they are too few.
+        """
+        by_town = self.split_by == "town"
+        group_of = {key: town_family(key.split("/")[1]) if by_town else walks[key] for key in keys}
+        what = f"{self.split_by}s with {what}"
+        groups = group_of.values()
+        split_of = assign_splits(groups, self.fractions, seed, too_few=self.too_few, what=what, fix=fix)
+        return {key: (group, split_of[group]) for key, group in group_of.items()}
 
 
-def check_no_leak(splits: Mapping[str, Iterable[Placed]], split_by: Literal["walk", "town"] = "walk") -> dict[str, int]:
-    """Check that no walk, trajectory, flight or (if asked) town stands in two splits, no trajectory in two walks, and no sample twice.
+def check_no_leak(
+    splits: Mapping[str, Iterable[SplitMember]], split_by: Literal["walk", "town"] = "walk"
+) -> dict[str, int]:
+    """Check that no walk, trajectory, flight or (if asked) town stands in two splits, no trajectory in two walks, and
+    no sample twice.
 
-    A sample's pictures are frames of its own flight, so that splits share no picture either. Holds eight bytes a sample.
+    A sample's pictures are frames of its own flight, so that splits share no picture either. Holds eight bytes a
+    sample.
 
     Returns:
         split -> number of samples.
@@ -89,11 +88,10 @@ def check_no_leak(splits: Mapping[str, Iterable[Placed]], split_by: Literal["wal
                 shared.append(("town", town_family(sample.town)))
             for what, name in shared:
                 if (owner := owners.setdefault((what, name), split)) != split:
-                    raise VerifyError(
-                        f"two splits share a {what}", where=sample.key, got=f"{name} in {owner} and in {split}"
-                    )
+                    got = f"{name} in {owner} and in {split}"
+                    raise VerifyError(f"two splits share a {what}", where=sample.key, got=got)
             number = numbers.setdefault(flight, len(numbers))
-            places.append((number << 32) + (sample.window[-1] << 1) + (sample.language == "zh"))
+            places.append((number << 32) + (sample.window[-1] << 1) + sample.key.endswith("/zh"))
     _check_once(places, list(numbers))
     return counts
 

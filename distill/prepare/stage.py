@@ -1,8 +1,8 @@
 """Captions to a training set: one sample per window and language, in splits that share no walk.
 
-Needs no torch. Images are not copied: a sample names frames of a playback tree relative to its root. Its prompt is that of the
-caption with the sentence about the pictures made anew, for those that the student gets. Memory grows by the flights, and by some
-bytes a window.
+Needs no torch. Images are not copied: a sample names frames of a playback tree relative to its root. Its prompt is that
+of the caption with the sentence about the pictures made anew, for those that the student gets. Memory grows by the
+flights, and by some bytes a window.
 """
 
 from __future__ import annotations
@@ -23,37 +23,35 @@ from cosfly.products.actions import action_tokens, actions_beside, not_in_set, o
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import PICTURES_MARK, Caption, Language, Verdict, read_captions
 from cosfly.products.places import FlightChoice
-from cosfly.products.splits import SPLITS, Split, assign_splits, town_family
+from cosfly.products.splits import SPLITS, Split
 from cosfly.work import in_place
 from cosfly.work.console import progress_bar
 from cosfly.work.provenance import fingerprint
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import dump_json
-from distill.prepare.choice import Cut, Ranks, cost_of, keeps, limit_to
-from distill.prepare.sources import CaptionedFlight, Flights, Source, check_sources, inputs_of
+from distill.prepare.choice import Balance, WindowRanks, balance_of, keeps, limit_to
+from distill.prepare.sources import CaptionedFlight, Flights, RunSource, check_sources, inputs_of
 from distill.prepare.splitting import SplitConfig, check_no_leak
 from distill.schema import Sample, SourceTree, TrainingSetWriter, open_split
+
+log = logging.getLogger(__name__)
+
+STAGE = "distill.prepare"
 
 
 class PrepareConfig(SplitConfig):
     """Settings of `distill prepare`."""
 
     flights: FlightChoice = Field(FlightChoice(), description="which flights of the trees")
-    languages: tuple[Language, ...] = Field(
-        ("en", "zh"), min_length=1, description="answers to learn, each language as samples of its own"
-    )
+    languages: tuple[Language, ...] = Field(("en", "zh"), min_length=1, description="answers to learn, each as samples")
     modalities: tuple[View, ...] = Field(
         ("rgb",),
-        description="pictures of each window frame, in this order: rgb, depth, segmentation, middle (the middle third of rgb, enlarged, "
-        "wherever the person is); none: text alone",
+        description="pictures of each frame, in this order; middle is the middle third of rgb; none: text alone",
     )
-    text_state: bool = Field(
-        True, description="the prompt holds what was measured on the frames, and the mission; false: pictures alone"
-    )
+    text_state: bool = Field(True, description="the prompt holds what was measured on frames; false: pictures alone")
     unbound: Literal["refuse", "accept"] = Field(
         "refuse",
-        description="captions of which no record says from which tree they were made, as after copying the file alone: another tree's "
-        "would go unseen",
+        description="captions of which no record says from which tree they were made, as after copying the file",
     )
     repaired: Literal["keep", "exclude"] = Field("keep", description="what happens to captions that a repair made")
     repaired_weight: float = Field(1.0, gt=0, le=1, description="weight of a repaired sample in the loss; 1: as any")
@@ -63,30 +61,15 @@ class PrepareConfig(SplitConfig):
     contradicted: Literal["keep", "exclude"] = Field(
         "exclude", description="what happens to answers of which the geometry contradicts a sentence"
     )
-    min_proved: float = Field(
-        0.0,
-        ge=0,
-        le=1,
-        description="least share of an answer's sentences that the geometry proves; 0 takes unread ones too",
-    )
-    weigh_proved: bool = Field(
-        False,
-        description="multiply a sample's weight by that share (half at least, so that what is unread still counts)",
-    )
+    min_proved: float = Field(0.0, ge=0, le=1, description="least share of proved sentences; 0 takes unread ones too")
+    weigh_proved: bool = Field(False, description="multiply a sample's weight by half of that share and a half")
     balance: Literal["none", "decisions"] = Field(
-        "none",
-        description="decisions: training windows of a decision beyond `balance_ratio` are left out; validation and test stay",
+        "none", description="decisions: training windows of a decision beyond `balance_ratio` are left out"
     )
     balance_ratio: float = Field(
-        1.0,
-        gt=0,
-        allow_inf_nan=False,
-        description="most training windows of a decision, as a multiple of an equal share (windows / decisions that occur)",
+        1.0, gt=0, allow_inf_nan=False, description="most training windows of a decision, in equal shares of all"
     )
-
-    limit: int = Field(
-        0, ge=0, description="windows in all splits together, of each decision its share; 0: all there are"
-    )
+    limit: int = Field(0, ge=0, description="windows in all splits together, of each decision its share; 0: all")
 
     @model_validator(mode="after")
     def _there_is_something_to_learn(self) -> PrepareConfig:
@@ -117,23 +100,17 @@ def make_sample(
     if parsed.coc is None:  # nothing may be taught that evaluation would call wrong
         return f"answer_{parsed.reason}"
     if PICTURES_MARK not in caption.prompt[language].user:
-        raise InputError(
-            "the prompt of a caption has no place for the sentence about the pictures",
-            where=f"{caption.sample_id}: prompt.{language}",
-            expected=f"{PICTURES_MARK} in it",
-            fix="run cosfly caption anew",
-        )
+        where, expected = f"{caption.sample_id}: prompt.{language}", f"{PICTURES_MARK} in it"
+        raise InputError("no place for the pictures", where=where, expected=expected, fix="run cosfly caption anew")
     pictures = Pictures(cfg.modalities, caption.picture_px, depth_range_m=caption.depth_range_m or DEPTH_RANGE_M)
     is_noisy = caption.label_from == "perturbed"  # and so is what that future rules out
+    place = {"town": caption.town, "trajectory": caption.trajectory, "variant": caption.variant, "walk": walk}
     return Sample(
         sample_id=sample_id or caption.sample_id,
         language=language,
         run=run,
         window_id=caption.sample_id,
-        town=caption.town,
-        trajectory=caption.trajectory,
-        variant=caption.variant,
-        walk=walk,
+        **place,
         window=tuple(caption.window),
         views=pictures.views,
         picture_px=pictures.size_px,
@@ -145,7 +122,7 @@ def make_sample(
         contradicted=None if is_noisy or (ruled_out := caption.checks.contradicted) is None else tuple(ruled_out),
         repair=None if caption.repair is None else caption.repair.strategy,
         proved=caption.coverage(language),
-        weight=_weight(caption, caption.coverage(language), cfg),
+        weight=(1.0 if caption.repair is None else cfg.repaired_weight) * _evidence(caption.coverage(language), cfg),
     )
 
 
@@ -164,14 +141,8 @@ def _reason_to_leave_out(caption: Caption, language: Language, cfg: PrepareConfi
     return None
 
 
-def _weight(caption: Caption, proved: float | None, cfg: PrepareConfig) -> float:
-    weight = 1.0 if caption.repair is None else cfg.repaired_weight
-    return weight * (0.5 + 0.5 * (proved or 0.0)) if cfg.weigh_proved else weight
-
-
-log = logging.getLogger(__name__)
-
-STAGE = "distill.prepare"
+def _evidence(proved: float | None, cfg: PrepareConfig) -> float:
+    return 0.5 + 0.5 * (proved or 0.0) if cfg.weigh_proved else 1.0
 
 
 @dataclass(frozen=True)
@@ -192,7 +163,7 @@ class _Window:
 class _Windows:
     """All windows of all sources, as often as they are asked for."""
 
-    def __init__(self, cfg: PrepareConfig, sources: Sequence[Source]) -> None:
+    def __init__(self, cfg: PrepareConfig, sources: Sequence[RunSource]) -> None:
         self._cfg, self._sources = cfg, sources
         self.flights = Flights(sources)
         self._frames_of = lru_cache(maxsize=16)(lambda flight: flight.whole_frames(cfg.modalities))
@@ -205,7 +176,7 @@ class _Windows:
             for caption in read_captions(source.captions):
                 yield self._window(source, caption)
 
-    def _window(self, source: Source, caption: Caption) -> _Window:
+    def _window(self, source: RunSource, caption: Caption) -> _Window:
         flight = self.flights.of(source, caption)
         if caption.en is not None and caption.en.flight_decision not in action_tokens():
             raise not_in_set(caption.en.flight_decision, f"{source.captions}: {caption.sample_id}")
@@ -238,36 +209,30 @@ class _Windows:
 class _Selection:
     """What goes where: walks (or towns) to splits, and which windows stay."""
 
-    cfg: PrepareConfig
-    walks: Mapping[str, str]
-    split_of: Mapping[str, Split]
-    cut: Cut | None
+    split_of: Mapping[str, Split]  # by key of the flight
+    num_groups: Counter[Split]  # walks (or towns) of each split
+    balance: Balance | None
     limit: Mapping[str, int] | None
     seed: int
 
-    def group(self, town: str, key: str) -> str:
-        return town_family(town) if self.cfg.split_by == "town" else self.walks[key]
-
-    def split(self, window: _Window) -> Split:
-        return self.split_of[self.group(window.flight.town, window.flight.key)]
-
     def left_out(self, window: _Window) -> str | None:
         """Give the reason for which a window is left out of its split."""
-        cut = self.cut if self.split(window) == "train" else None
-        if cut is not None and not cut.keeps(window.decision, window.sample_id):
+        balance = self.balance if self.split_of[window.flight.key] == "train" else None
+        if balance is not None and not keeps(balance.last_rank, self.seed, window.decision, window.sample_id):
             return "balance"
-        if self.limit is not None and not keeps(self.limit, self.seed, window.decision, window.sample_id):
-            return "limit"
-        return None
+        return None if keeps(self.limit or {}, self.seed, window.decision, window.sample_id) else "limit"
 
 
-def run(cfg: PrepareConfig, sources: Sequence[Source], out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
+def run(
+    cfg: PrepareConfig, sources: Sequence[RunSource], out: Path, *, seed: int = 0, resume: Resume = "if-same"
+) -> Path:
     """Read the captions and playback trees of some runs; write a training set (distill/schema.py) into `out`.
 
     Returns:
         `out`, the training set.
     Raises:
-        NothingKept: no caption can be used. InputError: there are too few walks to split. VerifyError: captions are of another tree.
+        NothingKept: no caption can be used. InputError: there are too few walks to split. VerifyError: captions are of
+            another tree.
     """
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs_of(sources), seed=seed, resume=resume)
     if stage.is_complete:
@@ -277,7 +242,7 @@ def run(cfg: PrepareConfig, sources: Sequence[Source], out: Path, *, seed: int =
         return _prepare(cfg, sources, out, seed, stage)
 
 
-def _prepare(cfg: PrepareConfig, sources: Sequence[Source], out: Path, seed: int, stage: StageFolder) -> Path:
+def _prepare(cfg: PrepareConfig, sources: Sequence[RunSource], out: Path, seed: int, stage: StageFolder) -> Path:
     windows = _Windows(cfg, sources)
     # Two passes: the splits, and what is too much, must be known before the first sample is written.
     ranks, excluded = _survey(windows, seed)
@@ -291,19 +256,18 @@ def _prepare(cfg: PrepareConfig, sources: Sequence[Source], out: Path, seed: int
     writer.finish(cfg.split_by, [SourceTree(run=s.run, sha256=fingerprint(s.data)) for s in sources])
     counts = check_no_leak({split: open_split(out, split) for split in SPLITS}, cfg.split_by)
     excluded += left_out
-    if chosen.cut is not None:
-        cost = cost_of(chosen.cut, left_out["balance"])
-        facts["train"]["balance"] = cost.model_dump()
-        log.info("%s: %s", STAGE, cost)
+    if chosen.balance is not None:
+        facts["train"]["balance"] = cost = chosen.balance.cost(left_out["balance"])
+        log.info("%s: balance of train: %s", STAGE, ", ".join(f"{name} {value}" for name, value in cost.items()))
     _warn(facts)
     tally = Tally(input=sum(counts.values()) + excluded.total(), kept=sum(counts.values()), dropped=excluded)
     stage.finish(writer.files, tally, splits=facts, split_by=cfg.split_by)
     return out
 
 
-def _survey(windows: _Windows, seed: int) -> tuple[Ranks, Counter[str]]:
+def _survey(windows: _Windows, seed: int) -> tuple[WindowRanks, Counter[str]]:
     """Go over all windows once: the ranks of those that can be used, and why samples are left out."""
-    ranks, excluded = Ranks(seed), Counter[str]()
+    ranks, excluded = WindowRanks(seed), Counter[str]()
     with progress_bar(f"{STAGE}: reading", total=None) as advance:
         for window in windows:
             windows.count += 1
@@ -314,23 +278,16 @@ def _survey(windows: _Windows, seed: int) -> tuple[Ranks, Counter[str]]:
     return ranks, excluded
 
 
-def _choose(cfg: PrepareConfig, windows: _Windows, ranks: Ranks, seed: int) -> _Selection:
+def _choose(cfg: PrepareConfig, windows: _Windows, ranks: WindowRanks, seed: int) -> _Selection:
     windows.walks = windows.flights.walks()
-    chosen = _Selection(cfg, windows.walks, {}, None, None, seed)
-    group_of = {}
-    for flight in ranks.flights:
-        key = flight.rpartition("/")[0]
-        group_of[flight] = chosen.group(key.split("/")[1], key)
-    split_of = assign_splits(
-        group_of.values(), cfg.fractions, seed, too_few=cfg.too_few,
-        what="walks with usable captions" if cfg.split_by == "walk" else "towns with usable captions",
-        fix="caption more flights, set a fraction to 0, or --set distill.prepare.too_few=fill",
-    )  # fmt: skip
-    train = [flight for flight, group in group_of.items() if split_of[group] == "train"]
-    cut = ranks.cut(train, cfg.balance_ratio) if cfg.balance == "decisions" else None
-    cuts = {flight: cut if split_of[group] == "train" else None for flight, group in group_of.items()}
-    limit = limit_to(ranks, cfg.limit, cuts) if cfg.limit else None
-    return _Selection(cfg, windows.walks, split_of, cut, limit, seed)
+    keys = {flight: flight.rpartition("/")[0] for flight in ranks.flights}
+    fix = "caption more flights, set a fraction to 0, or --set distill.prepare.too_few=fill"
+    owners = cfg.assigned(set(keys.values()), windows.walks, seed, "usable captions", fix)
+    split_of = {key: split for key, (_, split) in owners.items()}
+    train = {flight for flight, key in keys.items() if split_of[key] == "train"}
+    balance = balance_of(ranks, train, cfg.balance_ratio) if cfg.balance == "decisions" else None
+    limit = limit_to(ranks, cfg.limit, train, balance) if cfg.limit else None
+    return _Selection(split_of, Counter(split for _, split in set(owners.values())), balance, limit, seed)
 
 
 def _write(
@@ -342,7 +299,7 @@ def _write(
         split -> counts of its samples, by language, by decision, repaired; reason -> samples that were not chosen.
     """
     names = ("language", "decision", "repair")
-    counters: dict[str, dict[str, Counter[str]]] = {split: {name: Counter() for name in names} for split in SPLITS}
+    counters: dict[Split, dict[str, Counter[str]]] = {split: {name: Counter() for name in names} for split in SPLITS}
     flights: dict[str, set[str]] = {split: set() for split in SPLITS}
     left_out = Counter[str]()
     with progress_bar(f"{STAGE}: writing", total=windows.count) as advance:
@@ -353,7 +310,7 @@ def _write(
                 if reason is not None:
                     left_out[reason] += 1
                     continue
-                split = chosen.split(window)
+                split = chosen.split_of[window.flight.key]
                 writer.add_sample(split, sample)
                 flights[split].add(f"{window.flight.key}/{window.flight.variant}")
                 counter = counters[split]
@@ -363,7 +320,7 @@ def _write(
     facts: dict[str, dict[str, Any]] = {
         split: {
             "samples": found["language"].total(),
-            "groups": sum(1 for owner in chosen.split_of.values() if owner == split),
+            "groups": chosen.num_groups[split],
             "flights": len(flights[split]),
             **{f"by_{name}": dict(sorted(counter.items())) for name, counter in found.items()},
         }
