@@ -1,6 +1,8 @@
-"""A real vision-language model behind the test server: a random Qwen3.5 student, decoded under the request's JSON schema by llguidance.
+"""A real vision-language model behind the test server: a random Qwen3.5 student, decoded under the request's JSON
+schema by llguidance.
 
-Its text is noise; that is the point. It honours data-URL images, `response_format`, `temperature`, `top_p`, `seed`, `max_tokens`, `logit_bias`.
+Its text is noise; that is the point. It honours data-URL images, `response_format`, `temperature`, `top_p`, `seed`,
+`max_tokens`, `logit_bias`.
 """
 
 from __future__ import annotations
@@ -58,11 +60,14 @@ class ModelServer(TeacherServer):
             return self._complete(body)
 
     def _complete(self, body: dict[str, Any]) -> tuple[int, dict]:
-        own, row = self.student, self._encode(body["messages"])
+        own, (row, patches) = self.student, self._encode(body["messages"])
         length, max_tokens = len(row.prompt_ids), int(body["max_tokens"])
         if length + max_tokens > CONTEXT:
             return refusal(400, f"{length} + {max_tokens} tokens, at most {CONTEXT}")
-        inputs, processors = prompt_batch(own, [row]), LogitsProcessorList()
+        inputs, processors = (
+            prompt_batch(own, [row]) | {"pixel_values": torch.from_numpy(patches)},
+            LogitsProcessorList(),
+        )
         if not len(row.image_grids):
             del inputs["pixel_values"], inputs["image_grid_thw"]
         if wanted := body.get("response_format"):
@@ -87,7 +92,7 @@ class ModelServer(TeacherServer):
         usage = {"prompt_tokens": length, "completion_tokens": len(ids)}
         return 200, {"object": "chat.completion", "model": body["model"], "choices": [choice], "usage": usage}
 
-    def _encode(self, messages: list[dict]) -> EncodedSample:
+    def _encode(self, messages: list[dict]) -> tuple[EncodedSample, np.ndarray]:
         """Make token ids and patches of a chat: each image mark becomes as many tokens as its picture has patches."""
         images: list[Image.Image] = []
         for message in messages:
@@ -104,4 +109,4 @@ class ModelServer(TeacherServer):
         for count in (grids.prod(axis=1) // self.student.image_processor.merge_size**2).tolist():
             text = text.replace(IMAGE_TOKEN, "\x00" * count, 1)
         ids = self.student.tokenizer(text.replace("\x00", IMAGE_TOKEN), add_special_tokens=False)["input_ids"]
-        return EncodedSample("", np.array(ids, np.int64), np.zeros(0, np.int64), patches, grids, 1.0)
+        return EncodedSample("", np.array(ids, np.int64), np.zeros(0, np.int64), grids, 1.0), patches

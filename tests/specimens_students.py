@@ -1,13 +1,17 @@
-"""A training set of small pictures, a tiny student, and settings under which it learns in seconds; what a training left."""
+"""A training set of small pictures, a tiny student, and settings under which it learns in seconds; what a training
+left."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from specimens_distill import make_captions, prepared
 
 from distill.schema import Sample, open_split, resolve_trees
+from distill.student.encoding import encode_text, load_pictures, patches_of, prompt_batch
 from distill.student.model import Student, load_student
 from distill.student.random_student import make_tiny_student
 from specimens import make_playback_tree
@@ -39,6 +43,23 @@ def samples_of(place: Path, split: str = "train") -> list[Sample]:
 
 def trees_of(place: Path) -> dict[str, Path]:
     return resolve_trees(place / "set", [place / "tree"])
+
+
+def inputs_of(own: Student, samples: Sequence[Sample], trees: Mapping[str, Path]) -> dict[str, Any]:
+    """All that a model is given of some samples, with their pictures, each looked at anew."""
+    import torch
+
+    patches = patches_of(own, [picture for sample in samples for picture in load_pictures(sample, trees)])
+    rows = [encode_text(own, sample) for sample in samples]
+    return prompt_batch(own, rows) | {"pixel_values": torch.from_numpy(patches).to(own.dtype)}
+
+
+def features_of(own: Student, inputs: dict[str, Any]) -> Any:
+    """What the tower makes of the pictures among a model's inputs."""
+    import torch
+
+    found = own.core.get_image_features(inputs["pixel_values"], inputs["image_grid_thw"]).pooler_output
+    return torch.cat(found).detach()
 
 
 def log_of(out: Path, kind: str = "loss") -> list[dict]:

@@ -23,7 +23,7 @@ from cosfly.products.places import town_folder
 from cosfly.products.predictions import Prediction
 from cosfly.work.stage_folder import Failed
 from distill.inference import stage as infer
-from distill.inference.outcome import Outcome, make_prediction, prediction_of
+from distill.inference.outcome import SampleOutcome, make_prediction, prediction_of
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import open_split
 from release.columns import caption_values
@@ -259,7 +259,7 @@ def test_what_is_wrong_with_a_students_answer_drops_its_window(tree, rules, tmp_
     ]  # fmt: skip
     sample = make_sample(rules[2], "en", PrepareConfig())
     assert not isinstance(sample, str)
-    failed = Outcome(sample, Failed(id=sample.key, code="oom", message="no"))
+    failed = SampleOutcome(sample, Failed(id=sample.key, code="oom", message="no"))
     assert prediction_of(failed, "test").reason == "failed_oom"
 
 

@@ -1,4 +1,5 @@
-"""A student behind a server as a teacher: asked as it was taught, to the byte; judged, repaired and marked like any other."""
+"""A student behind a server as a teacher: asked as it was taught, to the byte; judged, repaired and marked like any
+other."""
 
 from __future__ import annotations
 
@@ -182,9 +183,6 @@ def test_two_languages_that_disagree_are_dropped(place, tmp_path):
     }
     assert {caption.status for caption in captions} == {"dropped"}
     assert 0 < asked.count(False) <= len(captions)  # once each: asked again it would answer the same
-
-
-# --- what cannot be -----------------------------------------------------------------------------------------------------
 
 
 def taught_otherwise(place: Path, folder: Path, **changes: Any) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,12 +13,13 @@ from PIL import Image
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
+from specimens_students import features_of  # noqa: E402
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 from torch.utils._pytree import tree_leaves  # noqa: E402
 from transformers import LogitsProcessor, LogitsProcessorList  # noqa: E402
 
 from distill.student import decoding  # noqa: E402
-from distill.student.decoding import Completion, decode  # noqa: E402
+from distill.student.decoding import Completion  # noqa: E402
 from distill.student.encoding import EncodedSample, prompt_batch  # noqa: E402
 from distill.student.model import IMAGE_TOKEN, Student, load_student  # noqa: E402
 from distill.student.random_student import make_tiny_student  # noqa: E402
@@ -35,13 +36,25 @@ def student(tmp_path_factory) -> Student:
 
 
 @pytest.fixture(scope="module")
-def rows(student) -> list[EncodedSample]:
+def rows(student) -> list[Asked]:
     """Prompts of 1 to 140 tokens with 0 to 5 pictures of two sizes."""
     rng = np.random.default_rng(4)
     return [make_row(student, rng, *size) for size in [(5, 2), (40, 1), (120, 5), (17, 3), (1, 0), (60, 0), (2, 1)]]
 
 
-def make_row(student: Student, rng: np.random.Generator, num_words: int, num_pictures: int) -> EncodedSample:
+@dataclass(frozen=True)
+class Asked(EncodedSample):
+    """A prompt with its pictures."""
+
+    pictures: dict[str, torch.Tensor]
+
+
+def decode(student: Student, rows: Sequence[Asked], **more) -> list[Completion]:
+    seen = [features_of(student, row.pictures) for row in rows if len(row.image_grids)]
+    return decoding.decode(student, rows, torch.cat(seen) if seen else torch.zeros(0, 64), **more)
+
+
+def make_row(student: Student, rng: np.random.Generator, num_words: int, num_pictures: int) -> Asked:
     start, image, end = student.tokenizer.convert_tokens_to_ids(["<|vision_start|>", IMAGE_TOKEN, "<|vision_end|>"])
     patches, grids = np.zeros((0, 1536), np.float32), np.zeros((0, 3), np.int64)
     if num_pictures:
@@ -53,14 +66,20 @@ def make_row(student: Student, rng: np.random.Generator, num_words: int, num_pic
     for count in (grids.prod(axis=1) // 4).tolist():
         ids += [int(rng.integers(20, 200)), start, *[image] * count, end]
     ids += rng.integers(20, 200, num_words).tolist()
-    return EncodedSample("row", np.array(ids, np.int64), np.zeros(0, np.int64), patches, grids, 1.0)
+    inputs = {"pixel_values": torch.from_numpy(patches), "image_grid_thw": torch.from_numpy(grids)}
+    return Asked("row", np.array(ids, np.int64), np.zeros(0, np.int64), grids, 1.0, inputs)
 
 
-def generated(student: Student, rows: Sequence[EncodedSample], most: int = MOST, **more) -> list[Completion]:
-    """The same by the library."""
+def given(student: Student, rows: Sequence[Asked]) -> dict[str, torch.Tensor]:
     inputs = prompt_batch(student, rows)
-    if not len(inputs["image_grid_thw"]):
-        del inputs["pixel_values"], inputs["image_grid_thw"]
+    if len(inputs["image_grid_thw"]):
+        return inputs | {"pixel_values": torch.cat([row.pictures["pixel_values"] for row in rows])}
+    return {name: value for name, value in inputs.items() if name != "image_grid_thw"}
+
+
+def generated(student: Student, rows: Sequence[Asked], most: int = MOST, **more) -> list[Completion]:
+    """The same by the library."""
+    inputs = given(student, rows)
     with torch.inference_mode():
         output = student.model.generate(
             **inputs, max_new_tokens=most, do_sample=False, eos_token_id=student.end_token_id,
@@ -74,9 +93,9 @@ def generated(student: Student, rows: Sequence[EncodedSample], most: int = MOST,
     return found
 
 
-def ending_at(student: Student, rows: Sequence[EncodedSample], most: int = MOST) -> Student:
+def ending_at(student: Student, rows: Sequence[Asked], most: int = MOST) -> Student:
     """The same student with another end token, such that its answers to `rows` end here and there."""
-    inputs = prompt_batch(student, rows)
+    inputs = given(student, rows)
     with torch.inference_mode():
         output = student.model.generate(
             **inputs, max_new_tokens=most, do_sample=False, eos_token_id=-1, pad_token_id=student.pad_token_id
@@ -119,23 +138,6 @@ def test_rows_that_ended_leave_the_batch(student, rows, monkeypatch):
     assert sum(sizes) == needed
     assert needed <= work <= needed / (1 - 0.25)
     assert sizes[0] == len(rows) > sizes[-1]
-
-
-def test_features_seen_before_give_the_same(student, rows):
-    seen = [prompt_batch(student, [row]) for row in rows if len(row.image_grids)]
-    with torch.inference_mode():
-        joined = torch.cat(
-            [
-                found
-                for row in seen
-                for found in student.core.model.get_image_features(
-                    row["pixel_values"], row["image_grid_thw"]
-                ).pooler_output
-            ]
-        )
-    with student.model.model.visual.register_forward_hook(lambda *_: pytest.fail("the tower looked again")):
-        found = decode(student, rows, max_tokens=MOST, features=joined)
-    assert found == generated(student, rows)
 
 
 def test_an_adapter_and_dropout(student, rows, tmp_path):
@@ -195,9 +197,11 @@ def test_a_constraint_decides_what_may_come(student, rows):
 
 
 class Recording(TorchDispatchMode):
-    """Every operation of a step as it runs, with the tensors that it read and wrote: played again, it does the same to the same places.
+    """Every operation of a step as it runs, with the tensors that it read and wrote: played again, it does the same to
+    the same places.
 
-    What an accelerator's graph is, on a CPU: no Python of the step runs again, sizes and places are those of the recording.
+    What an accelerator's graph is, on a CPU: no Python of the step runs again, sizes and places are those of the
+    recording.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,5 @@
-"""Students asked through an engine: what is sent, what is kept, and what happens when nobody answers. Needs no torch."""
+"""Students asked through an engine: what is sent, what is kept, and what happens when nobody answers. Needs no
+torch."""
 
 from __future__ import annotations
 
@@ -89,14 +90,8 @@ def test_nothing_answered_is_asked_twice(place, tmp_path):
 def test_one_sample_without_an_answer_costs_no_other(place, tmp_path):
     """And the command ends with status 1; run again, it asks about that sample alone."""
     words = ["distill", "infer", "--dataset", place / "set", "--data", place / "tree", "--engine", "endpoint"]
-    words += [
-        "--out",
-        tmp_path / "out",
-        "--set",
-        "distill.infer.split=train",
-        "--set",
-        "distill.infer.endpoint.max_tries=1",
-    ]
+    words += ["--out", tmp_path / "out", "--set", "distill.infer.split=train"]
+    words += ["--set", "distill.infer.endpoint.max_tries=1"]
     with TeacherServer(lambda number, body: "500" if number == 2 else None) as server:
         words = [str(word) for word in [*words, "--model", server.url]]
         result = CliRunner().invoke(app, words)

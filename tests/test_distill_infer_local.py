@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from specimens_distill import ADAPTER_PIXELS, make_adapter, make_captions, prepared
+from specimens_students import features_of, inputs_of
 from teacher_server import kept_answers
 from typer.testing import CliRunner
 
@@ -17,14 +18,14 @@ pytest.importorskip("peft", reason="needs the extra distill")
 
 from cosfly.chat.student_chat import TAUGHT  # noqa: E402
 from cosfly.cli import app  # noqa: E402
-from cosfly.errors import ConfigError, InputError  # noqa: E402
+from cosfly.errors import ConfigError  # noqa: E402
 from cosfly.products.predictions import Prediction, read_predictions  # noqa: E402
 from distill.inference import merge  # noqa: E402
 from distill.inference import stage as infer  # noqa: E402
 from distill.schema import Sample, open_split, resolve_trees  # noqa: E402
 from distill.student.checkpoint import ADAPTER_FACTS  # noqa: E402
 from distill.student.decoding import decode  # noqa: E402
-from distill.student.encoding import encode  # noqa: E402
+from distill.student.encoding import encode_text  # noqa: E402
 from distill.student.model import load_student  # noqa: E402
 from distill.student.random_student import make_tiny_student  # noqa: E402
 from specimens import make_playback_tree  # noqa: E402
@@ -76,10 +77,10 @@ def test_each_sample_has_the_answer_that_it_has_alone(place, clean):
         place / "student", device="cpu", max_pixels=ADAPTER_PIXELS, adapter=place / "trained" / "adapter"
     )
     samples, trees = samples_of(place), resolve_trees(place / "set", [place / "tree"])
-    alone = {
-        sample.key: decode(student, [encode(student, sample, trees)], max_tokens=NUM_TOKENS)[0].text
-        for sample in samples
-    }
+    alone = {}
+    for sample in samples:
+        features = features_of(student, inputs_of(student, [sample], trees))
+        alone[sample.key] = decode(student, [encode_text(student, sample)], features, max_tokens=NUM_TOKENS)[0].text
     predictions = read_predictions(clean)
     assert [prediction.key for prediction in predictions] == [sample.key for sample in samples]
     assert told(predictions) == alone
@@ -97,10 +98,8 @@ def test_a_merged_student_sees_pictures_as_it_was_taught(place, tmp_path):
     infer.run(*given, place / "student", tmp_path / "beside", adapter=adapter)
     infer.run(*given, merged, tmp_path / "alone")
     infer.run(*given, place / "student", tmp_path / "base")
-    beside, alone, base = (
-        [line["usage"]["prompt_tokens"] for line in kept_answers(tmp_path / name)]
-        for name in ("beside", "alone", "base")
-    )
+    runs = [kept_answers(tmp_path / name) for name in ("beside", "alone", "base")]
+    beside, alone, base = ([line["usage"]["prompt_tokens"] for line in run] for run in runs)
     assert alone == beside
     assert sum(base) > sum(beside)
 
@@ -115,19 +114,16 @@ def test_each_picture_is_looked_at_once_and_rows_of_like_length_go_together(plac
         )
         return student
 
-    def watched(student: Any, rows: Any, **more: Any) -> Any:
+    def watched(student: Any, rows: Any, features: Any, **more: Any) -> Any:
         lengths.append([len(row.prompt_ids) for row in rows])
-        return decode(student, rows, **more)
+        return decode(student, rows, features, **more)
 
     monkeypatch.setattr(infer, "load_student", load)
     monkeypatch.setattr("distill.inference.local.decode", watched)
     assert answer(place, tmp_path / "out").read_bytes() == clean.read_bytes()
     samples = samples_of(place)
-    assert (
-        len(looked)
-        == len({image for sample in samples for image in sample.images})
-        < sum(len(s.images) for s in samples) / 2
-    )
+    images = [image for sample in samples for image in sample.images]
+    assert len(looked) == len(set(images)) < len(images) / 2
     together = [length for batch in lengths for length in batch]
     assert together == sorted(together, reverse=True)
     assert len(set(together)) > 1
@@ -140,11 +136,11 @@ def test_the_size_of_batches_changes_no_answer(place, clean, tmp_path):
 def test_interrupted_and_continued_is_the_same(place, clean, tmp_path, monkeypatch):
     calls: list[int] = []
 
-    def stopping(student: Any, rows: Any, **more: Any) -> Any:
+    def stopping(student: Any, rows: Any, features: Any, **more: Any) -> Any:
         calls.append(len(rows))
         if len(calls) == 3:
             raise KeyboardInterrupt
-        return decode(student, rows, **more)
+        return decode(student, rows, features, **more)
 
     monkeypatch.setattr("distill.inference.local.decode", stopping)
     with pytest.raises(KeyboardInterrupt):
@@ -172,9 +168,8 @@ def test_one_bad_picture_costs_its_samples_only(place, clean, tmp_path):
     found, expected = read_predictions(tmp_path / "out" / "predictions.jsonl"), told(read_predictions(clean))
     assert {p.key for p in found if p.reason == "failed_input"} == hit
     assert 0 < len(hit) < len(samples) / 2
-    assert {p.key: p.raw for p in found if p.key not in hit} == {
-        key: raw for key, raw in expected.items() if key not in hit
-    }
+    others = {key: raw for key, raw in expected.items() if key not in hit}
+    assert {p.key: p.raw for p in found if p.key not in hit} == others
     assert counts_of(tmp_path / "out")["failed"] == {"input": len(hit)}
     assert (tmp_path / "out" / "failures.jsonl").read_text().count("not an image") == len(hit)
     (tree / bad).write_bytes(whole)  # mended: those alone are answered
@@ -182,9 +177,6 @@ def test_one_bad_picture_costs_its_samples_only(place, clean, tmp_path):
     assert result.exit_code == 0, result.output
     assert told(read_predictions(tmp_path / "out" / "predictions.jsonl")) == expected
     assert json.loads((tmp_path / "out" / "manifest.json").read_text())["speed"]["answers"] == len(hit)
-
-
-# --- a full memory ----------------------------------------------------------------------------------------------------
 
 
 def with_room_for(num_rows: int, sizes: list[int]) -> Any:
@@ -220,9 +212,6 @@ def test_a_memory_too_small_for_one_is_one_clear_line(place, tmp_path, monkeypat
         answer(place, tmp_path / "out")
 
 
-# --- what is answered -------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_constrained_answers_all_parse(place, clean, tmp_path):
     pytest.importorskip("llguidance")
@@ -241,11 +230,3 @@ def test_constrained_answers_all_parse(place, clean, tmp_path):
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-def test_an_adapter_of_another_student_is_refused(place, tmp_path):
-    other = make_tiny_student(tmp_path / "other", seed=5)
-    with pytest.raises(InputError, match="trained on another model"):
-        infer.run(
-            settings(), place / "set", [place / "tree"], other, tmp_path / "out", adapter=place / "trained" / "adapter"
-        )

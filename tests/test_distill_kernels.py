@@ -96,7 +96,8 @@ def test_float32_has_no_fast_kernels_and_a_cpu_is_let_alone(installed):
 
 
 def test_the_convolution_of_linear_attention_stands_in(installed):
-    """Held against the library's own function, through a stand-in written from what flash-linear-attention documents: x is (b, t, d)."""
+    """Held against the library's own function, through a stand-in written from what flash-linear-attention documents: x
+    is (b, t, d)."""
 
     def causal_conv1d(x, weight, bias=None, activation=None):
         width = weight.shape[1]

@@ -17,17 +17,15 @@ pytest.importorskip("peft", reason="needs the extra distill")
 from safetensors import safe_open  # noqa: E402
 from safetensors.torch import load_file, save_file  # noqa: E402
 from specimens_distill import TEACHING, make_adapter, make_captions, prepared  # noqa: E402
-from typer.testing import CliRunner  # noqa: E402
+from specimens_students import inputs_of  # noqa: E402
 
 from cosfly.chat.student_chat import TAUGHT, read_taught  # noqa: E402
-from cosfly.cli import app  # noqa: E402
 from cosfly.errors import InputError  # noqa: E402
 from cosfly.work.store import write_json  # noqa: E402
 from distill.inference import merge  # noqa: E402
 from distill.inference.merge import MergeConfig  # noqa: E402
 from distill.schema import open_split, resolve_trees  # noqa: E402
 from distill.student.checkpoint import ADAPTER_FACTS, base_digests  # noqa: E402
-from distill.student.encoding import encode, prompt_batch  # noqa: E402
 from distill.student.model import Student, load_student  # noqa: E402
 from distill.student.random_student import make_tiny_student  # noqa: E402
 from specimens import make_playback_tree  # noqa: E402
@@ -38,7 +36,8 @@ PIXELS = 64 * 64
 
 
 def make_calm_student(folder: Path) -> Path:
-    """A random student whose layers change little, as those of a trained one: else a rounding grows from layer to layer."""
+    """A random student whose layers change little, as those of a trained one: else a rounding grows from layer to
+    layer."""
     path = make_tiny_student(folder, seed=2) / "model.safetensors"
     tensors = {n: t * 0.25 if ".layers." in n and t.ndim == 2 else t for n, t in load_file(path).items()}
     save_file(tensors, path, {"format": "pt"})
@@ -66,7 +65,7 @@ def inputs(base, tmp_path_factory) -> dict:
     dataset = prepared(tree, root / "captions.jsonl", root / "set")
     student = load_student(base, device="cpu", max_pixels=PIXELS)
     trees = resolve_trees(dataset, [tree])
-    return prompt_batch(student, [encode(student, sample, trees) for sample in open_split(dataset, "train")[:3]])
+    return inputs_of(student, open_split(dataset, "train")[:3], trees)
 
 
 def logits(student: Student, inputs: dict) -> torch.Tensor:
@@ -115,7 +114,8 @@ def test_a_model_folder_is_whole(base, adapter, tmp_path):
 
 
 def sharded(base: Path, folder: Path) -> Path:
-    """The base in bfloat16 and two files, with a tensor that transformers does not load, and as links as in a hub's cache."""
+    """The base in bfloat16 and two files, with a tensor that transformers does not load, and as links as in a hub's
+    cache."""
     folder.mkdir()
     (blobs := folder.parent / "blobs").mkdir()
     for path in base.iterdir():
@@ -185,9 +185,11 @@ def test_another_kind_of_adapter_is_refused(base, adapter, tmp_path, changes, wo
 def test_damaged_adapters_are_refused(base, adapter, tmp_path):
     tensors = load_file(adapter / "adapter_model.safetensors")
     name = sorted(tensors)[0]
+    stranger = name.replace("layers.0", "layers.77")
+    pair = {stranger: tensors[name].clone(), stranger.replace("lora_A", "lora_B"): torch.ones(8, 4)}
     for number, (changed, words) in enumerate([
         ({n: t for n, t in tensors.items() if n != name}, "half an update"),
-        (tensors | {name.replace("layers.0", "layers.77"): tensors[name].clone(), name.replace("layers.0", "layers.77").replace("lora_A", "lora_B"): torch.ones(8, 4)}, "no layer that the adapter changes"),
+        (tensors | pair, "no layer that the adapter changes"),
         (tensors | {name.replace(".lora_A", ".other"): torch.ones(2)}, "not a tensor of a LoRA"),
         (tensors | {name: torch.ones(4, 7)}, "another shape"),
         (tensors | {name: tensors[name] * np.nan}, "not finite"),
@@ -243,10 +245,3 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half(base, adapter, tmp_path
         assert not [*tmp_path.rglob("*.partial"), *tmp_path.rglob("*.safetensors")]
     merge.run(MergeConfig(), base, adapter, tmp_path / "out")
     assert (tmp_path / "out" / "model" / "model.safetensors").exists()
-
-
-def test_the_command(base, adapter, tmp_path):
-    words = ["distill", "merge", "--model", base, "--adapter", adapter, "--out", tmp_path / "out"]
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    assert result.exit_code == 0, result.output
-    assert str(tmp_path / "out" / "model") in result.output.replace("\n", "")

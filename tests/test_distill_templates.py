@@ -1,8 +1,9 @@
 """distill: what a student is taught is what its own chat template writes, for the templates of Qwen3.5, 3.6 and 3.8.
 
-The templates here were written for these tests; they branch where the public ones do: texts are trimmed, thoughts of the last answer are
-kept and others dropped, 3.6 can keep them (`preserve_thinking`), 3.8 keeps them unless told otherwise, takes thoughts from their own
-field alone, and begins its system text with how much to think unless thinking is off.
+The templates here were written for these tests; they branch where the public ones do: texts are trimmed, thoughts of
+the last answer are kept and others dropped, 3.6 can keep them (`preserve_thinking`), 3.8 keeps them unless told
+otherwise, takes thoughts from their own field alone, and begins its system text with how much to think unless thinking
+is off.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ END = """
 
 
 def turns(keeps_thoughts: str, reads_thoughts: bool) -> str:
-    """The turns of a chat. keeps_thoughts: when thoughts of earlier answers stay. reads_thoughts: also from the text."""
+    """The turns of a chat. keeps_thoughts: when thoughts of earlier answers stay. reads_thoughts: also from the
+    text."""
     from_text = """
             {%- elif '</think>' in text -%}
                 {%- set thought = text.split('</think>')[0].rstrip('\\n').split('<think>')[-1].lstrip('\\n') -%}

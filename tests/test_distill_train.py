@@ -9,20 +9,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from specimens_distill import prepared, write_set
+from specimens_distill import write_set
 
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
-from specimens_students import FAST, MAX_PIXELS, TWELVE, load, log_of, samples_of, trees_of  # noqa: E402
+from specimens_students import FAST, MAX_PIXELS, TWELVE, inputs_of, load, log_of, samples_of, trees_of  # noqa: E402
 
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError  # noqa: E402
 from cosfly.products.predictions import read_predictions  # noqa: E402
 from distill.inference import stage as infer  # noqa: E402
-from distill.schema import open_split  # noqa: E402
 from distill.student import model as student  # noqa: E402
 from distill.student.checkpoint import load_checkpoint  # noqa: E402
-from distill.student.encoding import IGNORED, encode, encode_text, load_pictures, padded, prompt_batch  # noqa: E402
+from distill.student.encoding import IGNORED, encode_text, load_pictures, padded, prompt_batch  # noqa: E402
 from distill.student.random_student import make_tiny_student  # noqa: E402
 from distill.training import fit  # noqa: E402
 from distill.training import stage as train  # noqa: E402
@@ -47,9 +46,6 @@ def trained(place, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("trained")
     train.run(TrainConfig(**TWELVE), place / "set", [place / "tree"], place / "student", out)
     return out
-
-
-# --- student ----------------------------------------------------------------------------------------------------------
 
 
 def test_tiny_student_is_tiny_and_the_same_each_time(place, tmp_path):
@@ -89,10 +85,9 @@ def test_processor_agrees_with_the_library_one(place):
     wanted = oracle.apply_chat_template(
         messages, add_generation_prompt=True, tokenize=True, return_dict=True, return_tensors="pt"
     )
-    found = encode(own, sample, trees_of(place))
-    assert found.prompt_ids.tolist() == wanted["input_ids"][0].tolist()
-    assert np.array_equal(found.pixel_values, wanted["pixel_values"].numpy())
-    assert found.image_grids.tolist() == wanted["image_grid_thw"].tolist()
+    found = inputs_of(own, [sample], trees_of(place))
+    for name in ("input_ids", "pixel_values", "image_grid_thw"):
+        assert torch.equal(found[name], wanted[name]), name
 
 
 @pytest.mark.parametrize(
@@ -119,13 +114,10 @@ def test_a_missing_package_gives_the_install_line():
         student.require("json", "no_such_package")
 
 
-# --- encoding ---------------------------------------------------------------------------------------------------------
-
-
 def test_mask_covers_exactly_the_answer(place):
     own = load(place)
     samples = samples_of(place)[:2]  # one in each language
-    rows = [encode(own, sample, trees_of(place)) for sample in samples]
+    rows = [encode_text(own, sample) for sample in samples]
     ids, labels, positions = padded(own, rows)
     assert positions.shape == (3, *ids.shape)
     for i, sample in enumerate(samples):
@@ -143,40 +135,13 @@ def test_mask_covers_exactly_the_answer(place):
 def test_positions_are_the_librarys(place):
     """For every sample, and for pictures of two shapes between texts of all lengths."""
     own = load(place)
-    rows = [encode(own, sample, trees_of(place)) for sample in samples_of(place)]
+    rows = [encode_text(own, sample) for sample in samples_of(place)]
     for row in rows:
         inputs = prompt_batch(own, [row])
-        wanted, _ = own.core.model.get_rope_index(
-            inputs["input_ids"],
-            inputs["mm_token_type_ids"],
-            inputs["image_grid_thw"],
-            attention_mask=inputs["attention_mask"],
-        )
+        names = ("input_ids", "mm_token_type_ids", "image_grid_thw")
+        wanted, _ = own.core.model.get_rope_index(*(inputs[n] for n in names), attention_mask=inputs["attention_mask"])
         found = padded(own, [row])[2][:, 0, : len(row.prompt_ids)]
         assert np.array_equal(found, wanted[:, 0].numpy())
-
-
-def test_tokens_are_counted_without_looking_at_pictures(place):
-    own = load(place)
-    for sample in samples_of(place)[:3]:
-        row, text = encode(own, sample, trees_of(place)), encode_text(own, sample)
-        assert text.prompt_ids.tolist() == row.prompt_ids.tolist()
-        assert text.image_grids.tolist() == row.image_grids.tolist()
-        assert row.pixel_values is not None
-        assert len(row.pixel_values) == row.image_grids.prod(axis=1).sum()
-        assert text.pixel_values is None
-
-
-def test_every_modality_becomes_a_picture(place, tmp_path):
-    views = ("rgb", "depth", "segmentation")
-    out = prepared(place / "tree", place / "captions.jsonl", tmp_path / "set", modalities=views)
-    sample = open_split(out, "train")[0]
-    own = load(place)
-    row = encode(own, sample, trees_of(place))
-    assert len(sample.images) == len(row.image_grids) == 15
-    depth = load_pictures(sample, trees_of(place))[1]
-    assert depth.shape == (36, 64, 3)
-    assert depth.std() > 0
 
 
 def test_pictures_keep_all_pixels_unless_told(place, tmp_path):
@@ -184,9 +149,6 @@ def test_pictures_keep_all_pixels_unless_told(place, tmp_path):
     train.run(cfg, place / "set", [place / "tree"], place / "student", tmp_path / "out")
     facts = json.loads((tmp_path / "out" / "adapter" / "cosfly_adapter.json").read_text())
     assert facts["max_pixels"] == 64 * 36
-
-
-# --- training ---------------------------------------------------------------------------------------------------------
 
 
 def test_each_epoch_sees_each_sample_once():
@@ -256,10 +218,9 @@ def test_adapter_reloads_equal(place, trained):
     own = train.add_adapter(load(place), TrainConfig(**FAST), 0)
     assert load_checkpoint(trained / "checkpoints" / "step_00000012", own).step == 12
     again = student.load_student(place / "student", device="cpu", max_pixels=MAX_PIXELS, adapter=trained / "adapter")
-    row = encode(own, samples_of(place)[0], trees_of(place))
     logits = []
     for model in (own, again, load(place)):
-        inputs = prompt_batch(model, [row])
+        inputs = inputs_of(model, samples_of(place)[:1], trees_of(place))
         with torch.inference_mode():
             logits.append(model.model.eval()(**inputs).logits)
     assert torch.equal(logits[0], logits[1])
@@ -267,7 +228,8 @@ def test_adapter_reloads_equal(place, trained):
 
 
 def test_stopped_and_continued_is_the_same(place, tmp_path):
-    """Stop after 7 of 8 steps, cut a line of the log short, damage a newer checkpoint, then go on: the same log and the same adapter."""
+    """Stop after 7 of 8 steps, cut a line of the log short, damage a newer checkpoint, then go on: the same log and the
+    same adapter."""
     cfg = TrainConfig(**{**TWELVE, "lora_dropout": 0.3, "max_steps": 8})
     arguments = (cfg, place / "set", [place / "tree"], place / "student")
     out, steps, real = tmp_path / "out", [], fit.train_step
@@ -307,31 +269,19 @@ def test_a_learning_rate_that_explodes_stops_with_a_clear_error(place, tmp_path)
         train.run(cfg, place / "set", [place / "tree"], place / "student", tmp_path / "out")
 
 
-# --- the whole way ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_a_student_that_overfits_answers_right(place, tmp_path):
     """The whole way: two samples learned by heart come back as the answers they were, parsed."""
     learnt = samples_of(place)[:2]
     write_set(tmp_path / "set", {"train": learnt, "val": learnt}, [place / "tree"])
-    cfg = TrainConfig(
-        **{**FAST, "lora_rank": 16, "schedule": "cosine"},
-        batch_size=2,
-        samples_per_step=2,
-        epochs=80,
-        keep="last",
-        patience=0,
+    settings = {**FAST, "lora_rank": 16, "schedule": "cosine", "batch_size": 2, "samples_per_step": 2, "epochs": 80}
+    cfg, given = (
+        TrainConfig(**settings, keep="last", patience=0),
+        (tmp_path / "set", [place / "tree"], place / "student"),
     )
-    adapter = train.run(cfg, tmp_path / "set", [place / "tree"], place / "student", tmp_path / "trained")
-    out = infer.run(
-        infer.InferConfig(split="train", device="cpu"),
-        tmp_path / "set",
-        [place / "tree"],
-        place / "student",
-        tmp_path / "answers",
-        adapter=adapter,
-    )
+    adapter = train.run(cfg, *given, tmp_path / "trained")
+    asked = infer.InferConfig(split="train", device="cpu")
+    out = infer.run(asked, *given, tmp_path / "answers", adapter=adapter)
     predictions = read_predictions(out)
     assert [p.raw for p in predictions] == [sample.answer for sample in learnt]
     assert all(p.coc is not None and p.is_finished for p in predictions)

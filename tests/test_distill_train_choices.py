@@ -1,4 +1,5 @@
-"""distill: what a training can be: in full, of random weights, of texts alone; what it is told before, and when it ends."""
+"""distill: what a training can be: in full, of random weights, of texts alone; what it is told before, and when it
+ends."""
 
 from __future__ import annotations
 
@@ -15,14 +16,24 @@ torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
 from safetensors.torch import load_file  # noqa: E402
-from specimens_students import FAST, MAX_PIXELS, TWELVE, load, log_of, losses_of, samples_of, trees_of  # noqa: E402
+from specimens_students import (  # noqa: E402
+    FAST,
+    MAX_PIXELS,
+    TWELVE,
+    inputs_of,
+    load,
+    log_of,
+    losses_of,
+    samples_of,
+    trees_of,
+)
 
 from cosfly.errors import InputError, ResumeError  # noqa: E402
 from distill.schema import Sample  # noqa: E402
 from distill.student.checkpoint import Progress  # noqa: E402
-from distill.student.encoding import encode, prompt_batch  # noqa: E402
+from distill.student.decoding import Completion  # noqa: E402
 from distill.student.model import load_student  # noqa: E402
-from distill.training import preflight  # noqa: E402
+from distill.training import fit, preflight  # noqa: E402
 from distill.training import stage as train  # noqa: E402
 from distill.training.fit import Validation, judged  # noqa: E402
 from distill.training.loading import choose_over_all  # noqa: E402
@@ -44,11 +55,9 @@ def run(
     return train.run(cfg, dataset or place / "set", [place / "tree"], student or place / "student", out)
 
 
-# --- in full ----------------------------------------------------------------------------------------------------------
-
-
 def test_a_model_trained_in_full_is_a_whole_folder(place, tmp_path):
-    """transformers loads weights, tokenizer, picture processor, chat template and generation settings, and the tower is as it was."""
+    """transformers loads weights, tokenizer, picture processor, chat template and generation settings, and the tower is
+    as it was."""
     from transformers import AutoModelForImageTextToText, AutoTokenizer, GenerationConfig
 
     folder = run(place, tmp_path / "out", method="full", max_steps=4, learning_rate=1e-3)
@@ -58,8 +67,7 @@ def test_a_model_trained_in_full_is_a_whole_folder(place, tmp_path):
     assert GenerationConfig.from_pretrained(folder) is not None
     own = load_student(folder, device="cpu", max_pixels=10**9)
     assert own.image_processor.size["longest_edge"] == MAX_PIXELS  # what it was taught with stays its own bound
-    row = encode(own, samples_of(place)[0], trees_of(place))
-    inputs = prompt_batch(own, [row])
+    inputs = inputs_of(own, samples_of(place)[:1], trees_of(place))
     with torch.inference_mode():
         assert torch.equal(own.model.eval()(**inputs).logits, model.eval()(**inputs).logits)
     before, after = load(place).core.state_dict(), own.core.state_dict()
@@ -95,12 +103,10 @@ def test_bfloat16_computes_with_float32_weights_that_learn(place, tmp_path):
     assert {tensor.dtype for tensor in load_file(newest / "weights.safetensors").values()} == {torch.float32}
 
 
-# --- of random weights, of texts --------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_a_tiny_student_has_a_tokenizer_of_the_data(place, tmp_path):
-    """Its pieces are those of the samples: fewer tokens than those of a tokenizer trained on a few lines; and it is in the folder."""
+    """Its pieces are those of the samples: fewer tokens than those of a tokenizer trained on a few lines; and it is in
+    the folder."""
     run(place, tmp_path / "out", "tiny", max_steps=2)
     own = load_student(tmp_path / "out" / "student", device="cpu", max_pixels=MAX_PIXELS)
     sample = samples_of(place)[0]
@@ -113,11 +119,8 @@ def test_a_tiny_student_has_a_tokenizer_of_the_data(place, tmp_path):
     settings = {"width": 96, "layers": 8, "vision_layers": 1}
     run(place, tmp_path / "own", "random", max_steps=1, random_student=settings, method="full")
     config = load_student(tmp_path / "own" / "model", device="cpu", max_pixels=MAX_PIXELS).core.config
-    assert (config.text_config.hidden_size, config.text_config.num_hidden_layers, config.vision_config.depth) == (
-        96,
-        8,
-        1,
-    )
+    text = config.text_config
+    assert (text.hidden_size, text.num_hidden_layers, config.vision_config.depth) == (96, 8, 1)
 
 
 def test_a_student_of_texts_alone_learns(place, tmp_path):
@@ -126,9 +129,6 @@ def test_a_student_of_texts_alone_learns(place, tmp_path):
     found = losses_of(tmp_path / "out")
     assert found[-1] < found[0]
     assert "the student sees texts only" in (tmp_path / "out" / "preflight.json").read_text()
-
-
-# --- validation -------------------------------------------------------------------------------------------------------
 
 
 def sample_like(base: Sample, flight: int, frame: int, decision: str) -> Sample:
@@ -145,30 +145,46 @@ def test_validation_is_drawn_over_all_decisions_and_flights(place):
     assert chosen == sorted(set(chosen))
     assert Counter(samples[i].decision for i in chosen) == {"track_straight": 5, "hover": 5, "ascend": 2}
     assert len({samples[i].sample_id.split("_")[1] for i in chosen if samples[i].decision == "track_straight"}) == 3
-    assert (
-        choose_over_all(samples, 12, np.random.default_rng(0))
-        == chosen
-        != choose_over_all(samples, 12, np.random.default_rng(1))
-    )
+    again, other = (choose_over_all(samples, 12, np.random.default_rng(seed)) for seed in (0, 1))
+    assert again == chosen != other
     assert choose_over_all(samples, 1000, np.random.default_rng(0)) == list(range(len(samples)))
     assert choose_over_all([], 5, np.random.default_rng(0)) == []
 
 
-def test_the_best_is_who_decides_best_and_patience_ends():
-    progress = Progress()
-    found = []
-    for step, (accuracy, loss) in enumerate([(0.2, 3.0), (0.5, 2.0), (0.5, 1.0), (0.4, 0.5), (0.5, 1.5)], 1):
-        progress = judged(
-            progress.model_copy(update={"step": step}), Validation(samples=4, loss=loss, accuracy=accuracy), 2
-        )
+@pytest.mark.parametrize("best_by", ["decision", "verdict"])
+def test_the_best_is_who_decides_best_and_patience_ends(best_by):
+    progress, cfg, found = Progress(), TrainConfig(best_by=best_by, patience=2), []
+    for step, (share, loss) in enumerate([(0.2, 3.0), (0.5, 2.0), (0.5, 1.0), (0.4, 0.5), (0.5, 1.5)], 1):
+        other = 0.1 * step  # what is not followed only grows
+        accuracy, consistent = (share, other) if best_by == "decision" else (other, share)
+        validation = Validation(samples=4, loss=loss, accuracy=accuracy, consistent=consistent)
+        progress = judged(progress.model_copy(update={"step": step}), validation, cfg)
         found.append((progress.best_step, progress.stale, progress.has_ended))
     assert found == [(1, 0, False), (2, 0, False), (3, 0, False), (3, 1, False), (3, 2, True)]
-    assert judged(Progress(step=9, best_score=(1.0, 0.0)), Validation(samples=1, loss=1.0), 0).has_ended is False
+    patient = TrainConfig(patience=0)
+    assert not judged(Progress(step=9, best_score=(1.0, 0.0)), Validation(samples=1, loss=1.0), patient).has_ended
+    with pytest.raises(ValueError, match="verdict needs validation_answers"):
+        TrainConfig(best_by="verdict", validation_answers=False)
+
+
+def test_an_answer_is_judged_by_the_teacher_and_by_the_future(place):
+    sample = samples_of(place)[0].model_copy(update={"label": "hover", "contradicted": ("ascend",)})
+
+    def counts(changes: dict, **future: object) -> list[float]:
+        answer = json.dumps({**json.loads(sample.answer), **changes})
+        return fit._judged_answer(sample.model_copy(update=future), Completion(answer, 9, True)).tolist()
+
+    assert sample.decision != "hover"
+    assert counts({}) == [1, 1, 1, 0]
+    assert counts({"flight_decision": "hover"}) == [1, 0, 1, 1]
+    assert counts({"flight_decision": "hover"}, contradicted=None) == [1, 0, 0, 0]
+    assert counts({"flight_decision": "dance"}) == [0, 0, 1, 0]
 
 
 @pytest.mark.slow
 def test_training_ends_early_and_keeps_the_best_weights(place, tmp_path):
-    """A rate that soon makes it worse: the product is the checkpoint of the best validation, also when it is run again."""
+    """A rate that soon makes it worse: the product is the checkpoint of the best validation, also when it is run
+    again."""
     settings = {"learning_rate": 5.0, "validate_every_steps": 1, "patience": 2, "keep_checkpoints": 1, "max_steps": 12}
     out = tmp_path / "out"
     run(place, out, **settings)
@@ -189,9 +205,6 @@ def test_training_ends_early_and_keeps_the_best_weights(place, tmp_path):
     weights.write_bytes(weights.read_bytes()[:-7])
     with pytest.raises(InputError, match=r"best validation is damaged.*weights\.safetensors"):
         run(place, out, **settings)
-
-
-# --- before the first step --------------------------------------------------------------------------------------------
 
 
 def test_the_list_before_the_first_step(place, tmp_path):
@@ -216,7 +229,8 @@ def test_missing_fast_kernels_are_named_where_they_matter(place):
 
 
 def test_what_is_kept_for_the_backward_pass_is_measured(place):
-    """It grows with the batch, and recomputing keeps far less; freezing everything but the adapter keeps less than learning in full."""
+    """It grows with the batch, and recomputing keeps far less; freezing everything but the adapter keeps less than
+    learning in full."""
     cfg = TrainConfig(**FAST)
     lora = train.add_adapter(load(place), cfg, 0)
     kept = saved_bytes_per_token(lora, cfg)

@@ -1,4 +1,5 @@
-"""distill: what goes wrong in a training ends in one clear line or a recorded skip, and the last good checkpoint stays."""
+"""distill: what goes wrong in a training ends in one clear line or a recorded skip, and the last good checkpoint
+stays."""
 
 from __future__ import annotations
 
@@ -57,9 +58,6 @@ def begun(place: Path, out: Path, num_steps: int = 7, **settings: object) -> Non
             run(place, out, **settings)
 
 
-# --- samples that cannot be learnt from -------------------------------------------------------------------------------
-
-
 def test_samples_are_left_out_with_a_reason_and_counted(place, tmp_path):
     good = samples_of(place)
     long = good[0].model_copy(update={"sample_id": "long", "answer": "tree " * 5000})
@@ -83,13 +81,19 @@ def test_samples_are_left_out_with_a_reason_and_counted(place, tmp_path):
 
 
 def test_nothing_to_learn_from_is_an_error_with_the_counts(place, tmp_path):
+    """And the folder, where no training had begun, takes other settings: of the random student that stands in it,
+    too."""
     with pytest.raises(NothingKept, match="too_long 12"):
-        run(place, tmp_path / "out", max_tokens=32)
+        run(place, tmp_path / "out", "tiny", max_tokens=32)
     assert not (tmp_path / "out" / "manifest.json").exists()
+    assert (tmp_path / "out" / "student" / "config.json").exists()
+    run(place, tmp_path / "out", "random", max_steps=1, random_student={"width": 32})
+    assert '"hidden_size": 32' in (tmp_path / "out" / "student" / "config.json").read_text()
 
 
 def test_a_picture_that_does_not_decode_costs_its_samples(place, tmp_path):
-    """Its header is right, so only the step that needs it finds out; the others are learnt from, and once more the same."""
+    """Its header is right, so only the step that needs it finds out; the others are learnt from, and once more the
+    same."""
     tree = shutil.copytree(place / "tree", tmp_path / "tree")
     sample = samples_of(place)[0]
     path = tree / sample.images[0]
@@ -112,9 +116,6 @@ def test_a_decision_that_train_never_shows_is_told(place, tmp_path):
     run(place, tmp_path / "out", dataset=dataset, max_steps=1)
     assert "val asks for what train never shows" in (tmp_path / "out" / "preflight.json").read_text()
     assert "will be wrong: hover" in (tmp_path / "out" / "preflight.json").read_text()
-
-
-# --- students that do not fit -----------------------------------------------------------------------------------------
 
 
 def test_a_tokenizer_without_a_needed_token_is_named(place, tmp_path):
@@ -158,9 +159,6 @@ def test_presets_and_other_names(place, tmp_path):
         run(place, tmp_path / "out", "tiny:huge")
     with pytest.raises(InputError, match="student model"):
         run(place, tmp_path / "out", tmp_path / "nowhere")
-
-
-# --- machines ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -1,10 +1,12 @@
-"""distill: the loss against the library's own, samples in batches against samples alone, features of pictures against none kept."""
+"""distill: the loss against the library's own, samples in batches against samples alone, features of pictures against
+none kept."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,12 +14,12 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
-from specimens_students import FAST, TWELVE, load, losses_of, samples_of, trees_of  # noqa: E402
+from specimens_students import FAST, TWELVE, features_of, inputs_of, load, losses_of, samples_of, trees_of  # noqa: E402
 
 from cosfly.errors import ConfigError  # noqa: E402
-from distill.student.encoding import EncodedSample, encode, padded, prompt_batch  # noqa: E402
+from distill.student.encoding import EncodedSample, encode_text, padded  # noqa: E402
 from distill.student.features import (  # noqa: E402
-    Picture,
+    FramePicture,
     PictureData,
     PictureReader,
     VisionFeatures,
@@ -25,14 +27,14 @@ from distill.student.features import (  # noqa: E402
 )
 from distill.student.model import Student  # noqa: E402
 from distill.training import stage as train  # noqa: E402
-from distill.training.loading import PictureBatch  # noqa: E402
+from distill.training.loading import Maker, Order  # noqa: E402
 from distill.training.loss import answer_loss, chunked_loss, output_head  # noqa: E402
 from distill.training.settings import TARGET_MODULES, TrainConfig  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-# Adam divides by what gradients were before, so rounding grows from step to step, with a rate that makes a student learn in 12 steps
-# sooner than with usual ones.
+# Adam divides by what gradients were before, so rounding grows from step to step, with a rate that makes a student
+# learn in 12 steps sooner than with usual ones.
 FOUR = {**TWELVE, "max_steps": 4, "validation_samples": 0, "learning_rate": 1e-3}
 
 
@@ -41,16 +43,10 @@ def place(students) -> Path:
     return students
 
 
-def features_of(own: Student, rows: Sequence[EncodedSample]) -> torch.Tensor:
-    inputs = prompt_batch(own, rows)
-    return torch.cat(own.core.get_image_features(inputs["pixel_values"], inputs["image_grid_thw"]).pooler_output)
-
-
-def rows_of(place: Path, own: Student, count: int) -> list[EncodedSample]:
-    return [encode(own, sample, trees_of(place)) for sample in samples_of(place)[:count]]
-
-
-# --- the loss ---------------------------------------------------------------------------------------------------------
+def seen(place: Path, own: Student, count: int) -> tuple[list[EncodedSample], torch.Tensor]:
+    """Some samples, and what the tower makes of their pictures."""
+    samples = samples_of(place)[:count]
+    return [encode_text(own, s) for s in samples], features_of(own, inputs_of(own, samples, trees_of(place)))
 
 
 @pytest.mark.parametrize("chunk", [7, 1000])
@@ -84,20 +80,21 @@ def test_a_frozen_head_gets_no_gradient_and_no_tokens_no_loss():
 
 
 def test_loss_and_gradients_are_those_of_the_library(place):
-    """The library's own forward pass with labels: the same mean over answer tokens, and the same gradient of every adapted weight."""
+    """The library's own forward pass with labels: the same mean over answer tokens, and the same gradient of every
+    adapted weight."""
     own = train.add_adapter(load(place), TrainConfig(**FAST), 0)
     with torch.no_grad():  # a fresh adapter's second matrix is zero, which would hide the first one's gradient
         for name, parameter in own.model.named_parameters():
             if "lora_B" in name:
                 parameter.normal_(0, 0.02, generator=torch.Generator().manual_seed(len(name)))
-    row = rows_of(place, own, 1)[0]
+    (row,), features = seen(place, own, 1)
     learning = {name: p for name, p in own.model.named_parameters() if p.requires_grad}
-    total, nats = answer_loss(own, [row], features_of(own, [row]), 16)
+    total, nats = answer_loss(own, [row], features, 16)
     (total / len(row.answer_ids)).backward()
     found = {name: p.grad.clone() for name, p in learning.items()}
     own.model.zero_grad()
     ids, labels, _ = padded(own, [row])
-    inputs = prompt_batch(own, [row]) | {
+    inputs = inputs_of(own, samples_of(place)[:1], trees_of(place)) | {
         "input_ids": torch.from_numpy(ids), "attention_mask": torch.ones(ids.shape, dtype=torch.int64),
         "mm_token_type_ids": torch.from_numpy((ids == own.image_token_id).astype(np.int64)),
     }  # fmt: skip
@@ -112,13 +109,14 @@ def test_loss_and_gradients_are_those_of_the_library(place):
 def test_a_sample_in_a_batch_has_its_loss_alone(place):
     """Neither padding nor neighbours reach it, in linear attention, convolution or full attention."""
     own = load(place)
-    rows = rows_of(place, own, 4)
+    rows, features = seen(place, own, 4)
+    parts = features.split([int((row.prompt_ids == own.image_token_id).sum()) for row in rows])
     # Lengths far apart, one beyond a piece of 64 tokens of the linear attention.
     rows[1] = replace(rows[1], answer_ids=np.tile(rows[1].answer_ids, 3))
     rows[2] = replace(rows[2], answer_ids=rows[2].answer_ids[:5], weight=0.5)
     with torch.no_grad():
-        _, together = answer_loss(own, rows, features_of(own, rows), 64)
-        alone = [answer_loss(own, [row], features_of(own, [row]), 64) for row in rows]
+        _, together = answer_loss(own, rows, features, 64)
+        alone = [answer_loss(own, [row], part, 64) for row, part in zip(rows, parts, strict=True)]
     for row, found, (total, nats) in zip(rows, together.tolist(), alone, strict=True):
         assert found == pytest.approx(float(nats[0]), rel=1e-5)
         assert float(total) == pytest.approx(row.weight * float(nats[0]), rel=1e-6)
@@ -126,13 +124,9 @@ def test_a_sample_in_a_batch_has_its_loss_alone(place):
 
 def test_a_sample_without_pictures_has_a_loss(place):
     own = load(place)
-    row = rows_of(place, own, 1)[0]
-    text = replace(
-        row,
-        prompt_ids=row.prompt_ids[row.prompt_ids != own.image_token_id],
-        image_grids=np.zeros((0, 3), np.int64),
-        pixel_values=None,
-    )
+    row = encode_text(own, samples_of(place)[0])
+    words = row.prompt_ids[row.prompt_ids != own.image_token_id]
+    text = replace(row, prompt_ids=words, image_grids=np.zeros((0, 3), np.int64))
     with torch.no_grad():
         total, _ = answer_loss(own, [text], torch.zeros((0, 64)), 16)
     assert np.isfinite(float(total))
@@ -151,9 +145,6 @@ def test_adapted_layers_keep_no_copy_of_what_they_are_given(place):
     assert not any(found)
 
 
-# --- features ---------------------------------------------------------------------------------------------------------
-
-
 def fed(features: VisionFeatures, reader: PictureReader, pictures: Sequence) -> list:
     """Take a step's pictures; gives those that had to be read."""
     plan = features.plan()
@@ -168,7 +159,7 @@ def test_features_are_the_towers_and_made_once(place):
     pictures = pictures_of(sample)
     assert len(fed(features, reader, [*pictures, *pictures])) == 5
     found = features.of(pictures)
-    assert torch.allclose(found, features_of(own, [encode(own, sample, trees_of(place))]), atol=1e-5)
+    assert torch.allclose(found, features_of(own, inputs_of(own, [sample], trees_of(place))), atol=1e-5)
     features.end_step()
     assert fed(features, reader, pictures) == []
     assert torch.equal(features.of(pictures), found)
@@ -190,14 +181,16 @@ def test_what_memory_has_no_room_for_is_looked_at_again(place):
 
 def test_pictures_go_from_process_to_process_as_one_tensor():
     """However many they are: each tensor on its way holds a file open."""
-    pictures = [Picture("run", str(number), "rgb", (64, 64), 100.0) for number in range(40)]
+    pictures = [FramePicture("run", str(number), "rgb", (64, 64), 100.0) for number in range(40)]
     loaded = [PictureData(picture, torch.rand(number % 5, 6)) for number, picture in enumerate(pictures)]
-    for chosen in (loaded, loaded[:1], []):
-        packed = PictureBatch.of(chosen)
-        assert not any(isinstance(value, torch.Tensor) for facts in packed.pictures for value in facts)
-        for item, wanted in zip(packed.loaded(), chosen, strict=True):
+    reader = SimpleNamespace(processor=None, read={item.picture: item for item in loaded}.__getitem__)
+    for chosen in (pictures, pictures[:1], []):
+        made = Maker([], reader)(Order(0, [], chosen))
+        assert not any(isinstance(value, torch.Tensor) for facts in made.pictures for value in facts)
+        for item, wanted in zip(made.loaded(), loaded, strict=False):
             assert item.picture == wanted.picture
             assert torch.equal(item.patches, wanted.patches)
+        assert len(made.loaded()) == len(chosen)
 
 
 @pytest.mark.parametrize(

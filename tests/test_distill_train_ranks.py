@@ -1,4 +1,5 @@
-"""distill: many processes of one training, on a CPU over gloo, give what one gives; and what becomes of them when one dies."""
+"""distill: many processes of one training, on a CPU over gloo, give what one gives; and what becomes of them when one
+dies."""
 
 from __future__ import annotations
 
@@ -50,19 +51,29 @@ def start(place: Path, out: Path, size: int, **changes: object) -> list[subproce
     """Start the processes of a training as a launcher would."""
     settings = [f"distill.train.{name}={json.dumps(value)}" for name, value in {**SETTINGS, **changes}.items()]
     command = [
-        sys.executable, "-m", "cosfly", "distill", "train", "--dataset", str(place / "set"), "--data", str(place / "tree"),
-        "--student", str(place / "student"), "--out", str(out), *(word for text in settings for word in ("--set", text)),
-    ]  # fmt: skip
-    port = str(free_port())
+        sys.executable,
+        "-m",
+        "cosfly",
+        "distill",
+        "train",
+        "--student",
+        str(place / "student"),
+        "--out",
+        str(out),
+    ]
+    command += ["--dataset", str(place / "set"), "--data", str(place / "tree")]
+    command += [word for text in settings for word in ("--set", text)]
+    group = {
+        "WORLD_SIZE": str(size),
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(free_port()),
+        "OMP_NUM_THREADS": "1",
+    }
+    given: dict = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
     return [
-        subprocess.Popen(
-            command,
-            env={**os.environ, "OMP_NUM_THREADS": "1", "RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(size),
-                 "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port},
-            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-        )
+        subprocess.Popen(command, env={**os.environ, **group, "RANK": str(rank), "LOCAL_RANK": str(rank)}, **given)
         for rank in range(size)
-    ]  # fmt: skip
+    ]
 
 
 def finish(processes: list[subprocess.Popen]) -> list[int]:
@@ -136,12 +147,19 @@ def test_when_one_dies_all_end_and_one_process_goes_on(place, alone, tmp_path):
 @pytest.mark.slow
 def test_a_launcher_starts_them(place, tmp_path):
     """`torchrun` on the command itself: one folder, one log, status 0; and status 1 where a setting is wrong."""
+    settings = ["max_steps=2", "device=cpu", "data_workers=0", "validation_samples=2", "max_new_tokens=2"]
     command = [
-        sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", str(free_port()), "-m", "cosfly",
-        "distill", "train", "--dataset", str(place / "set"), "--data", str(place / "tree"), "--student", "tiny",
-        "--out", str(tmp_path / "out"), "--set", "distill.train.max_steps=2", "--set", "distill.train.device=cpu",
-        "--set", "distill.train.data_workers=0", "--set", "distill.train.validation_samples=2", "--set", "distill.train.max_new_tokens=2",
-    ]  # fmt: skip
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--nproc-per-node",
+        "2",
+        "--master-port",
+        str(free_port()),
+    ]
+    command += ["-m", "cosfly", "distill", "train", "--student", "tiny", "--out", str(tmp_path / "out")]
+    command += ["--dataset", str(place / "set"), "--data", str(place / "tree")]
+    command += [word for text in settings for word in ("--set", f"distill.train.{text}")]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=180, check=False)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -7,6 +7,7 @@ grows while items are finished, `failures.jsonl` and `manifest.json` are written
 from __future__ import annotations
 
 import logging
+import shutil
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -196,6 +197,7 @@ class StageFolder:
         audited: Collection[str] = (),
         grows: Collection[str] = (),
         begins_anew: bool = False,
+        begun: Collection[str] = (),
     ) -> StageFolder:
         """Start or continue a stage.
 
@@ -211,6 +213,7 @@ class StageFolder:
             audited: names of inputs that the stage itself holds against their records, item by item.
             grows: names of settings of which more means more items, those of before unchanged.
             begins_anew: with grown inputs all items are other ones, so none of before is kept.
+            begun: files and folders that the stage writes before anything is finished, beside those of every stage.
         Raises:
             VerifyError: an input is not what its stage finished, or was made of another one than that which is given
                 with it.
@@ -233,7 +236,7 @@ class StageFolder:
         lock = hold_folder(out, nothing=("stage.json",))
         try:
             refuse_links(out)
-            record = _taken_up(out, record, resume, grows, begins_anew)
+            record = _taken_up(out, record, resume, grows, begins_anew, (*BEGUN, *begun))
             # Failed items are tried again; the others stand in the journal.
             (out / "manifest.json").unlink(missing_ok=True)
             write_model(out / "stage.json", record, schema=STAGE_SCHEMA, version=VERSION)
@@ -325,7 +328,9 @@ class StageFolder:
         )
 
 
-def _taken_up(out: Path, record: StageRecord, resume: Resume, grows: Collection[str], begins_anew: bool) -> StageRecord:
+def _taken_up(
+    out: Path, record: StageRecord, resume: Resume, grows: Collection[str], begins_anew: bool, begun: Collection[str]
+) -> StageRecord:
     """Make what stands in a folder ready to be gone on with; gives the record with what has grown noted."""
     if not (out / "stage.json").exists():
         # A kill may have come while the record was being written.
@@ -336,12 +341,10 @@ def _taken_up(out: Path, record: StageRecord, resume: Resume, grows: Collection[
         return record
     found = read_stage_record(out)
     # An attempt that ended before anything was finished binds nobody to its settings, unless it grew from what was.
-    if not _holds_work(out) and not found.grown_from:
-        # stage.json stays until the new one is written: without it a kill would leave what looks like somebody else's
-        # files.
-        for name in BEGUN:
-            if name != "stage.json":
-                (out / name).unlink(missing_ok=True)
+    if not _holds_work(out, begun) and not found.grown_from:
+        # stage.json stays until the new one is written: without it a kill would leave what looks like foreign files.
+        for path in (out / name for name in begun if name != "stage.json"):
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
         return record
     grown = _may_continue(out, record, resume, grows)
     before = list(found.grown_from)
@@ -376,13 +379,14 @@ def _may_continue(out: Path, record: StageRecord, resume: Resume, grows: Collect
     return list(grown.values())
 
 
-def _holds_work(out: Path) -> bool:
+def _holds_work(out: Path, begun: Collection[str]) -> bool:
     """Tell whether a stage folder holds anything that was finished, and not only the records of failures."""
     if any(not isinstance(item, Failed) for item in Journal(out / "items.jsonl").read_as(read_item)):
         return True
     files = (path.relative_to(out) for path in out.rglob("*") if path.is_file())
     return any(
-        str(file) not in (*BEGUN, LOCK) and not any(part.endswith(".partial") for part in file.parts) for file in files
+        file.parts[0] not in (*begun, LOCK) and not any(part.endswith(".partial") for part in file.parts)
+        for file in files
     )
 
 

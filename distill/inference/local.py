@@ -1,7 +1,8 @@
-"""Samples answered by a student in this process: prompts of like length together, each picture looked at once, answers journaled.
+"""Samples answered in this process: prompts of like length together, each picture looked at once, answers journaled.
 
-Samples are taken a shelf at a time, in their order; within a shelf they are sorted by length and cut into batches. Which samples are in
-one batch follows from the samples and the settings alone, since rounding may depend on it: a run that was killed answers like one that was not.
+Samples are taken a shelf at a time, in their order; within a shelf they are sorted by length and cut into batches.
+Which samples are in one batch follows from the samples and the settings alone, since rounding may depend on it: a run
+that was killed answers like one that was not.
 """
 
 from __future__ import annotations
@@ -23,13 +24,12 @@ from cosfly.products.answer_text import answer_schema
 from cosfly.products.captions import Language
 from cosfly.products.places import flight_of
 from cosfly.work.console import Advance
-from cosfly.work.stage_folder import Failed
 from cosfly.work.store import dump_json, sha256_bytes
-from distill.inference.outcome import OpenFlights, Outcome
+from distill.inference.outcome import OpenFlights, SampleOutcome, failed
 from distill.schema import Sample
 from distill.student.decoding import Completion, Constraint, decode
 from distill.student.encoding import EncodedSample, encode_text
-from distill.student.features import Picture, PictureData, PictureReader, VisionFeatures, pictures_of
+from distill.student.features import FramePicture, PictureData, PictureReader, VisionFeatures, pictures_of
 from distill.student.model import Processor, Student, require
 
 log = logging.getLogger(__name__)
@@ -45,9 +45,9 @@ class _Shelf:
 
     def __init__(self, samples: list[Sample], features: VisionFeatures) -> None:
         self.samples, self.features = samples, features
-        self.found: dict[str, Outcome] = {}  # by key of the sample
+        self.found: dict[str, SampleOutcome] = {}  # by key of the sample
         self.rows: dict[str, EncodedSample] = {}
-        self.damaged: dict[Picture, InputError] = {}
+        self.damaged: dict[FramePicture, InputError] = {}
         self.plan = features.plan()
         self._num_told = 0
 
@@ -74,7 +74,7 @@ class LocalAnswers:
     ) -> None:
         """
         Args:
-            model: its name, for the journal. max_tokens: of an answer. constrain: makes what holds the answers of a batch to their form.
+            model: its name, for the journal. max_tokens: of an answer. constrain: makes a batch's constraint.
             feature_bytes: most memory for what the vision tower made of the pictures of a shelf.
         """
         self.student, self.book, self.model = student, book, model
@@ -92,7 +92,7 @@ class LocalAnswers:
     def __exit__(self, *_: object) -> None:
         self._threads.shutdown(wait=True, cancel_futures=True)
 
-    async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[Outcome, None]:
+    async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[SampleOutcome, None]:
         """Yield what becomes of each sample, in their order; `advance` is told of them as they come, a batch at a time.
 
         Raises:
@@ -113,18 +113,16 @@ class LocalAnswers:
         for sample in shelf.samples:
             known = self.book.get(self._flights.begun(sample), self._key(sample))
             if known is not None:
-                shelf.found[sample.key] = Outcome(sample, known)
+                shelf.found[sample.key] = SampleOutcome(sample, known)
 
     def _key(self, sample: Sample) -> str:
         """Name what the answer depends on beside what the folder's records hold: weights, pictures and settings."""
         asked = sample.model_dump(mode="json", include={"run", "window", "views", "picture_px", "prompt", "language"})
-        return sha256_bytes(
-            dump_json([self.model, sample.sample_id, asked, self.max_tokens, self.constrain is not None]).encode()
-        )
+        key = [self.model, sample.sample_id, asked, self.max_tokens, self.constrain is not None]
+        return sha256_bytes(dump_json(key).encode())
 
     async def _answer(self, shelf: _Shelf, advance: Advance) -> None:
-        """Answer what is not answered. Pictures of the others are looked at all the same: which are looked at together may tell in the
-        last bit."""
+        """Answer what is not answered. Pictures of all are looked at: which are together may tell in the last bit."""
         batches = self._batches(shelf)
         loading = [self._load(shelf, batch) for batch in batches[:1]]
         for number, batch in enumerate(batches):
@@ -143,25 +141,21 @@ class LocalAnswers:
             try:
                 shelf.rows[sample.key] = encode_text(self.student, sample)
             except InputError as error:
-                shelf.found[sample.key] = _failed(sample, error)
-        ordered = sorted(
-            (sample for sample in shelf.samples if sample.key in shelf.rows),
-            key=lambda sample: (
-                -len(shelf.rows[sample.key].prompt_ids),
-                sample.key,
-            ),  # the largest first: it shows what fits
-        )
+                shelf.found[sample.key] = failed(sample, error.code, error)
+        rows = sorted(
+            shelf.rows.values(), key=lambda row: (-len(row.prompt_ids), row.key)
+        )  # the largest shows what fits
+        by_key = {sample.key: sample for sample in shelf.samples}
+        ordered = [by_key[row.key] for row in rows]
         return [ordered[start : start + self.batch_size] for start in range(0, len(ordered), self.batch_size)]
 
-    # --- pictures ---
-
-    def _load(self, shelf: _Shelf, batch: Sequence[Sample]) -> dict[Picture, Future[PictureData]]:
+    def _load(self, shelf: _Shelf, batch: Sequence[Sample]) -> dict[FramePicture, Future[PictureData]]:
         """Have pictures read that are not known."""
         pictures = [picture for sample in batch for picture in pictures_of(sample) if picture not in shelf.damaged]
         wanted = shelf.features.wanted(shelf.plan, pictures)
         return {picture: self._threads.submit(self._reader.read, picture) for picture in wanted}
 
-    def _look(self, shelf: _Shelf, loading: Mapping[Picture, Future[PictureData]]) -> None:
+    def _look(self, shelf: _Shelf, loading: Mapping[FramePicture, Future[PictureData]]) -> None:
         """Have the vision tower look at what was read."""
         loaded: list[PictureData] = []
         for picture, future in loading.items():
@@ -175,10 +169,8 @@ class LocalAnswers:
         """Tell whether a picture of a sample cannot be read; it has then failed, and no other with it."""
         error = next((shelf.damaged[picture] for picture in pictures_of(sample) if picture in shelf.damaged), None)
         if error is not None:
-            shelf.found[sample.key] = _failed(sample, error)
+            shelf.found[sample.key] = failed(sample, error.code, error)
         return error is not None
-
-    # --- answers ---
 
     def _decode(self, shelf: _Shelf, samples: Sequence[Sample]) -> list[Completion]:
         """Answer samples together, in halves where the memory does not hold them all.
@@ -203,56 +195,38 @@ class LocalAnswers:
         import torch
 
         if num_rows == 1:
-            raise ConfigError(
-                "the accelerator's memory does not hold one sample", where="distill.infer.max_new_tokens", got=said,
-                fix="lower max_new_tokens or max_pixels, or ask a server (--engine endpoint)",
-            )  # fmt: skip
+            fix = "lower max_new_tokens or max_pixels, or ask a server (--engine endpoint)"
+            words, where = "the accelerator's memory does not hold one sample", "distill.infer.max_new_tokens"
+            raise ConfigError(words, where=where, got=said, fix=fix)
         self.most_rows = num_rows // 2
-        log.warning(
-            "distill.infer: the memory is full with %d samples; going on with %d at once", num_rows, self.most_rows
-        )
+        log.warning("distill.infer: the memory is full with %d samples; now %d at once", num_rows, self.most_rows)
         if torch.cuda.is_available():
             torch.cuda.empty_cache()
 
     def _decode_together(self, shelf: _Shelf, samples: Sequence[Sample]) -> list[Completion]:
-        return decode(
-            self.student,
-            [shelf.rows[sample.key] for sample in samples],
-            max_tokens=self.max_tokens,
-            constraint=self.constrain([sample.language for sample in samples]) if self.constrain else None,
-            features=shelf.features.of([picture for sample in samples for picture in pictures_of(sample)]),
-        )
+        constraint = self.constrain([sample.language for sample in samples]) if self.constrain else None
+        features = shelf.features.of([picture for sample in samples for picture in pictures_of(sample)])
+        rows = [shelf.rows[sample.key] for sample in samples]
+        return decode(self.student, rows, features, max_tokens=self.max_tokens, constraint=constraint)
 
-    async def _keep(
-        self, shelf: _Shelf, samples: Sequence[Sample], decoded: Sequence[Completion], begun_s: float
-    ) -> None:
+    async def _keep(self, shelf: _Shelf, samples: list[Sample], decoded: list[Completion], begun_s: float) -> None:
         """Journal new answers; they are on the disk when this returns."""
         latency_s = round(time.monotonic() - begun_s, 3)
         for sample, answer in zip(samples, decoded, strict=True):
             if sample.key not in shelf.found:
                 new = self._answer_of(sample, shelf.rows[sample.key], answer, latency_s)
-                shelf.found[sample.key] = Outcome(sample, new, is_new=True)
+                shelf.found[sample.key] = SampleOutcome(sample, new, is_new=True)
         found = [shelf.found[sample.key] for sample in samples]
         new_ones = [each.found for each in found if each.is_new and isinstance(each.found, Answer)]
         await asyncio.gather(*(self.book.put(flight_of(answer.sample_id), answer) for answer in new_ones))
 
     def _answer_of(self, sample: Sample, row: EncodedSample, decoded: Completion, latency_s: float) -> Answer:
         return Answer(
-            key=self._key(sample),
-            sample_id=sample.sample_id,
-            purpose=sample.language,
-            model=self.model,
-            text=decoded.text,
-            usage={"prompt_tokens": len(row.prompt_ids), "completion_tokens": decoded.num_tokens},
-            structured="json_schema" if self.constrain else "plain",
+            key=self._key(sample), sample_id=sample.sample_id, purpose=sample.language, model=self.model,
+            text=decoded.text, usage={"prompt_tokens": len(row.prompt_ids), "completion_tokens": decoded.num_tokens},
+            structured="json_schema" if self.constrain else "plain", latency_s=latency_s, time=round(time.time(), 3),
             finish_reason="stop" if decoded.is_finished else "length",
-            latency_s=latency_s,
-            time=round(time.time(), 3),
-        )
-
-
-def _failed(sample: Sample, error: InputError) -> Outcome:
-    return Outcome(sample, Failed(id=sample.key, code=error.code, message=str(error)))
+        )  # fmt: skip
 
 
 class SchemaConstraint:
@@ -294,12 +268,10 @@ class AnswerSchemas:
         self._tokens = from_tokenizer(student.tokenizer, eos_token=student.end_token_id)
         languages: tuple[Language, ...] = ("en", "zh")
         # Free whitespace would let a student pad for ever.
-        self._grammars = {
-            language: LLMatcher.grammar_from_json_schema(
-                answer_schema(language=language), defaults={"whitespace_flexible": False}
-            )
-            for language in languages
-        }
+        strict: Any = {"whitespace_flexible": False}
+        schemas = {language: answer_schema(language=language) for language in languages}
+        grammar_of = LLMatcher.grammar_from_json_schema
+        self._grammars = {language: grammar_of(schema, defaults=strict) for language, schema in schemas.items()}
 
     def __call__(self, languages: Sequence[Language]) -> SchemaConstraint:
         return SchemaConstraint(self._tokens, [self._grammars[language] for language in languages])

@@ -1,7 +1,7 @@
-"""An adapter's updates put into the weights of its base: a model folder that needs no peft, for transformers, vLLM and any server.
+"""An adapter's updates put into the weights of its base: a model folder for transformers, vLLM and any server.
 
-The base's files are gone through one tensor after the other, so a model of any size fits, and what the adapter leaves alone
-(the vision tower, layers that transformers does not load) comes out byte for byte as it was.
+The base's files are gone through one tensor after the other, so a model of any size fits, and what the adapter leaves
+alone (the vision tower, layers that transformers does not load) comes out byte for byte as it was.
 """
 
 from __future__ import annotations
@@ -32,10 +32,7 @@ COPIED = ("*.json", "*.jinja", "*.txt", "*.model", "LICENSE*")
 class MergeConfig(Config):
     """Settings of `distill merge`."""
 
-    dtype: Literal["base", "float32"] = Field(
-        "base",
-        description="of the tensors that the adapter changes: as in the base, or float32; sums are made in float32",
-    )
+    dtype: Literal["base", "float32"] = Field("base", description="of what the adapter changes; sums are in float32")
 
 
 class LoraSettings(BaseModel):
@@ -66,8 +63,8 @@ def run(cfg: MergeConfig, model: Path, adapter: Path, out: Path, *, resume: Resu
     Returns:
         The folder `model/`, which transformers and vLLM load.
     Raises:
-        InputError: the adapter is of another base, or of a kind that is not merged here. StorageError: the disk is full.
-        EnvironmentMissing: torch or safetensors is missing.
+        InputError: the adapter is of another base, or of a kind that is not merged here.
+        StorageError: the disk is full. EnvironmentMissing: torch or safetensors is missing.
     """
     require("torch", "safetensors")
     model = student_folder(str(model))
@@ -87,12 +84,8 @@ def run(cfg: MergeConfig, model: Path, adapter: Path, out: Path, *, resume: Resu
                 advance(1)
         _mend_index(partial, num_bytes)
         if left := updates.unused():
-            raise InputError(
-                "the base has no layer that the adapter changes",
-                where=adapter,
-                got=left[0],
-                fix="give the base that it was trained on",
-            )
+            fix = "give the base that it was trained on"
+            raise InputError("the base has no layer that the adapter changes", where=adapter, got=left[0], fix=fix)
     outputs = [path for path in merged.iterdir() if path.is_file()]
     tally = Tally(input=len(updates.names), kept=len(updates.names))
     stage.finish(outputs, tally, dtype=cfg.dtype)
@@ -107,11 +100,9 @@ def adapter_files(adapter: Path) -> dict[str, Path]:
     """
     names = ("adapter_config.json", "adapter_model.safetensors")
     if not all((adapter / name).is_file() for name in names):
-        whole = (adapter / "config.json").is_file()
-        raise InputError(
-            "whole weights already, with nothing to merge" if whole else "not an adapter",
-            where=adapter, expected=" and ".join(names), fix="give --model this folder" if whole else "give adapter/ of cosfly distill train",
-        )  # fmt: skip
+        if (adapter / "config.json").is_file():
+            raise InputError("whole weights already: nothing to merge", where=adapter, fix="give --model this folder")
+        raise InputError("not an adapter", where=adapter, expected=" and ".join(names))
     return {f"adapter/{path.name}": path for path in sorted(adapter.iterdir()) if path.is_file()}
 
 
@@ -142,13 +133,9 @@ class Updates:
     def add_to(self, name: str, weight: Any) -> Any:
         """Give a weight (m, n) with its update, in float32."""
         down, up = self._pairs[name]
-        if weight.shape != (up.shape[0], down.shape[1]):
-            raise InputError(
-                "an update of another shape than its layer",
-                where=name,
-                got=(up.shape[0], down.shape[1]),
-                expected=str(tuple(weight.shape)),
-            )
+        if weight.shape != (found := (up.shape[0], down.shape[1])):
+            words = "an update of another shape than its layer"
+            raise InputError(words, where=name, got=found, expected=str(tuple(weight.shape)))
         self._used.add(name)
         return weight.float() + self._scale * (up.float() @ down.float())
 
@@ -185,9 +172,8 @@ def _merge_shard(shard: Path, out: Path, updates: Updates, dtype: str) -> int:
         if name in updates:
             merged = updates.add_to(name, tensors[name])
             tensors[name] = merged.to(tensors[name].dtype if dtype == "base" else torch.float32)
-    for name in tensors:
-        if name in updates and not torch.isfinite(tensors[name]).all():
-            raise InputError("a merged weight is not finite", where=shard, got=name, fix="look at the training's loss")
+            if not torch.isfinite(tensors[name]).all():
+                raise InputError("a merged weight is not finite", where=shard, got=name, fix="see the training's loss")
     with storage_errors(out):
         save_tensors(out, tensors, metadata)
     return sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())

@@ -23,12 +23,17 @@ MOST_FLIGHTS = 32  # whose answers stay in memory when nothing is asked about th
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SampleOutcome:
     """A sample with its answer, or with why there is none."""
 
     sample: Sample
     found: Answer | Failed
     is_new: bool = False  # made by this run, not kept from an earlier one
+
+
+def failed(sample: Sample, code: str, error: Exception) -> SampleOutcome:
+    """Give what became of a sample that got no answer."""
+    return SampleOutcome(sample, Failed(id=sample.key, code=code, message=str(error)))
 
 
 def make_prediction(sample: Sample, split: Split, text: str, num_tokens: int, is_finished: bool) -> Prediction:
@@ -50,11 +55,11 @@ def make_prediction(sample: Sample, split: Split, text: str, num_tokens: int, is
 
 
 def failed_prediction(sample: Sample, split: Split, code: str) -> Prediction:
-    """Give the record of a sample without an answer: empty, and its reason says so, so that nobody takes it for a wrong one."""
+    """Give the record of a sample without an answer: empty, and its reason says that it is no wrong one."""
     return make_prediction(sample, split, "", 0, False).model_copy(update={"reason": f"{FAILED}{code}"})
 
 
-def prediction_of(answered: Outcome, split: Split) -> Prediction:
+def prediction_of(answered: SampleOutcome, split: Split) -> Prediction:
     """Give the record of a sample."""
     found = answered.found
     if isinstance(found, Failed):
@@ -65,7 +70,7 @@ def prediction_of(answered: Outcome, split: Split) -> Prediction:
 
 
 class Results:
-    """Writes what came of the samples, one after the other; the file appears when all are there. In memory stay counts and failures."""
+    """Writes what came of the samples one by one; the file appears when all are there. Holds counts and failures."""
 
     def __init__(self, split: Split, model: str, file: IO[bytes]) -> None:
         self.split, self.model, self._file = split, model, file
@@ -74,7 +79,7 @@ class Results:
         self.new = Counter[str]()  # answers of this run and their tokens
         self.speed: dict[str, float] = {}
 
-    def add(self, answered: Outcome) -> None:
+    def add(self, answered: SampleOutcome) -> None:
         found = answered.found
         prediction = prediction_of(answered, self.split).model_copy(update={"model": self.model})
         self._file.write((dump_json(prediction.model_dump(mode="json")) + "\n").encode())

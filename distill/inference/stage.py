@@ -24,16 +24,16 @@ from cosfly.products.answer_text import answer_schema
 from cosfly.products.predictions import PREDICTIONS, Split
 from cosfly.work.config import Config, MayDiffer
 from cosfly.work.console import Advance, progress_bar
-from cosfly.work.stage_folder import Failed, Resume, StageFolder, read_manifest
+from cosfly.work.stage_folder import Resume, StageFolder, read_manifest
 from cosfly.work.store import sha256_bytes
 from distill.inference.local import AnswerSchemas, LocalAnswers
-from distill.inference.outcome import ANSWERS, OpenFlights, Outcome, Results, writing_results
+from distill.inference.outcome import ANSWERS, OpenFlights, Results, SampleOutcome, failed, writing_results
 from distill.schema import Sample, in_its_actions, open_split, resolve_trees, tree_inputs
 from distill.student.checkpoint import read_adapter_facts
 from distill.student.encoding import load_pictures, most_pixels
 from distill.student.model import Device, load_student, require, student_folder, weight_files
 
-# Begun beyond those in flight, so that pictures are read while others are asked and a slow answer does not hold up the rest.
+# Times those in flight are begun: pictures are read while others are asked, and a slow answer holds up no other.
 WAITING = 4
 
 
@@ -50,7 +50,7 @@ def make_request(
     return student_request(sample.prompt, frames, answer_schema(language=sample.language), sampling)
 
 
-class Asking:
+class EngineAnswers:
     """One run of an engine over samples."""
 
     def __init__(
@@ -65,7 +65,7 @@ class Asking:
     ) -> None:
         """
         Args:
-            engine: started. sampling: as its requests say. max_pixels: most of a picture; 0: all. in_flight: most at once.
+            engine: started. max_pixels: most of a picture; 0: all. in_flight: most at once.
         """
         self.engine, self.book, self.trees, self.sampling = engine, book, trees, sampling
         self.max_pixels, self._most = max_pixels, in_flight
@@ -74,16 +74,16 @@ class Asking:
         self._flights = OpenFlights(book)
         self._failed_in_row = 0
 
-    async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[Outcome, None]:
+    async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[SampleOutcome, None]:
         """Yield what becomes of each sample, in their order; `advance` is told of them as they come.
 
         Raises:
             TeacherError: the engine cannot be used, or too many samples in a row got no answer.
         """
-        waiting: deque[asyncio.Task[Outcome]] = deque()
+        waiting: deque[asyncio.Task[SampleOutcome]] = deque()
         try:
             for sample in samples:
-                waiting.append(asyncio.create_task(self._answer(sample, advance)))
+                waiting.append(asyncio.create_task(self._asked(sample, advance)))
                 if len(waiting) >= WAITING * self._most:
                     yield await self._next(waiting)
             while waiting:
@@ -93,44 +93,38 @@ class Asking:
                 task.cancel()
             await asyncio.gather(*waiting, return_exceptions=True)
 
-    async def _next(self, waiting: deque[asyncio.Task[Outcome]]) -> Outcome:
+    async def _next(self, waiting: deque[asyncio.Task[SampleOutcome]]) -> SampleOutcome:
         answered = await waiting[0]
         waiting.popleft()
         self._flights.done(answered.sample)
         return answered
 
-    async def _answer(self, sample: Sample, advance: Advance) -> Outcome:
-        answered = await self._asked(sample)
-        advance(1)
-        return answered
-
-    async def _asked(self, sample: Sample) -> Outcome:
+    async def _asked(self, sample: Sample, advance: Advance) -> SampleOutcome:
         flight = self._flights.begun(sample)
         async with self._slots:
             try:
                 request = await asyncio.to_thread(make_request, sample, self.trees, self.sampling, self.max_pixels)
                 reply = await self._kept.ask(request, flight, sample.sample_id, sample.language)
             except InputError as error:
-                return Outcome(sample, Failed(id=sample.key, code=error.code, message=str(error)))
+                return failed(sample, error.code, error)
             except NoAnswer as error:
                 self._note_failure(error)
-                return Outcome(sample, Failed(id=sample.key, code=error.cause, message=str(error)))
+                return failed(sample, error.cause, error)
+            finally:
+                advance(1)
         self._failed_in_row = 0
         found = self.book.get(flight, answer_key(self.engine.model, request))
         assert isinstance(found, Answer), "what was asked is kept"
-        return Outcome(sample, found, is_new=not reply.is_kept)
+        return SampleOutcome(sample, found, is_new=not reply.is_kept)
 
     def _note_failure(self, error: NoAnswer) -> None:
         if error.is_final:  # the server answers, if only with a refusal
             return
         self._failed_in_row += 1
         if self._failed_in_row >= self.sampling.stop_after_failures:
-            raise TeacherError(
-                f"{self._failed_in_row} samples in a row got no answer",
-                where=self.engine.where,
-                got=str(error),
-                fix="see to the server, then run the same command again: nothing answered is asked twice",
-            )
+            words = f"{self._failed_in_row} samples in a row got no answer"
+            fix = "see to the server, then run the same command again: nothing answered is asked twice"
+            raise TeacherError(words, where=self.engine.where, got=str(error), fix=fix)
 
 
 STAGE = "distill.infer"
@@ -143,31 +137,17 @@ class InferConfig(Config):
     max_samples: int = Field(0, ge=0, description="answer only the first so many; 0: all")
     max_new_tokens: int = Field(512, ge=1, description="longest answer, tokens; a longer one is cut and will not parse")
     engine: Literal["transformers", "endpoint", "vllm"] = Field(
-        "transformers",
-        description="who computes: transformers in this process, a server at the URL --model, or vLLM in this process",
+        "transformers", description="who computes: transformers or vLLM in this process, or a server at the URL --model"
     )
     constrained: bool = Field(
-        False,
-        description="hold answers to their JSON schema: transformers and vllm by a mask over the tokens, a server by response_format. "
-        "Their parse rate then says nothing of the student",
+        False, description="hold answers to their JSON schema; their parse rate then says nothing of the student"
     )
-    batch_size: int = Field(
-        8,
-        ge=1,
-        description="samples that transformers answers together, halved where the memory is full; part of the result where rounding matters",
-    )
-    max_pixels: int = Field(
-        0,
-        ge=0,
-        description="most pixels kept of a picture; 0: as in training where the student's folder says, and at a server all",
-    )
+    batch_size: int = Field(8, ge=1, description="samples that transformers answers together; rounding may follow it")
+    max_pixels: int = Field(0, ge=0, description="most pixels of a picture; 0: as in training, where it is known")
     device: Device = Field("auto", description="auto, cpu or cuda for transformers; bfloat16 on cuda, float32 on a CPU")
-    feature_memory_gb: MayDiffer[float] = Field(
-        16.0, ge=0, description="memory for what the vision tower makes of pictures that several samples share, GB"
-    )
+    feature_memory_gb: MayDiffer[float] = Field(16.0, ge=0, description="memory for features of pictures, GB")
     endpoint: StudentEndpointConfig = Field(
-        StudentEndpointConfig(),
-        description="how the engines endpoint and vllm are asked; max_tokens is max_new_tokens, json_schema is constrained",
+        StudentEndpointConfig(), description="how endpoint and vllm are asked; max_new_tokens and constrained go before"
     )
     vllm: MayDiffer[VllmConfig] = Field(VllmConfig(), description="the engine vllm")
 
@@ -175,9 +155,6 @@ class InferConfig(Config):
     def sampling(self) -> StudentEndpointConfig:
         """How engines are asked."""
         return self.endpoint.model_copy(update={"max_tokens": self.max_new_tokens, "json_schema": self.constrained})
-
-
-# --- who answers --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -191,7 +168,7 @@ class Inputs:
 
     @property
     def taught_pixels(self) -> int:
-        """Most pixels of a picture that the student was taught with; 0: nothing here says, as of a server or a base as it is."""
+        """Most pixels of a picture that the student was taught with; 0: nothing here says, as of a server or a base."""
         if self.adapter is not None:
             return read_adapter_facts(self.adapter, Path(self.model)).max_pixels
         folder = Path(self.model)
@@ -199,7 +176,7 @@ class Inputs:
 
     @property
     def name(self) -> str:
-        """The model's name where it runs in this process: what `train` and `merge` call `model` is called as the folder it stands in."""
+        """The model's name where it runs in this process: `model` of `train` and `merge` has that of its folder."""
         folder = Path(self.model).absolute()
         name = folder.parent.name if folder.name == "model" else folder.name
         return name if self.adapter is None else f"{name}+{self.adapter.absolute().parent.name}"
@@ -208,7 +185,7 @@ class Inputs:
 @contextlib.asynccontextmanager
 async def _answering(
     cfg: InferConfig, inputs: Inputs, book: AnswerBook, advance: Advance
-) -> AsyncIterator[AsyncGenerator[Outcome, None]]:
+) -> AsyncIterator[AsyncGenerator[SampleOutcome, None]]:
     """Start who answers; gives what becomes of the samples, in their order."""
     if cfg.engine == "transformers":
         with _local(cfg, inputs, book) as local:
@@ -218,7 +195,7 @@ async def _answering(
     in_flight = cfg.vllm.batch if cfg.engine == "vllm" else cfg.endpoint.concurrency
     async with started(engine):
         max_pixels = cfg.max_pixels or (inputs.taught_pixels if cfg.engine == "vllm" else 0)
-        asking = Asking(engine, book, inputs.trees, cfg.sampling, max_pixels=max_pixels, in_flight=in_flight)
+        asking = EngineAnswers(engine, book, inputs.trees, cfg.sampling, max_pixels=max_pixels, in_flight=in_flight)
         yield asking.answers(inputs.samples, advance)
 
 
@@ -246,7 +223,7 @@ def _make_engine(cfg: InferConfig, inputs: Inputs) -> Engine:
 
 
 def _identified(cfg: InferConfig, url: str, out: Path) -> tuple[InferConfig, str]:
-    """Put the name of the model that a server serves into the settings, so that no folder holds answers of two students.
+    """Put the name of the model that a server serves into the settings: no folder holds answers of two students.
 
     A folder that is complete is not asked for again, so its server need not run.
 
@@ -256,22 +233,15 @@ def _identified(cfg: InferConfig, url: str, out: Path) -> tuple[InferConfig, str
     server = sha256_bytes(base_url(url).encode())[:16]
     if (out / "manifest.json").exists():
         facts = read_manifest(out).facts
-        if facts.get("server") == server and cfg.endpoint.model in (None, facts.get("model")):
-            return _serving(cfg, str(facts.get("model"))), server
-    client = ChatClient(url, cfg.sampling)
+        name = str(facts.get("model"))
+        if facts.get("server") == server and cfg.endpoint.model in (None, name):
+            return cfg.model_copy(update={"endpoint": cfg.endpoint.model_copy(update={"model": name})}), server
 
-    async def name() -> str:
-        async with started(client):
+    async def ask() -> str:
+        async with started(client := ChatClient(url, cfg.sampling)):
             return client.model
 
-    return _serving(cfg, asyncio.run(name())), server
-
-
-def _serving(cfg: InferConfig, model: str) -> InferConfig:
-    return cfg.model_copy(update={"endpoint": cfg.endpoint.model_copy(update={"model": model})})
-
-
-# --- the step ---------------------------------------------------------------------------------------------------------
+    return cfg.model_copy(update={"endpoint": cfg.endpoint.model_copy(update={"model": asyncio.run(ask())})}), server
 
 
 @in_its_actions
@@ -292,11 +262,12 @@ def run(
     Args:
         model: a folder, the name of a repository, or with engine `endpoint` a URL.
     Returns:
-        The path of `predictions.jsonl`: one line per sample, in the order of the split. Of a sample that was not answered it says so, and
-        the manifest counts it as failed; a later run tries it again.
+        The path of `predictions.jsonl`: one line per sample, in the order of the split. Of a sample that was not
+        answered it says so, and the manifest counts it as failed; a later run tries it again.
     Raises:
-        InputError: an input is missing or does not fit. ConfigError: the engine takes no adapter, or the memory is full with one sample.
-        EnvironmentMissing: a package is missing. TeacherError: the engine does not answer. NothingKept: no sample was answered.
+        InputError: an input is missing or does not fit. EnvironmentMissing: a package is missing.
+        ConfigError: the engine takes no adapter, or the memory is full with one sample.
+        TeacherError: the engine does not answer. NothingKept: no sample was answered.
     """
     trees = resolve_trees(dataset, data)
     files: dict[str, Path] = {"dataset": dataset, **tree_inputs(trees)}
@@ -304,10 +275,9 @@ def run(
     if cfg.engine == "transformers":
         require("torch", "transformers", "peft")
     elif adapter is not None:
-        raise ConfigError(
-            "an adapter is read by transformers alone", where="distill.infer.engine", got=cfg.engine,
-            fix="put it into the weights first (cosfly distill merge), or --engine transformers",
-        )  # fmt: skip
+        fix = "put it into the weights first (cosfly distill merge), or --engine transformers"
+        where = "distill.infer.engine"
+        raise ConfigError("an adapter is read by transformers alone", where=where, got=cfg.engine, fix=fix)
     if cfg.engine == "endpoint":
         cfg, facts["server"] = _identified(cfg, str(model), out)
     else:
@@ -321,12 +291,8 @@ def run(
         return out / PREDICTIONS
     split = open_split(dataset, cfg.split)
     if not len(split):
-        raise InputError(
-            "the split is empty",
-            where=dataset,
-            got=cfg.split,
-            fix="--set distill.infer.split=val, or prepare more walks",
-        )
+        fix = "--set distill.infer.split=val, or prepare more walks"
+        raise InputError("the split is empty", where=dataset, got=cfg.split, fix=fix)
     samples = split[: cfg.max_samples] if cfg.max_samples else split
     results = _answer_all(cfg, Inputs(samples, trees, model, adapter), out)
     outputs = [out / PREDICTIONS, *sorted((out / ANSWERS).glob("*.jsonl"))]
@@ -343,16 +309,11 @@ def _answer_all(cfg: InferConfig, inputs: Inputs, out: Path) -> Results:
     try:
         return asyncio.run(_write_answers(cfg, inputs, out))
     except Exception as error:  # torch's class has no name here until torch is loaded; all others go on
-        if not _is_memory_full(error):
+        if type(error).__name__ != "OutOfMemoryError" or not type(error).__module__.startswith("torch"):
             raise
-        said = f"{cfg.batch_size}: {str(error)[:120]}"
-    raise ConfigError(
-        "the accelerator's memory is full", where="distill.infer.batch_size", got=said, fix="lower it, or max_pixels"
-    )
-
-
-def _is_memory_full(error: Exception) -> bool:
-    return type(error).__name__ == "OutOfMemoryError" and type(error).__module__.startswith("torch")
+        got = f"{cfg.batch_size}: {str(error)[:120]}"
+    where, fix = "distill.infer.batch_size", "lower it, or max_pixels"
+    raise ConfigError("the accelerator's memory is full", where=where, got=got, fix=fix)
 
 
 async def _write_answers(cfg: InferConfig, inputs: Inputs, out: Path) -> Results:
@@ -365,9 +326,6 @@ async def _write_answers(cfg: InferConfig, inputs: Inputs, out: Path) -> Results
                 async with contextlib.aclosing(answers) as each:
                     async for answered in each:
                         results.add(answered)
-            results.speed = {
-                "loading_s": round(started_s - begun_s, 3),
-                "seconds": round(time.monotonic() - started_s, 3),
-                **results.new,
-            }
+            times_s = {"loading_s": started_s - begun_s, "seconds": time.monotonic() - started_s}
+            results.speed = {**{name: round(time_s, 3) for name, time_s in times_s.items()}, **results.new}
     return results

@@ -33,7 +33,8 @@ CHECKPOINT_SCHEMA, VERSION = "cosfly.checkpoint", "2.0"
 class Progress(BaseModel):
     """How far a training is: what its checkpoint says beside the weights.
 
-    best_step: of the best validation, 0 before the first; stale: validations since then. unreadable: samples that were left out.
+    best_step: of the best validation, 0 before the first; stale: validations since then. unreadable: samples that were
+    left out.
     """
 
     step: int = 0
@@ -107,10 +108,8 @@ def check_whole(checkpoint: Path) -> None:
     """
     damaged = _damage_of(checkpoint)
     if damaged is not None:
-        raise InputError(
-            "the checkpoint of the best validation is damaged", where=checkpoint, got=damaged,
-            fix="train anew in another --out (keep=last takes the last weights instead)",
-        )  # fmt: skip
+        fix = "train anew in another --out (keep=last takes the last weights instead)"
+        raise InputError("the checkpoint of the best validation is damaged", where=checkpoint, got=damaged, fix=fix)
 
 
 def _damage_of(checkpoint: Path) -> str | None:
@@ -141,13 +140,9 @@ def load_checkpoint(folder: Path, student: Student, optimizer: Any = None) -> Pr
     weights, found = learning_weights(student), load_file(folder / WEIGHTS)  # its checksums were compared
     shapes, wanted = ({n: tuple(t.shape) for n, t in tensors.items()} for tensors in (found, weights))
     if shapes != wanted:
-        name = next(iter({n for n in shapes.keys() | wanted.keys() if shapes.get(n) != wanted.get(n)}))
-        raise InputError(
-            "the checkpoint is of another student",
-            where=folder,
-            got=f"{name}: {shapes.get(name)}",
-            expected=f"{wanted.get(name)}",
-        )
+        name = next(n for n in shapes | wanted if shapes.get(n) != wanted.get(n))
+        got, expected = f"{name}: {shapes.get(name)}", wanted.get(name)
+        raise InputError("the checkpoint is of another student", where=folder, got=got, expected=f"{expected}")
     with torch.no_grad():
         for name, parameter in weights.items():
             parameter.copy_(found[name])
@@ -181,26 +176,18 @@ def checkpoint_path(folder: Path, step: int) -> Path:
 
 def cut_log(path: Path, num_steps: int) -> None:
     """Keep the lines of the first `num_steps` steps: what came after the checkpoint is done again."""
-    kept = []
-    if path.exists():
-        for line in read_lines(path, what="log"):
-            step = _step_of(line)
-            if step is not None and step <= num_steps:
-                kept.append(line)
-    write_bytes(path, b"".join(kept))
+    lines = read_lines(path, what="log") if path.exists() else ()
+    write_bytes(path, b"".join(line for line in lines if _is_of_steps(line, num_steps)))
 
 
-def _step_of(line: bytes) -> int | None:
-    """Read the step of a line of the log; None where a kill cut it short, or it is no line of a log."""
+def _is_of_steps(line: bytes, num_steps: int) -> bool:
+    """Tell whether a line of the log is of the first steps; one that a kill cut short is of none."""
     try:
         record = parse_json(line) if line.endswith(b"\n") else None
     except ValueError:
-        return None
+        return False
     step = record.get("step") if isinstance(record, dict) else None
-    return step if isinstance(step, int) else None
-
-
-# --- adapters -----------------------------------------------------------------------------------------------------------
+    return isinstance(step, int) and step <= num_steps
 
 
 def adapter_facts(student: Student, max_pixels: int, model: Path) -> dict[str, Any]:
@@ -226,8 +213,7 @@ def write_adapter_folder(student: Student, folder: Path, base_name: str) -> None
     """Write an adapter that peft loads.
 
     Args:
-        base_name: what its base is called. peft writes where it stands on this machine, which is nobody else's business, also into a
-            card that says nothing but that.
+        base_name: what its base is called; peft writes where it stands on this machine, also into a card.
     """
     with disk_errors(folder):
         student.model.save_pretrained(folder)
@@ -237,7 +223,8 @@ def write_adapter_folder(student: Student, folder: Path, base_name: str) -> None
 
 
 def write_model_folder(student: Student, folder: Path, base: Path) -> None:
-    """Write a whole model that transformers and vLLM load: weights, and whatever else its base has, with the processor as it was used.
+    """Write a whole model that transformers and vLLM load: weights, and whatever else its base has, with the processor
+    as it was used.
 
     Args:
         student: a model without an adapter beside its weights.
@@ -269,18 +256,9 @@ def read_adapter_facts(adapter: Path, model: Path) -> AdapterFacts:
     Raises:
         InputError: it was trained on other weights, or is malformed.
     """
-    path = adapter / ADAPTER_FACTS
-    value = read_json(
-        path, what="adapter", fix="a training that was stopped goes on: run its cosfly distill train again"
-    )
-    facts = validated(AdapterFacts, value, path)
-    found = base_digests(model)
-    if facts.base_sha256 != found:
-        raise InputError(
-            "the adapter was trained on another model",
-            where=path,
-            got=json.dumps(found)[:120],
-            expected=json.dumps(facts.base_sha256)[:120],
-            fix="give the model folder that it was trained on",
-        )
+    path, fix = adapter / ADAPTER_FACTS, "a training that was stopped goes on: run its cosfly distill train again"
+    facts = validated(AdapterFacts, read_json(path, what="adapter", fix=fix), path)
+    if facts.base_sha256 != (found := base_digests(model)):
+        got, expected = json.dumps(found)[:120], json.dumps(facts.base_sha256)[:120]
+        raise InputError("the adapter was trained on another model", where=path, got=got, expected=expected)
     return facts

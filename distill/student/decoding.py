@@ -1,8 +1,8 @@
-"""Greedy decoding of a batch of prompts over state of a fixed size: what `generate` gives, without what it spends on the way.
+"""Greedy decoding of a batch of prompts over state of a fixed size: what `generate` gives, in less time.
 
-All tensors of a step stand at fixed places, sizes change only when rows leave. The positions, the mask and the caches are handed to
-the language model as they are, so it derives nothing of its own. On an accelerator a step is recorded once for a size and played again:
-most of what a small batch's step takes is the host's telling it what to do.
+All tensors of a step stand at fixed places, sizes change only when rows leave. Positions, mask and caches are handed to
+the language model as they are, so it derives nothing of its own. On an accelerator a step is recorded once for a size
+and played again: most of what a step of a small batch takes is the host's telling it what to do.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ def recorder_for(student: Student) -> Record | None:
 
 
 def record_graph(step: Callable[[], None]) -> Play | None:
-    """Record a step as a CUDA graph. Recording computes nothing: only what is given does, and it moves the very tensors that the step named.
+    """Record a step as a CUDA graph. Recording computes nothing; playing it moves the very tensors that the step named.
 
     Args:
-        step: has run once with tensors of these sizes. It may neither ask for a value nor wait, and what it keeps it writes in place; a
-            tensor that it makes anew stays where it is, and each time it is played gets new values.
+        step: has run once with tensors of these sizes. It may neither ask for a value nor wait, and writes in place
+            what it keeps; a tensor that it makes anew stays where it is and gets new values each time it is played.
     Returns:
         What plays it; None where it cannot be recorded, which is logged: it is then computed plainly.
     Raises:
@@ -49,17 +49,14 @@ def record_graph(step: Callable[[], None]) -> Play | None:
     except torch.OutOfMemoryError:
         raise
     except RuntimeError as error:
-        log.warning(
-            "a step of decoding cannot be recorded and is computed plainly: %s", str(error).splitlines()[0][:160]
-        )
+        log.warning("a step of decoding is not recorded but computed plainly: %s", str(error).splitlines()[0][:120])
         return None
     return graph.replay
 
 
-# Rows that ended leave together, once they are this share of the batch: each leaving copies the state of those that stay, and has a
-# recorded step recorded anew, which takes as long as some ten steps that are played.
-LEAVING_SHARE = 0.25
-LEAVING_SHARE_RECORDED = 0.5
+# Rows that ended leave together, once they are this share of the batch: each leaving copies the state of those that
+# stay, and has a recorded step recorded anew, which takes as long as some ten steps that are played.
+LEAVING_SHARE, LEAVING_SHARE_RECORDED = 0.25, 0.5
 
 
 @dataclass(frozen=True)
@@ -75,7 +72,7 @@ class Constraint(Protocol):
     """Says which tokens may come next; rows are counted as they were given to `decode`."""
 
     def allowed(self, rows: Sequence[int], num_tokens: int) -> np.ndarray:
-        """Give (len(rows), num_tokens / 8, rounded up) uint8, a bit a token, the lowest first; every row allows one at least."""
+        """Give (len(rows), num_tokens / 8, rounded up) uint8, a bit a token, the lowest first; each row allows one."""
 
     def consume(self, row: int, token: int) -> None:
         """Note the token that a row was continued with."""
@@ -84,18 +81,19 @@ class Constraint(Protocol):
 def decode(
     student: Student,
     rows: Sequence[EncodedSample],
+    features: Any,
     *,
     max_tokens: int,
     constraint: Constraint | None = None,
-    features: Any = None,
     is_recorded: bool = True,
 ) -> list[Completion]:
     """Answer a batch of prompts greedily; their answers in `rows` are not looked at.
 
     Args:
+        features: (image tokens of all rows, width), what the vision tower made of the pictures, row after row.
         max_tokens: longest answer, the end token included.
-        features: (image tokens of all rows, width), where the vision tower has seen the pictures before; else it looks now.
-        is_recorded: on an accelerator, play steps from a recording: the same tokens in float32; in bfloat16 a recorded product may round otherwise.
+        is_recorded: on an accelerator, play steps from a recording: the same tokens in float32; bfloat16 may round
+            otherwise.
     Returns:
         One for each row, in their order.
     """
@@ -106,17 +104,15 @@ def decode(
         ended: dict[int, list[int]] = {}
         for count in range(1, max_tokens + 1):
             chosen = _choose(batch, constraint)
-            done = [
-                place for place, token in enumerate(chosen) if token == student.end_token_id and batch.is_live(place)
-            ]
-            for place in done:
-                ended[batch.rows[place]] = batch.tokens_of(place)[: count - 1]
-                batch.end(place)
-            if batch.num_live == 0 or count == max_tokens:
+            for place, token in enumerate(chosen):
+                if token == student.end_token_id and batch.is_live[place]:
+                    ended[batch.rows[place]] = batch.tokens_of(place)[: count - 1]
+                    batch.is_live[place] = False
+            if not any(batch.is_live) or count == max_tokens:
                 break
             batch.drop_ended()
             batch.step()
-        cut = {batch.rows[place]: batch.tokens_of(place) for place in range(len(batch.rows)) if batch.is_live(place)}
+        cut = {batch.rows[place]: batch.tokens_of(place) for place in batch.live}
     texts = ended | cut
     return [
         Completion(student.tokenizer.decode(texts[row], skip_special_tokens=False), len(texts[row]), row in ended)
@@ -141,7 +137,7 @@ def _choose(batch: _Batch, constraint: Constraint | None) -> list[int]:
 
     logits = batch.logits
     if constraint is not None:
-        live = [place for place in range(len(batch.rows)) if batch.is_live(place)]
+        live = batch.live
         bits = np.full((len(batch.rows), -(-logits.shape[1] // 8)), 255, np.uint8)
         bits[live] = constraint.allowed([batch.rows[place] for place in live], logits.shape[1])
         packed = torch.from_numpy(bits).to(logits.device)[:, :, None]
@@ -155,38 +151,28 @@ def _choose(batch: _Batch, constraint: Constraint | None) -> list[int]:
 
 
 class _Batch:
-    """The state of rows that are being answered: b places, prompts padded on the left to n tokens, room for n + max_tokens.
+    """The state of rows that are being answered: b places, prompts padded on the left to n tokens, room for n +
+    max_tokens.
 
-    rows: which row each place works on. logits: (b, vocabulary) float32 of the next token. All other tensors keep their place while
-    no row leaves: tokens (b, 1), positions (3, b, 1), mask (b, 1, 1, n + max_tokens) bool, caches.
+    rows: which row each place works on. is_live: whether it has not ended. logits: (b, vocabulary) float32 of the next
+    token. All other tensors keep their place while no row leaves: tokens (b, 1), positions (3, b, 1), mask (b, 1, 1, n
+    + max_tokens) bool, caches.
     """
 
     def __init__(
-        self,
-        student: Student,
-        rows: Sequence[EncodedSample],
-        max_tokens: int,
-        features: Any,
-        record: Record | None = None,
+        self, student: Student, rows: Sequence[EncodedSample], max_tokens: int, features: Any, record: Record | None
     ) -> None:
         import torch
         from transformers import StaticCache
 
         self._record, self._is_warm = record, False
         self._play: Play | None = None
-
         self._head, self._core, self._dtype = student.core.lm_head, student.core.model, student.dtype
-        self.rows = list(range(len(rows)))
-        self._is_live = [True] * len(rows)
+        self.rows, self.is_live = list(range(len(rows))), [True] * len(rows)
         inputs = prompt_batch(student, rows)
         ids, mask, grids = inputs["input_ids"], inputs["attention_mask"], inputs["image_grid_thw"]
         self._num_prompt, self._room = ids.shape[1], ids.shape[1] + max_tokens
-        if features is None:
-            features = self._look_at(inputs["pixel_values"], grids)
-        embedded = self._core.get_input_embeddings()(ids).to(student.dtype)
-        if features is not None:
-            is_image = (ids == student.image_token_id)[..., None]
-            embedded = embedded.masked_scatter(is_image, features.to(embedded.dtype))
+        embedded = student.embedded(ids, features)
         positions, deltas = self._core.get_rope_index(ids, inputs["mm_token_type_ids"], grids, attention_mask=mask)
         self._cache = StaticCache(config=self._core.config, max_cache_len=self._room)
         hidden = self._run(embedded, positions, _prompt_mask(mask, self._room), mask)
@@ -195,25 +181,17 @@ class _Batch:
         # What a step reads and moves on.
         device = ids.device
         self._tokens = torch.zeros((len(rows), 1), dtype=torch.int64, device=device)
-        self._positions = (
-            (mask.sum(dim=1, keepdim=True) + deltas).expand(3, -1, 1).clone(memory_format=torch.contiguous_format)
-        )
+        first = mask.sum(dim=1, keepdim=True) + deltas
+        self._positions = first.expand(3, -1, 1).clone(memory_format=torch.contiguous_format)
         self._mask = torch.zeros((len(rows), 1, 1, self._room), dtype=torch.bool, device=device)
         self._mask[:, 0, 0, : self._num_prompt] = mask.bool()
         self._place = torch.tensor([self._num_prompt], device=device)  # where the next token goes
         self._chosen = torch.zeros((len(rows), max_tokens), dtype=torch.int64, device=device)
 
-    # --- rows ---
-
     @property
-    def num_live(self) -> int:
-        return sum(self._is_live)
-
-    def is_live(self, place: int) -> bool:
-        return self._is_live[place]
-
-    def end(self, place: int) -> None:
-        self._is_live[place] = False
+    def live(self) -> list[int]:
+        """The places whose rows have not ended."""
+        return [place for place, is_live in enumerate(self.is_live) if is_live]
 
     def tokens_of(self, place: int) -> list[int]:
         """Give the tokens chosen so far."""
@@ -224,17 +202,15 @@ class _Batch:
         import torch
 
         share = LEAVING_SHARE if self._record is None else LEAVING_SHARE_RECORDED
-        if len(self.rows) - self.num_live < share * len(self.rows):
+        stay = self.live
+        if len(self.rows) - len(stay) < share * len(self.rows):
             return
-        stay = [place for place in range(len(self.rows)) if self._is_live[place]]
         index = torch.tensor(stay, device=self._tokens.device)
         self._tokens, self._mask, self._chosen = self._tokens[index], self._mask[index], self._chosen[index]
         self._positions = self._positions[:, index]
         self._cache.reorder_cache(index)  # type: ignore[arg-type]  # the library says LongTensor of any tensor of int64
-        self.rows, self._is_live = [self.rows[place] for place in stay], [True] * len(stay)
+        self.rows, self.is_live = [self.rows[place] for place in stay], [True] * len(stay)
         self._play, self._is_warm = None, False  # what was recorded moves the state that was left behind
-
-    # --- computing ---
 
     def take(self, chosen: Any) -> list[int]:
         """Keep what was chosen, (b,) int64, as the tokens to go on with."""
@@ -245,7 +221,8 @@ class _Batch:
     def step(self) -> None:
         """Read the tokens taken last and compute the logits of the next.
 
-        The first step of a size is computed plainly, so that libraries choose and compile their kernels; then one is recorded.
+        The first step of a size is computed plainly, so that libraries choose and compile their kernels; then one is
+        recorded.
         """
         if self._record is not None and self._play is None and self._is_warm:
             self._play = self._record(self._advance)
@@ -261,12 +238,6 @@ class _Batch:
         self.logits = self._logits(self._run(embedded, self._positions, self._mask, None))
         self._place.add_(1)
         self._positions.add_(1)
-
-    def _look_at(self, patches: Any, grids: Any) -> Any:
-        """Have the vision tower look at the pictures; None without any."""
-        import torch
-
-        return torch.cat(self._core.get_image_features(patches, grids).pooler_output) if len(grids) else None
 
     def _run(self, embedded: Any, positions: Any, mask: Any, linear_mask: Any) -> Any:
         return self._core.language_model(

@@ -1,14 +1,14 @@
 """Samples as tensors: images, prompt tokens, answer tokens, and batches of them.
 
-Prompt and answer are tokenized apart and joined, which is what inference sees: no token spans the border, so the mask that
-keeps the loss on the answer is exact by construction.
+Prompt and answer are tokenized apart and joined, which is what inference sees: no token spans the border, so the mask
+that keeps the loss on the answer is exact by construction.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +30,12 @@ IGNORED = -100  # label of tokens that carry no loss, the convention of PyTorch'
 
 @dataclass(frozen=True)
 class EncodedSample:
-    """One sample as arrays: prompt_ids, answer_ids (n,) int64, the end token included in the answer; patches of all images
-    (p, d) float32, None where a cache has their features, and their grids (k, 3) int64."""
+    """The texts of a sample as arrays: prompt_ids, answer_ids (n,) int64, the end token included in the answer; the
+    grids of its pictures (k, 3) int64, without a look at one."""
 
     key: str
     prompt_ids: np.ndarray
     answer_ids: np.ndarray
-    pixel_values: np.ndarray | None
     image_grids: np.ndarray
     weight: float
 
@@ -47,9 +46,6 @@ class EncodedSample:
 def messages_of(sample: Sample) -> list[dict[str, Any]]:
     """Give the chat of a sample, with a mark for every picture."""
     return chat_messages(sample.prompt, [[IMAGE_PART] * len(sample.views) for _ in sample.frames])
-
-
-# --- images -----------------------------------------------------------------------------------------------------------
 
 
 def load_pictures(sample: Sample, trees: Mapping[str, Path]) -> list[np.ndarray]:
@@ -80,9 +76,6 @@ def image_size(path: Path) -> tuple[int, int]:
     return size
 
 
-# --- tokens -----------------------------------------------------------------------------------------------------------
-
-
 def prompt_text(processor: Processor, sample: Sample, tokens_per_image: Sequence[int]) -> str:
     """Give the prompt as the chat template writes it, without thinking, each picture's mark repeated for its tokens."""
     text = processor.tokenizer.apply_chat_template(
@@ -90,34 +83,23 @@ def prompt_text(processor: Processor, sample: Sample, tokens_per_image: Sequence
     )
     pieces = text.split(IMAGE_TOKEN)
     if len(pieces) != len(tokens_per_image) + 1:
-        raise InputError(
-            "the prompt and its images do not match",
-            where=sample.key,
-            got=f"{len(pieces) - 1} image marks",
-            expected=f"{len(tokens_per_image)}",
-            fix=f"the prompt text may not hold {IMAGE_TOKEN}",
-        )
-    return pieces[0] + "".join(
-        IMAGE_TOKEN * count + piece for count, piece in zip(tokens_per_image, pieces[1:], strict=True)
-    )
+        got, fix = f"{len(pieces) - 1} marks for {len(tokens_per_image)}", f"texts may not hold {IMAGE_TOKEN}"
+        raise InputError("the prompt and its images do not match", where=sample.key, got=got, fix=fix)
+    marks = [IMAGE_TOKEN * count for count in tokens_per_image]
+    return pieces[0] + "".join(mark + piece for mark, piece in zip(marks, pieces[1:], strict=True))
 
 
 def chat_text(processor: Processor, sample: Sample) -> str:
-    """Give the whole chat, the answer in it, as the chat template writes it: what prompt, answer and end must add up to."""
+    """Give the whole chat as the chat template writes it: what prompt, answer and end must add up to."""
     answered = [*messages_of(sample), {"role": "assistant", "content": sample.answer}]
     return processor.tokenizer.apply_chat_template(answered, tokenize=False, enable_thinking=False)
 
 
 def special_token_in(processor: Processor, sample: Sample) -> str | None:
-    """Name a token of the chat's own that stands in a text of the sample: in an answer it would teach an early end, in a prompt
-    it would be a picture or a turn."""
+    """Name a token of the chat's own that stands in a text: in an answer an early end, in a prompt a picture or a
+    turn."""
     texts = (sample.prompt.system, sample.prompt.user, sample.answer)
     return next((t for t in processor.chat_tokens if any(t in text for text in texts)), None)
-
-
-def _answer_ids(processor: Processor, sample: Sample) -> np.ndarray:
-    ids = processor.tokenizer(sample.answer, add_special_tokens=False)["input_ids"]
-    return np.array([*ids, processor.end_token_id], dtype=np.int64)
 
 
 def picture_grid(processor: Processor, size_px: tuple[int, int]) -> tuple[int, int, int]:
@@ -131,43 +113,32 @@ def picture_grid(processor: Processor, size_px: tuple[int, int]) -> tuple[int, i
 
 
 def encode_text(processor: Processor, sample: Sample) -> EncodedSample:
-    """Make the arrays of one sample without looking at a pixel."""
+    """Make the arrays of one sample."""
     grid = picture_grid(processor, sample.picture_px)
     count = math.prod(grid) // processor.image_processor.merge_size**2
-    text = prompt_text(processor, sample, [count] * len(sample.images))
+    texts = [prompt_text(processor, sample, [count] * len(sample.images)), sample.answer]
+    prompt_ids, answer_ids = processor.tokenizer(texts, add_special_tokens=False)["input_ids"]
     return EncodedSample(
         key=sample.key,
-        prompt_ids=np.array(processor.tokenizer(text, add_special_tokens=False)["input_ids"], dtype=np.int64),
-        answer_ids=_answer_ids(processor, sample),
-        pixel_values=None,
+        prompt_ids=np.array(prompt_ids, dtype=np.int64),
+        answer_ids=np.array([*answer_ids, processor.end_token_id], dtype=np.int64),
         image_grids=np.array([grid] * len(sample.images), dtype=np.int64).reshape(-1, 3),
         weight=sample.weight,
     )
 
 
 def patches_of(processor: Processor, pictures: Sequence[np.ndarray]) -> np.ndarray:
-    """Cut pictures, each (h, w, 3) uint8, into the patches that the vision tower takes: (p, d) float32, those of all in a row."""
-    if not pictures:
-        return np.zeros((0, 1), np.float32)
+    """Cut pictures, each (h, w, 3) uint8, one at least, into the patches of the vision tower: (p, d) float32, of all in
+    a row."""
     images = [Image.fromarray(picture) for picture in pictures]
     return np.asarray(processor.image_processor(images, return_tensors="np")["pixel_values"], dtype=np.float32)
-
-
-def encode(processor: Processor, sample: Sample, trees: Mapping[str, Path]) -> EncodedSample:
-    """Make the arrays of one sample, its pictures among them.
-
-    Raises:
-        InputError: a picture of its playback tree cannot be read.
-    """
-    pictures = load_pictures(sample, trees)
-    return replace(encode_text(processor, sample), pixel_values=patches_of(processor, pictures))
 
 
 def positions_of(processor: Processor, ids: np.ndarray, grids: np.ndarray) -> np.ndarray:
     """Give the rotary positions of a row's tokens, (3, n) int64: time, height, width.
 
-    Text counts on by one in all three. A picture's tokens share the time at which it begins and count its rows and columns from there;
-    what follows begins after the longer side.
+    Text counts on by one in all three. A picture's tokens share the time at which it begins and count its rows and
+    columns from there; what follows begins after the longer side.
     """
     merge, positions, next_position, start = processor.image_processor.merge_size, [], 0, 0
     marks = np.flatnonzero(ids == processor.image_token_id)
@@ -182,11 +153,9 @@ def positions_of(processor: Processor, ids: np.ndarray, grids: np.ndarray) -> np
     return np.concatenate(positions, axis=1)
 
 
-# --- batches ----------------------------------------------------------------------------------------------------------
-
-
 def padded(student: Student, rows: Sequence[EncodedSample]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pad samples on the right: (tokens (b, n), labels (b, n) with IGNORED outside the answers, rotary positions (3, b, n)).
+    """Pad samples on the right: (tokens (b, n), labels (b, n) with IGNORED outside the answers, rotary positions (3, b,
+    n)).
 
     Causal layers, of either kind of attention, never see what stands on the right, so no mask is needed.
     """
@@ -203,32 +172,19 @@ def padded(student: Student, rows: Sequence[EncodedSample]) -> tuple[np.ndarray,
 
 
 def prompt_batch(student: Student, rows: Sequence[EncodedSample]) -> dict[str, Any]:
-    """Pad prompts on the left, so that all continue at the same place."""
+    """Pad prompts on the left, so that all continue at the same place; the model's inputs but for pictures."""
+    import torch
+
     length = max(len(row.prompt_ids) for row in rows)
     ids = np.full((len(rows), length), student.pad_token_id, dtype=np.int64)
     mask = np.zeros((len(rows), length), dtype=np.int64)
     for i, row in enumerate(rows):
         ids[i, length - len(row.prompt_ids) :] = row.prompt_ids
         mask[i, length - len(row.prompt_ids) :] = 1
-    return _inputs(student, rows, ids, mask)
-
-
-def _inputs(student: Student, rows: Sequence[EncodedSample], ids: np.ndarray, mask: np.ndarray) -> dict[str, Any]:
-    import torch
-
     arrays = {
         "input_ids": ids,
         "attention_mask": mask,
         "mm_token_type_ids": (ids == student.image_token_id).astype(np.int64),  # 1 marks image tokens
-        "pixel_values": patches_of_rows(rows),
         "image_grid_thw": np.concatenate([row.image_grids for row in rows]),
     }
-    tensors = {name: torch.from_numpy(array).to(student.device) for name, array in arrays.items()}
-    tensors["pixel_values"] = tensors["pixel_values"].to(student.dtype)
-    return tensors
-
-
-def patches_of_rows(rows: Sequence[EncodedSample]) -> np.ndarray:
-    """Put the patches of the pictures of all rows below each other: (p, d) float32."""
-    found = [row.pixel_values for row in rows if row.pixel_values is not None and len(row.pixel_values)]
-    return np.concatenate(found) if found else np.zeros((0, 1), np.float32)
+    return {name: torch.from_numpy(array).to(student.device) for name, array in arrays.items()}

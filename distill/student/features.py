@@ -1,8 +1,8 @@
 """What a frozen vision tower makes of pictures, kept in memory: each picture is read and looked at once.
 
-A frame stands in up to five windows, in two languages, in every epoch, and a frozen tower always says the same of it. What is kept is
-never thrown out: once the bound is reached, further pictures are looked at each time. Orders are drawn anew each epoch, so no other
-rule would find more of them, and who asks can tell beforehand what will be there.
+A frame stands in up to five windows, in two languages, in every epoch, and a frozen tower always says the same of it.
+What is kept is never thrown out: once the bound is reached, further pictures are looked at each time. Orders are drawn
+anew each epoch, so no other rule would find more of them, and who asks can tell beforehand what will be there.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from distill.student.encoding import patches_of, picture_grid
 from distill.student.model import Processor, Student
 
 
-class Picture(NamedTuple):
-    """One picture that a student is shown: a view of a frame of a run's playback tree, in the size and the colours of the prompt."""
+class FramePicture(NamedTuple):
+    """One picture that a student is shown: a view of a frame of a run's playback tree, in the size and the colours of
+    the prompt."""
 
     run: str
     frame: str
@@ -38,14 +39,14 @@ class Picture(NamedTuple):
 class PictureData:
     """A picture that was read: patches (p, d), a torch tensor."""
 
-    picture: Picture
+    picture: FramePicture
     patches: Any
 
 
-def pictures_of(sample: Sample) -> list[Picture]:
+def pictures_of(sample: Sample) -> list[FramePicture]:
     """Give the pictures of a sample in the order of its prompt."""
     return [
-        Picture(sample.run, frame, view, sample.picture_px, sample.depth_range_m)
+        FramePicture(sample.run, frame, view, sample.picture_px, sample.depth_range_m)
         for frame in sample.frames
         for view in sample.views
     ]
@@ -59,7 +60,7 @@ class PictureReader:
     trees: Mapping[str, Path]
     dtype: Any
 
-    def read(self, picture: Picture) -> PictureData:
+    def read(self, picture: FramePicture) -> PictureData:
         """Read a picture.
 
         Raises:
@@ -75,9 +76,9 @@ class PictureReader:
 class VisionFeatures:
     """Features of pictures, in memory up to `memory_bytes`.
 
-    For each step of a plan: `wanted` tells what must be read, `take` is given it, `of` gives features, `end_step` forgets what is
-    not kept.
-    With a tower that learns nothing is kept, and `of` has the tower look at the pictures each time.
+    For each step of a plan: `wanted` tells what must be read, `take` is given it, `of` gives features, `end_step`
+    forgets what is not kept. With a tower that learns nothing is kept, and `of` has the tower look at the pictures each
+    time.
     """
 
     def __init__(self, student: Student, *, memory_bytes: int = 0, is_frozen: bool = True) -> None:
@@ -85,26 +86,26 @@ class VisionFeatures:
         self.memory_bytes = memory_bytes if is_frozen else 0
         # One at a time, features do not depend on what else is looked at, to the last bit.
         self.encode_batch = 1 if student.device == "cpu" else 16
-        self._kept: dict[Picture, Any] = {}  # features
-        self._here: dict[Picture, Any] = {}  # of the step at hand; what was read, of a tower that learns
-        self._has_room: set[Picture] = set()
+        self._kept: dict[FramePicture, Any] = {}  # features
+        self._here: dict[FramePicture, Any] = {}  # of the step at hand; what was read, of a tower that learns
+        self._has_room: set[FramePicture] = set()
         self._room_bytes = 0
         self.num_encoded = 0
 
-    def bytes_of(self, picture: Picture) -> int:
+    def bytes_of(self, picture: FramePicture) -> int:
         """Give what the features of a picture take."""
         width = self.student.core.config.text_config.hidden_size
         return self._tokens_of(picture) * width * self.student.dtype.itemsize
 
-    def _tokens_of(self, picture: Picture) -> int:
+    def _tokens_of(self, picture: FramePicture) -> int:
         grid = picture_grid(self.student, picture.size_px)
         return math.prod(grid) // self.student.image_processor.merge_size**2
 
-    def plan(self) -> set[Picture]:
+    def plan(self) -> set[FramePicture]:
         """Begin to plan steps: gives the pictures that need not be read any more."""
         return set(self._kept)
 
-    def wanted(self, plan: set[Picture], pictures: Iterable[Picture]) -> list[Picture]:
+    def wanted(self, plan: set[FramePicture], pictures: Iterable[FramePicture]) -> list[FramePicture]:
         """Give those of a step's pictures that must be read, and add to the plan those of them that will stay.
 
         The steps of one plan are asked about in their order; earlier ones need not have been taken yet.
@@ -147,7 +148,7 @@ class VisionFeatures:
         counts = [self._tokens_of(item.picture) for item in items]
         return torch.cat(tuple(found)).to(student.dtype).split(counts)
 
-    def of(self, pictures: Sequence[Picture]) -> Any:
+    def of(self, pictures: Sequence[FramePicture]) -> Any:
         """Give the features of pictures that were taken, below each other: (tokens, width) on the student's device."""
         import torch
 

@@ -1,4 +1,5 @@
-"""Which code computes a student: faster kernels where an accelerator has them, PyTorch's own where float32 is asked for, and fewer calls."""
+"""Which code computes a student: faster kernels where an accelerator has them, PyTorch's own where float32 is asked
+for, and fewer calls."""
 
 from __future__ import annotations
 
@@ -14,11 +15,12 @@ LINEAR_ATTENTION = "fla"
 
 
 def use_kernels_for(dtype: Any, device: str) -> None:
-    """Decide what transformers will find when it first loads the model's code, which is when it chooses; call this before.
+    """Decide what transformers will find when it first loads the model's code, which is when it chooses; call this
+    before.
 
-    In float32 on an accelerator PyTorch's own functions compute, as exactly as is asked for: the fast kernels of linear attention round it
-    to fewer digits or refuse it. Else flash-linear-attention's short convolution stands in where causal-conv1d, which has to be compiled,
-    is not installed.
+    In float32 on an accelerator PyTorch's own functions compute, as exactly as is asked for: the fast kernels of linear
+    attention round it to fewer digits or refuse it. Else flash-linear-attention's short convolution stands in where
+    causal-conv1d, which has to be compiled, is not installed.
     """
     import torch
 
@@ -46,10 +48,11 @@ def _convolution(x: Any, weight: Any, bias: Any = None, activation: str | None =
 
 
 def fuse_norms(model: Any) -> None:
-    """Have the norms of a language model computed by one kernel each, which keeps its input and a number a row for its gradient.
+    """Have the norms of a language model computed by one kernel each, which keeps its input and a number a row for its
+    gradient.
 
-    The library computes them step by step in float32 and keeps what each step read. In float32 the numbers are the same; in bfloat16
-    the normed values are rounded once more before they are scaled.
+    The library computes them step by step in float32 and keeps what each step read. In float32 the numbers are the
+    same; in bfloat16 the normed values are rounded once more before they are scaled.
     """
     fused = _fused_norms()
     for module in model.modules():
@@ -83,10 +86,11 @@ def _fused_norms() -> dict[type, type]:
 
 
 def look_at_equal_sizes_at_once(model: Any) -> None:
-    """Have a vision tower attend to all pictures of a call in one product where they are of one size, as those of a flight are.
+    """Have a vision tower attend to all pictures of a call in one product where they are of one size, as those of a
+    flight are.
 
-    The library's attention asks the accelerator for their lengths in every layer and takes them one after the other; of pictures that
-    differ in size it still does.
+    The library's attention asks the accelerator for their lengths in every layer and takes them one after the other; of
+    pictures that differ in size it still does.
     """
     import torch
     from transformers.models.qwen3_5.modeling_qwen3_5 import Qwen3_5VisionAttention, apply_rotary_pos_emb_vision
@@ -99,7 +103,7 @@ def look_at_equal_sizes_at_once(model: Any) -> None:
         return asked[1]
 
     class JoinedAttention(Qwen3_5VisionAttention):
-        def forward(self, hidden_states: Any, cu_seqlens: Any, **others: Any) -> Any:  # type: ignore[override]  # by name only
+        def forward(self, hidden_states: Any, cu_seqlens: Any, **others: Any) -> Any:  # type: ignore[override]
             lengths = lengths_of(cu_seqlens)
             if len(set(lengths)) != 1:
                 return super().forward(hidden_states, cu_seqlens, **others)

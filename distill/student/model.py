@@ -1,8 +1,8 @@
 """The student: a vision-language model of Qwen3.5's structure (3.5, 3.6, 3.8), its tokenizer and its image processor.
 
-The processor is put together here from the tokenizer and the Pillow image processor, because the ready-made one needs
-torchvision and, without it, silently shrinks to the tokenizer. Only `student_folder` reaches for a network, and only when it is
-given the name of a repository.
+The processor is put together here from the tokenizer and the Pillow image processor: the ready-made one needs
+torchvision and, without it, silently shrinks to the tokenizer. Only `student_folder` reaches for a network, for a
+repository's name.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ class Processor:
 
 @dataclass
 class Student(Processor):
-    """A loaded student. `model` is a transformers model, or a peft model round one; `dtype` is what it computes in, which weights
-    that are trained may exceed."""
+    """A loaded student. `model` is a transformers model, or a peft model round one; `dtype` is what it computes in,
+    where weights that are trained may have more."""
 
     model: Any
     device: str
@@ -97,6 +97,14 @@ class Student(Processor):
     def tower(self) -> Any:
         """The vision tower."""
         return self.core.model.visual
+
+    def embedded(self, ids: Any, features: Any) -> Any:
+        """Give what the language model reads of tokens (b, n), with features of the pictures (image tokens, width) in
+        them."""
+        found = self.core.get_input_embeddings()(ids).to(self.dtype)
+        if not len(features):
+            return found
+        return found.masked_scatter((ids == self.image_token_id)[..., None], features.to(self.dtype))
 
     def computing(self) -> contextlib.AbstractContextManager:
         """Compute in `dtype`, whatever the weights are kept in; in float32 there is nothing to convert."""
@@ -113,7 +121,8 @@ def is_hub_name(name: str) -> bool:
 
 
 def student_folder(name: str) -> Path:
-    """Give the folder of a student: a folder as it is; of a repository's name, as `Qwen/Qwen3.5-2B`, the copy in the hub's cache.
+    """Give the folder of a student: a folder as it is; of a repository's name, as `Qwen/Qwen3.5-2B`, the copy in the
+    hub's cache.
 
     Raises:
         InputError: there is no such folder, or the repository cannot be had.
@@ -125,17 +134,11 @@ def student_folder(name: str) -> Path:
 
     try:
         return Path(snapshot_download(name, allow_patterns=MODEL_FILES))
-    except (
-        OSError,
-        ValueError,
-        RuntimeError,
-    ) as error:  # of the hub's client: no network, no such repository, no permission
+    except (OSError, ValueError, RuntimeError) as error:  # no network, no such repository, no permission
         raise InputError(
-            "no such folder, and the repository of that name cannot be loaded",
-            where=name,
-            got=f"{type(error).__name__}: {error}"[:300],
+            "no such folder, and the repository of that name cannot be loaded", where=name, got=str(error)[:300],
             fix="check name and network, or download it elsewhere and give its folder",
-        ) from error
+        ) from error  # fmt: skip
 
 
 def weight_files(folder: Path) -> dict[str, Path]:
@@ -147,18 +150,14 @@ def weight_files(folder: Path) -> dict[str, Path]:
     config = read_json(folder / "config.json", what="student model (a folder with config.json)")
     found = config.get("model_type") if isinstance(config, dict) else None
     if found != MODEL_TYPE:
-        raise InputError(
-            "not a student that cosfly knows",
-            where=f"{folder / 'config.json'}: model_type",
-            got=repr(found),
-            expected=f"{MODEL_TYPE!r}, for instance Qwen3.5-2B, 3.6 or 3.8, or a folder made by cosfly distill tiny-student",
-        )
+        where, expected = f"{folder / 'config.json'}: model_type", f"{MODEL_TYPE!r}, as Qwen3.5, 3.6 and 3.8 have"
+        raise InputError("not a student that cosfly knows", where=where, got=repr(found), expected=expected)
     weights = sorted(folder.glob("*.safetensors"))
     if not weights:
         raise InputError("no weights", where=folder, expected="*.safetensors", fix="download the whole model folder")
     settings = ("config.json", "tokenizer.json", "tokenizer_config.json", "preprocessor_config.json", TAUGHT)
-    files = [path for name in (*settings, "chat_template.jinja") if (path := folder / name).is_file()]
-    return {f"model/{path.name}": path for path in (*files, *weights)}
+    files = [folder / name for name in (*settings, "chat_template.jinja")]
+    return {f"model/{path.name}": path for path in (*files, *weights) if path.is_file()}
 
 
 def pick_device(wanted: Device) -> str:
@@ -176,7 +175,8 @@ def pick_device(wanted: Device) -> str:
 
 
 def compute_dtype(wanted: Dtype, device: str) -> Any:
-    """Give torch's name of what to compute in: bfloat16 on an accelerator and float32 on a CPU, unless told otherwise."""
+    """Give torch's name of what to compute in: bfloat16 on an accelerator and float32 on a CPU, unless told
+    otherwise."""
     import torch
 
     if wanted == "auto":
@@ -222,12 +222,7 @@ def load_student(
         )
         if adapter is not None:
             if not (adapter / "adapter_model.safetensors").is_file():
-                raise InputError(
-                    "not an adapter",
-                    where=adapter,
-                    expected="adapter_model.safetensors",
-                    fix="run cosfly distill train",
-                )
+                raise InputError("not an adapter", where=adapter, expected="adapter_model.safetensors")
             model = PeftModel.from_pretrained(model, adapter)
     except (OSError, RuntimeError, ValueError, SafetensorError) as error:
         raise InputError("the student does not load", where=adapter or folder, got=str(error)[:300]) from error
@@ -237,7 +232,7 @@ def load_student(
         model.to(device_name)
     except torch.OutOfMemoryError as error:
         raise EnvironmentMissing(
-            "the weights do not fit into the accelerator's memory", where=folder, got=str(error)[:120]
+            "the accelerator has no room for weights", where=folder, got=str(error)[:99]
         ) from error
     if device_name == "cuda":
         fuse_norms(student.core)
@@ -251,19 +246,13 @@ def check_tokens_fit(student: Student, folder: Path) -> None:
     Raises:
         InputError: the tokenizer knows more tokens than the model, or another one for pictures.
     """
-    known, room = len(student.tokenizer), student.core.get_input_embeddings().weight.shape[0]
-    if known > room:
-        raise InputError(
-            "the tokenizer knows more tokens than the model", where=folder, got=f"{known}", expected=f"<= {room}"
-        )
-    wanted = student.core.config.image_token_id
-    if student.image_token_id != wanted:
-        raise InputError(
-            f"the tokenizer and the model call {IMAGE_TOKEN} differently",
-            where=folder,
-            got=f"token {student.image_token_id}",
-            expected=f"token {wanted} (image_token_id in config.json)",
-        )
+    known, most = len(student.tokenizer), student.core.get_input_embeddings().weight.shape[0]
+    if known > most:
+        raise InputError("the tokenizer knows more tokens than the model", where=folder, got=known, expected=most)
+    found, wanted = student.image_token_id, student.core.config.image_token_id
+    if found != wanted:
+        words = f"the tokenizer and the model call {IMAGE_TOKEN} differently"
+        raise InputError(words, where=folder, got=found, expected=f"{wanted} (image_token_id in config.json)")
 
 
 def load_processor(folder: Path, max_pixels: int) -> tuple[Any, Any]:
@@ -283,12 +272,8 @@ def load_processor(folder: Path, max_pixels: int) -> tuple[Any, Any]:
         raise InputError("the student's processor does not load", where=folder, got=str(error)[:300]) from error
     if not tokenizer.chat_template:
         raise InputError("the tokenizer has no chat template", where=folder, expected="chat_template.jinja")
-    known = tokenizer.get_vocab()
-    missing = [token for token in NEEDED_TOKENS if token not in known]
-    if missing:
-        raise InputError(
-            "the tokenizer lacks tokens that a chat with pictures needs", where=folder, expected=", ".join(missing)
-        )
+    if missing := set(NEEDED_TOKENS) - tokenizer.get_vocab().keys():
+        raise InputError("the tokenizer lacks tokens of chats with pictures", where=folder, expected=", ".join(missing))
     side_px = image_processor.patch_size * image_processor.merge_size
     if max_pixels < side_px**2:
         raise ConfigError("too small for one patch", where="max_pixels", got=max_pixels, expected=f">= {side_px**2}")

@@ -1,4 +1,5 @@
-"""Students of random weights in Qwen3.5's structure, from 0.3 million parameters up, with a tokenizer trained on a data set.
+"""Students of random weights in Qwen3.5's structure, from 0.3 million parameters up, with a tokenizer trained on a data
+set.
 
 So all of distillation runs anywhere, and experiments can ask what a student learns that knows nothing before.
 """
@@ -38,7 +39,8 @@ _TOKENIZER_TEXT = (
     '{"critical_components":"the pedestrian is visible in the image at a distance of metres ahead of the drone",',
     '"reasoning_trace":"the target turns left so the drone should turn left to keep it in the centre of the view",',
     '{"critical_components":"目标行人在画面中央，无人机保持距离，左侧有建筑物","reasoning_trace":"行人向右转弯，因此无人机应右转跟随",',
-    "frame position velocity visibility true false drone target world depth camera yaw pitch roll five frames JSON object",
+    "frame position velocity visibility true false drone target world depth camera yaw pitch roll five frames"
+    " JSON object",
     " ".join(FIELDS),
 )
 HEAD_WIDTH = 16  # of the attention heads of small students; wide ones have Qwen3.5's
@@ -50,9 +52,7 @@ class RandomStudent(Config):
     """Settings of a student of random weights."""
 
     width: int = Field(64, ge=32, multiple_of=32, description="width of the language model")
-    layers: int = Field(
-        4, ge=4, multiple_of=4, description="its layers; three of four have linear attention, as in Qwen3.5"
-    )
+    layers: int = Field(4, ge=4, multiple_of=4, description="its layers; three of four have linear attention")
     vision_width: int = Field(32, ge=32, multiple_of=32, description="width of the vision tower")
     vision_layers: int = Field(2, ge=1, description="layers of the vision tower")
     vocabulary: int = Field(800, ge=300, description="tokens of the tokenizer, before the special ones")
@@ -66,7 +66,8 @@ PRESETS = {
 
 
 def random_student_settings(name: str, given: RandomStudent) -> RandomStudent | None:
-    """Give the settings of a student of random weights: of a preset's name, or `given` for `random`; None for any other name.
+    """Give the settings of a student of random weights: of a preset's name, or `given` for `random`; None for any other
+    name.
 
     Raises:
         InputError: there is no such preset.
@@ -113,8 +114,9 @@ def make_random_student(folder: Path, cfg: RandomStudent, seed: int, texts: Iter
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng_for(seed, "distill.tiny_student", "weights").integers(2**31)))
         model = Qwen3_5ForConditionalGeneration(model_config(cfg, tokenizer))
-        # Final norm and tied embeddings stay frozen under LoRA and bound the logits by |hidden| |embedding| = sqrt(width) * 1,
-        # hence the loss by about 0.29 nats in the smallest; twice the length lets a student be sure of an answer.
+        # Final norm and tied embeddings stay frozen under LoRA and bound the logits by |hidden| |embedding| =
+        # sqrt(width) * 1, hence the loss by about 0.29 nats in the smallest; twice the length lets a student be sure of
+        # an answer.
         with torch.no_grad():
             model.model.language_model.embed_tokens.weight.mul_(2.0)
     with atomic_folder(folder) as partial, disk_errors(partial):

@@ -1,7 +1,7 @@
-"""The loop: steps, validations, checkpoints, and what is told of them.
+"""The loop: steps, validations, checkpoints, and their log.
 
-Every random choice derives from (seed, epoch) or (seed, step, process), so a run that was killed and continued takes the same steps as
-one that was not; the checkpoint needs no generator state.
+Every random choice derives from (seed, epoch) or (seed, step, process), so a run that was killed and continued takes
+the same steps as one that was not; the checkpoint needs no generator state.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from pydantic import BaseModel
 
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.answer_text import parse_answer
+from cosfly.products.captions import verdict_on
 from cosfly.work.chance import rng_for
 from cosfly.work.console import progress_bar
 from cosfly.work.store import dump_json, storage_errors
@@ -36,34 +37,41 @@ from distill.student.checkpoint import (
     newest_checkpoint,
     save_checkpoint,
 )
-from distill.student.decoding import decode
+from distill.student.decoding import Completion, decode
 from distill.student.model import Student
-from distill.training.loading import Census, Ready, Row, Supply
+from distill.training.loading import Census, ReadyStep, Row, Supply
 from distill.training.loss import answer_loss
 from distill.training.preflight import used_gb
 from distill.training.ranks import Ranks
-from distill.training.settings import STAGE, Steps, TrainConfig, is_validated, learning_rate_at, share_of
+from distill.training.settings import STAGE, Steps, TrainConfig, learning_rate_at, share_of
+
+log = logging.getLogger(__name__)
+
+LOG, CHECKPOINTS = "log.jsonl", "checkpoints"
 
 
 class Validation(BaseModel):
-    """What a validation found. loss: nats an answer token. accuracy: share of samples with the right decision, an answer that does not
-    parse being wrong; None where answers are not asked for. parsed: share of answers that parse."""
+    """What a validation found. loss: nats an answer token.
+
+    Shares of the samples, None where answers are not asked for; an answer that does not parse counts against both.
+    accuracy: the decision is the teacher's. consistent: it is what the true future calls for, of samples whose future
+    is known. parsed: it parses.
+    """
 
     samples: int
     loss: float
     accuracy: float | None = None
+    consistent: float | None = None
     parsed: float | None = None
 
-    @property
-    def score(self) -> tuple[float, float]:
-        """What the best checkpoint has most of: decisions first, then likelihood."""
-        return (self.accuracy if self.accuracy is not None else 0.0, -self.loss)
+    def score(self, best_by: str) -> tuple[float, float]:
+        """Give what the best checkpoint has most of: decisions or verdicts first, then likelihood."""
+        return ((self.accuracy if best_by == "decision" else self.consistent) or 0.0, -self.loss)
 
     def __str__(self) -> str:
-        told = f"loss {self.loss:.4f}"
-        return (
-            told if self.accuracy is None else f"{told}, decisions right {self.accuracy:.3f}, parsed {self.parsed:.3f}"
-        )
+        shares = {"decisions right": self.accuracy, "consistent": self.consistent, "parsed": self.parsed}
+        words = [f"{name} {share:.3f}" for name, share in shares.items() if share is not None]
+        return ", ".join([f"loss {self.loss:.4f}", *words])
 
 
 def validate(
@@ -75,7 +83,7 @@ def validate(
     # By length, so that little is padded, and dealt out so that all have about the same to do.
     order = np.argsort(-census.tokens, kind="stable")[ranks.rank :: ranks.size].tolist()
     batches = [order[start : start + cfg.batch_size] for start in range(0, len(order), cfg.batch_size)]
-    sums = np.zeros(5)  # nats, their weight, samples, right, parsed
+    sums = np.zeros(7)  # nats, their weight, samples, parsed, right, with a known future, consistent with it
     shares = [(number, census.indices[batch].tolist()) for number, batch in enumerate(batches)]
     student.model.eval()
     with torch.no_grad(), progress_bar(f"{STAGE}: validation", total=len(order)) as advance:
@@ -83,14 +91,12 @@ def validate(
             if ready.rows:
                 sums += _validate_batch(student, ready.rows, supply, cfg)
             advance(len(ready.rows))
-    nats, weight, count, right, parsed = ranks.total(sums.tolist())
-    asked = cfg.validation_answers and count
-    return Validation(
-        samples=int(count),
-        loss=nats / weight if weight else 0.0,
-        accuracy=right / count if asked else None,
-        parsed=parsed / count if asked else None,
-    )
+    nats, weight, count, parsed, right, known, consistent = ranks.total(sums.tolist())
+    found = Validation(samples=int(count), loss=nats / weight if weight else 0.0)
+    if not cfg.validation_answers or not count:
+        return found
+    of_future = consistent / known if known else None
+    return found.model_copy(update={"accuracy": right / count, "parsed": parsed / count, "consistent": of_future})
 
 
 def _validate_batch(student: Student, rows: Sequence[Row], supply: Supply, cfg: TrainConfig) -> Any:
@@ -98,21 +104,21 @@ def _validate_batch(student: Student, rows: Sequence[Row], supply: Supply, cfg: 
     encoded = [row.encoded for row in rows]
     nats, _ = answer_loss(student, encoded, features, cfg.logit_chunk)
     weight = sum(len(row.answer_ids) * row.weight for row in encoded)
-    right = parsed = 0
+    counts = np.zeros(4)
     if cfg.validation_answers:
         with student.computing():
-            answers = decode(student, encoded, max_tokens=cfg.max_new_tokens, features=features)
-        for row, answer in zip(rows, answers, strict=True):
-            reason = None if answer.is_finished else "length"
-            coc = parse_answer(answer.text, row.sample.language, finish_reason=reason).coc
-            parsed += coc is not None
-            right += coc is not None and coc.flight_decision == row.sample.decision
-    return np.array([float(nats), weight, len(rows), right, parsed])
+            answers = decode(student, encoded, features, max_tokens=cfg.max_new_tokens)
+        counts = sum((_judged_answer(row.sample, answer) for row, answer in zip(rows, answers, strict=True)), counts)
+    return np.array([float(nats), weight, len(rows), *counts])
 
 
-log = logging.getLogger(__name__)
-
-LOG, CHECKPOINTS = "log.jsonl", "checkpoints"
+def _judged_answer(sample: Sample, answer: Completion) -> Any:
+    """Give what an answer adds to the counts: parsed, right, with a known future, consistent with it."""
+    coc = parse_answer(answer.text, sample.language, finish_reason=None if answer.is_finished else "length").coc
+    decision, ruled_out = coc and coc.flight_decision, sample.contradicted
+    is_known, is_right = ruled_out is not None, decision == sample.decision
+    verdict = verdict_on(decision, sample.label, ruled_out or ()) if decision and is_known else None
+    return np.array([coc is not None, is_right, is_known, verdict == "CONSISTENT"], float)
 
 
 @dataclass
@@ -133,13 +139,16 @@ class Lesson:
         self.steps = Steps.make(self.cfg, len(self.census), self.seed)
 
     def validate(self) -> Validation | None:
-        if not len(self.validation_census):
+        if not len(census := self.validation_census):
             return None
-        return validate(
-            self.student, self.validation_samples, self.validation_census, self.supply, self.cfg, self.ranks
-        )
+        return validate(self.student, self.validation_samples, census, self.supply, self.cfg, self.ranks)
 
-    def steps_from(self, first: int) -> Iterator[Ready]:
+    def is_validated(self, done: int) -> bool:
+        """Tell whether there is a validation after so many steps."""
+        every = self.cfg.validate_every_steps or self.steps.steps_per_epoch
+        return done == self.steps.num_steps or done % every == 0
+
+    def steps_from(self, first: int) -> Iterator[ReadyStep]:
         """Yield this process's rows of each step from one on, longest first."""
         lengths, ranks = self.census.tokens, self.ranks
         shares = (
@@ -169,7 +178,7 @@ def make_optimizer(student: Student, cfg: TrainConfig) -> Any:
     return torch.optim.AdamW(parameters, lr=cfg.learning_rate, weight_decay=cfg.weight_decay, fused=is_fused)
 
 
-def train_step(lesson: Lesson, optimizer: Any, ready: Ready, rate: float) -> dict[str, Any]:
+def train_step(lesson: Lesson, optimizer: Any, ready: ReadyStep, rate: float) -> dict[str, Any]:
     """Take one optimizer step over what all processes have ready, `batch_size` samples at a time.
 
     Returns:
@@ -189,11 +198,10 @@ def train_step(lesson: Lesson, optimizer: Any, ready: Ready, rate: float) -> dic
         nats, _ = answer_loss(student, [row.encoded for row in batch], features, cfg.logit_chunk)
         nats.backward()
         own_nats += float(nats.detach())
-    own = [row.encoded for row in rows]
-    own_weight = sum(len(row.answer_ids) * row.weight for row in own)
-    own_counts = [float(sum(len(row.answer_ids) for row in own)), float(sum(map(len, own))), float(len(own))]
+    answers = [(len(row.encoded.answer_ids), row.encoded.weight, len(row.encoded)) for row in rows]
+    own = [sum(n * w for n, w, _ in answers), sum(n for n, _, _ in answers), sum(n for _, _, n in answers), len(rows)]
     lesson.ranks.add_gradients(parameters)
-    total, weight, answers, tokens, samples = lesson.ranks.total([own_nats, own_weight, *own_counts])
+    total, weight, answer_tokens, tokens, samples = lesson.ranks.total([own_nats, *map(float, own)])
     if not weight:
         raise InputError("no sample of a step could be read", where=STAGE, fix="mend the pictures that the log names")
     for parameter in parameters:
@@ -202,21 +210,20 @@ def train_step(lesson: Lesson, optimizer: Any, ready: Ready, rate: float) -> dic
     norm = float(torch.nn.utils.clip_grad_norm_(parameters, cfg.max_gradient_norm or math.inf))
     if not math.isfinite(total) or not math.isfinite(norm):
         raise ConfigError(
-            "the loss or its gradient is not finite",
-            where="learning_rate",
-            got=f"{cfg.learning_rate}",
+            "the loss or its gradient is not finite", where="learning_rate", got=f"{cfg.learning_rate}",
             fix="lower learning_rate and choose another --out; the last checkpoint stays usable",
-        )
+        )  # fmt: skip
     for group in optimizer.param_groups:
         group["lr"] = rate
     optimizer.step()
     optimizer.zero_grad(set_to_none=True)
-    counts = {"answer_tokens": int(answers), "tokens": int(tokens), "samples": int(samples)}
-    return {"loss": total / weight, "gradient_norm": norm, **counts}
+    counts = {"answer_tokens": answer_tokens, "tokens": tokens, "samples": samples}
+    return {"loss": total / weight, "gradient_norm": norm, **{name: int(count) for name, count in counts.items()}}
 
 
 def fit(lesson: Lesson, out: Path) -> Progress:
-    """Train, from the newest checkpoint of `out` if there is one, and leave the student with the weights that are the product.
+    """Train, from the newest checkpoint of `out` if there is one, and leave the student with the weights that are the
+    product.
 
     Writes `log.jsonl` and `checkpoints/` in `out`.
     """
@@ -227,8 +234,7 @@ def fit(lesson: Lesson, out: Path) -> Progress:
     if progress.step:
         log.info("%s: continuing after step %d of %d", STAGE, progress.step, lesson.steps.num_steps)
     ranks.first_does(partial(cut_log, out / LOG, progress.step if newest else -1))
-    with contextlib.ExitStack() as stack:
-        note = stack.enter_context(_notebook(out / LOG)) if ranks.is_first else _keep_nothing
+    with _notebook(out / LOG if ranks.is_first else None) as note:
         if newest is None and (found := lesson.validate()) is not None:
             note({"step": 0, "validation": found.model_dump()})
             log.info("%s: before the first step: %s", STAGE, found)
@@ -263,10 +269,10 @@ def _run_steps(
             for key in left_out.keys() - progress.unreadable.keys():
                 log.warning("%s is left out: %s", key, left_out[key])
             progress = progress.model_copy(update={"step": done, "unreadable": progress.unreadable | left_out})
-            is_asked = is_validated(cfg, lesson.steps, done)
+            is_asked = lesson.is_validated(done)
             if is_asked and (found := lesson.validate()) is not None:
                 note({"step": done, "validation": found.model_dump()})
-                progress = judged(progress, found, cfg.patience)
+                progress = judged(progress, found, cfg)
                 log.info("%s: after step %d: %s", STAGE, done, found)
             is_last = done == num_steps or progress.has_ended
             if is_last or is_asked or done % cfg.save_every_steps == 0:
@@ -278,16 +284,14 @@ def _run_steps(
     return progress
 
 
-def judged(progress: Progress, found: Validation, patience: int) -> Progress:
+def judged(progress: Progress, found: Validation, cfg: TrainConfig) -> Progress:
     """Take a validation into account: is it the best, and has there been none better for too long."""
-    if progress.best_score is None or found.score > progress.best_score:
-        return progress.model_copy(update={"best_step": progress.step, "best_score": found.score, "stale": 0})
-    stale = progress.stale + 1
-    has_ended = bool(patience) and stale >= patience
+    score, stale = found.score(cfg.best_by), progress.stale + 1
+    if progress.best_score is None or score > progress.best_score:
+        return progress.model_copy(update={"best_step": progress.step, "best_score": score, "stale": 0})
+    has_ended = bool(cfg.patience) and stale >= cfg.patience
     if has_ended:
-        log.info(
-            "%s: %d validations in a row were not better than that after step %d", STAGE, stale, progress.best_step
-        )
+        log.info("%s: %d validations were not better than that after step %d", STAGE, stale, progress.best_step)
     return progress.model_copy(update={"stale": stale, "has_ended": has_ended})
 
 
@@ -298,19 +302,23 @@ def _save(student: Student, optimizer: Any, progress: Progress, folder: Path, cf
 
 def _speed(lesson: Lesson, facts: dict[str, Any], seconds: float, left_s: float) -> dict[str, float]:
     """Give what a step took: seconds with the wait for its data, rates over all processes, memory of this one."""
+    seconds = max(seconds, 1e-9)
     return {
         "seconds": round(seconds, 4),
-        "waited_share": round(min(1.0, lesson.supply.waited_s / max(seconds, 1e-9)), 4),
-        "tokens_per_s": round(facts["tokens"] / max(seconds, 1e-9), 1),
-        "samples_per_s": round(facts["samples"] / max(seconds, 1e-9), 3),
+        "waited_share": round(min(1.0, lesson.supply.waited_s / seconds), 4),
+        "tokens_per_s": round(facts["tokens"] / seconds, 1),
+        "samples_per_s": round(facts["samples"] / seconds, 3),
         "memory_gb": round(used_gb(lesson.student.device), 3),
         "left_s": round(left_s, 1),
     }
 
 
 @contextlib.contextmanager
-def _notebook(path: Path) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Give a function that appends a record to the log."""
+def _notebook(path: Path | None) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """Give a function that appends a record to the log; None: it keeps nothing, as in all processes but the first."""
+    if path is None:
+        yield lambda record: None
+        return
     with storage_errors(path), open(path, "a", encoding="utf-8") as file:
 
         def note(record: dict[str, Any]) -> None:
@@ -318,7 +326,3 @@ def _notebook(path: Path) -> Iterator[Callable[[dict[str, Any]], None]]:
             file.flush()
 
         yield note
-
-
-def _keep_nothing(_: dict[str, Any]) -> None:
-    """What processes but the first do with records."""

@@ -1,4 +1,4 @@
-"""Work that is done ahead by worker processes: samples counted and checked, steps made ready, texts to tokens and pictures to patches."""
+"""Work that is done ahead by worker processes: samples are counted and checked, steps made ready."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from cosfly.work.store import inside
 from cosfly.work.worker import end_with_parent
 from distill.schema import Sample
 from distill.student.encoding import EncodedSample, encode_text, image_size, special_token_in
-from distill.student.features import Picture, PictureData, PictureReader, VisionFeatures, pictures_of
+from distill.student.features import FramePicture, PictureData, PictureReader, VisionFeatures, pictures_of
 from distill.student.model import Processor
 from distill.training.ranks import Ranks
 
@@ -38,9 +38,6 @@ OrderT = TypeVar("OrderT")
 ResultT = TypeVar("ResultT")
 
 
-# --- workers ----------------------------------------------------------------------------------------------------------
-
-
 def num_workers(wanted: int) -> int:
     """Give how many workers to start: one a core, at most MOST_WORKERS, unless told otherwise."""
     return wanted if wanted >= 0 else min(MOST_WORKERS, len(os.sched_getaffinity(0)))
@@ -48,8 +45,8 @@ def num_workers(wanted: int) -> int:
 
 @dataclass(frozen=True)
 class _Work(Generic[OrderT, ResultT]):
-    """What torch's loader takes for a data set whose items are named by orders. An error comes back as a value: the loader would
-    raise another in its place."""
+    """What torch's loader takes for a data set whose items are named by orders. An error comes back as a value: the
+    loader would raise another in its place."""
 
     function: Callable[[OrderT], ResultT]
     limits: Limits
@@ -108,22 +105,16 @@ def in_order(function: Callable[[OrderT], ResultT], orders: Iterable[OrderT], wo
 def reader_errors() -> Iterator[None]:
     """Turn torch's word that a process which reads samples was killed into an error for people.
 
-    torch says it from a signal's handler, so wherever this process then is: in the middle of a step as well as where it waits for a sample.
+    torch says it from a signal's handler, wherever this process then is, also in the middle of a step.
     """
     try:
         yield
     except RuntimeError as error:
         if "DataLoader worker" not in str(error):
             raise
-        raise EnvironmentMissing(
-            "a process that reads samples was ended by the system",
-            got=str(error).splitlines()[0][:160],
-            fix="run the same command again; where memory was short, give the machine more (a container also --shm-size), "
-            "or lower distill.train.data_workers",
-        ) from error
-
-
-# --- steps ------------------------------------------------------------------------------------------------------------
+        fix = "run the same command again; where memory (or --shm-size) was short, lower distill.train.data_workers"
+        words, got = "a process that reads samples was ended by the system", str(error).splitlines()[0][:160]
+        raise EnvironmentMissing(words, got=got, fix=fix) from error
 
 
 @dataclass(frozen=True)
@@ -131,7 +122,7 @@ class Row:
     """A sample ready to be computed, but for the features of its pictures."""
 
     encoded: EncodedSample
-    pictures: tuple[Picture, ...]
+    pictures: tuple[FramePicture, ...]
     sample: Sample
 
 
@@ -141,39 +132,26 @@ class Order:
 
     step: int
     samples: Sequence[int]
-    pictures: Sequence[Picture]
-
-
-@dataclass(frozen=True)
-class PictureBatch:
-    """Pictures that were read, their patches in one tensor: a tensor on its way from one process to another holds a file open, and a
-    step may have hundreds of pictures. pictures: each with how many rows are its own."""
-
-    pictures: list[tuple[Picture, int]]
-    patches: Any
-
-    @classmethod
-    def of(cls, loaded: Sequence[PictureData]) -> PictureBatch:
-        import torch
-
-        patches = torch.cat([item.patches for item in loaded]) if loaded else None
-        return cls([(item.picture, len(item.patches)) for item in loaded], patches)
-
-    def loaded(self) -> list[PictureData]:
-        if not self.pictures:
-            return []
-        parts = self.patches.split([count for _, count in self.pictures])
-        return [PictureData(picture, part) for (picture, _), part in zip(self.pictures, parts, strict=True)]
+    pictures: Sequence[FramePicture]
 
 
 @dataclass(frozen=True)
 class StepData:
-    """What a worker made. unreadable: picture -> why it cannot be read."""
+    """What a worker made. unreadable: picture -> why it cannot be read.
+
+    Patches of all pictures are one tensor, since each on its way from one process to another holds a file open, and a
+    step may have hundreds of pictures. pictures: each with how many rows are its own.
+    """
 
     step: int
     rows: list[Row]
-    packed: PictureBatch
-    unreadable: dict[Picture, str]
+    pictures: list[tuple[FramePicture, int]]
+    patches: Any
+    unreadable: dict[FramePicture, str]
+
+    def loaded(self) -> list[PictureData]:
+        parts = self.patches.split([count for _, count in self.pictures]) if self.pictures else ()
+        return [PictureData(picture, part) for (picture, _), part in zip(self.pictures, parts, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -184,6 +162,8 @@ class Maker:
     reader: PictureReader
 
     def __call__(self, order: Order) -> StepData:
+        import torch
+
         samples = [self.samples[index] for index in order.samples]
         rows = [Row(encode_text(self.reader.processor, s), tuple(pictures_of(s)), s) for s in samples]
         loaded, unreadable = [], {}
@@ -192,11 +172,12 @@ class Maker:
                 loaded.append(self.reader.read(picture))
             except InputError as error:
                 unreadable[picture] = str(error)
-        return StepData(order.step, rows, PictureBatch.of(loaded), unreadable)
+        patches = torch.cat([item.patches for item in loaded]) if loaded else None
+        return StepData(order.step, rows, [(item.picture, len(item.patches)) for item in loaded], patches, unreadable)
 
 
 @dataclass(frozen=True)
-class Ready:
+class ReadyStep:
     """The rows of a step. left_out: key of a sample whose pictures cannot be read -> why."""
 
     step: int
@@ -206,20 +187,21 @@ class Ready:
 
 @dataclass
 class Supply:
-    """Gives the rows of one step after the other, features of their pictures at hand, and measures how long it was waited for."""
+    """Gives the rows of one step after the other, features of their pictures at hand, and measures how long it was
+    waited for."""
 
     features: VisionFeatures
     reader: PictureReader
     workers: int
     waited_s: float = 0.0  # for the last step
-    _unreadable: dict[Picture, str] = field(default_factory=dict)
+    _unreadable: dict[FramePicture, str] = field(default_factory=dict)
 
     def steps(
         self,
         samples: Sequence[Sample],
-        pictures: Callable[[int], Sequence[Picture]],
+        pictures: Callable[[int], Sequence[FramePicture]],
         shares: Iterable[tuple[int, Sequence[int]]],
-    ) -> Iterator[Ready]:
+    ) -> Iterator[ReadyStep]:
         """Yield what is ready for each (step, indices of samples).
 
         Args:
@@ -231,14 +213,11 @@ class Supply:
             for step, indices in shares
         )
         made_steps = in_order(Maker(samples, self.reader), orders, self.workers)
-        while True:
-            begun_s = time.monotonic()
-            made = next(made_steps, None)
-            if made is None:
-                return
+        begun_s = time.monotonic()
+        for made in made_steps:
             self._unreadable |= made.unreadable
-            self.features.take(made.packed.loaded())
-            ready = Ready(made.step, [], {})
+            self.features.take(made.loaded())
+            ready = ReadyStep(made.step, [], {})
             for row in made.rows:
                 bad = next((picture for picture in row.pictures if picture in self._unreadable), None)
                 if bad is None:
@@ -248,6 +227,7 @@ class Supply:
             self.waited_s = time.monotonic() - begun_s
             yield ready
             self.features.end_step()
+            begun_s = time.monotonic()
 
 
 SAMPLES_AT_ONCE = 64  # what a worker is given
@@ -255,20 +235,21 @@ TOO_LONG, SPECIAL_TOKEN, UNFIT_PICTURE = "too_long", "special_token", "unfit_pic
 
 
 @dataclass
-class Counts:
-    """What was seen of some samples, each picture once, so that a million samples take little. rows: (index, prompt, answer tokens)."""
+class SampleCounts:
+    """What was seen of some samples, each picture once, so that a million samples take little. rows: (index, prompt,
+    answer tokens)."""
 
     rows: list[tuple[int, int, int]] = field(default_factory=list)
     of_samples: list[np.ndarray] = field(default_factory=list)  # places of the pictures of each row
-    places: dict[Picture, int] = field(default_factory=dict)
+    places: dict[FramePicture, int] = field(default_factory=dict)
     decisions: Counter[str] = field(default_factory=Counter)
     skipped: Counter[str] = field(default_factory=Counter)
     examples: dict[str, tuple[int, str]] = field(default_factory=dict)  # reason -> index and words of the first
 
-    def places_of(self, pictures: Iterable[Picture]) -> np.ndarray:
+    def places_of(self, pictures: Iterable[FramePicture]) -> np.ndarray:
         return np.array([self.places.setdefault(picture, len(self.places)) for picture in pictures], np.int32)
 
-    def add(self, part: Counts) -> None:
+    def add(self, part: SampleCounts) -> None:
         new_place = self.places_of(part.places)
         self.of_samples += [new_place[places] for places in part.of_samples]
         self.rows += part.rows
@@ -287,8 +268,8 @@ class Counting:
     trees: Mapping[str, Path]
     max_tokens: int
 
-    def __call__(self, indices: Sequence[int]) -> Counts:
-        seen, checked = Counts(), dict[Picture, str]()
+    def __call__(self, indices: Sequence[int]) -> SampleCounts:
+        seen, checked = SampleCounts(), dict[FramePicture, str]()
         for index in indices:
             sample = self.samples[index]
             row = None if (token := special_token_in(self.processor, sample)) else encode_text(self.processor, sample)
@@ -308,7 +289,7 @@ class Counting:
             seen.examples.setdefault(reason, (index, f"{sample.key}: {detail}"))
         return seen
 
-    def _why_unfit(self, sample: Sample, checked: dict[Picture, str]) -> str:
+    def _why_unfit(self, sample: Sample, checked: dict[FramePicture, str]) -> str:
         """Compare the headers of the pictures' files with the prompt; the empty string: they fit."""
         for picture in pictures_of(sample):
             if picture not in checked:
@@ -327,7 +308,8 @@ class Counting:
 class Census:
     """The samples of a split that are learnt from, and how many were left out for what reason.
 
-    indices (n,): their places in the split, increasing. prompt_tokens, answer_tokens (n,). examples: reason -> the first sample left out.
+    indices (n,): their places in the split, increasing. prompt_tokens, answer_tokens (n,). examples: reason -> the
+    first sample left out.
     """
 
     indices: np.ndarray
@@ -337,7 +319,7 @@ class Census:
     decisions: Counter[str]
     skipped: Counter[str]
     examples: dict[str, str]
-    pictures: list[Picture]  # each once
+    pictures: list[FramePicture]  # each once
     _places: list[np.ndarray] = field(repr=False)  # of the pictures of each sample in `pictures`
 
     def __len__(self) -> int:
@@ -347,7 +329,7 @@ class Census:
     def tokens(self) -> np.ndarray:
         return self.prompt_tokens + self.answer_tokens
 
-    def pictures_of(self, index: int) -> list[Picture]:
+    def pictures_of(self, index: int) -> list[FramePicture]:
         """Give the pictures of the sample at a place of the split."""
         return [self.pictures[place] for place in self._places[int(np.searchsorted(self.indices, index))]]
 
@@ -370,7 +352,7 @@ def take_census(
     """
     chunks = [chosen[start : start + SAMPLES_AT_ONCE] for start in range(0, len(chosen), SAMPLES_AT_ONCE)]
     mine, counting = chunks[ranks.rank :: ranks.size], Counting(samples, processor, trees, max_tokens)
-    seen, whole = Counts(), Counts()
+    seen, whole = SampleCounts(), SampleCounts()
     with progress_bar(label, total=sum(map(len, mine))) as advance:
         for counts in in_order(counting, mine, max(0, min(workers, len(mine) - 1))):
             seen.add(counts)
@@ -390,9 +372,6 @@ def take_census(
         pictures=list(whole.places),
         _places=[whole.of_samples[place] for place in order],
     )
-
-
-# --- which samples of val ---------------------------------------------------------------------------------------------
 
 
 def choose_over_all(samples: Sequence[Sample], count: int, rng: np.random.Generator) -> list[int]:

@@ -1,8 +1,9 @@
 """The loss: negative log-likelihood of answer tokens, without a table of logits for all of them at once.
 
-With a vocabulary of 248,320 the logits of one token take a megabyte, and plain training keeps three such tables for every token of a
-batch. Here they exist for a chunk of answer tokens at a time: loss and gradient of the chunk are computed together, and only what has
-the width of the network is kept (the idea of fused linear cross-entropy, as in Hsu et al. 2024, Liger Kernel).
+With a vocabulary of 248,320 the logits of one token take a megabyte, and plain training keeps three such tables for
+every token of a batch. Here they exist for a chunk of answer tokens at a time: loss and gradient of the chunk are
+computed together, and only what has the width of the network is kept (fused linear cross-entropy, as in Hsu et al.
+2024, Liger Kernel).
 """
 
 from __future__ import annotations
@@ -88,9 +89,8 @@ def output_head(student: Student) -> Any:
 
     head = student.core.get_output_embeddings()
     if type(head) is not torch.nn.Linear or head.bias is not None:
-        raise ConfigError(
-            "the head cannot be adapted", where="target_modules", got=type(head).__name__, fix="leave lm_head out"
-        )
+        got = type(head).__name__
+        raise ConfigError("the head cannot be adapted", where="target_modules", got=got, fix="leave lm_head out")
     return head.weight
 
 
@@ -105,14 +105,9 @@ def answer_loss(student: Student, rows: Sequence[EncodedSample], features: Any, 
     import torch
 
     ids, labels, positions = (torch.from_numpy(array).to(student.device) for array in padded(student, rows))
-    core = student.core
     with student.computing():
-        embedded = core.get_input_embeddings()(ids).to(student.dtype)
-        marks = ids == student.image_token_id
-        if len(features):
-            embedded = embedded.masked_scatter(marks[..., None], features.to(student.dtype))
-        hidden = core.model.language_model(
-            inputs_embeds=embedded, position_ids=positions, attention_mask=None, use_cache=False
+        hidden = student.core.model.language_model(
+            inputs_embeds=student.embedded(ids, features), position_ids=positions, attention_mask=None, use_cache=False
         ).last_hidden_state
     is_target = labels[:, 1:] != IGNORED  # what stands before i + 1 tells it
     row_of = is_target.nonzero()[:, 0]

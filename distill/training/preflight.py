@@ -1,4 +1,4 @@
-"""What is known before the first step, in one list: what will be learnt from, how much memory it will need, and what stands in the way."""
+"""What is known before the first step, in one list: samples, steps, memory, and what stands in the way."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ from distill.student.model import Processor, Student
 from distill.training.loading import Census
 from distill.training.loss import answer_loss
 from distill.training.settings import Steps, TrainConfig
+
+log = logging.getLogger(__name__)
 
 GB = 1e9
 PROBES = (64, 192)  # tokens; the fallback of linear attention works in pieces of 64
@@ -56,10 +58,10 @@ class Memory:
 
 
 def saved_bytes_per_token(student: Student, cfg: TrainConfig) -> float:
-    """Measure what a forward pass keeps for its backward pass, a token: two short texts are run, and what is saved is counted.
+    """Measure what a forward pass keeps for its backward pass, bytes a token, by running two short texts.
 
-    What is saved depends on the layers, on peft and on which kernels are there, and grows evenly with the tokens. With gradient
-    checkpointing it is what stays; what one layer makes anew comes on top of it, once.
+    What is saved depends on the layers, on peft and on which kernels are there, and grows evenly with the tokens. With
+    gradient checkpointing it is what stays; what one layer makes anew comes on top of it, once.
     """
     import torch
 
@@ -75,7 +77,7 @@ def saved_bytes_per_token(student: Student, cfg: TrainConfig) -> float:
             return tensor
 
         half = np.full(length // 2, student.end_token_id, np.int64)
-        row = EncodedSample("probe", half, half, None, np.zeros((0, 3), np.int64), 1.0)
+        row = EncodedSample("probe", half, half, np.zeros((0, 3), np.int64), 1.0)
         with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
             answer_loss(student, [row], torch.zeros((0, 1)), cfg.logit_chunk)
         found.append(sum(storage.nbytes() for storage in storages.values()))
@@ -133,18 +135,13 @@ def memory_errors(cfg: TrainConfig) -> Iterator[None]:
         is_full = isinstance(error, torch.OutOfMemoryError | MemoryError) or "DefaultCPUAllocator" in str(error)
         if not is_full:
             raise
-        smaller = f"--set distill.train.batch_size={max(1, cfg.batch_size // 2)}"
+        smaller = f"--set distill.train.batch_size={cfg.batch_size // 2}"
         less = "--set distill.train.gradient_checkpointing=true"
-        raise ConfigError(
-            "the memory is full",
-            where="distill.train.batch_size",
-            got=f"{cfg.batch_size}: {str(error)[:120]}",
-            fix=f"run the same command again with {smaller if cfg.batch_size > 1 else less}, which goes on from the last checkpoint"
-            + (f"; or with {less}" if cfg.batch_size > 1 and not cfg.gradient_checkpointing else ""),
-        ) from error
+        advice = [smaller] * (cfg.batch_size > 1) + [less] * (not cfg.gradient_checkpointing)
+        fix = f"run it again with {' or '.join(advice) or 'a shorter max_tokens'}: it goes on from the last checkpoint"
+        got = f"{cfg.batch_size}: {str(error)[:120]}"
+        raise ConfigError("the memory is full", where="distill.train.batch_size", got=got, fix=fix) from error
 
-
-log = logging.getLogger(__name__)
 
 # Packages without which Qwen3.5 silently falls back to slow code, and what each is for.
 FAST_KERNELS = {
@@ -155,7 +152,7 @@ FAST_KERNELS = {
 
 
 @dataclass(frozen=True)
-class Finding:
+class Precheck:
     """A line of the list. warning: it may be meant so; error: training would not do what was asked for."""
 
     topic: str
@@ -171,106 +168,87 @@ def findings(
     features: VisionFeatures,
     sample: Sample,
     steps: Steps,
-) -> list[Finding]:
+) -> list[Precheck]:
     """Look at everything that can be known beforehand.
 
     Args:
         sample: any sample that is learnt from.
     """
+    tokens, answers, longest = (int(n) for n in (census.tokens.sum(), census.answer_tokens.sum(), census.tokens.max()))
+    words = f"{tokens} tokens, {answers} of them answers; the longest has {longest} of {cfg.max_tokens}"
     return [
-        *_about_data(cfg, census, validation, steps),
+        Precheck("samples", f"{len(census)} of {census.num_samples}; {words}"),
+        Precheck("steps", f"{steps.num_steps} of {cfg.samples_per_step} samples, {steps.steps_per_epoch} an epoch"),
+        *(
+            Precheck("left out", f"{name}: {reason} {count}, first {part.examples[reason]}", "warning")
+            for name, part in (("train", census), ("val", validation))
+            for reason, count in sorted(part.skipped.items())
+        ),
+        Precheck("validation", f"{len(validation)} samples of {len(validation.decisions)} decisions"),
         *_about_decisions(census, validation),
         _about_chat(student, sample),
-        *_about_memory(cfg, student, census, features),
+        _about_memory(cfg, student, census, features),
         _about_features(census, validation, features),
         *_about_kernels(student),
     ]
 
 
-def _about_data(cfg: TrainConfig, census: Census, validation: Census, steps: Steps) -> list[Finding]:
-    tokens, answers = int(census.tokens.sum()), int(census.answer_tokens.sum())
-    found = [
-        Finding(
-            "samples",
-            f"{len(census)} of {census.num_samples}; {tokens} tokens, {answers} of them answers; the longest has "
-            f"{int(census.tokens.max())} of {cfg.max_tokens}",
-        ),
-        Finding("steps", f"{steps.num_steps} of {cfg.samples_per_step} samples, {steps.steps_per_epoch} an epoch"),
-    ]
-    for name, part in (("train", census), ("val", validation)):
-        for reason, count in sorted(part.skipped.items()):
-            found.append(Finding("left out", f"{name}: {reason} {count}, first {part.examples[reason]}", "warning"))
-    return [*found, Finding("validation", f"{len(validation)} samples of {len(validation.decisions)} decisions")]
-
-
-def _about_decisions(census: Census, validation: Census) -> list[Finding]:
+def _about_decisions(census: Census, validation: Census) -> list[Precheck]:
     """Say once which decisions train never shows: a fact of most small sets, and of weight where val asks for them."""
     missing = [action for action in action_tokens() if not census.decisions[action]]
     asked = {action: validation.decisions[action] for action in missing if validation.decisions[action]}
     if not asked:
-        return [Finding("decisions", f"no sample of {', '.join(missing)}")] if missing else []
+        return [Precheck("decisions", f"no sample of {', '.join(missing)}")] if missing else []
     counts = ", ".join(f"{action} {count}" for action, count in asked.items())
     rest = ", ".join(action for action in missing if action not in asked)
-    return [
-        Finding(
-            "decisions",
-            f"val asks for what train never shows, and {sum(asked.values())} of its {len(validation)} samples will be wrong: {counts}"
-            f"{f'; nor does it show {rest}' if rest else ''}; more walks or towns in train have them, another seed splits otherwise",
-            "warning",
-        )
-    ]
+    words = f"{sum(asked.values())} of its {len(validation)} samples will be wrong: {counts}"
+    more = f"; nor does it show {rest}" if rest else ""
+    return [Precheck("decisions", f"val asks for what train never shows, and {words}{more}", "warning")]
 
 
-def _about_chat(processor: Processor, sample: Sample) -> Finding:
+def _about_chat(processor: Processor, sample: Sample) -> Precheck:
     """Hold what a student is taught against what its own chat template makes of the whole chat."""
     prompt = prompt_text(processor, sample, [1] * len(sample.images))
     taught, whole = prompt + sample.answer + END_OF_ANSWER, chat_text(processor, sample)
     thinking = "an empty thought, so it answers at once" if "<think>" in prompt else "no thoughts"
-    if taught != whole:
-        differs = next(
-            (i for i, (a, b) in enumerate(zip(taught, whole, strict=False)) if a != b), min(len(taught), len(whole))
-        )
-        return Finding(
-            "chat template",
-            f"prompt, answer and end are not what the template writes: at character {differs} {taught[differs : differs + 40]!r} for "
-            f"{whole[differs : differs + 40]!r}",
-            "error",
-        )
-    return Finding("chat template", f"the student's own; {thinking}; the prompt ends with {prompt[-32:]!r}")
+    if taught == whole:
+        return Precheck("chat template", f"the student's own; {thinking}; the prompt ends with {prompt[-32:]!r}")
+    at = next((i for i, pair in enumerate(zip(taught, whole, strict=False)) if len(set(pair)) > 1), len(taught))
+    words = f"at character {at} {taught[at : at + 40]!r} for {whole[at : at + 40]!r}"
+    return Precheck("chat template", f"prompt, answer and end are not what the template writes: {words}", "error")
 
 
-def _about_memory(cfg: TrainConfig, student: Student, census: Census, features: VisionFeatures) -> list[Finding]:
-    memory = estimate(
-        student, cfg, int(census.tokens.max()), sum(map(features.bytes_of, census.pictures_of(int(census.indices[0]))))
-    )
+def _about_memory(cfg: TrainConfig, student: Student, census: Census, features: VisionFeatures) -> Precheck:
+    of_pictures = sum(map(features.bytes_of, census.pictures_of(int(census.indices[0]))))
+    memory = estimate(student, cfg, int(census.tokens.max()), of_pictures)
     level: Any = "warning" if memory.needed > memory.available else "fact"
-    return [Finding("memory", f"about {memory} with batch_size {cfg.batch_size}", level)]
+    return Precheck("memory", f"about {memory} with batch_size {cfg.batch_size}", level)
 
 
-def _about_features(census: Census, validation: Census, features: VisionFeatures) -> Finding:
+def _about_features(census: Census, validation: Census, features: VisionFeatures) -> Precheck:
     pictures = dict.fromkeys([*census.pictures, *validation.pictures])
     if not pictures:
-        return Finding("pictures", "none: the student sees texts only")
+        return Precheck("pictures", "none: the student sees texts only")
     if not features.is_frozen:
-        return Finding("pictures", f"{len(pictures)}; the vision tower learns and looks at each whenever it is shown")
+        return Precheck("pictures", f"{len(pictures)}; the vision tower learns and looks at each whenever it is shown")
     total = sum(features.bytes_of(picture) for picture in pictures)
-    told = f"{len(pictures)}, features {total / GB:.3f} GB"
+    words = f"{len(pictures)}, features {total / GB:.3f} GB"
     if (rest := total - features.memory_bytes) > 0:
-        return Finding("pictures", f"{told}; {rest / GB:.3f} GB have no room and are looked at each time", "warning")
-    return Finding("pictures", told)
+        return Precheck("pictures", f"{words}; {rest / GB:.3f} GB have no room and are looked at each time", "warning")
+    return Precheck("pictures", words)
 
 
-def _about_kernels(student: Student) -> list[Finding]:
+def _about_kernels(student: Student) -> list[Precheck]:
     if student.device == "cpu":
-        return [Finding("kernels", "PyTorch's, as on every CPU")]
+        return [Precheck("kernels", "PyTorch's, as on every CPU")]
     return [
-        Finding("kernels", f"{package} is missing: {what} runs as slow PyTorch code; pip install {package}", "warning")
+        Precheck("kernels", f"{package} is missing: {what} runs as slow PyTorch code; pip install {package}", "warning")
         for module, (package, what) in FAST_KERNELS.items()
         if importlib.util.find_spec(module) is None
     ]
 
 
-def tell(found: Sequence[Finding], path: Path) -> None:
+def tell(found: Sequence[Precheck], path: Path) -> None:
     """Log the list and write it to `preflight.json`.
 
     Raises:
@@ -280,6 +258,5 @@ def tell(found: Sequence[Finding], path: Path) -> None:
     log.info("before the first step:")
     for finding in found:
         log.log(logging.INFO if finding.level == "fact" else logging.WARNING, "  %-14s %s", finding.topic, finding.text)
-    errors = [f"{finding.topic}: {finding.text}" for finding in found if finding.level == "error"]
-    if errors:
+    if errors := [f"{finding.topic}: {finding.text}" for finding in found if finding.level == "error"]:
         raise InputError("training cannot begin", where=path, got="; ".join(errors))

@@ -1,4 +1,5 @@
-"""The processes of one training, as `torchrun` and `accelerate launch` start them: each has its device and its share of every step.
+"""The processes of one training, as `torchrun` and `accelerate launch` start them: each has its device and its share of
+every step.
 
 One process needs none of this, and gets a group of one that does nothing.
 """
@@ -141,12 +142,8 @@ def joined(device: Device) -> Iterator[Ranks]:
     """
     import torch
 
-    name, size, rank, local = (
-        pick_device(device),
-        _number("WORLD_SIZE", 1),
-        _number("RANK", 0),
-        _number("LOCAL_RANK", 0),
-    )
+    name, size = pick_device(device), _number("WORLD_SIZE", 1)
+    rank, local = _number("RANK", 0), _number("LOCAL_RANK", 0)
     if name == "cuda":
         if local >= torch.cuda.device_count():
             raise EnvironmentMissing(
@@ -168,7 +165,7 @@ def joined(device: Device) -> Iterator[Ranks]:
         yield Ranks(rank, size, name)
         ended_well = True
     finally:
-        # After an error nobody waits for anybody: NCCL would, so its connections break with the process. The threads of gloo have
-        # to be ended, or the interpreter's end sometimes turns the error into an abort.
+        # After an error nobody waits for anybody: NCCL would, so its connections break with the process. The threads of
+        # gloo have to be ended, or the interpreter's end sometimes turns the error into an abort.
         if ended_well or backend == "gloo":
             torch.distributed.destroy_process_group()

@@ -1,4 +1,5 @@
-"""Settings of `distill train`, and what follows from them: which samples each step sees, in which process, at what learning rate."""
+"""Settings of `distill train`, and what follows from them: the samples of each step and process, and the learning
+rate."""
 
 from __future__ import annotations
 
@@ -16,95 +17,60 @@ from cosfly.work.config import Config, MayDiffer
 from distill.student.model import Device, Dtype
 from distill.student.random_student import RandomStudent
 
-# All linear layers of the language model. Three of four Qwen3.5 layers are linear attention, so q, k, v, o alone would leave
-# most of the network untouched; the vision tower stays frozen.
+# All linear layers of the language model. Three of four Qwen3.5 layers are linear attention, so q, k, v, o alone would
+# leave most of the network untouched; the vision tower stays frozen.
 TARGET_MODULES = (
     r".*language_model\.layers\.\d+\.(self_attn\.(q|k|v|o)_proj"
     r"|linear_attn\.(in_proj_qkv|in_proj_z|in_proj_a|in_proj_b|out_proj)"
     r"|mlp\.(gate|up|down)_proj)"
 )
+STAGE = "distill.train"
 
 
 class TrainConfig(Config):
-    """Settings of `distill train`. Those that are MayDiffer change how it is computed and, but for rounding, not what."""
+    """Settings of `distill train`. Those that are MayDiffer change how it is computed and, but for rounding, not
+    what."""
 
     method: Literal["lora", "full"] = Field(
-        "lora", description="lora: matrices of low rank beside frozen weights; full: all weights of the language model"
+        "lora", description="lora: matrices beside frozen weights; full: all of them"
     )
-    train_vision: bool = Field(
-        False, description="with method full: the vision tower learns, too; nothing is cached then"
-    )
+    train_vision: bool = Field(False, description="with method full: the vision tower learns too; no features are kept")
     lora_rank: int = Field(16, ge=1, description="rank of the LoRA update")
     lora_alpha: float = Field(32.0, gt=0, description="LoRA scale; the update is multiplied by alpha / rank")
-    lora_dropout: float = Field(
-        0.0,
-        ge=0,
-        lt=1,
-        description="dropout in front of the LoRA matrices; 0: off. It keeps a copy of what each layer gets, and what is dropped depends "
-        "on batch_size and the number of processes",
-    )
-    target_modules: str = Field(
-        TARGET_MODULES, description="regular expression over the full names of the adapted layers"
-    )
+    lora_dropout: float = Field(0.0, ge=0, lt=1, description="dropout before the LoRA matrices; it follows batch_size")
+    target_modules: str = Field(TARGET_MODULES, description="regular expression over the full names of adapted layers")
     epochs: int = Field(3, ge=1, description="passes over the training split")
     max_steps: int = Field(0, ge=0, description="stop after this many optimizer steps; 0: only by epochs")
-    samples_per_step: int = Field(
-        16, ge=1, description="samples of an optimizer step, over all processes and forward passes"
-    )
+    samples_per_step: int = Field(16, ge=1, description="samples of an optimizer step, over all processes")
     learning_rate: float = Field(1e-4, gt=0, description="peak learning rate of AdamW")
     schedule: Literal["cosine", "constant"] = Field("cosine", description="learning rate after the warm-up")
     warmup_fraction: float = Field(0.03, ge=0, lt=1, description="share of the steps with a rising rate; 0: none")
     weight_decay: float = Field(0.0, ge=0, description="AdamW's decoupled weight decay")
     max_gradient_norm: float = Field(1.0, ge=0, description="gradients are scaled down to this norm; 0: off")
-    max_pixels: int = Field(
-        0,
-        ge=0,
-        description="most pixels kept of a picture; 0: all. Fewer than it has, and pixel values of the texts fit it no more",
-    )
-    max_tokens: int = Field(
-        4096, ge=16, description="longest sample, images and answer included; a longer one is skipped and counted"
-    )
-    dtype: Dtype = Field(
-        "auto",
-        description="what is computed in; auto: bfloat16 on an accelerator, float32 on a CPU. Learning weights are float32",
-    )
+    max_pixels: int = Field(0, ge=0, description="most pixels of a picture; 0: all, as texts speak of them")
+    max_tokens: int = Field(4096, ge=16, description="longest sample with images and answer; longer ones are left out")
+    dtype: Dtype = Field("auto", description="what is computed in; auto: bfloat16 on cuda, float32 on a CPU")
     random_student: RandomStudent = Field(RandomStudent(), description="the student of `--student random`")
 
-    validation_samples: int = Field(
-        64,
-        ge=0,
-        description="samples of val, drawn over all decisions and flights, for loss and decision accuracy; 0: none",
-    )
+    validation_samples: int = Field(64, ge=0, description="samples of val, over all decisions and flights; 0: none")
     validate_every_steps: int = Field(0, ge=0, description="steps between validations; 0: at the end of each epoch")
-    validation_answers: bool = Field(
-        True, description="let the student answer them, for the decision accuracy; false: the loss alone"
-    )
+    validation_answers: bool = Field(True, description="the student answers them; false: the loss alone is measured")
     max_new_tokens: int = Field(512, ge=1, description="longest answer in validation, tokens")
-    patience: int = Field(
-        3,
-        ge=0,
-        description="validations in a row without a better decision accuracy after which training ends; 0: never",
+    best_by: Literal["decision", "verdict"] = Field(
+        "decision",
+        description="which validation is best: most of the teacher's decisions, or most consistent with the future",
     )
-    keep: Literal["best", "last"] = Field(
-        "best", description="which weights are the product: those of the best validation, or the last"
-    )
+    patience: int = Field(3, ge=0, description="validations without a better one after which training ends; 0: never")
+    keep: Literal["best", "last"] = Field("best", description="the weights of the best validation, or the last")
 
     batch_size: MayDiffer[int] = Field(1, ge=1, description="samples in one forward pass of one process")
-    gradient_checkpointing: MayDiffer[bool] = Field(
-        False, description="recompute activations: less memory, about 30 percent slower"
-    )
-    logit_chunk: MayDiffer[int] = Field(
-        512,
-        ge=1,
-        description="answer tokens whose logits exist at a time: each takes 4 bytes times the vocabulary, three times",
-    )
+    gradient_checkpointing: MayDiffer[bool] = Field(False, description="recompute activations: less memory, slower")
+    logit_chunk: MayDiffer[int] = Field(512, ge=1, description="answer tokens whose logits exist at a time")
     feature_memory_gb: MayDiffer[float] = Field(
-        16.0,
-        ge=0,
-        description="memory for what the frozen vision tower makes of pictures, GB a process; 0: nothing is kept",
+        16.0, ge=0, description="memory for features, GB a process; 0: none are kept"
     )
     data_workers: MayDiffer[int] = Field(
-        -1, ge=-1, description="processes that read pictures, for each that trains; -1: one a core, at most 16; 0: none"
+        -1, ge=-1, description="processes that read pictures; -1: one a core, 16 at most"
     )
     save_every_steps: MayDiffer[int] = Field(50, ge=1, description="steps between checkpoints")
     keep_checkpoints: MayDiffer[int] = Field(2, ge=1, description="newest checkpoints that stay, beside the best")
@@ -123,10 +89,9 @@ class TrainConfig(Config):
     def _fits(self) -> TrainConfig:
         if self.train_vision and self.method != "full":
             raise ValueError("train_vision needs method=full: adapters leave the vision tower alone")
+        if self.best_by == "verdict" and not self.validation_answers:
+            raise ValueError("best_by=verdict needs validation_answers: a loss has no verdict")
         return self
-
-
-STAGE = "distill.train"
 
 
 @dataclass(frozen=True)
@@ -160,8 +125,7 @@ def share_of(chosen: Sequence[int], lengths: np.ndarray, rank: int, num_ranks: i
     Args:
         chosen: the step's samples. lengths: (n,) tokens of every sample.
     """
-    by_length = sorted(chosen, key=lambda index: (-int(lengths[index]), index))
-    return by_length[rank::num_ranks]
+    return sorted(chosen, key=lambda index: (-int(lengths[index]), index))[rank::num_ranks]
 
 
 def learning_rate_at(cfg: TrainConfig, step: int, num_steps: int) -> float:
@@ -173,8 +137,3 @@ def learning_rate_at(cfg: TrainConfig, step: int, num_steps: int) -> float:
         return cfg.learning_rate
     share = (step - warmup) / max(1, num_steps - warmup)
     return cfg.learning_rate * 0.5 * (1.0 + math.cos(math.pi * share))
-
-
-def is_validated(cfg: TrainConfig, steps: Steps, done: int) -> bool:
-    """Tell whether there is a validation after so many steps."""
-    return done == steps.num_steps or done % (cfg.validate_every_steps or steps.steps_per_epoch) == 0

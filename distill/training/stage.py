@@ -5,7 +5,6 @@ The loss counts answer tokens only, and nothing is ever cut: a sample that does 
 
 from __future__ import annotations
 
-import logging
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -51,14 +50,9 @@ def taught_by(samples: Iterable[Sample], max_pixels: int) -> Taught:
     return Taught(prompts=dict(sorted(prompts.items())), num_frames=lengths.pop(), looks=ordered, max_pixels=max_pixels)
 
 
-log = logging.getLogger(__name__)
-
 ADAPTER, MODEL, STUDENT, PREFLIGHT = "adapter", "model", "student", "preflight.json"
 UNREADABLE = "unreadable_picture"
 TOKENIZER_SAMPLES = 2000  # what the tokenizer of a student of random weights is trained on, at most
-
-
-# --- the student ------------------------------------------------------------------------------------------------------
 
 
 def add_adapter(student: Student, cfg: TrainConfig, seed: int) -> Student:
@@ -84,7 +78,8 @@ def add_adapter(student: Student, cfg: TrainConfig, seed: int) -> Student:
     with seeded(student, seed, "adapter"):
         student.model = get_peft_model(student.model, lora)
     for module in student.model.modules():
-        # peft would keep a float32 copy of what each adapted layer is given; autocast converts where it is used instead.
+        # peft would keep a float32 copy of what each adapted layer is given; autocast converts where it is used
+        # instead.
         if hasattr(module, "cast_input_dtype_enabled"):
             module.cast_input_dtype_enabled = False
     return student
@@ -121,9 +116,6 @@ def made_student(cfg: TrainConfig, samples: Sequence[Sample], folder: Path, seed
     return folder
 
 
-# --- the step ---------------------------------------------------------------------------------------------------------
-
-
 @in_its_actions
 def run(
     cfg: TrainConfig,
@@ -135,10 +127,12 @@ def run(
     seed: int = 0,
     resume: Resume = "if-same",
 ) -> Path:
-    """Read a training set, its playback trees and a student; write `adapter/` or `model/`, `log.jsonl`, `preflight.json`, `checkpoints/`.
+    """Read a training set, its playback trees and a student; write `adapter/` or `model/`, `log.jsonl`,
+    `preflight.json`, `checkpoints/`.
 
     Args:
-        student: a folder, the name of a repository, or `tiny`, `tiny:small`, `tiny:medium`, `random`, which are made in `out`.
+        student: a folder, the name of a repository, or `tiny`, `tiny:small`, `tiny:medium`, `random`, which are made in
+            `out`.
     Returns:
         The folder of the adapter, which peft loads, or of the model, which transformers loads.
     Raises:
@@ -159,31 +153,29 @@ def run(
         opened: list[StageFolder] = []
 
         def begin() -> bool:
-            opened.append(StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume))
+            given: Any = {"config": cfg, "inputs": inputs, "seed": seed, "resume": resume}
+            opened.append(StageFolder.open(out, STAGE, **given, begun=(LOG, STUDENT)))
             return opened[0].is_complete
 
         if ranks.first_does(begin):
             return product
-        samples = open_split(dataset, "train")
         if preset is not None:
-            ranks.first_does(lambda: str(made_student(cfg, samples, base, seed)))
+            ranks.first_does(lambda: str(made_student(cfg, open_split(dataset, "train"), base, seed)))
         with memory_errors(cfg), reader_errors():
-            lesson, taught = _lesson(cfg, samples, dataset, trees, base, out, seed, ranks)
+            lesson, taught = _lesson(cfg, dataset, trees, base, out, seed, ranks)
             progress = fit(lesson, out)
         ranks.first_does(lambda: _write_product(lesson, progress, taught, product, base, base_name, opened[0]))
     return product
 
 
 def _lesson(
-    cfg: TrainConfig, samples: Sequence[Sample], dataset: Path, trees: dict[str, Path], base: Path, out: Path, seed: int,
-    ranks: Ranks,
-) -> tuple[Lesson, Taught]:  # fmt: skip
-    validation = open_split(dataset, "val")
+    cfg: TrainConfig, dataset: Path, trees: dict[str, Path], base: Path, out: Path, seed: int, ranks: Ranks
+) -> tuple[Lesson, Taught]:
+    samples, validation = open_split(dataset, "train"), open_split(dataset, "val")
     chosen = choose_over_all(validation, cfg.validation_samples, rng_for(seed, STAGE, "validation"))
     if not samples:
-        raise InputError(
-            "the training split is empty", where=dataset, fix="prepare it with more captions, or other fractions"
-        )
+        fix = "prepare it with more captions, or other fractions"
+        raise InputError("the training split is empty", where=dataset, fix=fix)
     taught = taught_by(samples, max(1, cfg.max_pixels))
     sizes_px = [*(look.size_px for look in taught.looks), *(validation[index].picture_px for index in chosen)]
     max_pixels = cfg.max_pixels or max(width_px * height_px for width_px, height_px in sizes_px)
@@ -225,15 +217,13 @@ def _write_product(
         write_taught(partial, taught)
     num_unreadable = len(progress.unreadable)
     dropped = census.skipped + Counter({UNREADABLE: num_unreadable})
+    tally = Tally(input=census.num_samples, kept=len(census) - num_unreadable, dropped=dropped)
+    tokens = {"samples": len(census), "tokens": census.tokens.sum(), "answer_tokens": census.answer_tokens.sum()}
     stage.finish(
         [path for path in (stage.path / LOG, stage.path / PREFLIGHT, *product.iterdir()) if path.is_file()],
-        Tally(input=census.num_samples, kept=len(census) - num_unreadable, dropped=dropped),
+        tally,
         steps=progress.step,
         best_step=progress.best_step,
-        tokens={
-            "samples": len(census),
-            "tokens": int(census.tokens.sum()),
-            "answer_tokens": int(census.answer_tokens.sum()),
-        },
+        tokens={name: int(count) for name, count in tokens.items()},
         **{name: facts[name] for name in ("trainable_parameters", "parameters", "device", "versions")},
     )

@@ -1,13 +1,14 @@
 """How fast a student of Qwen3.5's 2 B shape answers, with random weights and made-up samples, beside plain `generate`.
 
-    python tests/benchmarks/bench_decoding.py --shape 2b --batch 16 64 128       on an accelerator
-    python tests/benchmarks/bench_decoding.py                                    on a CPU: a tiny shape, to see that it runs
+    python tests/benchmarks/bench_decoding.py --shape 2b --batch 16 64 128       on an accelerator python
+    tests/benchmarks/bench_decoding.py                                    on a CPU: a tiny shape, to see that it runs
     python tests/benchmarks/bench_decoding.py --check                            tokens against `generate`, in float32
     python tests/benchmarks/bench_decoding.py --check --dtype bfloat16           recorded steps against plain ones
 
-Pictures are noise in memory; what it takes to read them, and what frames that several samples share save, tells `cosfly distill infer` on a
-playback tree (`speed` in its manifest). Ways: generate (the library's), decode (ours), features (ours, the pictures looked at before), plain (the same, no step
-recorded; on a CPU none is). flash-linear-attention does not compute in float32: `--check` has PyTorch's own functions do it.
+Pictures are noise in memory; what reading takes, and what frames that several samples share save, tells `cosfly distill
+infer` on a playback tree (`speed` in its manifest). Ways: generate (the library's), decode (ours, looking at the
+pictures), features (ours, the pictures looked at before), plain (the same, no step recorded; on a CPU none is).
+flash-linear-attention does not compute in float32: `--check` has PyTorch's own functions do it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass
 from itertools import takewhile
 from typing import Any
 
@@ -36,25 +37,35 @@ class Numbers(Words):
         return " ".join(map(str, ids))
 
 
-def make_batch(student: Student, shape: dict[str, Any], count: int) -> tuple[list[EncodedSample], Any]:
-    """Give prompts with their patches, and what the tower makes of these."""
-    rows = []
-    for row, pictures in make_rows(shape, count, seed=1):
-        patches = torch.cat([noise_of(picture, torch.float32).patches for picture in pictures]).numpy()
-        rows.append(replace(row, pixel_values=patches))
-    with torch.inference_mode():
+@dataclass(frozen=True)
+class Batch:
+    """Prompts, and the patches of their pictures, prompt by prompt."""
+
+    rows: list[EncodedSample]
+    patches: list[Any]
+
+    def look(self, student: Student) -> Any:
+        """What the tower makes of the pictures, one prompt after the other: all at once would be the most memory of
+        all."""
         seen = []
-        for row in rows:  # one after the other: a batch of towers' activations would be the most memory of all
-            inputs = prompt_batch(student, [row])
-            seen += student.core.model.get_image_features(
-                inputs["pixel_values"], inputs["image_grid_thw"]
-            ).pooler_output
-        return rows, torch.cat(seen)
+        with torch.inference_mode():
+            for row, patches in zip(self.rows, self.patches, strict=True):
+                grids = torch.from_numpy(row.image_grids).to(student.device)
+                given = patches.to(student.device, student.dtype)
+                seen += student.core.model.get_image_features(given, grids).pooler_output
+        return torch.cat(seen)
 
 
-def generate(student: Student, rows: list[EncodedSample], num_tokens: int) -> list[str]:
+def make_batch(shape: str, count: int) -> Batch:
+    rows = make_rows(shape, count, seed=1)
+    noise = [torch.cat([noise_of(picture, torch.float32).patches for picture in pictures]) for _, pictures in rows]
+    return Batch([row for row, _ in rows], noise)
+
+
+def generate(student: Student, batch: Batch, num_tokens: int) -> list[str]:
     """Answer by the library's own way."""
-    inputs = prompt_batch(student, rows)
+    inputs = prompt_batch(student, batch.rows)
+    inputs["pixel_values"] = torch.cat(batch.patches).to(student.device, student.dtype)
     with torch.inference_mode():
         output = student.model.generate(
             **inputs, max_new_tokens=num_tokens, do_sample=False, eos_token_id=END, pad_token_id=PAD
@@ -79,14 +90,14 @@ def seconds(work: Callable[[], Any], device: str, repeats: int) -> float:
     return min(times)
 
 
-def measure(student: Student, shape: dict[str, Any], count: int, options: argparse.Namespace) -> list[list[Any]]:
-    rows, features = make_batch(student, shape, count)
-    seen = [replace(row, pixel_values=None) for row in rows]  # as `infer` gives them, whose pictures were looked at
+def measure(student: Student, shape: str, count: int, options: argparse.Namespace) -> list[list[Any]]:
+    batch = make_batch(shape, count)
+    rows, features = batch.rows, batch.look(student)
     ways: dict[str, Callable[[int], Any]] = {
-        "generate": lambda tokens: generate(student, rows, tokens),
-        "decode": lambda tokens: decode(student, rows, max_tokens=tokens),
-        "features": lambda tokens: decode(student, seen, max_tokens=tokens, features=features),
-        "plain": lambda tokens: decode(student, seen, max_tokens=tokens, features=features, is_recorded=False),
+        "generate": lambda tokens: generate(student, batch, tokens),
+        "decode": lambda tokens: decode(student, rows, batch.look(student), max_tokens=tokens),
+        "features": lambda tokens: decode(student, rows, features, max_tokens=tokens),
+        "plain": lambda tokens: decode(student, rows, features, max_tokens=tokens, is_recorded=False),
     }
     table = []
     for name in options.ways:
@@ -100,23 +111,28 @@ def measure(student: Student, shape: dict[str, Any], count: int, options: argpar
     return table
 
 
-def check(student: Student, shape: dict[str, Any], count: int, num_tokens: int) -> None:
+def check(student: Student, shape: str, count: int, num_tokens: int) -> None:
     """Say how far the answers of all ways agree. In float32 they must.
 
-    In bfloat16 a matrix product that is recorded may add in another order, and of random weights the two best tokens are often one
-    rounding apart, after which answers go their own ways: how long they agree is told, no more.
+    In bfloat16 a matrix product that is recorded may add in another order, and of random weights the two best tokens
+    are often one rounding apart, after which answers go their own ways: how long they agree is told, no more.
     """
-    rows, features = make_batch(student, shape, count)
+    batch = make_batch(shape, count)
+    features = batch.look(student)
 
     def answers(given: Any, is_recorded: bool = True) -> list[str]:
-        found = decode(student, rows, max_tokens=num_tokens, features=given, is_recorded=is_recorded)
+        found = decode(student, batch.rows, given, max_tokens=num_tokens, is_recorded=is_recorded)
         return [answer.text for answer in found]
 
     plain = answers(features, is_recorded=False)
     expected, whose = plain, "plain steps"
     if student.dtype == torch.float32:
-        expected, whose = generate(student, rows, num_tokens), "generate"
-    ways = {"plain": answers(features, is_recorded=False), "decode": answers(None), "features": answers(features)}
+        expected, whose = generate(student, batch, num_tokens), "generate"
+    ways = {
+        "plain": answers(features, is_recorded=False),
+        "decode": answers(batch.look(student)),
+        "features": answers(features),
+    }
     for name, found in ways.items():
         pairs = [(a.split(), b.split()) for a, b in zip(found, expected, strict=True)]
         num_equal = sum(a == b for a, b in pairs)
@@ -142,15 +158,15 @@ def main() -> None:
     device = "cuda" if torch.cuda.is_available() else "cpu"
     scenes.one_thread_and_machine()
     dtype = compute_dtype("float32" if options.check and options.dtype == "auto" else options.dtype, device)
-    student = make_student(SHAPES[options.shape], device, dtype)
+    student = make_student(options.shape, device, dtype)
     if device == "cuda" and not options.check:
         fuse_norms(student.core)
     student.tokenizer = Numbers()
     student.model.eval()
     if options.check:
-        check(student, SHAPES[options.shape], max(options.batch), options.tokens)
+        check(student, options.shape, max(options.batch), options.tokens)
         return
-    table = [row for count in options.batch for row in measure(student, SHAPES[options.shape], count, options)]
+    table = [row for count in options.batch for row in measure(student, options.shape, count, options)]
     names = ["way", "batch", "first token, s", "ms a step", "answers/s", "tokens/s", "peak GiB"]
     scenes.print_table(f"{options.shape}, {options.tokens} tokens, {device}, {dtype}", names, table)
 

@@ -1,16 +1,17 @@
-"""How fast a student of Qwen3.5's 2 B shape is trained, and in how much memory, with random weights and made-up samples.
+"""How fast a student of Qwen3.5's 2 B shape is trained, and in how much memory, with random weights and made-up
+samples.
 
-    python tests/benchmarks/bench_training.py --shape 2b --batch 16              on an accelerator
-    python tests/benchmarks/bench_training.py --shape tiny --batch 2 --steps 3   on a CPU, to see that it runs
-    python tests/benchmarks/bench_training.py --shape 2b --batch 8 --way plain   plain transformers and peft, for comparison
-    torchrun --nproc-per-node 4 tests/benchmarks/bench_training.py --shape 2b --batch 64 --micro 16
-    python tests/benchmarks/bench_training.py --shape 2b --check                 loss and gradients against plain, in float32
-    python tests/benchmarks/bench_training.py --shape 2b --check --dtype bfloat16 --kept FILE   the same of bfloat16 and the fast kernels,
-                                                 against plain float32, of which `--check --kept FILE` left the numbers
+    P=tests/benchmarks/bench_training.py
+    python $P --shape 2b --batch 16              on an accelerator
+    python $P --batch 2 --steps 3                on a CPU: a tiny shape, to see that it runs
+    python $P --shape 2b --batch 8 --way plain   plain transformers and peft, for comparison
+    torchrun --nproc-per-node 4 $P --shape 2b --batch 64 --micro 16
+    python $P --shape 2b --check                 loss and gradients against plain, in float32; `--kept FILE` keeps them
+    python $P --shape 2b --check --dtype bfloat16 --kept FILE    bfloat16 and the fast kernels against what was kept
 
-`--way ours` takes the project's own steps: features of pictures kept, logits for a few answer tokens at a time, rows by length; pictures
-are noise in memory, so what it takes to read them is not in these figures: `cosfly distill train` on a playback tree tells that
-(`waited_share` in its log). The first steps compile kernels and are not counted.
+`--way ours` takes the project's own steps: features of pictures kept, logits for a few answer tokens at a time, rows by
+length. Pictures are noise in memory: what reading takes tells `cosfly distill train` on a tree (`waited_share` in its
+log). The first steps compile kernels and are not counted.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from safetensors.torch import load_file, save_file
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
 from distill.student.encoding import EncodedSample, padded
-from distill.student.features import Picture, PictureData, VisionFeatures
+from distill.student.features import FramePicture, PictureData, VisionFeatures
 from distill.student.kernels import fuse_norms, look_at_equal_sizes_at_once, use_kernels_for
 from distill.student.model import Student, compute_dtype
 from distill.training.fit import make_optimizer
@@ -36,15 +37,21 @@ from distill.training.ranks import Ranks, joined
 from distill.training.settings import TrainConfig
 from distill.training.stage import add_adapter
 
-# Width, layers, heads of full attention, key-value heads, head width, linear heads (keys, values, width), MLP, tower (width, layers).
 SHAPES: dict[str, dict[str, Any]] = {
-    "2b": {"hidden_size": 2048, "num_hidden_layers": 24, "num_attention_heads": 8, "num_key_value_heads": 2, "head_dim": 256,
-           "linear_num_key_heads": 16, "linear_num_value_heads": 16, "linear_key_head_dim": 128, "linear_value_head_dim": 128,
-           "intermediate_size": 6144, "vocab_size": 248_320, "tower": (1024, 24, 4096), "size_px": (640, 352), "words": (660, 250)},
-    "tiny": {"hidden_size": 64, "num_hidden_layers": 4, "num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 16,
-             "linear_num_key_heads": 2, "linear_num_value_heads": 4, "linear_key_head_dim": 16, "linear_value_head_dim": 16,
-             "intermediate_size": 128, "vocab_size": 5000, "tower": (32, 2, 64), "size_px": (64, 64), "words": (80, 40)},
+    "2b": {
+        "hidden_size": 2048, "num_hidden_layers": 24, "num_attention_heads": 8, "num_key_value_heads": 2, "head_dim": 256,
+        "linear_num_key_heads": 16, "linear_num_value_heads": 16, "linear_key_head_dim": 128,
+        "linear_value_head_dim": 128, "intermediate_size": 6144, "vocab_size": 248_320,
+    },
+    "tiny": {
+        "hidden_size": 64, "num_hidden_layers": 4, "num_attention_heads": 4, "num_key_value_heads": 2, "head_dim": 16,
+        "linear_num_key_heads": 2, "linear_num_value_heads": 4, "linear_key_head_dim": 16,
+        "linear_value_head_dim": 16, "intermediate_size": 128, "vocab_size": 5000,
+    },
 }  # fmt: skip
+TOWERS = {"2b": (1024, 24, 4096), "tiny": (32, 2, 64)}  # width, layers, MLP
+SIZES_PX = {"2b": (640, 352), "tiny": (64, 64)}
+WORDS = {"2b": (660, 250), "tiny": (80, 40)}  # of prompt and answer
 PICTURES = 5
 IMAGE, END, PAD, FIRST_WORD = 3, 1, 0, 10  # token numbers of the made-up vocabulary
 WARM_UP = 3
@@ -59,69 +66,51 @@ class Words:
         return {"<|image_pad|>": IMAGE}.get(token, END)
 
 
-def make_student(shape: dict[str, Any], device: str, dtype: Any, seed: int = 0) -> Student:
+def make_student(shape: str, device: str, dtype: Any, seed: int = 0) -> Student:
     use_kernels_for(dtype, device)
     from transformers import Qwen3_5Config, Qwen3_5ForConditionalGeneration
 
-    width, depth, inner = shape["tower"]
-    head = shape["head_dim"]
-    section = head // 32  # as Qwen3.5: a quarter of a head turns, 11 + 11 + 10 of 32 pairs in the real one
-    text = {key: value for key, value in shape.items() if key not in ("tower", "size_px", "words")} | {
-        "layer_types": (["linear_attention"] * 3 + ["full_attention"]) * (shape["num_hidden_layers"] // 4),
-        "tie_word_embeddings": True, "eos_token_id": END, "pad_token_id": PAD,
-        "rope_parameters": {"rope_type": "default", "rope_theta": 1e7, "partial_rotary_factor": 0.25 if head > 16 else 0.5,
-                            "mrope_section": [11, 11, 10] if head == 256 else [head // 4 - 2 * section, section, section],
-                            "mrope_interleaved": True},
+    sizes, (width, depth, inner) = SHAPES[shape], TOWERS[shape]
+    head = sizes["head_dim"]
+    rope = {
+        "rope_type": "default", "rope_theta": 1e7, "partial_rotary_factor": 0.25 if head > 16 else 0.5,
+        "mrope_section": [11, 11, 10] if head == 256 else [4, 0, 0], "mrope_interleaved": True,
     }  # fmt: skip
-    vision = {"depth": depth, "hidden_size": width, "intermediate_size": inner, "num_heads": max(2, width // 64),
-              "out_hidden_size": shape["hidden_size"]}  # fmt: skip
+    text = sizes | {
+        "layer_types": (["linear_attention"] * 3 + ["full_attention"]) * (sizes["num_hidden_layers"] // 4),
+        "tie_word_embeddings": True, "eos_token_id": END, "pad_token_id": PAD, "rope_parameters": rope,
+    }  # fmt: skip
+    vision = {"depth": depth, "hidden_size": width, "intermediate_size": inner, "num_heads": max(2, width // 64)}
     config = Qwen3_5Config(
-        text_config=text, vision_config=vision, image_token_id=IMAGE, video_token_id=4, vision_start_token_id=5, vision_end_token_id=6,
-        tie_word_embeddings=True,
+        text_config=text, vision_config=vision | {"out_hidden_size": sizes["hidden_size"]}, image_token_id=IMAGE,
+        video_token_id=4, vision_start_token_id=5, vision_end_token_id=6, tie_word_embeddings=True,
     )  # fmt: skip
     torch.manual_seed(seed)
     with torch.device(device):
         model = Qwen3_5ForConditionalGeneration(config).to(dtype)
-    images = Qwen2VLImageProcessorPil(
-        patch_size=16, merge_size=2, temporal_patch_size=2, size={"shortest_edge": 32 * 32, "longest_edge": 1280 * 1280}
-    )
+    areas = {"shortest_edge": 32 * 32, "longest_edge": 1280 * 1280}
+    images = Qwen2VLImageProcessorPil(patch_size=16, merge_size=2, temporal_patch_size=2, size=areas)
     look_at_equal_sizes_at_once(model)
     return Student(Words(), images, model, device, dtype)
 
 
-def make_rows(shape: dict[str, Any], count: int, seed: int) -> list[tuple[EncodedSample, list[Picture]]]:
+def make_rows(shape: str, count: int, seed: int) -> list[tuple[EncodedSample, list[FramePicture]]]:
     """Samples whose lengths differ by a few per cent, as captions' do; a frame stands in five windows."""
-    rng, (width_px, height_px) = np.random.default_rng(seed), shape["size_px"]
-    grid = (1, height_px // 16, width_px // 16)
+    rng, size_px = np.random.default_rng(seed), SIZES_PX[shape]
+    grid, vocabulary = (1, size_px[1] // 16, size_px[0] // 16), SHAPES[shape]["vocab_size"]
     rows = []
     for number in range(count):
-        prompt, answer = (int(length * rng.uniform(0.9, 1.1)) for length in shape["words"])
-        ids: list[int] = []
-        for _ in range(PICTURES):
-            ids += [5, *[IMAGE] * (grid[1] * grid[2] // 4), 6]
-        ids += rng.integers(FIRST_WORD, shape["vocab_size"], prompt).tolist()
-        answers = rng.integers(FIRST_WORD, shape["vocab_size"], answer)
-        encoded = EncodedSample(
-            str(number),
-            np.array(ids, np.int64),
-            np.append(answers, END),
-            None,
-            np.array([grid] * PICTURES, np.int64),
-            1.0,
-        )
-        rows.append(
-            (
-                encoded,
-                [
-                    Picture("run", str(seed * count + number + i), "rgb", shape["size_px"], 100.0)
-                    for i in range(PICTURES)
-                ],
-            )
-        )
+        prompt, answer = (int(length * rng.uniform(0.9, 1.1)) for length in WORDS[shape])
+        ids = [5, *[IMAGE] * (grid[1] * grid[2] // 4), 6] * PICTURES
+        ids += rng.integers(FIRST_WORD, vocabulary, prompt).tolist()
+        answers = np.append(rng.integers(FIRST_WORD, vocabulary, answer), END)
+        encoded = EncodedSample(str(number), np.array(ids), answers, np.array([grid] * PICTURES), 1.0)
+        frames = [str(seed * count + number + i) for i in range(PICTURES)]
+        rows.append((encoded, [FramePicture("run", frame, "rgb", size_px, 100.0) for frame in frames]))
     return rows
 
 
-def noise_of(picture: Picture, dtype: Any) -> PictureData:
+def noise_of(picture: FramePicture, dtype: Any) -> PictureData:
     width_px, height_px = picture.size_px
     values = np.random.default_rng(int(picture.frame)).standard_normal((height_px * width_px // 256, 1536), np.float32)
     return PictureData(picture, torch.from_numpy(values).to(dtype))
@@ -130,11 +119,10 @@ def noise_of(picture: Picture, dtype: Any) -> PictureData:
 def plain_loss(student: Student, rows: list[EncodedSample], patches: Any) -> Any:
     """What plain transformers does: every token's logits, the tower in every step, a padding mask."""
     ids, labels, _ = padded(student, rows)
-    mask = np.zeros_like(ids)
-    for i, row in enumerate(rows):
-        mask[i, : len(row)] = 1
+    lengths = np.array([[len(row)] for row in rows])
     arrays = {
-        "input_ids": ids, "labels": labels, "attention_mask": mask, "mm_token_type_ids": (ids == IMAGE).astype(np.int64),
+        "input_ids": ids, "labels": labels, "attention_mask": (np.arange(ids.shape[1]) < lengths).astype(np.int64),
+        "mm_token_type_ids": (ids == IMAGE).astype(np.int64),
         "image_grid_thw": np.concatenate([row.image_grids for row in rows]),
     }  # fmt: skip
     inputs = {name: torch.from_numpy(array).to(student.device) for name, array in arrays.items()}
@@ -158,7 +146,7 @@ def backward(student: Student, way: str, rows: list, features: VisionFeatures, c
 
 
 def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
-    shape, dtype = SHAPES[arguments.shape], compute_dtype(arguments.dtype, ranks.device)
+    shape, dtype = arguments.shape, compute_dtype(arguments.dtype, ranks.device)
     cfg = TrainConfig(
         batch_size=arguments.micro or arguments.batch, samples_per_step=arguments.batch, logit_chunk=arguments.chunk,
         gradient_checkpointing=arguments.checkpointing,
@@ -169,7 +157,8 @@ def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
     if cfg.gradient_checkpointing:
         student.model.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
     student.model.train()
-    optimizer, parameters = make_optimizer(student, cfg), [p for p in student.model.parameters() if p.requires_grad]
+    optimizer = make_optimizer(student, cfg)
+    parameters = [p for p in student.model.parameters() if p.requires_grad]
     features = VisionFeatures(student, memory_bytes=int(64e9))
     seconds, tokens = 0.0, 0
     for step in range(WARM_UP + arguments.steps):
@@ -190,8 +179,9 @@ def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
             tokens += sum(len(row) for row, _ in rows)
     (all_tokens,) = ranks.total([float(tokens)])
     return {
-        "way": arguments.way, "shape": arguments.shape, "parameters": sum(p.numel() for p in student.model.parameters()),
-        "processes": ranks.size, "samples_per_step": arguments.batch, "batch_size": cfg.batch_size, "dtype": str(dtype),
+        "way": arguments.way, "shape": shape, "parameters": sum(p.numel() for p in student.model.parameters()),
+        "processes": ranks.size, "samples_per_step": arguments.batch, "batch_size": cfg.batch_size,
+        "dtype": str(dtype),
         "step_s": round(seconds / arguments.steps, 4), "tokens_per_s": round(all_tokens / seconds, 1),
         "memory_gb": round(used_gb(ranks.device), 2), "pictures_looked_at": features.num_encoded,
     }  # fmt: skip
@@ -200,15 +190,15 @@ def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
 def check(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
     """Hold our loss and gradients against plain transformers on the same weights and samples.
 
-    Both in float32, of one process; in bfloat16 against what a float32 run left in `--kept`, since a process has either PyTorch's functions
-    or the fast kernels.
+    Both in float32, of one process; in bfloat16 against what a float32 run left in `--kept`, since a process has either
+    PyTorch's functions or the fast kernels.
     """
     cfg, dtype = TrainConfig(logit_chunk=arguments.chunk), compute_dtype(arguments.dtype, ranks.device)
     if arguments.dtype == "auto":
         dtype = torch.float32
-    student = add_adapter(make_student(SHAPES[arguments.shape], ranks.device, dtype), cfg, 0)
+    student = add_adapter(make_student(arguments.shape, ranks.device, dtype), cfg, 0)
     learned = {name: parameter for name, parameter in student.model.named_parameters() if parameter.requires_grad}
-    rows = make_rows(SHAPES[arguments.shape], 2, 0)
+    rows = make_rows(arguments.shape, 2, 0)
 
     def gradients_of(way: str) -> dict[str, torch.Tensor]:
         loss = backward(student, way, rows, VisionFeatures(student), cfg)
@@ -252,9 +242,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--dtype", choices=("auto", "float32", "bfloat16"), default="auto")
     parser.add_argument("--checkpointing", action="store_true")
-    parser.add_argument(
-        "--same", action="store_true", help="the same samples in every step: all features are kept from the first on"
-    )
+    parser.add_argument("--same", action="store_true", help="the same samples in every step: all features are kept")
     parser.add_argument("--norms", choices=("fused", "library"), default="fused", help="of ours, who computes norms")
     parser.add_argument("--check", action="store_true")
     parser.add_argument("--kept", help="a safetensors file of a float32 check's gradients and adapter")
