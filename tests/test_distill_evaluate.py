@@ -1,4 +1,5 @@
-"""distill/evaluation: numbers that can be checked by hand, intervals beside scipy's, and BERTScore on a tiny local encoder."""
+"""distill/evaluation: numbers that can be checked by hand, intervals beside scipy's, and BERTScore on a tiny local
+encoder."""
 
 from __future__ import annotations
 
@@ -19,6 +20,7 @@ from cosfly.cli import app
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import write_captions
+from cosfly.products.flights import find_flights
 from cosfly.products.predictions import Prediction, read_predictions
 from cosfly.work.journal import Journal
 from cosfly.work.stage_folder import StageFolder, Tally
@@ -26,10 +28,20 @@ from cosfly.work.store import dump_json
 from distill.evaluation import compare
 from distill.evaluation.bertscore import BertScoreConfig, Scorer
 from distill.evaluation.floors import Floors, coc_of, majority, shuffled_groups, shuffled_places, write_floors
-from distill.evaluation.measure import STUDENT, Report, measure, pair_up, read_judged, read_report, speed_of, text_of
+from distill.evaluation.measure import (
+    STUDENT,
+    Evaluation,
+    measure,
+    pair_up,
+    read_judged,
+    read_report,
+    speed_of,
+    text_of,
+)
 from distill.evaluation.scores import (
+    STATES,
     VERDICTS,
-    Answer,
+    ScoredAnswer,
     Scores,
     differences_of,
     draw_walks,
@@ -43,15 +55,15 @@ from distill.evaluation.stage import EvaluateConfig, run
 from distill.inference.outcome import failed_prediction, make_prediction
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample, open_split
+from specimens import make_playback_tree
 
 
 def sample_of(frame: int, language: str = "en") -> Sample:
-    sample = make_sample(make_caption("Town01", "trajectory_1", "ORI", frame), language, PrepareConfig())  # type: ignore[arg-type]
-    assert isinstance(sample, Sample)
-    return sample
+    return make_sample(make_caption("Town01", "trajectory_1", "ORI", frame), language, PrepareConfig())
 
 
-# Frames 4..11 have the decisions slow_down, track, yaw_left, track, slow_down, track, yaw_left, track (see specimens_distill).
+# Frames 4..11 have the decisions slow_down, track, yaw_left, track, slow_down, track, yaw_left, track (see
+# specimens_distill).
 FRAMES = range(4, 12)
 DECISIONS = ["slow_down", "track_straight", "yaw_left_to_follow", "track_straight"] * 2
 
@@ -61,7 +73,8 @@ def answer_with(sample: Sample, decision: str) -> str:
 
 
 def predictions_of(samples: list[Sample]) -> list[Prediction]:
-    """Right for four of eight: two wrong decisions, one answer cut short, one that is prose; one right one needs mending."""
+    """Right for four of eight: two wrong decisions, one answer cut short, one that is prose; one right one needs
+    mending."""
     texts = [sample.answer for sample in samples]
     texts[1] = answer_with(samples[1], "slow_down")
     texts[2] = answer_with(samples[2], "track_straight")
@@ -78,13 +91,10 @@ def samples() -> list[Sample]:
     return found
 
 
-def pairs_of(samples, predictions=None):
-    return pair_up(samples, predictions or predictions_of(samples))
-
-
 def scores_of(samples, predictions=None, **more) -> Scores:
-    pairs = pairs_of(samples, predictions)
-    return score_answers([sample for sample, _ in pairs], [Answer.of(prediction) for _, prediction in pairs], **more)
+    pairs = pair_up(samples, predictions or predictions_of(samples))
+    answers = [ScoredAnswer.of(prediction) for _, prediction in pairs]
+    return score_answers([sample for sample, _ in pairs], answers, **more)
 
 
 def figures(scores: Scores, resamples: int = 200, confidence: float = 0.95):
@@ -132,18 +142,16 @@ def test_failures_are_no_wrong_answers(samples):
 
 
 def test_verdicts_are_those_of_the_true_future(samples):
-    futures = [("slow_down", ()), ("hover", ()), (None, ("track_straight",)), (None, ()), ("hover", ("hover",))] + [
-        (None, None)
-    ] * 3
-    told = [
+    futures = [("slow_down", ()), ("hover", ()), (None, ("track_straight",)), (None, ()), ("hover", ("hover",))]
+    futures += [(None, None)] * 3
+    known = [
         sample.model_copy(update={"label": label, "contradicted": contradicted})
         for sample, (label, contradicted) in zip(samples, futures, strict=True)
     ]
-    scores = scores_of(told, predictions_of(samples))
+    scores = scores_of(known, predictions_of(samples))
     # Answers: slow_down, slow_down, track_straight, then two that do not parse; of the last three nothing is known.
-    assert [VERDICTS[number] if number >= 0 else None for number in scores.verdict] == [
-        "CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", None, None, None, None, None,
-    ]  # fmt: skip
+    words = [VERDICTS[number] if number >= 0 else None for number in scores.verdict]
+    assert words == ["CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", *[None] * 5]
     found, _ = figures(scores)
     assert (found["consistent"].value, found["hard_conflict"].count) == (1 / 3, 3)
 
@@ -162,9 +170,6 @@ def test_macro_f1_agrees_with_counting():
     assert np.isnan(macro_f1(np.zeros((17, 18))))
 
 
-# --- intervals --------------------------------------------------------------------------------------------------------
-
-
 def made_up(num_walks: int, rng: np.random.Generator, *, size: int = 6, skill: float = 0.6) -> Scores:
     """Scores of walks of some size, in which right answers come in clumps."""
     sizes = rng.integers(2, 2 * size, num_walks)
@@ -172,13 +177,13 @@ def made_up(num_walks: int, rng: np.random.Generator, *, size: int = 6, skill: f
     count = len(walk)
     right = rng.random(count) < np.repeat(rng.beta(2 * skill, 2 * (1 - skill), num_walks), sizes)
     reference = rng.integers(0, 3, count).astype(np.int8)
-    empty, known = np.full(count, np.nan), np.ones(count, dtype=bool)
-    none = np.full(count, -1, dtype=np.int8)
-    return Scores(
-        key=np.array([f"{name}/{i}" for i, name in enumerate(walk)], dtype=object), walk=walk, language=np.full(count, "en", dtype=object),
-        against=np.full(count, "the same", dtype=object), reference=reference, answer=np.where(right, reference, 5).astype(np.int8), label=none, answered=known, unmended=known, verdict=none,
-        precision=empty, recall=empty, f1=empty, proved=empty, contradicted=empty, unread=empty, num_tokens=np.zeros(count, dtype=np.int64),
-    )  # fmt: skip
+    texts = {name: np.full(count, "x", dtype=object) for name in ("language", "against")}
+    texts |= {"key": np.array([f"{name}/{i}" for i, name in enumerate(walk)], dtype=object), "walk": walk}
+    unknown = {name: np.full(count, np.nan) for name in ("precision", "recall", "f1", *STATES)}
+    codes = {name: np.full(count, -1, dtype=np.int8) for name in ("label", "verdict")}
+    flags = {name: np.ones(count, dtype=bool) for name in ("answered", "unmended")}
+    answer, tokens = np.where(right, reference, 5).astype(np.int8), np.zeros(count, dtype=np.int64)
+    return Scores(reference=reference, answer=answer, num_tokens=tokens, **texts, **unknown, **codes, **flags)
 
 
 def test_intervals_agree_with_the_bootstrap_of_scipy():
@@ -201,23 +206,21 @@ def test_paired_differences(samples):
     rng = np.random.default_rng(5)
     one = made_up(50, rng)
     worse = replace(one, answer=np.where(rng.random(len(one)) < 0.3, 7, one.answer).astype(np.int8))
-    count, found = differences_of(one, worse, resamples=2000, confidence=0.95, rng=np.random.default_rng(0))
-    accuracy = found["accuracy"]
+
+    def compared(other: Scores, resamples: int = 2000) -> tuple:
+        return differences_of(one, other, resamples=resamples, confidence=0.95, rng=np.random.default_rng(0))
+
+    count, found = compared(worse)
+    accuracy, right = found["accuracy"], [(each.answer == each.reference).mean() for each in (one, worse)]
     assert count == len(one)
-    assert accuracy.value == pytest.approx(
-        (one.answer == one.reference).mean() - (worse.answer == worse.reference).mean()
-    )
-    assert accuracy.low > 0
-    assert accuracy.p == 1 / 2000
+    assert accuracy.value == pytest.approx(right[0] - right[1])
+    assert (accuracy.low > 0, accuracy.p) == (True, 1 / 2000)
     # The same samples in another order, and a few of them: keys pair, not places.
     order = rng.permutation(len(one))
-    assert differences_of(one, worse.at(order), resamples=2000, confidence=0.95, rng=np.random.default_rng(0)) == (
-        count,
-        found,
-    )
-    same = differences_of(one, one.at(order[:40]), resamples=200, confidence=0.95, rng=np.random.default_rng(0))
+    assert compared(worse.at(order)) == (count, found)
+    same = compared(one.at(order[:40]), 200)
     assert (same[0], same[1]["accuracy"].value, same[1]["accuracy"].p) == (40, 0.0, 1.0)
-    assert differences_of(one, replace(one, key=one.key + "x"), resamples=200, confidence=0.95, rng=rng)[0] == 0
+    assert compared(replace(one, key=one.key + "x"), 200)[0] == 0
 
 
 def test_scores_survive_the_disk(tmp_path, samples):
@@ -226,13 +229,9 @@ def test_scores_survive_the_disk(tmp_path, samples):
     write_scores(tmp_path / "scores.parquet", scores)
     again = read_scores(tmp_path / "scores.parquet")
     for name in Scores.__dataclass_fields__:
-        assert np.array_equal(
-            getattr(again, name), getattr(scores, name), equal_nan=name in ("proved", "contradicted", "unread")
-        ), name
-        assert getattr(again, name).dtype == getattr(scores, name).dtype
-
-
-# --- floors -----------------------------------------------------------------------------------------------------------
+        found, wanted = getattr(again, name), getattr(scores, name)
+        assert np.array_equal(found, wanted, equal_nan=name in STATES), name
+        assert found.dtype == wanted.dtype
 
 
 @given(st.integers(2, 5000), st.integers(0, 10))
@@ -257,7 +256,8 @@ def test_floors_by_hand(samples):
 
 
 def test_a_rule_on_the_numbers_of_the_prompt_beats_the_majority(samples):
-    """What two comparisons of numbers tell is no merit of a student: decisions by speed and distance, among numbers that mean nothing."""
+    """What two comparisons of numbers tell is no merit of a student: decisions by speed and distance, among numbers
+    that mean nothing."""
     rng = np.random.default_rng(0)
 
     def told(count: int) -> list[Sample]:
@@ -292,9 +292,6 @@ def test_floors_are_predictions_that_a_verifier_can_judge(place):
         assert all(decisions[f"{p.sample_id}/en"] == decisions[f"{p.sample_id}/zh"] for p in found)
 
 
-# --- run --------------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def place(tmp_path, samples) -> Path:
     """A training set of two languages and two walks, and the predictions of its test split."""
@@ -320,27 +317,43 @@ def test_without_a_model_the_report_says_so_and_gives_no_number(place):
     path = run(CFG, place / "predictions.jsonl", place / "set", place / "out")
     report = read_report(path.parent)
     assert report.metrics == {"en": None, "zh": None}
-    student = report.languages["zh"].who[STUDENT].figures
+    student, teacher = report.languages["zh"].who[STUDENT].figures, report.all.who["teacher"].figures
     assert (student["parsed"].value, student["bertscore_f1"].value) == (0.75, None)
-    assert report.all.who[STUDENT].figures["accuracy"].value == 8 / 16
-    assert report.all.who["majority"].figures["accuracy"].value == 8 / 16
-    assert set(report.all.who) == {STUDENT, "teacher", "majority", "shuffled", "constant", "rule"}
-    teacher = report.all.who["teacher"].figures
-    assert (teacher["accuracy"].value, teacher["accuracy_on_labels"].value, teacher["bertscore_f1"].value) == (
-        1,
-        1,
-        None,
-    )
+    accuracy = {name: own.figures["accuracy"].value for name, own in report.all.who.items()}
+    assert (accuracy.pop(STUDENT), accuracy.pop("majority"), accuracy.pop("teacher")) == (8 / 16, 8 / 16, 1)
+    assert accuracy.keys() == {"shuffled", "constant", "rule"}
+    assert (teacher["accuracy_on_labels"].value, teacher["bertscore_f1"].value) == (1, None)
     page = (place / "out" / "evaluation.md").read_text()
     assert "BERTScore of en: not computed, no model folder" in page
     assert re.search(r"\| answers that parse \| 75\.00% \(.*to.*\) \| 100\.00% \|", page)
-    html = (place / "out" / "evaluation.html").read_text()
-    assert html.count("<svg") == 6
-    assert not re.search(r"(src|href)=.http", html)
     assert len(report.examples) == 12
     again = run(CFG, place / "predictions.jsonl", place / "set", place / "again")
     for name in ("report.json", "evaluation.md", "evaluation.html", "scores.parquet"):
         assert (again.parent / name).read_bytes() == (path.parent / name).read_bytes()
+
+
+def test_the_page_opens_with_what_a_person_asks_first(place):
+    """How much, how good, a picture; the confusion has a column for what does not parse, in table and picture alike."""
+    (place / "run").mkdir()
+    tree = make_playback_tree(place / "run" / "tree", 1, 12, with_augmented=False)
+    flight = find_flights(tree)[0]
+    samples = [
+        sample.model_copy(update={"run": "run", "town": flight.parts[-3], "trajectory": flight.parts[-2]})
+        for sample in open_split(place / "set", "test")
+    ]
+    write_set(place / "own", {"train": samples, "test": samples}, [tree])
+    run(CFG, place / "predictions.jsonl", place / "own", place / "out", data=[tree])
+    html = (place / "out" / "evaluation.html").read_text()
+    assert "<h1>unknown <small>evaluation on test</small></h1>" in html
+    marks = ['<div class="tile"><b>16</b>samples', "decisions right", "rule on two numbers", "of the teacher", "<img",
+             "<svg", "<table", "samples side by side", "How it was measured"]  # fmt: skip
+    assert [html.index(mark) for mark in marks] == sorted(html.index(mark) for mark in marks)
+    assert html.count("<img") == 5 * (12 + 1)  # of each sample shown, and of the first once more
+    assert html.count("<svg") == 6
+    assert "track_straight answered as (unparsed): 2 of 8" in html
+    assert not re.search(r"(src|href)=.http", html)
+    run(CFG, place / "predictions.jsonl", place / "own", place / "bare")
+    assert "Their pictures are shown with --data" in (place / "bare" / "evaluation.html").read_text()
 
 
 def test_foreign_text_shows_as_text(place, samples):
@@ -413,29 +426,16 @@ def test_speed_comes_from_what_stands_beside_the_predictions(place):
     assert (found.seconds, found.samples_per_s) == (6.0, 0.5)
 
 
-# --- several students -------------------------------------------------------------------------------------------------
-
-
 def test_students_side_by_side(place):
     predictions = read_predictions(place / "predictions.jsonl")
     samples = {sample.key: sample for sample in open_split(place / "set", "test")}
-    write_predictions(
-        place,
-        [make_prediction(samples[p.key], "test", samples[p.key].answer, 5, True) for p in predictions],
-        "right.jsonl",
-    )
+    right = [make_prediction(samples[p.key], "test", samples[p.key].answer, 5, True) for p in predictions]
+    write_predictions(place, right, "right.jsonl")
     for name in ("predictions", "right"):
         run(CFG, place / f"{name}.jsonl", place / "set", place / "students" / name)
     folders = [place / "students" / name for name in ("right", "predictions")]
-    words = [
-        "distill",
-        "report",
-        *map(str, folders),
-        "--out",
-        str(place / "table"),
-        "--set",
-        "distill.report.resamples=100",
-    ]
+    words = ["distill", "report", *map(str, folders), "--out", str(place / "table")]
+    words += ["--set", "distill.report.resamples=100"]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0, result.output
     page = (place / "table" / "comparison.md").read_text()
@@ -445,7 +445,7 @@ def test_students_side_by_side(place):
     assert re.search(r"\| decision accuracy, all answers \| \+0\.5000 \|", page)
     assert (place / "table" / "comparison.html").read_text().count("<svg") == 3
     with pytest.raises(InputError, match="one name"):
-        compare.run(compare.CompareConfig(), [folders[0], folders[0]], place / "x")
+        compare.run(compare.ReportConfig(), [folders[0], folders[0]], place / "x")
 
 
 def test_students_of_other_references_are_not_compared(place):
@@ -465,12 +465,9 @@ def test_students_of_other_references_are_not_compared(place):
         write_predictions(place, predictions, f"{name}.jsonl")
         run(CFG, place / f"{name}.jsonl", place / f"set_{name}", place / "strangers" / name)
     folders = {name: place / "strangers" / name for name in kinds}
-    compare.run(compare.CompareConfig(), [folders["first"], folders["blind"]], place / "ablation")
+    compare.run(compare.ReportConfig(), [folders["first"], folders["blind"]], place / "ablation")
     with pytest.raises(InputError, match=r"first and foreign.*different references.*1 samples"):
-        compare.run(compare.CompareConfig(), [folders["first"], folders["foreign"]], place / "strange")
-
-
-# --- BERTScore --------------------------------------------------------------------------------------------------------
+        compare.run(compare.ReportConfig(), [folders["first"], folders["foreign"]], place / "strange")
 
 
 def make_encoder(folder: Path) -> Path:
@@ -483,35 +480,17 @@ def make_encoder(folder: Path) -> Path:
     tokenizer = Tokenizer(models.BPE())
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)
     tokenizer.decoder = decoders.ByteLevel()
-    special = ["<s>", "<pad>", "</s>", "<unk>", "<mask>"]
-    trainer = trainers.BpeTrainer(
-        vocab_size=400,
-        special_tokens=special,
-        initial_alphabet=sorted(pre_tokenizers.ByteLevel.alphabet()),
-        show_progress=False,
-    )
+    special, letters = ["<s>", "<pad>", "</s>", "<unk>", "<mask>"], sorted(pre_tokenizers.ByteLevel.alphabet())
+    given: dict = {"special_tokens": special, "initial_alphabet": letters, "show_progress": False}
+    trainer = trainers.BpeTrainer(vocab_size=400, **given)
     tokenizer.train_from_iterator([sample_of(frame).answer for frame in FRAMES], trainer)
     tokenizer.post_processor = processors.RobertaProcessing(("</s>", 2), ("<s>", 0))
-    PreTrainedTokenizerFast(
-        tokenizer_object=tokenizer,
-        bos_token="<s>",
-        eos_token="</s>",
-        cls_token="<s>",
-        sep_token="</s>",
-        unk_token="<unk>",
-        pad_token="<pad>",
-        mask_token="<mask>",
-    ).save_pretrained(folder)
-    config = RobertaConfig(
-        vocab_size=tokenizer.get_vocab_size(),
-        hidden_size=32,
-        num_hidden_layers=3,
-        num_attention_heads=4,
-        intermediate_size=64,
-        max_position_embeddings=514,
-        pad_token_id=1,
-        initializer_range=0.3,
-    )
+    names = {"bos": "<s>", "eos": "</s>", "cls": "<s>", "sep": "</s>", "unk": "<unk>", "pad": "<pad>", "mask": "<mask>"}
+    own = {f"{name}_token": token for name, token in names.items()}
+    PreTrainedTokenizerFast(tokenizer_object=tokenizer, **own).save_pretrained(folder)
+    sizes = {"hidden_size": 32, "num_hidden_layers": 3, "num_attention_heads": 4, "intermediate_size": 64}
+    vocabulary = {"vocab_size": tokenizer.get_vocab_size(), "max_position_embeddings": 514, "pad_token_id": 1}
+    config = RobertaConfig(**sizes, **vocabulary, initializer_range=0.3)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         RobertaModel(config).save_pretrained(folder)
@@ -523,7 +502,7 @@ def encoder(tmp_path_factory) -> Path:
     return make_encoder(tmp_path_factory.mktemp("bert") / "encoder")
 
 
-def evaluated(place: Path, encoder: Path, language: str = "en", **settings: object) -> Report:
+def evaluated(place: Path, encoder: Path, language: str = "en", **settings: object) -> Evaluation:
     bertscore = {"device": "cpu", **{k: v for k, v in settings.items() if k == "idf"}}
     bertscore[language] = {"layer": 2, **{k: v for k, v in settings.items() if k != "idf"}}
     cfg = EvaluateConfig.model_validate({"resamples": 100, "bertscore": bertscore})

@@ -21,7 +21,7 @@ from cosfly.simplify.passes import SimplifyConfig
 from cosfly.work.chance import rng_for
 from cosfly.work.config import Config, build
 from cosfly.work.worker_pool import Watch
-from distill.evaluation.compare import CompareConfig
+from distill.evaluation.compare import ReportConfig
 from distill.evaluation.stage import EvaluateConfig
 from distill.inference.merge import MergeConfig
 from distill.inference.stage import InferConfig
@@ -42,7 +42,7 @@ class DistillConfig(Config):
     infer: InferConfig = Field(default_factory=InferConfig, description="answers of the student")
     merge: MergeConfig = Field(default_factory=MergeConfig, description="an adapter into its base's weights")
     evaluate: EvaluateConfig = Field(default_factory=EvaluateConfig, description="scores")
-    report: CompareConfig = Field(default_factory=CompareConfig, description="students side by side")
+    report: ReportConfig = Field(default_factory=ReportConfig, description="students side by side")
 
 
 class RunConfig(Config):

@@ -152,6 +152,10 @@ def distill_evaluate(
     dataset: Dataset,
     predictions: Annotated[Path, Option(help="Predictions, the output of `distill infer`.")],
     out: options.Out,
+    data: Annotated[
+        list[Path] | None,
+        Option(help="Playback tree, for the pictures of the page; repeat it where there are several."),
+    ] = None,
     bertscore_en: Annotated[
         Path | None, Option(help="Model folder for BERTScore of English (roberta-large); none: not computed.")
     ] = None,
@@ -163,11 +167,11 @@ def distill_evaluate(
     """Parse rate, decisions, verdicts, BERTScore and evidence, each beside its floors and with its interval."""
     from distill.evaluation import stage as evaluate
 
-    job.begin(out, predictions, dataset)
+    job.begin(out, predictions, dataset, *(data or []))
     given: Any = {"en": bertscore_en, "zh": bertscore_zh}
-    models = {language: folder for language, folder in given.items() if folder is not None}
-    more: Any = {"judged": _judged(judged or []), "seed": job.cfg.seed, "resume": job.resume}
-    typer.echo(evaluate.run(job.cfg.distill.evaluate, predictions, dataset, out, bertscore_models=models, **more))
+    more: Any = {"bertscore_models": {language: folder for language, folder in given.items() if folder is not None}}
+    more |= {"data": data or [], "judged": _judged(judged or []), "seed": job.cfg.seed, "resume": job.resume}
+    typer.echo(evaluate.run(job.cfg.distill.evaluate, predictions, dataset, out, **more))
 
 
 def _judged(given: list[str]) -> dict[str, list[Path]]:

@@ -1,4 +1,4 @@
-"""BERTScore on local model folders, one for each language: the library scores, its traps are avoided here. Knows texts only, no samples.
+"""BERTScore on local model folders, one for each language: the library scores, its traps are avoided here.
 
 Source: Zhang et al. 2020, doi:10.48550/arXiv.1904.09675; settings of sec:appendix_f_caption_distillation.
 """
@@ -30,9 +30,7 @@ class LanguageMetric(Config):
     """BERTScore of one language; the model's folder is an argument of the command."""
 
     layer: int = Field(17, ge=1, description="layer of the embeddings")
-    baseline: Path | None = Field(
-        None, description="baseline file (.tsv) of the scored model to rescale with; none: no rescaling"
-    )
+    baseline: Path | None = Field(None, description="baseline file (.tsv) of the model to rescale with")
 
 
 class BertScoreConfig(Config):
@@ -88,16 +86,11 @@ class Scorer:
 
         try:
             self._library = bert_score.BERTScorer(
-                model_type=str(folder),
-                num_layers=own.layer,
-                batch_size=cfg.batch_size,
-                nthreads=1,
-                idf=cfg.idf,
-                device=pick_device(cfg.device),
-                rescale_with_baseline=own.baseline is not None,
+                model_type=str(folder), num_layers=own.layer, batch_size=cfg.batch_size, nthreads=1, idf=cfg.idf,
+                device=pick_device(cfg.device), rescale_with_baseline=own.baseline is not None,
                 baseline_path=str(own.baseline) if own.baseline else None,
                 lang="en" if own.baseline else None,  # asked for by the library, unused with a baseline file
-            )
+            )  # fmt: skip
         except (OSError, ValueError, RuntimeError) as error:
             raise InputError("the BERTScore model does not load", where=folder, got=str(error)[:300]) from error
         # Without this limit in the tokenizer's files the library overflows; two places go to the sentence marks.
@@ -160,10 +153,8 @@ def score_beside_floors(
 def _warn_of_foreign(language: Language, references: Sequence[str], num_tokens: int, folder: Path) -> None:
     num_characters = sum(map(len, references))
     if language == "zh" and num_tokens > FOREIGN_TOKENS * num_characters:
-        log.warning(
-            "%s: %.1f tokens a Chinese character: its vocabulary has no Chinese, scores say little (bert-base-chinese has 1)",
-            folder, num_tokens / num_characters,
-        )  # fmt: skip
+        share = num_tokens / num_characters
+        log.warning("%s: %.1f tokens a Chinese character (bert-base-chinese has 1): scores say little", folder, share)
 
 
 def check_encoder(own: LanguageMetric, folder: Path, language: Language) -> None:
@@ -180,15 +171,7 @@ def check_encoder(own: LanguageMetric, folder: Path, language: Language) -> None
     if own.layer > layers:
         raise ConfigError("the model has fewer layers", where=f"{where}.layer", got=own.layer, expected=f"<= {layers}")
     if "t5" in str(folder) or str(folder).startswith("scibert"):  # bert-score reads the model's family off its path
-        raise InputError(
-            "bert-score would take this path for another kind of model",
-            where=folder,
-            fix="rename or link it without 't5' and not as scibert...",
-        )
+        words, fix = "bert-score would take this path for another kind of model", "name it without 't5' or 'scibert'"
+        raise InputError(words, where=folder, fix=fix)
     if own.baseline is not None and not own.baseline.is_file():
-        raise ConfigError(
-            "no such baseline file",
-            where=f"{where}.baseline",
-            got=str(own.baseline),
-            expected="a .tsv of the scored model",
-        )
+        raise ConfigError("no such baseline file", where=f"{where}.baseline", got=str(own.baseline))

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -20,11 +21,12 @@ from cosfly.work.chance import rng_for
 from cosfly.work.config import Config
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import write_bytes, write_model
-from distill.evaluation.measure import STUDENT, Measured, Report, read_report
+from distill.evaluation.measure import STUDENT, Evaluation, FigureSet, read_report
 from distill.evaluation.pages import (
     COLORS,
     NOTHING,
     STYLE,
+    column_name,
     decision_bars,
     figure_table,
     heat_map,
@@ -46,10 +48,10 @@ from distill.evaluation.scores import (
 
 STAGE = "distill.report"
 FLOORS = ("majority", "rule", "shuffled", "constant", "teacher")
-Names = dict[str, Report]
+Names = dict[str, Evaluation]
 
 
-class CompareConfig(Config):
+class ReportConfig(Config):
     """Settings of `distill report`."""
 
     confidence: float = Field(0.95, gt=0, lt=1, description="level of the intervals of differences")
@@ -67,23 +69,21 @@ class Pairing(BaseModel):
     differences: dict[str, Difference]
 
 
-class Comparison(BaseModel):
+class StudentComparison(BaseModel):
     """`comparison.json`. not_comparable: figures that were measured in another way, and why."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    students: dict[str, Measured]
+    students: dict[str, FigureSet]
     models: dict[str, str]
-    floors: dict[str, Measured]
+    floors: dict[str, FigureSet]
     pairings: list[Pairing]
     not_comparable: list[str]
     confidence: float
     resamples: int
 
 
-def run(
-    cfg: CompareConfig, evaluations: Sequence[Path], out: Path, *, seed: int = 0, resume: Resume = "if-same"
-) -> Path:
+def run(cfg: ReportConfig, folders: Sequence[Path], out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
     """Read the evaluations of several students; write their comparison.
 
     Returns:
@@ -91,25 +91,22 @@ def run(
     Raises:
         InputError: two evaluations have one name, are of other splits, or of other references.
     """
-    names = [folder.absolute().name for folder in evaluations]
+    names = [folder.absolute().name for folder in folders]
     if len(set(names)) < len(names):
-        raise InputError(
-            "two evaluations have one name",
-            got=", ".join(names),
-            fix="give folders of different names: they name the rows",
-        )
-    inputs = {f"evaluation/{name}": folder for name, folder in zip(names, evaluations, strict=True)}
+        fix = "give folders of different names: they name the rows"
+        raise InputError("two evaluations have one name", got=", ".join(names), fix=fix)
+    inputs = {f"evaluation/{name}": folder for name, folder in zip(names, folders, strict=True)}
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
     path = out / "comparison.md"
     if stage.is_complete:
         return path
-    folders = dict(zip(names, evaluations, strict=True))
-    reports = {name: read_report(folder) for name, folder in folders.items()}
-    with in_place.put(actions=one_set((folders[name], report.actions) for name, report in reports.items())):
-        return _compare(cfg, reports, folders, stage, seed)
+    of_names = dict(zip(names, folders, strict=True))
+    reports = {name: read_report(folder) for name, folder in of_names.items()}
+    with in_place.put(actions=one_set((of_names[name], report.actions) for name, report in reports.items())):
+        return _compare(cfg, reports, of_names, stage, seed)
 
 
-def _compare(cfg: CompareConfig, reports: Names, folders: Mapping[str, Path], stage: StageFolder, seed: int) -> Path:
+def _compare(cfg: ReportConfig, reports: Names, folders: Mapping[str, Path], stage: StageFolder, seed: int) -> Path:
     out = stage.path
     splits = {report.split for report in reports.values()}
     if len(splits) > 1:
@@ -123,21 +120,20 @@ def _compare(cfg: CompareConfig, reports: Names, folders: Mapping[str, Path], st
     return path
 
 
-def compare(cfg: CompareConfig, reports: Names, folders: Mapping[str, Path], seed: int) -> Comparison:
+def compare(cfg: ReportConfig, reports: Names, folders: Mapping[str, Path], seed: int) -> StudentComparison:
     """Put students side by side; of the floors those of the first."""
     scores = {name: read_scores(folder / SCORES) for name, folder in folders.items()}
     pairings, strangers = [], []
     for first, second in combinations(reports, 2):
         _check_references(first, scores[first], second, scores[second])
         rng = rng_for(seed, STAGE, f"{first}/{second}")
-        count, found = differences_of(
-            scores[first], scores[second], resamples=cfg.resamples, confidence=cfg.confidence, rng=rng
-        )
+        given: Any = {"resamples": cfg.resamples, "confidence": cfg.confidence, "rng": rng}
+        count, found = differences_of(scores[first], scores[second], **given)
         if not count:
             strangers.append(f"{first} and {second} were asked no sample in common")
         pairings.append(Pairing(first=first, second=second, samples=count, differences=found))
     someone = next(iter(reports.values())).all
-    return Comparison(
+    return StudentComparison(
         students={name: report.all.who[STUDENT] for name, report in reports.items()},
         models={name: report.model for name, report in reports.items()},
         floors={name: someone.who[name] for name in FLOORS if name in someone.who},
@@ -151,18 +147,14 @@ def compare(cfg: CompareConfig, reports: Names, folders: Mapping[str, Path], see
 def _check_references(first: str, one: Scores, second: str, other: Scores) -> None:
     """Check that the samples that two students share are held against the same answers.
 
-    Two training sets of other captions may call their samples alike; what was asked may differ, as pictures and state of an ablation do.
+    Training sets of other captions may call their samples alike. What was asked may differ, as in an ablation.
     """
     held = dict(zip(other.key, other.against, strict=True))
     differ = [key for key, digest in zip(one.key, one.against, strict=True) if held.get(key, digest) != digest]
     if differ:
-        raise InputError(
-            "two evaluations hold samples of one name against different references",
-            where=f"{first} and {second}",
-            got=f"{len(differ)} samples, the first {differ[0]}",
-            expected="training sets of the same captions",
-            fix="evaluate both students on one set's test split",
-        )
+        words, fix = "two evaluations have different references", "evaluate both students on one set's test split"
+        got = f"{len(differ)} samples, the first {differ[0]}"
+        raise InputError(words, where=f"{first} and {second}", got=got, fix=fix)
 
 
 def _mismatches(reports: Names) -> list[str]:
@@ -177,29 +169,27 @@ def _mismatches(reports: Names) -> list[str]:
     return found
 
 
-# --- the table --------------------------------------------------------------------------------------------------------
-
 # The paper's table, and what its text adds.
-_TABLE = ("parsed", "bertscore_precision", "bertscore_recall", "bertscore_f1", "accuracy", "accuracy_parsed", "macro_f1",
-          "consistent", "hard_conflict", "proved", "contradicted", "tokens")  # fmt: skip
+_TABLE = (
+    *("parsed", "bertscore_precision", "bertscore_recall", "bertscore_f1", "accuracy", "accuracy_parsed", "macro_f1"),
+    *("consistent", "hard_conflict", "proved", "contradicted", "tokens"),
+)
 
 
-def everyone_of(comparison: Comparison) -> dict[str, Measured]:
+def everyone_of(comparison: StudentComparison) -> dict[str, FigureSet]:
     """Give the students and the floors, by what they are called."""
-    return comparison.students | {f"floor: {name}": own for name, own in comparison.floors.items()}
+    return comparison.students | {column_name(name): own for name, own in comparison.floors.items()}
 
 
-def _rows(comparison: Comparison, reports: Names) -> tuple[list[str], list[list[str]]]:
+def _rows(comparison: StudentComparison, reports: Names) -> tuple[list[str], list[list[str]]]:
     everyone = everyone_of(comparison)
     names = [name for name in _TABLE if any(own.figures[name].value is not None for own in everyone.values())]
     header = ["", *(FIGURES[name] for name in names), "samples/s"]
     rows = []
     for who, own in everyone.items():
         speed = reports[who].speed.samples_per_s if who in reports else None
-        rows.append([
-            who, *(shown(name, own.figures[name], interval=who in reports) for name in names),
-            NOTHING if speed is None else f"{speed:.2f}",
-        ])  # fmt: skip
+        cells = [shown(name, own.figures[name], interval=who in reports) for name in names]
+        rows.append([who, *cells, NOTHING if speed is None else f"{speed:.2f}"])
     return header, rows
 
 
@@ -225,32 +215,25 @@ def _said(pairing: Pairing) -> list[list[str]]:
 _HEADER = ["", "difference", "interval", "p", "better"]
 
 
-def markdown_of(comparison: Comparison, reports: Names) -> str:
+def markdown_of(comparison: StudentComparison, reports: Names) -> str:
     """Give the comparison as a Markdown page."""
     header, rows = _rows(comparison, reports)
     lines = ["# Students side by side", "", *table(header, [[for_markdown(cell) for cell in row] for row in rows]), ""]
     lines += [f"- {for_markdown(name)}: {for_markdown(model)}" for name, model in comparison.models.items()]
     lines += [f"- not comparable: {for_markdown(words)}" for words in comparison.not_comparable]
     for pairing in comparison.pairings:
-        lines += [
-            "",
-            f"## {for_markdown(pairing.first)} less {for_markdown(pairing.second)}",
-            "",
-            _how(comparison, pairing),
-            "",
-        ]
+        title = f"## {for_markdown(pairing.first)} less {for_markdown(pairing.second)}"
+        lines += ["", title, "", _how(comparison, pairing), ""]
         lines += table(_HEADER, [[for_markdown(cell) for cell in row] for row in _said(pairing)])
     return "\n".join(lines) + "\n"
 
 
-def _how(comparison: Comparison, pairing: Pairing) -> str:
-    return (
-        f"On the {pairing.samples} samples that both were asked; intervals {comparison.confidence:.0%}, {comparison.resamples} draws "
-        "of walks, the same for both."
-    )
+def _how(comparison: StudentComparison, pairing: Pairing) -> str:
+    how = f"intervals {comparison.confidence:.0%}, {comparison.resamples} draws of walks, the same for both"
+    return f"On the {pairing.samples} samples that both were asked; {how}."
 
 
-def page_of(comparison: Comparison, reports: Names) -> str:
+def page_of(comparison: StudentComparison, reports: Names) -> str:
     """Give the comparison as a page that needs nothing but itself."""
     header, rows = _rows(comparison, reports)
     charts = [("Accuracy by decision", decision_bars(comparison.students))]
@@ -263,7 +246,9 @@ def page_of(comparison: Comparison, reports: Names) -> str:
         {"title": f"{one.first} less {one.second}", "how": _how(comparison, one), "rows": _said(one)}
         for one in comparison.pairings
     ]
+    everyone = everyone_of(comparison)
     return page(
-        "distill/evaluation/comparison.html", title=", ".join(comparison.students), style=STYLE, colors=COLORS, comparison=comparison,
-        header=header, rows=rows, figures=charts, pairings=pairings, difference_header=_HEADER, everyone=figure_table(everyone_of(comparison)),
+        "distill/evaluation/comparison.html", title=", ".join(comparison.students), style=STYLE, colors=COLORS,
+        comparison=comparison, header=header, rows=rows, figures=charts, pairings=pairings, difference_header=_HEADER,
+        everyone=figure_table(everyone, intervals=[*everyone]),
     )  # fmt: skip

@@ -3,8 +3,8 @@
 majority    the decision that train has most often; no text
 shuffled    the reference of another sample of the split
 constant    one answer of train, with the majority's decision, for every sample
-rule        a decision tree of depth two on the numbers of the prompt, fitted on train (CART, Breiman et al. 1984); no text
-teacher     no floor but the reference itself: what the teacher reaches in figures that are measured against the geometry
+rule        a decision tree of depth two on the prompt's numbers, fitted on train (CART, Breiman et al. 1984); no text
+teacher     no floor but the reference itself: what it reaches in figures that are measured against the geometry
 """
 
 from __future__ import annotations
@@ -25,16 +25,15 @@ from cosfly.products.splits import Split
 from cosfly.reading.documents import parse_document, validated
 from cosfly.work.chance import rng_for
 from cosfly.work.store import dump_json, write_bytes
-from distill.evaluation.scores import Answer, number_of
+from distill.evaluation.scores import ScoredAnswer, number_of
 from distill.schema import Sample, in_its_actions, open_split
 
 SHUFFLED_AMONG = 1024  # samples that are scored together: what is shuffled within needs no text to be embedded twice
 WRITTEN = ("shuffled", "constant")  # floors that have texts
 RULE_SAMPLES = 20_000  # of train that the rule is fitted on, drawn by their names
 _NUMERAL = re.compile(r"-?\d+(?:\.\d+)?")
-Rule = (
-    int | tuple[int, float, "Rule", "Rule"]
-)  # a decision's number, or column, threshold, and what holds up to it and above
+# A decision's number, or column, threshold, and the rules up to it and above.
+Rule = int | tuple[int, float, "Rule", "Rule"]
 
 
 def coc_of(sample: Sample) -> Coc:
@@ -66,7 +65,7 @@ def shuffled_places(groups: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def numbers_of(samples: Iterable[Sample], width: int | None = None) -> np.ndarray:
-    """Give the numbers of each prompt in their order, (n, width), inf where it has fewer; None: as many as the longest has."""
+    """Give the numbers of each prompt in their order, (n, width), inf where it has fewer; None: the longest's width."""
     rows = [list(map(float, _NUMERAL.findall(sample.prompt.user)))[:width] for sample in samples]
     table = np.full((len(rows), max(map(len, rows), default=0) if width is None else width), np.inf)
     for place, row in enumerate(rows):
@@ -75,7 +74,7 @@ def numbers_of(samples: Iterable[Sample], width: int | None = None) -> np.ndarra
 
 
 def fit_rule(table: np.ndarray, labels: np.ndarray, depth: int = 2) -> Rule:
-    """Fit a decision tree: at each node the threshold that leaves the least Gini impurity; labels: (n,) numbers of decisions."""
+    """Fit a decision tree: at each node the threshold of the least Gini impurity; labels (n,): numbers of decisions."""
     counts, best = np.bincount(labels), (-1.0, 0, 0.0)
     if depth == 0 or (counts > 0).sum() < 2:
         return int(counts.argmax())
@@ -91,12 +90,8 @@ def fit_rule(table: np.ndarray, labels: np.ndarray, depth: int = 2) -> Rule:
         return int(counts.argmax())
     _, column, threshold = best
     low = table[:, column] <= threshold
-    return (
-        column,
-        threshold,
-        fit_rule(table[low], labels[low], depth - 1),
-        fit_rule(table[~low], labels[~low], depth - 1),
-    )
+    below_it, above_it = (fit_rule(table[rows], labels[rows], depth - 1) for rows in (low, ~low))
+    return column, threshold, below_it, above_it
 
 
 def decide(rule: Rule, row: np.ndarray) -> int:
@@ -107,8 +102,8 @@ def decide(rule: Rule, row: np.ndarray) -> int:
     return rule
 
 
-def _bare(decision: str) -> Answer:
-    return Answer(Coc(critical_components="", reasoning_trace="", flight_decision=decision))
+def _bare(decision: str) -> ScoredAnswer:
+    return ScoredAnswer(Coc(critical_components="", reasoning_trace="", flight_decision=decision))
 
 
 class Floors:
@@ -134,18 +129,18 @@ class Floors:
         self.rule = fit_rule(table, labels) if drawn else None
 
     def groups(self, count: int) -> list[np.ndarray]:
-        """Deal samples into groups, within which references are shuffled; the same in both languages of the same windows."""
+        """Deal samples into groups, within which references are shuffled; in both languages of windows the same."""
         return shuffled_groups(count, rng_for(self._seed, "distill.floor", "shuffled"))
 
-    def answers(self, samples: Sequence[Sample], references: Sequence[Coc]) -> dict[str, list[Answer]]:
+    def answers(self, samples: Sequence[Sample], references: Sequence[Coc]) -> dict[str, list[ScoredAnswer]]:
         """Give what each floor answers to samples with their references, of which there is one at least."""
-        found: dict[str, list[Answer]] = {"teacher": [Answer(reference) for reference in references]}
+        found: dict[str, list[ScoredAnswer]] = {"teacher": [ScoredAnswer(reference) for reference in references]}
         if self._constant is not None and self.decision is not None:
             found["majority"] = [_bare(self.decision)] * len(references)
-            found["constant"] = [Answer(self._constant)] * len(references)
+            found["constant"] = [ScoredAnswer(self._constant)] * len(references)
         if len(references) > 1:
             places = shuffled_places(self.groups(len(references))).tolist()
-            found["shuffled"] = [Answer(references[place]) for place in places]
+            found["shuffled"] = [ScoredAnswer(references[place]) for place in places]
         if self.rule is not None:
             bare = [_bare(token) for token in action_tokens()]
             found["rule"] = [bare[decide(self.rule, row)] for row in numbers_of(samples, self._width)]
@@ -154,24 +149,22 @@ class Floors:
 
 @in_its_actions
 def write_floors(dataset: Path, split: Split, out: Path, seed: int) -> list[Path]:
-    """Write the floors that have texts as predictions, so that `cosfly caption --teacher student:` judges their sentences too.
+    """Write the floors that have texts as predictions, so that `caption --teacher student:` judges their sentences too.
 
     Raises:
         InputError: the split is empty.
     """
     samples = open_split(dataset, split)
     if not samples:
-        raise InputError(
-            "the split is empty", where=dataset, got=split, fix="choose another --split, or prepare more walks"
-        )
+        fix = "choose another --split, or prepare more walks"
+        raise InputError("the split is empty", where=dataset, got=split, fix=fix)
     lines: dict[str, list[str]] = {name: [] for name in WRITTEN}
     languages: list[Language] = ["en", "zh"]
     for language in languages:
         own = [sample for sample in samples if sample.language == language]
         if own:
-            floors = Floors(open_split(dataset, "train"), language, seed).answers(
-                own, [coc_of(sample) for sample in own]
-            )
+            references = [coc_of(sample) for sample in own]
+            floors = Floors(open_split(dataset, "train"), language, seed).answers(own, references)
             for name in WRITTEN:
                 for sample, answer in zip(own, floors.get(name, ()), strict=False):
                     lines[name].append(_prediction(sample, split, name, answer).model_dump_json() + "\n")
@@ -181,10 +174,10 @@ def write_floors(dataset: Path, split: Split, out: Path, seed: int) -> list[Path
     return paths
 
 
-def _prediction(sample: Sample, split: Split, name: str, answer: Answer) -> Prediction:
+def _prediction(sample: Sample, split: Split, name: str, answer: ScoredAnswer) -> Prediction:
     assert answer.coc is not None
     return Prediction(
         sample_id=sample.sample_id, language=sample.language, run=sample.run, window_id=sample.window_id, split=split,
-        model=f"floor: {name}",
-        raw=dump_json(answer.coc.model_dump()), num_tokens=0, is_finished=True, coc=answer.coc, reason=None, recovered=[],
+        model=f"floor: {name}", raw=dump_json(answer.coc.model_dump()), num_tokens=0, is_finished=True, coc=answer.coc,
+        reason=None, recovered=[],
     )  # fmt: skip

@@ -10,8 +10,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from cosfly.chat.answers import Answer as KeptAnswer
-from cosfly.chat.answers import read_line
+from cosfly.chat.answers import Answer, read_line
 from cosfly.errors import InputError
 from cosfly.products.actions import ActionSet, action_tokens
 from cosfly.products.captions import FIELDS, Coc, Language, SentenceState, read_captions
@@ -24,15 +23,20 @@ from cosfly.work.provenance import MANIFEST_SCHEMA
 from cosfly.work.stage_folder import read_manifest
 from distill.evaluation.bertscore import Metric, score_beside_floors
 from distill.evaluation.floors import WRITTEN, Floors, coc_of
-from distill.evaluation.scores import UNPARSED, Answer, Figure, Scores, draw_walks, figures_of, score_answers
+from distill.evaluation.scores import UNPARSED, Figure, ScoredAnswer, Scores, draw_walks, figures_of, score_answers
 from distill.schema import Sample
 
 
-class Speed(BaseModel):
-    """seconds: of the last start of `distill infer`, without loading; samples_per_s: answers made in it, a second, None where it made none or
-    nothing says. latency_s: of an answer, as who asked saw it: mean, median, 95th percentile."""
-
+class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Speed(_Strict):
+    """How fast a student answered, None where nothing says.
+
+    seconds: of the last start of `distill infer`, without loading. samples_per_s: answers made in it. latency_s: of an
+    answer, as who asked saw it: mean, median, 95th percentile.
+    """
 
     seconds: float | None = None
     samples_per_s: float | None = None
@@ -56,16 +60,20 @@ def speed_of(predictions_path: Path, predictions: Sequence[Prediction]) -> Speed
     folder = predictions_path.parent
     seconds, num_new = _last_start(folder)
     tokens = [prediction.num_tokens for prediction in predictions if prediction.num_tokens]
-    latencies = np.array([answer.latency_s for answer in _answers(folder / "answers")])
+    journals = sorted((folder / "answers").glob("*.jsonl"))
+    lines = (line for path in journals for line in Journal(path).read_as(read_line))
+    latencies = np.array([line.latency_s for line in lines if isinstance(line, Answer)])
     return Speed(
         seconds=seconds,
         samples_per_s=num_new / seconds if seconds and num_new else None,
         mean_tokens=float(np.mean(tokens)) if tokens else None,
-        latency_s=None if not len(latencies) else {
-            "mean": float(latencies.mean()), "median": float(np.median(latencies)),
-            "p95": float(np.quantile(latencies, 0.95)),
-        },
-    )  # fmt: skip
+        latency_s=_latency(latencies) if len(latencies) else None,
+    )
+
+
+def _latency(times_s: np.ndarray) -> dict[str, float]:
+    median, p95 = np.quantile(times_s, [0.5, 0.95]).tolist()
+    return {"mean": float(times_s.mean()), "median": median, "p95": p95}
 
 
 def _last_start(folder: Path) -> tuple[float | None, int]:
@@ -77,11 +85,6 @@ def _last_start(folder: Path) -> tuple[float | None, int]:
     return found.seconds, found.answers
 
 
-def _answers(folder: Path) -> list[KeptAnswer]:
-    lines = (line for path in sorted(folder.glob("*.jsonl")) for line in Journal(path).read_as(read_line))
-    return [line for line in lines if isinstance(line, KeptAnswer)]
-
-
 REPORT, REPORT_SCHEMA, REPORT_VERSION = "report.json", "cosfly.distill_report", "2.0"
 STAGE = "distill.evaluate"
 STUDENT = "student"
@@ -90,12 +93,8 @@ SentenceStates = Mapping[str, Mapping[str, Sequence[SentenceState]]]  # who -> s
 TextScorer = Callable[[Sequence[tuple[str, str]]], np.ndarray]  # (candidate, reference) -> (n, 3)
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Measured(_Strict):
-    """Of one who answers: figures by name (figures.py), accuracy by decision, reference -> answers."""
+class FigureSet(_Strict):
+    """Of one who answers: figures by name (FIGURES), accuracy by decision, reference -> answers."""
 
     figures: dict[str, Figure]
     by_decision: dict[str, Figure]
@@ -103,14 +102,14 @@ class Measured(_Strict):
 
 
 class Measurement(_Strict):
-    """Of one language, or over all. who: `student`, then the floors; failed: samples without an answer; unparsed: by reason."""
+    """Of one language, or over all. who: `student`, then the floors. failed: samples without an answer, by reason."""
 
     samples: int
     walks: int
     failed: dict[str, int]
     unparsed: dict[str, int]
     histogram_f1: list[int] | None  # of the student's parsed answers, in hundredths from 0 to 1
-    who: dict[str, Measured]
+    who: dict[str, FigureSet]
 
 
 class Example(_Strict):
@@ -125,7 +124,7 @@ class Example(_Strict):
     f1: float | None
 
 
-class Report(_Strict):
+class Evaluation(_Strict):
     """`report.json`."""
 
     model: str
@@ -147,16 +146,16 @@ class Report(_Strict):
 NOTES = [
     "reference: the teacher's accepted answer; an answer that does not parse is a wrong one and scores 0 in BERTScore",
     "a sample that got no answer is no wrong answer: it is counted under `answered` and in nothing else",
-    "intervals: whole walks drawn with replacement, as windows of a flight overlap and flights of a walk resemble each other",
-    "floor rule: a tree of depth two on the numbers of the prompt, fitted on train; `teacher` is no floor but the reference itself",
+    "intervals: whole walks are drawn with replacement: windows of a flight overlap, flights of a walk are alike",
+    "floor rule: a tree of depth two on the numbers of the prompt, fitted on train; `teacher`: the reference itself",
     "verdicts: against what the flight did after the window, as the captions' own were made",
 ]
 
 
-def read_report(folder: Path) -> Report:
+def read_report(folder: Path) -> Evaluation:
     """Read an evaluation's report; raises as `read_model`."""
     path = folder / REPORT
-    return read_model(path, Report, schema=REPORT_SCHEMA, version=REPORT_VERSION, what="report", tree=folder)
+    return read_model(path, Evaluation, schema=REPORT_SCHEMA, version=REPORT_VERSION, what="report", tree=folder)
 
 
 def pair_up(samples: Sequence[Sample], predictions: Sequence[Prediction]) -> list[tuple[Sample, Prediction]]:
@@ -166,14 +165,9 @@ def pair_up(samples: Sequence[Sample], predictions: Sequence[Prediction]) -> lis
         InputError: a prediction is for a sample that the split does not have.
     """
     by_key = {prediction.key: prediction for prediction in predictions}
-    unknown = by_key.keys() - {sample.key for sample in samples}
-    if unknown:
-        raise InputError(
-            "a prediction is for a sample that the split does not have",
-            where=min(unknown),
-            got=f"{len(unknown)} such predictions",
-            fix="give the training set that the predictions were made from",
-        )
+    if unknown := by_key.keys() - {sample.key for sample in samples}:
+        words, fix = "a prediction is for a sample that the split does not have", "give the training set that it is of"
+        raise InputError(words, where=min(unknown), got=f"{len(unknown)} such predictions", fix=fix)
     return [(sample, by_key[sample.key]) for sample in samples if sample.key in by_key]
 
 
@@ -183,35 +177,29 @@ def read_judged(paths: Sequence[Path], samples: Iterable[Sample]) -> dict[str, S
     Args:
         paths: one file a tree.
     Raises:
-        InputError: as `read_captions`; or somebody else than a student wrote them, or several trees share the name of a window.
+        InputError: as `read_captions`; somebody else wrote them, or several trees share the name of a window.
     """
     keys: dict[str, dict[str, str]] = {}  # window and language -> run -> sample's key
     for sample in samples:
         keys.setdefault(f"{sample.window_id}/{sample.language}", {})[sample.run] = sample.key
     found: dict[str, Sequence[SentenceState]] = {}
     for path, caption in ((file, caption) for file in paths for caption in read_captions(file)):
-        if caption.teacher.kind != "student":
-            raise InputError(
-                "these are no captions of a student", where=f"{path}: {caption.sample_id}", got=caption.teacher.kind,
-                fix="give what cosfly caption --teacher student:PREDICTIONS wrote",
-            )  # fmt: skip
+        where, kind = f"{path}: {caption.sample_id}", caption.teacher.kind
+        if kind != "student":
+            fix = "give what cosfly caption --teacher student:PREDICTIONS wrote"
+            raise InputError("these are no captions of a student", where=where, got=kind, fix=fix)
         for language, states in (caption.checks.sentences or {}).items():
             by_run = keys.get(f"{caption.sample_id}/{language}", {})
             if caption.teacher.run is None and len(by_run) > 1:
-                raise InputError(
-                    "several trees have a window of this name", where=f"{path}: {caption.sample_id}",
-                    got=", ".join(sorted(by_run)), fix="caption each tree with --set caption.student.run=NAME",
-                )  # fmt: skip
+                got, fix = ", ".join(sorted(by_run)), "caption each tree with --set caption.student.run=NAME"
+                raise InputError("several trees have a window of this name", where=where, got=got, fix=fix)
             of_run = by_run.values() if caption.teacher.run is None else filter(None, [by_run.get(caption.teacher.run)])
             found |= dict.fromkeys(of_run, states)
     return found
 
 
 def text_of(coc: Coc | None) -> str:
-    """Join the three fields into the text that BERTScore compares (sec:appendix_f_caption_distillation); "" for no answer.
-
-    A floor without texts has none to compare.
-    """
+    """Join the fields into the text that BERTScore compares (sec:appendix_f_caption_distillation); "" for none."""
     if coc is None or not coc.reasoning_trace:
         return ""
     return " ".join(getattr(coc, name) for name in FIELDS).strip()
@@ -223,12 +211,10 @@ def score_language(
     """Score the student and the floors on the samples of one language: who -> scores."""
     samples = [sample for sample, _ in pairs]
     references = [coc_of(sample) for sample in samples]
-    who = {STUDENT: [Answer.of(prediction) for _, prediction in pairs], **floors.answers(samples, references)}
+    who = {STUDENT: [ScoredAnswer.of(prediction) for _, prediction in pairs], **floors.answers(samples, references)}
     texts: dict[str, np.ndarray] = {}
     if scorer is not None:
-        written = {
-            name: [text_of(a.coc) for a in answers] for name, answers in who.items() if name in (STUDENT, *WRITTEN)
-        }
+        written = {name: [text_of(a.coc) for a in who[name]] for name in (STUDENT, *WRITTEN) if name in who}
         groups = floors.groups(len(samples))
         texts = score_beside_floors(scorer, groups, written, [text_of(c) for c in references], samples[0].language)
     return {name: score_answers(samples, answers, texts.get(name), judged.get(name)) for name, answers in who.items()}
@@ -253,16 +239,17 @@ def measure(
     draws = draw_walks(len(set(student.walk)), resamples, rng_for(seed, STAGE, "draws"))
     for name, own in scores.items():
         figures, decisions = figures_of(own, draws, confidence=confidence)
-        found[name] = Measured(figures=figures, by_decision=decisions, confusion=_confusion(own))
+        found[name] = FigureSet(figures=figures, by_decision=decisions, confusion=_confusion(own))
     reasons = Counter(p.reason or "unknown" for p in predictions if p.coc is None)
     failed = {reason for reason in reasons if reason.startswith(FAILED)}
     known = student.answered & (student.answer != UNPARSED) & ~np.isnan(student.f1)
     histogram = np.histogram(np.clip(student.f1[known], 0, 1), bins=100, range=(0, 1))[0].tolist()
+    counts = sorted(reasons.items())
     return Measurement(
         samples=len(student),
         walks=len(set(student.walk)),
-        failed={reason: count for reason, count in sorted(reasons.items()) if reason in failed},
-        unparsed={reason: count for reason, count in sorted(reasons.items()) if reason not in failed},
+        failed={reason: count for reason, count in counts if reason in failed},
+        unparsed={reason: count for reason, count in counts if reason not in failed},
         histogram_f1=histogram if known.any() else None,
         who=found,
     )
@@ -270,9 +257,8 @@ def measure(
 
 def _confusion(scores: Scores) -> dict[str, dict[str, int]]:
     names = {UNPARSED: UNPARSED_NAME, **dict(enumerate(action_tokens()))}
-    cells = Counter(
-        zip(scores.reference[scores.answered].tolist(), scores.answer[scores.answered].tolist(), strict=True)
-    )
+    pairs = np.stack([scores.reference, scores.answer], axis=1)[scores.answered]
+    cells = Counter(map(tuple, pairs.tolist()))
     found: dict[str, dict[str, int]] = {}
     for (reference, answer), count in sorted(cells.items()):
         found.setdefault(names[reference], {})[names[answer]] = count
@@ -290,11 +276,10 @@ def examples_of(pairs: Sequence[tuple[Sample, Prediction]], scores: Scores, coun
             if places and len(chosen) < count:
                 chosen.append(places.pop())
     for place in chosen:
-        sample, prediction = pairs[place]
-        f1 = float(scores.f1[place])
+        (sample, prediction), f1 = pairs[place], float(scores.f1[place])
         yield Example(
-            key=sample.key, walk=sample.walk, reference=coc_of(sample), answer=prediction.coc, raw=prediction.raw[:2000],
-            label=sample.label, f1=None if np.isnan(f1) else f1,
+            key=sample.key, walk=sample.walk, reference=coc_of(sample), answer=prediction.coc,
+            raw=prediction.raw[:2000], label=sample.label, f1=None if np.isnan(f1) else f1,
         )  # fmt: skip
 
 

@@ -1,8 +1,8 @@
-"""An evaluation as Markdown and as one self-contained HTML page, with the figures of the paper's appendix on captions' distillation."""
+"""An evaluation as Markdown and as one HTML page that stands alone, with the paper's figures of students."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +11,14 @@ from cosfly.look.page import page
 from cosfly.products.actions import action_tokens
 from cosfly.products.captions import FIELDS
 from cosfly.reading.files import read_text
-from distill.evaluation.measure import STUDENT, UNPARSED_NAME, Measured, Measurement, Report
+from distill.evaluation.measure import STUDENT, UNPARSED_NAME, Evaluation, FigureSet, Measurement
 from distill.evaluation.scores import FIGURES, Figure
 
 STYLE = "\n" + read_text(Path(__file__).with_name("pages.css"))
 COLORS = ("#2b6cb0", "#c05621", "#2f855a", "#6b46c1", "#b83280", "#4a5568")
 SHARES = {name for name in FIGURES if not name.startswith(("bertscore", "macro", "tokens"))}
 NOTHING = "-"
+CELL_PX = 58  # of a confusion table
 
 
 def shown(name: str, figure: Figure, *, interval: bool = True) -> str:
@@ -31,47 +32,48 @@ def shown(name: str, figure: Figure, *, interval: bool = True) -> str:
     return f"{text} ({digits.format(figure.low)} to {digits.format(figure.high)})"
 
 
-def metric_lines(report: Report) -> list[str]:
+def metric_lines(report: Evaluation) -> list[str]:
     """Say what BERTScore was measured with."""
     lines = []
     for language, metric in report.metrics.items():
         if metric is None:
             lines.append(f"BERTScore of {language}: not computed, no model folder")
             continue
-        weights = [digest for name, digest in metric.sha256.items() if name.endswith((".safetensors", ".bin"))]
-        lines.append(
-            f"BERTScore of {language}: {metric.model}, layer {metric.layer}, {'idf' if metric.idf else 'no idf'}, "
-            f"{'rescaled' if metric.baseline_sha256 else 'not rescaled'}, weights {', '.join(d[:12] for d in weights)}, "
-            + ", ".join(f"{name} {number}" for name, number in metric.versions.items())
-            + (f"; {metric.cut} references longer than {metric.max_tokens} tokens" if metric.cut else "")
-        )
+        weights = [d[:12] for name, d in metric.sha256.items() if name.endswith((".safetensors", ".bin"))]
+        words = [metric.model, f"layer {metric.layer}", "idf" if metric.idf else "no idf"]
+        words += ["rescaled" if metric.baseline_sha256 else "not rescaled", f"weights {', '.join(weights)}"]
+        words += [f"{name} {number}" for name, number in metric.versions.items()]
+        cut = f"; {metric.cut} references longer than {metric.max_tokens} tokens" if metric.cut else ""
+        lines.append(f"BERTScore of {language}: {', '.join(words)}{cut}")
     return lines
 
 
-def _notes(report: Report) -> list[str]:
+def _notes(report: Evaluation) -> list[str]:
     speed = report.speed
-    said = [f"intervals: {report.confidence:.0%}, {report.resamples} draws of {report.all.walks} walks", *report.notes]
-    said += metric_lines(report)
-    if "student" not in report.judged:
-        said.append("sentences were not judged: give --judged what cosfly caption --teacher student: wrote")
+    notes = [f"intervals: {report.confidence:.0%}, {report.resamples} draws of {report.all.walks} walks", *report.notes]
+    notes += metric_lines(report)
+    if STUDENT not in report.judged:
+        notes.append("sentences were not judged: give --judged what cosfly caption --teacher student: wrote")
     if speed.samples_per_s is not None:
-        said.append(f"its last start answered for {speed.seconds:.1f} s, {speed.samples_per_s:.2f} samples/s")
+        notes.append(f"its last start answered for {speed.seconds:.1f} s, {speed.samples_per_s:.2f} samples/s")
     if speed.latency_s is not None:
-        said.append("latency, s: " + ", ".join(f"{name} {value:.2f}" for name, value in speed.latency_s.items()))
+        notes.append("latency, s: " + ", ".join(f"{name} {value:.2f}" for name, value in speed.latency_s.items()))
     if report.not_asked:
-        said.append(f"{report.not_asked} samples of the split were not asked")
+        notes.append(f"{report.not_asked} samples of the split were not asked")
     for what, reasons in (("no answer", report.all.failed), ("unparsed", report.all.unparsed)):
         if reasons:
-            said.append(f"{what}: " + ", ".join(f"{reason} {count}" for reason, count in reasons.items()))
-    return said
+            notes.append(f"{what}: " + ", ".join(f"{reason} {count}" for reason, count in reasons.items()))
+    return notes
 
 
-def _parts(report: Report) -> dict[str, Measurement]:
+def _parts(report: Evaluation) -> dict[str, Measurement]:
     parts: dict[str, Measurement] = dict(report.languages.items())
     return {"all": report.all, **parts} if len(parts) > 1 else parts
 
 
-# --- Markdown ---------------------------------------------------------------------------------------------------------
+def column_name(name: str) -> str:
+    """Name a column: the student, the teacher, or a floor."""
+    return name if name in (STUDENT, "teacher") else f"floor: {name}"
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -79,24 +81,22 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     return [f"| {' | '.join(cells)} |" for cells in (header, ["---"] * len(header), *rows)]
 
 
-def markdown_of(report: Report) -> str:
+def figure_table(who: Mapping[str, FigureSet], *, intervals: Collection[str]) -> dict[str, Any]:
+    """Give the figures of those who answered, one a column, of some with their intervals: header and rows."""
+    rows = [
+        [words, *(shown(name, own.figures[name], interval=called in intervals) for called, own in who.items())]
+        for name, words in FIGURES.items()
+        if any(own.figures[name].value is not None for own in who.values())
+    ]
+    return {"header": ["", *who], "rows": rows}
+
+
+def markdown_of(report: Evaluation) -> str:
     """Give the report as a Markdown page."""
     lines = [f"# {for_markdown(report.model)} on {report.split}", ""]
     for title, part in _parts(report).items():
         lines += [f"## {title}: {part.samples} samples of {part.walks} walks", ""]
-        header = ["", *(name if name == STUDENT else f"floor: {name}" for name in part.who)]
-        lines += table(
-            header,
-            (
-                [
-                    words,
-                    *(shown(name, who.figures[name], interval=who is part.who[STUDENT]) for who in part.who.values()),
-                ]
-                for name, words in FIGURES.items()
-                if any(who.figures[name].value is not None for who in part.who.values())
-            ),
-        )
-        lines += ["", *_decisions(part), ""]
+        lines += [*table(**figure_table(_beside(part), intervals=[STUDENT])), "", *_decisions(part), ""]
     lines += ["## How it was measured", "", *(f"- {for_markdown(note)}" for note in _notes(report))]
     return "\n".join(lines) + "\n"
 
@@ -110,76 +110,73 @@ def _decisions(part: Measurement) -> list[str]:
     return table(["decision", "samples", "accuracy", "most frequent answers"], rows)
 
 
-# --- HTML -------------------------------------------------------------------------------------------------------------
+def page_of(report: Evaluation, pictures: Mapping[str, Sequence[str]]) -> str:
+    """Give the report as a page that needs nothing but itself.
 
-Chart = dict[str, Any]  # as charts.html draws it: view, width, names of its colours, lines, rects, texts
-
-
-def page_of(report: Report) -> str:
-    """Give the report as a page that needs nothing but itself."""
+    Args:
+        pictures: key of an example -> the frames of its window, JPEG in base64.
+    """
     parts = []
     for title, part in _parts(report).items():
         student = part.who[STUDENT]
-        charts: list[tuple[str, Chart]] = [
-            ("Accuracy by decision", decision_bars({STUDENT: student, **_beside(part, "majority")})),
+        charts = [
+            ("Accuracy by decision", decision_bars({STUDENT: student, **_beside(part, "majority", "rule")})),
             ("Reference against answer", heat_map(student)),
         ]
         if part.histogram_f1 is not None:
             beside = _beside(part, "shuffled", "constant")
             charts.append(("BERTScore F1 of parsed answers", histogram({STUDENT: part.histogram_f1})))
             charts.append(("BERTScore, all answers", score_bars({STUDENT: student, **beside})))
-        parts.append(
-            {"title": title, "samples": part.samples, "walks": part.walks, "charts": charts}
-            | figure_table({STUDENT: student, **_beside(part, *part.who)})
-        )
+        own = {"title": title, "samples": part.samples, "walks": part.walks, "charts": charts}
+        parts.append(own | figure_table(_beside(part), intervals=[*_beside(part)]))
     return page(
-        "distill/evaluation/evaluation.html", title=report.model, style=STYLE, report=report, parts=parts, notes=_notes(report),
-        fields=FIELDS, colors=COLORS,
+        "distill/evaluation/evaluation.html", title=report.model, style=STYLE, report=report, tiles=_tiles(report.all),
+        parts=parts, notes=_notes(report), fields=FIELDS, colors=COLORS, pictures=pictures,
     )  # fmt: skip
 
 
-def _beside(part: Measurement, *names: str) -> dict[str, Measured]:
-    return {f"floor: {name}": part.who[name] for name in names if name in part.who and name != STUDENT}
+def _tiles(part: Measurement) -> list[tuple[str, str]]:
+    """Give what a person asks first: how much was asked, how good the answers are, and how good those of floors."""
+    tiles = [(f"{part.samples:,}", "samples"), (f"{part.walks:,}", "walks")]
+    for figure, who, words in (
+        ("accuracy", STUDENT, "decisions right"),
+        ("accuracy", "rule", "by a rule on two numbers of the prompt"),
+        ("accuracy", "majority", "by the most frequent decision"),
+        ("accuracy_on_labels", STUDENT, "are the geometric label"),
+        ("accuracy_on_labels", "teacher", "of the teacher's are"),
+        ("parsed", STUDENT, "answers parse"),
+    ):
+        if who in part.who and (value := part.who[who].figures[figure].value) is not None:
+            tiles.append((f"{value:.0%}", words))
+    return tiles
 
 
-def figure_table(who: Mapping[str, Measured]) -> dict[str, Any]:
-    """Give the figures of those who answered, one a column: header and rows."""
-    rows = [
-        [words, *(shown(name, own.figures[name]) for own in who.values())]
-        for name, words in FIGURES.items()
-        if any(own.figures[name].value is not None for own in who.values())
-    ]
-    return {"header": ["", *who], "rows": rows}
+def _beside(part: Measurement, *names: str) -> dict[str, FigureSet]:
+    """Give those who answered, all or some, by what their columns are called."""
+    return {column_name(name): own for name, own in part.who.items() if name in names or not names}
 
 
-def _rect(x: float, y: float, width: float, height: float, fill: str, title: str, opacity: float = 1.0, kind: str = "") -> dict:  # fmt: skip
-    return {
-        "x": round(x, 1), "y": round(y, 1), "width": round(width, 1), "height": round(height, 1), "fill": fill, "title": title,
-        "opacity": round(opacity, 3), "kind": kind,
-    }  # fmt: skip
+Chart = dict[str, Any]  # as charts.html draws it: view, width, names of its colours, lines, rects, texts
 
 
-def _line(x1: float, x2: float, y1: float, y2: float, kind: str = "axis") -> dict:
-    return {"x1": round(x1, 1), "x2": round(x2, 1), "y1": round(y1, 1), "y2": round(y2, 1), "kind": kind}
-
-
-def _text(x: float, y: float, words: str, anchor: str = "start", turned: int = 0, *, is_on: bool = False) -> dict:
-    return {"x": round(x, 1), "y": round(y, 1), "words": words, "anchor": anchor, "turned": turned, "is_on": is_on}
+def _shape(**values: Any) -> dict[str, Any]:
+    """Give a line, rectangle or text of a chart, its numbers rounded."""
+    return {name: round(value, 3) if isinstance(value, float) else value for name, value in values.items()}
 
 
 def bars(groups: Mapping[str, Mapping[str, Figure]], low: float = 0.0) -> Chart:
     """Give grouped bars with their intervals; groups: label -> who -> figure, values from `low` to 1."""
     names = list(dict.fromkeys(name for group in groups.values() for name in group))
     width, height = 18, 200
-    step = width * len(names) + 26
+    step = max(60, width * len(names) + 26)
     total = 50 + step * len(groups)
 
     def y(value: float) -> float:
         return 20 + height * (1 - (min(1.0, max(low, value)) - low) / (1 - low))
 
     ticks = [low + (1 - low) * k / 5 for k in range(6)]
-    lines, rects = [_line(46, total, y(v), y(v)) for v in ticks], []
-    texts = [_text(40, y(v) + 4, f"{v:.2f}", "end") for v in ticks]
+    lines = [_shape(x1=46, x2=total, y1=y(v), y2=y(v), kind="axis") for v in ticks]
+    texts, rects = [_shape(x=40, y=y(v) + 4, words=f"{v:.2f}", anchor="end") for v in ticks], []
     for place, (label, group) in enumerate(groups.items()):
         left = 56 + place * step
         for number, name in enumerate(names):
@@ -187,29 +184,30 @@ def bars(groups: Mapping[str, Mapping[str, Figure]], low: float = 0.0) -> Chart:
             if figure is None or figure.value is None:
                 continue
             x, top = left + number * width, y(figure.value)
-            title = f"{name}, {label}: {figure.value:.4f} of {figure.count}"
-            rects.append(_rect(x, top, width - 3, y(low) - top, COLORS[number % 6], title))
+            title, fill = f"{name}, {label}: {figure.value:.4f} of {figure.count}", COLORS[number % 6]
+            rects.append(_shape(x=x, y=top, width=width - 3, height=y(low) - top, fill=fill, title=title))
             if figure.low is not None and figure.high is not None:
                 middle = x + (width - 3) / 2
-                lines.append(_line(middle, middle, y(figure.high), y(figure.low), "whisker"))
-        texts.append(_text(left + width * len(names) / 2, 236, label, "end", -28))
-    return {"names": names, "view": f"-60 0 {total + 70} 330", "width": total + 70, "lines": lines, "rects": rects, "texts": texts}  # fmt: skip
+                lines.append(_shape(x1=middle, x2=middle, y1=y(figure.high), y2=y(figure.low), kind="whisker"))
+        texts.append(_shape(x=left + width * len(names) / 2, y=236, words=label, anchor="end", turned=-28))
+    places = {"view": f"-60 0 {total + 70} 330", "width": total + 70}
+    return {"names": names, "lines": lines, "rects": rects, "texts": texts, **places}
 
 
-def decision_bars(who: Mapping[str, Measured]) -> Chart:
+def decision_bars(who: Mapping[str, FigureSet]) -> Chart:
     """Give the accuracy by decision, the most frequent first."""
     counts: dict[str, int] = {}
     for own in who.values():
         for token, figure in own.by_decision.items():
             counts[token] = max(counts.get(token, 0), figure.count)
-    order = sorted(counts, key=lambda token: (-counts[token], token))
-    return bars({
-        f"{token} ({counts[token]})": {name: own.by_decision[token] for name, own in who.items() if token in own.by_decision}
-        for token in order
-    })  # fmt: skip
+    groups = {}
+    for token in sorted(counts, key=lambda token: (-counts[token], token)):
+        found = {name: own.by_decision[token] for name, own in who.items() if token in own.by_decision}
+        groups[f"{token} ({counts[token]})"] = found
+    return bars(groups)
 
 
-def score_bars(who: Mapping[str, Measured]) -> Chart:
+def score_bars(who: Mapping[str, FigureSet]) -> Chart:
     """Give BERTScore's precision, recall and F1; the axis begins below the least of them."""
     names = {"precision": "bertscore_precision", "recall": "bertscore_recall", "F1": "bertscore_f1"}
     groups = {label: {n: own.figures[name] for n, own in who.items()} for label, name in names.items()}
@@ -218,50 +216,49 @@ def score_bars(who: Mapping[str, Measured]) -> Chart:
 
 
 def histogram(who: Mapping[str, Sequence[int]]) -> Chart:
-    """Give how often which F1 occurs; who -> counts in equal bins from 0 to 1. Empty bins at the low end are left out."""
-    num_bins = len(next(iter(who.values())))
+    """Give how often which F1 occurs; who -> counts in equal bins from 0 to 1. Empty low bins are left out."""
+    num_bins, kinds = len(next(iter(who.values()))), len(who)
     first = min(next((k for k, count in enumerate(counts) if count), num_bins - 1) for counts in who.values())
     first = min(first, num_bins - 5)
-    most = max(1, *(max(counts) for counts in who.values()))
-    width, height, kinds = 600 / (num_bins - first), 180, len(who)
-    rects = [
-        _rect(
-            46 + (k - first) * width + number * width / kinds, 200 - height * counts[k] / most, max(1.0, width / kinds - 1),
-            height * counts[k] / most, COLORS[number % 6], f"{name}, {k / num_bins:.2f} to {(k + 1) / num_bins:.2f}: {counts[k]}",
-        )
-        for number, (name, counts) in enumerate(who.items())
-        for k in range(first, num_bins)
-    ]  # fmt: skip
-    every = max(1, (num_bins - first) // 8)
-    ticks = range(first, num_bins + 1, every)
-    texts = [_text(46 + (k - first) * width, 218, f"{k / num_bins:.2f}", "middle") for k in ticks]
-    texts.append(_text(40, 24, str(most), "end"))
-    return {"names": list(who), "view": "0 0 670 230", "width": 670, "lines": [_line(46, 646, 200, 200)], "rects": rects, "texts": texts}  # fmt: skip
+    most, width, rects = max(1, *(max(counts) for counts in who.values())), 600 / (num_bins - first), []
+    for number, (name, counts) in enumerate(who.items()):
+        for k in range(first, num_bins):
+            x, height = 46 + (k - first) * width + number * width / kinds, 180 * counts[k] / most
+            title = f"{name}, {k / num_bins:.2f} to {(k + 1) / num_bins:.2f}: {counts[k]}"
+            size = {"width": max(1.0, width / kinds - 1), "height": height}
+            rects.append(_shape(x=x, y=200 - height, **size, fill=COLORS[number % 6], title=title))
+    ticks = range(first, num_bins + 1, max(1, (num_bins - first) // 8))
+    places = [(46 + (k - first) * width, f"{k / num_bins:.2f}") for k in ticks]
+    texts = [_shape(x=x, y=218, words=words, anchor="middle") for x, words in places]
+    texts.append(_shape(x=40, y=24, words=str(most), anchor="end"))
+    line = _shape(x1=46, x2=646, y1=200, y2=200, kind="axis")
+    return {"names": list(who), "lines": [line], "rects": rects, "texts": texts, "view": "0 0 670 230", "width": 670}
 
 
-def heat_map(who: Measured) -> Chart:
+def heat_map(who: FigureSet) -> Chart:
     """Give the confusion of decisions: rows are references, columns answers, colours the share of the row."""
     rows = [token for token in action_tokens() if token in who.confusion]
-    columns = [
-        name
-        for name in (*action_tokens(), UNPARSED_NAME)
-        if name in rows or any(name in who.confusion[row] for row in rows)
+    answers = {name for row in rows for name in who.confusion[row]}
+    columns = [name for name in (*action_tokens(), UNPARSED_NAME) if name in rows or name in answers]
+    size, left, top = CELL_PX, 220, 160
+    texts = [
+        _shape(x=left + j * size + size / 2, y=top - 8, words=name, anchor="start", turned=-40)
+        for j, name in enumerate(columns)
     ]
-    size, left, top = 44, 190, 150
-    rects, texts = (
-        [],
-        [_text(left + j * size + size / 2, top - 8, name, "start", -40) for j, name in enumerate(columns)],
-    )
+    rects = []
     for i, row in enumerate(rows):
         total, y = sum(who.confusion[row].values()), top + i * size
-        texts.append(_text(left - 8, y + 27, row, "end"))
+        texts.append(_shape(x=left - 8, y=y + size / 2 + 4, words=f"{row} ({total})", anchor="end"))
         for j, name in enumerate(columns):
             count, x = who.confusion[row].get(name, 0), left + j * size
-            share = count / total if total else 0.0
-            title, kind = f"{row} answered as {name}: {count} of {total}", "same" if row == name else ""
-            rects.append(_rect(x + 1, y + 1, size - 2, size - 2, "var(--accent)", title, share, kind))
+            share = count / total
+            look = {"fill": "var(--accent)", "opacity": share, "kind": "same" if row == name else "cell"}
+            title = f"{row} answered as {name}: {count} of {total}"
+            rects.append(_shape(x=x + 1, y=y + 1, width=size - 2, height=size - 2, title=title, **look))
             if count:
                 words = f"{share:.0%}" if share >= 0.01 else "<1%"
-                texts.append(_text(x + size / 2, y + 27, words, "middle", is_on=share > 0.55))
-    width, height = left + len(columns) * size + 130, top + len(rows) * size + 10
-    return {"names": [], "view": f"0 0 {width} {height}", "width": width, "lines": [], "rects": rects, "texts": texts}
+                place = {"x": x + size / 2, "y": y + size / 2 + 4, "anchor": "middle"}
+                texts.append(_shape(words=words, is_on=share > 0.55, **place))
+    width, height = left + len(columns) * size + 150, top + len(rows) * size + 10
+    places = {"view": f"0 0 {width} {height}", "width": width}
+    return {"names": [], "lines": [], "rects": rects, "texts": texts, **places}

@@ -1,11 +1,11 @@
-"""What each answer is worth, sample by sample (`scores.parquet`), and the figures of an evaluation that are computed from it.
+"""What each answer is worth, sample by sample (`scores.parquet`), and the figures that are computed from it.
 
-A sample that got no answer (`answered` false: a picture could not be read, a server refused) is no wrong answer. An answer that does not
-parse is one: it decides nothing, and its texts score 0.
+A sample that got no answer (`answered` false: a picture could not be read, a server refused) is no wrong answer. An
+answer that does not parse is one: it decides nothing, and its texts score 0.
 
-Windows of a flight overlap, flights of a walk resemble each other and languages share windows, so samples are no independent draws.
-Whole walks are drawn instead, with replacement (Efron and Tibshirani 1993, sec. 8; the cluster bootstrap): the interval of a figure is the
-percentiles of what it becomes on such draws.
+Windows of a flight overlap, flights of a walk resemble each other and languages share windows, so samples are no
+independent draws. Whole walks are drawn instead, with replacement (Efron and Tibshirani 1993, sec. 8; the cluster
+bootstrap): the interval of a figure is the percentiles of what it becomes on such draws.
 """
 
 from __future__ import annotations
@@ -39,29 +39,28 @@ _VERDICT = {name: number for number, name in enumerate(VERDICTS)}
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What somebody answered. coc: None where it does not parse; mended: whether punctuation had to be put right first."""
+class ScoredAnswer:
+    """What somebody answered. coc: None where it does not parse. mended: punctuation had to be put right first."""
 
     coc: Coc | None
     is_answered: bool = True
     mended: bool = False
-    reason: str | None = None
     num_tokens: int = 0
 
     @classmethod
-    def of(cls, prediction: Prediction) -> Answer:
-        reason = prediction.reason
-        is_answered = not (reason or "").startswith(FAILED)
-        return cls(prediction.coc, is_answered, bool(prediction.recovered), reason, prediction.num_tokens)
+    def of(cls, prediction: Prediction) -> ScoredAnswer:
+        is_answered = not (prediction.reason or "").startswith(FAILED)
+        return cls(prediction.coc, is_answered, bool(prediction.recovered), prediction.num_tokens)
 
 
 @dataclass(frozen=True)
 class Scores:
     """Columns over n samples.
 
-    key, walk, language (n,) str; against (n,) str, a digest of what the answer is held against; reference, answer, label (n,) int8 numbers of action_tokens(), UNPARSED, NONE; answered, unmended (n,) bool;
-    verdict (n,) int8 number of VERDICTS or NONE; precision, recall, f1 (n,) of BERTScore, NaN where it was not computed;
-    proved, contradicted, unread (n,) numbers of sentences, NaN where nobody judged them; num_tokens (n,).
+    key, walk, language (n,) str; against (n,) str, a digest of what the answer is held against; reference, answer,
+    label (n,) int8 numbers of action_tokens(), UNPARSED, NONE; answered, unmended (n,) bool; verdict (n,) int8 number
+    of VERDICTS or NONE; precision, recall, f1 (n,) of BERTScore, NaN where it was not computed; proved, contradicted,
+    unread (n,) numbers of sentences, NaN where nobody judged them; num_tokens (n,).
     """
 
     key: np.ndarray
@@ -107,34 +106,35 @@ def number_of(decision: str, sample: Sample) -> int:
 
 
 def digest_of_reference(sample: Sample) -> str:
-    """Name what answers to a sample are held against: the teacher's answer, the label, and what the future rules out."""
+    """Name what answers are held against: the teacher's answer, the label, and what the future rules out."""
     return sha256_bytes(dump_json([sample.answer, sample.label, sample.contradicted]).encode())[:REFERENCE_DIGITS]
 
 
 def score_answers(
     samples: Sequence[Sample],
-    answers: Sequence[Answer],
+    answers: Sequence[ScoredAnswer],
     texts: np.ndarray | None = None,
     judged: Mapping[str, Sequence[SentenceState]] | None = None,
 ) -> Scores:
     """Score answers, one a sample.
 
     Args:
-        texts: (n, 3) precision, recall, F1 of BERTScore, NaN where it was not computed. judged: sample's key -> its sentences' states.
+        texts: (n, 3) precision, recall, F1 of BERTScore, NaN where it was not computed.
+        judged: sample's key -> its sentences' states.
     """
     verdicts = []
     for sample, answer in zip(samples, answers, strict=True):
-        known = answer.coc is not None and sample.contradicted is not None
-        verdicts.append(
-            _VERDICT[verdict_on(answer.coc.flight_decision, sample.label, sample.contradicted or ())]  # type: ignore[union-attr]
-            if known
-            else NONE
-        )
+        if answer.coc is None or sample.contradicted is None:
+            verdicts.append(NONE)
+        else:
+            verdicts.append(_VERDICT[verdict_on(answer.coc.flight_decision, sample.label, sample.contradicted)])
+    both = zip(samples, answers, strict=True)
+    decisions = [number_of(a.coc.flight_decision, s) if a.coc else UNPARSED for s, a in both]
     is_answered = np.array([answer.is_answered for answer in answers], dtype=bool)
     bert = np.where(is_answered[:, None], np.nan if texts is None else texts, np.nan) * np.ones((1, 3))
     found = [(judged or {}).get(sample.key) for sample in samples]
     sentences = {
-        state: np.array([np.nan if states is None else states.count(state) for states in found], dtype=float)  # type: ignore[attr-defined]
+        state: np.array([np.nan if states is None else list(states).count(state) for states in found], dtype=float)
         for state in STATES
     }
     return Scores(
@@ -143,10 +143,7 @@ def score_answers(
         language=np.array([sample.language for sample in samples], dtype=object),
         against=np.array([digest_of_reference(sample) for sample in samples], dtype=object),
         reference=np.array([number_of(sample.decision, sample) for sample in samples], dtype=np.int8),
-        answer=np.array(
-            [number_of(a.coc.flight_decision, s) if a.coc else UNPARSED for s, a in zip(samples, answers, strict=True)],
-            dtype=np.int8,
-        ),
+        answer=np.array(decisions, dtype=np.int8),
         label=np.array([number_of(s.label, s) if s.label else NONE for s in samples], dtype=np.int8),
         answered=is_answered,
         unmended=np.array([a.coc is not None and not a.mended for a in answers], dtype=bool),
@@ -158,8 +155,6 @@ def score_answers(
         **sentences,
     )
 
-
-# --- on disk ----------------------------------------------------------------------------------------------------------
 
 _TEXT, _NAMES = ("key", "walk", "language", "against"), [field.name for field in fields(Scores)]
 
@@ -186,11 +181,9 @@ def read_scores(path: Path) -> Scores:
     """
     columns: dict[str, list[Any]] = {name: [] for name in _NAMES}
     for group in row_groups(path):
-        wrong = [name for name in _NAMES if group.column_names.count(name) != 1]
-        if wrong:
+        if wrong := [name for name in _NAMES if group.column_names.count(name) != 1]:
             got = f"{group.column_names.count(wrong[0])} columns {wrong[0]}"
-            fix = "run cosfly distill evaluate anew"
-            raise InputError("not the scores of an evaluation", where=path, got=got, expected="one", fix=fix)
+            raise InputError("not the scores of an evaluation", where=path, got=got, expected="one")
         for name in _NAMES:
             with arrow_errors(path):  # text that is no UTF-8 shows here
                 columns[name] += group.column(name).to_pylist()
@@ -201,11 +194,12 @@ def read_scores(path: Path) -> Scores:
 
 
 def _column_values(name: str, values: list[Any]) -> np.ndarray:
-    if name == "verdict":
-        return np.array([NONE if word is None else _VERDICT[word] for word in values], dtype=np.int8)
-    if name in ("reference", "answer", "label"):
-        numbers = _numbers() | {"(unparsed)": UNPARSED}
-        return np.array([NONE if word is None else numbers[word] for word in values], dtype=np.int8)
+    if name in ("reference", "answer", "label", "verdict"):
+        numbers: dict[Any, int] = {
+            None: NONE,
+            **(_VERDICT if name == "verdict" else _numbers() | {"(unparsed)": UNPARSED}),
+        }
+        return np.array([numbers[word] for word in values], dtype=np.int8)
     if name in _TEXT:
         if not all(isinstance(value, str) for value in values):
             raise ValueError(f"{name}: not text")
@@ -256,7 +250,10 @@ class Figure(BaseModel):
 
 @dataclass(frozen=True)
 class _Sums:
-    """Of each walk the sums over its samples: numerators, denominators (walks, figures); confusion (walks, a, a + 1) of a actions, what does not parse last."""
+    """Of each walk the sums over its samples: numerators, denominators (walks, figures).
+
+    confusion: (walks, a, a + 1) of a actions, what does not parse last.
+    """
 
     names: list[str]
     numerators: np.ndarray
@@ -294,9 +291,7 @@ def _terms(scores: Scores) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 def _sums(scores: Scores, walk: np.ndarray, num_walks: int) -> _Sums:
     terms = _terms(scores)
-    per_walk = [
-        [np.bincount(walk, weights=part.astype(float), minlength=num_walks) for part in pair] for pair in terms.values()
-    ]
+    per_walk = [[np.bincount(walk, part.astype(float), num_walks) for part in pair] for pair in terms.values()]
     answered = scores.answered
     count = len(action_tokens())
     answer = np.where(scores.answer == UNPARSED, count, scores.answer)
@@ -311,7 +306,7 @@ def _sums(scores: Scores, walk: np.ndarray, num_walks: int) -> _Sums:
 
 
 def macro_f1(confusion: np.ndarray) -> np.ndarray:
-    """Give the mean F1 over the decisions that the references have, (...,) from (..., a, a + 1) counts; NaN without any.
+    """Give the mean F1 over the decisions that references have, (...,) from (..., a, a + 1) counts; NaN without any.
 
     F1 = 2 tp / (2 tp + fp + fn); an answer that does not parse is a miss of its reference and nobody's false alarm.
     """
@@ -342,7 +337,7 @@ def draw_walks(num_walks: int, resamples: int, rng: np.random.Generator) -> np.n
 
 
 def figures_of(scores: Scores, draws: np.ndarray, *, confidence: float) -> tuple[dict[str, Figure], dict[str, Figure]]:
-    """Give all figures, and the accuracy of each decision that the references have; draws: of the walks (`draw_walks`)."""
+    """Give all figures, and the accuracy of each decision that references have; draws: of the walks (`draw_walks`)."""
     names, walk = np.unique(scores.walk.astype(str), return_inverse=True)
     sums = _sums(scores, walk, len(names))
     whole = _values(sums, np.ones((1, len(names))))
@@ -351,7 +346,7 @@ def figures_of(scores: Scores, draws: np.ndarray, *, confidence: float) -> tuple
     references = sums.confusion.sum(axis=(0, 2))
     counts |= {"macro_f1": references.sum(), **{f"decision/{a}": references[i] for i, a in enumerate(action_tokens())}}
     found = {
-        name: _figure(float(whole[name][0]), drawn[name], int(counts[name]), len(names), confidence) for name in whole
+        name: _figure(float(v[0]), drawn[name], int(counts[name]), len(names), confidence) for name, v in whole.items()
     }
     decisions = {token: found[f"decision/{token}"] for i, token in enumerate(action_tokens()) if references[i]}
     return {name: found[name] for name in FIGURES}, decisions
@@ -372,9 +367,6 @@ def _interval(drawn: np.ndarray, confidence: float) -> tuple[float | None, float
     return float(low), float(high)
 
 
-# --- two students -----------------------------------------------------------------------------------------------------
-
-
 class Difference(BaseModel):
     """One student's figure less another's on the samples that both were asked.
 
@@ -392,7 +384,7 @@ class Difference(BaseModel):
 def differences_of(
     one: Scores, other: Scores, *, resamples: int, confidence: float, rng: np.random.Generator
 ) -> tuple[int, dict[str, Difference]]:
-    """Compare two students on the same draws of walks; gives the number of samples that both have, and the differences."""
+    """Compare two students on the same draws of walks: the number of samples that both have, and the differences."""
     places: Mapping[str, int] = {key: place for place, key in enumerate(other.key)}
     here = np.array([place for place, key in enumerate(one.key) if key in places], dtype=int)
     if not len(here):

@@ -1,7 +1,8 @@
-"""Measure a student: parse rate, decisions, verdicts, BERTScore and evidence, each beside its floors and with its interval.
+"""Measure a student: parse rate, decisions, verdicts, BERTScore and evidence, each beside its floors and with its
+interval.
 
-The reference is the teacher's accepted answer, as in the paper; agreement with the geometric label and the verdict on the true future stand
-beside it.
+The reference is the teacher's accepted answer, as in the paper; agreement with the geometric label and the verdict on
+the true future stand beside it.
 """
 
 from __future__ import annotations
@@ -13,12 +14,13 @@ from typing import Any
 from pydantic import Field
 
 from cosfly.errors import InputError
+from cosfly.look.frame_views import thumbnail
 from cosfly.products.captions import Language
 from cosfly.products.predictions import Prediction, read_predictions
 from cosfly.work import in_place
 from cosfly.work.config import Config
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
-from cosfly.work.store import write_bytes, write_model
+from cosfly.work.store import inside, write_bytes, write_model
 from distill.evaluation.bertscore import BertScoreConfig, Metric, Scorer, check_encoder, deciding_files
 from distill.evaluation.floors import Floors, coc_of
 from distill.evaluation.measure import (
@@ -28,8 +30,8 @@ from distill.evaluation.measure import (
     REPORT_VERSION,
     STAGE,
     STUDENT,
+    Evaluation,
     Measurement,
-    Report,
     SentenceStates,
     examples_of,
     join,
@@ -42,8 +44,10 @@ from distill.evaluation.measure import (
 )
 from distill.evaluation.pages import markdown_of, page_of
 from distill.evaluation.scores import SCORES, Scores, write_scores
-from distill.schema import Sample, in_its_actions, open_split
+from distill.schema import Sample, in_its_actions, open_split, resolve_trees, tree_inputs
 from distill.student.model import require
+
+THUMBNAIL_PX = 256  # width of a frame on the page
 
 
 class EvaluateConfig(Config):
@@ -62,23 +66,27 @@ def run(
     dataset: Path,
     out: Path,
     *,
+    data: Sequence[Path] = (),
     bertscore_models: Mapping[Language, Path] | None = None,
     judged: Mapping[str, Sequence[Path]] | None = None,
     seed: int = 0,
     resume: Resume = "if-same",
 ) -> Path:
-    """Read `predictions.jsonl` and the training set it was made from; write `report.json`, `scores.parquet` and two pages.
+    """Read `predictions.jsonl` and the training set it was made from; write `report.json`, `scores.parquet` and two
+    pages.
 
     Args:
         bertscore_models: local folders of the encoders; a language without one is not scored, and the report says so.
-        judged: who (`student`, `shuffled`, `constant`) -> the captions that `cosfly caption --teacher student:` made of their answers, a file a tree.
+        judged: who (`student`, `shuffled`, `constant`) -> the captions that `cosfly caption --teacher student:` made of
+            their answers, a file a tree.
     Returns:
         The path of `report.json`.
     Raises:
         InputError: an input is missing, or predictions and training set do not belong together.
     """
     models, captions = dict(bertscore_models or {}), dict(judged or {})
-    inputs = {"predictions": predictions, "dataset": dataset}
+    trees = resolve_trees(dataset, data) if data else {}
+    inputs = {"predictions": predictions, "dataset": dataset, **tree_inputs(trees)}
     inputs |= {f"judged/{name}/{n}": path for name, paths in captions.items() for n, path in enumerate(paths, 1)}
     for language, folder in models.items():
         require("torch", "transformers", "bert_score")
@@ -101,12 +109,19 @@ def run(
     write_model(path, report, schema=REPORT_SCHEMA, version=REPORT_VERSION)
     write_scores(out / SCORES, scores)
     write_bytes(out / "evaluation.md", markdown_of(report).encode())
-    write_bytes(out / "evaluation.html", page_of(report).encode())
+    shown = {sample.key: sample for sample, _ in pairs}
+    pictures = {example.key: _pictures_of(shown[example.key], trees) for example in report.examples if trees}
+    write_bytes(out / "evaluation.html", page_of(report, pictures).encode())
     tally = Tally(input=len(samples), kept=len(pairs), dropped={"not_asked": num_left} if num_left else {})
-    stage.finish(
-        [path, out / SCORES, out / "evaluation.md", out / "evaluation.html"], tally, split=splits[0], model=report.model
-    )
+    files = [path, *(out / name for name in (SCORES, "evaluation.md", "evaluation.html"))]
+    stage.finish(files, tally, split=splits[0], model=report.model)
     return path
+
+
+def _pictures_of(sample: Sample, trees: Mapping[str, Path]) -> list[str]:
+    """Give the frames of a sample's window that can be read as small JPEGs in base64."""
+    found = (thumbnail(inside(trees[sample.run], frame), THUMBNAIL_PX) for frame in sample.frames)
+    return [picture for picture in found if picture is not None]
 
 
 def _evaluate(
@@ -116,7 +131,7 @@ def _evaluate(
     models: Mapping[Language, Path],
     judged: SentenceStates,
     seed: int,
-) -> tuple[Report, Scores]:
+) -> tuple[Evaluation, Scores]:
     given: Any = {"resamples": cfg.resamples, "confidence": cfg.confidence, "seed": seed}
     parts: list[dict[str, Scores]] = []
     measurements: dict[Language, Measurement] = {}
@@ -136,7 +151,7 @@ def _evaluate(
         asked += own
     scores = join(parts)
     predictions = [prediction for _, prediction in asked]
-    return Report(
+    return Evaluation(
         model=", ".join(sorted({prediction.model or "unknown" for prediction in predictions})),
         split=predictions[0].split,
         **given,
