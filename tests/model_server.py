@@ -64,10 +64,8 @@ class ModelServer(TeacherServer):
         length, max_tokens = len(row.prompt_ids), int(body["max_tokens"])
         if length + max_tokens > CONTEXT:
             return refusal(400, f"{length} + {max_tokens} tokens, at most {CONTEXT}")
-        inputs, processors = (
-            prompt_batch(own, [row]) | {"pixel_values": torch.from_numpy(patches)},
-            LogitsProcessorList(),
-        )
+        inputs = prompt_batch(own, [row]) | {"pixel_values": torch.from_numpy(patches)}
+        processors = LogitsProcessorList()
         if not len(row.image_grids):
             del inputs["pixel_values"], inputs["image_grid_thw"]
         if wanted := body.get("response_format"):
@@ -78,8 +76,8 @@ class ModelServer(TeacherServer):
         torch.manual_seed(int(body.get("seed", 0)))
         with torch.inference_mode():
             output = own.model.generate(
-                **inputs, max_new_tokens=max_tokens, do_sample=body["temperature"] > 0, temperature=body["temperature"] or None,
-                top_p=body.get("top_p", 1.0), top_k=0, eos_token_id=own.end_token_id, pad_token_id=own.pad_token_id,
+                **inputs, max_new_tokens=max_tokens, do_sample=body["temperature"] > 0,
+                temperature=body["temperature"] or None, top_p=body.get("top_p", 1.0), top_k=0, eos_token_id=own.end_token_id, pad_token_id=own.pad_token_id,
                 sequence_bias=bias or None, logits_processor=processors,
             )  # fmt: skip
         ids = output[0, length:].tolist()

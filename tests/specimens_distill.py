@@ -96,10 +96,8 @@ def make_captions(path: Path, tree: Path) -> list[Caption]:
     captions = []
     for folder in find_flights(tree):
         flight = read_flight(folder)
-        captions += [
-            make_caption(flight.town, flight.trajectory, flight.variant, frame)
-            for frame in range(WINDOW - 1, len(flight))
-        ]
+        names = (flight.town, flight.trajectory, flight.variant)
+        captions += [make_caption(*names, frame) for frame in range(WINDOW - 1, len(flight))]
     write_captions(path, captions)
     return captions
 
@@ -121,16 +119,12 @@ def make_adapter(base: Path, folder: Path, **changes) -> Path:
     from distill.training.settings import TARGET_MODULES
 
     student = load_student(base, device="cpu", max_pixels=ADAPTER_PIXELS)
-    lora = {
-        "r": 4,
-        "lora_alpha": 12,
-        "target_modules": TARGET_MODULES,
-        "init_lora_weights": False,
-        "task_type": "CAUSAL_LM",
-    }
+    lora = {"r": 4, "lora_alpha": 12, "init_lora_weights": False, "task_type": "CAUSAL_LM"}
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(7)
-        student.model = get_peft_model(student.model, LoraConfig(**{**lora, **changes}))
+        student.model = get_peft_model(
+            student.model, LoraConfig(**{"target_modules": TARGET_MODULES, **lora, **changes})
+        )
     with torch.no_grad():  # what training changes is small beside what was there
         for name, tensor in student.model.named_parameters():
             if "lora_B" in name:

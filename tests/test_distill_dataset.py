@@ -55,7 +55,7 @@ def test_what_two_splits_share_is_found():
         ([one], [sample_of("t2").model_copy(update={"walk": one.walk})], "walk", walk),  # another timestamp
         ([one], [sample_of("t2", town="Town01_Opt")], "town", town),
         ([one, sample_of(frame=6).model_copy(update={"walk": "elsewhere"})], [], "walk", "of two walks"),
-        ([one, *[sample_of(language="zh")] * 2], [], "walk", "twice.*frame 4 of run/Town01/trajectory_1/ORI, language zh"),
+        ([one, *[sample_of(language="zh")] * 2], [], "walk", "twice.*frame 4 of .*/trajectory_1/ORI, language zh"),
     ):  # fmt: skip
         with pytest.raises(VerifyError, match=words):
             check_no_leak({"train": train, "val": val}, split_by)
@@ -263,11 +263,8 @@ def test_the_walk_of_a_flight_decides_its_split_and_not_its_name(tmp_path):
     assert len(set.union(*walks.values())) == 4
     everyone = [sample for found in samples.values() for sample in found]
     assert len({sample.key for sample in everyone}) == len(everyone) == 3 * 4 * 2 * 4 * 2
-    # A walk has the flights of three runs, clean and perturbed.
-    assert {
-        len({(s.run, s.trajectory, s.variant) for s in everyone if s.walk == walk})
-        for walk in set.union(*walks.values())
-    } == {6}
+    flights = {(s.walk, s.run, s.trajectory, s.variant) for s in everyone}
+    assert set(Counter(walk for walk, *_ in flights).values()) == {6}  # of three runs, clean and perturbed
     facts = json.loads((out / "manifest.json").read_text())["splits"]
     assert sum(found["flights"] for found in facts.values()) == 24
     trees = resolve_trees(out, [source.data for source in reversed(runs)])

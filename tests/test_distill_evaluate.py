@@ -271,12 +271,10 @@ def test_a_rule_on_the_numbers_of_the_prompt_beats_the_majority(samples):
 
     floors, asked = Floors(told(400), "en", 0), told(100)
     answers = floors.answers(asked, [coc_of(sample) for sample in asked])
-    right = {
-        name: sum(a.coc.flight_decision == s.decision for a, s in zip(answers[name], asked, strict=True))
-        for name in ("rule", "majority")
-    }
-    assert right["rule"] >= 97
-    assert right["majority"] < 60
+    decisions = {name: np.array([answer.coc.flight_decision for answer in own]) for name, own in answers.items()}
+    wanted = np.array([sample.decision for sample in asked])
+    assert (decisions["rule"] == wanted).sum() >= 97
+    assert (decisions["majority"] == wanted).sum() < 60
 
 
 def test_floors_are_predictions_that_a_verifier_can_judge(place):
@@ -296,10 +294,8 @@ def test_floors_are_predictions_that_a_verifier_can_judge(place):
 def place(tmp_path, samples) -> Path:
     """A training set of two languages and two walks, and the predictions of its test split."""
     both = [*samples, *(sample_of(frame, "zh") for frame in FRAMES)]
-    both = [
-        sample.model_copy(update={"walk": f"walk_{k % 2}", "contradicted": ("ascend",)})
-        for k, sample in enumerate(both)
-    ]
+    known = {"contradicted": ("ascend",)}
+    both = [sample.model_copy(update={"walk": f"walk_{k % 2}", **known}) for k, sample in enumerate(both)]
     write_set(tmp_path / "set", {"train": both, "val": both, "test": both})
     write_predictions(tmp_path, predictions_of(both[:8]) + predictions_of(both[8:]))
     return tmp_path
@@ -454,11 +450,8 @@ def test_students_of_other_references_are_not_compared(place):
     predictions = [make_prediction(samples[0], "test", samples[0].answer, 5, True)]
     coc = coc_of(samples[0])
     other = dump_json(coc.model_copy(update={"reasoning_trace": coc.reasoning_trace + " So it is."}).model_dump())
-    kinds = {
-        "first": {},
-        "blind": {"prompt": samples[0].prompt.model_copy(update={"user": "Nothing is given."})},
-        "foreign": {"answer": other},
-    }
+    blind = {"prompt": samples[0].prompt.model_copy(update={"user": "Nothing is given."})}
+    kinds = {"first": {}, "blind": blind, "foreign": {"answer": other}}
     for name, changes in kinds.items():
         changed = [sample.model_copy(update=changes if sample.key == samples[0].key else {}) for sample in samples]
         write_set(place / f"set_{name}", {"train": changed, "test": changed})

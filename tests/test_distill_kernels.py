@@ -37,7 +37,8 @@ def computed(found: torch.nn.ModuleDict, dtype, autocast: bool) -> list[torch.Te
 
 
 @pytest.mark.parametrize(("dtype", "autocast", "tolerance"), [
-    (torch.float32, False, 1e-5), (torch.float32, True, 1e-5), (torch.bfloat16, False, 0.03), (torch.bfloat16, True, 0.03),
+    (torch.float32, False, 1e-5), (torch.float32, True, 1e-5),
+    (torch.bfloat16, False, 0.03), (torch.bfloat16, True, 0.03),
 ])  # fmt: skip
 def test_fused_norms_are_the_librarys_with_their_gradients(dtype, autocast, tolerance):
     plain, fused = norms(dtype), norms(dtype)

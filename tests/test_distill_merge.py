@@ -130,9 +130,8 @@ def sharded(base: Path, folder: Path) -> Path:
         save_file(
             {name: tensors[name] for name in part} | (extra if file is files[1] else {}), blobs / file, {"format": "pt"}
         )
-    weight_map = {name: file for file, part in zip(files, parts, strict=True) for name in part} | {
-        "mtp.layers.0.weight": files[1]
-    }
+    weight_map = {name: file for file, part in zip(files, parts, strict=True) for name in part}
+    weight_map["mtp.layers.0.weight"] = files[1]
     write_json(blobs / "model.safetensors.index.json", {"metadata": {"total_size": 1}, "weight_map": weight_map})
     for path in blobs.iterdir():
         (folder / path.name).symlink_to(Path("..") / "blobs" / path.name)

@@ -30,7 +30,8 @@ WORDS = """
     {%- if content is string -%}{{ content }}
     {%- else -%}
         {%- for part in content -%}
-            {%- if part.type == 'image' or 'image' in part or 'image_url' in part -%}<|vision_start|><|image_pad|><|vision_end|>
+            {%- if part.type == 'image' or 'image' in part or 'image_url' in part -%}
+                {{- '<|vision_start|><|image_pad|><|vision_end|>' -}}
             {%- elif 'text' in part -%}{{ part.text }}
             {%- else -%}{{ raise_exception('Unexpected item type in content.') }}
             {%- endif -%}
@@ -38,7 +39,9 @@ WORDS = """
     {%- endif -%}
 {%- endmacro -%}
 {%- set place = namespace(last_question=-1) -%}
-{%- for message in messages if message.role == 'user' -%}{%- set place.last_question = messages.index(message) -%}{%- endfor -%}
+{%- for message in messages if message.role == 'user' -%}
+    {%- set place.last_question = messages.index(message) -%}
+{%- endfor -%}
 """
 END = """
 {%- if add_generation_prompt -%}
@@ -87,7 +90,7 @@ EFFORT = """
 {%- set effort = '' -%}
 {%- if enable_thinking is undefined or enable_thinking is true -%}
     {%- set wanted = reasoning_effort | default('xhigh') -%}
-    {%- if wanted not in ('xhigh', 'medium', 'low') -%}{{ raise_exception('Unexpected reasoning effort ' ~ wanted) }}{%- endif -%}
+    {%- if wanted not in ('xhigh', 'medium', 'low') -%}{{ raise_exception('Unexpected effort ' ~ wanted) }}{%- endif -%}
     {%- if wanted != 'medium' -%}{%- set effort = 'Reasoning effort is set to ' ~ wanted ~ '.' -%}{%- endif -%}
 {%- endif -%}
 """

@@ -275,10 +275,8 @@ def test_a_student_that_overfits_answers_right(place, tmp_path):
     learnt = samples_of(place)[:2]
     write_set(tmp_path / "set", {"train": learnt, "val": learnt}, [place / "tree"])
     settings = {**FAST, "lora_rank": 16, "schedule": "cosine", "batch_size": 2, "samples_per_step": 2, "epochs": 80}
-    cfg, given = (
-        TrainConfig(**settings, keep="last", patience=0),
-        (tmp_path / "set", [place / "tree"], place / "student"),
-    )
+    cfg = TrainConfig(**settings, keep="last", patience=0)
+    given = (tmp_path / "set", [place / "tree"], place / "student")
     adapter = train.run(cfg, *given, tmp_path / "trained")
     asked = infer.InferConfig(split="train", device="cpu")
     out = infer.run(asked, *given, tmp_path / "answers", adapter=adapter)

@@ -65,11 +65,8 @@ def test_samples_are_left_out_with_a_reason_and_counted(place, tmp_path):
     shown = good[2].prompt.model_copy(update={"user": "an <|image_pad|> stands here"})
     pictured = good[2].model_copy(update={"sample_id": "pictured", "prompt": shown})
     sized = good[3].model_copy(update={"sample_id": "sized", "picture_px": (32, 32)})
-    dataset = write_set(
-        tmp_path / "set",
-        {"train": [*good, long, spoken, pictured, sized], "val": samples_of(place, "val")},
-        [place / "tree"],
-    )
+    splits = {"train": [*good, long, spoken, pictured, sized], "val": samples_of(place, "val")}
+    dataset = write_set(tmp_path / "set", splits, [place / "tree"])
     run(place, tmp_path / "out", dataset=dataset, max_steps=1)
     counts = json.loads((tmp_path / "out" / "manifest.json").read_text())["counts"]
     assert counts["dropped"] == {"special_token": 2, "too_long": 1, "unfit_picture": 1}

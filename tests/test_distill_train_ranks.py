@@ -25,6 +25,7 @@ from cosfly.errors import ConfigError, InputError  # noqa: E402
 from distill.training.ranks import Ranks, _buckets, joined  # noqa: E402
 
 # A usual rate: with one that makes a student learn in 12 steps, rounding grows beyond 1e-5 within few of them.
+COSFLY = (sys.executable, "-m", "cosfly")
 SETTINGS = {**TWELVE, "learning_rate": 1e-3, "validation_answers": True, "max_new_tokens": 4}
 
 
@@ -50,30 +51,14 @@ def free_port() -> int:
 def start(place: Path, out: Path, size: int, **changes: object) -> list[subprocess.Popen]:
     """Start the processes of a training as a launcher would."""
     settings = [f"distill.train.{name}={json.dumps(value)}" for name, value in {**SETTINGS, **changes}.items()]
-    command = [
-        sys.executable,
-        "-m",
-        "cosfly",
-        "distill",
-        "train",
-        "--student",
-        str(place / "student"),
-        "--out",
-        str(out),
-    ]
+    command = [*COSFLY, "distill", "train", "--student", str(place / "student"), "--out", str(out)]
     command += ["--dataset", str(place / "set"), "--data", str(place / "tree")]
     command += [word for text in settings for word in ("--set", text)]
-    group = {
-        "WORLD_SIZE": str(size),
-        "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": str(free_port()),
-        "OMP_NUM_THREADS": "1",
-    }
+    address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "OMP_NUM_THREADS": "1"}
+    group = {**os.environ, **address, "WORLD_SIZE": str(size)}
     given: dict = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
-    return [
-        subprocess.Popen(command, env={**os.environ, **group, "RANK": str(rank), "LOCAL_RANK": str(rank)}, **given)
-        for rank in range(size)
-    ]
+    ranks = [{"RANK": str(rank), "LOCAL_RANK": str(rank)} for rank in range(size)]
+    return [subprocess.Popen(command, env={**group, **own}, **given) for own in ranks]
 
 
 def finish(processes: list[subprocess.Popen]) -> list[int]:
@@ -89,11 +74,8 @@ def wait_for_steps(out: Path, count: int) -> None:
 
 
 def losses_of_whole_lines(out: Path) -> list[str]:
-    return [
-        line
-        for line in (out / "log.jsonl").read_text().splitlines(keepends=True)
-        if '"loss"' in line and "speed" in line
-    ]
+    lines = (out / "log.jsonl").read_text().splitlines(keepends=True)
+    return [line for line in lines if '"loss"' in line and "speed" in line]
 
 
 def test_one_process_needs_no_group(monkeypatch):
@@ -148,15 +130,8 @@ def test_when_one_dies_all_end_and_one_process_goes_on(place, alone, tmp_path):
 def test_a_launcher_starts_them(place, tmp_path):
     """`torchrun` on the command itself: one folder, one log, status 0; and status 1 where a setting is wrong."""
     settings = ["max_steps=2", "device=cpu", "data_workers=0", "validation_samples=2", "max_new_tokens=2"]
-    command = [
-        sys.executable,
-        "-m",
-        "torch.distributed.run",
-        "--nproc-per-node",
-        "2",
-        "--master-port",
-        str(free_port()),
-    ]
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2"]
+    command = [*launcher, "--master-port", str(free_port())]
     command += ["-m", "cosfly", "distill", "train", "--student", "tiny", "--out", str(tmp_path / "out")]
     command += ["--dataset", str(place / "set"), "--data", str(place / "tree")]
     command += [word for text in settings for word in ("--set", f"distill.train.{text}")]

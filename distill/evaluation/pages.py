@@ -121,7 +121,7 @@ def page_of(report: Evaluation, pictures: Mapping[str, Sequence[str]]) -> str:
         student = part.who[STUDENT]
         charts = [
             ("Accuracy by decision", decision_bars({STUDENT: student, **_beside(part, "majority", "rule")})),
-            ("Reference against answer", heat_map(student)),
+            ("Reference (rows) against answer", heat_map(student)),
         ]
         if part.histogram_f1 is not None:
             beside = _beside(part, "shuffled", "constant")
@@ -240,7 +240,7 @@ def heat_map(who: FigureSet) -> Chart:
     rows = [token for token in action_tokens() if token in who.confusion]
     answers = {name for row in rows for name in who.confusion[row]}
     columns = [name for name in (*action_tokens(), UNPARSED_NAME) if name in rows or name in answers]
-    size, left, top = CELL_PX, 220, 160
+    size, left, top = CELL_PX, 205, 160
     texts = [
         _shape(x=left + j * size + size / 2, y=top - 8, words=name, anchor="start", turned=-40)
         for j, name in enumerate(columns)
@@ -259,6 +259,6 @@ def heat_map(who: FigureSet) -> Chart:
                 words = f"{share:.0%}" if share >= 0.01 else "<1%"
                 place = {"x": x + size / 2, "y": y + size / 2 + 4, "anchor": "middle"}
                 texts.append(_shape(words=words, is_on=share > 0.55, **place))
-    width, height = left + len(columns) * size + 150, top + len(rows) * size + 10
+    width, height = left + len(columns) * size + 110, top + len(rows) * size + 10
     places = {"view": f"0 0 {width} {height}", "width": width}
     return {"names": [], "lines": [], "rects": rects, "texts": texts, **places}

@@ -103,20 +103,14 @@ def make_random_student(folder: Path, cfg: RandomStudent, seed: int, texts: Iter
 
     quiet_transformers()
     tokenizer = _tokenizer((*_TOKENIZER_TEXT, " ".join(action_tokens()), *texts), cfg.vocabulary)
-    image_processor = Qwen2VLImageProcessorPil(
-        patch_size=16,
-        merge_size=2,
-        temporal_patch_size=2,
-        image_mean=[0.5] * 3,
-        image_std=[0.5] * 3,
-        size={"shortest_edge": 32 * 32, "longest_edge": 1280 * 1280},  # areas in pixels
-    )
+    sizes: Any = {"patch_size": 16, "merge_size": 2, "temporal_patch_size": 2}
+    areas: Any = {"shortest_edge": 32 * 32, "longest_edge": 1280 * 1280}  # in pixels
+    image_processor = Qwen2VLImageProcessorPil(**sizes, image_mean=[0.5] * 3, image_std=[0.5] * 3, size=areas)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng_for(seed, "distill.tiny_student", "weights").integers(2**31)))
         model = Qwen3_5ForConditionalGeneration(model_config(cfg, tokenizer))
-        # Final norm and tied embeddings stay frozen under LoRA and bound the logits by |hidden| |embedding| =
-        # sqrt(width) * 1, hence the loss by about 0.29 nats in the smallest; twice the length lets a student be sure of
-        # an answer.
+        # Final norm and tied embeddings stay frozen under LoRA and bound the logits by |hidden| |embedding|, which is
+        # sqrt(width), hence the loss by 0.29 nats in the smallest; twice the length lets it be sure of an answer.
         with torch.no_grad():
             model.model.language_model.embed_tokens.weight.mul_(2.0)
     with atomic_folder(folder) as partial, disk_errors(partial):
@@ -133,24 +127,16 @@ def _tokenizer(lines: Iterable[str], vocabulary: int) -> Any:
     bpe = Tokenizer(models.BPE())
     bpe.normalizer = normalizers.NFC()
     bpe.decoder = decoders.ByteLevel()
-    bpe.pre_tokenizer = pre_tokenizers.Sequence(
-        [
-            pre_tokenizers.Split(Regex(PRETOKENIZE_REGEX), "isolated"),
-            pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False),
-        ]
-    )
-    trainer = trainers.BpeTrainer(
-        vocab_size=vocabulary, initial_alphabet=sorted(pre_tokenizers.ByteLevel.alphabet()), show_progress=False
-    )
+    words = pre_tokenizers.Split(Regex(PRETOKENIZE_REGEX), "isolated")
+    letters = pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False)
+    bpe.pre_tokenizer = pre_tokenizers.Sequence([words, letters])
+    given: Any = {"initial_alphabet": sorted(letters.alphabet()), "show_progress": False}
+    trainer = trainers.BpeTrainer(vocab_size=vocabulary, **given)
     bpe.train_from_iterator(lines, trainer)
     state: dict[str, Any] = json.loads(bpe.to_str())["model"]
-    tokenizer = Qwen3_5Tokenizer(
-        vocab=state["vocab"],
-        merges=[tuple(merge) for merge in state["merges"]],  # type: ignore[misc]  # pairs, as the library wants them
-        eos_token=END_OF_TURN,
-        pad_token=_SPECIAL_TOKENS[0],
-        model_max_length=32768,
-    )
+    own: Any = {"vocab": state["vocab"], "merges": [tuple(merge) for merge in state["merges"]]}
+    ends: Any = {"eos_token": END_OF_TURN, "pad_token": _SPECIAL_TOKENS[0]}
+    tokenizer = Qwen3_5Tokenizer(**own, **ends, model_max_length=32768)
     tokenizer.add_special_tokens({"extra_special_tokens": list(_SPECIAL_TOKENS[1:])})
     tokenizer.chat_template = _CHAT_TEMPLATE
     return tokenizer
@@ -164,13 +150,8 @@ def model_config(cfg: RandomStudent, tokenizer: Any) -> Any:
     head = WIDE_HEAD_WIDTH if cfg.width >= WIDE else HEAD_WIDTH
     heads = max(2, cfg.width // head)
     section = head // 16  # of half of the rotary half of a head: a quarter each for height and width, the rest for time
-    rope = {
-        "rope_type": "default",
-        "rope_theta": 1e4,
-        "partial_rotary_factor": 0.5,
-        "mrope_section": [head // 4 - 2 * section, section, section],
-        "mrope_interleaved": True,
-    }
+    rope = {"rope_type": "default", "rope_theta": 1e4, "partial_rotary_factor": 0.5, "mrope_interleaved": True}
+    rope["mrope_section"] = [head // 4 - 2 * section, section, section]
     text = {
         "vocab_size": len(tokenizer),
         "hidden_size": cfg.width,
@@ -198,12 +179,6 @@ def model_config(cfg: RandomStudent, tokenizer: Any) -> Any:
         "out_hidden_size": cfg.width,
         "num_position_embeddings": 64,
     }
-    return Qwen3_5Config(
-        text_config=text,
-        vision_config=vision,
-        image_token_id=ids[IMAGE_TOKEN],
-        video_token_id=ids["<|video_pad|>"],
-        vision_start_token_id=ids["<|vision_start|>"],
-        vision_end_token_id=ids["<|vision_end|>"],
-        tie_word_embeddings=True,
-    )
+    kinds = ("image", "video", "vision_start", "vision_end")
+    marks = {f"{kind}_token_id": ids[f"<|{kind}_pad|>" if kind in kinds[:2] else f"<|{kind}|>"] for kind in kinds}
+    return Qwen3_5Config(text_config=text, vision_config=vision, tie_word_embeddings=True, **marks)

@@ -98,7 +98,8 @@ def estimate(student: Student, cfg: TrainConfig, longest: int, picture_bytes: fl
         weights=weights,
         gradients=learning,
         optimizer=ADAM_COPIES * learning,
-        activations=saved_bytes_per_token(student, cfg) * longest * rows,
+        # While a layer goes backward, the gradients of what it kept stand beside what all layers kept.
+        activations=saved_bytes_per_token(student, cfg) * longest * rows * (1 + 1 / config.num_hidden_layers),
         logits=float(TABLES * cfg.logit_chunk * config.vocab_size * 4),
         pictures=rows * picture_bytes,
         program=max(0.0, used_gb(student.device) * GB - weights),

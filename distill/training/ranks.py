@@ -114,11 +114,9 @@ def _collective(call: Callable[..., Any], *arguments: Any) -> None:
     try:
         call(*arguments)
     except RuntimeError as error:  # what torch.distributed raises of a broken connection
-        raise EnvironmentMissing(
-            "another process of this training has ended",
-            got=str(error).splitlines()[0][:160],
-            fix="its own message says why; run the same command again: it goes on from the last checkpoint",
-        ) from error
+        fix = "its own message says why; run the same command again: it goes on from the last checkpoint"
+        got = str(error).splitlines()[0][:160]
+        raise EnvironmentMissing("another process of this training has ended", got=got, fix=fix) from error
 
 
 def is_first_process() -> bool:
@@ -146,12 +144,9 @@ def joined(device: Device) -> Iterator[Ranks]:
     rank, local = _number("RANK", 0), _number("LOCAL_RANK", 0)
     if name == "cuda":
         if local >= torch.cuda.device_count():
-            raise EnvironmentMissing(
-                "fewer accelerators than processes",
-                where=f"process {local} of this machine",
-                got=f"{torch.cuda.device_count()} accelerators",
-                fix="start at most as many processes (--nproc-per-node), or set distill.train.device=cpu",
-            )
+            got, where = f"{torch.cuda.device_count()} accelerators", f"process {local} of this machine"
+            fix = "start at most as many processes (--nproc-per-node), or set distill.train.device=cpu"
+            raise EnvironmentMissing("fewer accelerators than processes", where=where, got=got, fix=fix)
         torch.cuda.set_device(local)
     if size == 1:
         yield Ranks(0, 1, name)

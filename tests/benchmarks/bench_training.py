@@ -39,8 +39,8 @@ from distill.training.stage import add_adapter
 
 SHAPES: dict[str, dict[str, Any]] = {
     "2b": {
-        "hidden_size": 2048, "num_hidden_layers": 24, "num_attention_heads": 8, "num_key_value_heads": 2, "head_dim": 256,
-        "linear_num_key_heads": 16, "linear_num_value_heads": 16, "linear_key_head_dim": 128,
+        "hidden_size": 2048, "num_hidden_layers": 24, "num_attention_heads": 8, "num_key_value_heads": 2,
+        "head_dim": 256, "linear_num_key_heads": 16, "linear_num_value_heads": 16, "linear_key_head_dim": 128,
         "linear_value_head_dim": 128, "intermediate_size": 6144, "vocab_size": 248_320,
     },
     "tiny": {
