@@ -1,6 +1,4 @@
-"""Maps of one's own: tables and GeoJSON of boxes in the forms that people write, and what is wrong with others, all at
-once.
-"""
+"""Maps of one's own: tables and GeoJSON of boxes as people write them, and what is wrong with others, all at once."""
 
 import json
 import re
@@ -67,15 +65,16 @@ def loaded(tmp_path: Path, text: str, suffix: str = ".csv", **settings: object) 
     return load(BoxesConfig(path=path, **settings))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_a_table_in_any_form_says_the_same(tmp_path, form):
-    text, settings = FORMS[form]
-    box_map = loaded(tmp_path, text, **settings)
-    assert [KIND_NAMES[int(kind)] for kind in box_map.kinds] == ["Buildings", "Vegetation", "Roads"]
-    assert box_map.ids.tolist() == [7, 8, 9]
-    assert_allclose(box_map.centers, [[10, 20, 4], [40, -5, 3], [25, 0, -0.15]], atol=1e-9)
-    assert_allclose(box_map.half_extents, [[6, 4, 4], [2, 2, 3], [45, 3.5, 0.15]], atol=1e-9)
-    assert_allclose(box_map.rotations_deg[:, 1], [30, 0, 0], atol=1e-9)
+def test_a_table_in_any_form_says_the_same(tmp_path, subtests):
+    for form in FORMS:
+        with subtests.test(form=form):
+            text, settings = FORMS[form]
+            box_map = loaded(tmp_path, text, **settings)
+            assert [KIND_NAMES[int(kind)] for kind in box_map.kinds] == ["Buildings", "Vegetation", "Roads"]
+            assert box_map.ids.tolist() == [7, 8, 9]
+            assert_allclose(box_map.centers, [[10, 20, 4], [40, -5, 3], [25, 0, -0.15]], atol=1e-9)
+            assert_allclose(box_map.half_extents, [[6, 4, 4], [2, 2, 3], [45, 3.5, 0.15]], atol=1e-9)
+            assert_allclose(box_map.rotations_deg[:, 1], [30, 0, 0], atol=1e-9)
 
 
 def collection(*features: dict, **more: object) -> str:
@@ -107,9 +106,7 @@ def test_outlines_and_points_of_geojson(tmp_path):
 
 
 def test_longitude_and_latitude_become_metres(tmp_path):
-    """A degree of latitude at 52 degrees north is 111,267 m on the ellipsoid, one of longitude 68,677 m (tables of WGS
-    84).
-    """
+    """At 52 degrees north a degree of latitude is 111,267 m, one of longitude 68,677 m (tables of WGS 84)."""
     ring = [[4.0, 52.0], [4.001, 52.0], [4.001, 52.001], [4.0, 52.001], [4.0, 52.0]]
     box_map = loaded(tmp_path, collection(feature("Polygon", [ring], type="Buildings", height=9)), ".geojson")
     size = sorted(box_map.half_extents[0, :2] * 2)
@@ -124,6 +121,10 @@ def test_ours_is_read_as_it_is_and_named_anew(tmp_path):
         load(BoxesConfig(path=tmp_path / "own.json", metres_per_unit=0.01))
     with pytest.raises(ConfigError, match=r"and ground.*got ground_z_m"):
         load(BoxesConfig(path=tmp_path / "own.json", ground_z_m=4.0))
+    boxes = replace(town(), centers=town().centers * 100, half_extents=town().half_extents * 100)
+    write_boxes(tmp_path / "own.json", boxes)
+    with pytest.raises(InputError, match=r"are these centimetres\?.*write all of the file in metres"):
+        load(BoxesConfig(path=tmp_path / "own.json"))
 
 
 def test_what_is_wrong_with_many_rows_hides_nothing_else(tmp_path):
@@ -131,18 +132,9 @@ def test_what_is_wrong_with_many_rows_hides_nothing_else(tmp_path):
     with pytest.raises(InputError) as caught:
         loaded(tmp_path, "\n".join(["type,x,y,length,width,height", *rows]))
     assert "line 2: unknown type 'house' (and 39 more)" in str(caught.value)
-    assert "line 42: unknown type 'road' (did you mean 'Roads'?), height is not a finite number: 'wide'" in str(
-        caught.value
-    )
+    line_42 = "line 42: unknown type 'road' (did you mean 'Roads'?), height is not a finite number: 'wide'"
+    assert line_42 in str(caught.value)
     assert "2 to mend" in str(caught.value)
-
-
-def test_ours_in_centimetres_is_asked_about(tmp_path):
-    boxes = town()
-    boxes = replace(boxes, centers=boxes.centers * 100, half_extents=boxes.half_extents * 100)
-    write_boxes(tmp_path / "own.json", boxes)
-    with pytest.raises(InputError, match=r"are these centimetres\?.*write all of the file in metres"):
-        load(BoxesConfig(path=tmp_path / "own.json"))
 
 
 def test_the_documents_list_every_type():
@@ -154,87 +146,80 @@ def test_the_documents_list_every_type():
 
 
 def test_a_map_far_from_the_origin_is_moved_there_and_says_so(tmp_path):
-    text = (
-        PLAIN.replace(",10,20,4", ",500010,5000020,4")
-        .replace(",40,-5,3", ",500040,4999995,3")
-        .replace(",25,0,-", ",500025,5000000,-")
-    )
+    far = {",10,20,4": ",500010,5000020,4", ",40,-5,3": ",500040,4999995,3", ",25,0,-": ",500025,5000000,-"}
+    text = PLAIN
+    for near, place in far.items():
+        text = text.replace(near, place)
     box_map = loaded(tmp_path, text)
     assert box_map.header.offset_m == {"x": 500025.0, "y": 5000010.0, "z": 0.0}
     assert np.abs(box_map.centers).max() < 100
 
 
-@pytest.mark.parametrize(
-    ("text", "settings", "words"),
-    [
-        (PLAIN.replace("Vegetation", "vegetable").replace("Roads", "roads"), {},
-         r"line 3: unknown type 'vegetable' \(did you mean 'Vegetation'\?\); "
-         r"line 4: unknown type 'roads' \(did you mean 'Roads'\?\); expected types are Roads.*2 to mend"),
-        (PLAIN.replace(",yaw_deg", ",yaw_dge"), {},
-         r"column 'yaw_dge' has no meaning here \(did you mean 'yaw_deg'\?\).*maps\.boxes\.ignore"),
-        (PLAIN.replace("type,x", "note,x"), {"ignore": ["note"]},
-         r"no column for type \(type, category, kind, class\)"),
-        (PLAIN.replace("height,yaw_deg", "height,half_z"), {}, "height twice, whole and half"),
-        (PLAIN.replace("height,yaw_deg", "height,center_z"), {}, "2 columns are the z: z, center_z"),
-        (PLAIN.replace(",12,8,8,30", ",12,8,8"), {}, "line 2: 8 cells, where the first line has 9"),
-        (PLAIN.replace("12,8,8,30", '"12,5",8,8,30'), {},
-         r"length is not a finite number: '12,5'; write a decimal point"),
-        (PLAIN.replace("12,8,8,30", "-12,8,8,30").replace("4,4,6,0", "4,4,nan,0"), {},
-         r"line 2: length is not more than 0: -12 m; line 3: height is not a finite number: 'nan'"),
-        (PLAIN.replace("7,Buildings", "8,Buildings"), {}, "id 8 occurs 2 times"),
-        (PLAIN.replace("7,Buildings", "x,Buildings"), {}, "id 'x' is not a whole number"),
-        (PLAIN.replace(",10,20,4", ",1000,200000000,4"), {}, r"are these centimetres\?.*metres_per_unit=0\.01"),
-        (PLAIN.replace("12,8,8,30", "12,8,800,30"), {}, r"too high: are these centimetres\?.*usually 800 m"),
-        ("x,y,length,type\n1,2,3,Buildngs\n1,zz,3,Buildings\n", {},
-         r"no column for width .*; line 2: unknown type 'Buildngs'.*; line 3: y is not .*3 to mend"),
-        (PLAIN.replace(",width,height", ",note,height"), {"ignore": ["note"]},
-         r"csv: no column for width \(width, size_y, half_width, half_y, extent_y\)$"),
-        (PLAIN.replace(",", ";"), {},
-         r"line 1: the columns are not parted by commas|parted by commas.*line 1.*expected commas, where ; stand"),
-        (PLAIN.replace(",", "\t"), {}, r"commas, where tabs stand"),
-        ("", {}, r"holds no boxes; got nothing after the first line; expected a box a line.*docs/files\.md"),
-        (PLAIN + "\"a", {}, "not a table"),
-    ],
-)  # fmt: skip
-def test_all_that_is_wrong_with_a_table_is_told(tmp_path, text, settings, words):
-    with pytest.raises(InputError, match=words):
-        loaded(tmp_path, text, **settings)
+def test_all_that_is_wrong_with_a_table_is_told(tmp_path, subtests):
+    for text, settings, words in [
+            (PLAIN.replace("Vegetation", "vegetable").replace("Roads", "roads"), {},
+             r"line 3: unknown type 'vegetable' \(did you mean 'Vegetation'\?\); "
+             r"line 4: unknown type 'roads' \(did you mean 'Roads'\?\); expected types are Roads.*2 to mend"),
+            (PLAIN.replace(",yaw_deg", ",yaw_dge"), {},
+             r"column 'yaw_dge' has no meaning here \(did you mean 'yaw_deg'\?\).*maps\.boxes\.ignore"),
+            (PLAIN.replace("type,x", "note,x"), {"ignore": ["note"]},
+             r"no column for type \(type, category, kind, class\)"),
+            (PLAIN.replace("height,yaw_deg", "height,half_z"), {}, "height twice, whole and half"),
+            (PLAIN.replace("height,yaw_deg", "height,center_z"), {}, "2 columns are the z: z, center_z"),
+            (PLAIN.replace(",12,8,8,30", ",12,8,8"), {}, "line 2: 8 cells, where the first line has 9"),
+            (PLAIN.replace("12,8,8,30", '"12,5",8,8,30'), {},
+             r"length is not a finite number: '12,5'; write a decimal point"),
+            (PLAIN.replace("12,8,8,30", "-12,8,8,30").replace("4,4,6,0", "4,4,nan,0"), {},
+             r"line 2: length is not more than 0: -12 m; line 3: height is not a finite number: 'nan'"),
+            (PLAIN.replace("7,Buildings", "8,Buildings"), {}, "id 8 occurs 2 times"),
+            (PLAIN.replace("7,Buildings", "x,Buildings"), {}, "id 'x' is not a whole number"),
+            (PLAIN.replace(",10,20,4", ",1000,200000000,4"), {}, r"are these centimetres\?.*metres_per_unit=0\.01"),
+            (PLAIN.replace("12,8,8,30", "12,8,800,30"), {}, r"too high: are these centimetres\?.*usually 800 m"),
+            ("x,y,length,type\n1,2,3,Buildngs\n1,zz,3,Buildings\n", {},
+             r"no column for width .*; line 2: unknown type 'Buildngs'.*; line 3: y is not .*3 to mend"),
+            (PLAIN.replace(",width,height", ",note,height"), {"ignore": ["note"]},
+             r"csv: no column for width \(width, size_y, half_width, half_y, extent_y\)$"),
+            (PLAIN.replace(",", ";"), {},
+             r"line 1: the columns are not parted by commas|parted by commas.*line 1.*expected commas, where ; stand"),
+            (PLAIN.replace(",", "\t"), {}, r"commas, where tabs stand"),
+            ("", {}, r"holds no boxes; got nothing after the first line; expected a box a line.*docs/files\.md"),
+            (PLAIN + "\"a", {}, "not a table"),
+        ]:  # fmt: skip
+        with subtests.test(text=text, settings=settings), pytest.raises(InputError, match=words):
+            loaded(tmp_path, text, **settings)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (collection(feature("LineString", [[0, 0], [1, 1]], type="Walls")),
-         "feature 1: a geometry that has no place here, LineString; there are Point"),
-        (collection(feature("Polygon", [[[0, 0], [9, 0]]], type="Walls")),
-         "feature 1: its coordinates are not places: at least four finite"),
-        (collection(feature("Polygon", [[[0, 0], [9, "x"], [9, 9], [0, 0]]], type="Walls")),
-         "not places: at least four"),
-        (collection(feature("Polygon", [[[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]], type="Buildings", height=3)),
-         r"feature 1: the outline crosses itself: Self-intersection\[4\.5 4\.5\]"),
-        (collection(feature("Point", [5, 5], type="Vegetation", height=3)),
-         "feature 1: neither length nor half_length"),
-        (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 0]]], type="Buildings")),
-         "feature 1: neither height nor half_height"),
-        (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 9]]], type="Buildings", height=3)),
-         "the last the first again"),
-        (
-            collection(
-                {**feature("LineString", [[0, 0], [1, 1]], type="Walls"), "id": "way/7"},
-                feature("Point", [5, 5], type="Vegetation", name="old oak", height="tall"),
-                feature("Point", [5, 5], type="house", levels=3, length=4, width=4, height=6),
+def test_all_that_is_wrong_with_geojson_is_told(tmp_path, subtests):
+    for text, words in [
+            (collection(feature("LineString", [[0, 0], [1, 1]], type="Walls")),
+             "feature 1: a geometry that has no place here, LineString; there are Point"),
+            (collection(feature("Polygon", [[[0, 0], [9, 0]]], type="Walls")),
+             "feature 1: its coordinates are not places: at least four finite"),
+            (collection(feature("Polygon", [[[0, 0], [9, "x"], [9, 9], [0, 0]]], type="Walls")),
+             "not places: at least four"),
+            (collection(feature("Polygon", [[[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]], type="Buildings", height=3)),
+             r"feature 1: the outline crosses itself: Self-intersection\[4\.5 4\.5\]"),
+            (collection(feature("Point", [5, 5], type="Vegetation", height=3)),
+             "feature 1: neither length nor half_length"),
+            (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 0]]], type="Buildings")),
+             "feature 1: neither height nor half_height"),
+            (collection(feature("Polygon", [[[0, 0], [9, 0], [9, 9], [0, 9]]], type="Buildings", height=3)),
+             "the last the first again"),
+            (
+                collection(
+                    {**feature("LineString", [[0, 0], [1, 1]], type="Walls"), "id": "way/7"},
+                    feature("Point", [5, 5], type="Vegetation", name="old oak", height="tall"),
+                    feature("Point", [5, 5], type="house", levels=3, length=4, width=4, height=6),
+                ),
+                r"properties: column 'levels' has no meaning.*feature 1 \(way/7\): a geometry.*feature 2 \(old oak\): "
+                r"height is not a finite number: 'tall'"
+                r".*feature 3: unknown type 'house'.*expected columns .*types are .*4 to mend",
             ),
-            r"properties: column 'levels' has no meaning.*feature 1 \(way/7\): a geometry.*feature 2 \(old oak\): "
-            r"height is not a finite number: 'tall'"
-            r".*feature 3: unknown type 'house'.*expected columns .*types are .*4 to mend",
-        ),
-        (json.dumps({"type": "Topology"}), "not GeoJSON"),
-        (collection(), "holds no boxes"),
-    ],
-)  # fmt: skip
-def test_all_that_is_wrong_with_geojson_is_told(tmp_path, text, words):
-    with pytest.raises(InputError, match=words):
-        loaded(tmp_path, text, ".geojson")
+            (json.dumps({"type": "Topology"}), "not GeoJSON"),
+            (collection(), "holds no boxes"),
+        ]:  # fmt: skip
+        with subtests.test(words), pytest.raises(InputError, match=words):
+            loaded(tmp_path, text, ".geojson")
 
 
 HOUSES = [f"Buildings,{40 * (k % 5)},{40 * (k // 5)},20,15,{9 + k % 4},{20 * k % 90}" for k in range(25)]
@@ -244,40 +229,32 @@ def town_table(*rows: str, yaw: str = "yaw_deg", houses: list[str] = HOUSES) -> 
     return "\n".join([f"type,x,y,length,width,height,{yaw}", *houses, *rows])
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (town_table(houses=[re.sub(r"\d+$", lambda deg: f"{np.radians(int(deg[0])):.3f}", row) for row in HOUSES]),
-         "all 22 yaws lie within 1.4 degrees.*yaw_rad"),
-        (town_table(*[HOUSES[3]] * 20), "20 of 45 boxes repeat another exactly"),
-        (town_table(*(f"Buildings,10,10,12,8,{5 + 0.1 * k},0" for k in range(150))),
-         "150 of 175 buildings have their middle at x 10, y 10"),
-        (town_table(), ""),
-        (town_table(*("Buildings,7,7,4,4,3,5", "Buildings,17,7,4,4,3,5", "Buildings,27,7,4,4,3,2"), houses=[]), ""),
-    ],
-)  # fmt: skip
-def test_what_can_be_meant_and_hardly_is_gets_a_warning(tmp_path, caplog, text, words):
-    loaded(tmp_path, text)
-    assert len(caplog.messages) == bool(words)
-    assert re.search(words, caplog.text)
+def test_what_can_be_meant_and_hardly_is_gets_a_warning(tmp_path, caplog, subtests):
+    for text, words in [
+            (town_table(houses=[re.sub(r"\d+$", lambda deg: f"{np.radians(int(deg[0])):.3f}", row) for row in HOUSES]),
+             "all 22 yaws lie within 1.4 degrees.*yaw_rad"),
+            (town_table(*[HOUSES[3]] * 20), "20 of 45 boxes repeat another exactly"),
+            (town_table(*(f"Buildings,10,10,12,8,{5 + 0.1 * k},0" for k in range(150))),
+             "150 of 175 buildings have their middle at x 10, y 10"),
+            (town_table(), ""),
+            (town_table(*("Buildings,7,7,4,4,3,5", "Buildings,17,7,4,4,3,5", "Buildings,27,7,4,4,3,2"), houses=[]), ""),
+        ]:  # fmt: skip
+        with subtests.test(words):
+            caplog.clear()
+            loaded(tmp_path, text)
+            assert len(caplog.messages) == bool(words)
+            assert re.search(words, caplog.text)
 
 
-def test_degrees_in_the_column_of_radians_are_refused(tmp_path):
-    with pytest.raises(
-        InputError, match=r"line 3: yaw_rad is more than a full turn of 6\.2832; .* yaw_deg \(and 21 more\)"
-    ):
+def test_degrees_as_radians_and_a_town_wholly_below_its_ground_are_refused(tmp_path):
+    words = r"line 3: yaw_rad is more than a full turn of 6\.2832; .* yaw_deg \(and 21 more\)"
+    with pytest.raises(InputError, match=words):
         loaded(tmp_path, town_table(yaw="yaw_rad"))
-
-
-def test_a_town_wholly_below_its_ground_is_refused(tmp_path):
-    rows = [
-        "type,x,y,z,length,width,height",
-        "Roads,0,0,-50,90,7,0.2",
-        *(f"Buildings,{30 * k},0,-45,9,9,10" for k in range(5)),
-    ]
+    houses = [f"Buildings,{30 * k},0,-45,9,9,10" for k in range(5)]
+    low = "\n".join(["type,x,y,z,length,width,height", "Roads,0,0,-50,90,7,0.2", *houses])
     with pytest.raises(InputError, match=r"below the ground; got 5 boxes, the highest ends 40 m .*ground_z_m=-50$"):
-        loaded(tmp_path, "\n".join(rows))
-    assert len(loaded(tmp_path, "\n".join(rows), ground_z_m=-50.0)) == 6
+        loaded(tmp_path, low)
+    assert len(loaded(tmp_path, low, ground_z_m=-50.0)) == 6
 
 
 def test_a_file_is_needed_and_known_by_its_suffix(tmp_path):
@@ -289,22 +266,19 @@ def test_a_file_is_needed_and_known_by_its_suffix(tmp_path):
         BoxesConfig(types={"haus": "House"})
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ('"extent":', '"size":', r"boxes\[0\]\.extent: Field required|boxes\[0\]\.size"),
+def test_what_a_map_tells_beside_its_boxes_must_follow_from_them(tmp_path, subtests):
+    for old, new, words in [
         ('"id":1,', '"id":1,"yaw":3,', r"boxes\[0\]\.yaw: Extra inputs"),
         ("x east, y north", "x forward, y right", r"axes: not what its boxes are.*expected right-handed"),
         ('"num_boxes": ', '"num_boxes": 1', "num_boxes: not what its boxes are"),
         ('"Buildings": ', '"Buildings": 1', "counts: not what its boxes are"),
         ('"semantic_id":3', '"semantic_id":4', "semantic_id: not the number of its type; got 4; expected 3, Buildings"),
         ('"max":[', '"max":[8', "max: does not follow from center, extent and rotation"),
-    ],
-)
-def test_what_a_map_tells_beside_its_boxes_must_follow_from_them(tmp_path, old, new, words):
-    path = tmp_path / "boxes_3d.json"
-    write_boxes(path, town())
-    assert old in path.read_text()
-    path.write_text(path.read_text().replace(old, new, 1))
-    with pytest.raises(InputError, match=words):
-        read_boxes(path)
+    ]:
+        with subtests.test(old=old, new=new):
+            path = tmp_path / "boxes_3d.json"
+            write_boxes(path, town())
+            assert old in path.read_text()
+            path.write_text(path.read_text().replace(old, new, 1))
+            with pytest.raises(InputError, match=words):
+                read_boxes(path)

@@ -75,74 +75,53 @@ def answer(capfd, monkeypatch, *words: str) -> tuple[int, str]:
     return int(end.value.code or 0), lines[-1] if lines else ""
 
 
-@pytest.mark.parametrize(
-    ("words", "parts"),
-    [
-        (("config", "check", "quikstart"), ("quikstart", "did you mean 'quickstart'", "simworld")),
-        (("config", "check", "quickstart", "--set", "a..b=1"), ("--set", "a..b=1", "key=value")),
-        (
-            ("config", "check", "quickstart", "--set", "maps={source: boxes, boxes: {path: none.csv}}"),
-            ("no such file", "maps.boxes", "none.csv"),
-        ),
-        (("simplify", "--map", "nope.json", "--out", "x"), ("nope.json", "no such file")),
-        (("simplify", "--map", "town.csv", "--out", "x"), ("town.csv", "cosfly maps --source boxes")),
-        (("maps", "--out", "/proc/x"), ("/proc/x", "cannot write", "--out")),
-        (("maps", "--out", "taken/inside"), ("taken", "cannot write", "--out")),
-        (("run", "stage"), ("stage: a folder", "no run.yaml", "cosfly list stage")),
-        (("config", "check", str(Path("deep/stage"))), ("deep/stage: a folder", "no run.yaml", "quickstart")),
-        (("release", "viewer", "town.csv", "--out", "x"), ("town.csv", "there is no such folder", "check the path")),
-        (("simplify", "--map", "zero.json", "--out", "x"), ("zero.json", "a device", "a regular file")),
-        (("caption", "prompts", "--export", "taken"), ("taken", "cannot write", "--out")),
-        (("run", "quickstart", "--out", "stage"), ("stage: the folder of a stage", "choose another --out")),
-        (
-            ("run", "quickstart", "--out", "stage", "--dry-run"),
-            ("stage: the folder of a stage", "choose another --out"),
-        ),
-    ],
-)
-def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, words, parts):
+def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, subtests):
     monkeypatch.chdir(tmp_path)
     for name in ("taken", "town.csv"):
         (tmp_path / name).write_text("a file")
     for folder in ("stage", "deep/stage"):
         write_json(tmp_path / folder / "stage.json", {})
     (tmp_path / "zero.json").symlink_to("/dev/zero")
-    status, line = answer(capfd, monkeypatch, *words)
-    assert status == 1
-    assert line.startswith("error: ")
-    for part in parts:
-        assert part in line
-
-
-def test_a_folder_named_as_a_configuration_that_ships_hides_it_from_nobody(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "quickstart").mkdir()
+    (tmp_path / "quickstart").mkdir()  # hides the configuration of its name from nobody
     assert resolve(Path("quickstart"), None).name == "quickstart"
+    no_file = "maps={source: boxes, boxes: {path: none.csv}}"
+    for words, parts in (
+        (("config", "check", "quikstart"), ("quikstart", "did you mean 'quickstart'", "simworld")),
+        (("config", "check", "quickstart", "--set", "a..b=1"), ("--set", "a..b=1", "key=value")),
+        (("config", "check", "quickstart", "--set", no_file), ("no such file", "maps.boxes", "none.csv")),
+        (("simplify", "--map", "nope.json", "--out", "x"), ("nope.json", "no such file")),
+        (("simplify", "--map", "town.csv", "--out", "x"), ("town.csv", "cosfly maps --source boxes")),
+        (("maps", "--out", "/proc/x"), ("/proc/x", "cannot write", "--out")),
+        (("maps", "--out", "taken/inside"), ("taken", "cannot write", "--out")),
+        (("run", "stage"), ("stage: a folder", "no run.yaml", "cosfly list stage")),
+        (("config", "check", "deep/stage"), ("deep/stage: a folder", "no run.yaml", "quickstart")),
+        (("release", "viewer", "town.csv", "--out", "x"), ("town.csv", "there is no such folder", "check the path")),
+        (("simplify", "--map", "zero.json", "--out", "x"), ("zero.json", "a device", "a regular file")),
+        (("caption", "prompts", "--export", "taken"), ("taken", "cannot write", "--out")),
+        (("run", "quickstart", "--out", "stage"), ("stage: the folder of a stage", "choose another --out")),
+        (("run", "quickstart", "--out", "stage", "--dry-run"), ("stage: the folder of a stage", "another --out")),
+        (("config", "schema", "--log-file", "no/log.txt"), ("cannot write the log",)),
+    ):
+        with subtests.test(words=words):
+            status, line = answer(capfd, monkeypatch, *words)
+            assert status == 1
+            assert line.startswith("error: ")
+            assert [part for part in parts if part not in line] == []
 
 
-@pytest.mark.parametrize(
-    ("redirect", "status", "told"),
-    [
-        ("> /dev/full", 1, "error: cannot write the output; got No space left on device"),
-        (">&-", 0, ""),
-        ("2>&-", 0, ""),
-    ],
-)
-@pytest.mark.parametrize("words", ["config show quickstart", "list ."])
-def test_an_output_that_is_full_or_closed_is_no_bug(tmp_path, words, redirect, status, told):
-    command = f"{sys.executable} -m cosfly {words} {redirect}"
-    done = subprocess.run(["bash", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == status
-    assert done.stderr.startswith(told)
-    assert "Traceback" not in done.stderr
-
-
-def test_the_doctor_shows_brackets_as_they_are(capfd, monkeypatch):
-    monkeypatch.setattr(doctor, "examine", lambda *given: [Check("x", "optional", 'pip install "cosfly[vllm]"')])
-    monkeypatch.setattr(sys, "argv", ["cosfly", "doctor"])
-    with pytest.raises(SystemExit):
-        cli.main()
-    assert "cosfly[vllm]" in capfd.readouterr().out
+def test_an_output_that_is_full_or_closed_is_no_bug(tmp_path):
+    full = "error: cannot write the output; got No space left on device"
+    for words, redirect, status, told in (
+        ("config show quickstart", "> /dev/full", 1, full),
+        ("list .", "> /dev/full", 1, full),
+        ("list .", ">&-", 0, ""),
+        ("config show quickstart", "2>&-", 0, ""),
+    ):
+        command = f"{sys.executable} -m cosfly {words} {redirect}"
+        done = subprocess.run(["bash", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == status, command
+        assert done.stderr.startswith(told)
+        assert "Traceback" not in done.stderr
 
 
 STAND_IN = """
@@ -158,19 +137,17 @@ cli.main()
 """
 
 
-@pytest.mark.parametrize(
-    ("words", "moved"),
-    [
+def test_options_of_all_commands_may_stand_anywhere(subtests):
+    for words, moved in [
         (["run", "quickstart", "-v"], ["-v", "run", "quickstart"]),
         (["run", "--log-file", "a.log", "quickstart"], ["--log-file", "a.log", "run", "quickstart"]),
         (["-q", "run", "--log-file=a.log"], ["-q", "--log-file=a.log", "run"]),
         (["run", "--", "-v"], ["run", "--", "-v"]),
         (["run", "--log-file"], ["--log-file", "run"]),
         (["run", "quickstart"], ["run", "quickstart"]),
-    ],
-)
-def test_options_of_all_commands_may_stand_anywhere(words, moved):
-    assert cli.options_first(words) == moved
+    ]:
+        with subtests.test(words=words, moved=moved):
+            assert cli.options_first(words) == moved
 
 
 def test_no_command_has_an_option_of_all():
@@ -198,11 +175,6 @@ def test_more_or_less_is_told_and_a_file_holds_all(tmp_path):
     shown, _ = told("maps", "--out", str(out), "--verbose")
     assert re.search(line, shown, re.MULTILINE)
     assert "complete for the same settings" in shown
-
-
-def test_a_log_that_cannot_be_written_is_an_error(capfd, monkeypatch, tmp_path):
-    status, line = answer(capfd, monkeypatch, "config", "schema", "--log-file", str(tmp_path / "no/log.txt"))
-    assert (status, "cannot write the log" in line) == (1, True)
 
 
 def test_a_log_whose_disk_gets_full_is_told_once(tmp_path):
@@ -248,16 +220,21 @@ def test_failed_items_make_the_command_exit_1_unless_the_settings_accept_them(ca
     assert capfd.readouterr().out.count("product") == 2
 
 
-@pytest.mark.parametrize(
-    ("teacher", "asked"),
-    [
-        ("http://h:8000", "http://h:8000/v1/models"),
-        ("http://h:8000/v1/chat/completions", "http://h:8000/v1/models"),
-        ("https://h/v1beta/openai", "https://h/v1beta/openai/models"),
-        ("https://h/api/v3/", "https://h/api/v3/models"),
-    ],
-)
-def test_the_doctor_asks_for_the_models_where_captions_do(tmp_path, monkeypatch, teacher, asked):
+# --- the doctor -------------------------------------------------------------------------------------------------------
+
+
+def test_the_doctor_shows_brackets_as_they_are(capfd, monkeypatch):
+    monkeypatch.setattr(doctor, "examine", lambda *given: [Check("x", "optional", 'pip install "cosfly[vllm]"')])
+    monkeypatch.setattr(sys, "argv", ["cosfly", "doctor"])
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert "cosfly[vllm]" in capfd.readouterr().out
+
+
+def test_the_doctor_asks_for_the_models_where_captions_do_or_says_what_is_wrong(tmp_path, monkeypatch):
+    for teacher in ("http://me:pw@h/v1", "http://h?key=pw", "http://[::1", "http://127.0.0.1:1"):
+        found = doctor.examine(tmp_path, teacher)[-1]
+        assert (found.state, "pw" in found.detail) == ("missing", False), teacher
     urls = []
 
     async def exchange(self, url, content=None):
@@ -265,24 +242,24 @@ def test_the_doctor_asks_for_the_models_where_captions_do(tmp_path, monkeypatch,
         return Response(200, b'{"data": [{"id": "one"}, {"id": "two"}]}')
 
     monkeypatch.setattr(Connections, "exchange", exchange)
-    found = doctor.examine(tmp_path, teacher)[-1]
-    assert urls == [asked]
-    assert found.state == "ok"
-    assert found.detail.endswith(": one, two")
+    asked = {
+        "http://h:8000": "http://h:8000/v1/models",
+        "http://h:8000/v1/chat/completions": "http://h:8000/v1/models",
+        "https://h/v1beta/openai": "https://h/v1beta/openai/models",
+        "https://h/api/v3/": "https://h/api/v3/models",
+    }
+    for teacher in asked:
+        found = doctor.examine(tmp_path, teacher)[-1]
+        assert found.state == "ok"
+        assert found.detail.endswith(": one, two")
+    assert urls == list(asked.values())
 
 
-@pytest.mark.parametrize(("free_gib", "state"), [(3, "missing"), (30, "ok")])
-def test_the_doctor_tells_how_many_frames_the_disk_takes(tmp_path, monkeypatch, free_gib, state):
-    usage = shutil.disk_usage(tmp_path)._replace(free=free_gib * 2**30)
-    monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage)
-    disk = {check.name: check for check in doctor.examine(tmp_path / "not" / "there")}["disk"]
-    assert disk.state == state
-    assert f"about {free_gib * 200:,} frames" in disk.detail
-    assert ("free some space" in disk.detail) == (state == "missing")
-
-
-@pytest.mark.parametrize("teacher", ["http://me:pw@h/v1", "http://h?key=pw", "http://[::1", "http://127.0.0.1:1"])
-def test_the_doctor_says_what_is_wrong_with_an_endpoint(tmp_path, teacher):
-    found = doctor.examine(tmp_path, teacher)[-1]
-    assert found.state == "missing"
-    assert "pw" not in found.detail
+def test_the_doctor_tells_how_many_frames_the_disk_takes(tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)
+    for free_gib, state in ((3, "missing"), (30, "ok")):
+        monkeypatch.setattr(shutil, "disk_usage", lambda folder, free=free_gib: usage._replace(free=free * 2**30))
+        disk = {check.name: check for check in doctor.examine(tmp_path / "not" / "there")}["disk"]
+        assert disk.state == state
+        assert f"about {free_gib * 200:,} frames" in disk.detail
+        assert ("free some space" in disk.detail) == (state == "missing")

@@ -4,7 +4,6 @@ import asyncio
 import base64
 import dataclasses
 import io
-import itertools
 import re
 
 import numpy as np
@@ -31,17 +30,20 @@ from specimens import PERSON_ID, make_playback_tree
 
 
 @pytest.fixture(scope="module")
-def frame(tmp_path_factory):
-    tree = tmp_path_factory.mktemp("tree")
-    make_playback_tree(tree, 1, 2, with_augmented=False)
+def tree(tmp_path_factory):
+    return make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 10, with_augmented=False)
+
+
+@pytest.fixture(scope="module")
+def frame(tree):
     return read_flight(find_flights(tree)[0]).frame_folder(1)
 
 
-def test_depth_colors_near_is_bright_and_sky_is_dark():
-    depth = np.array([[0.5, 50.0, 99.9, 1000.0, 0.0]], dtype=np.float32)
-    brightness = depth_colors(depth, 100.0).sum(axis=2)[0]
-    assert brightness[0] > brightness[1] > brightness[2]
-    assert brightness[3] == brightness[4] <= brightness[2]
+def test_depth_colors_near_is_bright_and_sky_and_no_depth_are_dark():
+    colors = depth_colors(np.array([[0.5, 50.0, 99.9, 1000.0, 0.0, 100.0]], dtype=np.float32), 100.0)[0]
+    brightness = colors.sum(axis=1)
+    assert brightness[0] > brightness[1] > brightness[2] >= brightness[5]
+    assert (colors[3:5] == colors[5]).all()
 
 
 def test_only_the_pedestrian_is_vivid():
@@ -71,17 +73,15 @@ def test_the_middle_is_cut_out_wherever_the_person_is(tmp_path):
         Pictures(("middle",), (50, 20)).read(tmp_path)
 
 
-def test_depth_colors_mark_sky_and_invalid():
-    colors = depth_colors(np.array([[1000.0, 0.0, 3.0, 90.0]], np.float32))
-    dark = depth_colors(np.array([[100.0]], np.float32))[0, 0]
-    assert (colors[0, :2] == dark).all()
-    assert colors[0, 2].sum() > colors[0, 3].sum() > dark.sum()
-
-
 # --- what is told and what is shown ---
 
-# 15: all 7 sets, in any order.
-ORDERS = [order for count in (1, 2, 3) for order in itertools.permutations(("rgb", "depth", "segmentation"), count)]
+# Views, layout, largest side: every count of views, orders that are not the usual one, both layouts and sizes.
+SHAPES = [
+    (("rgb",), "separate", 640),
+    (("depth", "rgb"), "tiled", 40),
+    (("segmentation", "rgb", "depth"), "separate", 40),
+    (("depth", "segmentation", "rgb"), "tiled", 640),
+]
 NAMES = {
     "en": {"RGB": "rgb", "depth": "depth", "segmentation": "segmentation", "enlarged": "middle"},
     "zh": {"RGB": "rgb", "深度": "depth", "分割": "segmentation", "放大": "middle"},
@@ -114,11 +114,6 @@ def sent_pictures(messages: list[dict]) -> list[np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def tree(tmp_path_factory):
-    return make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 10, with_augmented=False)
-
-
-@pytest.fixture(scope="module")
 def window(tree) -> Window:
     return next(cut_windows(read_flight(find_flights(tree)[0]), WindowConfig()))
 
@@ -131,24 +126,21 @@ def ask(window: Window, cfg: ImageConfig) -> tuple[dict[Language, str], list[np.
     return {language: prompt.user for language, prompt in question.asked.items()}, sent_pictures(messages)
 
 
-@pytest.mark.parametrize("max_side_px", [640, 40])
-@pytest.mark.parametrize("layout", ["separate", "tiled"])
-@pytest.mark.parametrize("views", [*ORDERS, ("middle",), ("rgb", "middle", "depth")])
-def test_a_teacher_is_told_what_it_is_shown(window, views, layout, max_side_px):
-    cfg = ImageConfig(modalities=views, layout=layout, max_side_px=max_side_px, encoding="png")
-    told, pictures = ask(window, cfg)
-    for language, text in told.items():
-        assert told_views(text, language) == views
-        assert len(pictures) == 5 * told_count(text, language)
-        width, height = told_size(text)
-        assert (width, height) == ((64, 36) if max_side_px == 640 else (40, 22))
-        across = len(views) if layout == "tiled" else 1
-        assert {picture.shape for picture in pictures} == {(height, across * width, 3)}
+def test_a_teacher_is_told_what_it_is_shown(window):
+    middle = [(("middle",), "separate", 640), (("rgb", "middle", "depth"), "tiled", 40)]
+    for views, layout, max_side_px in [*SHAPES, *middle]:
+        cfg = ImageConfig(modalities=views, layout=layout, max_side_px=max_side_px, encoding="png")
+        told, pictures = ask(window, cfg)
+        for language, text in told.items():
+            assert told_views(text, language) == views
+            assert len(pictures) == 5 * told_count(text, language)
+            width, height = told_size(text)
+            assert (width, height) == ((64, 36) if max_side_px == 640 else (40, 22))
+            across = len(views) if layout == "tiled" else 1
+            assert {picture.shape for picture in pictures} == {(height, across * width, 3)}
 
 
-@pytest.mark.parametrize("max_side_px", [640, 40])
-@pytest.mark.parametrize("layout", ["separate", "tiled"])
-@pytest.mark.parametrize("views", ORDERS)
+@pytest.mark.parametrize(("views", "layout", "max_side_px"), SHAPES)
 def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, window, views, layout, max_side_px):
     """The teacher gets all three; the student any of them, in any order."""
     image = {"layout": layout, "max_side_px": max_side_px, "depth_range_m": 40.0, "encoding": "png"}
@@ -205,18 +197,11 @@ def test_a_picture_of_another_shape_is_refused(frame):
 # --- pixels ---
 
 
-@pytest.fixture(scope="module")
-def large(tmp_path_factory) -> Window:
-    """A window of 640x360, a person of some 20 x 60 px in it."""
-    root = tmp_path_factory.mktemp("large")
-    make_playback_tree(root, 1, 10, seed=1, width_px=640, height_px=360, with_augmented=False)
-    return next(cut_windows(read_flight(find_flights(root)[0]), WindowConfig()))
-
-
-@pytest.mark.parametrize("max_side_px", [640, 500, 320])
-def test_a_size_read_off_the_picture_is_the_measured_one(large, max_side_px):
-    """The red person of the segmentation that is sent, against the facts, in every frame that shows all of it."""
-    observed = large.observed
+@pytest.mark.parametrize("max_side_px", [640, 500])
+def test_a_size_read_off_the_picture_is_the_measured_one(tmp_path, max_side_px):
+    """The red person (some 20 x 60 px) of the segmentation that is sent, against the facts, wherever all of it is shown."""
+    make_playback_tree(tmp_path, 1, 10, seed=1, width_px=640, height_px=360, with_augmented=False)
+    observed = next(cut_windows(read_flight(find_flights(tmp_path)[0]), WindowConfig())).observed
     cfg = ImageConfig(modalities=("segmentation",), max_side_px=max_side_px)
     facts = make_question(observed, cfg, "prose").facts
     assert facts.width_px == max_side_px

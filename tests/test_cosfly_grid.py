@@ -44,12 +44,9 @@ def one_box(center, half_extents, rotation_deg=(0, 0, 0), kind=BUILDINGS):
 # --- cells and metres -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("point", "cell"), [((-10.0, 5.0), (0, 0)), ((-9.51, 5.49), (0, 0)), ((-9.5, 5.5), (1, 1)), ((0.0, 0.0), (20, -10))]
-)
-def test_world_to_cell_is_the_floor_of_the_papers_map(point, cell):
-    grid = free_grid(40, 40, 0.5, -10.0, 5.0)
-    assert tuple(grid.cells_at(np.array(point))) == cell
+def test_world_to_cell_is_the_floor_of_the_papers_map():
+    points = np.array([(-10.0, 5.0), (-9.51, 5.49), (-9.5, 5.5), (0.0, 0.0)])
+    assert free_grid(40, 40, 0.5, -10.0, 5.0).cells_at(points).tolist() == [[0, 0], [0, 0], [1, 1], [20, -10]]
 
 
 @given(st.integers(-50, 50), st.integers(-50, 50), st.floats(0.1, 3.0), st.floats(-500, 500))
@@ -65,28 +62,26 @@ def test_empty_grid_covers_the_bounds_and_no_more():
     assert not grid.occupied.any()
 
 
-def test_a_stray_box_is_an_error_and_not_a_memory_error():
+def test_a_stray_box_and_bad_arguments_are_errors():
     box_map = make_box_map([[0, 0, 0], [1e9, 1e9, 0]], np.ones((2, 3)), np.zeros((2, 3)), [BUILDINGS] * 2)
     with pytest.raises(InputError, match=r"too wide.*coarser resolution_m"):
         empty_grid(box_map)
-
-
-def test_bad_arguments_are_value_errors():
-    box_map = one_box((0, 0, 0), (1, 1, 1))
     with pytest.raises(ValueError, match="resolution_m"):
         empty_grid(box_map, 0.0)
     with pytest.raises(ValueError, match="at least one box"):
-        empty_grid(box_map.select(np.zeros(1, dtype=bool)))
+        empty_grid(box_map.select(np.zeros(2, dtype=bool)))
     with pytest.raises(ValueError, match="radius_m"):
         inflate(free_grid(2, 2), -1.0)
+    for other in (free_grid(3, 2), free_grid(2, 2, 0.5), free_grid(2, 2, 1.0, 0.5)):
+        with pytest.raises(ValueError, match="same cells"):
+            compare(free_grid(2, 2), other)
 
 
 # --- which boxes, which cells -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("bottom_m", "top_m", "kind", "blocks"),
-    [
+def test_only_boxes_at_a_persons_height_block(subtests):
+    for bottom_m, top_m, kind, blocks in [
         (0.0, 3.0, BUILDINGS, True),
         (-5.0, 0.0, BUILDINGS, False),  # ends at the ground
         (-5.0, 0.1, BUILDINGS, True),
@@ -97,29 +92,25 @@ def test_bad_arguments_are_value_errors():
         (-0.2, 0.3, ROADS, False),
         (-4.0, -1.0, WATER, True),
         (0.0, 1.0, WATER, True),
-    ],
-)
-def test_only_boxes_at_a_persons_height_block(bottom_m, top_m, kind, blocks):
-    box_map = one_box((0, 0, (bottom_m + top_m) / 2), (1, 1, (top_m - bottom_m) / 2), kind=kind)
-    assert blocks_walking(box_map).tolist() == [blocks]
-    assert occupancy(box_map).occupied.any() == blocks
+    ]:
+        with subtests.test(bottom_m=bottom_m):
+            box_map = one_box((0, 0, (bottom_m + top_m) / 2), (1, 1, (top_m - bottom_m) / 2), kind=kind)
+            assert blocks_walking(box_map).tolist() == [blocks]
+            assert occupancy(box_map).occupied.any() == blocks
 
 
 def test_a_box_on_cell_borders_fills_its_cells_and_no_neighbour():
-    grid = occupancy(one_box((3, 2, 1), (1, 1, 1)), like=free_grid(6, 4))
-    expected = grid_of("...... ..##.. ..##.. ......")
-    np.testing.assert_array_equal(grid.occupied, expected.occupied)
-
-
-def test_a_wall_without_thickness_leaves_no_gap():
-    grid = occupancy(one_box((3, 2, 1), (0.0, 1.0, 1)), like=free_grid(6, 4))
-    np.testing.assert_array_equal(grid.occupied, grid_of("...... ..##.. ..##.. ......").occupied)
-
-
-def test_what_lies_outside_the_grid_is_left_out():
-    grid = occupancy(one_box((0, 0, 1), (2.5, 1.5, 1)), like=free_grid(3, 3))
-    np.testing.assert_array_equal(grid.occupied, grid_of("... ### ###").occupied)
-    assert not occupancy(one_box((90, 90, 1), (2, 2, 1)), like=free_grid(3, 3)).occupied.any()
+    for box, like, cells in (
+        (one_box((3, 2, 1), (1, 1, 1)), free_grid(6, 4), "...... ..##.. ..##.. ......"),
+        (
+            one_box((3, 2, 1), (0.0, 1.0, 1)),
+            free_grid(6, 4),
+            "...... ..##.. ..##.. ......",
+        ),  # without thickness, no gap
+        (one_box((0, 0, 1), (2.5, 1.5, 1)), free_grid(3, 3), "... ### ###"),  # what lies outside is left out
+        (one_box((90, 90, 1), (2, 2, 1)), free_grid(3, 3), "... ... ..."),
+    ):
+        np.testing.assert_array_equal(occupancy(box, like=like).occupied, grid_of(cells).occupied)
 
 
 @settings(max_examples=60)
@@ -138,19 +129,20 @@ def test_turned_boxes_fill_the_cells_that_shapely_finds(x, y, half_x, half_y, ya
             assert not grid.occupied[row, column]
 
 
-@pytest.mark.parametrize("rotation_deg", [(25, 40, 0), (70, -15, 33), (0, 10, 60), (-90, 20, 0)])
-def test_a_tilted_box_fills_what_its_slice_at_walking_height_covers(rotation_deg):
-    center, half_extents = np.array([6.3, 5.2, 2.9]), np.array([4.0, 1.3, 2.1])
-    grid = occupancy(one_box(center, half_extents, rotation_deg), like=free_grid(12, 11))
-    pitch, yaw, roll = np.radians(rotation_deg)
-    body_from_world = rotation_matrix(pitch, yaw, roll).T
-    sides = np.vstack([body_from_world, -body_from_world])
-    limits = np.concatenate([half_extents, half_extents]) + sides @ center
-    assert 0 < grid.occupied.sum() < grid.occupied.size
-    for row, column in itertools.product(range(11), range(12)):
-        bounds = [(column, column + 1), (row, row + 1), (0, 2)]
-        is_met = linprog([0, 0, 0], A_ub=sides, b_ub=limits, bounds=bounds).status == 0
-        assert grid.occupied[row, column] == is_met, (row, column)
+def test_a_tilted_box_fills_what_its_slice_at_walking_height_covers(subtests):
+    for rotation_deg in [(25, 40, 0), (70, -15, 33), (0, 10, 60), (-90, 20, 0)]:
+        with subtests.test(rotation_deg=rotation_deg):
+            center, half_extents = np.array([6.3, 5.2, 2.9]), np.array([4.0, 1.3, 2.1])
+            grid = occupancy(one_box(center, half_extents, rotation_deg), like=free_grid(12, 11))
+            pitch, yaw, roll = np.radians(rotation_deg)
+            body_from_world = rotation_matrix(pitch, yaw, roll).T
+            sides = np.vstack([body_from_world, -body_from_world])
+            limits = np.concatenate([half_extents, half_extents]) + sides @ center
+            assert 0 < grid.occupied.sum() < grid.occupied.size
+            for row, column in itertools.product(range(11), range(12)):
+                bounds = [(column, column + 1), (row, row + 1), (0, 2)]
+                is_met = linprog([0, 0, 0], A_ub=sides, b_ub=limits, bounds=bounds).status == 0
+                assert grid.occupied[row, column] == is_met, (row, column)
 
 
 def test_one_more_box_never_frees_a_cell():
@@ -181,29 +173,20 @@ def test_compare_by_hand():
     assert compare(free_grid(3, 3), free_grid(3, 3))[1] == 1.0
 
 
-@pytest.mark.parametrize("other", [free_grid(3, 2), free_grid(2, 2, 0.5), free_grid(2, 2, 1.0, 0.5)])
-def test_grids_over_other_cells_are_not_compared(other):
-    with pytest.raises(ValueError, match="same cells"):
-        compare(free_grid(2, 2), other)
-
-
 # --- growing, cutting out, connecting ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("radius_m", "expected"),
-    [
+def test_inflation_by_hand():
+    occupied = grid_of("..... ..... ..#.. ..... .....").occupied
+    for radius_m, expected in (
         (0.4, "..... ..... ..#.. ..... ....."),
         (0.5, "..... ..#.. .###. ..#.. ....."),
         (0.7, "..... ..#.. .###. ..#.. ....."),
         (0.75, "..... .###. .###. .###. ....."),
         (1.0, "..#.. .###. ##### .###. ..#.."),
-    ],
-)
-def test_inflation_by_hand(radius_m, expected):
-    occupied = grid_of("..... ..... ..#.. ..... .....").occupied
-    grown = inflate(OccupancyGrid(0.0, 0.0, 0.5, occupied), radius_m)
-    np.testing.assert_array_equal(grown.occupied, grid_of(expected).occupied)
+    ):
+        grown = inflate(OccupancyGrid(0.0, 0.0, 0.5, occupied), radius_m)
+        np.testing.assert_array_equal(grown.occupied, grid_of(expected).occupied)
 
 
 @settings(max_examples=25)
@@ -245,9 +228,5 @@ def test_a_corner_joins_eight_neighbours_but_not_four():
     assert set(labels[free]) == {1}
     assert set(labels[~free]) == {0}
     assert sorted(connected_parts(free, 4)[1].tolist()) == [0, 4, 6]
-
-
-def test_nothing_free_has_no_parts():
     labels, sizes = connected_parts(np.zeros((3, 4), dtype=bool), 8)
-    assert sizes.tolist() == [0]
-    assert not labels.any()
+    assert (sizes.tolist(), labels.any()) == ([0], False)

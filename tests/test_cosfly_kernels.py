@@ -69,78 +69,69 @@ def one_box(center=(0, 0, 0), half=(1, 2, 3), yaw_deg=0.0):
     return kernels.index_boxes([center], [half], rotation_matrix(0, np.radians(yaw_deg), 0)[None])
 
 
-@pytest.mark.parametrize(
-    ("point", "distance", "normal"),
-    [
-        ((3, 0, 0), 2, (1, 0, 0)),
-        ((-1.5, 0, 0), 0.5, (-1, 0, 0)),
-        ((0, 6, 0), 4, (0, 1, 0)),
-        ((0, 0, -5), 2, (0, 0, -1)),
-        ((4, 6, 3), 5, (0.6, 0.8, 0)),
-        ((0.5, 0, 0), -0.5, (1, 0, 0)),
-        ((0, -1.75, 0), -0.25, (0, -1, 0)),
-        ((0, 0, 0), -1, (1, 0, 0)),
-    ],
-)
-def test_distance_and_normal_by_hand(point, distance, normal):
-    index = one_box()
-    found, boxes = kernels.signed_distances(index, [point])
-    assert found[0] == pytest.approx(distance)
-    np.testing.assert_allclose(normals_at(index, [point], boxes), [normal], atol=1e-12)
+BY_HAND = [  # point, signed distance to one_box(), outward normal
+    ((3, 0, 0), 2, (1, 0, 0)), ((-1.5, 0, 0), 0.5, (-1, 0, 0)), ((0, 6, 0), 4, (0, 1, 0)), ((0, 0, -5), 2, (0, 0, -1)),
+    ((4, 6, 3), 5, (0.6, 0.8, 0)), ((0.5, 0, 0), -0.5, (1, 0, 0)), ((0, -1.75, 0), -0.25, (0, -1, 0)),
+    ((0, 0, 0), -1, (1, 0, 0)),
+]  # fmt: skip
 
 
-def test_a_turned_box_has_turned_faces():
-    index = one_box(half=(1, 2, 3), yaw_deg=90)  # now 2 along x, 1 along y
-    distances, boxes = kernels.signed_distances(index, [(5, 0, 0), (0, 5, 0)])
-    np.testing.assert_allclose(distances, [3, 4])
-    np.testing.assert_allclose(normals_at(index, [(5, 0, 0), (0, 5, 0)], boxes), [(1, 0, 0), (0, 1, 0)], atol=1e-12)
+def test_distance_and_normal_by_hand():
+    turned = one_box(half=(1, 2, 3), yaw_deg=90)  # now 2 along x, 1 along y
+    for index, rows in ((one_box(), BY_HAND), (turned, [((5, 0, 0), 3, (1, 0, 0)), ((0, 5, 0), 4, (0, 1, 0))])):
+        points, distances, normals = map(list, zip(*rows, strict=True))
+        found, boxes = kernels.signed_distances(index, points)
+        np.testing.assert_allclose(found, distances)
+        np.testing.assert_allclose(normals_at(index, points, boxes), normals, atol=1e-12)
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("cell_m", [1.0, 8.0, 500.0])
-def test_nearest_agrees_with_all_pairs(seed, cell_m):
-    rng = np.random.default_rng(seed)
-    index = random_boxes(rng, 80)
-    index = kernels.index_boxes(*parts(index), cell_m=cell_m)
-    points = rng.uniform(-150, 150, (200, 3))  # inside the grid, at its border and far outside
-    expected = slow_distances(index, points)
-    distances, boxes = kernels.signed_distances(index, points)
-    np.testing.assert_allclose(distances, expected.min(axis=1), atol=1e-9)
-    np.testing.assert_allclose(expected[np.arange(200), boxes], distances, atol=1e-9)
-    limited, in_reach = kernels.signed_distances(index, points, 10.0)
-    np.testing.assert_allclose(limited, np.minimum(expected.min(axis=1), 10.0), atol=1e-9)
-    assert ((in_reach == -1) == (expected.min(axis=1) >= 10.0)).all()
+def test_nearest_agrees_with_all_pairs(subtests):
+    for cell_m in [1.0, 8.0, 500.0]:
+        for seed in range(4):
+            with subtests.test(cell_m=cell_m, seed=seed):
+                rng = np.random.default_rng(seed)
+                index = random_boxes(rng, 80)
+                index = kernels.index_boxes(*parts(index), cell_m=cell_m)
+                points = rng.uniform(-150, 150, (200, 3))  # inside the grid, at its border and far outside
+                expected = slow_distances(index, points)
+                distances, boxes = kernels.signed_distances(index, points)
+                np.testing.assert_allclose(distances, expected.min(axis=1), atol=1e-9)
+                np.testing.assert_allclose(expected[np.arange(200), boxes], distances, atol=1e-9)
+                limited, in_reach = kernels.signed_distances(index, points, 10.0)
+                np.testing.assert_allclose(limited, np.minimum(expected.min(axis=1), 10.0), atol=1e-9)
+                assert ((in_reach == -1) == (expected.min(axis=1) >= 10.0)).all()
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_moving_along_the_normal_changes_the_distance_by_as_much(seed):
-    rng = np.random.default_rng(seed)
-    index = random_boxes(rng, 1)
-    points = rng.uniform(-90, 90, (100, 3))
-    distances, boxes = kernels.signed_distances(index, points)
-    normals = normals_at(index, points, boxes)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
-    moved, _ = kernels.signed_distances(index, points + 0.25 * normals)
-    outside = distances > 0
-    np.testing.assert_allclose(moved[outside], distances[outside] + 0.25, atol=1e-9)
+def test_moving_along_the_normal_changes_the_distance_by_as_much(subtests):
+    for seed in range(3):
+        with subtests.test(seed=seed):
+            rng = np.random.default_rng(seed)
+            index = random_boxes(rng, 1)
+            points = rng.uniform(-90, 90, (100, 3))
+            distances, boxes = kernels.signed_distances(index, points)
+            normals = normals_at(index, points, boxes)
+            np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
+            moved, _ = kernels.signed_distances(index, points + 0.25 * normals)
+            outside = distances > 0
+            np.testing.assert_allclose(moved[outside], distances[outside] + 0.25, atol=1e-9)
 
 
-@pytest.mark.parametrize("inflate_m", [0.0, 2.5])
-def test_segments_agree_with_plane_clipping(inflate_m):
-    rng = np.random.default_rng(5)
-    index = random_boxes(rng, 60)
-    starts, ends = rng.uniform(-80, 80, (2, 300, 3)) * np.array([1, 1, 0.3])
-    ends[:40, 0] = starts[:40, 0]  # along y
-    ends[40:80, :2] = starts[40:80, :2]  # upright
-    ends[80:90] = starts[80:90]  # a point
-    expected = [slow_hits(index, a, b, inflate_m).any() for a, b in zip(starts, ends, strict=True)]
-    assert 0 < sum(expected) < 300
-    np.testing.assert_array_equal(kernels.segments_hit(index, starts, ends, inflate_m), expected)
+def test_segments_agree_with_plane_clipping(subtests):
+    for inflate_m in [0.0, 2.5]:
+        with subtests.test(inflate_m=inflate_m):
+            rng = np.random.default_rng(5)
+            index = random_boxes(rng, 60)
+            starts, ends = rng.uniform(-80, 80, (2, 300, 3)) * np.array([1, 1, 0.3])
+            ends[:40, 0] = starts[:40, 0]  # along y
+            ends[40:80, :2] = starts[40:80, :2]  # upright
+            ends[80:90] = starts[80:90]  # a point
+            expected = [slow_hits(index, a, b, inflate_m).any() for a, b in zip(starts, ends, strict=True)]
+            assert 0 < sum(expected) < 300
+            np.testing.assert_array_equal(kernels.segments_hit(index, starts, ends, inflate_m), expected)
 
 
-@pytest.mark.parametrize(
-    ("start", "end", "hit"),
-    [
+def test_segments_by_hand():
+    rows = [
         ((-5, 0, 0), (5, 0, 0), True),
         ((-5, 2, 0), (5, 2, 0), True),  # along a face
         ((-5, 2.001, 0), (5, 2.001, 0), False),
@@ -148,10 +139,9 @@ def test_segments_agree_with_plane_clipping(inflate_m):
         ((2, 0, 0), (5, 0, 0), False),
         ((1, 0, 0), (5, 0, 0), True),  # starts on a face
         ((-5, 0, 0), (-1.5, 0, 0), False),  # ends before it
-    ],
-)
-def test_segments_by_hand(start, end, hit):
-    assert kernels.segments_hit(one_box(), [start], [end])[0] == hit
+    ]
+    starts, ends, hits = map(list, zip(*rows, strict=True))
+    assert kernels.segments_hit(one_box(), starts, ends).tolist() == hits
 
 
 def test_visibility_agrees_with_slow_rays():
@@ -171,10 +161,7 @@ def test_a_wall_hides_what_it_should():
     assert kernels.visibility(wall, [(20.0, 0.0, 20.0)], target)[0] == 1.0
     assert kernels.visibility(wall, [(20.0, 9.0, 0.0)], target)[0] == pytest.approx(0.0)
     assert kernels.visibility(wall, [(20.0, 11.0, 0.0)], target)[0] == 1.0  # past its end
-
-
-def test_a_person_inside_a_box_is_hidden_from_everywhere():
-    index = one_box(half=(2, 2, 2))
+    index = one_box(half=(2, 2, 2))  # somebody inside a box is hidden from everywhere
     assert kernels.visibility(index, [(20.0, 0.0, 20.0), (-9.0, 3.0, 50.0)], [(0.0, 0.0, 0.9)] * 2).tolist() == [0, 0]
 
 
@@ -189,19 +176,16 @@ def test_no_boxes_no_points():
     assert kernels.signed_distances(one_box(), np.empty((0, 3)))[0].shape == (0,)
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
+def test_bad_arguments_are_value_errors(subtests):
+    for call in [
         lambda: kernels.index_boxes([(0, 0, 0)], [(1, -1, 1)], NO_TURN),
         lambda: kernels.index_boxes([(0, 0, np.nan)], [(1, 1, 1)], NO_TURN),
         lambda: kernels.index_boxes([(0, 0, 0)], [(1, 1, 1)], np.eye(3)),
         lambda: kernels.signed_distances(one_box(), np.zeros(3)),
         lambda: kernels.segments_hit(one_box(), np.zeros((2, 3)), np.zeros((3, 3))),
-    ],
-)
-def test_bad_arguments_are_value_errors(call):
-    with pytest.raises(ValueError, match=r"must be|differ|starts for"):
-        call()
+    ]:
+        with subtests.test(call=call), pytest.raises(ValueError, match=r"must be|differ|starts for"):
+            call()
 
 
 def test_a_stray_box_far_away_does_not_fill_the_memory():

@@ -1,5 +1,6 @@
 """Who else moves: the product, lanes of a map, and the placing of people and cars about a walk."""
 
+import itertools
 import json
 from pathlib import Path
 
@@ -18,7 +19,6 @@ from cosfly.products.kinds import KINDS
 from cosfly.products.others import BUILDS, Company, Other, distances_to_boxes_m, gaps_m, read_others, write_others
 from cosfly.products.walks import read_paths
 from cosfly.work.chance import rng_for
-from cosfly.work.config import build
 from cosfly.work.store import dump_json
 
 PERSON, CAR = "Pedestrians", "Car"
@@ -50,15 +50,15 @@ def going(kind: str, start, end, n: int = 2) -> Other:
     return Other(kind, places, np.full(n, np.arctan2(*(end - start)[1::-1])))
 
 
-@pytest.mark.parametrize("name", PACES)
-@pytest.mark.parametrize("num_waypoints", [2, 3, 6, 120])
-def test_who_walks_there_and_back_gets_on_between_any_two_stops(name, num_waypoints):
+def test_who_walks_there_and_back_gets_on_between_any_two_stops():
     """A stop of the pace may be the waypoint before the end, where one stands before walking back."""
-    line, cfg = np.column_stack([0.5 * np.arange(num_waypoints), np.zeros(num_waypoints)]), PedestriansConfig()
-    for seed in range(60):
-        rng = np.random.default_rng(seed)
+    for name, num_waypoints, seed in itertools.product(PACES, (2, 3, 6, 120), range(60)):
+        line, rng = (
+            np.column_stack([0.5 * np.arange(num_waypoints), np.zeros(num_waypoints)]),
+            np.random.default_rng(seed),
+        )
         way = take_pace(line, PACES[name], rng)
-        course = Trip(PERSON, way, speeds_at(way, PACES[name], cfg, rng))
+        course = Trip(PERSON, way, speeds_at(way, PACES[name], PedestriansConfig(), rng))
         for _ in range(3):
             course = and_back(course)
             along_m = course.along_m(np.linspace(0.0, 3000.0, 50))
@@ -70,22 +70,20 @@ def test_who_walks_there_and_back_gets_on_between_any_two_stops(name, num_waypoi
 # --- the product ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("one", "two", "gap_m"),
-    [
+def test_gaps_by_hand():
+    through = going(PERSON, (-5, 0), (5, 0))
+    for one, two, gap_m in (
         (standing(PERSON, 0, 0), standing(PERSON, 1, 0), 0.4),
         (standing(PERSON, 0, 0), standing(PERSON, 0.5, 0), -0.1),
-        (going(PERSON, (-5, 0), (5, 0)), standing(PERSON, 0, 2), 1.4),  # nearest between the two times
-        (going(PERSON, (-5, 0), (5, 0)), going(PERSON, (5, 0), (-5, 0)), -0.6),  # through each other
+        (through, standing(PERSON, 0, 2), 1.4),  # nearest between the two times
+        (through, going(PERSON, (5, 0), (-5, 0)), -0.6),  # through each other
         (standing(CAR, 0, 0), standing(PERSON, 0, 2), 0.5),
         (standing(CAR, 0, 0), standing(PERSON, 3.45, 0), 0.5),
         (standing(CAR, 0, 0, np.pi / 2), standing(PERSON, 0, 3.45), 0.5),
         (standing(CAR, 0, 0), standing(CAR, 0, 3), 0.6),
-    ],
-)
-def test_gaps_by_hand(one, two, gap_m):
-    assert gaps_m(one, two).tolist() == pytest.approx([gap_m])
-    assert gaps_m(two, one).tolist() == pytest.approx([gap_m])
+    ):
+        assert gaps_m(one, two).tolist() == pytest.approx([gap_m])
+        assert gaps_m(two, one).tolist() == pytest.approx([gap_m])
 
 
 @settings(max_examples=30)
@@ -178,29 +176,19 @@ def test_lanes_keep_off_what_stands_there():
     parked = ("Car", (-40, -3, 0.75), (2.2, 0.9, 0.75))
     shifted = lanes_of(crossing_town(parked))
     assert len(shifted) == 8
-    east = [
-        lane
-        for lane in shifted
-        if np.ptp(lane.points_m[:, 1]) < 1e-9 and lane.points_m[0, 0] < lane.points_m[-1, 0] < 0
-    ]
-    (lane,) = east
-    assert -1.3 < lane.points_m[0, 1] < -0.6, "nearer to the middle line, where a parked car stands"
+    ways = [lane.points_m for lane in shifted]
+    (way,) = (p for p in ways if np.ptp(p[:, 1]) < 1e-9 and p[0, 0] < p[-1, 0] < 0)  # to the east
+    assert -1.3 < way[0, 1] < -0.6, "nearer to the middle line, where a parked car stands"
     blocked = lanes_of(crossing_town(("Walls", (-40, 0, 1.0), (0.2, 4, 1.0))))
     assert len(blocked) == 6
 
 
-@pytest.mark.parametrize("kind", ["Terrain", "Ground"])
-def test_a_map_without_straight_roads_has_no_lanes(kind):
-    assert lanes_of(make_box_map([[0, 0, -0.1]], [[50, 50, 0.1]], np.zeros((1, 3)), [KINDS[kind]])) == []
-    squares = make_box_map([[0, 0, -0.1]], [[50, 50, 0.1]], np.zeros((1, 3)), [KINDS["Roads"]])
-    assert lanes_of(squares) == []
-
-
-def test_streets_in_one_line_with_road_between_are_one_way():
+def test_lanes_need_straight_roads_and_go_on_where_road_lies_between():
+    for kind in ("Terrain", "Ground", "Roads"):  # a square of road has no direction
+        assert lanes_of(make_box_map([[0, 0, -0.1]], [[50, 50, 0.1]], np.zeros((1, 3)), [KINDS[kind]])) == []
     pieces = [((-25, 0, -0.1), (20, 4, 0.1)), ((25, 0, -0.1), (20, 4, 0.1)), ((0, 0, -0.1), (5, 4, 0.1))]
     box_map = make_box_map(*zip(*pieces, strict=True), np.zeros((3, 3)), [KINDS["Roads"]] * 3)
-    lanes = lanes_of(box_map)
-    assert sum(len(lane.onward) for lane in lanes) == 2
+    assert sum(len(lane.onward) for lane in lanes_of(box_map)) == 2
 
 
 @settings(max_examples=40)
@@ -279,12 +267,7 @@ def test_the_same_numbers_give_the_same_company_and_more_keep_the_first(placed):
         walk, ground, lanes, CFG.model_copy(update={"others": 2, "traffic": 0}), rng_for(0, "others", "0")
     )
     assert [o.as_json() for o in fewer.others] == [o.as_json() for o in company.others[:2]]
-
-
-def test_where_there_is_no_road_there_is_nobody_to_drive(placed):
-    _, ground, _, made = placed
-    company = company_of(made[0][0], ground, [], CFG, np.random.default_rng(0))
-    assert {other.kind for other in company.others} == {PERSON}
+    assert {o.kind for o in company_of(walk, ground, [], CFG, np.random.default_rng(0)).others} == {PERSON}, "no road"
 
 
 def test_who_finds_no_place_is_left_out():
@@ -306,7 +289,7 @@ def test_the_stage_writes_others_only_where_they_are_wanted(tmp_path: Path, capl
     run(plain, tmp_path / "map.json", tmp_path / "none")
     assert not (tmp_path / "none/others.json").exists()
     assert "others" not in json.loads((tmp_path / "none/pedestrians_report.json").read_text())
-    cfg = replace_settings(plain, others=3, traffic=2)
+    cfg = plain.model_copy(update={"others": 3, "traffic": 2})
     for folder, workers in (("one", 1), ("two", 2)):
         run(cfg, tmp_path / "map.json", tmp_path / folder, workers=workers)
     one, two = ((tmp_path / folder / "others.json").read_bytes() for folder in ("one", "two"))
@@ -327,7 +310,3 @@ def test_a_map_without_roads_says_how_many_cars_are_missing(tmp_path, caplog):
     counts = json.loads((tmp_path / "out/pedestrians_report.json").read_text())["others"]
     assert counts["Car"] == {"wanted": 8, "placed": 0}
     assert "0 of 8 others of kind Car found a place" in caplog.text
-
-
-def replace_settings(cfg: PedestriansConfig, **changes) -> PedestriansConfig:
-    return build(PedestriansConfig, {**cfg.model_dump(), **changes}, "test")

@@ -59,27 +59,26 @@ def test_a_foreign_header_survives(tmp_path):
     assert read_boxes(path).header.licence == "unknown"
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
+def test_bad_maps_are_named(tmp_path, subtests):
+    for change, words in [
         (lambda v: v.update(licence="CC BY 4.0"), r"licence: not a licence identifier.*hub.*CC BY 4.0"),
         (lambda v: v["boxes"][1].update(extent=[1, -2, 1]), r"box 2: extent.*-2"),
         (lambda v: v["boxes"][1].update(center=[1, "2", 1]), r"boxes\[1\].center"),
+        (lambda v: v["boxes"][1].pop("rotation"), r"boxes\[1\].rotation"),
         (lambda v: v["boxes"][1].update(type="Building"), r"boxes\[1\].type.*did you mean 'Buildings'"),
         (lambda v: v["boxes"][1].update(id=1), r"more than once"),
         (lambda v: v.update(boxes=[]), r"no boxes"),
         (lambda v: v.update(boxes={}), r"boxes.*dict"),
-    ],
-)
-def test_bad_maps_are_named(tmp_path, change, words):
-    path = tmp_path / "boxes_3d.json"
-    write_boxes(path, some_boxes())
-    value = json.loads(path.read_text())
-    change(value)
-    path.write_text(json.dumps(value))
-    with pytest.raises(InputError, match=words) as caught:
-        read_boxes(path)
-    assert "boxes_3d.json" in str(caught.value)
+    ]:
+        with subtests.test(words):
+            path = tmp_path / "boxes_3d.json"
+            write_boxes(path, some_boxes())
+            value = json.loads(path.read_text())
+            change(value)
+            path.write_text(json.dumps(value))
+            with pytest.raises(InputError, match=words) as caught:
+                read_boxes(path)
+            assert "boxes_3d.json" in str(caught.value)
 
 
 def test_nan_in_a_map(tmp_path):
@@ -108,9 +107,8 @@ def test_roi_forms(tmp_path):
     assert [p.points_world for p in read_roi(path).rings()] == [[tuple(map(float, point)) for point in square]] * 2
 
 
-@pytest.mark.parametrize(
-    ("value", "words"),
-    [
+def test_bad_rois(tmp_path, subtests):
+    for value, words in [
         ({"closed": False, "points_world": [[0, 0], [1, 0], [1, 1]]}, "not closed"),
         ({"closed": True, "points_world": []}, "no polygon"),
         ({"closed": True, "points_world": [[0, 0], [1, 0]]}, "not a ring"),
@@ -120,13 +118,12 @@ def test_roi_forms(tmp_path):
             {"type": "Polygon", "coordinates": [[[4.1, 52], [4.2, 52], [4.2, 52.1], [4.1, 52]]]},
             "longitude and latitude are not",
         ),
-    ],
-)
-def test_bad_rois(tmp_path, value, words):
-    path = tmp_path / "roi_polygon.json"
-    path.write_text(json.dumps(value))
-    with pytest.raises(InputError, match=words):
-        read_roi(path)
+    ]:
+        with subtests.test(words):
+            path = tmp_path / "roi_polygon.json"
+            path.write_text(json.dumps(value))
+            with pytest.raises(InputError, match=words):
+                read_roi(path)
 
 
 def a_path(n=4):
@@ -140,45 +137,39 @@ def a_trace(n=4):
     return DroneTrace("path_00000", "muco", t, m, m, m, np.ones(n), np.full(n, 5.0), {"a": 1.0}, {"b": 2}, None)
 
 
-@pytest.mark.parametrize(
-    ("write", "read", "make", "group"),
-    [
+def test_path_and_trace_round_trip(tmp_path, subtests):
+    for write, read, make, group in [
         (write_paths, read_paths, a_path, "paths"),
         (write_traces, read_traces, a_trace, "traces"),
         (write_paths, read_paths, lambda: replace(a_path(), pace="hurry"), "paths"),
         (write_traces, read_traces, lambda: replace(a_trace(), pace="hurry"), "traces"),
-    ],
-    ids=["path", "trace", "hurried_path", "hurried_trace"],
-)
-def test_path_and_trace_round_trip(tmp_path, write, read, make, group):
-    path = tmp_path / "p.json"
-    write(path, [make()], {"map": "T", "seed": 0})
-    back = read(path)[0]
-    for name, value in vars(make()).items():
-        if isinstance(value, np.ndarray):
-            assert_allclose(getattr(back, name), value)
-        else:
-            assert getattr(back, name) == value
-    value = json.loads(path.read_text())
-    value[group][0]["t"][1] = "x"
-    path.write_text(json.dumps(value))
-    with pytest.raises(InputError, match=rf"{group}\[0\]\.t"):
-        read(path)
+    ]:
+        with subtests.test(write=write, read=read):
+            path = tmp_path / "p.json"
+            write(path, [make()], {"map": "T", "seed": 0})
+            back = read(path)[0]
+            for name, value in vars(make()).items():
+                if isinstance(value, np.ndarray):
+                    assert_allclose(getattr(back, name), value)
+                else:
+                    assert getattr(back, name) == value
+            value = json.loads(path.read_text())
+            value[group][0]["t"][1] = "x"
+            path.write_text(json.dumps(value))
+            with pytest.raises(InputError, match=rf"{group}\[0\]\.t"):
+                read(path)
 
 
-def test_a_pace_is_a_name(tmp_path):
+def test_a_pace_that_is_no_name_and_columns_of_different_lengths_are_named(tmp_path):
     path = tmp_path / "p.json"
     write_paths(path, [replace(a_path(), pace="hurry")], {})
-    path.write_text(path.read_text().replace('"hurry"', "3"))
-    with pytest.raises(InputError, match=r"paths\[0\]\.pace: .*got 3"):
-        read_paths(path)
-
-
-def test_columns_of_different_lengths(tmp_path):
-    path = tmp_path / "p.json"
-    write_paths(path, [a_path()], {})
     value = json.loads(path.read_text())
-    value["paths"][0]["x"].pop()
-    path.write_text(json.dumps(value))
-    with pytest.raises(InputError, match="different lengths"):
-        read_paths(path)
+    for change, words in (
+        (lambda walk: walk.update(pace=3), r"paths\[0\]\.pace: .*got 3"),
+        (lambda walk: walk["x"].pop(), "different lengths"),
+    ):
+        changed = json.loads(json.dumps(value))
+        change(changed["paths"][0])
+        path.write_text(json.dumps(changed))
+        with pytest.raises(InputError, match=words):
+            read_paths(path)

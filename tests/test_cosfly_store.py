@@ -35,12 +35,12 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]  # no litter
 
 
-@pytest.mark.parametrize("place", [".", "/", "there"])
-def test_a_folder_in_the_place_of_a_file_is_one_error(tmp_path, monkeypatch, place):
+def test_a_folder_in_the_place_of_a_file_is_one_error(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there").mkdir()
-    with pytest.raises(StorageError, match="where a folder is"):
-        write_json(Path(place), {})
+    for place in (".", "/", "there"):
+        with pytest.raises(StorageError, match="where a folder is"):
+            write_json(Path(place), {})
 
 
 def test_nan_is_never_a_value(tmp_path):
@@ -101,13 +101,6 @@ class Demo(Config):
     threads: MayDiffer[int] = 1
 
 
-class Newer(Demo):
-    """The same settings in a later version, with one more and a group more."""
-
-    solids: bool = True
-    extra: Demo = Demo()
-
-
 class Growing(Config):
     count: int
 
@@ -117,43 +110,48 @@ def _open(out, **changes):
     return StageFolder.open(out, "demo", **arguments)
 
 
+def _finished(out, tally: Tally | None = None, **changes) -> StageFolder:
+    """A stage with one product and its manifest."""
+    stage = _open(out, **changes)
+    write_json(out / "product.json", 1)
+    stage.finish([out / "product.json"], tally or Tally(input=1, kept=1), extra_fact=7)
+    return stage
+
+
 def test_stage_life(tmp_path):
     source, out = tmp_path / "in.json", tmp_path / "out"
     write_json(source, {"x": 1})
-    stage = _open(out, inputs={"map": source})
-    assert not stage.is_complete
-    write_json(out / "product.json", {"y": 2})
-    stage.finish([out / "product.json"], Tally(input=1, kept=1), extra_fact=7)
-    again = _open(out, inputs={"map": source})
-    assert again.is_complete
+    assert not _finished(out, inputs={"map": source}).is_complete
+    assert _open(out, inputs={"map": source}).is_complete
     assert read_manifest(out).facts == {"extra_fact": 7}
-    assert read_manifest(out).counts == Tally(input=1, kept=1)
     assert read_json(out / "manifest.json")["counts"] == {"input": 1, "kept": 1, "dropped": {}, "failed": {}}
+    (out / "product.json").unlink()
+    with pytest.raises(VerifyError, match=r"product\.json"):
+        _open(out, inputs={"map": source})
+    failed = _finished(tmp_path / "failed", Tally(input=2, kept=1, failed={"input": 1}))
+    assert not _open(failed.path).is_complete, "failed items are tried again"
+    assert not (failed.path / "manifest.json").exists()
 
 
-def test_a_stage_with_failed_items_is_open_again(tmp_path):
-    stage = _open(tmp_path / "out")
-    write_json(stage.path / "product.json", 1)
-    stage.finish([stage.path / "product.json"], Tally(input=2, kept=1, failed={"input": 1}))
-    again = _open(tmp_path / "out")
-    assert not again.is_complete
-    assert not (again.path / "manifest.json").exists()
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
+def test_other_settings_and_inputs_are_named(tmp_path):
+    source, out = tmp_path / "in.json", tmp_path / "out"
+    write_json(source, 1)
+    inputs = {"map": source}
+    _open(out, inputs=inputs).journal.append({"id": "a", "status": "kept"})
+    _open(out, inputs=inputs, config=Demo(threads=2))  # may differ, and is not on record
+    assert read_json(out / "stage.json")["config"] == {"a": {"b": 1}}
+    for changes, words in (
         ({"config": Demo(a={"b": 2})}, "a.b was 1, is 2"),
         ({"seed": 5}, "seed was 0, is 5"),
         ({"config": Demo(a={})}, "a.b was 1"),
-    ],
-)
-def test_other_settings_are_named(tmp_path, changes, words):
-    _open(tmp_path / "out").journal.append({"id": "a", "status": "kept"})
-    with pytest.raises(ResumeError, match=words):
-        _open(tmp_path / "out", **changes)
-    with pytest.raises(ResumeError, match="already holds work"):
-        _open(tmp_path / "out", **changes, resume="never")
+    ):
+        with pytest.raises(ResumeError, match=words):
+            _open(out, inputs=inputs, **changes)
+        with pytest.raises(ResumeError, match="already holds work"):
+            _open(out, inputs=inputs, **changes, resume="never")
+    write_json(source, 2)
+    with pytest.raises(ResumeError, match="the input map"):
+        _open(out, inputs=inputs)
 
 
 def test_a_command_that_is_refused_before_it_did_anything_leaves_nothing(tmp_path):
@@ -167,19 +165,9 @@ def test_a_command_that_is_refused_before_it_did_anything_leaves_nothing(tmp_pat
     stage.journal.append({"id": "a", "status": "kept"})
     give_up(tmp_path)
     assert sorted(path.name for path in stage.path.iterdir()) == ["items.jsonl", "stage.json"]
-
-
-def test_a_folder_that_somebody_removed_meanwhile_can_be_given_up(tmp_path):
-    stage = _open(tmp_path / "out")
-    shutil.rmtree(stage.path)
+    shutil.rmtree(_open(tmp_path / "out").path)  # by somebody, meanwhile
     give_up(tmp_path)
-    assert not stage.path.exists()
-
-
-def test_a_setting_that_may_differ_is_not_on_record(tmp_path):
-    _open(tmp_path / "out").journal.append({"id": "a", "status": "kept"})
-    again = _open(tmp_path / "out", config=Demo(threads=2))
-    assert read_json(again.path / "stage.json")["config"] == {"a": {"b": 1}}
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_stage_that_kept_nothing_is_one_error_and_not_complete(tmp_path):
@@ -188,15 +176,6 @@ def test_a_stage_that_kept_nothing_is_one_error_and_not_complete(tmp_path):
     with pytest.raises(NothingKept, match=r"out: demo kept nothing.*4 dropped \(short 4\).* of 5.*the disk is round"):
         stage.finish([], Tally(input=5, dropped={"short": 4}, failed={"input": 1}))
     assert not (tmp_path / "out/manifest.json").exists()
-
-
-def test_a_changed_input_is_named(tmp_path):
-    source = tmp_path / "in.json"
-    write_json(source, 1)
-    _open(tmp_path / "out", inputs={"map": source}).journal.append({"id": "a", "status": "kept"})
-    write_json(source, 2)
-    with pytest.raises(ResumeError, match="the input map"):
-        _open(tmp_path / "out", inputs={"map": source})
 
 
 def test_an_attempt_without_finished_work_binds_nobody(tmp_path):
@@ -222,20 +201,12 @@ def test_a_missing_input_is_not_taken_for_a_full_disk(tmp_path):
         (tmp_path / "input").read_bytes()
 
 
-@pytest.mark.parametrize("name", ["thesis.txt", ".thesis.txt.1.partial"])
-def test_foreign_files_are_not_touched(tmp_path, name):
-    (tmp_path / name).write_text("x")
-    with pytest.raises(ResumeError, match="not cosfly's"):
-        _open(tmp_path)
-
-
-def test_a_missing_product_of_a_complete_stage_is_found(tmp_path):
-    stage = _open(tmp_path / "out")
-    write_json(stage.path / "product.json", 1)
-    stage.finish([stage.path / "product.json"], Tally(input=1, kept=1))
-    (stage.path / "product.json").unlink()
-    with pytest.raises(VerifyError, match=r"product\.json"):
-        _open(tmp_path / "out")
+def test_foreign_files_are_not_touched(tmp_path):
+    for name in ("thesis.txt", ".thesis.txt.1.partial"):
+        (tmp_path / name).write_text("x")
+        with pytest.raises(ResumeError, match="not cosfly's"):
+            _open(tmp_path)
+        (tmp_path / name).unlink()
 
 
 def test_a_folder_in_which_another_process_works_is_refused(tmp_path, held_by_another):
@@ -250,23 +221,14 @@ def test_a_folder_in_which_another_process_works_is_refused(tmp_path, held_by_an
 
 def test_a_finished_folder_needs_no_lock_and_holds_none(tmp_path, held_by_another):
     out = tmp_path / "out"
-    stage = _open(out)
-    write_json(out / "product.json", 1)
-    stage.finish([out / "product.json"], Tally(input=1, kept=1))
+    _finished(out)
     assert not (out / ".lock").exists()
     with held_by_another(out):
         assert _open(out).is_complete
         with pytest.raises(ResumeError, match="seed was 0"):
             _open(out, seed=1)
     assert (out / "manifest.json").exists()
-
-
-def test_a_lock_that_a_kill_left_in_a_finished_folder_goes(tmp_path):
-    out = tmp_path / "out"
-    stage = _open(out)
-    write_json(out / "product.json", 1)
-    stage.finish([out / "product.json"], Tally(input=1, kept=1))
-    (out / ".lock").write_text("{}")
+    (out / ".lock").write_text("{}")  # a kill left it
     assert _open(out).is_complete
     assert not (out / ".lock").exists()
 
@@ -275,9 +237,7 @@ def test_a_lock_that_a_kill_left_in_a_finished_folder_goes(tmp_path):
 def test_what_a_stage_has_grown_from_outlives_a_kill_before_its_new_record(tmp_path, monkeypatch, is_killed):
     """Else the stages behind it would take the larger product for another one, and not go on."""
     out = tmp_path / "out"
-    stage = _open(out, config=Growing(count=1))
-    write_json(out / "product.json", 1)
-    stage.finish([out / "product.json"], Tally(input=1, kept=1))
+    _finished(out, config=Growing(count=1))
     before = fingerprint(out)
     if is_killed:
         unlink = Path.unlink
@@ -299,9 +259,7 @@ def test_what_a_stage_has_grown_from_outlives_a_kill_before_its_new_record(tmp_p
 
 def test_what_a_stage_has_grown_from_outlives_a_kill_while_it_begins_anew(tmp_path):
     out = tmp_path / "out"
-    stage = _open(out, config=Growing(count=1))
-    write_json(out / "product.json", 1)
-    stage.finish([out / "product.json"], Tally(input=1, kept=1))
+    _finished(out, config=Growing(count=1))
     before = fingerprint(out)
     _open(out, config=Growing(count=2), grows=("count",), begins_anew=True)
     (out / "product.json").unlink()
@@ -310,23 +268,18 @@ def test_what_a_stage_has_grown_from_outlives_a_kill_while_it_begins_anew(tmp_pa
     assert has_grown_from(out, before)
 
 
-@pytest.mark.parametrize("is_own", [False, True])  # a container gives the same ids again
-def test_what_a_kill_left_of_a_file_goes_when_it_is_written_again(tmp_path, is_own):
-    name = f".a.json.{os.getpid() if is_own else 999_999_999}.partial"
-    (tmp_path / name).write_text("half")
-    for other in (".a.json.b.999999999.partial", f".a.json.{os.getppid()}.partial", ".a.json.mine.partial"):
+def test_what_a_kill_left_of_a_file_or_folder_goes_when_it_is_written_again(tmp_path):
+    others = (".a.json.b.999999999.partial", f".a.json.{os.getppid()}.partial", ".a.json.mine.partial")
+    for other in others:
         (tmp_path / other).write_text("of another file, of a process that lives, of nobody")
-    write_json(tmp_path / "a.json", 1)
-    assert not (tmp_path / name).exists()
-    assert len(list(tmp_path.iterdir())) == 4
-
-
-def test_what_a_kill_left_of_a_folder_goes_when_it_is_written_again(tmp_path):
-    for pid in (os.getpid(), 999_999_999):
-        (tmp_path / f".a.{pid}.partial/b").mkdir(parents=True)
-    with store.atomic_folder(tmp_path / "a") as folder:
-        (folder / "c").write_text("c")
-    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["a", "a/c"]
+    for pid in (os.getpid(), 999_999_999):  # a container gives the same ids again
+        (tmp_path / f".a.json.{pid}.partial").write_text("half")
+        (tmp_path / f".f.{pid}.partial/b").mkdir(parents=True)
+        write_json(tmp_path / "a.json", 1)
+        with store.atomic_folder(tmp_path / "f") as folder:
+            (folder / "c").write_text("c")
+        assert {path.name for path in tmp_path.iterdir()} == {*others, "a.json", "f"}
+        shutil.rmtree(tmp_path / "f")
 
 
 def test_a_lock_leads_nowhere_else(tmp_path):
@@ -338,28 +291,27 @@ def test_a_lock_leads_nowhere_else(tmp_path):
     assert (tmp_path / "private").read_text() == "mine"
 
 
-@pytest.mark.parametrize("name", ["items.jsonl", "Town01", "Town01/trajectory_1", "Town01/.x.1.partial", "made.json"])
-def test_a_stage_writes_through_no_link_in_its_folder(tmp_path, name):
+def test_a_stage_writes_through_no_link_in_its_folder(tmp_path):
     out, private = tmp_path / "out", tmp_path / "private"
     _open(out)
     (private / "ORI").mkdir(parents=True)
     (private / "ORI/mine").write_text("mine")
-    link = out / name
-    link.parent.mkdir(exist_ok=True)
-    link.symlink_to(private)
-    before = sorted(out.rglob("*"))
-    with pytest.raises(StorageError, match=f"{name}.*a link to {private}"):
-        _open(out)
-    assert sorted(out.rglob("*")) == before, "nothing of the folder was touched"
+    for name in ("items.jsonl", "Town01", "Town01/trajectory_1", "Town01/.x.1.partial", "made.json"):
+        link = out / name
+        link.parent.mkdir(exist_ok=True)
+        link.symlink_to(private)
+        before = sorted(out.rglob("*"))
+        with pytest.raises(StorageError, match=f"{name}.*a link to {private}"):
+            _open(out)
+        assert sorted(out.rglob("*")) == before, "nothing of the folder was touched"
+        link.unlink()
     assert (private / "ORI/mine").read_text() == "mine"
 
 
 def test_the_output_folder_itself_may_be_a_link(tmp_path):
     (tmp_path / "disk").mkdir()
     (tmp_path / "out").symlink_to(tmp_path / "disk")
-    stage = _open(tmp_path / "out")
-    write_json(stage.path / "made.json", 1)
-    stage.finish([stage.path / "made.json"], Tally(input=1, kept=1))
+    _finished(tmp_path / "out")
     assert (tmp_path / "disk/manifest.json").exists()
 
 
