@@ -42,9 +42,9 @@ def problems(free: np.ndarray, route: np.ndarray) -> list[str]:
     return found + [f"blocked: {(x, y)}" for x, y in route.tolist() if not free[y, x]]
 
 
-@pytest.mark.parametrize(
-    ("text", "start", "goal", "cost"),
-    [
+def test_costs_by_hand():
+    for text, start, goal, cost in (
+        ("...", (1, 0), (1, 0), 0.0),
         ("....", (0, 0), (3, 0), 3.0),
         (".... .... .... ....", (0, 0), (3, 3), 3 * SQRT2),
         (".... .... .... ....", (3, 0), (0, 1), 2 + SQRT2),
@@ -52,51 +52,32 @@ def problems(free: np.ndarray, route: np.ndarray) -> list[str]:
         (".# ..", (0, 0), (1, 1), 2.0),  # the corner may not be cut
         (".#. .#. ...", (0, 0), (2, 0), 6.0),
         ("..... .###. .....", (0, 1), (4, 1), 6.0),
-    ],
-)
-def test_costs_by_hand(text, start, goal, cost):
-    free = free_cells(text)
-    route = find_route(free, start, goal)
-    assert route_cost(route) == pytest.approx(cost, abs=1e-12)
-    assert tuple(route[0]) == start
-    assert tuple(route[-1]) == goal
-    assert problems(free, route) == []
+    ):
+        free = free_cells(text)
+        route = find_route(free, start, goal)
+        assert route_cost(route) == pytest.approx(cost, abs=1e-12)
+        assert (tuple(route[0]), tuple(route[-1])) == (start, goal)
+        assert problems(free, route) == []
 
 
-def test_start_is_goal():
-    assert find_route(free_cells("..."), (1, 0), (1, 0)).tolist() == [[1, 0]]
-    assert route_cost(np.array([[1, 0]])) == 0.0
+def test_no_route_is_none():
+    for text, goal in (("..#.. ..#.. ..#..", (4, 2)), ("..... ...## ...#.", (4, 2)), (".# #.", (1, 1))):
+        assert find_route(free_cells(text), (0, 0), goal) is None, text
 
 
-@pytest.mark.parametrize("text", ["..#.. ..#.. ..#..", "..... ...## ...#."])
-def test_no_route_is_none(text):
-    free = free_cells(text)
-    assert find_route(free, (0, 0), (4, 2)) is None
-
-
-def test_two_cells_that_touch_by_a_corner_have_no_route():
-    assert find_route(free_cells(".# #."), (0, 0), (1, 1)) is None
-
-
-@pytest.mark.parametrize(
-    ("start", "goal", "words"),
-    [
+def test_bad_ends_and_grids_are_value_errors():
+    for start, goal, words in (
         ((1, 0), (2, 0), "start.*not a free"),
         ((0, 0), (1, 0), "goal.*not a free"),
         ((-1, 0), (2, 0), "start.*off the grid"),
         ((0, 0), (3, 0), "goal.*off the grid"),
         ((0, 0), (0, 1), "goal.*off the grid"),
-    ],
-)
-def test_bad_ends_are_value_errors(start, goal, words):
-    with pytest.raises(ValueError, match=words):
-        find_route(free_cells(".#."), start, goal)
-
-
-@pytest.mark.parametrize("free", [np.ones((4, 4)), np.ones(4, dtype=bool), np.ones((4, 4), dtype=bool).T[::2]])
-def test_bad_grids_are_value_errors(free):
-    with pytest.raises(ValueError, match="contiguous"):
-        find_route(free, (0, 0), (1, 1))
+    ):
+        with pytest.raises(ValueError, match=words):
+            find_route(free_cells(".#."), start, goal)
+    for free in (np.ones((4, 4)), np.ones(4, dtype=bool), np.ones((4, 4), dtype=bool).T[::2]):
+        with pytest.raises(ValueError, match="contiguous"):
+            find_route(free, (0, 0), (1, 1))
 
 
 def test_the_checker_finds_planted_faults():

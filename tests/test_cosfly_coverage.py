@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -36,13 +39,10 @@ def test_what_lies_beyond_counts_in_the_outermost_bins_and_nan_nowhere():
     assert axis.percentile([], 0.5) is None
 
 
-@pytest.mark.parametrize(
-    ("offset", "azimuth"), [((10, 0), 0), ((0, 10), 90), ((-10, 0.001), 180), ((0, -10), -90), ((7, 7), 45)]
-)
-def test_azimuths_count_from_the_walkers_heading_to_the_left(offset, azimuth):
-    for heading in (0.0, 90.0, -135.0):
+def test_azimuths_count_from_the_walkers_heading_to_the_left():
+    offsets = {(10, 0): 0, (0, 10): 90, (-10, 0.001): 180, (0, -10): -90, (7, 7): 45}
+    for heading, ((x, y), azimuth) in itertools.product((0.0, 90.0, -135.0), offsets.items()):
         turn = np.radians(heading)
-        x, y = offset
         turned = [x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn), 20.0]
         found = azimuths_deg(np.array([turned]), np.array([heading]))[0]
         assert (found - azimuth + 180) % 360 - 180 == pytest.approx(0, abs=0.1)
@@ -62,8 +62,6 @@ def test_flights_add_up(flights):
 
 
 def test_who_stands_keeps_his_heading(flights):
-    from dataclasses import replace
-
     flight = flights[0]
     targets = flight.targets_m.copy()
     targets[4:] = targets[4]  # stands from there on

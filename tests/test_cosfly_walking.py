@@ -15,8 +15,6 @@ from cosfly.pedestrians.walking import (
     take_pace,
 )
 
-BEND_45 = np.array([[0.0, 0.0], [0.5, 0.0], [1.0, 0.5]])  # a straight step, then a diagonal one
-
 
 def calm(curvatures, **settings_):
     return speed_profile(np.asarray(curvatures, dtype=float), np.random.default_rng(0), jitter=0.0, **settings_)
@@ -25,27 +23,18 @@ def calm(curvatures, **settings_):
 # --- curvature --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("points", "curvature"),
-    [
+def test_curvature_by_hand():
+    for points, curvature in (
         ([(0, 0), (1, 0), (2, 0)], 0.0),
-        (
-            [(0, 0), (0.5, 0), (0.5, 0.5)],
-            2 * np.sqrt(2),
-        ),  # circle through three corners of a 0.5 m square: radius 0.3536
-        (BEND_45, 4 / np.sqrt(10)),
+        ([(0, 0), (0.5, 0), (0.5, 0.5)], 2 * np.sqrt(2)),  # of a 0.5 m square: radius 0.3536
+        ([(0, 0), (0.5, 0), (1, 0.5)], 4 / np.sqrt(10)),  # a straight step, then a diagonal one
         ([(0, 0), (1, 0), (1, 0)], 0.0),  # no distance, no curvature
         ([(0, 0), (1, 0), (0, 0)], 0.0),  # there and back
         ([(0, 0), (1e-3, 0), (1e-3, 1e-3)], 0.0),  # product of lengths 1.4e-9 m3, below the guard
-    ],
-)
-def test_curvature_by_hand(points, curvature):
-    assert menger_curvature(np.array(points, dtype=float)).tolist() == pytest.approx([0.0, curvature, 0.0])
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_short_polylines_have_no_curvature(count):
-    assert menger_curvature(np.ones((count, 2))).tolist() == [0.0] * count
+    ):
+        assert menger_curvature(np.array(points, dtype=float)).tolist() == pytest.approx([0.0, curvature, 0.0])
+    for count in (1, 2):
+        assert menger_curvature(np.ones((count, 2))).tolist() == [0.0] * count
 
 
 @given(st.floats(0.5, 200), st.floats(0.01, 1.0), st.floats(-100, 100))
@@ -64,10 +53,7 @@ def test_speeds_by_hand():
     np.testing.assert_allclose(calm([0.0, 1.0], cruise_speed_mps=3.0), [1.6, 0.5])
     np.testing.assert_allclose(calm([0.0, 1.0], min_speed_mps=0.4), [1.2, 0.4])
     np.testing.assert_allclose(calm([5.0], curvature_gain_m=0.0), [1.2])
-
-
-def test_nobody_stands_still_for_ever():
-    assert calm([1e9]).tolist() == [SLOWEST_SPEED_MPS]
+    assert calm([1e9]).tolist() == [SLOWEST_SPEED_MPS], "nobody stands still for ever"
 
 
 def test_the_guard_changes_nothing_at_the_sharpest_grid_corner_and_the_papers_settings():
@@ -89,9 +75,6 @@ def test_jitter_is_even_within_its_share():
 def test_times_by_hand():
     polyline = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 4.0]])
     np.testing.assert_allclose(arrival_times(polyline, np.array([1.0, 0.5, 1.5])), [0.0, 4.0, 8.0])
-
-
-def test_no_speed_is_a_value_error():
     with pytest.raises(ValueError, match="for ever"):
         arrival_times(np.array([[0.0, 0.0], [1.0, 0.0]]), np.zeros(2))
 
@@ -103,12 +86,8 @@ def test_even_speed_gives_even_steps_and_ends_at_the_goal():
     np.testing.assert_allclose(time_s, [0, 0.5, 1.0, 1.5, 2.0, 2.5])
     np.testing.assert_allclose(positions, [[0, 0], [0.5, 0], [1, 0], [1, 0.5], [1, 1.0], [1, 1.3]], atol=1e-12)
     np.testing.assert_allclose(sampled, 1.0)
-
-
-def test_a_walk_that_ends_on_a_step_has_no_second_last_point():
-    polyline = np.array([[0.0, 0.0], [1.0, 0.0]])
-    time_s, positions, _ = resample(polyline, np.ones(2), np.array([0.0, 1.0]), 0.5, np.zeros(2))
-    np.testing.assert_allclose(time_s, [0.0, 0.5, 1.0])
+    time_s, positions, _ = resample(polyline[:2], np.ones(2), np.array([0.0, 1.0]), 0.5, np.zeros(2))
+    np.testing.assert_allclose(time_s, [0.0, 0.5, 1.0])  # one that ends on a step has no second last point
     np.testing.assert_allclose(positions[-1], [1.0, 0.0])
 
 
