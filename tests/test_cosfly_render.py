@@ -28,8 +28,10 @@ from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.reading.files import sha256_file
 from cosfly.render.camera import box_depths, rendered_visibility, view_target
 from cosfly.render.contract import (
+    FAR_M,
     GROUND_PLANE_HALF_M,
     MAX_BOX_ID,
+    NEAR_M,
     PERSON_ID,
     SHARED_ID,
     Frame,
@@ -87,13 +89,13 @@ def test_what_is_drawn_is_what_the_slow_way_finds():
     parts = builder.finish()
     pose = world_from_camera(np.array([10.0, -20.0, 40.0]), np.array([5.0, -25.0, 130.0]))
     view = CameraView(pose[:3, :3], pose[:3, 3], intrinsic_matrix(320, 180, 70.0), 320, 180)
-    in_camera = (parts.object_centers - view.eye) @ view.world_from_camera
-    size_px = view._size_px(in_camera, parts.object_radii)
-    inside = (
-        view._is_inside(in_camera, parts.object_radii)
-        & (size_px >= np.maximum(parts.min_px, 0.4))
-        & (size_px < parts.max_px)
-    )
+    x, y, z = (in_camera := (parts.object_centers - view.eye) @ view.world_from_camera).T
+    radii, size, focal = parts.object_radii, np.array([320, 180]), view.intrinsic[0, 0]
+    size_px = focal * radii / np.maximum(np.linalg.norm(in_camera, axis=1) - radii, NEAR_M)
+    inside = (z + radii > NEAR_M) & (z - radii < FAR_M)
+    for along, half in zip((x, y), size / 2 / focal, strict=True):  # tangents of the picture's borders
+        inside &= np.abs(along) - z * half < radii * np.sqrt(1 + half**2)
+    inside &= (size_px >= np.maximum(parts.min_px, 0.4)) & (size_px < parts.max_px)
     expected = np.flatnonzero(inside)
     away = (in_camera[:, 2] - parts.object_radii)[expected]
     expected = expected[np.lexsort((away, -parts.records["bias"][expected]))]

@@ -97,12 +97,7 @@ def test_fixed_takes_the_named_presets(name):
         "sun_altitude_angle": -30,
         "sun_azimuth_angle": 0,
     }
-    assert record.model_dump() == {
-        "mode": "fixed",
-        "weather_name": "heavy_rain",
-        "tod_name": "night",
-        "params": params,
-    }
+    assert record.model_dump() == {"mode": "fixed", "weather_name": "heavy_rain", "tod_name": "night", "params": params}
 
 
 @pytest.mark.parametrize(

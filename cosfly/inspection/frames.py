@@ -150,10 +150,7 @@ def _other(line: OtherMeta) -> Other | None:
     return Other(kind, feet_m[None], np.array([line.heading_rad]))
 
 
-SMALL_PX, SMALL_ROWS = (
-    (128, 72),
-    5,
-)  # frames are shrunk to this, of every fifth row, before they are compared with each other
+SMALL_PX, SMALL_ROWS = (128, 72), 5  # frames are shrunk to this, of every fifth row, before they are compared
 BLANK_STD = 2.0  # grey levels; a frame of one colour has 0, fog over a street still has more than 5
 # The centre of the person's box and its visible surface are at most a half height apart along the optical axis.
 SURFACE_TOLERANCE_M = PERSON_HALF_EXTENTS_M[2] + 0.3

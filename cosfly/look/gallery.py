@@ -15,7 +15,7 @@ from cosfly.look.overlay import Overlay
 from cosfly.look.topview import add_caption, draw_text
 from cosfly.products.boxes import BoxMap
 from cosfly.products.flights import find_flights
-from cosfly.products.frames import DEBUG_FILE, frame_path, read_instance, read_meta, read_rgb, rgb_bytes
+from cosfly.products.frames import DEBUG_FILE, FRAME_FILES, frame_path, read_instance, read_meta, read_rgb, rgb_bytes
 from cosfly.products.places import ALL_FLIGHTS, FlightChoice
 from cosfly.products.playback import Flight, read_flight
 from cosfly.products.town import read_instance_ids
@@ -74,11 +74,7 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
     Raises:
         InputError: no such frame, one without pictures, or neither `debug.png` nor a map.
     """
-    folder = (
-        best_frame(tree, "rgb.png", "depth.npy", "instance.png", "meta.json")
-        if frame is None
-        else frame_in(tree, frame)
-    )
+    folder = best_frame(tree, *FRAME_FILES) if frame is None else frame_in(tree, frame)
     meta, rgb = read_meta(folder), read_rgb(folder)
     if (folder / DEBUG_FILE).exists():
         debug = cv2.cvtColor(read_picture(folder / DEBUG_FILE, tree=tree), cv2.COLOR_BGR2RGB)

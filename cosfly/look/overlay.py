@@ -136,10 +136,8 @@ class _Labels:
         taken: list[tuple[float, float, float, float]] = []
         for text, x, y, color in reversed(self._waiting):
             (long, high), _ = cv2.getTextSize(text, FONT, self._size, 1)
-            left, base = (
-                float(np.clip(x - long / 2, 2, max(2, width - long - 2))),
-                float(np.clip(y - 4, high + 2, height - 4)),
-            )
+            left = float(np.clip(x - long / 2, 2, max(2, width - long - 2)))
+            base = float(np.clip(y - 4, high + 2, height - 4))
             own = left - 2, base - high - 2, left + long + 2, base + 3
             if any(own[0] < t[2] and t[0] < own[2] and own[1] < t[3] and t[1] < own[3] for t in taken):
                 continue

@@ -152,11 +152,8 @@ class Flight:
     @property
     def weather(self) -> dict[str, str | None]:
         """The presets of weather and time of day that the file names; None where it has no such record."""
-        told = (
-            {"weather": self.raw["weather"]}
-            if isinstance(self.raw.get("weather"), str)
-            else object_of(self.raw, "weather")
-        )
+        word = self.raw.get("weather")
+        told = {"weather": word} if isinstance(word, str) else object_of(self.raw, "weather")
         named = {own: (told.get(name) for name in names) for own, names in WEATHER_KEYS.items()}
         return {own: next((one for one in found if isinstance(one, str)), None) for own, found in named.items()}
 

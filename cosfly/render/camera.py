@@ -1,4 +1,4 @@
-"""What a camera sees: which spheres; the target, its box and depth, and how much of it is seen (sec:step6)."""
+"""What a camera sees of the target: its box and depth, and how much of it is seen (sec:step6)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 from cosfly.geometry import box_corners, project
 from cosfly.products.frames import Camera
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
-from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Frame
-from cosfly.work.compiled import njit
+from cosfly.render.contract import NEAR_M, PERSON_ID, Frame
 
 DEPTH_TOLERANCE_M = 0.05  # something this little in front of the target's box does not hide it
 NOT_HIDDEN = -1  # no instance id
@@ -141,37 +140,3 @@ def _rays_to_box(
     at = pixels[inside, 1], pixels[inside, 0]
     free = (frame.depth[at] >= near[inside] - DEPTH_TOLERANCE_M) | (frame.ids[at] == PERSON_ID)
     return len(pixels), np.where(free, NOT_HIDDEN, frame.ids[at].astype(np.int64))
-
-
-@njit(cache=True, nogil=True)
-def spheres_in_view(  # type: ignore[no-untyped-def]
-    centers, radii, min_px, max_px, eye, turn, tangents, slants, focal_px
-):
-    """Find the spheres that a camera may see, whose radius on the image lies in [min_px, max_px): one pass over all
-    that a map has.
-
-    Args:
-        centers: (k, 3) float32 m; radii, min_px, max_px: (k,) float32; eye: (3,) float32 m; turn: (3, 3) float32,
-            world_from_camera.
-        tangents, slants: (2,) float64, of the widest angles to the sides and up: tangent, and 1 / cosine. focal_px:
-            float.
-    Returns:
-        rows (n,) int64, in their order; (n,) float32 m, how far along the axis each begins.
-    """
-    rows, away, count = np.empty(len(centers), np.int64), np.empty(len(centers), np.float32), 0
-    near, focal = np.float32(NEAR_M), np.float32(focal_px)
-    for k in range(len(centers)):
-        dx, dy, dz = centers[k, 0] - eye[0], centers[k, 1] - eye[1], centers[k, 2] - eye[2]
-        radius = radii[k]
-        z = dx * turn[0, 2] + dy * turn[1, 2] + dz * turn[2, 2]
-        if not (z + radius > near and z - radius < FAR_M):
-            continue
-        x = dx * turn[0, 0] + dy * turn[1, 0] + dz * turn[2, 0]
-        y = dx * turn[0, 1] + dy * turn[1, 1] + dz * turn[2, 1]
-        if abs(x) - z * tangents[0] >= radius * slants[0] or abs(y) - z * tangents[1] >= radius * slants[1]:
-            continue
-        size_px = focal * radius / max(np.sqrt(x * x + y * y + z * z) - radius, near)
-        if min_px[k] <= size_px < max_px[k]:
-            rows[count], away[count] = k, z - radius
-            count += 1
-    return rows[:count], away[:count]

@@ -13,15 +13,7 @@ from typing import Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from cosfly.errors import ConfigError, nearest
-from cosfly.products.weather import (
-    TIMES,
-    WEATHERS,
-    TimePreset,
-    WeatherPreset,
-    WeatherRecord,
-    preset_token,
-    resolved,
-)
+from cosfly.products.weather import TIMES, WEATHERS, TimePreset, WeatherPreset, WeatherRecord, preset_token, resolved
 from cosfly.work.config import Config, MayDiffer, build, read_yaml
 
 DEFAULT_SEED = 20260423  # of the paper's production runs (app:weather:coverage)
@@ -62,10 +54,7 @@ class WeatherConfig(Config):
     @model_validator(mode="after")
     def _settings_agree(self) -> WeatherConfig:
         problems = []
-        for field, pool_field, presets in (
-            ("weather_name", "weather_pool", WEATHERS),
-            ("tod_name", "tod_pool", TIMES),
-        ):
+        for field, pool_field, presets in (("weather_name", "weather_pool", WEATHERS), ("tod_name", "tod_pool", TIMES)):
             name, pool = getattr(self, field), getattr(self, pool_field)
             if name is None and self.weather_mode == "fixed":
                 problems.append(f"{field} is needed in weather_mode fixed")

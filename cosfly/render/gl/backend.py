@@ -347,10 +347,8 @@ class GlRenderer:
         records = np.concatenate([*(part for part, _ in moving), self._parts.records[rows]])
         groups = np.concatenate([*(_groups(part, mesh) for part, mesh in moving), self._groups[rows]])
         order = np.argsort(groups, kind="stable")
-        records, starts = (
-            records[order],
-            np.searchsorted(groups[order], np.arange(part_tables.NUM_MATERIALS * MESH_STRIDE + 1)),
-        )
+        records = records[order]
+        starts = np.searchsorted(groups[order], np.arange(part_tables.NUM_MATERIALS * MESH_STRIDE + 1))
         for material in part_tables.DRAW_ORDER:
             for mesh in range(len(self._meshes)):
                 group = material * MESH_STRIDE + mesh

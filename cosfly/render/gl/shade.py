@@ -49,16 +49,10 @@ def shades_of(
         sun: (3,) unit vector towards it. has_headlights: cars among the others light what lies before them.
     """
     shades: list[Shade] = []
-    found = (
-        [
-            (own, _darkened(own, sun, SKY_RADII * float(own[0, 0, 3]), LONGEST_M), False)
-            for own in np.split(capsules, len(capsules))
-        ]
-        if len(capsules)
-        else []
-    )
-    if has_headlights:
-        found = [(own, np.concatenate([points, _lit(own)]), who) for own, points, who in found]
+    found = []
+    for own in capsules[:, None]:
+        points = _darkened(own, sun, SKY_RADII * float(own[0, 0, 3]), LONGEST_M)
+        found.append((own, np.concatenate([points, _lit(own)]) if has_headlights else points, False))
     if len(bones):
         found.append((capsules[:0], _darkened(bones, sun, PERSON_SKY_M, PERSON_REACH_M), True))
     for own, points, is_person in found:

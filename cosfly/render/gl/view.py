@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosfly.render.camera import spheres_in_view
 from cosfly.render.contract import FAR_M, NEAR_M
 from cosfly.render.gl.parts import Parts
+from cosfly.work.compiled import njit
 
 SMALLEST_PX = 0.4  # an object whose radius on the image is below this is not drawn
 
@@ -25,25 +25,24 @@ class CameraView:
 
     def rows(self, parts: Parts) -> np.ndarray:
         """Rows of the parts to draw, nearest objects first."""
-        tangents, slants = self._cone()
-        rows, away = spheres_in_view(
-            parts.object_centers,
-            parts.object_radii,
-            np.maximum(parts.min_px, np.float32(SMALLEST_PX)),
-            parts.max_px,
-            self.eye.astype(np.float32),
-            np.ascontiguousarray(self.world_from_camera, np.float32),
-            tangents,
-            slants,
-            float(self.intrinsic[0, 0]),
-        )
+        least_px = np.maximum(parts.min_px, np.float32(SMALLEST_PX))
+        rows, away = self._spheres(parts.object_centers, parts.object_radii, least_px, parts.max_px)
         return rows[np.lexsort((away, -parts.records["bias"][rows]))]
 
     def shown(self, centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
         """Which spheres may be seen, the nearest first; centers (n, 3), radii (n,) float32, from the scene's origin."""
-        in_camera = self._in_camera(centers)
-        seen = np.flatnonzero(self._is_inside(in_camera, radii) & (self._size_px(in_camera, radii) >= SMALLEST_PX))
-        return seen[np.argsort((in_camera[:, 2] - radii)[seen], kind="stable")]
+        least_px, most_px = (np.full(len(radii), size, np.float32) for size in (SMALLEST_PX, np.inf))
+        rows, away = self._spheres(centers.astype(np.float32), radii, least_px, most_px)
+        return rows[np.argsort(away, kind="stable")]
+
+    def _spheres(
+        self, centers: np.ndarray, radii: np.ndarray, min_px: np.ndarray, max_px: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        middle, size = self.intrinsic[:2, 2], np.array([self.width_px, self.height_px])
+        tangents = np.maximum(middle, size - middle) / np.diag(self.intrinsic)[:2]
+        eye, turn = self.eye.astype(np.float32), np.ascontiguousarray(self.world_from_camera, np.float32)
+        slants = np.sqrt(1.0 + tangents**2)
+        return spheres_in_view(centers, radii, min_px, max_px, eye, turn, tangents, slants, float(self.intrinsic[0, 0]))
 
     def can_show(self, center: np.ndarray, radius: float) -> bool:
         """Tell whether something within a sphere may be seen; center: (3,) relative to the scene's origin."""
@@ -66,21 +65,36 @@ class CameraView:
     def _in_camera(self, centers: np.ndarray) -> np.ndarray:
         return (centers - self.eye.astype(np.float32)) @ self.world_from_camera.astype(np.float32)
 
-    def _is_inside(self, in_camera: np.ndarray, radius: np.ndarray) -> np.ndarray:
-        x, y, z = in_camera.T
-        tangents, slants = self._cone()
-        inside = (z + radius > NEAR_M) & (z - radius < FAR_M)
-        inside &= np.abs(x) - z * tangents[0] < radius * slants[0]
-        inside &= np.abs(y) - z * tangents[1] < radius * slants[1]
-        return inside
 
-    def _cone(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of the image's widest angle to each side, (2,): tangent, and how many radii off a sphere's middle may be."""
-        middle, size = self.intrinsic[:2, 2], np.array([self.width_px, self.height_px])
-        tangents = np.maximum(middle, size - middle) / np.diag(self.intrinsic)[:2]
-        return tangents, np.sqrt(1.0 + tangents**2)
+@njit(cache=True, nogil=True)
+def spheres_in_view(  # type: ignore[no-untyped-def]
+    centers, radii, min_px, max_px, eye, turn, tangents, slants, focal_px
+):
+    """Find the spheres that a camera may see, whose radius on the image lies in [min_px, max_px): one pass over all
+    that a map has.
 
-    def _size_px(self, in_camera: np.ndarray, radius: np.ndarray) -> np.ndarray:
-        """Radius on the image."""
-        x, y, z = in_camera.T
-        return float(self.intrinsic[0, 0]) * radius / np.maximum(np.sqrt(x * x + y * y + z * z) - radius, NEAR_M)
+    Args:
+        centers: (k, 3) float32 m; radii, min_px, max_px: (k,) float32; eye: (3,) float32 m; turn: (3, 3) float32,
+            world_from_camera.
+        tangents, slants: (2,) float64, of the widest angles to the sides and up: tangent, and 1 / cosine. focal_px:
+            float.
+    Returns:
+        rows (n,) int64, in their order; (n,) float32 m, how far along the axis each begins.
+    """
+    rows, away, count = np.empty(len(centers), np.int64), np.empty(len(centers), np.float32), 0
+    near, focal = np.float32(NEAR_M), np.float32(focal_px)
+    for k in range(len(centers)):
+        dx, dy, dz = centers[k, 0] - eye[0], centers[k, 1] - eye[1], centers[k, 2] - eye[2]
+        radius = radii[k]
+        z = dx * turn[0, 2] + dy * turn[1, 2] + dz * turn[2, 2]
+        if not (z + radius > near and z - radius < FAR_M):
+            continue
+        x = dx * turn[0, 0] + dy * turn[1, 0] + dz * turn[2, 0]
+        y = dx * turn[0, 1] + dy * turn[1, 1] + dz * turn[2, 1]
+        if abs(x) - z * tangents[0] >= radius * slants[0] or abs(y) - z * tangents[1] >= radius * slants[1]:
+            continue
+        size_px = focal * radius / max(np.sqrt(x * x + y * y + z * z) - radius, near)
+        if min_px[k] <= size_px < max_px[k]:
+            rows[count], away[count] = k, z - radius
+            count += 1
+    return rows[:count], away[:count]

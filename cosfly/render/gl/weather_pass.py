@@ -28,10 +28,8 @@ from cosfly.render.gl.programs import set_uniform
 
 
 CLEAR_HAZE_M = 620.0  # air without fog, as in Look.haze_m
-FOG_AT_FULL, FOG_POWER = (
-    0.10,
-    2.4,
-)  # extinction per m at 100 percent; dense fog (80) leaves 5 % of what stands 60 m away
+# Extinction per m at 100 percent; dense fog (80) leaves 5 % of what stands 60 m away.
+FOG_AT_FULL, FOG_POWER = 0.10, 2.4
 RAIN_EXTINCTION = 0.0045  # per m of the heaviest rain: a visibility of some 700 m
 MOON = np.array([-0.35, -0.62, 0.70])  # towards the moon, which is the light where the sun is down
 LOWEST_SUN_DEG, SUN_IS_DOWN_DEG = 2.5, -3.0  # a sun on the horizon still lights walls
@@ -169,10 +167,8 @@ def _mixed(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
 SOFT_M, FAINT = 0.25, 0.02  # from such a border on a shadow is drawn soft; a sun of less light throws none
 LAMP_UNIT, DEPTH_UNIT = 2, 3
 WIND = (0.07, 0.03)  # m to the side for each m that a drop falls
-GLOW_FROM, GLOW_SHRINK = (
-    208,
-    4,
-)  # levels that shine beyond their place; the glow is computed in a picture so many times smaller
+# Levels that shine beyond their place; the glow is computed in a picture so many times smaller.
+GLOW_FROM, GLOW_SHRINK = 208, 4
 GLOW_WIDTHS_PX = ((5.0, 0.22), (19.0, 0.16))  # of a picture of 1280 px: width, share
 
 
