@@ -45,9 +45,12 @@ def test_a_changed_word_of_it_is_found(dataset, tmp_path):
 
 def test_mlcroissant_accepts_it(dataset):
     pytest.importorskip("mlcroissant", reason="extra dev")
-    code = "import sys; from mlcroissant.scripts.cli import main; sys.argv[1:] = ['validate', '--jsonld', sys.argv[1]]; main()"
+    code = "from mlcroissant.scripts.cli import main; sys.argv[1:] = ['validate', '--jsonld', sys.argv[1]]; main()"
     done = subprocess.run(
-        [sys.executable, "-c", code, str(dataset / CROISSANT)], capture_output=True, text=True, check=False
+        [sys.executable, "-c", f"import sys; {code}", str(dataset / CROISSANT)],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert "Done" in done.stderr

@@ -1,4 +1,5 @@
-"""The statistics: figures against those of whole flights, tables against rows counted by hand, pages that show no foreign text as markup."""
+"""The statistics: figures against those of whole flights, tables against rows counted by hand, pages that show no
+foreign text as markup."""
 
 from __future__ import annotations
 
@@ -48,13 +49,15 @@ def counted(rows: list[dict]) -> Counts:
 def rows_of(positions: np.ndarray, frames: list[int], offsets: np.ndarray | None = None) -> list[dict]:
     """Rows at some frames of a flight, perturbed by known offsets."""
     offsets = np.zeros_like(positions) if offsets is None else offsets
+
+    def at(place: np.ndarray) -> dict[str, float]:
+        return dict.fromkeys(POSE, 0.0) | dict(zip(POINT, place.tolist(), strict=True))
+
+    nothing = dict.fromkeys(POINT, 0.0)
     return [
-        make_row(
-            i, "aug_001", pose=dict.fromkeys(POSE, 0.0) | dict(zip(POINT, (positions[i] + offsets[i]).tolist(), strict=True)),
-            drone_offset=dict.fromkeys(POSE, 0.0) | dict(zip(POINT, offsets[i].tolist(), strict=True)), target_offset=dict.fromkeys(POINT, 0.0),
-        )
+        make_row(i, "aug_001", pose=at(positions[i] + offsets[i]), drone_offset=at(offsets[i]), target_offset=nothing)
         for i in frames
-    ]  # fmt: skip
+    ]
 
 
 @given(seed=st.integers(0, 99), num=st.integers(4, 30))

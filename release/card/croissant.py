@@ -1,7 +1,8 @@
-"""`croissant.json`: the release in the machine-readable words of MLCommons Croissant 1.0, so that data-set searches and `mlcroissant` read it.
+"""`croissant.json`: the release in the machine-readable words of MLCommons Croissant 1.0, so that data-set searches and
+`mlcroissant` read it.
 
-`render_croissant` makes it of `release.json` alone, as the card is made, so that one which says anything else is found. Structs become
-one field a member (`pose/x_m`), pictures are images, depth is the bytes of a `.npy` file.
+`render_croissant` makes it of `release.json` alone, as the card is made, so that one which says anything else is found.
+Structs become one field a member (`pose/x_m`), pictures are images, depth is the bytes of a `.npy` file.
 """
 
 from __future__ import annotations
@@ -19,14 +20,16 @@ CROISSANT = "croissant.json"
 FRAMES = "frames"  # the one record set
 # The context that Croissant 1.0 asks for, to the letter.
 CONTEXT: dict[str, Any] = {
-    "@language": "en", "@vocab": "https://schema.org/", "citeAs": "cr:citeAs", "column": "cr:column", "conformsTo": "dct:conformsTo",
-    "cr": "http://mlcommons.org/croissant/", "rai": "http://mlcommons.org/croissant/RAI/", "data": {"@id": "cr:data", "@type": "@json"},
+    "@language": "en", "@vocab": "https://schema.org/", "citeAs": "cr:citeAs", "column": "cr:column",
+    "conformsTo": "dct:conformsTo", "cr": "http://mlcommons.org/croissant/",
+    "rai": "http://mlcommons.org/croissant/RAI/", "data": {"@id": "cr:data", "@type": "@json"},
     "dataType": {"@id": "cr:dataType", "@type": "@vocab"}, "dct": "http://purl.org/dc/terms/",
-    "equivalentProperty": "cr:equivalentProperty", "examples": {"@id": "cr:examples", "@type": "@json"}, "extract": "cr:extract",
-    "field": "cr:field", "fileProperty": "cr:fileProperty", "fileObject": "cr:fileObject", "fileSet": "cr:fileSet", "format": "cr:format",
-    "includes": "cr:includes", "isLiveDataset": "cr:isLiveDataset", "jsonPath": "cr:jsonPath", "key": "cr:key", "md5": "cr:md5",
-    "parentField": "cr:parentField", "path": "cr:path", "recordSet": "cr:recordSet", "references": "cr:references", "regex": "cr:regex",
-    "repeated": "cr:repeated", "replace": "cr:replace", "samplingRate": "cr:samplingRate", "sc": "https://schema.org/",
+    "equivalentProperty": "cr:equivalentProperty", "examples": {"@id": "cr:examples", "@type": "@json"},
+    "extract": "cr:extract", "field": "cr:field", "fileProperty": "cr:fileProperty", "fileObject": "cr:fileObject",
+    "fileSet": "cr:fileSet", "format": "cr:format", "includes": "cr:includes", "isLiveDataset": "cr:isLiveDataset",
+    "jsonPath": "cr:jsonPath", "key": "cr:key", "md5": "cr:md5", "parentField": "cr:parentField", "path": "cr:path",
+    "recordSet": "cr:recordSet", "references": "cr:references", "regex": "cr:regex", "repeated": "cr:repeated",
+    "replace": "cr:replace", "samplingRate": "cr:samplingRate", "sc": "https://schema.org/",
     "separator": "cr:separator", "source": "cr:source", "subField": "cr:subField", "transform": "cr:transform",
 }  # fmt: skip
 PARQUET = "application/x-parquet"
@@ -48,8 +51,9 @@ def render_croissant(record: ReleaseRecord) -> str:
         "conformsTo": "http://mlcommons.org/croissant/1.0",
         "name": re.sub(r"[^\w-]+", "-", record.name).strip("-") or "release",
         "alternateName": record.name,
-        "description": f"{record.numbers.frames} rendered frames of a drone that follows a walking person ({names}): pictures, poses, and "
-        f"reasons for manoeuvres in two languages. {record.credits} Axes: {CONTRACT['position']}. Depth: {CONTRACT['depth']}.",
+        "description": f"{record.numbers.frames} rendered frames of a drone that follows a walking person ({names}): "
+        f"pictures, poses, and reasons for manoeuvres in two languages. {record.credits} Axes: {CONTRACT['position']}. "
+        f"Depth: {CONTRACT['depth']}.",
         "license": record.licence,
         "creditText": " ".join(filter(None, [record.credits, *(entry.credits for entry in record.maps)])),
         "citeAs": f"{record.name}, made by {record.made_by}",
@@ -72,8 +76,8 @@ def _distribution(record: ReleaseRecord) -> list[dict[str, Any]]:
     """Each shard with its checksum, and the set of all, found by their names beside this file."""
     shards = [
         {
-            "@type": "cr:FileObject", "@id": shard.path, "name": shard.path, "contentUrl": shard.path, "contentSize": f"{shard.bytes} B",
-            "encodingFormat": PARQUET, "sha256": shard.sha256,
+            "@type": "cr:FileObject", "@id": shard.path, "name": shard.path, "contentUrl": shard.path,
+            "contentSize": f"{shard.bytes} B", "encodingFormat": PARQUET, "sha256": shard.sha256,
         }
         for shard in record.shards
     ]  # fmt: skip

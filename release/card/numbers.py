@@ -1,7 +1,7 @@
 """Every number of the card and of `release.json`, computed from the parquet shards; none is typed.
 
-Memory holds a row group and a few numbers a flight, however many frames there are. Sums are of whole millionths, so they are exact and the same
-in any order: shards can be counted by several processes and added up.
+Memory holds a row group and a few numbers a flight, however many frames there are. Sums are of whole millionths, so
+they are exact and the same in any order.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ LARGEST = 1e9  # of a value: beyond any town, flight and picture
 FLAGS = ("is_perturbed", "target_in_view", "target_visible", "has_caption")
 COVERED = ("style", "pace", "label")
 COLUMNS = [
-    "sample_id", *PLACE, "track", "style", "pace", "weather", "time_of_day", "frame_index", "time_s", "width_px", "height_px", "fov_deg", "pose", "drone_offset", "target",
+    "sample_id", *PLACE, "track", "style", "pace", "weather", "time_of_day", "frame_index", "time_s", "width_px",
+    "height_px", "fov_deg", "pose", "drone_offset", "target",
     "target_heading_deg", "target_mask_bbox", "visibility", *FLAGS, *COUNTED, *CAPTION_SHARES, *CAPTION_FIELDS,
 ]  # fmt: skip
 SCHEMA = schema(tuple(PICTURES))
@@ -46,26 +47,20 @@ def compute_numbers(shards: list[Path], num_frames: int | None) -> Numbers:
     Raises:
         InputError: a shard cannot be read, or holds a number that is none.
     """
-    counted = Counted()
+    counted = RowCounts()
     for shard in shards:
-        counted.merge(count_shard(shard))
+        for rows in row_lists(shard, COLUMNS):
+            counted.add(rows)
+            del rows  # before the next ones are made
     return counted.numbers(shards, num_frames)
-
-
-def count_shard(shard: Path) -> Counted:
-    """Count the rows of one shard; raises as `compute_numbers`."""
-    counted = Counted()
-    for rows in row_lists(shard, COLUMNS):
-        counted.add(rows)
-        del rows  # before the next ones are made
-    return counted
 
 
 def row_lists(shard: Path, columns: list[str]) -> Iterator[list[dict[str, Any]]]:
     """Yield the rows of a shard, a row group at a time, in which every value that must be there is there.
 
     Raises:
-        InputError: it cannot be read, has other columns than a release, or a required column, or a part of a pose, place or box, is null.
+        InputError: it cannot be read, has other columns than a release, or a required column, or a part of a pose,
+        place or box, is null.
     """
     for group in row_groups(shard, columns, tree=shard.parents[1]):
         check_columns(group, columns, shard)
@@ -161,7 +156,8 @@ def bounded(value: float) -> float:
 
 @dataclass
 class FlightCount:
-    """What is kept of a flight: frames, its first and last time and place without perturbation (None: not known), the way between.
+    """What is kept of a flight: frames, its first and last time and place without perturbation (None: not known), the
+    way between.
 
     A place is not known where a perturbed frame does not say how far it was shifted.
     """
@@ -195,8 +191,8 @@ SUMS = ("height_m", "distance_m", "visibility", *CAPTION_SHARES)
 
 
 @dataclass
-class Counted:
-    """Counts and sums of rows, in their order; what several counted can be merged."""
+class RowCounts:
+    """Counts and sums of rows, in their order."""
 
     rows: int = 0
     counts: dict[str, Counter[str]] = field(
@@ -219,32 +215,10 @@ class Counted:
                 names += [row[column]] if row[column] is not None else []
         if rows:
             values = np.array(seen, dtype=np.float64)
-            part = Coverage.of(
-                axis_values(values[:, :3], *values[:, 3:].T),
-                named["style"],
-                named["pace"],
-                named["label"],
-                skies=[(row["weather"], row["time_of_day"]) for row in rows],
-            )
+            axes, skies = axis_values(values[:, :3], *values[:, 3:].T), [(r["weather"], r["time_of_day"]) for r in rows]
+            part = Coverage.of(axes, named["style"], named["pace"], named["label"], skies=skies)
             self.coverage = Coverage.total([self.coverage, part]) if self.rows else part
         self.rows += len(rows)
-
-    def merge(self, later: Counted) -> None:
-        """Add what was counted of the rows that follow."""
-        for name, counts in later.counts.items():
-            self.counts[name].update(counts)
-        self.totals.update(later.totals)
-        self.characters.update(later.characters)
-        for name, values in later.sums.items():
-            self.sums[name].join(values)
-        for key, flight in later.flights.items():
-            self._go_on(key, flight)
-        for trajectory, frames in later.fovs.items():
-            self.fovs.setdefault(trajectory, Counter()).update(frames)
-        if later.rows:
-            self.coverage = Coverage.total([self.coverage, later.coverage]) if self.rows else later.coverage
-        self.example = self.example or later.example
-        self.rows += later.rows
 
     def _add(self, row: dict[str, Any]) -> tuple[float, ...]:
         """Count a row; give what the coverage needs: person to drone (x, y, z), heading, height in px, visibility."""
@@ -257,7 +231,11 @@ class Counted:
         pose, target, box = row["pose"], row["target"], row["target_mask_bbox"]
         place = clean_place(row)
         here = FlightCount(1, (row["time_s"], row["time_s"]), (place, place), is_known=place is not None)
-        self._go_on((row["track"], *(row[name] for name in PLACE)), here)
+        key = (row["track"], *(row[name] for name in PLACE))
+        if key in self.flights:
+            self.flights[key].join(here)
+        else:
+            self.flights[key] = here
         offset = [math.nan] * 3 if target is None else [pose[axis] - target[axis] for axis in POINT]
         if target is not None:
             self.sums["height_m"].add(offset[2])
@@ -270,12 +248,6 @@ class Counted:
         height_px = None if box is None else box["ymax_px"] - box["ymin_px"]
         known = (row["target_heading_deg"], height_px, row["visibility"])
         return (*offset, *(math.nan if value is None else value for value in known))
-
-    def _go_on(self, key: tuple[str, ...], later: FlightCount) -> None:
-        if key in self.flights:
-            self.flights[key].join(later)
-        else:
-            self.flights[key] = later
 
     def _add_caption(self, row: dict[str, Any]) -> None:
         for name in COUNTED:

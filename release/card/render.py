@@ -1,7 +1,8 @@
 """The data-set card: `render_card` turns release.json into README.md, so that a card which says anything else is found.
 
 Its numbers are those of `numbers.py`: build writes them into release.json, verify computes them again and compares.
-In words it says only what the record gives grounds for. Where it gives none, that is said. Every text that the template prints is escaped.
+In words it says only what the record gives grounds for. Where it gives none, that is said. Every text that the template
+prints is escaped.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from release.record import DepthCodingName, History, ReleaseRecord, SourceRecord
 MAPS = {
     "synthetic": "made by cosfly's generator from a seed; no real place",
     "simworld": "a SimWorld world: procedural, no real place that cosfly knows of",
-    "cityjson": "a 3D city model (CityJSON), of a real place where its makers say so; the buildings are theirs, surfaces and plants are drawn by cosfly",
+    "cityjson": "a 3D city model (CityJSON), of a real place where its makers say so; the buildings are theirs, "
+    "surfaces and plants are drawn by cosfly",
 }
 UNKNOWN_MAP = "made elsewhere; what it shows is not known to cosfly, see its licence and credits"
 DEPTH: dict[DepthCodingName, dict[str, str]] = {  # in words, and how a row of it is decoded
@@ -42,7 +44,8 @@ DEPTH: dict[DepthCodingName, dict[str, str]] = {  # in words, and how a row of i
     },
     "millimetre_png": {
         "text": "z-depth in millimetres, PNG of 16 bits",
-        "decode": 'depth_m = np.asarray(Image.open(io.BytesIO(row["depth"]))) / np.float32(1000.0)  # (height, width); 65.535 is sky, 0 invalid',
+        "decode": 'depth_m = np.asarray(Image.open(io.BytesIO(row["depth"]))) / np.float32(1000.0)  '
+        "# (height, width); 65.535 is sky, 0 invalid",
     },
 }
 FEW_WALKS = 10
@@ -121,8 +124,8 @@ def size_category(num_frames: int) -> str:
 
 
 def _front_matter(record: ReleaseRecord) -> str:
-    """Give what the hub reads. `synthetic`: only where all pictures are known to be rendered. The patterns of shards name the content: by
-    it the library's cache tells one release from another."""
+    """Give what the hub reads. `synthetic`: only where all pictures are known to be rendered. The patterns of shards
+    name the content: by it the library's cache tells one release from another."""
     rendered = all(_is_rendered_by_us(source) for source in record.provenance.sources)
     tags = ["uav", "aerial-tracking", *(["synthetic"] if rendered else [])]
     files = {"depth": "depth", "instance": "instance-segmentation"}

@@ -1,6 +1,8 @@
-"""Counts over the rows of a release, a row group at a time: what the tables are made of. Memory holds a few numbers a flight.
+"""Counts over the rows of a release, a row group at a time: what the tables are made of. Memory holds a few numbers a
+flight.
 
-Motion is that of the plan: positions less the recorded offsets, so that a perturbed flight counts as its clean twin does.
+Motion is that of the plan: positions less the recorded offsets, so that a perturbed flight counts as its clean twin
+does.
 """
 
 from __future__ import annotations
@@ -14,10 +16,14 @@ from typing import Any
 from cosfly.products.captions import FIELDS
 from cosfly.products.walks import TARGET_HEIGHT_M
 from release.card.numbers import Place3, Sum, bounded, clean_place
-from release.columns import BOX, LANGUAGES, PLACE, POINT, SCALARS, STATES
+from release.columns import BOX, LANGUAGES, PLACE, POINT, POSE, SCALARS, STATES
 
 SAME_FOV_DEG = 0.05
 LEAST_STEP_S = 1e-3  # between two frames
+STATES_OF = {  # shifted, turned
+    (False, False): "unperturbed", (True, False): "position only", (False, True): "rotation only", (True, True): "full",
+}  # fmt: skip
+LOOK = "sun {sun_azimuth_deg:g} deg, {sun_elevation_deg:g} deg high; haze {haze_m:g} m; exposure {exposure:g}"
 TEXT_BIN = {"en": 25, "zh": 10}  # characters
 # What a frame may be annotated with: a name, and the column that holds it.
 ANNOTATIONS = {column.title: column.name for column in SCALARS if column.annotation}
@@ -27,8 +33,8 @@ ANNOTATIONS = {column.title: column.name for column in SCALARS if column.annotat
 class FlightSums:
     """Sums over the frames of one flight. fov_deg, focal_px: of its first frame; zooms: later ones have others.
 
-    path_m: the way of the clean motion through its frames. accel, jerk: squares of the differences of four frames in a row, and how many. tail: the
-    last frames in a row, index, s, place.
+    path_m: the way of the clean motion through its frames. accel, jerk: squares of the differences of four frames in a
+    row, and how many. tail: the last frames in a row, index, s, place.
     """
 
     track: str
@@ -152,14 +158,9 @@ class Counts:
         self.frames += 1
         place = tuple(row[name] for name in PLACE)
         if place not in self.flights:
-            self.flights[place] = FlightSums(
-                row["track"],
-                row["town"],
-                row["split"],
-                row["walk"],
-                bounded(row["fov_deg"]),
-                bounded(row["intrinsics"]["fx"]) if row["intrinsics"] else None,
-            )
+            focal_px = bounded(row["intrinsics"]["fx"]) if row["intrinsics"] else None
+            names = {name: row[name] for name in ("track", "town", "split", "walk")}
+            self.flights[place] = FlightSums(**names, fov_deg=bounded(row["fov_deg"]), focal_px=focal_px)
         self.flights[place].add(row)
         self.annotated.update(name for name, column in ANNOTATIONS.items() if row[column] is not None)
         self.image_px[f"{row['width_px']} x {row['height_px']} px"] += 1
@@ -168,11 +169,7 @@ class Counts:
         self.last = (place, row["frame_index"], row["time_s"])
         self.weather[row["weather"], row["time_of_day"]] += 1
         if row["look"] is not None:
-            self.looks[
-                "sun {sun_azimuth_deg:g} deg, {sun_elevation_deg:g} deg high; haze {haze_m:g} m; exposure {exposure:g}".format(
-                    **row["look"]
-                )
-            ] += 1
+            self.looks[LOOK.format(**row["look"])] += 1
         self._over_frames(row)
         self._perturbed(row)
         if row["has_caption"]:
@@ -194,20 +191,10 @@ class Counts:
                 self.events[row["track"], event, outcome] += 1
         offset, walker = row["drone_offset"], row["target_offset"]
         if row["track"] == "perturbed" and offset is not None:
-            shift_m, turn_deg = (
-                math.hypot(*(offset[name] for name in names)) for names in (POINT, ("pitch_deg", "yaw_deg", "roll_deg"))
-            )
+            shift_m, turn_deg = (math.hypot(*(offset[name] for name in names)) for names in (POINT, POSE[3:]))
             walker_m = 0.0 if walker is None else math.hypot(*(walker[name] for name in POINT))
             is_shifted, is_turned = shift_m > 0.0 or walker_m > 0.0, turn_deg > 0.0
-            self.states[
-                "full"
-                if is_shifted and is_turned
-                else "position only"
-                if is_shifted
-                else "rotation only"
-                if is_turned
-                else "unperturbed"
-            ] += 1
+            self.states[STATES_OF[is_shifted, is_turned]] += 1
             for name, value in (
                 ("shift of the drone, m", shift_m),
                 ("shift of the person, m", walker_m),
@@ -228,13 +215,8 @@ class Counts:
             if all(count is not None for count in counts.values()):
                 for state, count in counts.items():
                     self.sentences[language, state] += count
-                kind = (
-                    "a contradicted one"
-                    if counts["contradicted"]
-                    else "some unread"
-                    if counts["unread"]
-                    else "all proved"
-                )
+                kind = "some unread" if counts["unread"] else "all proved"
+                kind = "a contradicted one" if counts["contradicted"] else kind
                 self.whole[language, kind] += 1
             for name in FIELDS[:2]:
                 length = len(row[f"caption_{language}_{name}"] or "")

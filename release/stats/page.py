@@ -31,7 +31,8 @@ def page_html(
     """
     return page(
         "release/stats/page.html", title=", ".join(stats.runs) or stats.name, style=STYLE, stats=stats, tiles=tiles,
-        picture=picture, coverage=coverage_html(coverage), shown=shown, numeric_columns=_numeric_columns, greatest=_greatest,
+        picture=picture, coverage=coverage_html(coverage), shown=shown, numeric_columns=_numeric_columns,
+        greatest=_greatest,
     )  # fmt: skip
 
 

@@ -1,4 +1,5 @@
-"""What the pictures of some frames hold: percentiles of depth, and shares of pixels by kind. Frames are taken evenly over the whole release."""
+"""What the pictures of some frames hold: percentiles of depth, and shares of pixels by kind. Frames are taken evenly
+over the whole release."""
 
 from __future__ import annotations
 

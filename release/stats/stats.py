@@ -6,7 +6,7 @@ from pathlib import Path
 
 from cosfly.work.console import progress_bar
 from cosfly.work.store import write_bytes, write_json
-from release.card.numbers import Counted, check_rows, row_lists
+from release.card.numbers import RowCounts, check_rows, row_lists
 from release.columns import SHORT_NAMES
 from release.record import read_record, release_folder
 from release.stats.counting import Counts
@@ -16,7 +16,8 @@ from release.stats.tables import make_stats
 
 
 def run(dataset: Path, out: Path, *, pixels: int = 200) -> Path:
-    """Reads a release folder; writes `stats.json`, `stats.md`, `stats.html` and gives the page. Memory holds a row group and a few numbers a flight.
+    """Reads a release folder; writes `stats.json`, `stats.md`, `stats.html` and gives the page. Memory holds a row
+    group and a few numbers a flight.
 
     Args:
         pixels: frames whose depth and instance pictures are decoded; 0 for none.
@@ -25,7 +26,7 @@ def run(dataset: Path, out: Path, *, pixels: int = 200) -> Path:
     """
     dataset = release_folder(dataset)
     record = read_record(dataset / "release.json")
-    counts, card = Counts(), Counted()
+    counts, card = Counts(), RowCounts()
     with progress_bar("stats: rows", sum(shard.rows for shard in record.shards)) as advance:
         for shard in record.shards:
             check_rows(dataset / shard.path, shard.rows)

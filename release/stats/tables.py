@@ -24,16 +24,17 @@ from release.stats.pixels import Pixels
 Cell = str | int | float | None
 Rows = list[list[Cell]]
 Plot = Literal["bars", "stacked", "heat"]
-SPREAD = ["axis", "mean", "std", "least", "most", "values"]  # the head of a table of spread rows
 REVIEW_BELOW = 0.5  # of the smoothness score (sec:step6)
 VERDICTS = ("CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN")
 MOST_LOOKS = 40
+WHOLE = ("all proved", "a contradicted one", "some unread")  # what the sentences of a caption are together
 
 
 class Table(BaseModel):
     """One table. paper: the label of the paper's; rows: as long as `head`; plot: how the page draws it beside.
 
-    bars: the second column as bars, named by the first. stacked: all columns of numbers, a bar a row. heat: the numbers of a row and column of names.
+    bars: the second column as bars, named by the first. stacked: all columns of numbers, a bar a row. heat: the numbers
+    of a row and column of names.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -71,6 +72,43 @@ class Stats(BaseModel):
     rules: dict[str, str] = {}
 
 
+SPREAD = "axis|mean|std|least|most|values"
+LENGTHS = [(language, name) for language in LANGUAGES for name in FIELDS[:2]]
+SHAPES: dict[str, tuple[str, str, str, Plot | None]] = {  # of each table: title, of the paper, head, how it is drawn
+    "release": ("The release", "sec:dataset_stats, sec:exp_release", "|number", None),
+    "quality_stats": ("Funnel and smoothness", "tab:quality_stats", "|value", None),
+    "dist_stats": ("Per-axis statistics over trajectories", "tab:dist_stats", SPREAD, None),
+    "dist_frames": ("The same over frames", "tab:dist_stats", SPREAD, None),
+    "decisions": ("Decisions", "tab:coc_actions", "action|decisions|%|labels|% |group", "bars"),
+    "confusion": ("Label (rows) against decision (columns)", "fig:confusion_patterns", "label", "heat"),
+    "verdicts": ("Decision against the geometry", "fig:consistency_verdict", "verdict|captions|%", "bars"),
+    "repairs": ("Repairs", "fig:regen_strategy", "strategy|captions|%", "bars"),
+    "teachers": ("Teachers", "tab:caption_pipeline", "|number", None),
+    "evidence": ("Evidence of sentences", "", "language|" + "|".join(STATES), "stacked"),
+    "evidence_captions": ("Evidence of captions", "", "language|" + "|".join(WHOLE), "stacked"),
+    "text_lengths": ("Length of the texts", "fig:coc_lengths", SPREAD.replace("axis", "text") + "|floor", None),
+    **{
+        f"lengths_{language}_{name}": (f"{LANGUAGE_NAMES[language]}, {name.replace('_', ' ')}: characters",
+                                       "fig:coc_lengths", "characters|captions", "bars")
+        for language, name in LENGTHS
+    },
+    "annotations": ("Annotations of a frame", "sec:dataset_stats", "annotation|frames|%", None),
+    "towns": ("Towns", "sec:exp_release", "town|trajectories|frames|captions|map (licence)", "bars"),
+    "splits": ("Splits", "", "split|frames|captions|flights|trajectories|walks|towns", "bars"),
+    "zoom_eval": ("Zoom", "tab:zoom_eval", "level|field of view, deg|track|focal length, px|flights|width, px|"
+                  "height, px|visibility, %|IoU", None),
+    "fovs": ("Fields of view", "tab:zoom_config, sec:exp_release", "degrees|trajectories|frames", "bars"),
+    "weather": ("Weather and time of day", "tab:weather_coverage", "preset", "heat"),
+    "looks": ("Sun and air", "", "look|frames", None),
+    "augmentation_states": ("Perturbation", "tab:augmentation_states", "state|frames|%", "bars"),
+    "offsets": ("Size of the offsets", "", SPREAD, None),
+    "events": ("What became of each perturbation", "sec:exp_zoom", "track|event|outcome|frames", None),
+    "files": ("Bytes", "", "|bytes|a frame", None),
+    "depth": ("Depth, percentiles", "sec:step6", "pixels nearer than|m", None),
+    "semantics": ("Kinds in the pictures", "sec:step6", "kind|% of pixels|% of frames", "bars"),
+}  # fmt: skip
+
+
 def make_stats(record: ReleaseRecord, counts: Counts, pixels: Pixels | None) -> Stats:
     """Put the tables together.
 
@@ -78,21 +116,22 @@ def make_stats(record: ReleaseRecord, counts: Counts, pixels: Pixels | None) -> 
         pixels: of some frames' pictures; None where nobody looked at them.
     """
     tables = [
-        _release(record, counts), _quality(record, counts), _dist(record, counts), _frames(counts), *_captions(record, counts),
-        _annotations(record, counts), _towns(record, counts), _splits(record), _zoom(counts), _fovs(counts), *weather(counts),
-        *_perturbation(counts), _files(record), *_pixels(pixels),
+        _release(record, counts), _quality(record, counts), _dist(record, counts), _frames(counts),
+        *_captions(record, counts), _annotations(record, counts), _towns(record, counts), _splits(record),
+        _zoom(counts), _fovs(counts), *weather(counts), *_perturbation(counts), _files(record), *_pixels(pixels),
     ]  # fmt: skip
     return Stats(
-        name=record.name, runs=[source.run for source in record.provenance.sources], content_digest=record.content_digest,
-        tables=[table for table in tables if table is not None], absent=_absent(record, counts, pixels),
+        name=record.name, runs=[source.run for source in record.provenance.sources], tables=tables,
+        content_digest=record.content_digest, absent=_absent(record, counts, pixels),
         rules={"Frames of a flight": record.frame_selection, "Splits": record.splits.rule},
     )  # fmt: skip
 
 
-def _table(
-    key: str, title: str, head: list[str], rows: Rows, *, paper: str = "", note: str = "", plot: Plot | None = None
-) -> Table:
-    return Table(key=key, title=title, head=head, rows=rows, paper=paper or None, note=note, plot=plot)
+def _table(key: str, rows: Rows, note: str = "", more: Iterable[str] = (), title: str = "") -> Table:
+    """Give a table by its shape. more: of its head, behind what stands there."""
+    name, paper, head, plot = SHAPES[key]
+    heads = [*head.split("|"), *more]
+    return Table(key=key, title=title or name, head=heads, rows=rows, paper=paper or None, note=note, plot=plot)
 
 
 # --- cells ------------------------------------------------------------------------------------------------------------
@@ -100,6 +139,10 @@ def _table(
 
 def _pairs(front: str, counted: Iterable[tuple[str, int]]) -> Rows:
     return [[front + name, count] for name, count in counted]
+
+
+def _shares(counted: Iterable[tuple[str, int]], total: int) -> Rows:
+    return [[name, count, percent(count, total)] for name, count in counted]
 
 
 def _spread_row(title: str, spread: Spread) -> list[Cell]:
@@ -132,31 +175,23 @@ def percent(count: int, total: int) -> float | None:
 
 def _release(record: ReleaseRecord, counts: Counts) -> Table:
     flights, numbers, planned = counts.flights.values(), record.numbers, record.history.trajectories
-    rendered, released = [one.frames_available for one in record.flights], [one.frames for one in flights]
     steps: Cell = ", ".join(f"{step:g}" for step in sorted(counts.step_s)) or None
     if len(counts.step_s) == 1:
         steps = next(iter(counts.step_s))  # a number stands where numbers stand
+    rows: Rows = [["trajectories", numbers.trajectories]]
+    rows += _pairs("flights, ", sorted(Counter(flight.track for flight in flights).items()))
     kinds = record.settings.modalities
-    rows: Rows = [
-        ["trajectories", numbers.trajectories],
-        *_pairs("flights, ", sorted(Counter(flight.track for flight in flights).items())),
-        ["walks", len({flight.walk for flight in flights})],
-        ["frames", counts.frames],
-        [f"pictures ({', '.join(kinds)})", counts.frames * len(kinds)],
-        ["frames of a flight as rendered, least", min(rendered, default=None)],
-        ["frames of a flight as rendered, most", max(rendered, default=None)],
-        ["frames of a flight as released, least", min(released, default=None)],
-        ["frames of a flight as released, most", max(released, default=None)],
-        ["time step, s", steps],
-        *_pairs("frames of ", counts.image_px.most_common()),
-        ["captions", numbers.captions.frames_with],
-        [
-            "trajectories planned for one accepted",
-            round(planned.planned / planned.accepted, 2) if planned and planned.accepted else None,
-        ],
-    ]
-    paper = "sec:dataset_stats, sec:exp_release"
-    return _table("release", "The release", ["", "number"], rows, paper=paper)
+    rows += [["walks", len({flight.walk for flight in flights})], ["frames", counts.frames]]
+    rows += [[f"pictures ({', '.join(kinds)})", counts.frames * len(kinds)]]
+    for when, lengths in (
+        ("rendered", [one.frames_available for one in record.flights]), ("released", [one.frames for one in flights]),
+    ):  # fmt: skip
+        rows += [[f"frames of a flight as {when}, least", min(lengths, default=None)]]
+        rows += [[f"frames of a flight as {when}, most", max(lengths, default=None)]]
+    rows += [["time step, s", steps], *_pairs("frames of ", counts.image_px.most_common())]
+    each = round(planned.planned / planned.accepted, 2) if planned and planned.accepted else None
+    rows += [["captions", numbers.captions.frames_with], ["trajectories planned for one accepted", each]]
+    return _table("release", rows)
 
 
 def _quality(record: ReleaseRecord, counts: Counts) -> Table:
@@ -182,12 +217,13 @@ def _quality(record: ReleaseRecord, counts: Counts) -> Table:
         [f"trajectories with S below {REVIEW_BELOW:g}", sum(score < REVIEW_BELOW for score in scores)],
         ["trajectories whose motion is known", len(known)],
     ]
-    note = "The way to the release is as the record tells it. Acceleration and jerk: of the motion without perturbation, over frames in a row."
-    return _table("quality_stats", "Funnel and smoothness", ["", "value"], rows, paper="tab:quality_stats", note=note)
+    note = "The way to the release is as the record tells it. Acceleration and jerk: of the motion without "
+    return _table("quality_stats", rows, note + "perturbation, over frames in a row.")
 
 
 def smoothness(counts: Counts) -> tuple[list[tuple[float, float]], int, list[float]]:
-    """Give acceleration and jerk of the trajectories whose motion is known, how many are within the paper's bounds, and their scores."""
+    """Give acceleration and jerk of the trajectories whose motion is known, how many are within the paper's bounds, and
+    their scores."""
     dynamics = [(flight.accel_rms_mps2, flight.jerk_rms_mps3) for flight in _trajectories(counts)]
     known = [(accel, jerk) for accel, jerk in dynamics if accel is not None and jerk is not None]
     within = sum(accel <= ACCEL_RMS_MAX_MPS2 and jerk <= JERK_RMS_MAX_MPS3 for accel, jerk in known)
@@ -222,22 +258,17 @@ def _dist(record: ReleaseRecord, counts: Counts) -> Table:
         _spread_row("five-ray visibility, as inspected", spread_of(_five_ray(record, counts))),
     ]
     note = (
-        "Means of each trajectory, as flown without perturbation: of its clean flight, else its perturbed one less the recorded offsets. "
-        f"The length is that through the released frames: of {sum(f.frames for f in flights):,} frames."
+        "Means of each trajectory, as flown without perturbation: of its clean flight, else its perturbed one less the "
+        f"recorded offsets. The length is that through {sum(f.frames for f in flights):,} released frames."
     )
-    title = "Per-axis statistics over trajectories"
-    return _table("dist_stats", title, SPREAD, rows, paper="tab:dist_stats", note=note)
+    return _table("dist_stats", rows, note)
 
 
 def _frames(counts: Counts) -> Table:
-    titles = {
-        "altitude": "altitude over the person's ground, m",
-        "distance": "target distance, m",
-        "visibility": "rendered visibility",
-    }
+    titles = {"altitude": "altitude over the person's ground, m", "distance": "target distance, m"}
+    titles["visibility"] = "rendered visibility"
     rows = [_spread_row(title, counts.over_frames[name].spread()) for name, title in titles.items()]
-    note = "Both tracks, as the pictures show it, perturbation and all."
-    return _table("dist_frames", "The same over frames", SPREAD, rows, paper="tab:dist_stats", note=note)
+    return _table("dist_frames", rows, "Both tracks, as the pictures show it, perturbation and all.")
 
 
 # --- captions ---------------------------------------------------------------------------------------------------------
@@ -245,12 +276,12 @@ def _frames(counts: Counts) -> Table:
 
 def _captions(record: ReleaseRecord, counts: Counts) -> list[Table]:
     """What captions say: decisions, verdicts, repairs, evidence, lengths."""
-    repairs: Rows = [[name, n, percent(n, counts.repairs.total())] for name, n in counts.repairs.most_common()]
-    head = ["strategy", "captions", "%"]
+    order = [name for name in (*record.closed_set, "none") if counts.labels[name] or counts.decisions[name]]
+    confusion: Rows = [[label, *(counts.confusion[label, decision] for decision in order)] for label in order]
+    repairs = _shares(counts.repairs.most_common(), counts.repairs.total())
     return [
-        _decisions(record, counts), _confusion(record, counts), _verdicts(counts),
-        _table("repairs", "Repairs", head, repairs, paper="fig:regen_strategy", plot="bars"),
-        _teachers(record), *_evidence(counts), _lengths(counts), *_length_bins(counts),
+        _decisions(record, counts), _table("confusion", confusion, more=order), _verdicts(counts),
+        _table("repairs", repairs), _teachers(record), *_evidence(counts), *_lengths(counts),
     ]  # fmt: skip
 
 
@@ -264,31 +295,17 @@ def _decisions(record: ReleaseRecord, counts: Counts) -> Table:
         shares = percent(decisions[name], total), percent(labels[name], labelled)
         rows.append([name, decisions[name], shares[0], labels[name], shares[1], group])
     note = f"Decisions of {total:,} captions, and the labels that the later positions imply for {labelled:,} of them."
-    head = ["action", "decisions", "%", "labels", "% ", "group"]
-    return _table("decisions", "Decisions", head, rows, paper="tab:coc_actions", note=note, plot="bars")
-
-
-def _confusion(record: ReleaseRecord, counts: Counts) -> Table:
-    order = [name for name in (*record.closed_set, "none") if counts.labels[name] or counts.decisions[name]]
-    rows: Rows = [[label, *(counts.confusion[label, decision] for decision in order)] for label in order]
-    title, paper = "Label (rows) against decision (columns)", "fig:confusion_patterns"
-    return _table("confusion", title, ["label", *order], rows, paper=paper, plot="heat")
+    return _table("decisions", rows, note)
 
 
 def _verdicts(counts: Counts) -> Table:
     tracks = sorted({track for _, track in counts.verdicts})
     names = [*VERDICTS, *sorted({name for name, _ in counts.verdicts} - set(VERDICTS))]
-    rows: Rows = []
-    for name in names:
-        own = [counts.verdicts[name, track] for track in tracks]
-        rows.append([name, sum(own), percent(sum(own), counts.verdicts.total()), *own])
+    own = {name: [counts.verdicts[name, track] for track in tracks] for name in names}
+    total = counts.verdicts.total()
+    rows: Rows = [[name, sum(each), percent(sum(each), total), *each] for name, each in own.items()]
     note = "Of accepted captions, after repair: what the paper's figure shows is of first answers, before it."
-    title, head, paper = (
-        "Decision against the geometry",
-        ["verdict", "captions", "%", *tracks],
-        "fig:consistency_verdict",
-    )
-    return _table("verdicts", title, head, rows, paper=paper, note=note, plot="bars")
+    return _table("verdicts", rows, note, tracks)
 
 
 def _teachers(record: ReleaseRecord) -> Table:
@@ -297,48 +314,34 @@ def _teachers(record: ReleaseRecord) -> Table:
     rows += [["asks", made.asks], *_pairs("", [(name.replace("_", " "), count) for name, count in made.tokens.items()])]
     rows += [["first answers that stood", made.repairs.first_answers]]
     rows += _pairs("repaired by ", made.repairs.repaired_by_rung.items())
-    note = "As the record tells it, of all captions that were read."
-    return _table("teachers", "Teachers", ["", "number"], rows, paper="tab:caption_pipeline", note=note)
+    return _table("teachers", rows, "As the record tells it, of all captions that were read.")
 
 
 def _evidence(counts: Counts) -> list[Table]:
     if not counts.sentences:
         return []
-    kinds = ("all proved", "a contradicted one", "some unread")
-    sentences: Rows = [
-        [LANGUAGE_NAMES[name], *(counts.sentences[name, state] for state in STATES)] for name in LANGUAGES
-    ]
-    captions: Rows = [[LANGUAGE_NAMES[name], *(counts.whole[name, kind] for kind in kinds)] for name in LANGUAGES]
-    note, title = "Sentences of the captions against the geometry of their flight.", "Evidence of sentences"
+
+    def rows(counted: Counter[tuple[str, str]], kinds: Iterable[str]) -> Rows:
+        return [[LANGUAGE_NAMES[name], *(counted[name, kind] for kind in kinds)] for name in LANGUAGES]
+
+    note = "Sentences of the captions against the geometry of their flight."
     return [
-        _table("evidence", title, ["language", *STATES], sentences, note=note, plot="stacked"),
-        _table("evidence_captions", "Evidence of captions", ["language", *kinds], captions, plot="stacked"),
+        _table("evidence", rows(counts.sentences, STATES), note),
+        _table("evidence_captions", rows(counts.whole, WHOLE)),
     ]
 
 
-def _lengths(counts: Counts) -> Table:
-    rows: Rows = []
-    for language in LANGUAGES:
-        least = MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS
-        for name in FIELDS[:2]:
-            title = f"{LANGUAGE_NAMES[language]}, {name.replace('_', ' ')}"
-            rows.append([*_spread_row(title, counts.lengths[language, name].spread()), least[name]])
-    note, head = "Characters. The last column is the least that an answer may have.", ["text", *SPREAD[1:], "floor"]
-    return _table("text_lengths", "Length of the texts", head, rows, paper="fig:coc_lengths", note=note)
-
-
-def _length_bins(counts: Counts) -> list[Table]:
-    tables = []
-    for language in LANGUAGES:
-        for name in FIELDS[:2]:
-            found = {k: n for (own, field, k), n in counts.length_bins.items() if (own, field) == (language, name)}
-            width = TEXT_BIN[language]
-            bins = range(min(found, default=0), max(found, default=-1) + 1)
-            rows: Rows = [[f"{k * width} to {k * width + width - 1}", found.get(k, 0)] for k in bins]
-            title = f"{LANGUAGE_NAMES[language]}, {name.replace('_', ' ')}: characters"
-            key, head = f"lengths_{language}_{name}", ["characters", "captions"]
-            tables += [_table(key, title, head, rows, paper="fig:coc_lengths", plot="bars")] if rows else []
-    return tables
+def _lengths(counts: Counts) -> list[Table]:
+    rows, tables = list[list[Cell]](), list[Table]()
+    for language, name in LENGTHS:
+        least = (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS)[name]
+        title = f"{LANGUAGE_NAMES[language]}, {name.replace('_', ' ')}"
+        rows.append([*_spread_row(title, counts.lengths[language, name].spread()), least])
+        found = {k: n for (own, field, k), n in counts.length_bins.items() if (own, field) == (language, name)}
+        width, bins = TEXT_BIN[language], range(min(found, default=0), max(found, default=-1) + 1)
+        binned: Rows = [[f"{k * width} to {k * width + width - 1}", found.get(k, 0)] for k in bins]
+        tables += [_table(f"lengths_{language}_{name}", binned)] if binned else []
+    return [_table("text_lengths", rows, "Characters. The last column is the least that an answer may have."), *tables]
 
 
 # --- frames -----------------------------------------------------------------------------------------------------------
@@ -347,23 +350,20 @@ def _length_bins(counts: Counts) -> list[Table]:
 def _annotations(record: ReleaseRecord, counts: Counts) -> Table:
     found = {f"picture: {PICTURES[file].name}": counts.frames for file in record.settings.modalities}
     found |= {name: counts.annotated[name] for name in ANNOTATIONS}
-    rows: Rows = [[name, count, percent(count, counts.frames)] for name, count in found.items()]
-    head = ["annotation", "frames", "%"]
-    return _table("annotations", "Annotations of a frame", head, rows, paper="sec:dataset_stats")
+    return _table("annotations", _shares(found.items(), counts.frames))
 
 
 def _towns(record: ReleaseRecord, counts: Counts) -> Table:
-    frames, captions, trajectories = Counter[str](), Counter[str](), Counter[str]()
+    frames, captions = Counter[str](), Counter[str]()
     for flight in counts.flights.values():
         frames[flight.town] += flight.frames
         captions[flight.town] += flight.captions
-    trajectories.update(flight.town for flight in _trajectories(counts))
-    maps = {shown.town: f"{shown.name} ({shown.licence})" for shown in record.maps}
+    trajectories = Counter(flight.town for flight in _trajectories(counts))
+    maps = {one.town: f"{one.name} ({one.licence})" for one in record.maps}
     rows: Rows = [
         [town, trajectories[town], frames[town], captions[town], maps.get(town, "")] for town in sorted(frames)
     ]
-    head = ["town", "trajectories", "frames", "captions", "map (licence)"]
-    return _table("towns", "Towns", head, rows, paper="sec:exp_release", plot="bars")
+    return _table("towns", rows)
 
 
 def _splits(record: ReleaseRecord) -> Table:
@@ -371,8 +371,7 @@ def _splits(record: ReleaseRecord) -> Table:
         [split, own.frames, own.captions, own.flights, own.trajectories, len(own.walks), len(own.towns)]
         for split, own in record.splits.splits.items()
     ]
-    head = ["split", "frames", "captions", "flights", "trajectories", "walks", "towns"]
-    return _table("splits", f"Splits, by {record.splits.by}", head, rows, plot="bars")
+    return _table("splits", rows, title=f"Splits, by {record.splits.by}")
 
 
 def _zoom(counts: Counts) -> Table:
@@ -390,14 +389,11 @@ def _zoom(counts: Counts) -> Table:
     here = {round(fov) for fov, _ in groups}
     missing = ", ".join(f"{name} ({fov} deg)" for fov, name in LEVEL_NAMES.items() if fov not in here)
     note = (
-        "Means over the frames that show the person, then over flights. Size: of the projected box; IoU: of that box and the box of the person's pixels. "
-        'A flight of one field of view is in its row, one that zooms under "changing", so rows are of different flights; the paper\'s study of the same flights at four is another matter.'
+        "Means over the frames that show the person, then over flights. Size: of the projected box; IoU: of it and "
+        "the box of the person's pixels. A flight of one field of view is in its row, one that zooms under "
+        '"changing", so rows are of different flights; the paper\'s study of the same flights is another matter.'
     )
-    note += f" Not in this release: {missing}." if missing else ""
-    head = [
-        "level", "field of view, deg", "track", "focal length, px", "flights", "width, px", "height, px", "visibility, %", "IoU",
-    ]  # fmt: skip
-    return _table("zoom_eval", "Zoom", head, rows, paper="tab:zoom_eval", note=note)
+    return _table("zoom_eval", rows, note + (f" Not in this release: {missing}." if missing else ""))
 
 
 def _fovs(counts: Counts) -> Table:
@@ -406,8 +402,7 @@ def _fovs(counts: Counts) -> Table:
         frames[_fov_of(flight)] += flight.frames
     trajectories = Counter(map(_fov_of, _trajectories(counts)))
     rows: Rows = [[f"{fov:g}" if fov else "changing", trajectories[fov], frames[fov]] for fov in sorted(frames)]
-    head, paper = ["degrees", "trajectories", "frames"], "tab:zoom_config, sec:exp_release"
-    return _table("fovs", "Fields of view", head, rows, paper=paper, plot="bars")
+    return _table("fovs", rows)
 
 
 def _fov_of(flight: FlightSums) -> float:
@@ -416,21 +411,18 @@ def _fov_of(flight: FlightSums) -> float:
 
 
 def weather(counts: Counts) -> list[Table]:
-    """Frames by preset and time of day: no table where no frame names one, and sun and air where the frames tell these."""
+    """Frames by preset and time of day where a frame names one, and sun and air where the frames tell these."""
     tables = []
-    named = Counter(
-        {(_token(a), _token(b)): n for (a, b), n in counts.weather.items() if a is not None or b is not None}
-    )
+    named = Counter({(_token(a), _token(b)): n for (a, b), n in counts.weather.items() if (a, b) != (None, None)})
     if named:
         presets = [*WEATHERS, *sorted({weather for weather, _ in named} - set(WEATHERS))]
         times = [*TIMES, *sorted({time for _, time in named} - set(TIMES))]
         rows: Rows = [[preset, *(named[preset, time] for time in times)] for preset in presets]
-        note = f"Frames. Presets of the paper are all listed; {len(named)} of {len(presets) * len(times)} pairs are in this release."
-        title, head = "Weather and time of day", ["preset", *times]
-        tables += [_table("weather", title, head, rows, paper="tab:weather_coverage", note=note, plot="heat")]
+        pairs = f"{len(named)} of {len(presets) * len(times)} pairs are in this release."
+        tables += [_table("weather", rows, f"Frames. Presets of the paper are all listed; {pairs}", times)]
     if counts.looks:
-        looks, note = _pairs("", counts.looks.most_common(MOST_LOOKS)), "Of the renderer's own settings."
-        tables += [_table("looks", "Sun and air", ["look", "frames"], looks, note=note)]
+        looks = _pairs("", counts.looks.most_common(MOST_LOOKS))
+        tables += [_table("looks", looks, "Of the renderer's own settings.")]
     return tables
 
 
@@ -440,20 +432,17 @@ def _token(text: str | None) -> str:
 
 def _perturbation(counts: Counts) -> list[Table]:
     tables = []
-    total = counts.states.total()
-    if total:
+    if total := counts.states.total():
         order = ("unperturbed", "position only", "rotation only", "full")
-        rows: Rows = [[state, counts.states[state], percent(counts.states[state], total)] for state in order]
-        note = "Frames of perturbed flights by what of their recorded offsets is not zero: after fallbacks, so fewer are perturbed than were drawn."
-        key, head = "augmentation_states", ["state", "frames", "%"]
-        tables += [_table(key, "Perturbation", head, rows, paper=f"tab:{key}", note=note, plot="bars")]
+        rows: Rows = _shares(((state, counts.states[state]) for state in order), total)
+        note = "Frames of perturbed flights by what of their recorded offsets is not zero: after fallbacks, so fewer "
+        tables += [_table("augmentation_states", rows, note + "are perturbed than were drawn.")]
         sizes = {name: values for name, values in counts.over_frames.items() if name.endswith((", m", ", deg"))}
         rows = [_spread_row(name, values.spread()) for name, values in sizes.items()]
-        tables += [_table("offsets", "Size of the offsets", SPREAD, rows, note="Where they are not zero.")]
+        tables += [_table("offsets", rows, "Where they are not zero.")]
     if counts.events:
-        rows = [[*names, count] for names, count in sorted(counts.events.items())]
-        title, head = "What became of each perturbation", ["track", "event", "outcome", "frames"]
-        tables += [_table("events", title, head, rows, paper="sec:exp_zoom")]
+        events: Rows = [[*names, count] for names, count in sorted(counts.events.items())]
+        tables += [_table("events", events)]
     return tables
 
 
@@ -461,7 +450,7 @@ def _files(record: ReleaseRecord) -> Table:
     files, frames = record.numbers.files, max(1, record.numbers.frames)
     sizes = {**files.bytes_by_modality, "all shards": files.bytes}
     rows: Rows = [[name, size, round(size / frames, 1)] for name, size in sizes.items()]
-    return _table("files", "Bytes", ["", "bytes", "a frame"], rows, note=f"{files.shards} shards.")
+    return _table("files", rows, f"{files.shards} shards.")
 
 
 def _pixels(pixels: Pixels | None) -> list[Table]:
@@ -473,26 +462,28 @@ def _pixels(pixels: Pixels | None) -> list[Table]:
     if depths:
         seen = int(pixels.depths.sum()) + pixels.sky + pixels.invalid
         sky, invalid = percent(pixels.sky, seen), percent(pixels.invalid, seen)
-        shares = f"{note} Sky: {sky} % of the pixels, invalid: {invalid} %."
-        head = ["pixels nearer than", "m"]
-        tables += [_table("depth", "Depth, percentiles", head, depths, paper="sec:step6", note=shares)]
+        tables += [_table("depth", depths, f"{note} Sky: {sky} % of the pixels, invalid: {invalid} %.")]
     kinds: Rows = [[kind, round(100 * share, 3), round(100 * shown, 1)] for kind, share, shown in pixels.by_kind()]
-    if kinds:
-        head = ["kind", "% of pixels", "% of frames"]
-        tables += [_table("semantics", "Kinds in the pictures", head, kinds, paper="sec:step6", note=note, plot="bars")]
-    return tables
+    return [*tables, *([_table("semantics", kinds, note)] if kinds else [])]
 
 
 def _absent(record: ReleaseRecord, counts: Counts, pixels: Pixels | None) -> list[Absent]:
     """Name what the paper has and this release cannot tell."""
     no_weather = all(weather is None and time is None for weather, time in counts.weather)
     table = [
-        (True, "the same flights at four fields of view", "tab:zoom_eval", "needs rendering: each flight of a release has one field of view"),
-        (True, "boxes of the maps, before and after simplification", "sec:dataset_stats", "a release holds no map: see simplify_report.json"),
-        (True, "verdicts of first answers", "fig:consistency_verdict", "a release holds accepted captions alone: see caption_report.json"),
-        (not _five_ray(record, counts), "five-ray visibility of the planner", "tab:dist_stats, tab:quality_stats", "no flight of this release was inspected against its map"),
-        (no_weather, "weather and time of day, 15 x 4", "tab:weather_coverage", "no frame of this release names a preset"),
-        (not counts.events, "fallbacks of the perturbation", "sec:exp_zoom", "no frame of this release tells what became of it"),
-        (pixels is None, "percentiles of depth, kinds in the pictures", "sec:step6", "the pictures were not looked at: --pixels"),
+        (True, "the same flights at four fields of view", "tab:zoom_eval",
+         "needs rendering: each flight of a release has one field of view"),
+        (True, "boxes of the maps, before and after simplification", "sec:dataset_stats",
+         "a release holds no map: see simplify_report.json"),
+        (True, "verdicts of first answers", "fig:consistency_verdict",
+         "a release holds accepted captions alone: see caption_report.json"),
+        (not _five_ray(record, counts), "five-ray visibility of the planner", "tab:dist_stats, tab:quality_stats",
+         "no flight of this release was inspected against its map"),
+        (no_weather, "weather and time of day, 15 x 4", "tab:weather_coverage",
+         "no frame of this release names a preset"),
+        (not counts.events, "fallbacks of the perturbation", "sec:exp_zoom",
+         "no frame of this release tells what became of it"),
+        (pixels is None, "percentiles of depth, kinds in the pictures", "sec:step6",
+         "the pictures were not looked at: --pixels"),
     ]  # fmt: skip
     return [Absent(what=what, paper=paper, why=why) for is_absent, what, paper, why in table if is_absent]
