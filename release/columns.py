@@ -1,8 +1,8 @@
 """The columns of the released parquet files: one table that says all there is to say of a column.
 
-A new column is one row of FRAME or CAPTION: its type, the values that it may hold, the field that it is taken from, and where people see it. Schema,
-rows, card, Croissant, viewer and `release verify` follow. No list stands in a row except the caption's window, picture size and states of
-sentences, so that every reader of parquet shows plain columns.
+A new column is one row of FRAME or CAPTION: its type, the values that it may hold, the field that it is taken from, and
+where people see it. Schema, rows, card, Croissant, viewer and `release verify` follow. No list stands in a row except
+the caption's window, picture size and states of sentences, so that every reader of parquet shows plain columns.
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ CONTRACT: dict[str, Any] = {
     "depth": f"z-depth along the optical axis, metres, float32; {SKY_DEPTH_M:g} sky, {INVALID_DEPTH_M:g} invalid",
     "instance": "PNG; R semantic number (CARLA 0.9.16 CityObjectLabel), G low and B high byte of the instance id",
     "target": "hip of the tracked person; target_heading_deg, whither it walks, as yaw; null before its first step",
-    "offsets": "the perturbation of the frame, already contained in pose and target; where a position was shifted the camera "
-    "was aimed anew, and the rotation offset is its turn away from that aim",
-    "perturbation": "what became of the frame's two events, position (shift of drone and person) and rotation (turn of the view): none, applied, "
-    "or `fallback: ` and why the frame is as planned; null where the tree does not say",
+    "offsets": "the perturbation of the frame, already contained in pose and target; where a position was shifted the "
+    "camera was aimed anew, and the rotation offset is its turn away from that aim",
+    "perturbation": "what became of the frame's two events, position (shift of drone and person) and rotation (turn of "
+    "the view): none, applied, or `fallback: ` and why the frame is as planned; null where the tree does not say",
     "time": "seconds; the frames of a flight are one time step apart, 0.5 s in the paper",
 }
 
@@ -80,7 +80,8 @@ TYPES: dict[str, tuple[pa.DataType, dict[str, Any]]] = {
         {event: {"dtype": "string", "_type": "Value"} for event in EVENTS},
     ),
     "image": (pa.struct([("bytes", pa.binary()), ("path", pa.string())]), {"_type": "Image"}),
-    # `element` is parquet's own name. `Sequence` is what `datasets` before version 4 calls a list; later versions still read it.
+    # `element` is parquet's own name. `Sequence` is what `datasets` before version 4 calls a list; later versions still
+    # read it.
     "indices": (
         pa.list_(pa.field("element", pa.int32())),
         {"feature": {"dtype": "int32", "_type": "Value"}, "_type": "Sequence"},
@@ -93,10 +94,11 @@ TYPES: dict[str, tuple[pa.DataType, dict[str, Any]]] = {
 
 
 @dataclass(frozen=True)
-class Placed:
+class Placement:
     """What the rows of a flight say of its place in the release: the columns of these names.
 
-    pair: the name of its twin in the records, None where that is not released. look: (4,) sun and air (LOOK), None where nobody says.
+    pair: the name of its twin in the records, None where that is not released. look: (4,) sun and air (LOOK), None
+    where nobody says.
     """
 
     walk: str
@@ -110,11 +112,15 @@ class Column:
     """One column.
 
     type: of TYPES, or the members of a struct of numbers.
-    of_frame: its value at frame i of a flight; of_caption: its value of the frame's caption, null where there is none. NaN becomes null. Neither: a
-        picture, whose bytes the writer has, or what Placed says.
-    words: those that it may hold, empty: any; "actions": the decisions of the release. ranges: of its numbers, by member ("" where it has none).
-    required: it is null in no row (of a caption's: in no row with a caption). constant: it does not change within a flight.
-    title: what people call it; annotation: it counts as one, under that title, in the statistics. counted: the card counts the captions by its
+    of_frame: its value at frame i of a flight; of_caption: its value of the frame's caption, null where there is none.
+    NaN becomes null. Neither: a
+        picture, whose bytes the writer has, or what Placement says.
+    words: those that it may hold, empty: any; "actions": the decisions of the release. ranges: of its numbers, by
+    member ("" where it has none).
+    required: it is null in no row (of a caption's: in no row with a caption). constant: it does not change within a
+    flight.
+    title: what people call it; annotation: it counts as one, under that title, in the statistics. counted: the card
+    counts the captions by its
         values. shown: the viewer shows it beside the frame or caption.
     """
 
@@ -131,12 +137,12 @@ class Column:
     counted: bool = False
     shown: bool = False
 
-    def cell(self, flight: Flight, i: int, caption: ReleasedCaption | None, placed: Placed) -> Any:
+    def cell(self, flight: Flight, i: int, caption: ReleasedCaption | None, placement: Placement) -> Any:
         value: Any
         if self.of_caption is not None:
             value = None if caption is None else caption[self.name]
         else:
-            value = getattr(placed, self.name) if self.of_frame is None else self.of_frame(flight, i)
+            value = getattr(placement, self.name) if self.of_frame is None else self.of_frame(flight, i)
         if isinstance(self.type, tuple):  # of few numbers Python's own are faster than an array
             numbers = [] if value is None else value.tolist()
             is_null = not numbers or any(map(math.isnan, numbers))
@@ -216,9 +222,18 @@ FRAME = (  # everything of a frame but pictures and depth
     Column("walk", "string", constant=True),
     Column("split", "string", constant=True),
     Column("pair", "string", constant=True),
-    Column("weather", "string", lambda f, i: f.weather["weather"], constant=True, title="weather", annotation=True, shown=True),
-    Column("time_of_day", "string", lambda f, i: f.weather["time_of_day"], constant=True, title="time of day", annotation=True, shown=True),
-    Column("weather_mode", "string", lambda f, i: f.weather_record and f.weather_record.mode, words=get_args(WeatherMode), constant=True),
+    Column(
+        "weather", "string", lambda f, i: f.weather["weather"], constant=True, title="weather", annotation=True,
+        shown=True,
+    ),
+    Column(
+        "time_of_day", "string", lambda f, i: f.weather["time_of_day"], constant=True, title="time of day",
+        annotation=True, shown=True,
+    ),
+    Column(
+        "weather_mode", "string", lambda f, i: f.weather_record and f.weather_record.mode, words=get_args(WeatherMode),
+        constant=True,
+    ),
     Column(
         "weather_params", WEATHER_PARAMS, lambda f, i: _knobs(f), constant=True,
         ranges={
@@ -229,7 +244,8 @@ FRAME = (  # everything of a frame but pictures and depth
     Column(
         "look", LOOK, constant=True, title="sun and air", annotation=True,
         ranges={
-            "sun_azimuth_deg": (0.0, 360.0), "sun_elevation_deg": (-90.0, 90.0), "haze_m": (0.0, 1e6), "exposure": (0.0, 100.0),
+            "sun_azimuth_deg": (0.0, 360.0), "sun_elevation_deg": (-90.0, 90.0), "haze_m": (0.0, 1e6),
+            "exposure": (0.0, 100.0),
         },
     ),
     Column("frame_index", "int32", lambda f, i: i, required=True),
@@ -240,7 +256,10 @@ FRAME = (  # everything of a frame but pictures and depth
         "fov_deg", "float64", lambda f, i: round(f.camera_at(i).fov_deg, 6),
         ranges={"": (LEAST_FOV_DEG, MOST_FOV_DEG)}, required=True, constant=True,  # but of a camera that zooms
     ),
-    Column("intrinsics", INTRINSICS, lambda f, i: f.camera_at(i).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]], required=True, constant=True),
+    Column(
+        "intrinsics", INTRINSICS, lambda f, i: f.camera_at(i).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]], required=True,
+        constant=True,
+    ),
     Column(
         "pose", POSE, lambda f, i: np.concatenate([f.positions_m[i], f.rotations_deg[i]]),
         ranges={"pitch_deg": (-90.0, 90.0), "yaw_deg": (-360.0, 360.0), "roll_deg": (-180.0, 180.0)},
@@ -251,7 +270,8 @@ FRAME = (  # everything of a frame but pictures and depth
     Column("target_uv", ("u_px", "v_px"), lambda f, i: f.target_uv[i]),
     Column("target_bbox", BOX, lambda f, i: f.target_bbox[i], title="projected box of the target", annotation=True),
     Column(
-        "target_mask_bbox", BOX, lambda f, i: np.full(4, np.nan) if f.target_mask_bbox is None else f.target_mask_bbox[i],
+        "target_mask_bbox", BOX,
+        lambda f, i: np.full(4, np.nan) if f.target_mask_bbox is None else f.target_mask_bbox[i],
         title="box of the target's pixels", annotation=True,
     ),
     Column("target_depth_m", "float64", lambda f, i: f.target_depth_m[i]),
@@ -262,7 +282,9 @@ FRAME = (  # everything of a frame but pictures and depth
         title="rendered visibility of the target", annotation=True,
     ),
     Column("is_perturbed", "bool", lambda f, i: f.is_perturbed[i], required=True),
-    Column("perturbation", "events", lambda f, i: f.events(i), title="what became of the perturbation", annotation=True),
+    Column(
+        "perturbation", "events", lambda f, i: f.events(i), title="what became of the perturbation", annotation=True,
+    ),
     Column(
         "drone_offset", POSE, lambda f, i: np.concatenate([f.drone_offsets_m[i], f.rotation_offsets_deg[i]]),
         title="offsets of the perturbation", annotation=True,
@@ -271,7 +293,10 @@ FRAME = (  # everything of a frame but pictures and depth
     Column("has_caption", "bool", of_caption=lambda c: True, required=True),
 )  # fmt: skip
 CAPTION = (  # what a row holds of an accepted caption, and nulls where there is none
-    Column("decision", "string", of_caption=_decision, words="actions", required=True, title="decision", counted=True, shown=True),
+    Column(
+        "decision", "string", of_caption=_decision, words="actions", required=True, title="decision", counted=True,
+        shown=True,
+    ),
     Column("label", "string", of_caption=lambda c: c.label, words="actions", title="label", counted=True, shown=True),
     Column(
         "label_from", "string", of_caption=lambda c: c.label_from, words=get_args(LabelFrom), required=True,
@@ -366,9 +391,9 @@ def schema(files: Collection[FrameFile]) -> pa.Schema:
     return pa.schema(fields, {b"huggingface": json.dumps({"info": {"features": features}}).encode()})
 
 
-def scalar_row(flight: Flight, i: int, caption: ReleasedCaption | None, placed: Placed) -> dict[str, Any]:
+def scalar_row(flight: Flight, i: int, caption: ReleasedCaption | None, placement: Placement) -> dict[str, Any]:
     """Give the row of one frame without its pictures, right-handed axes."""
-    return {column.name: column.cell(flight, i, caption, placed) for column in SCALARS}
+    return {column.name: column.cell(flight, i, caption, placement) for column in SCALARS}
 
 
 def picture_bytes(row: Mapping[str, Any], file: FrameFile) -> bytes:

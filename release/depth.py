@@ -1,4 +1,5 @@
-"""Depth of a released row: float32 as the tree has it, or coded smaller with an error that is measured on every pixel."""
+"""Depth of a released row: float32 as the tree has it, or coded smaller with an error that is measured on every
+pixel."""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ MOST_PNG_M = 65.5  # beyond, 16 bits of millimetres end
 
 
 class DepthErrors(BaseModel):
-    """Of the pixels that are neither sky nor invalid: the least and greatest depth, m, and the greatest error of the coding, m."""
+    """Of the pixels that are neither sky nor invalid: the least and greatest depth, m, and the greatest error of the
+    coding, m."""
 
     min_m: float | None = None
     max_m: float | None = None
@@ -91,7 +93,8 @@ def _as_millimetres(values: np.ndarray, is_measured: np.ndarray, where: Path) ->
     farthest = float(values[is_measured].max(initial=0.0))
     if farthest > MOST_PNG_M:
         raise InputError(
-            "depth that a PNG of millimetres cannot hold", where=where, got=f"{farthest:g} m", expected=f"at most {MOST_PNG_M} m",
+            "depth that a PNG of millimetres cannot hold", where=where, got=f"{farthest:g} m",
+            expected=f"at most {MOST_PNG_M} m",
             fix="--set release.depth=float16, or float32, which is lossless",
         )  # fmt: skip
     millimetres = np.clip(np.rint(values * MM_A_METRE), 1, MOST_MM).astype(np.uint16)

@@ -44,8 +44,9 @@ class Shard(Strict):
 class ReleasedFlight(Strict):
     """One flight, `run/town/trajectory/variant`; `frames_available` is the length of the flight that was rendered.
 
-    pair: the other track's flight of the same trajectory, null where that is not released. five_ray_mean: share of five rays that reach the
-    person, as the inspection measured it on the map, which the shards do not hold; null where nobody did.
+    pair: the other track's flight of the same trajectory, null where that is not released. five_ray_mean: share of five
+    rays that reach the person, as the inspection measured it on the map, which the shards do not hold; null where
+    nobody did.
     """
 
     flight: str
@@ -64,7 +65,8 @@ class ReleasedMap(TownMap):
 
 
 class Settings(Strict):
-    """The settings that change what is released. num_frames: of each flight, null for all; uniform_stride: chosen one by one and not in runs;
+    """The settings that change what is released. num_frames: of each flight, null for all; uniform_stride: chosen one
+    by one and not in runs;
     window_frames: of a caption's window."""
 
     num_frames: int | None = Field(ge=1)
@@ -76,7 +78,8 @@ class Settings(Strict):
 
 
 class DepthCoding(Strict):
-    """How `depth` is stored. The error is the greatest one of a pixel, measured over all released ones that are neither sky nor invalid.
+    """How `depth` is stored. The error is the greatest one of a pixel, measured over all released ones that are neither
+    sky nor invalid.
 
     min_m, max_m: of these pixels; null where nothing was coded anew, so that nothing was measured.
     """
@@ -112,7 +115,8 @@ class Splits(Strict):
 
 
 class MadeBy(Strict):
-    """One stage of one source: its settings, seed, version, and the sha256 of what it read. Paths and addresses are left out."""
+    """One stage of one source: its settings, seed, version, and the sha256 of what it read. Paths and addresses are
+    left out."""
 
     stage: str
     code_version: str
@@ -122,8 +126,8 @@ class MadeBy(Strict):
 
 
 class SourceRecord(Strict):
-    """One source of the release: fingerprints of its tree, captions, inspection and what people decided of that (null: without), and the
-    stages that made them."""
+    """One source of the release: fingerprints of its tree, captions, inspection and what people decided of that (null:
+    without), and the stages that made them."""
 
     run: str
     tree_sha256: str
@@ -133,7 +137,7 @@ class SourceRecord(Strict):
     stages: list[MadeBy]
 
 
-class Teacher(Strict):
+class TeacherRecord(Strict):
     """Who was asked, and how: of all captions that were read, the released ones and the others."""
 
     kind: str
@@ -143,7 +147,8 @@ class Teacher(Strict):
 
 
 class Repairs(Strict):
-    """Of the accepted captions, those whose first answer stood and those that a repair made, by rung; shares of all accepted ones."""
+    """Of the accepted captions, those whose first answer stood and those that a repair made, by rung; shares of all
+    accepted ones."""
 
     accepted: int
     first_answers: int
@@ -156,7 +161,7 @@ class Provenance(Strict):
 
     versions: dict[str, str]
     sources: list[SourceRecord]
-    teachers: list[Teacher]
+    teachers: list[TeacherRecord]
     repairs: Repairs
     tokens: Counts
     asks: int
@@ -173,8 +178,8 @@ class Spread(Strict):
 
 
 class CaptionNumbers(Strict):
-    """frames_by: column -> frames by what their captions say there; mean_proved: of their sentences the share that the geometry proves, where any was judged;
-    `example` is the first one's sample_id and texts, empty without any."""
+    """frames_by: column -> frames by what their captions say there; mean_proved: of their sentences the share that the
+    geometry proves, where any was judged; `example` is the first one's sample_id and texts, empty without any."""
 
     frames_with: int
     frames_without: int
@@ -240,7 +245,8 @@ class FlightHistory(Strict):
 
 
 class CaptionHistory(Strict):
-    """read = accepted + dropped, by reason; accepted = released + frame_not_selected + window_not_whole + flight_left_out."""
+    """read = accepted + dropped, by reason; accepted = released + frame_not_selected + window_not_whole +
+    flight_left_out."""
 
     read: int
     dropped: Counts
@@ -263,7 +269,8 @@ class History(Strict):
 
 
 class PartOf(Strict):
-    """The release that this one is a part of: its name and content digest, the address it was fetched from, what was asked for."""
+    """The release that this one is a part of: its name and content digest, the address it was fetched from, what was
+    asked for."""
 
     name: str
     content_digest: str
@@ -272,8 +279,9 @@ class PartOf(Strict):
 
 
 class ReleaseRecord(Strict):
-    """The whole file. actions: the closed set of decisions, null for the one that ships. prompts: by run the questions (`user_en`,
-    `user_zh`) of captions that were asked with prompts of their own. part_of: null for what `release build` made, whole as it is."""
+    """The whole file. actions: the closed set of decisions, null for the one that ships. prompts: by run the questions
+    (`user_en`, `user_zh`) of captions that were asked with prompts of their own. part_of: null for what `release build`
+    made, whole as it is."""
 
     name: str
     licence: str
@@ -305,7 +313,8 @@ DIGEST_CHARACTERS = 12  # of the content's digest, in the names of shards
 
 
 def content_digest(shards: Iterable[tuple[SplitName, str]]) -> str:
-    """Give the sha256 of a release's content, of the split and sha256 of each shard in order: other rows, another digest."""
+    """Give the sha256 of a release's content, of the split and sha256 of each shard in order: other rows, another
+    digest."""
     return sha256_bytes("".join(f"{split} {sha256}\n" for split, sha256 in shards).encode())
 
 
@@ -315,12 +324,14 @@ def shard_path(split: SplitName, digest: str, number: int, count: int) -> str:
 
 
 def shard_pattern(split: SplitName, digest: str) -> str:
-    """Give the pattern that the card names for a split. The library's cache goes by it: without the digest a new release shows old rows."""
+    """Give the pattern that the card names for a split. The library's cache goes by it: without the digest a new
+    release shows old rows."""
     return f"data/{split}-{digest[:DIGEST_CHARACTERS]}-*.parquet"
 
 
 def release_folder(folder: Path) -> Path:
-    """Give the folder that holds the files of a release: this one, or where `release build` and `cosfly run` put them below it.
+    """Give the folder that holds the files of a release: this one, or where `release build` and `cosfly run` put them
+    below it.
 
     A folder that holds none is given as it is, for its reader to say so.
     """

@@ -1,7 +1,8 @@
 """Who published a release: an ed25519 signature over its list of checksums, which names every file with its sha256.
 
-The signed bytes are `checksums.sha256` as they stand, so that `openssl pkeyutl -verify` can check them too. Key pairs are made by other tools:
-`openssl genpkey -algorithm ed25519` or `ssh-keygen -t ed25519`. Nothing of a private key or its passphrase is printed, logged or written.
+The signed bytes are `checksums.sha256` as they stand, so that `openssl pkeyutl -verify` can check them too. Key pairs
+are made by other tools: `openssl genpkey -algorithm ed25519` or `ssh-keygen -t ed25519`. Nothing of a private key or
+its passphrase is printed, logged or written.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ class Signature(Strict):
 
 
 def read_private_key(path: Path) -> Any:
-    """Read an ed25519 private key, PEM as openssl or ssh-keygen write it; an encrypted one by the passphrase of the environment.
+    """Read an ed25519 private key, PEM as openssl or ssh-keygen write it; an encrypted one by the passphrase of the
+    environment.
 
     Raises:
         InputError: it is none, or the passphrase is missing or wrong; it quotes neither the file nor the library.
@@ -63,7 +65,8 @@ def read_private_key(path: Path) -> Any:
 
 
 def read_public_key(path: Path) -> bytes:
-    """Read an ed25519 public key, PEM of openssl or the line of ssh-keygen; gives its 32 bytes. InputError if it is none."""
+    """Read an ed25519 public key, PEM of openssl or the line of ssh-keygen; gives its 32 bytes. InputError if it is
+    none."""
     data, serialization = _key_file(path, "public key", "PRIVATE KEY-----")
     is_ssh = data.startswith(b"ssh-")
     parse = serialization.load_ssh_public_key if is_ssh else serialization.load_pem_public_key
@@ -107,7 +110,8 @@ def _of_kind(name: str, key: Any, path: Path) -> Any:
 
 
 def sign(folder: Path, key: Any) -> Path:
-    """Sign the list of checksums of a release folder, after every file was compared with it; gives the file of the signature.
+    """Sign the list of checksums of a release folder, after every file was compared with it; gives the file of the
+    signature.
 
     Raises:
         VerifyError: a file is not the one of the list. InputError: there is no list.

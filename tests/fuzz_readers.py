@@ -31,7 +31,13 @@ from caption.writing.slots import Slots
 from cosfly.app.settings import RunConfig
 from cosfly.chat.answers import TOTALS, AnswerBook, journal_name
 from cosfly.chat.contract import Request
-from cosfly.chat.protocol import base_url, error_words, read_body, read_completion, read_models
+from cosfly.chat.protocol import (
+    base_url,
+    error_words,
+    read_body,
+    read_completion,
+    read_models,
+)
 from cosfly.chat.refusals import kind_of
 from cosfly.chat.student_chat import TAUGHT, read_taught, write_taught
 from cosfly.chat.wire import Response, retry_after_s

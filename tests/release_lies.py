@@ -1,4 +1,4 @@
-"""Lies about a release, each told with hashes, counts and card made right again. A lie changes the rows in place; `True`: pixels tell it."""
+"""Lies about a release, each told with hashes, counts and card made right again. A lie changes the rows in place."""
 
 from __future__ import annotations
 
@@ -10,43 +10,54 @@ import zlib
 from collections.abc import Callable
 from typing import Any
 
+import cv2
 import numpy as np
 from release_tampering import depth_of, pixels_of, png, set_depth
 
+from cosfly.geometry import box_corners, project, world_from_camera
+from cosfly.products.captions import FIELDS
 from cosfly.products.kinds import KINDS
+from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 
 Row = dict[str, Any]
-Lie = Callable[[list[Row]], None]
+Rows = list[Row]
+Lie = Callable[[Rows], None]
+Choose = Callable[[Rows], Rows]
+XYZ = ("x_m", "y_m", "z_m")
+BOX = ("xmin_px", "ymin_px", "xmax_px", "ymax_px")
+SKY_M = 999.0
 
 
-def clean(rows: list[Row]) -> list[Row]:
-    """The rows of the first clean flight."""
-    first = next(row for row in rows if row["track"] == "clean")
-    return flight_of(rows, first)
+# --- which rows -------------------------------------------------------------------------------------------------------
 
 
-def flight_of(rows: list[Row], one: Row) -> list[Row]:
+def flight_of(rows: Rows, one: Row) -> Rows:
     return [row for row in rows if (row["trajectory"], row["variant"]) == (one["trajectory"], one["variant"])]
 
 
-def perturbed(rows: list[Row]) -> list[Row]:
-    first = next(row for row in rows if row["track"] == "perturbed")
-    return flight_of(rows, first)
+def clean(rows: Rows) -> Rows:
+    """The rows of the first clean flight."""
+    return flight_of(rows, next(row for row in rows if row["track"] == "clean"))
 
 
-def shifted(rows: list[Row]) -> Row:
-    return next(row for row in perturbed(rows) if row["perturbation"]["position"] == "applied")
+def perturbed(rows: Rows) -> Rows:
+    return flight_of(rows, next(row for row in rows if row["track"] == "perturbed"))
 
 
-def captioned(rows: list[Row]) -> list[Row]:
+def trajectory(rows: Rows) -> Rows:
+    """Both flights of the first trajectory."""
+    return [row for row in rows if row["trajectory"] == clean(rows)[0]["trajectory"]]
+
+
+def captioned(rows: Rows) -> Rows:
     return [row for row in rows if row["has_caption"]]
 
 
-def seen(rows: list[Row]) -> list[Row]:
+def seen(rows: Rows) -> Rows:
     return [row for row in clean(rows) if row["target_visible"]]
 
 
-def other_flight(rows: list[Row]) -> list[Row]:
+def other_flight(rows: Rows) -> Rows:
     """A clean flight of another trajectory; where there is none, the perturbed one."""
     own = clean(rows)[0]
     others = (row for row in rows if row["track"] == "clean" and row["trajectory"] != own["trajectory"])
@@ -54,755 +65,457 @@ def other_flight(rows: list[Row]) -> list[Row]:
     return perturbed(rows) if one is None else flight_of(rows, one)
 
 
+def at(choose: Choose, k: int) -> Choose:
+    return lambda rows: [choose(rows)[k]]
+
+
+def half(choose: Choose) -> Choose:
+    return lambda rows: [choose(rows)[len(choose(rows)) // 2]]
+
+
+def first(choose: Choose, holds: Callable[[Row], Any]) -> Choose:
+    return lambda rows: [next(row for row in choose(rows) if holds(row))]
+
+
+def everything(rows: Rows) -> Rows:
+    return rows
+
+
+shifted = first(perturbed, lambda row: row["perturbation"]["position"] == "applied")
+unturned = first(perturbed, lambda row: row["perturbation"]["rotation"] == "none")
+
+
+def twin_of(rows: Rows, row: Row) -> Row:
+    return next(one for one in clean(rows) if one["frame_index"] == row["frame_index"])
+
+
+# --- what is done to them ---------------------------------------------------------------------------------------------
+
+
+def put(choose: Choose, **values: Any) -> Lie:
+    return change(choose, lambda row: row.update(copy.deepcopy(values)))
+
+
+def change(choose: Choose, what: Callable[[Row], Any]) -> Lie:
+    def lie(rows: Rows) -> None:
+        for row in choose(rows):
+            what(row)
+
+    return lie
+
+
+def alter(choose: Choose, **new_of: Callable[[Any], Any]) -> Lie:
+    """Make of the values of columns new ones."""
+    return change(choose, lambda row: row.update({name: of(row[name]) for name, of in new_of.items()}))
+
+
 def swap(one: Row, other: Row, *names: str) -> None:
     for name in names:
         one[name], other[name] = other[name], one[name]
 
 
+def swapped(choose: Choose, a: int, b: int, *names: str) -> Lie:
+    return lambda rows: swap(choose(rows)[a], choose(rows)[b], *names)
+
+
+def swapped_flights(*names: str) -> Lie:
+    return lambda rows: [swap(a, b, *names) for a, b in zip(clean(rows), other_flight(rows), strict=False)] and None
+
+
+def add(name: str, number: float, *members: str) -> Callable[[Row], None]:
+    """Add to a column of numbers, or to members of a group of them."""
+
+    def added(row: Row) -> None:
+        if members:
+            row[name] = row[name] | {member: row[name][member] + number for member in members}
+        else:
+            row[name] += number
+
+    return added
+
+
 def projected(row: Row) -> None:
     """Make pixel, depth and boxes of the target those of its pose again."""
-    from cosfly.geometry import box_corners, project, world_from_camera
-    from cosfly.products.walks import PERSON_HALF_EXTENTS_M
-
-    pose, k = row["pose"], row["intrinsics"]
-    camera = world_from_camera(
-        np.array([pose["x_m"], pose["y_m"], pose["z_m"]]),
-        np.array([pose["pitch_deg"], pose["yaw_deg"], pose["roll_deg"]]),
-    )
+    pose, k, size = row["pose"], row["intrinsics"], [row["width_px"], row["height_px"]]
+    angles = np.array([pose["pitch_deg"], pose["yaw_deg"], pose["roll_deg"]])
+    camera = world_from_camera(np.array([pose[axis] for axis in XYZ]), angles)
     matrix = np.array([[k["fx"], 0, k["cx"]], [0, k["fy"], k["cy"]], [0, 0, 1.0]])
-    target = np.array([row["target"][axis] for axis in ("x_m", "y_m", "z_m")])
+    target = np.array([row["target"][axis] for axis in XYZ])
     uv, z = project(target[None], camera, matrix)
     corners, _ = project(box_corners(target, np.array(PERSON_HALF_EXTENTS_M)), camera, matrix)
     if np.isnan(corners).any():
         return
-    low = np.clip(corners.min(axis=0), 0, [row["width_px"], row["height_px"]])
-    high = np.clip(corners.max(axis=0), 0, [row["width_px"], row["height_px"]])
-    row["target_uv"] = {"u_px": float(uv[0, 0]), "v_px": float(uv[0, 1])}
-    row["target_depth_m"] = float(z[0])
+    row["target_uv"], row["target_depth_m"] = {"u_px": float(uv[0, 0]), "v_px": float(uv[0, 1])}, float(z[0])
     if row["target_bbox"] is not None:
-        row["target_bbox"] = dict(
-            zip(("xmin_px", "ymin_px", "xmax_px", "ymax_px"), map(float, (*low, *high)), strict=True)
-        )
+        ends = np.clip([corners.min(axis=0), corners.max(axis=0)], 0, size)
+        row["target_bbox"] = dict(zip(BOX, map(float, ends.ravel()), strict=True))
 
 
-# --- identity ---------------------------------------------------------------------------------------------------------
+def turned(choose: Choose, what: Callable[[Row], Any]) -> Lie:
+    """Change rows and project their targets anew."""
+
+    def both(row: Row) -> None:
+        what(row)
+        projected(row)
+
+    return change(choose, both)
 
 
-def sample_id_of_another_frame(rows):
-    clean(rows)[3]["sample_id"] = clean(rows)[3]["sample_id"][:-5] + "00999"
+def with_depth(of: Callable[[np.ndarray, Row], np.ndarray]) -> Callable[[Row], None]:
+    """Change what is seen of a depth; the sky stays."""
+
+    def changed(row: Row) -> None:
+        depth = depth_of(row)
+        new = np.where(depth < SKY_M, np.minimum(of(depth, row), SKY_M - 1), depth)
+        set_depth(row, new.astype(np.float32))
+
+    return changed
 
 
-def label_outside_the_set(rows):
-    captioned(rows)[0]["label"] = "fly_away"
+def with_ids(of: Callable[[np.ndarray, np.ndarray], Any], *, box: bool = False) -> Callable[[Row], None]:
+    """Change a mask in place: (h, w, 3) and its ids (h, w). box: of the person's pixels anew."""
+
+    def changed(row: Row) -> None:
+        pixels = pixels_of(row, "instance")
+        of(pixels, pixels[..., 1].astype(int) | pixels[..., 2].astype(int) << 8)
+        row["instance"]["bytes"] = png(pixels)
+        if box:
+            row["target_mask_bbox"] = box_of_person(pixels)
+
+    return changed
 
 
-def verdict_outside_the_set(rows):
-    captioned(rows)[0]["verdict"] = "FINE"
+def with_colours(of: Callable[[np.ndarray, Row], bytes]) -> Callable[[Row], None]:
+    return lambda row: row["image"].update(bytes=of(pixels_of(row, "image"), row))
 
 
-def consistent_with_another_decision(rows):
-    row = next(r for r in captioned(rows) if r["label"] and r["decision"] == r["label"])
-    row["label"] = "hover" if row["label"] != "hover" else "ascend"
+def box_of_person(pixels: np.ndarray) -> dict[str, float] | None:
+    """Give `target_mask_bbox` of an instance image."""
+    rows, columns = np.nonzero((pixels[..., 1] == 255) & (pixels[..., 2] == 255))
+    if not len(rows):
+        return None
+    edges = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+    return dict(zip(BOX, map(float, edges), strict=True))
 
 
-def visibility_above_one(rows):
-    clean(rows)[0]["visibility"] = 1.7
+def chunk(name: bytes, data: bytes) -> Callable[[Row], None]:
+    """Add a chunk to a PNG."""
+
+    def added(row: Row) -> None:
+        old, crc = row["image"]["bytes"], struct.pack(">I", zlib.crc32(name + data))
+        row["image"]["bytes"] = old[:33] + struct.pack(">I", len(data)) + name + data + crc + old[33:]
+
+    return added
 
 
-def visible_but_not_in_view(rows):
-    seen(rows)[0]["target_in_view"] = False
+# --- lies that take more than a line ----------------------------------------------------------------------------------
 
 
-def perturbed_without_offsets(rows):
-    row = next(r for r in perturbed(rows) if not r["is_perturbed"])
-    row["is_perturbed"] = True
+def another_camera(row: Row) -> None:
+    """A field of view that fits its focal length."""
+    row["intrinsics"]["fx"] = row["intrinsics"]["fy"] = row["intrinsics"]["fx"] * 1.2
+    row["fov_deg"] = round(math.degrees(2 * math.atan(row["width_px"] / (2 * row["intrinsics"]["fx"]))), 6)
 
 
-def offsets_without_flag(rows):
-    shifted(rows)["is_perturbed"] = False
+def farther_on_its_line(row: Row) -> None:
+    row["target"] = {axis: row["pose"][axis] + 1.4 * (row["target"][axis] - row["pose"][axis]) for axis in XYZ}
 
 
-def track_against_variant(rows):
-    for row in clean(rows):
-        row["track"] = "perturbed"
+def mirrored_world(row: Row) -> None:
+    """North and east exchanged: a mirror image."""
+    for place in filter(None, (row["pose"], row["target"])):
+        place["x_m"], place["y_m"] = place["y_m"], place["x_m"]
+    row["pose"]["yaw_deg"] = 90.0 - row["pose"]["yaw_deg"]
+    if row["target_heading_deg"] is not None:
+        row["target_heading_deg"] = 90.0 - row["target_heading_deg"]
 
 
-def path_that_escapes(rows):
-    for row in clean(rows):
-        row["run"] = ".."
+def heading_backwards(row: Row) -> None:
+    if row["target_heading_deg"] is not None:
+        row["target_heading_deg"] = row["target_heading_deg"] % 360.0 - 180.0
 
 
-def time_backwards(rows):
-    own = clean(rows)
-    swap(own[2], own[3], "time_s")
+def nobody_followed(row: Row) -> None:
+    nulls = ("target", "target_uv", "target_bbox", "target_mask_bbox", "target_depth_m", "target_heading_deg")
+    row.update(dict.fromkeys(nulls), target_in_view=False, target_visible=False, visibility=0.0)
 
 
-def a_second_lost(rows):
-    for row in clean(rows)[5:]:
-        row["time_s"] += 1.0
-
-
-def time_stretched(rows):
-    for row in clean(rows):
-        row["time_s"] *= 1.5
-
-
-def all_targets_null(rows):
-    for row in rows:
-        for name in ("target", "target_uv", "target_bbox", "target_mask_bbox", "target_depth_m", "target_heading_deg"):
-            row[name] = None
-        row["target_in_view"] = row["target_visible"] = False
-        row["visibility"] = 0.0
-
-
-def infinite_angle(rows):
-    clean(rows)[1]["drone_offset"]["roll_deg"] = math.inf
-
-
-def field_of_view_against_focal_length(rows):
-    for row in clean(rows):
-        row["fov_deg"] = 75.0
-
-
-def focal_lengths_exchanged(rows):
-    for row in clean(rows):
-        row["intrinsics"]["fy"] *= 1.1
+def with_poses(own: Rows, others: Rows) -> None:
+    """Give rows the poses of others, and project their targets anew."""
+    poses = [dict(other["pose"]) for other in others]
+    for row, pose in zip(own, poses, strict=True):
+        row["pose"] = pose
         projected(row)
 
 
-def principal_point_moved(rows):
-    for row in clean(rows):
-        row["intrinsics"]["cx"] += 12.0
-        projected(row)
-
-
-def another_camera_all_along(rows):
-    """A field of view that fits its focal length, and everything projected anew."""
-    for row in clean(rows):
-        row["intrinsics"]["fx"] = row["intrinsics"]["fy"] = row["intrinsics"]["fx"] * 1.2
-        row["fov_deg"] = round(math.degrees(2 * math.atan(row["width_px"] / (2 * row["intrinsics"]["fx"]))), 6)
-        projected(row)
-        row["target_mask_bbox"] = row["target_mask_bbox"] and dict(row["target_mask_bbox"])
-
-
-# --- geometry and motion ----------------------------------------------------------------------------------------------
-
-
-def target_pixel_moved(rows):
-    seen(rows)[1]["target_uv"]["u_px"] += 3.0
-
-
-def box_against_mask(rows):
-    box = seen(rows)[1]["target_mask_bbox"]
-    box["xmin_px"] += 2.0
-    box["xmax_px"] += 2.0
-
-
-def box_moved(rows):
-    box = seen(rows)[1]["target_bbox"]
-    for name in box:
-        box[name] += 4.0
-
-
-def target_depth_against_depth(rows):
-    seen(rows)[1]["target_depth_m"] += 5.0
-
-
-def target_far_behind_on_its_line(rows):
-    """The target moved along its line of sight: pixel right, depth made right, boxes made right."""
-    for row in seen(rows):
-        for axis in ("x_m", "y_m", "z_m"):
-            row["target"][axis] = row["pose"][axis] + 1.4 * (row["target"][axis] - row["pose"][axis])
-        projected(row)
-
-
-def pose_of_the_next_frame(rows):
-    own = clean(rows)
-    own[4]["pose"] = dict(own[5]["pose"])
-    projected(own[4])
-
-
-def poses_of_two_frames_exchanged(rows):
-    own = clean(rows)
-    swap(own[4], own[9], "pose")
-    projected(own[4])
-    projected(own[9])
-
-
-def poses_of_two_flights_exchanged(rows):
-    for one, other in zip(clean(rows), other_flight(rows), strict=False):
-        swap(one, other, "pose", "target", "target_uv", "target_bbox", "target_depth_m", "target_heading_deg")
-        swap(one, other, "intrinsics", "fov_deg")
-
-
-def pose_frozen(rows):
-    own = clean(rows)
-    for row in own[5:12]:
-        row["pose"] = dict(own[5]["pose"])
-        projected(row)
-
-
-def pose_jumps(rows):
-    row = clean(rows)[6]
-    row["pose"]["x_m"] += 20.0
-    projected(row)
-
-
-def world_turned(rows):
-    """North and east exchanged for one flight, everything projected anew: a mirror image."""
-    for row in clean(rows):
-        for place in (row["pose"], row["target"]):
-            if place:
-                place["x_m"], place["y_m"] = place["y_m"], place["x_m"]
-        row["pose"]["yaw_deg"] = 90.0 - row["pose"]["yaw_deg"]
-        if row["target_heading_deg"] is not None:
-            row["target_heading_deg"] = 90.0 - row["target_heading_deg"]
-        if row["target"]:
-            projected(row)
-
-
-def lower_than_it_was(rows):
-    """A flight three metres lower, target too: nothing of a row tells."""
-    for row in clean(rows):
-        row["pose"]["z_m"] -= 3.0
-
-
-def heading_backwards(rows):
-    for row in clean(rows):
-        if row["target_heading_deg"] is not None:
-            row["target_heading_deg"] = (row["target_heading_deg"] + 180.0 + 180.0) % 360.0 - 180.0
-
-
-def offsets_with_the_other_sign(rows):
-    for row in perturbed(rows):
-        row["drone_offset"] = {name: -value + 0.0 for name, value in row["drone_offset"].items()}
-
-
-def target_offset_lost(rows):
-    row = shifted(rows)
-    row["target_offset"] = {"x_m": 0.0, "y_m": 0.0, "z_m": 0.0}
-
-
-def unperturbed_called_applied(rows):
-    row = next(r for r in perturbed(rows) if r["perturbation"]["rotation"] == "none")
-    row["perturbation"]["rotation"] = "applied"
-
-
-def undrawn_event_called_fallback(rows):
-    row = next(r for r in perturbed(rows) if r["perturbation"]["rotation"] == "none")
-    row["perturbation"]["rotation"] = "fallback: target out of view"
-
-
-def perturbation_taken_off(rows):
+def perturbation_taken_off(rows: Rows) -> None:
     """A frame is that of the clean flight, pictures too: flag, words, offsets, pose and pixels agree."""
-    row = shifted(rows)
-    twin = next(r for r in clean(rows) if r["frame_index"] == row["frame_index"])
-    kept = ("sample_id", "variant", "track", "pair")
-    row.update({name: copy.deepcopy(value) for name, value in twin.items() if name not in (*kept, *CAPTION)})
+    (row,) = shifted(rows)
+    twin, kept = twin_of(rows, row), {"sample_id", "variant", "track", "pair", *CAPTION}
+    row.update({name: copy.deepcopy(value) for name, value in twin.items() if name not in kept})
     for file in ("image", "instance"):
         row[file]["path"] = row[file]["path"].replace(twin["sample_id"], row["sample_id"])
     row["perturbation"] = {"position": "none", "rotation": "none"}
 
 
-def pace_called_otherwise(rows):
-    """In both flights of a walk."""
-    own = clean(rows)[0]["trajectory"]
-    for row in (row for row in rows if row["trajectory"] == own):
-        row["pace"] = "hurry"
+CAPTION = [
+    "decision", "label", "label_from", "verdict", "repair_strategy", "teacher_kind", "teacher_model", "writing",
+    "proved_en", "proved_zh",
+    *(f"{state}_sentences_{lang}" for state in ("proved", "contradicted", "unread") for lang in ("en", "zh")),
+    "sentence_states_en", "sentence_states_zh",
+    *(f"caption_{lang}_{name}" for lang in ("en", "zh") for name in FIELDS),
+    "system_en", "system_zh", "prompt_en", "prompt_zh",
+]  # fmt: skip
+TEXTS = [name for name in CAPTION if name.startswith(("caption_", "sentence", "proved_", "unread", "contradicted"))]
+DECISIONS = ("decision", "caption_en_flight_decision", "caption_zh_flight_decision")
 
 
-def clean_flight_from_another_time(rows):
-    for row in perturbed(rows):
-        row["time_s"] += 0.5
+def in_one_text(pattern: str, new: Any, *fields: str) -> Lie:
+    """Change the first match of the first text that has one."""
+
+    def lie(rows: Rows) -> None:
+        for row in captioned(rows):
+            for name in fields:
+                text = re.sub(pattern, new, row[name], count=1)
+                if text != row[name]:
+                    row[name] = text
+                    return
+        raise AssertionError("nothing to change")
+
+    return lie
 
 
-# --- captions ---------------------------------------------------------------------------------------------------------
-
-
-def window_into_the_future(rows):
-    row = captioned(rows)[0]
-    row["caption_window"] = [index + 1 for index in row["caption_window"]]
-
-
-def window_with_a_gap(rows):
-    row = captioned(rows)[0]
-    row["caption_window"][0] -= 1
-
-
-def decision_differs_between_languages(rows):
-    captioned(rows)[0]["caption_zh_flight_decision"] = "hover"
-
-
-def number_differs_between_languages(rows):
+def number_wrong_in_both_languages(rows: Rows) -> None:
+    en, zh = "caption_en_critical_components", "caption_zh_critical_components"
     for row in captioned(rows):
-        for name in ("caption_zh_reasoning_trace", "caption_zh_critical_components"):
-            text = re.sub(r"(\d+)\.(\d)", lambda m: f"{int(m[1]) + 3}.{m[2]}", row[name], count=1)
-            if text != row[name]:
-                row[name] = text
-                return
-    raise AssertionError("no number to change")
-
-
-def side_differs_between_languages(rows):
-    for row in captioned(rows):
-        for name in ("caption_zh_reasoning_trace", "caption_zh_critical_components"):
-            if "左" in row[name] or "右" in row[name]:
-                row[name] = row[name].translate(str.maketrans("左右", "右左"))
-                return
-    raise AssertionError("no side to change")
-
-
-def number_wrong_in_both_languages(rows):
-    for row in captioned(rows):
-        found = re.search(r"(\d+\.\d) m\b", row["caption_en_critical_components"])
-        if found and found[1] in row["caption_zh_critical_components"]:
-            wrong = f"{float(found[1]) + 7.3:.1f}"
-            for language in ("en", "zh"):
-                name = f"caption_{language}_critical_components"
-                row[name] = row[name].replace(found[1], wrong)
+        found = re.search(r"(\d+\.\d) m\b", row[en])
+        if found and found[1] in row[zh]:
+            row.update({name: row[name].replace(found[1], f"{float(found[1]) + 7.3:.1f}") for name in (en, zh)})
             return
     raise AssertionError("no number to change")
 
 
-CAPTION = [
-    "decision", "label", "label_from", "verdict", "repair_strategy", "teacher_kind", "teacher_model", "writing", "proved_en", "proved_zh",
-    *(f"{state}_sentences_{lang}" for state in ("proved", "contradicted", "unread") for lang in ("en", "zh")),
-    "sentence_states_en", "sentence_states_zh",
-    *(f"caption_{lang}_{name}" for lang in ("en", "zh") for name in ("critical_components", "reasoning_trace", "flight_decision")),
-    "system_en", "system_zh", "prompt_en", "prompt_zh",
-]  # fmt: skip
-TEXTS = [name for name in CAPTION if name.startswith(("caption_", "sentence", "proved_", "unread", "contradicted"))]
-
-
-def captions_of_two_windows_exchanged(rows):
-    """Everything of two captions but the window itself, of flights that go differently."""
-    own = captioned(rows)
-    swap(own[0], own[-1], *CAPTION)
-
-
-def texts_of_two_windows_exchanged(rows):
+def texts_of_two_windows_exchanged(rows: Rows) -> None:
     """Texts alone, of two windows with the same decision."""
     own = captioned(rows)
-    for one in own:
-        for other in reversed(own):
-            if one["trajectory"] != other["trajectory"] and one["decision"] == other["decision"]:
-                swap(one, other, *TEXTS)
-                return
-    raise AssertionError("no such windows")
+    pairs = ((one, other) for one in own for other in reversed(own) if one["trajectory"] != other["trajectory"])
+    swap(*next(pair for pair in pairs if pair[0]["decision"] == pair[1]["decision"]), *TEXTS)
 
 
-def decision_and_label_changed_together(rows):
-    """The decision in the row and in both languages, label and verdict: all of it says hover."""
-    row = next(r for r in captioned(rows) if r["decision"] != "hover")
-    for name in ("decision", "label", "caption_en_flight_decision", "caption_zh_flight_decision"):
-        row[name] = "hover"
-    row["verdict"] = "CONSISTENT"
-
-
-def hard_conflict_called_soft(rows):
-    row = captioned(rows)[1]
+def hard_conflict_called_soft(row: Row) -> None:
     wrong = "move_backward" if row["label"] != "move_backward" else "ascend"
-    for name in ("decision", "caption_en_flight_decision", "caption_zh_flight_decision"):
-        row[name] = wrong
-    row["verdict"] = "SOFT_CONFLICT"
+    row.update(dict.fromkeys(DECISIONS, wrong), verdict="SOFT_CONFLICT")
 
 
-def prompt_that_holds_the_future(rows):
-    row = captioned(rows)[0]
-    row["prompt_en"] += "\nAfter the last frame the drone turns left."
-    row["prompt_zh"] += "\n最后一帧之后无人机向左转。"
+def farther_but_for_the_person(depth: np.ndarray, row: Row) -> np.ndarray:
+    far, box = depth * 1.3, row["target_bbox"] or dict.fromkeys(BOX, 0)
+    part = np.s_[int(box["ymin_px"]) : int(box["ymax_px"]) + 1, int(box["xmin_px"]) : int(box["xmax_px"]) + 1]
+    far[part] = depth[part]
+    return far
 
 
-def prompt_of_the_next_window(rows):
-    own = captioned(rows)
-    own[0]["prompt_en"], own[0]["prompt_zh"] = own[1]["prompt_en"], own[1]["prompt_zh"]
+def along_the_ray(depth: np.ndarray, row: Row) -> np.ndarray:
+    k, (v, u) = row["intrinsics"], np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
+    return depth * np.sqrt(((u - k["cx"]) / k["fx"]) ** 2 + ((v - k["cy"]) / k["fy"]) ** 2 + 1)
 
 
-def all_sentences_called_proved(rows):
-    row = captioned(rows)[0]
-    row["proved_sentences_en"] = (row["proved_sentences_en"] or 0) + 1
-
-
-def text_about_something_else(rows):
-    row = captioned(rows)[0]
-    row["caption_en_critical_components"] = "The person is 97.5 m ahead of the drone."
-
-
-def chinese_in_english(rows):
-    row = captioned(rows)[0]
-    row["caption_zh_reasoning_trace"] = row["caption_en_reasoning_trace"]
-
-
-# --- pictures ---------------------------------------------------------------------------------------------------------
-
-
-def colours_of_neighbours_exchanged(rows):
-    own = perturbed(rows)
-    swap(own[4], own[5], "image")
-
-
-def colours_of_two_flights_exchanged(rows):
-    for one, other in zip(clean(rows), other_flight(rows), strict=False):
-        swap(one, other, "image")
-
-
-def depth_of_neighbours_exchanged(rows):
-    own = perturbed(rows)
-    swap(own[4], own[5], "depth")
-
-
-def instances_of_neighbours_exchanged(rows):
-    own = perturbed(rows)
-    swap(own[4], own[5], "instance")
-
-
-def instances_exchanged_with_their_boxes(rows):
-    own = perturbed(rows)
-    swap(own[4], own[5], "instance", "target_mask_bbox")
-
-
-def depth_doubled(rows):
-    row = seen(rows)[2]
+def not_a_number(row: Row) -> None:
     depth = depth_of(row)
-    set_depth(row, np.where(depth < 1000, np.minimum(depth * 2, 999), depth).astype(np.float32))
-
-
-def depth_doubled_but_at_the_person(rows):
-    row = clean(rows)[4]
-    depth = depth_of(row)
-    far = np.where(depth < 1000, np.minimum(depth * 1.3, 999), depth).astype(np.float32)
-    box = row["target_bbox"] or {"xmin_px": 0, "ymin_px": 0, "xmax_px": 1, "ymax_px": 1}
-    y, x = slice(int(box["ymin_px"]), int(box["ymax_px"]) + 1), slice(int(box["xmin_px"]), int(box["xmax_px"]) + 1)
-    far[y, x] = depth[y, x]
-    set_depth(row, far)
-
-
-def depth_not_a_number(rows):
-    depth = depth_of(clean(rows)[3])
     depth[3, 3] = np.nan
-    set_depth(clean(rows)[3], depth)
+    set_depth(row, depth)
 
 
-def distance_along_the_ray(rows):
-    """Depth as the length of the ray, not along the axis, in all of a flight."""
-    for row in clean(rows):
-        depth, k = depth_of(row), row["intrinsics"]
-        v, u = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
-        length = np.sqrt(((u - k["cx"]) / k["fx"]) ** 2 + ((v - k["cy"]) / k["fy"]) ** 2 + 1)
-        set_depth(row, np.where(depth < 1000, np.minimum(depth * length, 999), depth).astype(np.float32))
+def boxed(depth: np.ndarray, row: Row) -> np.ndarray:
+    depth = depth.copy()
+    depth[5:25, 5:25] = 3.0
+    return depth
 
 
-def depth_in_centimetres(rows):
-    for row in clean(rows):
-        depth = depth_of(row)
-        set_depth(row, np.where(depth < 1000, np.minimum(depth / 10, 999), depth).astype(np.float32))
+def one_thing_farther(row: Row) -> None:
+    pixels, depth = pixels_of(row, "instance"), depth_of(row)
+    ids = pixels[..., 1].astype(int) | pixels[..., 2].astype(int) << 8
+    sizes = {k: (ids == k).sum() for k in np.unique(ids) if k not in (0, 65534, 65535) and depth[ids == k].max() < 900}
+    depth[ids == max(sizes, key=lambda k: sizes[k] if sizes[k] < ids.size / 4 else 0)] *= np.float32(1.08)
+    set_depth(row, depth)
 
 
-def empty_instances(rows):
-    row = seen(rows)[2]
-    row["instance"]["bytes"] = png(np.zeros((row["height_px"], row["width_px"], 3), np.uint8))
+def ids_exchanged(pixels: np.ndarray, ids: np.ndarray) -> None:
+    known, new = [k for k in np.unique(ids) if k not in (0, 65534, 65535)], ids.copy()
+    for own, other in zip(known, [*known[1:], known[0]], strict=True):
+        new[ids == own] = other
+    pixels[..., 1], pixels[..., 2] = new & 255, new >> 8
 
 
-def person_painted_over(rows):
-    row = seen(rows)[2]
-    pixels = pixels_of(row, "instance")
-    pixels[(pixels[..., 1] == 255) & (pixels[..., 2] == 255)] = (1, 0, 0)
-    row["instance"]["bytes"] = png(pixels)
-
-
-def person_without_an_instance_of_a_person(rows):
-    row = seen(rows)[2]
-    pixels = pixels_of(row, "instance")
-    pixels[(pixels[..., 1] == 255) & (pixels[..., 2] == 255), 0] = 3
-    row["instance"]["bytes"] = png(pixels)
-
-
-def jpeg_under_a_png_name(rows):
-    import cv2
-
-    row = clean(rows)[2]
-    row["image"]["bytes"] = cv2.imencode(".jpg", pixels_of(row, "image"))[1].tobytes()
-
-
-def smaller_picture(rows):
-    import cv2
-
-    row = clean(rows)[2]
-    row["image"]["bytes"] = png(cv2.resize(pixels_of(row, "image"), (row["width_px"] // 2, row["height_px"] // 2)))
-
-
-def one_picture_in_two_rows(rows):
-    own = clean(rows)
-    own[9]["image"] = copy.deepcopy(own[2]["image"])
-
-
-def other_visibility(rows):
-    row = next(r for r in seen(rows) if r["visibility"] > 0.6)
-    row["visibility"] = 0.3
-
-
-# --- between flights --------------------------------------------------------------------------------------------------
-
-
-def split_that_leaks(rows):
-    own = clean(rows)
-    for row in own:
-        row["split"] = "test" if row["split"] != "test" else "train"
-
-
-def walk_renamed(rows):
-    first = clean(rows)[0]
-    for row in rows:
-        if row["trajectory"] == first["trajectory"] and row["track"] == "perturbed":
-            row["walk"] = "another/walk"
-
-
-def walk_of_nobody(rows):
-    walk = clean(rows)[0]["walk"]
-    for row in rows:
-        if row["walk"] == walk:
-            row["walk"] = walk[:-1] + ("0" if walk[-1] != "0" else "1")
-
-
-def clock_that_starts_late(rows):
-    trajectory = clean(rows)[0]["trajectory"]
-    for row in rows:
-        if row["trajectory"] == trajectory:
-            row["time_s"] += 10.0
-
-
-def pair_lost(rows):
-    for row in clean(rows):
-        row["pair"] = None
-
-
-# --- told without having seen the checks ------------------------------------------------------------------------------
-
-
-def middle(rows: list[Row]) -> Row:
-    own = clean(rows)
-    return own[len(own) // 2]
-
-
-def set_colours(row: Row, pixels: np.ndarray) -> None:
-    row["image"]["bytes"] = png(pixels)
-
-
-def person_of(pixels: np.ndarray) -> np.ndarray:
-    return (pixels[..., 1] == 255) & (pixels[..., 2] == 255)
-
-
-def box_of_person(pixels: np.ndarray) -> dict[str, float] | None:
-    """Give `target_mask_bbox` of an instance image."""
-    rows, columns = np.nonzero(person_of(pixels))
-    if not len(rows):
-        return None
-    edges = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
-    return dict(zip(("xmin_px", "ymin_px", "xmax_px", "ymax_px"), map(float, edges), strict=True))
-
-
-def noise_in_one_depth(rows):
-    depth = depth_of(middle(rows))
-    noise = np.random.default_rng(0).normal(1.0, 0.003, depth.shape)
-    set_depth(middle(rows), np.where(depth < 999, np.minimum(depth * noise, 998.0), depth).astype(np.float32))
-
-
-def visibility_a_little_lower(rows):
-    next(row for row in clean(rows) if row["visibility"] > 0.5)["visibility"] -= 0.05
-
-
-def picture_that_one_sees_through(rows):
-    import cv2
-
-    pixels = pixels_of(middle(rows), "image")[..., ::-1]
-    nothing = np.zeros(pixels.shape[:2], np.uint8)
-    middle(rows)["image"]["bytes"] = cv2.imencode(".png", np.dstack([pixels, nothing]))[1].tobytes()
-
-
-def bytes_behind_a_picture(rows):
-    middle(rows)["image"]["bytes"] += b"something else " * 100
-
-
-def add_chunk(row: Row, name: bytes, data: bytes) -> None:
-    png_bytes, crc = row["image"]["bytes"], struct.pack(">I", zlib.crc32(name + data))
-    row["image"]["bytes"] = png_bytes[:33] + struct.pack(">I", len(data)) + name + data + crc + png_bytes[33:]
-
-
-def words_in_a_picture(rows):
-    add_chunk(middle(rows), b"tEXt", b"Author\0somebody")
-
-
-def colours_meant_darker(rows):
-    add_chunk(middle(rows), b"gAMA", struct.pack(">I", 200_000))
-
-
-def weather_that_nobody_drew(rows):
-    for row in rows:
-        row["weather"] = "HardRainNoon"
-
-
-def night_that_nobody_drew(rows):
-    for row in rows:
-        row["time_of_day"] = "night"
-
-
-def headings_lost(rows):
-    for row in clean(rows):
-        row["target_heading_deg"] = None
-
-
-def window_with_a_frame_twice(rows):
-    row = captioned(rows)[0]
-    row["caption_window"] = [row["caption_window"][0], *row["caption_window"][:-1]]
-
-
-def depth_of_the_twin(rows):
-    row = shifted(rows)
-    twin = next(r for r in clean(rows) if r["frame_index"] == row["frame_index"])
-    swap(row, twin, "depth")
-
-
-def frame_mirrored_with_its_boxes(rows):
-    row = seen(rows)[len(seen(rows)) // 2]
-    instance, width = pixels_of(row, "instance")[:, ::-1].copy(), row["width_px"]
+def frame_mirrored_with_its_boxes(row: Row) -> None:
+    width, instance = row["width_px"], pixels_of(row, "instance")[:, ::-1].copy()
     row["instance"]["bytes"], row["target_mask_bbox"] = png(instance), box_of_person(instance)
-    set_colours(row, pixels_of(row, "image")[:, ::-1].copy())
+    row["image"]["bytes"] = png(pixels_of(row, "image")[:, ::-1].copy())
     set_depth(row, depth_of(row)[:, ::-1].copy())
     row["target_uv"]["u_px"] = width - row["target_uv"]["u_px"]
     box = row["target_bbox"]
     box["xmin_px"], box["xmax_px"] = width - box["xmax_px"], width - box["xmin_px"]
 
 
-def depth_a_hundredth_farther(rows):
-    depth = depth_of(middle(rows))
-    depth[depth < 999] *= np.float32(1.01)
-    set_depth(middle(rows), depth)
+def another_split(row: Row) -> None:
+    row["split"] = "test" if row["split"] != "test" else "train"
 
 
-def depth_in_decimetres_called_lossless(rows):
-    for row in clean(rows):
-        depth = depth_of(row)
-        set_depth(row, np.where(depth < 999, np.maximum(np.round(depth, 1), 0.1), depth).astype(np.float32))
+def walk_of_nobody(rows: Rows) -> None:
+    walk = clean(rows)[0]["walk"]
+    new = walk[:-1] + ("0" if walk[-1] != "0" else "1")
+    put(lambda _: [row for row in rows if row["walk"] == walk], walk=new)(rows)
 
 
-def obstacle_that_is_not_there(rows):
-    depth = depth_of(middle(rows))
-    depth[5:25, 5:25] = 3.0
-    set_depth(middle(rows), depth)
+def renamed_kind(pixels: np.ndarray, ids: np.ndarray) -> None:
+    pixels[pixels[..., 0] == KINDS["Buildings"], 0] = KINDS["Walls"]
 
 
-def second_person_far_away(rows):
-    row = seen(rows)[len(seen(rows)) // 2]
-    pixels = pixels_of(row, "instance")
+def transparent(pixels: np.ndarray, row: Row) -> bytes:
+    return cv2.imencode(".png", np.dstack([pixels[..., ::-1], np.zeros(pixels.shape[:2], np.uint8)]))[1].tobytes()
+
+
+def as_jpeg(pixels: np.ndarray, row: Row) -> bytes:
+    return cv2.imencode(".jpg", pixels)[1].tobytes()
+
+
+def noise(depth: np.ndarray, row: Row) -> np.ndarray:
+    return depth * np.random.default_rng(0).normal(1.0, 0.003, depth.shape)
+
+
+def second_person(pixels: np.ndarray, ids: np.ndarray) -> None:
     pixels[-4:, -4:] = (12, 255, 255)
-    row["instance"]["bytes"], row["target_mask_bbox"] = png(pixels), box_of_person(pixels)
 
 
-def ids_of_things_exchanged(rows):
-    row = middle(rows)
-    pixels = pixels_of(row, "instance")
-    ids = pixels[..., 1].astype(int) | pixels[..., 2].astype(int) << 8
-    known = [own for own in np.unique(ids) if own not in (0, 65534, 65535)]
-    new = ids.copy()
-    for own, other in zip(known, [*known[1:], known[0]], strict=True):
-        new[ids == own] = other
-    pixels[..., 1], pixels[..., 2] = new & 255, new >> 8
-    row["instance"]["bytes"] = png(pixels)
+def without_the_person(kind: tuple[int, ...] | int) -> Callable[[np.ndarray, np.ndarray], None]:
+    def painted(pixels: np.ndarray, ids: np.ndarray) -> None:
+        pixels[ids == 65535, : 3 if isinstance(kind, tuple) else 1] = kind
+
+    return painted
 
 
-# --- of an outsider's list ---------------------------------------------------------------------------------------------
-
-
-def names_of_pictures_exchanged(rows):
-    swap(clean(rows)[2]["image"], clean(rows)[3]["image"], "path")
-
-
-def question_that_looks_ahead(rows):
-    for row in captioned(rows):
-        row["system_en"] += " The frames that follow are shown too."
-
-
-def depth_in_centimetres_called_lossless(rows):
-    for row in clean(rows):
-        depth = depth_of(row)
-        set_depth(row, np.round(depth, 2).astype(np.float32))
-
-
-def ids_in(row: Row) -> tuple[np.ndarray, np.ndarray]:
-    """The mask of a row, and of each pixel the id."""
-    pixels = pixels_of(row, "instance")
-    return pixels, pixels[..., 1].astype(int) | pixels[..., 2].astype(int) << 8
-
-
-def change_depth(rows: list[Row], share: float, off_m: float = 0.0) -> None:
-    for row in rows:
-        depth = depth_of(row)
-        set_depth(row, np.where(depth < 999, np.minimum(depth * share + off_m, 998.0), depth).astype(np.float32))
-
-
-def depth_scaled_by_a_fiftieth(rows):
-    change_depth(rows, 1.02)
-
-
-def depth_set_off(rows):
-    change_depth(rows, 1.0, 0.3)
-
-
-def depth_of_a_flight_scaled(rows):
-    change_depth(clean(rows), 1.02)
-
-
-def thing_farther_in_one_frame(rows):
-    row = middle(rows)
-    _, ids = ids_in(row)
-    depth = depth_of(row)
-    sizes = {
-        own: (ids == own).sum()
-        for own in np.unique(ids)
-        if own not in (0, 65534, 65535) and depth[ids == own].max() < 900
-    }
-    thing = ids == max(sizes, key=lambda own: sizes[own] if sizes[own] < ids.size / 4 else 0)
-    depth[thing] *= np.float32(1.08)
-    set_depth(row, depth)
-
-
-def things_of_another_kind_in_a_trajectory(rows):
-    """Everything that is a building elsewhere."""
-    own = clean(rows)[0]["trajectory"]
-    for row in (row for row in rows if row["trajectory"] == own):
-        pixels = pixels_of(row, "instance")
-        pixels[pixels[..., 0] == KINDS["Buildings"], 0] = KINDS["Walls"]
-        row["instance"]["bytes"] = png(pixels)
-
-
-LIES: dict[str, tuple[Lie, bool]] = {
-    lie.__name__: (lie, is_of_pixels)
-    for is_of_pixels, lies in (
-        (False, (
-            sample_id_of_another_frame, label_outside_the_set, verdict_outside_the_set, consistent_with_another_decision,
-            visibility_above_one, visible_but_not_in_view, perturbed_without_offsets, offsets_without_flag, track_against_variant,
-            path_that_escapes, time_backwards, a_second_lost, all_targets_null, infinite_angle,
-            field_of_view_against_focal_length, focal_lengths_exchanged, principal_point_moved, target_pixel_moved, box_moved,
-            target_depth_against_depth, pose_jumps, heading_backwards, offsets_with_the_other_sign, target_offset_lost,
-            unperturbed_called_applied, clean_flight_from_another_time, window_into_the_future, window_with_a_gap,
-            decision_differs_between_languages, number_differs_between_languages, side_differs_between_languages,
-            number_wrong_in_both_languages, captions_of_two_windows_exchanged, texts_of_two_windows_exchanged,
-            decision_and_label_changed_together, hard_conflict_called_soft, prompt_that_holds_the_future, prompt_of_the_next_window,
-            all_sentences_called_proved, text_about_something_else, chinese_in_english, split_that_leaks, walk_renamed, pair_lost,
-            walk_of_nobody, clock_that_starts_late, weather_that_nobody_drew, night_that_nobody_drew, headings_lost, window_with_a_frame_twice,
-            names_of_pictures_exchanged, question_that_looks_ahead, undrawn_event_called_fallback, perturbation_taken_off, pace_called_otherwise,
-            time_stretched, pose_of_the_next_frame, poses_of_two_frames_exchanged, lower_than_it_was, pose_frozen,
-        )),
-        (True, (
-            another_camera_all_along, box_against_mask, target_far_behind_on_its_line, poses_of_two_flights_exchanged,
-            world_turned, colours_of_neighbours_exchanged, colours_of_two_flights_exchanged, depth_of_neighbours_exchanged,
-            instances_of_neighbours_exchanged, instances_exchanged_with_their_boxes, depth_doubled, depth_doubled_but_at_the_person,
-            depth_not_a_number, distance_along_the_ray, depth_in_centimetres, empty_instances, person_painted_over,
-            person_without_an_instance_of_a_person, jpeg_under_a_png_name, smaller_picture, one_picture_in_two_rows, other_visibility, picture_that_one_sees_through, bytes_behind_a_picture, words_in_a_picture, colours_meant_darker, depth_of_the_twin,
-            frame_mirrored_with_its_boxes, depth_a_hundredth_farther, depth_in_decimetres_called_lossless, obstacle_that_is_not_there,
-            second_person_far_away, ids_of_things_exchanged, depth_in_centimetres_called_lossless, noise_in_one_depth, visibility_a_little_lower,
-            depth_scaled_by_a_fiftieth, depth_set_off, depth_of_a_flight_scaled, thing_farther_in_one_frame, things_of_another_kind_in_a_trajectory,
-        )),
-    )
-    for lie in lies
+not_hovering = first(captioned, lambda row: row["decision"] != "hover")
+caption, middle, middle_seen = at(captioned, 0), half(clean), half(seen)
+FALLBACK = "fallback: target hidden"
+ZH = ("caption_zh_reasoning_trace", "caption_zh_critical_components")
+ids_of_things_exchanged = change(middle, with_ids(ids_exchanged))
+box_moved = change(at(seen, 1), add("target_bbox", 4.0, *BOX))
+LIES_OF_ROWS: dict[str, Lie] = {
+    "sample_id_of_another_frame": change(at(clean, 3), lambda r: r.update(sample_id=r["sample_id"][:-5] + "00999")),
+    "label_outside_the_set": put(caption, label="fly_away"),
+    "verdict_outside_the_set": put(caption, verdict="FINE"),
+    "consistent_with_another_decision": change(
+        first(captioned, lambda r: r["label"] and r["decision"] == r["label"]),
+        lambda r: r.update(label="hover" if r["label"] != "hover" else "ascend"),
+    ),
+    "visibility_above_one": put(at(clean, 0), visibility=1.7),
+    "visible_but_not_in_view": put(at(seen, 0), target_in_view=False),
+    "perturbed_without_offsets": put(first(perturbed, lambda r: not r["is_perturbed"]), is_perturbed=True),
+    "offsets_without_flag": put(shifted, is_perturbed=False),
+    "track_against_variant": put(clean, track="perturbed"),
+    "path_that_escapes": put(clean, run=".."),
+    "time_backwards": swapped(clean, 2, 3, "time_s"),
+    "a_second_lost": change(lambda rows: clean(rows)[5:], add("time_s", 1.0)),
+    "time_stretched": change(clean, lambda r: r.update(time_s=r["time_s"] * 1.5)),
+    "clock_that_starts_late": change(trajectory, add("time_s", 10.0)),
+    "clean_flight_from_another_time": change(perturbed, add("time_s", 0.5)),
+    "all_targets_null": change(everything, nobody_followed),
+    "infinite_angle": change(at(clean, 1), lambda r: r["drone_offset"].update(roll_deg=math.inf)),
+    "field_of_view_against_focal_length": put(clean, fov_deg=75.0),
+    "focal_lengths_exchanged": turned(clean, lambda r: r["intrinsics"].update(fy=r["intrinsics"]["fy"] * 1.1)),
+    "principal_point_moved": turned(clean, add("intrinsics", 12.0, "cx")),
+    "target_pixel_moved": change(at(seen, 1), add("target_uv", 3.0, "u_px")),
+    "box_moved": box_moved,
+    "target_depth_against_depth": change(at(seen, 1), add("target_depth_m", 5.0)),
+    "pose_of_the_next_frame": lambda rows: with_poses(clean(rows)[4:5], clean(rows)[5:6]),
+    "poses_of_two_frames_exchanged": lambda rows: with_poses(clean(rows)[4:10:5], clean(rows)[9:3:-5]),
+    "pose_frozen": lambda rows: with_poses(clean(rows)[5:12], clean(rows)[5:6] * 7),
+    "pose_jumps": turned(at(clean, 6), add("pose", 20.0, "x_m")),
+    "lower_than_it_was": change(clean, add("pose", -3.0, "z_m")),
+    "heading_backwards": change(clean, heading_backwards),
+    "headings_lost": put(clean, target_heading_deg=None),
+    "offsets_with_the_other_sign": change(
+        perturbed, lambda r: r.update(drone_offset={name: -value + 0.0 for name, value in r["drone_offset"].items()})
+    ),
+    "target_offset_lost": put(shifted, target_offset=dict.fromkeys(XYZ, 0.0)),
+    "unperturbed_called_applied": alter(unturned, perturbation=lambda p: p | {"rotation": "applied"}),
+    "undrawn_event_called_fallback": alter(unturned, perturbation=lambda p: p | {"rotation": FALLBACK}),
+    "perturbation_taken_off": perturbation_taken_off,
+    "pace_called_otherwise": put(trajectory, pace="hurry"),
+    "style_called_otherwise": put(trajectory, style="orbit_left"),
+    "window_into_the_future": alter(caption, caption_window=lambda w: [i + 1 for i in w]),
+    "window_with_a_gap": alter(caption, caption_window=lambda w: [w[0] - 1, *w[1:]]),
+    "window_with_a_frame_twice": alter(caption, caption_window=lambda w: [w[0], *w[:-1]]),
+    "decision_differs_between_languages": put(not_hovering, caption_zh_flight_decision="hover"),
+    "number_differs_between_languages": in_one_text(r"(\d+)\.(\d)", lambda m: f"{int(m[1]) + 3}.{m[2]}", *ZH),
+    "side_differs_between_languages": in_one_text("[左右]", lambda m: "右" if m[0] == "左" else "左", *ZH),
+    "number_wrong_in_both_languages": number_wrong_in_both_languages,
+    "captions_of_two_windows_exchanged": swapped(captioned, 0, -1, *CAPTION),
+    "texts_of_two_windows_exchanged": texts_of_two_windows_exchanged,
+    "decision_and_label_changed_together": put(
+        not_hovering, **dict.fromkeys((*DECISIONS, "label"), "hover"), verdict="CONSISTENT"
+    ),
+    "hard_conflict_called_soft": change(at(captioned, 1), hard_conflict_called_soft),
+    "prompt_that_holds_the_future": alter(
+        caption, prompt_en=lambda p: p + "\nIt turns left.", prompt_zh=lambda p: p + "\n然后无人机向左转。"
+    ),
+    "prompt_of_the_next_window": swapped(captioned, 0, 1, "prompt_en", "prompt_zh"),
+    "question_that_looks_ahead": alter(captioned, system_en=lambda s: s + " The frames that follow are shown too."),
+    "all_sentences_called_proved": alter(caption, proved_sentences_en=lambda n: (n or 0) + 1),
+    "text_about_something_else": put(caption, caption_en_critical_components="The person is 97.5 m ahead of it."),
+    "chinese_in_english": change(caption, lambda r: r.update({ZH[0]: r["caption_en_reasoning_trace"]})),
+    "split_that_leaks": change(clean, another_split),
+    "walk_renamed": put(lambda rows: [r for r in trajectory(rows) if r["track"] == "perturbed"], walk="another/walk"),
+    "walk_of_nobody": walk_of_nobody,
+    "pair_lost": put(clean, pair=None),
+    "weather_that_nobody_drew": put(everything, weather="HardRainNoon"),
+    "night_that_nobody_drew": put(everything, time_of_day="night"),
+    "names_of_pictures_exchanged": lambda rows: swap(clean(rows)[2]["image"], clean(rows)[3]["image"], "path"),
 }  # fmt: skip
+POSES = ("pose", "target", "target_uv", "target_bbox", "target_depth_m", "target_heading_deg", "intrinsics", "fov_deg")
+LIES_OF_PIXELS: dict[str, Lie] = {
+    "another_camera_all_along": turned(clean, another_camera),
+    "box_against_mask": change(at(seen, 1), add("target_mask_bbox", 2.0, "xmin_px", "xmax_px")),
+    "target_far_behind_on_its_line": turned(seen, farther_on_its_line),
+    "poses_of_two_flights_exchanged": swapped_flights(*POSES),
+    "world_turned": turned(clean, mirrored_world),
+    "colours_of_neighbours_exchanged": swapped(perturbed, 4, 5, "image"),
+    "colours_of_two_flights_exchanged": swapped_flights("image"),
+    "depth_of_neighbours_exchanged": swapped(perturbed, 4, 5, "depth"),
+    "depth_of_the_twin": lambda rows: swap(shifted(rows)[0], twin_of(rows, shifted(rows)[0]), "depth"),
+    "instances_of_neighbours_exchanged": swapped(perturbed, 4, 5, "instance"),
+    "instances_exchanged_with_their_boxes": swapped(perturbed, 4, 5, "instance", "target_mask_bbox"),
+    "depth_doubled": change(at(seen, 2), with_depth(lambda depth, _: depth * 2)),
+    "depth_doubled_but_at_the_person": change(at(clean, 4), with_depth(farther_but_for_the_person)),
+    "depth_not_a_number": change(at(clean, 3), not_a_number),
+    "distance_along_the_ray": change(clean, with_depth(along_the_ray)),
+    "depth_in_centimetres": change(clean, with_depth(lambda depth, _: depth / 10)),
+    "depth_a_hundredth_farther": change(middle, with_depth(lambda depth, _: depth * 1.01)),
+    "depth_in_decimetres_called_lossless": change(clean, with_depth(lambda depth, _: np.round(depth, 1) + 0.1)),
+    "depth_in_centimetres_called_lossless": change(clean, with_depth(lambda depth, _: np.round(depth, 2))),
+    "depth_scaled_by_a_fiftieth": change(everything, with_depth(lambda depth, _: depth * 1.02)),
+    "depth_set_off": change(everything, with_depth(lambda depth, _: depth + 0.3)),
+    "depth_of_a_flight_scaled": change(clean, with_depth(lambda depth, _: depth * 1.02)),
+    "noise_in_one_depth": change(middle, with_depth(noise)),
+    "obstacle_that_is_not_there": change(middle, with_depth(boxed)),
+    "thing_farther_in_one_frame": change(middle, one_thing_farther),
+    "empty_instances": change(at(seen, 2), with_ids(lambda pixels, _: pixels.fill(0))),
+    "person_painted_over": change(at(seen, 2), with_ids(without_the_person((1, 0, 0)))),
+    "person_without_an_instance_of_a_person": change(at(seen, 2), with_ids(without_the_person(3))),
+    "second_person_far_away": change(middle_seen, with_ids(second_person, box=True)),
+    "ids_of_things_exchanged": ids_of_things_exchanged,
+    "things_of_another_kind_in_a_trajectory": change(trajectory, with_ids(renamed_kind)),
+    "frame_mirrored_with_its_boxes": change(middle_seen, frame_mirrored_with_its_boxes),
+    "jpeg_under_a_png_name": change(at(clean, 2), with_colours(as_jpeg)),
+    "smaller_picture": change(at(clean, 2), with_colours(lambda pixels, _: png(pixels[::2, ::2]))),
+    "picture_that_one_sees_through": change(middle, with_colours(transparent)),
+    "bytes_behind_a_picture": alter(middle, image=lambda i: i | {"bytes": i["bytes"] + b"something else " * 100}),
+    "words_in_a_picture": change(middle, chunk(b"tEXt", b"Author\0somebody")),
+    "colours_meant_darker": change(middle, chunk(b"gAMA", struct.pack(">I", 200_000))),
+    "one_picture_in_two_rows": lambda rows: put(at(clean, 9), image=clean(rows)[2]["image"])(rows),
+    "other_visibility": put(first(seen, lambda r: r["visibility"] > 0.6), visibility=0.3),
+    "visibility_a_little_lower": change(first(clean, lambda r: r["visibility"] > 0.5), add("visibility", -0.05)),
+}  # fmt: skip
+# name -> the lie, and whether only pixels tell it
+LIES = {name: (lie, False) for name, lie in LIES_OF_ROWS.items()} | {
+    name: (lie, True) for name, lie in LIES_OF_PIXELS.items()
+}

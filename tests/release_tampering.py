@@ -1,4 +1,5 @@
-"""A forger's kit: change the rows of a release and make hashes, counts, splits and card right again, as somebody would who knows the format."""
+"""A forger's kit: change the rows of a release and make hashes, counts, splits and card right again, as somebody would
+who knows the format."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ def forge(
     change: Callable[[list[Row]], None] = lambda rows: None,
     change_record: Callable[[dict[str, Any]], None] = lambda record: None,
 ) -> Path:
-    """Copy a release, change all of its rows together, then its record, and make everything that counts or hashes them right again."""
+    """Copy a release, change all of its rows together, then its record, and make everything that counts or hashes them
+    right again."""
     record, shards = read_all(dataset)
     change([row for rows in shards for row in rows])
     shutil.rmtree(out, ignore_errors=True)

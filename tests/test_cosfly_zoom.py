@@ -34,7 +34,7 @@ from cosfly.render.stage import run
 from cosfly.studies import weather
 from cosfly.work.config import build
 from cosfly.work.stage_folder import read_failures, read_manifest
-from release.columns import INTRINSICS, Placed, matrices_of, scalar_row
+from release.columns import INTRINSICS, Placement, matrices_of, scalar_row
 from specimens import make_flight
 
 LEVELS = (110.0, 90.0, 60.0, 30.0)
@@ -135,7 +135,7 @@ def test_the_cameras_of_a_flight_survive_the_file(tmp_path):
     np.testing.assert_array_equal(found.intrinsics, flight.intrinsics)
     assert found.camera_at(7).focal_px == pytest.approx(2 * found.camera.focal_px)
     assert found.fovs_deg[0] < found.fovs_deg[1] == pytest.approx(60.0)
-    row = scalar_row(found, 7, None, Placed("", "walk", "train", None))
+    row = scalar_row(found, 7, None, Placement("", "walk", "train", None))
     np.testing.assert_array_equal(
         matrices_of(np.array([row["intrinsics"][name] for name in INTRINSICS])[None])[0], flight.intrinsics[7]
     )

@@ -1,25 +1,16 @@
 """Every command of the documentation parses: its options and arguments exist. Nothing is run."""
 
-import ast
 import re
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pytest
 import typer
 
-from cosfly.app.settings import RunConfig
-from cosfly.app.settings_guide import explain
 from cosfly.cli import app, options_first
-from cosfly.cli.options import resolve
-from cosfly.errors import CosflyError
-from cosfly.products.boxes import read_boxes
-from cosfly.products.review import how_to_decide
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("cosfly", "caption", "distill", "release")
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 TOWNS = [f"runs/learning/{name}" for name in ("grid", "old_town", "city_a", "city_b")]
 VARIABLES = {
@@ -95,48 +86,3 @@ def test_no_option_in_running_text_is_unknown():
             known = {option for parameter in command.params for option in parameter.opts} | {"--help", "--version"}
             unknown += [f"{page.name}: cosfly {text}" for word in words if word.startswith("-") and word not in known]
     assert not unknown
-
-
-# --- what messages tell to type ---------------------------------------------------------------------------------------
-
-
-def told_texts() -> Iterator[tuple[str, str]]:
-    """Every text of the sources that names a command or an override: where, and the text; what is filled in is FILLED."""
-    for path in (path for name in PACKAGES for path in sorted((ROOT / name).rglob("*.py"))):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        parts = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
-        for node in ast.walk(tree):
-            if isinstance(node, ast.JoinedStr):
-                text = "".join(part.value if isinstance(part, ast.Constant) else "FILLED" for part in node.values)
-            elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in parts:
-                text = node.value
-            else:
-                continue
-            if re.search(r"--set \S|cosfly [a-z]", text):
-                yield f"{path.relative_to(ROOT)}:{node.lineno}", text
-
-
-def test_an_override_in_a_message_can_be_pasted_into_a_shell():
-    """It is one word of a shell, and names a setting with a value, not an ellipsis."""
-    known, found = {setting.name for setting in explain(RunConfig())}, list[str]()
-    for place, text in told_texts():
-        for word in re.findall(r"--set ('[^']*'|[^\s,;:)`]+)", text):
-            name, _, value = shlex.split(word)[0].partition("=")
-            is_plain = word.startswith("'") or not set(word) & set("[]{}()<>*?$&|\"'`")
-            if not is_plain or "..." in word or not (value and (name in known or "FILLED" in name)):
-                found.append(f"{place}: {word}")
-    assert [line for line in found if not line.endswith(("A.B=C", "a.b=c", ": FILLED"))] == []
-
-
-def test_paths_in_messages_are_quoted(tmp_path):
-    folder = tmp_path / "two words"
-    folder.mkdir()
-    for command in (how_to_decide(folder), error_of(lambda: read_boxes(folder / "a b.csv"))):
-        assert any(word.endswith(("two words", "a b.csv")) for word in shlex.split(command))
-    assert str(folder) in shlex.split(error_of(lambda: resolve(folder, None)))
-
-
-def error_of(call: Callable[[], object]) -> str:
-    with pytest.raises(CosflyError) as caught:
-        call()
-    return str(caught.value.fix)

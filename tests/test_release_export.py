@@ -289,7 +289,8 @@ def flight_of(frames: list[int]) -> ReleasedRows:
 
 
 @pytest.mark.parametrize(
-    ("frames", "runs"), [([0, 1, 2], [(0, 3)]), ([0, 2, 3, 7], [(0, 1), (1, 3), (3, 4)]), ([5], [(0, 1)])]
+    ("frames", "runs"),
+    [([0, 1, 2], [(0, 3)]), ([0, 2, 3, 7], [(0, 1), (1, 3), (3, 4)]), ([5], [(0, 1)])],
 )
 def test_an_episode_has_no_gap(frames, runs):
     assert runs_of(flight_of(frames)) == runs

@@ -1,7 +1,9 @@
-"""Honest releases verify: maps, sizes, weather, zoom, renderers, perturbations and captions of every kind; and what a release tells of lies about them.
+"""Honest releases verify: maps, sizes, weather, zoom, renderers, perturbations and captions of every kind; and what a
+release tells of lies about them.
 
-Real maps stand first: a check of looks that holds in a synthetic town alone is found here. Each kind is a run of a few short flights that shares maps, walks and
-plans with the kinds of its map. The table of all kinds is looked through to its end, so that one run names everything that is wrong.
+Real maps stand first: a check of looks that holds in a synthetic town alone is found here. Each kind is a run of a few
+short flights that shares maps, walks and plans with the kinds of its map. The table of all kinds is looked through to
+its end, so that one run names everything that is wrong.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 SKY_M = 999.0
 SHARED_STAGES = ("maps", "simplify", "pedestrians", "plan")
 SHORT = [
-    "pedestrians.num_paths=2", "pedestrians.min_distance_m=14", "pedestrians.max_distance_m=22", "caption.window.stride=2",
+    "pedestrians.num_paths=2", "pedestrians.min_distance_m=14", "pedestrians.max_distance_m=22",
+    "caption.window.stride=2",
     "render.width_px=320", "render.height_px=180", "release.licence=cc-by-4.0",
 ]  # fmt: skip
 # name -> shipped configuration, or none, and what it is told; DATA is the folder of real maps
@@ -47,12 +50,16 @@ MAPS = {
         "maps.simworld.sizes=[DATA/simworld-robotics/Bbox_total.json, DATA/simworld-progen/Bbox.json]",
     ]),
     "delft": ("delft", ["maps.cityjson.path=DATA/delft-bgt-lod1/delft.json.gz"]),
-    "campus_3dbag": (None, ["maps.source=cityjson", "maps.cityjson.path=DATA/tudelft-3dbag/extension.city.jsonl.gz", "pedestrians.ground=anywhere"]),
+    "campus_3dbag": (None,
+     ["maps.source=cityjson", "maps.cityjson.path=DATA/tudelft-3dbag/extension.city.jsonl.gz",
+      "pedestrians.ground=anywhere"]),
     "town": (None, []),
     "uneven": (None, ["maps.synthetic.unevenness=0.2"]),
     "river": (None, ["maps.synthetic.preset=river"]),
     "towers": (None, ["maps.synthetic.preset=towers"]),
-    "park_styles": (None, ["maps.synthetic.preset=park", "plan.planner=muco", "plan.styles={orbit_left: 1, rise: 1}", "pedestrians.pace={hurry: 1, stop_and_look: 1}"]),
+    "park_styles": (None,
+     ["maps.synthetic.preset=park", "plan.planner=muco", "plan.styles={orbit_left: 1, rise: 1}",
+      "pedestrians.pace={hurry: 1, stop_and_look: 1}"]),
     "crowd": (None, ["maps.synthetic.preset=market", "pedestrians.others=6", "pedestrians.traffic=4"]),
     "one": (None, ["pedestrians.num_paths=1"]),
 }  # fmt: skip
@@ -71,7 +78,8 @@ SMALL, HD = ["render.width_px=160", "render.height_px=90"], ["render.width_px=12
 NARROW, WIDE = ["render.fovs_deg=[30]"], ["render.fovs_deg=[110]"]
 ZOOM = ["render.fovs_deg=[30, 60, 90]", "render.zoom.mode=dynamic", "render.zoom.part_s=5", "render.zoom.ramp_s=2"]
 FAR = [
-    "render.perturbation.pedestrian_radius_m=6", "render.perturbation.drone_radius_m=6", "render.perturbation.max_view_deg=20",
+    "render.perturbation.pedestrian_radius_m=6", "render.perturbation.drone_radius_m=6",
+    "render.perturbation.max_view_deg=20",
     "render.perturbation.view_radius_m=6",
 ]  # fmt: skip
 TEACHER = "caption.teacher=TEACHER"
@@ -101,7 +109,8 @@ KINDS = {
     "town 1280 px": ("one", HD),
     "town random weather": ("town", ["render.look={}", "render.weather_mode=random_per_path"]),
     "town fog at night": ("town", weather("dense_fog", "night")),
-    "town cubic perturbation": ("town", [*FAR, "render.perturbation.sampling=cubic", "render.perturbation.position_probability=1"]),
+    "town cubic perturbation": ("town",
+     [*FAR, "render.perturbation.sampling=cubic", "render.perturbation.position_probability=1"]),
     "town float16": ("town", ["release.depth=float16"]),
     "town millimetres": ("town", ["release.depth=millimetre_png", *NARROW]),
     "town colours alone": ("town", ["release.modalities=[rgb]"]),
@@ -120,7 +129,8 @@ KINDS = {
 
 
 def stages(cfg: RunConfig, out: Path) -> list[pipeline.Stage]:
-    """Give the stages of a run, which do their work in this process: workers take longer to start than these flights."""
+    """Give the stages of a run, which do their work in this process: workers take longer to start than these
+    flights."""
     with mock.patch.object(pipeline, "manner_of_work", return_value={"workers": 0}):
         return pipeline.stages(cfg, out)
 
@@ -213,13 +223,15 @@ def labels_mirrored(rows: list[Row]) -> None:
 
 
 SEALED = {
-    "depth 2 % farther": depth_of_all(1.02, 0.0), "depth 0.3 m farther": depth_of_all(1.0, 0.3), "a box moved": box_moved,
+    "depth 2 % farther": depth_of_all(1.02, 0.0), "depth 0.3 m farther": depth_of_all(1.0, 0.3),
+    "a box moved": box_moved,
     "ids exchanged": ids_of_things_exchanged, "labels mirrored": labels_mirrored,
 }  # fmt: skip
 
 
 def test_sealed_lies_about_real_maps_are_found(runs, tmp_path):
-    """The lies of release_lies.py are about a synthetic town; these are about cities, and of depths that are wrong everywhere by little."""
+    """The lies of release_lies.py are about a synthetic town; these are about cities, and of depths that are wrong
+    everywhere by little."""
     missed = [
         f"{kind}: {name}"
         for kind in ("simworld 160 px", "delft 160 px", "town")

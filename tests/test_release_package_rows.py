@@ -1,4 +1,5 @@
-"""The writing of shards: whatever the size of the writes and whatever the file system can, the file holds them and the digest is theirs."""
+"""The writing of shards: whatever the size of the writes and whatever the file system can, the file holds them and the
+digest is theirs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Signatures of releases: keys of openssl and ssh-keygen, what a forger can do, and what a fetched release still tells."""
+"""Signatures of releases: keys of openssl and ssh-keygen, what a forger can do, and what a fetched release still
+tells."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ SECRET = "correct horse"
 
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory) -> Path:
-    """Pairs as users make them: NAME and NAME.pub, of openssl and of ssh-keygen, plain and encrypted, and one of RSA."""
+    """Pairs as users make them: NAME and NAME.pub, of openssl and of ssh-keygen, plain and encrypted, and one of
+    RSA."""
     folder = tmp_path_factory.mktemp("keys")
     for tool in ("openssl", "ssh-keygen"):
         if shutil.which(tool) is None:
@@ -93,8 +95,10 @@ def test_keys_that_will_not_do_are_named_and_never_quoted(keys, monkeypatch, tmp
     (tmp_path / "empty").write_bytes(b"")
     cases = [
         (read_private_key, keys / "rsa", "another kind"), (read_public_key, keys / "rsa.pub", "another kind"),
-        (read_private_key, keys / "pem.pub", "other key of the pair"), (read_private_key, keys / "ssh.pub", "other key of the pair"),
-        (read_public_key, keys / "pem", "other key of the pair"), (read_public_key, keys / "ssh", "other key of the pair"),
+        (read_private_key, keys / "pem.pub", "other key of the pair"),
+        (read_private_key, keys / "ssh.pub", "other key of the pair"),
+        (read_public_key, keys / "pem", "other key of the pair"),
+        (read_public_key, keys / "ssh", "other key of the pair"),
         (read_private_key, keys / "pem_locked", PASSPHRASE), (read_private_key, keys / "ssh_locked", PASSPHRASE),
         (read_private_key, tmp_path / "junk", "cannot read"), (read_public_key, tmp_path / "junk", "other key"),
         (read_private_key, tmp_path / "empty", "cannot read"), (read_public_key, tmp_path / "empty", "cannot read"),
@@ -158,7 +162,8 @@ def test_a_forger_who_makes_every_checksum_right_is_found(keys, dataset, tmp_pat
         "claimed key": (claim_key, {"signature", "card"}),
         "no signature": (lambda folder: (folder / SIGNATURE).unlink(), {"signature"}),
         "not JSON": (lambda folder: (folder / SIGNATURE).write_bytes(b"{"), {"signature"}),
-        "no base64": (lambda f: write_json(f / SIGNATURE, read_json(f / SIGNATURE) | {"signature": "A" * 87 + "!"}), {"signature"}),
+        "no base64": (lambda f: write_json(f / SIGNATURE, read_json(f / SIGNATURE) | {"signature": "A" * 87 + "!"}),
+         {"signature"}),
         "list gone": (lambda folder: (folder / CHECKSUMS).unlink(), {"signature", "checksum", "missing"}),
     }  # fmt: skip
     for name, (change, wanted) in changes.items():

@@ -1,4 +1,5 @@
-"""`release verify`: what honest releases get, what lies it finds that make everything else right again, and what hostile files do to it."""
+"""`release verify`: what honest releases get, what lies it finds that make everything else right again, and what
+hostile files do to it."""
 
 from __future__ import annotations
 
@@ -8,13 +9,14 @@ import os
 import shutil
 import struct
 import zlib
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from release_lies import LIES
+from release_lies import LIES, at, captioned, change, everything, put
 from release_tampering import errors_in, forge, read_all, set_depth
 from specimens_foreign import hub_snapshot, write_foreign_tree
 from typer.testing import CliRunner
@@ -29,16 +31,16 @@ from cosfly.products.frames import instance_bytes
 from cosfly.reading.documents import read_json
 from cosfly.work.config import load
 from cosfly.work.store import write_bytes
-from release.columns import POSE
+from release.columns import INTRINSICS, POSE
 from release.package import stage as package
 from release.package.config import ReleaseConfig
 from release.package.sources import Source
 from release.record import read_record
 from release.rules import split_groups
-from release.verify.by_rule import check_inspected
+from release.verify.by_rule import check_settings
 from release.verify.findings import EXAMPLES, Findings
+from release.verify.records import check_shards
 from release.verify.rows import FlightRows
-from release.verify.shards import check_shards
 from release.verify.verify import verify
 
 TINY = [
@@ -128,13 +130,18 @@ def test_trees_pass_ours_and_the_public_layout(honest_run, tmp_path):
 
 # One of each kind of check; all of them take a minute and more.
 QUICK_LIES = {
-    "sample_id_of_another_frame", "target_pixel_moved", "offsets_with_the_other_sign", "pace_called_otherwise", "hard_conflict_called_soft",
-    "all_sentences_called_proved", "prompt_that_holds_the_future", "split_that_leaks", "box_against_mask", "depth_set_off", "bytes_behind_a_picture",
+    "sample_id_of_another_frame", "target_pixel_moved", "offsets_with_the_other_sign", "pace_called_otherwise",
+    "hard_conflict_called_soft",
+    "all_sentences_called_proved", "prompt_that_holds_the_future", "split_that_leaks", "box_against_mask",
+    "depth_set_off", "bytes_behind_a_picture",
     "ids_of_things_exchanged", "poses_of_two_frames_exchanged",
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in QUICK_LIES else pytest.mark.slow) for name in LIES])  # fmt: skip
+MARKED = [pytest.param(name, marks=() if name in QUICK_LIES else pytest.mark.slow) for name in LIES]
+
+
+@pytest.mark.parametrize("name", MARKED)
 def test_a_lie_is_found(honest, tmp_path, name):
     lie, is_of_pixels = LIES[name]
     forged = forge(honest, tmp_path / "forged", lie)
@@ -166,19 +173,11 @@ def test_the_shards_tell_which_library_wrote_them(honest):
 @pytest.mark.parametrize(("most", "num_frames", "is_found"), [(5.0, 20, False), (0.5, 20, True), (0.5, 30, False)])
 def test_a_whole_clean_flight_keeps_the_bounds_of_its_inspection(most, num_frames, is_found):
     """One that goes to and fro by a metre every second; of a flight in part nobody knows."""
-    rows = [
-        {
-            "frame_index": k,
-            "time_s": 0.5 * k,
-            "track": "clean",
-            "pose": dict.fromkeys(POSE, 0.0) | {"x_m": float(k // 2 % 2)},
-        }
-        for k in range(20)
-    ]
+    poses = [dict.fromkeys(POSE, 0.0) | {"x_m": float(k // 2 % 2)} for k in range(20)]
+    rows = [{"frame_index": k, "time_s": 0.5 * k, "track": "clean", "pose": pose} for k, pose in enumerate(poses)]
     found = Findings()
-    check_inspected(
-        FlightRows("run/Town/trajectory/ORI", rows, num_frames=num_frames), {"accel_rms_max_mps2": most}, found
-    )
+    settings = {"inspect": {"accel_rms_max_mps2": most}}
+    check_settings(FlightRows("run/Town/trajectory/ORI", rows, num_frames=num_frames), settings, found)
     assert [code for _, code in found.kinds] == ["settings"] * is_found
 
 
@@ -205,9 +204,26 @@ RECORD_LIES = {
     "a flight rejected for nothing": lambda r: _one_less(r, "rejected"),
     "larger pictures": lambda r: _stage(r, "render")["config"].update(width_px=1920, height_px=1080),
     "longer windows": lambda r: _stage(r, "caption")["config"]["window"].update(num_frames=9),
+    "windows lost that none could lose": lambda r: _more_lost(r, "window_not_whole", 900),
+    "frames not chosen that there are none of": lambda r: _more_lost(r, "frame_not_selected", 90_000),
+    "a smaller error of the depth": lambda r: r["depth"].update(max_error_m=0.1),
     "a sky of 999 m": lambda r: r["depth"].update(sky=999.0),
     "a town of another map": lambda r: r["maps"][0].update(name="Delft"),
 }
+
+
+def _more_lost(record: dict, name: str, count: int) -> None:
+    """More captions were accepted and lost by the choice of frames; every sum is right."""
+    captions, made = record["history"]["captions"], record["provenance"]
+    for counts, key in (
+        (captions, name), (captions, "accepted"), (captions, "read"), (made, "asks"), (made["repairs"], "accepted"),
+        (made["repairs"], "first_answers"), (made["teachers"][0], "captions"),
+    ):  # fmt: skip
+        counts[key] += count
+    shares = made["repairs"]["shares"]
+    for share in shares:
+        counted = made["repairs"]["repaired_by_rung"] | {"first_answers": made["repairs"]["first_answers"]}
+        shares[share] = round(counted[share.removeprefix("repaired: ")] / made["repairs"]["accepted"], 4)
 
 
 def _seed_of_other_splits(record: dict) -> int:
@@ -304,161 +320,97 @@ def large_array() -> bytes:
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
 
 
-def a_broken_link(folder: Path) -> None:
-    shard = next((folder / "data").iterdir())
-    shard.unlink()
-    shard.symlink_to("nowhere.parquet")
+def shard_of(folder: Path) -> Path:
+    return next((folder / "data").iterdir())
+
+
+def instead(path: Path, make) -> None:
+    """Put something in the place of a file."""
+    path.unlink()
+    make(path)
 
 
 def a_link_that_leads_out(folder: Path) -> None:
-    shard = next((folder / "data").iterdir())
+    shard = shard_of(folder)
     shutil.move(shard, folder.parent / "elsewhere.parquet")
     shard.symlink_to(folder.parent / "elsewhere.parquet")
 
 
-def a_loop_of_links(folder: Path) -> None:
-    (folder / "data/deeper").symlink_to(folder, target_is_directory=True)
+def large(path: Path) -> None:
+    path.touch()
+    os.truncate(path, 20_000_000_000)
 
 
-def checksums_in_another_encoding(folder: Path) -> None:
-    (folder / "checksums.sha256").write_bytes(b"\xff\xfe\x00" * 40)
-
-
-def a_card_in_another_encoding(folder: Path) -> None:
-    (folder / "README.md").write_bytes(b"\xff\xfe\x00" * 40)
-
-
-def a_shard_cut_short(folder: Path) -> None:
-    shard = next((folder / "data").iterdir())
-    os.truncate(shard, shard.stat().st_size // 2)
-
-
-def a_shard_of_another_schema(folder: Path) -> None:
-    pq.write_table(pa.table({"a": [1, 2, 3]}), next((folder / "data").iterdir()))
-
-
-def a_sparse_shard(folder: Path) -> None:
-    os.truncate(next((folder / "data").iterdir()), 20_000_000_000)
-
-
-def a_sparse_file_beside(folder: Path) -> None:
-    (folder / "data/more.parquet").touch()
-    os.truncate(folder / "data/more.parquet", 20_000_000_000)
-
-
-def a_pipe(folder: Path) -> None:
-    shard = next((folder / "data").iterdir())
-    shard.unlink()
-    os.mkfifo(shard)
-
-
-def a_folder_for_a_file(folder: Path) -> None:
-    (folder / "README.md").unlink()
-    (folder / "README.md").mkdir()
-
-
-def a_number_that_overflows(folder: Path) -> None:
-    text = (folder / "release.json").read_text()
-    (folder / "release.json").write_text(text.replace('"frames": ', '"frames": 1e999, "x": ', 1))
-
-
-def a_path_that_escapes(folder: Path) -> None:
-    record = json.loads((folder / "release.json").read_text())
-    record["shards"][0]["path"] = "../../etc/passwd"
-    (folder / "release.json").write_text(json.dumps(record))
-
-
-def a_checksum_of_a_file_outside(folder: Path) -> None:
-    with (folder / "checksums.sha256").open("a") as file:
-        file.write(f"{'0' * 64}  ../../../etc/passwd\n")
-
-
-HOSTILE = (
-    a_broken_link, a_link_that_leads_out, a_loop_of_links, checksums_in_another_encoding, a_card_in_another_encoding,
-    a_shard_cut_short, a_shard_of_another_schema, a_sparse_shard, a_sparse_file_beside, a_pipe, a_folder_for_a_file,
-    a_number_that_overflows, a_path_that_escapes, a_checksum_of_a_file_outside,
-)  # fmt: skip
-
-
-@pytest.mark.parametrize("damage", HOSTILE, ids=lambda damage: damage.__name__)
-def test_hostile_files_are_findings_and_no_traceback(dataset, damage):
-    damage(dataset)
-    for level in ("structure", "pixels"):
-        assert errors_in(dataset, level)
-
-
-def _claims(column: str, data: bytes):
-    def change(rows):
-        if column == "depth":
-            rows[2]["depth"] = data
-        else:
-            rows[2][column]["bytes"] = data
+def in_record(old: str, new: str):
+    def change(folder: Path) -> None:
+        text = (folder / "release.json").read_text()
+        assert old in text
+        (folder / "release.json").write_text(text.replace(old, new, 1))
 
     return change
 
 
-def _null_pose(rows):
-    rows[2]["pose"] = None
+HOSTILE = {
+    "a broken link": lambda f: instead(shard_of(f), lambda path: path.symlink_to("nowhere.parquet")),
+    "a link that leads out": a_link_that_leads_out,
+    "a loop of links": lambda f: (f / "data/deeper").symlink_to(f, target_is_directory=True),
+    "checksums in another encoding": lambda f: (f / "checksums.sha256").write_bytes(b"\xff\xfe\x00" * 40),
+    "a card in another encoding": lambda f: (f / "README.md").write_bytes(b"\xff\xfe\x00" * 40),
+    "a shard cut short": lambda f: os.truncate(shard_of(f), shard_of(f).stat().st_size // 2),
+    "a shard of another schema": lambda f: pq.write_table(pa.table({"a": [1, 2, 3]}), shard_of(f)),
+    "a sparse shard": lambda f: large(shard_of(f)),
+    "a sparse file beside": lambda f: large(f / "data/more.parquet"),
+    "a pipe": lambda f: instead(shard_of(f), os.mkfifo),
+    "a folder for a file": lambda f: instead(f / "README.md", Path.mkdir),
+    "a number that overflows": in_record('"frames": ', '"frames": 1e999, "x": '),
+    "a flight of 10^12 frames": in_record('"frames_available": ', '"frames_available": 1000000000000'),
+    "a path that escapes": in_record('"path": "data/', '"path": "../../etc/'),
+    "a checksum of a file outside": lambda f: (f / "checksums.sha256").write_text(f"{'0' * 64}  ../../../etc/passwd\n"),
+}
 
 
-def _null_everything(rows):
-    keep = {"sample_id", "run", "town", "trajectory", "variant", "frame_index", "image", "instance", "depth", "split", "walk", "pair",
-            "width_px", "height_px", "track", "time_s", "fov_deg", "pose", "has_caption"}  # fmt: skip
-    rows[2].update({name: None for name in rows[2] if name not in keep})
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_files_are_findings_and_no_traceback(dataset, name):
+    HOSTILE[name](dataset)
+    for level in ("structure", "pixels"):
+        assert errors_in(dataset, level)
 
 
-def _half_a_caption(rows):
-    row = next(row for row in rows if row["has_caption"])
-    row["caption_window"], row["caption_picture_px"] = [], [0]
-
-
-def _zero_focal(rows):
-    for row in rows:
-        row["intrinsics"] = {"fx": 0.0, "fy": 0.0, "cx": 0.0, "cy": 0.0}
-
-
-def _zero_focal_at_the_end(rows):
-    rows[-1]["intrinsics"]["fx"] = 0.0
-
-
-def _infinitely_far(rows):
-    for row in rows:
-        row["target"]["x_m"] = math.inf
-
-
-def _palette(rows):
-    rows[1]["instance"]["bytes"] = instance_bytes(np.zeros((90, 160), np.uint8), np.zeros((90, 160), np.uint16))[:-30]
-
-
-def _flat_depth(rows):
-    set_depth(rows[1], np.full((90, 160), 7.0, np.float32))
-
-
-def _double_depth(rows):
-    from io import BytesIO
-
+def double_depth() -> bytes:
     buffer = BytesIO()
     np.save(buffer, np.full((90, 160), 7.0))
-    rows[1]["depth"] = buffer.getvalue()
+    return buffer.getvalue()
 
 
+def picture(column: str, data: bytes):
+    return (
+        put(at(everything, 2), depth=data)
+        if column == "depth"
+        else change(at(everything, 2), lambda r: r[column].update(bytes=data))
+    )
+
+
+KEPT = {"sample_id", "run", "town", "trajectory", "variant", "frame_index", "image", "instance", "depth", "split",
+ "walk", "pair",
+        "width_px", "height_px", "track", "time_s", "fov_deg", "pose", "has_caption"}  # fmt: skip
+MASK = instance_bytes(np.zeros((90, 160), np.uint8), np.zeros((90, 160), np.uint16))
 ODD_ROWS = {
-    "a PNG of 60,000 x 60,000": _claims("image", large_png(60_000, 60_000)),
-    "an instance of 60,000 x 60,000": _claims("instance", large_png(60_000, 60_000)),
-    "a PNG that unpacks to less": _claims("image", large_png(160, 90)),
-    "an array of 4 TB": _claims("depth", large_array()),
-    "no bytes": _claims("image", b""),
-    "no depth": _claims("depth", b""),
-    "text for a picture": _claims("instance", b"hello" * 100),
-    "no pose": _null_pose,
-    "hardly anything": _null_everything,
-    "an empty window": _half_a_caption,
-    "no focal length": _zero_focal,
-    "no focal length in the last frame": _zero_focal_at_the_end,
-    "people infinitely far away": _infinitely_far,
-    "an instance cut short": _palette,
-    "a flat depth": _flat_depth,
-    "depth in double": _double_depth,
+    "a PNG of 60,000 x 60,000": picture("image", large_png(60_000, 60_000)),
+    "an instance of 60,000 x 60,000": picture("instance", large_png(60_000, 60_000)),
+    "a PNG that unpacks to less": picture("image", large_png(160, 90)),
+    "an array of 4 TB": picture("depth", large_array()),
+    "no bytes": picture("image", b""),
+    "no depth": picture("depth", b""),
+    "text for a picture": picture("instance", b"hello" * 100),
+    "an instance cut short": picture("instance", MASK[:-30]),
+    "depth in double": picture("depth", double_depth()),
+    "a flat depth": change(at(everything, 1), lambda r: set_depth(r, np.full((90, 160), 7.0, np.float32))),
+    "no pose": put(at(everything, 2), pose=None),
+    "hardly anything": change(at(everything, 2), lambda r: r.update(dict.fromkeys(r.keys() - KEPT))),
+    "an empty window": put(at(captioned, 0), caption_window=[], caption_picture_px=[0]),
+    "no focal length": put(everything, intrinsics=dict.fromkeys(INTRINSICS, 0.0)),
+    "no focal length in the last frame": change(at(everything, -1), lambda r: r["intrinsics"].update(fx=0.0)),
+    "people infinitely far away": change(everything, lambda r: r["target"].update(x_m=math.inf)),
 }
 
 
@@ -505,7 +457,8 @@ def test_one_line_a_kind_with_count_and_first_places():
 def test_the_command_tells_people_and_machines(honest, tmp_path):
     forged = forge(honest, tmp_path / "forged", LIES["visibility_above_one"][0])
     before = {path: path.read_bytes() for path in forged.rglob("*") if path.is_file()}
-    arguments = ["release", "verify", str(forged), "--level", "rows", "--json", str(tmp_path / "found.json"), "--repair-plan", "--workers", "1"]  # fmt: skip
+    more = ["--json", str(tmp_path / "found.json"), "--repair-plan", "--workers", "1"]
+    arguments = ["release", "verify", str(forged), "--level", "rows", *more]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 1
     assert "range: once" in result.output

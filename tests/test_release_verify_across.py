@@ -13,8 +13,10 @@ from release.verify.findings import Findings
 
 def flight(number: int, num_rows: int, **told) -> Summary:
     values = {
-        "name": f"run/Town01/trajectory_{number}/ORI", "rows_file": f"{number}.rows", "split": "train", "walk": str(number), "pair": None,
-        "track": "clean", "town": "Town01", "is_foreign": False, "num_rows": num_rows, "first_frames": [], "frames_digest": "",
+        "name": f"run/Town01/trajectory_{number}/ORI", "rows_file": f"{number}.rows", "split": "train",
+        "walk": str(number), "pair": None,
+        "track": "clean", "town": "Town01", "is_foreign": False, "num_rows": num_rows, "first_frames": [],
+        "frames_digest": "",
         "way_digest": "", "kinds": [], "grounds_m": [],
     }  # fmt: skip
     return Summary(**(values | told))
@@ -23,7 +25,7 @@ def flight(number: int, num_rows: int, **told) -> Summary:
 def stored(folder, flights: list[np.ndarray]) -> tuple[RowFiles, list[Summary]]:
     rows = RowFiles(folder)
     for number, own in enumerate(flights):
-        rows.write(f"{number}.rows", own)
+        (folder / f"{number}.rows").write_bytes(own.tobytes())
     return rows, [flight(number, len(own)) for number, own in enumerate(flights)]
 
 
@@ -115,7 +117,7 @@ def told_of(flights: list[Summary], tmp_path) -> list[str]:
     findings = Findings()
     rows = RowFiles(tmp_path)
     for one in flights:
-        rows.write(one.rows_file, np.zeros(one.num_rows, COMPARED))
+        (tmp_path / one.rows_file).write_bytes(np.zeros(one.num_rows, COMPARED).tobytes())
     check_across(flights, rows, by_town=False, both=False, findings=findings)
     return sorted(code for _, code in findings.kinds)
 

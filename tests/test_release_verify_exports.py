@@ -1,4 +1,5 @@
-"""`release verify` on exports: rows and pictures of each format are read again, and lies in them are found whatever its checksums say."""
+"""`release verify` on exports: rows and pictures of each format are read again, and lies in them are found whatever its
+checksums say."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from release.verify.pixels import NUM_IDS, PERSON, SKY, depths_of_person, new_kinds, rays_to_person, survey
+from release.verify.pixels import NUM_IDS, PERSON, SKY, new_kinds, rays_to_person, survey
 
 FAR_M = np.float32(1000.0)
 
@@ -36,7 +36,7 @@ def _obvious(depth, mask):
 
 
 @pytest.mark.parametrize("sky", [True, False])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_every_pixel_is_counted(seed, sky):
     depth, mask = _frame(seed, sky=sky)
     found, (counts, box) = survey(depth, mask), _obvious(depth, mask)
@@ -60,8 +60,10 @@ def test_pixels_at_corners_are_seen(corner):
 @pytest.mark.parametrize(
     ("odd", "limits"),
     [
-        (np.nan, (np.nan, np.nan)), (-np.nan, (np.nan, np.nan)), (np.inf, (np.nan, np.nan)), (-np.inf, (np.nan, np.nan)),
-        (-3.5, (-3.5, 7.0)), (0.0, (0.0, 7.0)), (-0.0, (0.0, 7.0)), (1e-42, (np.float32(1e-42), 7.0)), (2000.0, (5.0, 2000.0)),
+        (np.nan, (np.nan, np.nan)), (-np.nan, (np.nan, np.nan)), (np.inf, (np.nan, np.nan)),
+        (-np.inf, (np.nan, np.nan)),
+        (-3.5, (-3.5, 7.0)), (0.0, (0.0, 7.0)), (-0.0, (0.0, 7.0)), (1e-42, (np.float32(1e-42), 7.0)),
+        (2000.0, (5.0, 2000.0)),
     ],
 )  # fmt: skip
 def test_limits_of_depth(odd, limits):
@@ -90,19 +92,9 @@ def test_a_thing_is_of_one_kind():
     assert new_kinds(mask, known) == [263 << 8 | 3]
 
 
-@pytest.mark.parametrize("is_ours", [True, False])
-def test_depths_of_the_person(is_ours):
-    depth, mask = _frame(1)
-    mask[20:30, 20:30] = (PERSON, 1, 0)  # somebody else
-    x0, y0, x1, y1 = box = np.array([5, 3, 60, 40])
-    wanted = mask[y0:y1, x0:x1, 0] == PERSON
-    if is_ours:
-        wanted &= (mask[y0:y1, x0:x1, 1:] == 255).all(axis=2)
-    assert_array_equal(depths_of_person(depth, mask, box, is_ours), depth[y0:y1, x0:x1][wanted])
-
-
 def test_rays_that_meet_the_person():
-    """A box of 2 x 2 m, 10 m before a camera of 100 px, half of it behind something and half of what is left beyond the picture."""
+    """A box of 2 x 2 m, 10 m before a camera of 100 px, half of it behind something and half of what is left beyond the
+    picture."""
     depth, mask = np.full((40, 40), 50.0, np.float32), np.zeros((40, 40, 3), np.uint8)
     depth[20:] = 3.0
     pixels = np.arange(-10.0, 50.0)

@@ -50,7 +50,7 @@ TRIES = 3
 READ_CAPTIONS = 4
 MAX_COMPLAINT = 2000  # characters that a complaint hardly ever takes
 ODD_WORD = "zebra-41"  # what no model writes to a greeting unless it is made to
-NO_THINKING = "--set 'caption.endpoint.extra_body={chat_template_kwargs: {enable_thinking: false}}'"
+NO_THINKING = "endpoint.extra_body={chat_template_kwargs: {enable_thinking: false}}"
 
 
 @dataclass(frozen=True)
@@ -311,7 +311,7 @@ class _Examination:
             "unusable",
             f"{low}, our prompts hold {self.num_images} ({refusal}); raise the server's limit (vLLM: "
             f"--limit-mm-per-prompt "
-            f"'{{\"image\": {self.num_images}}}'), or --set caption.image.layout=tiled, or fewer caption.image.modalities",
+            f"'{{\"image\": {self.num_images}}}'), or set image.layout=tiled or fewer image.modalities",
         )
         return False
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from inspect import Parameter, Signature, signature
@@ -205,7 +204,7 @@ def _config_path(config: Path | None) -> Path | None:
     names = sorted(path.stem for path in shipped(".").glob("*.yaml") if path.stem != "glossary")
     expected = f"a YAML file, a run folder, or one that ships: {', '.join(names)}"
     if config.is_dir():
-        fix = f"cosfly list {shlex.quote(str(config))} names the runs in it"
+        fix = f"cosfly list {config} names the runs in it"
         raise ConfigError(
             "a folder, and not that of a run", where=config, got="no run.yaml", expected=expected, fix=fix
         )

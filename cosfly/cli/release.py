@@ -93,7 +93,6 @@ def release_verify(
     from cosfly.app.settings import manner_of_work
     from cosfly.work.store import write_json
     from release.sign import read_public_key
-    from release.verify.repair import plan_of
     from release.verify.verify import LEVELS, verify
 
     if level not in LEVELS:
@@ -101,7 +100,7 @@ def release_verify(
     key = None if public_key is None else read_public_key(public_key)
     report = verify(folder, level=level, reader=read_released, source=source, public_key=key, **manner_of_work(job.cfg))
     typer.echo(str(report))
-    for line in plan_of(report) if repair_plan else []:
+    for line in report.repair_plan() if repair_plan else []:
         typer.echo(f"repair plan: {line}")
     if json_file is not None:
         write_json(json_file, report.as_json())

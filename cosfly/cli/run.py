@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -124,7 +123,7 @@ def show(run: Annotated[Path, Argument(metavar="RUN", help="A run folder.")]) ->
     for folder, count in seen.waiting().items():
         lines.append(f"review   {count} flights wait for a person: {how_to_decide(Path(os.path.relpath(folder)))}")
     if seen.num_complete < len(seen.stages) and not seen.is_at_work:
-        lines.append(f"continue  cosfly run {shlex.quote(os.path.relpath(run))}")
+        lines.append(f"continue  cosfly run {os.path.relpath(run)}")
     for line in lines:
         answer_console.print(line, soft_wrap=True)
 

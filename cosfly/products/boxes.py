@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -280,8 +279,7 @@ def read_boxes(path: Path) -> BoxMap:
         InputError: names the file, the box and the field.
     """
     if path.suffix.lower() in (".csv", ".geojson"):
-        setting = shlex.quote(f"maps.boxes.path={path}")
-        fix = f"cosfly maps --source boxes --set {setting} --out DIR makes boxes_3d.json of it"
+        fix = f"cosfly maps --source boxes --set maps.boxes.path={path} --out DIR makes boxes_3d.json of it"
         raise InputError("boxes of one's own, not a map yet", where=path, fix=fix)
     value = read_json(path, what="map")
     header = MapHeader(name=path.stem)

@@ -9,7 +9,6 @@ anything.
 from __future__ import annotations
 
 import logging
-import shlex
 from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -93,7 +92,7 @@ def undecided(inspected: Path) -> list[str]:
 def how_to_decide(folder: Path) -> str:
     """Say how a person decides the flights that an inspection, in `folder`, left in review."""
     return (
-        f"cosfly inspect review --inspect {shlex.quote(str(folder))} makes a page to look at them; with --accept FLIGHT --by NAME "
+        f"cosfly inspect review --inspect {folder} makes a page to look at them; with --accept FLIGHT --by NAME "
         f"--reason TEXT it accepts one"
     )
 

@@ -1,7 +1,7 @@
 """How much a file may ask of this machine before it is refused, and which links are followed: settings `reading.*`.
 
-They decide what is refused and never what is made, so they are the process's and not a stage's; workers get those of
-the process that started them (worker_pool.py).
+They decide what is refused and never what is made, so they are the process's and not a stage's; workers get those of the process that
+started them (worker_pool.py).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Limits(BaseModel):
     polygon_crossings: int = Field(
         500,
         ge=0,
-        description="how often one outline may cross itself; mending takes a second for 1,000, a minute for 10,000",
+        description="how often the outline of one polygon may cross itself; mending takes a second for 1,000, a minute for 10,000",
     )
 
 
@@ -57,7 +57,10 @@ def use_limits(chosen: Limits) -> None:
 
 def over_limit(name: str, where: object, got: str, unit: str = "") -> InputError:
     """Give the error of what is over one of the limits; it says how to raise it."""
-    most = getattr(_limits, name)
-    fix = f"if you trust the file, raise it, for instance to ten times as much: --set reading.{name}={10 * most}"
-    what, expected = f"over the limit reading.{name}", f"at most {most:,}{unit}"
-    return InputError(what, where=str(where), got=got, expected=expected, fix=fix)
+    return InputError(
+        f"over the limit reading.{name}",
+        where=str(where),
+        got=got,
+        expected=f"at most {getattr(_limits, name):,}{unit}",
+        fix=f"if you trust the file, raise it with --set reading.{name}=...",
+    )

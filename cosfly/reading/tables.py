@@ -48,7 +48,8 @@ class _Table(pq.ParquetFile):
         self.packed = pq.ParquetFile(file, metadata=self.metadata, read_dictionary=texts, **how)
 
     def _repeats(self, j: int) -> bool:
-        """Whether a column holds bytes by a dictionary; pictures stand plainly: looking for equal ones takes long."""
+        """Whether a column holds bytes of any kind by a dictionary; pictures stand plainly, and looking for equal ones
+        would take long."""
         groups = (self.metadata.row_group(k).column(j) for k in range(self.num_row_groups))
         return any(one.physical_type == "BYTE_ARRAY" and one.has_dictionary_page for one in groups)
 
@@ -69,7 +70,8 @@ def open_table(path: Path, *, tree: Path | None = None) -> Iterator[_Table]:
 
 @contextlib.contextmanager
 def open_stream(file: io.RawIOBase, where: str) -> Iterator[_Table]:
-    """Open a parquet file that is read by ranges, as one from elsewhere; pages are held against their checksums.
+    """Open a parquet file that is read by ranges, as one that lies somewhere else; checksums of pages are held against
+    the pages.
 
     Raises:
         InputError: it is no whole parquet file; or what `file` raises.
@@ -89,7 +91,8 @@ def num_rows(path: Path) -> int:
 def row_groups(
     path: Path, columns: list[str] | None = None, *, tree: Path | None = None, wanted: Collection[int] | None = None
 ) -> Iterator[pa.Table]:
-    """Yield row groups, of these numbers or all, one at a time; raises as `open_table`, and for one over the limit."""
+    """Yield the row groups of a parquet file, of these numbers or all, in memory one at a time; raises as `open_table`,
+    and for one over the limit."""
     with open_table(path, tree=tree) as table:
         for k in range(table.num_row_groups):
             if wanted is None or k in wanted:
@@ -97,7 +100,8 @@ def row_groups(
 
 
 def read_row_group(path: Path | str, table: _Table, k: int, columns: list[str] | None) -> pa.Table:
-    """Read one row group of an open table; `path` is for messages. Texts are unpacked once their size is known.
+    """Read one row group of an open table; `path` is for messages. A text is unpacked once it is known how much all of
+    them are.
 
     Raises:
         InputError: it is damaged, or over the limit.
@@ -136,7 +140,8 @@ def _plain(kind: pa.DataType) -> pa.DataType:
 
 
 def row_batches(path: Path | str, table: _Table, k: int, columns: list[str], num_rows: int) -> Iterator[pa.RecordBatch]:
-    """Yield a row group, few rows at a time, so that the same memory serves again; raises as `read_row_group`."""
+    """Yield one row group of an open table, few rows at a time, so that the same memory serves again; raises as
+    `read_row_group`."""
     _check_size(path, table, k)
     with arrow_errors(path):
         batches = table.iter_batches(num_rows, row_groups=[k], columns=columns, use_threads=False)
@@ -167,7 +172,8 @@ GROUPS_HELD = 4  # row groups that a look at single rows keeps
 
 
 class TableRows(Sequence[dict[str, Any]]):
-    """The rows of a parquet file by number. It stays open, a few row groups in memory; each process opens its own.
+    """The rows of a parquet file by number. The file stays open, a few row groups in memory; each process opens its
+    own.
 
     Raises:
         InputError: as `open_table`, when rows are counted or read; and for columns that are not there.

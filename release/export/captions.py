@@ -1,7 +1,7 @@
 """Captions alone, for tools of others: a table, JSON lines, ShareGPT, LLaVA. Pictures are named, not copied.
 
-Names of pictures are relative to the playback tree that the captions are of; those of a release, to the tree that
-`cosfly release export --format tree` makes of it.
+Names of pictures are relative to the playback tree that the captions are of; those of a release, to the tree that `cosfly release export
+--format tree` makes of it.
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ import csv
 import io
 import json
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Literal
 
 from cosfly.errors import InputError, NothingKept, StorageError
 from cosfly.look.frame_views import Pictures, frame_label
-from cosfly.products.captions import FIELDS, Language, Prompt, read_captions
+from cosfly.products.captions import FIELDS, Caption, Language, Prompt, read_captions
 from cosfly.products.frames import FILE_NAMES, frame_name
 from cosfly.reading.files import check_stays_below
 from cosfly.work.store import atomic_file, dump_json, inside
-from release.columns import LANGUAGES, PLACE, SplitName, caption_values
+from release.columns import LANGUAGES, SplitName
 from release.export.source import open_release, rows_of_flight, scan
 from release.export.tree import tree_folder
 
@@ -40,7 +40,7 @@ LAST: dict[Language, str] = {
 
 @dataclass(frozen=True)
 class CaptionLine:
-    """One accepted caption as it leaves. images: of its window, oldest first. texts: language -> FIELDS -> text."""
+    """One accepted caption as it leaves. images: of the frames of its window, oldest first. texts: language -> FIELDS -> text."""
 
     sample_id: str
     run: str
@@ -71,7 +71,7 @@ class CaptionLine:
 
 
 def read_lines(source: Path, left_out: Counter[str]) -> Iterator[CaptionLine]:
-    """Yield the accepted captions of a run folder, a captions.jsonl (or its folder) or a release, in their order.
+    """Yield the accepted captions of a run folder, a captions.jsonl (or the folder it stands in) or a release, in their order.
 
     Args:
         left_out: counts the others by reason.
@@ -107,14 +107,26 @@ def _of_captions(path: Path, tree: Path | None, left_out: Counter[str]) -> Itera
         if tree is not None and not all((tree / image).is_file() for image in images):
             left_out["missing_picture"] += 1
             continue
-        place = {name: getattr(caption, name) for name in ("sample_id", "town", "trajectory", "variant", "frame_index")}
-        run = "" if tree is None else tree.absolute().parent.name
-        yield _line(caption_values(caption) | place | {"run": run, "split": ""}, images)
+        yield _of_caption(caption, images, "" if tree is None else tree.absolute().parent.name)
+
+
+def _of_caption(caption: Caption, images: list[str], run: str) -> CaptionLine:
+    answers = {"en": caption.en, "zh": caption.zh}
+    texts = {language: coc.model_dump() for language in LANGUAGES if (coc := answers[language]) is not None}
+    first = next(iter(texts.values()), {})
+    return CaptionLine(
+        sample_id=caption.sample_id, run=run, town=caption.town, trajectory=caption.trajectory, variant=caption.variant, split="",
+        frame_index=caption.frame_index, window=caption.window, images=images, picture_px=caption.picture_px,
+        decision=first.get("flight_decision", ""), label=caption.label, verdict=caption.verdict,
+        repair_strategy=None if caption.repair is None else caption.repair.strategy,
+        teacher=f"{caption.teacher.kind}: {caption.teacher.model}", texts=texts,
+        prompts={language: caption.prompt[language] for language in texts if language in caption.prompt},
+    )  # fmt: skip
 
 
 _COLUMNS = [
-    "sample_id", *PLACE, "frame_index", "split", "has_caption", "caption_window", "caption_picture_px", "decision",
-    "label", "verdict", "repair_strategy", "teacher_kind", "teacher_model",
+    "sample_id", "frame_index", "split", "has_caption", "caption_window", "caption_picture_px", "decision", "label", "verdict",
+    "repair_strategy", "teacher_kind", "teacher_model",
     *(f"caption_{language}_{name}" for language in LANGUAGES for name in FIELDS),
     *(f"{part}_{language}" for language in LANGUAGES for part in ("system", "prompt")),
 ]  # fmt: skip
@@ -125,7 +137,9 @@ def _of_release(folder: Path) -> Iterator[CaptionLine]:
     flights = scan(release)
     has_runs = len({flight.run for flight in flights}) > 1
     for flight in flights:
-        numbers = {int(index): n for n, index in enumerate(flight.frame_index)}  # a tree counts released frames
+        numbers = {
+            int(index): number for number, index in enumerate(flight.frame_index)
+        }  # a tree counts released frames
         for row in rows_of_flight(release, flight, _COLUMNS):
             if not row["has_caption"]:
                 continue
@@ -137,10 +151,10 @@ def _of_release(folder: Path) -> Iterator[CaptionLine]:
                 )  # fmt: skip
             place = tree_folder(flight, has_runs)
             images = [(place / frame_name(numbers[index]) / FILE_NAMES["rgb"]).as_posix() for index in window]
-            yield _line(row, images)
+            yield _of_row(row, flight, images)
 
 
-def _line(row: Mapping[str, Any], images: list[str]) -> CaptionLine:
+def _of_row(row: dict[str, Any], flight: Any, images: list[str]) -> CaptionLine:
     texts = {
         language: {name: row[f"caption_{language}_{name}"] for name in FIELDS}
         for language in LANGUAGES
@@ -153,10 +167,10 @@ def _line(row: Mapping[str, Any], images: list[str]) -> CaptionLine:
     }
     width_px, height_px = row["caption_picture_px"]
     return CaptionLine(
-        **{name: row[name] for name in ("sample_id", *PLACE, "frame_index", "label", "verdict", "repair_strategy")},
-        split=row["split"] or "", window=row["caption_window"], images=images, picture_px=(width_px, height_px),
-        decision=row["decision"] or "", teacher=f"{row['teacher_kind']}: {row['teacher_model']}", texts=texts,
-        prompts=prompts,
+        sample_id=row["sample_id"], run=flight.run, town=flight.town, trajectory=flight.trajectory, variant=flight.variant,
+        split=row["split"] or "", frame_index=row["frame_index"], window=row["caption_window"], images=images,
+        picture_px=(width_px, height_px), decision=row["decision"] or "", label=row["label"], verdict=row["verdict"],
+        repair_strategy=row["repair_strategy"], teacher=f"{row['teacher_kind']}: {row['teacher_model']}", texts=texts, prompts=prompts,
     )  # fmt: skip
 
 
@@ -185,13 +199,13 @@ def export(
     split: SplitName | None = None,
     overwrite: bool = False,
 ) -> CaptionTally:
-    """Write the accepted captions of a source to one file: a row a window, or a conversation a window and language.
+    """Write the accepted captions of a source to one file; a table or JSON lines have a row a window, the others a sample a window and language.
 
     Args:
         shown: pictures of a sample in ShareGPT and LLaVA: those of all frames, or of the last one alone.
         split: the captions of this one alone. overwrite: replace a file that stands at `out`.
     Raises:
-        StorageError: something stands at `out`. InputError: nothing to read, or conversations would mix splits.
+        StorageError: something stands at `out`. InputError: there is nothing to read, or conversations would mix splits.
         NothingKept: no caption can go out.
     """
     if out.exists() and not (overwrite and out.is_file()):
@@ -225,11 +239,10 @@ def _of_split(
 
 def _row(line: CaptionLine, languages: list[Language]) -> dict[str, Any]:
     row: dict[str, Any] = {
-        name: getattr(line, name)
-        for name in (
-            "sample_id", *PLACE, "split", "frame_index", "window", "images", "picture_px", "decision", "label",
-            "verdict", "repair_strategy", "teacher",
-        )
+        "sample_id": line.sample_id, "run": line.run, "town": line.town, "trajectory": line.trajectory, "variant": line.variant,
+        "split": line.split, "frame_index": line.frame_index, "window": line.window, "images": line.images,
+        "picture_px": list(line.picture_px), "decision": line.decision, "label": line.label, "verdict": line.verdict,
+        "repair_strategy": line.repair_strategy, "teacher": line.teacher,
     }  # fmt: skip
     for language in languages:
         texts, prompt = (
@@ -259,7 +272,7 @@ def _csv(
 
 
 def cell(value: Any) -> str:
-    """Give a value as a spreadsheet may show it: a list as JSON, and no text that it would calculate."""
+    """Give a value as a spreadsheet may show it: a list as JSON, nothing for None, and no text that it would calculate."""
     text = "" if value is None else value if isinstance(value, str) else dump_json(value)
     return f"'{text}" if isinstance(value, str) and text.lstrip(" ").startswith(FORMULA) else text
 
@@ -275,7 +288,7 @@ def _jsonl(
 def _sharegpt(
     file: IO[bytes], lines: Iterable[CaptionLine], languages: list[Language], shown: ImageChoice, told: CaptionTally
 ) -> None:
-    """As LLaMA-Factory reads it: human first, as many marks as `images`, which are joined to its media_dir."""
+    """As LLaMA-Factory reads it: roles in turns, human first; as many marks as `images`, which are joined to its media_dir."""
 
     def sample(name: str, prompt: Prompt, images: list[str], asked: str, answer: str) -> dict[str, Any]:
         turns = [{"from": "human", "value": asked}, {"from": "gpt", "value": answer}]
@@ -287,7 +300,7 @@ def _sharegpt(
 def _llava(
     file: IO[bytes], lines: Iterable[CaptionLine], languages: list[Language], shown: ImageChoice, told: CaptionTally
 ) -> None:
-    """As LLaVA's trainers read it: `image` below its image folder, one name, or a list, which the first does not take.
+    """As LLaVA's trainers read it: `image` below its image folder, one name, or a list, which the first LLaVA does not take.
 
     It has no place for a system prompt, so that stands in front of the question.
     """
@@ -334,7 +347,6 @@ def _write_array(file: IO[bytes], samples: Iterable[dict[str, Any]]) -> None:
     file.write(b"\n]\n")
 
 
-Writer = Callable[[IO[bytes], Iterable[CaptionLine], list[Language], ImageChoice, CaptionTally], None]
-WRITERS: dict[FormatName, Writer] = {
+WRITERS: dict[FormatName, Callable[[IO[bytes], Iterable[CaptionLine], list[Language], ImageChoice, CaptionTally], None]] = {
     "csv": _csv, "jsonl": _jsonl, "sharegpt": _sharegpt, "llava": _llava,
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""The release that an export is made of: its flights, and their rows, read a row group at a time."""
+"""The release that an export is made of: its flights, where their rows stand, and the rows themselves, read a row group at a time."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -20,7 +20,7 @@ from cosfly.reading.tables import arrow_errors, open_table, read_row_group, row_
 from cosfly.work.store import inside
 from release.columns import PICTURES, PLACE, REQUIRED, SPLIT_NAMES, SplitName, flight_spans, schema
 from release.depth import depth_of
-from release.record import DepthCoding, ReleaseRecord, Shard, read_record, release_folder
+from release.record import DepthCoding, ReleaseRecord, read_record, release_folder
 
 # Names of columns below come from `release/columns.py`; those of shards from `release build`.
 SHARD_NAME = re.compile(r"data/(train|validation|test)-[0-9a-f]{12}-\d{5}-of-\d{5}\.parquet")
@@ -43,10 +43,9 @@ class Span:
 
 @dataclass
 class ReleasedRows:
-    """One flight of a release, n frames.
+    """One flight of a release, n frames. frames (n,) int32, rising; time_s (n,) float64; decisions: of the captions, "" where none.
 
-    frame_index: (n,) int32, rising. time_s: (n,) float64. decisions: of the captions, "" where none. num_bytes:
-    unpacked.
+    num_bytes: of its rows, unpacked.
     """
 
     run: str
@@ -99,8 +98,7 @@ def open_release(folder: Path) -> Release:
     record = read_record(folder / "release.json")
     wrong = []
     for shard in record.shards:
-        named = SHARD_NAME.fullmatch(shard.path)
-        if named is None or named[1] != shard.split:
+        if not SHARD_NAME.fullmatch(shard.path):
             wrong.append(f"{shard.path!r} is no name of a shard")
         elif not (path := inside(folder, shard.path)).is_file():
             wrong.append(f"{shard.path} is missing")
@@ -111,40 +109,49 @@ def open_release(folder: Path) -> Release:
     return Release(folder, record, sha256_file(folder / "release.json", tree=folder))
 
 
+def split_of(shard: str) -> SplitName:
+    """Give the split that a shard's name says: train, validation or test."""
+    match = SHARD_NAME.fullmatch(shard)
+    assert match is not None, shard
+    return cast(SplitName, match[1])
+
+
 def scan(release: Release) -> list[ReleasedRows]:
     """Find the flights of a release and where their rows stand, splits in their order; reads no picture.
 
     Raises:
-        InputError: a shard cannot be read, has other columns, or a flight cannot be (frames that do not rise, two
-            splits, a name
+        InputError: a shard cannot be read, has other columns, or a flight cannot be (frames that do not rise, two splits, a name
             that is no part of a path); names them.
     """
     flights: dict[Place, ReleasedRows] = {}
-    shards = sorted(release.record.shards, key=lambda shard: (SPLIT_NAMES.index(shard.split), shard.path))
+    shards = sorted(
+        (shard.path for shard in release.record.shards), key=lambda path: (SPLIT_NAMES.index(split_of(path)), path)
+    )
     wanted = schema(release.modalities)
     for shard in shards:
-        path = inside(release.folder, shard.path)
+        path = inside(release.folder, shard)
         with open_table(path, tree=release.folder) as table:
             found = {member.name: member.type for member in table.schema_arrow}
             names = table.schema_arrow.names
             if differing := [m.name for m in wanted if found.get(m.name) != m.type or names.count(m.name) != 1]:
                 raise InputError(
-                    "not a shard of this version", where=path,
-                    got=f"missing, twice there or of another type: {', '.join(differing)}",
+                    "not a shard of this version", where=path, got=f"missing, twice there or of another type: {', '.join(differing)}",
                     fix="build the release again with this version of cosfly",
                 )  # fmt: skip
             for k in range(table.num_row_groups):
-                num_bytes = table.metadata.row_group(k).total_byte_size
-                _scan_group(flights, shard, k, read_row_group(path, table, k, LIGHT), num_bytes)
+                _scan_group(flights, shard, k, read_row_group(path, table, k, LIGHT), _unpacked_bytes(table, k))
     for flight in flights.values():
-        if not (np.diff(flight.frame_index) > 0).all() or not (np.diff(flight.time_s) > 0).all():
-            raise InputError("the frames of a flight do not rise", where=f"{release.folder}: {flight.name}")
+        _check(flight, release.folder)
     return list(flights.values())
 
 
-def _scan_group(flights: dict[Place, ReleasedRows], shard: Shard, k: int, group: Any, num_bytes: int) -> None:
+def _unpacked_bytes(table: Any, k: int) -> int:
+    return table.metadata.row_group(k).total_byte_size
+
+
+def _scan_group(flights: dict[Place, ReleasedRows], shard: str, k: int, group: Any, num_bytes: int) -> None:
     """Note the flights of one row group, which may hold several."""
-    with arrow_errors(shard.path):
+    with arrow_errors(shard):
         rows = {name: group.column(name).to_pylist() for name in LIGHT if name not in PLACE}
         spans = flight_spans(group)
     for place, start, stop in spans:
@@ -152,19 +159,25 @@ def _scan_group(flights: dict[Place, ReleasedRows], shard: Shard, k: int, group:
             isinstance(part, str) and (PART.fullmatch(part) or (part == "" and n == 0)) for n, part in enumerate(place)
         ):
             raise InputError(
-                "not names of folders", where=f"{shard.path}: {rows['sample_id'][start]}", got=repr(place)[:200]
+                "not names of folders", where=f"{shard}: {rows['sample_id'][start]}", got=repr(place)[:200]
             )
-        flight = flights.setdefault(place, ReleasedRows(*place, shard.split))
-        if flight.split != shard.split:
-            raise InputError("a flight in two splits", where=flight.name, got=f"{flight.split} and {shard.split}")
+        flight = flights.setdefault(place, ReleasedRows(*place, split_of(shard)))
+        if flight.split != split_of(shard):
+            raise InputError("a flight in two splits", where=flight.name, got=f"{flight.split} and {split_of(shard)}")
         times = rows["time_s"][start:stop]
         if None in times or None in rows["frame_index"][start:stop]:
-            raise InputError("a frame without index or time", where=f"{shard.path}: {flight.name}")
-        flight.spans.append(Span(shard.path, k, start, stop))
+            raise InputError("a frame without index or time", where=f"{shard}: {flight.name}")
+        flight.spans.append(Span(shard, k, start, stop))
         flight.frames.append(np.array(rows["frame_index"][start:stop], dtype=np.int32))
         flight.times.append(np.array(times, dtype=np.float64))
         flight.decisions += [decision or "" for decision in rows["decision"][start:stop]]
         flight.num_bytes += num_bytes * (stop - start) // len(group)
+
+
+def _check(flight: ReleasedRows, where: Path) -> None:
+    frames, time_s = flight.frame_index, flight.time_s
+    if not (np.diff(frames) > 0).all() or not (np.diff(time_s) > 0).all():
+        raise InputError("the frames of a flight do not rise", where=f"{where}: {flight.name}")
 
 
 def read_span(release: Release, span: Span, columns: list[str] | None = None) -> list[dict[str, Any]]:
@@ -218,7 +231,7 @@ def picture(row: dict[str, Any], file: FrameFile) -> bytes:
 
 
 def depth_npy(row: dict[str, Any], coding: DepthCoding | None) -> bytes:
-    """Give the depth of a row as the bytes of a `depth.npy` of float32: the released ones, or decoded.
+    """Give the depth of a row as the bytes of a `depth.npy` of float32: the released ones, or decoded where the release has coded it.
 
     Raises:
         InputError: it is not what the record of the release says.
@@ -234,8 +247,7 @@ def depth_in_words(coding: DepthCoding | None, stored: str) -> str:
     if coding is None or coding.coding == "float32":
         return f"{stored}: float32, metres, lossless"
     return (
-        f"{stored}: of {coding.coding} in the release ({coding.unit}, {coding.min_m} to {coding.max_m} m; "
-        f"{coding.sky:g} sky, {coding.invalid:g} invalid), "
+        f"{stored}: of {coding.coding} in the release ({coding.unit}, {coding.min_m} to {coding.max_m} m; {coding.sky:g} sky, {coding.invalid:g} invalid), "
         f"whose greatest error, measured over all pixels, is {coding.max_error_m:g} m"
     )
 

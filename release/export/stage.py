@@ -1,7 +1,7 @@
 """`cosfly release export`: a release in another format.
 
-Reads a release folder; writes `<format>/` with the format's files, `export.json` (which release it came from, how
-things are stored), README.md and checksums.sha256.
+Reads a release folder; writes `<format>/` with the format's files, `export.json` (which release it came from, how things are stored),
+README.md and checksums.sha256.
 """
 
 from __future__ import annotations
@@ -18,10 +18,9 @@ from cosfly.errors import InputError, VerifyError
 from cosfly.escaping import for_markdown
 from cosfly.products.actions import ActionSet
 from cosfly.reading.documents import read_model
-from cosfly.reading.files import sha256_file
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.work.stage_folder import Resume, StageFolder, result_of
-from cosfly.work.store import CHECKSUMS, inside, storage_errors, write_bytes, write_checksums, write_model
+from cosfly.work.store import CHECKSUMS, dump_json, inside, sha256_bytes, storage_errors, write_bytes, write_checksums
 from release.export.contract import ExportConfig, ExportUnit, FormatFacts, UnitFiles, format_of
 from release.export.source import Release, open_release, scan
 from release.record import DepthCoding, ReleasedMap, Strict
@@ -39,8 +38,8 @@ class SourceRelease(Strict):
 
 
 class ExportRecord(Strict):
-    """`export.json`. depth: how the release codes it; null where it has none. actions, prompts: the closed set of
-    decisions (null: the one that ships) and the questions, as the release's record has them."""
+    """`export.json`. depth: how the release codes it; null where it has none. actions, prompts: the closed set of decisions (null: the one
+    that ships) and the questions, as the release's record has them."""
 
     format: str
     format_version: str
@@ -63,17 +62,36 @@ class ExportRecord(Strict):
 
 def describe(release: Release, facts: FormatFacts, cfg: ExportConfig, *, frames: int, num_bytes: int) -> ExportRecord:
     """Give the record of an export."""
-    record, made_by = release.record, f"cosfly {cosfly.__version__}"
+    record = release.record
     return ExportRecord(
-        format=cfg.format, format_version=facts.version, made_by=made_by,
+        format=cfg.format,
+        format_version=facts.version,
+        made_by=f"cosfly {cosfly.__version__}",
         release=SourceRelease(
             name=record.name, made_by=record.made_by, digest=record.content_digest, record_sha256=release.record_sha256
         ),
-        licence=record.licence, credits=record.credits, maps=record.maps,
-        coordinates=facts.coordinates or record.coordinates, actions=record.actions, prompts=record.prompts,
-        settings=cfg.recorded(), codings=facts.codings, depth=record.depth, notes=facts.notes,
-        how_to_open=facts.how_to_open, frames=frames, bytes=num_bytes,
-    )  # fmt: skip
+        licence=record.licence,
+        credits=record.credits,
+        maps=record.maps,
+        coordinates=facts.coordinates or record.coordinates,
+        actions=record.actions,
+        prompts=record.prompts,
+        settings=cfg.recorded(),
+        codings=facts.codings,
+        depth=record.depth,
+        notes=facts.notes,
+        how_to_open=facts.how_to_open,
+        frames=frames,
+        bytes=num_bytes,
+    )
+
+
+def write_export(path: Path, record: ExportRecord) -> str:
+    """Write `export.json`; give its sha256."""
+    value = {"schema": EXPORT_SCHEMA, "schema_version": EXPORT_VERSION, **record.model_dump(mode="json")}
+    data = (dump_json(value, indent=1) + "\n").encode()
+    write_bytes(path, data)
+    return sha256_bytes(data)
 
 
 def read_export(path: Path) -> ExportRecord:
@@ -106,9 +124,8 @@ def render_readme(record: ExportRecord) -> str:
     lines = [
         "---", yaml.safe_dump(front, sort_keys=True, allow_unicode=True).rstrip(), "---", "",
         f"# {for_markdown(record.release.name)}: {record.format} {record.format_version}", "",
-        f"{record.frames:,} frames of the release {for_markdown(record.release.name)} "
-        f"(content {record.release.digest}), exported by {for_markdown(record.made_by)}. `export.json` says the same "
-        "to programs; `checksums.sha256` lists the files.", "",
+        f"{record.frames:,} frames of the release {for_markdown(record.release.name)} (content {record.release.digest}), "
+        f"exported by {for_markdown(record.made_by)}. `export.json` says the same to programs; `checksums.sha256` lists the files.", "",
         "```python", record.how_to_open, "```", "",
         "## How things are stored", "",
         *(f"- {name}: {for_markdown(text)}" for name, text in record.codings.items()), "",
@@ -136,7 +153,13 @@ def make_worker(release: Release, parts: Path, cfg: ExportConfig) -> Work:
 
 
 def run(
-    cfg: ExportConfig, folder: Path, out: Path, *, workers: int = 0, watch: Watch = Watch(), resume: Resume = "if-same"
+    cfg: ExportConfig,
+    folder: Path,
+    out: Path,
+    *,
+    workers: int = 0,
+    watch: Watch = Watch(),
+    resume: Resume = "if-same",
 ) -> Path:
     """Read a release; write it in the format of the settings and give the folder it stands in."""
     release = open_release(folder)
@@ -157,7 +180,7 @@ def run(
     if finished.tally.failed:  # nothing half is published
         raise InputError(
             "parts of the release could not be exported", where=out / "failures.jsonl", got=str(finished.tally),
-            fix="mend what that file names (`cosfly release verify`) and run the same command again",
+            fix="mend what that file names (`cosfly release verify`) and run the same command again: only those are done again",
         )  # fmt: skip
     written = [result_of(kept, UnitFiles) for kept in finished.kept]
     _check_parts(parts, written)
@@ -177,9 +200,9 @@ def _publish(
     about = describe(
         release, facts, cfg, frames=sum(unit.frames for unit in units), num_bytes=sum(one.bytes for one in written)
     )
-    write_model(parts / "export.json", about, schema=EXPORT_SCHEMA, version=EXPORT_VERSION)
-    digests["export.json"] = sha256_file(parts / "export.json")
-    write_bytes(parts / "README.md", render_readme(about).encode())
+    digests["export.json"] = write_export(parts / "export.json", about)
+    readme = render_readme(about).encode()
+    write_bytes(parts / "README.md", readme)
     write_checksums(parts, digests)
 
 

@@ -2,8 +2,8 @@
 
     train-00000.tar     trajectory_1_ORI_frame_00000.depth.npy, .instance.png, .json, .rgb.png, then the next frame
 
-A shard is a run of row groups of the release, so its size is bounded by the setting and one row group; its bytes depend
-on the rows alone (no times, no owners). The JSON holds every column but the pictures.
+A shard is a run of row groups of the release, so its size is bounded by the setting and one row group; its bytes depend on the rows alone
+(no times, no owners). The JSON holds every column but the pictures.
 """
 
 from __future__ import annotations
@@ -56,7 +56,10 @@ def write(release: Release, unit: ExportUnit, folder: Path, cfg: ExportConfig) -
     """
     files = Files(folder)
     name, keys = f"{unit.name}.tar", set[str]()
-    with atomic_file(folder / name) as file, tarfile.open(fileobj=file, mode="w|", format=tarfile.GNU_FORMAT) as tar:
+    with (
+        atomic_file(folder / name) as file,
+        tarfile.open(fileobj=file, mode="w|", format=tarfile.GNU_FORMAT) as tar,
+    ):
         for span in unit.spans:
             for row in read_span(release, span):
                 key = row["sample_id"].replace(".", "_")  # a key ends at its first dot

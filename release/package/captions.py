@@ -1,4 +1,5 @@
-"""Which captions go into a release: the accepted ones, by flight, and an account of all. Only places in the file are kept in memory."""
+"""Which captions go into a release: the accepted ones, by flight, and an account of all. Only places in the file are
+kept in memory."""
 
 from __future__ import annotations
 
@@ -19,7 +20,6 @@ from release.columns import LANGUAGES
 
 FlightKey = tuple[str, str, str]  # town's folder, trajectory, variant
 Span = tuple[int, int]  # first byte and size of lines that stand one after the other
-MOST_SIDE_PX = 20_000  # of a picture that a teacher was shown
 MOST_SPAN_BYTES = 4_000_000  # of which the captions are in memory at once
 
 
@@ -164,11 +164,6 @@ def _no_caption(caption: Caption, where: str) -> InputError | None:
     if not window or window[0] < 0 or window[-1] != caption.frame_index or window != sorted(set(window)):
         expected = f"frames in order of time, the last one {caption.frame_index}"
         return InputError("not the window of a caption", where=where, got=str(window)[:80], expected=expected)
-    if not all(1 <= side <= MOST_SIDE_PX for side in caption.picture_px):
-        return InputError(
-            "not the size of a picture", where=f"{where}: picture_px", got=str(caption.picture_px)[:80],
-            expected=f"1 to {MOST_SIDE_PX:,}",
-        )  # fmt: skip
     if any(index <= caption.frame_index for index in caption.future):
         return InputError("the future of a caption has begun", where=where, got=str(caption.future)[:80])
     if any(language not in caption.prompt for language in LANGUAGES):

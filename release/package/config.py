@@ -25,20 +25,20 @@ class ReleaseConfig(Config):
     num_frames: int | None = Field(
         400,
         ge=1,
-        description="frames per flight, in evenly spread runs that keep captions' windows whole; shorter flights are whole, never padded; null: all",
+        description="frames per flight, in runs that keep captions' windows whole; shorter ones are whole; null: all",
     )
     uniform_stride: bool = Field(
         False,
-        description="choose num_frames evenly, frame by frame, as the paper does; captions whose windows are then not whole are left out and counted",
+        description="choose frames one by one, as the paper does; captions whose windows lack frames are left out",
     )
     flights: tuple[str, ...] = Field(
         (),
-        description="patterns for the folders of flights in their trees, as Town01/trajectory_17*/ORI or Town0[12]; empty: all",
+        description="patterns for the folders of flights in their trees, as Town01/trajectory_17*/ORI; empty: all",
     )
     tracks: tuple[Track, ...] = Field(("clean", "perturbed"), min_length=1, description="which flights of a trajectory")
     pairs: Pairs = Field(
         "both",
-        description="both: of two wanted tracks neither flight without the other; any: also flights whose twin is left out",
+        description="both: of two wanted tracks neither without the other; any: also flights whose twin is left out",
     )
     include_review: bool = Field(False, description="also release flights that the inspection routed to manual review")
     unbound: str = Field(
@@ -55,7 +55,7 @@ class ReleaseConfig(Config):
     )
     depth: DepthCodingName = Field(
         "float32",
-        description="float32: lossless; float16, or millimetre_png (16 bits, up to 65.5 m): smaller, the error is measured and stands in the record",
+        description="float32: lossless; float16, millimetre_png (16 bits, to 65.5 m): smaller, with a measured error",
     )
     shard_mb: int = Field(
         500, ge=1, description="size that a parquet file should not pass by more than one flight, MB before compression"

@@ -1,4 +1,5 @@
-"""What is released and which flights stand in which shard. Decided before any is written, so that neither workers nor a kill change it."""
+"""What is released and which flights stand in which shard. Decided before any is written, so that neither workers nor a
+kill change it."""
 
 from __future__ import annotations
 
@@ -14,19 +15,19 @@ from cosfly.products.frames import DEPTH_PNG, FILE_NAMES, frame_name, frame_path
 from cosfly.products.places import FlightChoice
 from cosfly.products.review import how_to_decide
 from cosfly.work.stage_folder import Failed, StageFolder, Tally, write_failures
-from release.columns import SPLIT_NAMES, SplitName
+from release.columns import SPLIT_NAMES, Placement, SplitName
 from release.package.captions import CaptionAccount, FlightCaptions, FlightKey, index_captions
 from release.package.config import ReleaseConfig
 from release.package.shards import FlightPart
 from release.package.sources import IN_REVIEW, Material, Source, choose_licence, gather, maps_of
-from release.package.survey import Placing, Surveyed, Tell, check_alike, keep_pairs, place_flights, survey
+from release.package.survey import Surveyed, Tell, check_alike, keep_pairs, place_flights, survey
 from release.record import ReleasedMap
 from release.rules import select_frames
 
 NUM_NAMED = 10  # things that are wrong, in a message; failures.jsonl has all
 
 
-class Findings:
+class Faults:
     """Takes what is wrong, and refuses to go on."""
 
     def __init__(self, stage: StageFolder) -> None:
@@ -39,7 +40,7 @@ class Findings:
         """Refuse to go on if anything is wrong.
 
         Raises:
-            InputError, VerifyError: names the first findings; `failures.jsonl` has all.
+            InputError, VerifyError: names the first; `failures.jsonl` has all.
         """
         if not self.failures:
             return
@@ -51,7 +52,8 @@ class Findings:
         wrong = "1 thing is" if len(self.failures) == 1 else f"{len(self.failures)} things are"
         raise kind(
             f"nothing is released: {wrong} wrong with the material", where=self._stage.path,
-            got=" | ".join(listed) + more, fix="mend them, or leave the flights out, and run the same command again: finished shards are kept",
+            got=" | ".join(listed) + more,
+            fix="mend them, or leave the flights out, and run the same command again: finished shards are kept",
         )  # fmt: skip
 
 
@@ -79,7 +81,8 @@ def plan_shards(sizes: Sequence[int], target_bytes: int) -> list[list[int]]:
 
 
 def selected_bytes(flight: Surveyed, cfg: ReleaseConfig, window_frames: int, tell: Tell) -> tuple[int, int]:
-    """Count a flight's selected frames and the bytes of their files, depth unpacked; `tell` takes files that are not there."""
+    """Count a flight's selected frames and the bytes of their files, depth unpacked; `tell` takes files that are not
+    there."""
     folder, total = flight.candidate.folder, 0
     selected = select_frames(flight.num_frames, cfg.num_frames, window_frames, cfg.uniform_stride).tolist()
     for i in selected:
@@ -100,7 +103,7 @@ def _size(path: Path) -> int:
 
 
 def shards_of(
-    flights: list[tuple[Surveyed, FlightCaptions, int, int]], placings: dict[str, Placing], target_bytes: int
+    flights: list[tuple[Surveyed, FlightCaptions, int, int]], placements: dict[str, Placement], target_bytes: int
 ) -> list[PlannedShard]:
     """Give the shards in the order of the release: split by split, and in each the flights as they come.
 
@@ -109,11 +112,11 @@ def shards_of(
     """
     shards: list[PlannedShard] = []
     for split in SPLIT_NAMES:
-        own = [entry for entry in flights if placings[entry[0].name].split == split]
+        own = [entry for entry in flights if placements[entry[0].name].split == split]
         for number, group in enumerate(plan_shards([entry[3] for entry in own], target_bytes)):
             members = [own[index] for index in group]
-            parts = [FlightPart(f.candidate, placings[f.name], captions) for f, captions, *_ in members]
-            named = "".join(f"{f.name} {placings[f.name]} {frames} {size}\n" for f, _, frames, size in members)
+            parts = [FlightPart(f.candidate, placements[f.name], captions) for f, captions, *_ in members]
+            named = "".join(f"{f.name} {placements[f.name]} {frames} {size}\n" for f, _, frames, size in members)
             name = f"{split}-{number:05d}-{hashlib.sha256(named.encode()).hexdigest()[:12]}"
             shards.append(PlannedShard(name, split, parts, sum(entry[2] for entry in members)))
     return shards
@@ -123,11 +126,11 @@ def shards_of(
 
 
 @dataclass(frozen=True)
-class Plan:
+class ReleasePlan:
     """All that is decided before the first byte is written."""
 
     flights: list[tuple[Surveyed, FlightCaptions, int, int]]
-    placings: dict[str, Placing]
+    placements: dict[str, Placement]
     shards: list[PlannedShard]
     account: CaptionAccount
     material: Material
@@ -137,71 +140,57 @@ class Plan:
     licence: str
 
 
-def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> Plan:
+def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> ReleasePlan:
     """Look at all of the material, and decide what goes where.
 
     Raises:
-        InputError: it cannot be released; names everything that is wrong. NothingKept: there is no flight. ConfigError: no licence.
+        InputError: it cannot be released; names everything that is wrong. NothingKept: there is no flight. ConfigError:
+        no licence.
     """
-    findings = Findings(stage)
-    material = gather(
-        sources,
-        include_review=cfg.include_review,
-        accept_unbound=cfg.unbound == "accept",
-        choice=FlightChoice(match=cfg.flights),
-    )
-    flights, walks, left_out = survey(material.candidates, cfg.tracks, findings.tell)
-    flights, without_twin = keep_pairs(flights, cfg.pairs, cfg.tracks, findings.tell)
+    faults = Faults(stage)
+    choice, accepts = FlightChoice(match=cfg.flights), cfg.unbound == "accept"
+    material = gather(sources, include_review=cfg.include_review, accept_unbound=accepts, choice=choice)
+    flights, walks, left_out = survey(material.candidates, cfg.tracks, faults.tell)
+    flights, without_twin = keep_pairs(flights, cfg.pairs, cfg.tracks, faults.tell)
     left_out = left_out + without_twin
-    check_alike(flights, findings.tell)
-    captions, account = _index(sources, material, flights, findings)
-    findings.check()
+    check_alike(flights, faults.tell)
+    captions, account = _index(sources, material, flights, faults)
+    faults.check()
     if not flights:
         raise _no_flight(sources, material, left_out, stage)
     sized = [
-        (
-            flight,
-            captions[flight.name],
-            *selected_bytes(flight, cfg, account.window_frames, findings.tell),
-        )
+        (flight, captions[flight.name], *selected_bytes(flight, cfg, account.window_frames, faults.tell))
         for flight in flights
     ]
-    findings.check()
-    placings = place_flights(flights, walks, cfg.split_by, cfg.fractions, cfg.split_seed)
+    faults.check()
+    placements = place_flights(flights, walks, cfg.split_by, cfg.fractions, cfg.split_seed)
     maps = maps_of([flight.candidate for flight in flights])
-    return Plan(
-        flights=sized,
-        placings=placings,
-        shards=shards_of(sized, placings, cfg.shard_bytes),
-        account=account,
-        material=material,
-        left_out=left_out,
-        window_frames=account.window_frames,
-        maps=maps,
-        licence=choose_licence(cfg.licence, [(shown.town, shown.licence) for shown in maps]),
-    )
+    return ReleasePlan(
+        flights=sized, placements=placements, shards=shards_of(sized, placements, cfg.shard_bytes), account=account,
+        material=material, left_out=left_out, window_frames=account.window_frames, maps=maps,
+        licence=choose_licence(cfg.licence, [(one.town, one.licence) for one in maps]),
+    )  # fmt: skip
 
 
 def _no_flight(sources: list[Source], material: Material, left_out: Counter[str], stage: StageFolder) -> NothingKept:
     """Say that no flight is left, and what to do: most often a person has to decide."""
     tally = Tally(input=len(material.candidates), dropped=left_out)
     waiting = [one.source for one in material.candidates if (one.left_out or "").startswith(IN_REVIEW)]
-    inspected = next((sources[number].inspect for number in waiting), None) or next(
-        (s.inspect for s in sources if s.inspect), None
-    )
+    inspected = next((s.inspect for s in [*(sources[k] for k in waiting), *sources] if s.inspect), None)
+    choose = "choose others with release.tracks, release.pairs or release.flights"
     if inspected is None:
-        return stage.nothing_kept(
-            tally, expected="a flight", fix="choose others with release.tracks, release.pairs or release.flights"
-        )
+        return stage.nothing_kept(tally, expected="a flight", fix=choose)
     folder = inspected.parent
-    fix = f"mend what {folder / 'report.html'} names and inspect again, or choose others with release.tracks, release.pairs or release.flights"
     if waiting:
-        fix = f"{how_to_decide(folder)}; then the same command again. Or, with another --out, take them undecided: --set release.include_review=true"
+        again = "then the same command again. Or, with another --out, take them undecided"
+        fix = f"{how_to_decide(folder)}; {again}: --set release.include_review=true"
+    else:
+        fix = f"mend what {folder / 'report.html'} names and inspect again, or {choose}"
     return stage.nothing_kept(tally, expected="an inspected flight that passed", where=folder, fix=fix)
 
 
 def _index(
-    sources: list[Source], material: Material, flights: list[Surveyed], findings: Findings
+    sources: list[Source], material: Material, flights: list[Surveyed], faults: Faults
 ) -> tuple[dict[str, FlightCaptions], CaptionAccount]:
     """Find the captions of each flight, by its name."""
     total, found = CaptionAccount(), dict[str, FlightCaptions]()
@@ -209,14 +198,12 @@ def _index(
         own = _by_key([flight for flight in flights if flight.candidate.source == number])
         others: set[FlightKey] = {one.key for one in material.candidates if one.source == number} - own.keys()
         lengths = {key: min(flight.num_frames for flight in group) for key, group in own.items()}
-        captions, account = index_captions(source.captions, lengths, others, findings.tell)
+        captions, account = index_captions(source.captions, lengths, others, faults.tell)
         for key, of_flight in captions.items():
             if len(own[key]) > 1 and of_flight.count:
                 names = ", ".join(flight.name for flight in own[key])
                 what = "captions that may be of any of several flights"
-                findings.tell(
-                    names, InputError(what, where=source.captions, got=names, fix="release their trees apart")
-                )
+                faults.tell(names, InputError(what, where=source.captions, got=names, fix="release their trees apart"))
             found |= {flight.name: of_flight for flight in own[key]}
         total = total + account
     return found, total

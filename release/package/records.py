@@ -1,4 +1,5 @@
-"""The folder that is published: finished shards under their names, and the records beside them, without anything of this machine."""
+"""The folder that is published: finished shards under their names, and the records beside them, without anything of
+this machine."""
 
 from __future__ import annotations
 
@@ -7,7 +8,6 @@ import platform
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +27,8 @@ from release.columns import SPLIT_NAMES, SplitName
 from release.depth import depth_record
 from release.package.captions import CaptionAccount, teacher_settings
 from release.package.config import ReleaseConfig
-from release.package.plan import Plan
-from release.package.shards import Written
+from release.package.plan import ReleasePlan
+from release.package.shards import ShardResult
 from release.package.sources import Source, input_names
 from release.record import (
     CaptionHistory,
@@ -45,7 +45,7 @@ from release.record import (
     SourceRecord,
     SplitNumbers,
     Splits,
-    Teacher,
+    TeacherRecord,
     content_digest,
     shard_path,
     write_record,
@@ -75,7 +75,7 @@ def provenance_of(sources: list[Source], inputs: Mapping[str, StageInput], accou
         },
         sources=[_source(source, names, inputs) for source, names in zip(sources, input_names(sources), strict=True)],
         teachers=[
-            Teacher(kind=kind, model=model, settings=published(teacher_settings(settings)), captions=count)
+            TeacherRecord(kind=kind, model=model, settings=published(teacher_settings(settings)), captions=count)
             for (kind, model, settings), count in sorted(account.teachers.items())
         ],
         repairs=Repairs(
@@ -110,7 +110,7 @@ def _source(source: Source, names: dict[str, str], inputs: Mapping[str, StageInp
     )
 
 
-def account_for(plan: Plan, written: list[Written]) -> History:
+def account_for(plan: ReleasePlan, written: list[ShardResult]) -> History:
     """Say where all flights and captions went; every sum is checked here and again by `release verify`."""
     flights = [flight for result in written for flight in result.flights]
     account = plan.account
@@ -135,19 +135,19 @@ def account_for(plan: Plan, written: list[Written]) -> History:
     return History(trajectories=plan.material.trajectories, flights=found, captions=captions)
 
 
-def splits_of(cfg: ReleaseConfig, plan: Plan, written: list[Written]) -> Splits:
+def splits_of(cfg: ReleaseConfig, plan: ReleasePlan, written: list[ShardResult]) -> Splits:
     """Give what the record says of its splits."""
     surveyed = {flight.name: flight for flight, *_ in plan.flights}
     numbers: dict[SplitName, SplitNumbers] = {}
     for split in SPLIT_NAMES:
-        own = [f for result in written for f in result.flights if plan.placings[f.name].split == split]
+        own = [f for result in written for f in result.flights if plan.placements[f.name].split == split]
         if own:
             numbers[split] = SplitNumbers(
                 frames=sum(flight.frames for flight in own),
                 captions=sum(flight.captions for flight in own),
                 flights=len(own),
                 trajectories=len({surveyed[flight.name].candidate.trajectory for flight in own}),
-                walks=sorted({plan.placings[flight.name].walk for flight in own}),
+                walks=sorted({plan.placements[flight.name].walk for flight in own}),
                 towns=sorted({surveyed[flight.name].candidate.place.town for flight in own}),
             )
     return Splits(by=cfg.split_by, rule=SPLIT_RULE, seed=cfg.split_seed, fractions=cfg.fractions, splits=numbers)
@@ -155,8 +155,8 @@ def splits_of(cfg: ReleaseConfig, plan: Plan, written: list[Written]) -> Splits:
 
 def make_record(
     cfg: ReleaseConfig,
-    plan: Plan,
-    written: list[Written],
+    plan: ReleasePlan,
+    written: list[ShardResult],
     shards: list[Shard],
     numbers: Numbers,
     provenance: Provenance,
@@ -192,9 +192,9 @@ def make_record(
                 flight=flight.name,
                 frames=flight.frames,
                 frames_available=flight.frames_available,
-                split=plan.placings[flight.name].split,
-                walk=plan.placings[flight.name].walk,
-                pair=plan.placings[flight.name].pair,
+                split=plan.placements[flight.name].split,
+                walk=plan.placements[flight.name].walk,
+                pair=plan.placements[flight.name].pair,
                 five_ray_mean=five_ray[flight.name],
             )
             for result in written
@@ -205,48 +205,42 @@ def make_record(
     )
 
 
+OF_SHARD = {"rows", "bytes", "sha256"}  # what is known of it once it is written
 DATASET, PARTS = "dataset", "parts"  # in the folder of the stage: what gets published, and shards on the way there
 
 
-@dataclass(frozen=True)
-class Finished:
-    """A shard that is written, and where it stands until the release has its name."""
-
-    split: SplitName
-    path: Path
-    rows: int
-    bytes: int
-    sha256: str
-
-
-def check_parts(shards: Sequence[Finished], out: Path) -> None:
+def check_parts(parts: Sequence[tuple[Path, Shard]], out: Path) -> None:
     """See that what was finished, also by an earlier run, is there; `out` is the folder of the stage.
 
     Raises:
         VerifyError: it is not.
     """
-    for shard in shards:
-        if not shard.path.is_file() or shard.path.stat().st_size != shard.bytes:
+    for path, shard in parts:
+        if not path.is_file() or path.stat().st_size != shard.bytes:
             raise VerifyError(
-                "a shard that was finished before is missing or has another size", where=shard.path,
+                "a shard that was finished before is missing or has another size", where=path,
                 expected=f"{shard.bytes} bytes", fix=f"remove {out} and run again",
             )  # fmt: skip
 
 
-def name_shards(finished: Sequence[Finished], folder: Path) -> list[Shard]:
-    """Put shards under their names in the release: linked, so that no byte moves and a kill costs nothing."""
-    digest = content_digest((shard.split, shard.sha256) for shard in finished)
-    counts, numbers = Counter(shard.split for shard in finished), Counter[str]()
+def name_shards(parts: Sequence[tuple[Path, Shard]], folder: Path) -> list[Shard]:
+    """Put shards under their names in the release: linked, so that no byte moves and a kill costs nothing.
+
+    Args:
+        parts: where they stand until the release has its name, and what they are; their `path` is not read.
+    """
+    digest = content_digest((shard.split, shard.sha256) for _, shard in parts)
+    counts, numbers = Counter(shard.split for _, shard in parts), Counter[str]()
     (folder / "data").mkdir()
     shards = []
-    for shard in finished:
+    for part, shard in parts:
         path = shard_path(shard.split, digest, numbers[shard.split], counts[shard.split])
         numbers[shard.split] += 1
         try:
-            os.link(shard.path, folder / path)
+            os.link(part, folder / path)
         except OSError:  # the file system has no links
-            shutil.copyfile(shard.path, folder / path)
-        shards.append(Shard(path=path, split=shard.split, rows=shard.rows, bytes=shard.bytes, sha256=shard.sha256))
+            shutil.copyfile(part, folder / path)
+        shards.append(shard.model_copy(update={"path": path}))
     return shards
 
 

@@ -1,4 +1,5 @@
-"""Rows on their way into a shard: pictures in memory that is used again, from where parquet takes them, and how the file is laid out."""
+"""Rows on their way into a shard: pictures in memory that is used again, from where parquet takes them, and how the
+file is laid out."""
 
 from __future__ import annotations
 
@@ -35,9 +36,9 @@ DIRECT = getattr(os, "O_DIRECT", 0)  # Linux
 class HashedFile:
     """What parquet writes to: blocks are filled here, and a thread hashes them and writes them to an open, empty file.
 
-    Where the file system can, the blocks go past the page cache: a copy into it costs the processor more than the digest does, and nobody
-    reads a shard soon. A block stands at a page's begin and is whole pages long, as that way of writing asks for, so the last one is padded
-    and the file then cut to its length.
+    Where the file system can, the blocks go past the page cache: a copy into it costs the processor more than the
+    digest does, and nobody reads a shard soon. A block stands at a page's begin and is whole pages long, as that way of
+    writing asks for, so the last one is padded and the file then cut to its length.
     """
 
     closed = False  # whoever opened the file closes it
@@ -238,8 +239,8 @@ class Rows:
 def open_writer(sink: str | pa.NativeFile, schema: pa.Schema) -> pq.ParquetWriter:
     """Open a parquet file whose bytes depend on the rows alone.
 
-    PNG files do not compress, so they are stored as they are; everything else is zstd. Statistics of pictures would only
-    repeat their first bytes. The page index lets the hub's viewer read one row without its row group.
+    PNG files do not compress, so they are stored as they are; everything else is zstd. Statistics of pictures would
+    only repeat their first bytes. The page index lets the hub's viewer read one row without its row group.
     """
     leaves: list[str] = []  # parquet's paths of the primitive columns
     for member in schema:

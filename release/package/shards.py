@@ -1,6 +1,7 @@
 """One shard: the frames of some flights, read once, held against their digests and written as parquet.
 
-A worker writes whole shards, so that no byte is written twice, and pictures are read into memory that is used again: parquet takes them from there.
+A worker writes whole shards, so that no byte is written twice, and pictures are read into memory that is used again:
+parquet takes them from there.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,16 +36,17 @@ from cosfly.work.items import advance
 from cosfly.work.provenance import FLIGHT, digest_of, folder_digests
 from cosfly.work.store import CHECKSUMS, atomic_file, read_checksums
 from release import columns
-from release.columns import Placed, ReleasedCaption, caption_values
+from release.columns import Placement, ReleasedCaption, caption_values
 from release.depth import DepthErrors
 from release.package.captions import FlightCaptions
 from release.package.rows import HashedFile, Rows, ShardPlan, open_writer
 from release.package.sources import Candidate
-from release.package.survey import Placing, look_of, open_flight
+from release.package.survey import look_of, open_flight
 from release.rules import is_whole, select_frames
 
 CHUNK_FRAME_BYTES = 12  # of a PNG's chunk: length, name, checksum
-# Bits a channel; colour type, RGB or RGBA; interlacing: bytes 24, 25 and 28 of a PNG. What the readers of a release take.
+# Bits a channel; colour type, RGB or RGBA; interlacing: bytes 24, 25 and 28 of a PNG. What the readers of a release
+# take.
 KIND = struct.Struct(">BBxxB")
 KINDS = ((8, 2, 0), (8, 6, 0))
 CONVERT = "convert it without loss, as Pillow's Image.open(FILE).convert('RGB').save(FILE), and inspect the tree again"
@@ -68,17 +70,13 @@ def check_picture(file: FrameFile, data: memoryview, size_px: tuple[int, int], w
         got = f"{len(data)} bytes that do not {'begin' if found is None else 'end'} as a PNG"
         raise InputError("a picture is damaged or cut short", where=where, got=got, fix=RENDER)
     if found != size_px:
-        raise InputError(
-            "a picture of another size",
-            where=where,
-            got=f"{found[0]} x {found[1]} px",
-            expected=f"{size_px[0]} x {size_px[1]} px",
-            fix=RENDER,
-        )
+        got, expected = (f"{width} x {height} px" for width, height in (found, size_px))
+        raise InputError("a picture of another size", where=where, got=got, expected=expected, fix=RENDER)
     bits, colour_type, interlace = KIND.unpack_from(data, PNG_HEADER_BYTES)
     if (bits, colour_type, interlace) not in KINDS:
         got = f"{bits} bits, colour type {colour_type}{', interlaced' if interlace else ''}"
-        raise InputError("a PNG of another kind", where=where, got=got, expected="8 bits, RGB or RGBA (2 or 6), not interlaced", fix=CONVERT)  # fmt: skip
+        expected = "8 bits, RGB or RGBA (2 or 6), not interlaced"
+        raise InputError("a PNG of another kind", where=where, got=got, expected=expected, fix=CONVERT)
     if not is_known and (chunk := next(_broken_chunks(data), None)):
         raise InputError(
             "a picture is damaged", where=where, got=f"chunk {chunk} does not have its checksum", fix=RENDER
@@ -123,7 +121,7 @@ class FlightPart:
     """A flight of a shard."""
 
     candidate: Candidate
-    placing: Placing
+    placement: Placement
     captions: FlightCaptions
 
 
@@ -138,7 +136,7 @@ class ReleasedPart(BaseModel):
     window_not_whole: int
 
 
-class Written(BaseModel):
+class ShardResult(BaseModel):
     """A shard that is written."""
 
     rows: int
@@ -148,7 +146,7 @@ class Written(BaseModel):
     depth: DepthErrors
 
 
-def write_shard(path: Path, parts: Sequence[FlightPart], plan: ShardPlan) -> Written:
+def write_shard(path: Path, parts: Sequence[FlightPart], plan: ShardPlan) -> ShardResult:
     """Write the selected frames of some flights.
 
     Raises:
@@ -165,9 +163,8 @@ def write_shard(path: Path, parts: Sequence[FlightPart], plan: ShardPlan) -> Wri
             rows.flush()
         problems.raise_any()
         size, sha256 = hashed.finish()
-    return Written(
-        rows=sum(flight.frames for flight in flights), bytes=size, sha256=sha256, flights=flights, depth=rows.depth
-    )
+    num_rows = sum(flight.frames for flight in flights)
+    return ShardResult(rows=num_rows, bytes=size, sha256=sha256, flights=flights, depth=rows.depth)
 
 
 def _write_flight(part: FlightPart, plan: ShardPlan, rows: Rows, problems: _Problems) -> ReleasedPart:
@@ -176,7 +173,7 @@ def _write_flight(part: FlightPart, plan: ShardPlan, rows: Rows, problems: _Prob
     flight = open_flight(part.candidate)
     selected = select_frames(len(flight), plan.num_frames, plan.window_frames, plan.uniform_stride).tolist()
     captions, not_selected, not_whole = _captions_of(part.captions, set(selected))
-    placing, tree = part.placing, tree_of(flight.frame_folder(0))
+    tree = tree_of(flight.frame_folder(0))
     check_stays_below(folder / FRAMES_DIR, tree)
     for i in selected:
         with problems.collected():
@@ -184,21 +181,17 @@ def _write_flight(part: FlightPart, plan: ShardPlan, rows: Rows, problems: _Prob
             if frame.is_symlink():
                 check_stays_below(frame, tree)
             _check_digest(folder, f"{frame_name(i)}/{META}", None, digests)
-            placed = Placed(placing.walk, placing.split, placing.pair, look_of(flight, i))
+            placement = replace(part.placement, look=look_of(flight, i))
             for file in plan.files:
                 path = frame_path(frame, FILE_NAMES[file])
                 data = _read_picture(flight, path, file, tree, rows, is_known=bool(digests))
                 _check_digest(folder, f"{frame_name(i)}/{path.name}", data, digests)
-            rows.add(columns.scalar_row(flight, i, captions.get(i), placed), flight, i, keep=not problems.errors)
+            rows.add(columns.scalar_row(flight, i, captions.get(i), placement), flight, i, keep=not problems.errors)
         advance()
     return ReleasedPart(
-        name=part.candidate.name,
-        frames=len(selected),
-        frames_available=len(flight),
-        captions=len(captions),
-        frame_not_selected=not_selected,
-        window_not_whole=not_whole,
-    )
+        name=part.candidate.name, frames=len(selected), frames_available=len(flight), captions=len(captions),
+        frame_not_selected=not_selected, window_not_whole=not_whole,
+    )  # fmt: skip
 
 
 def _captions_of(captions: FlightCaptions, selected: set[int]) -> tuple[dict[int, ReleasedCaption], int, int]:
@@ -244,7 +237,8 @@ class _Problems:
 
 
 def _digests(candidate: Candidate) -> dict[str, str]:
-    """Give the sha256 of each file of a flight, as far as they are known, once it is clear that they are those that were inspected.
+    """Give the sha256 of each file of a flight, as far as they are known, once it is clear that they are those that
+    were inspected.
 
     Raises:
         VerifyError: they are not.

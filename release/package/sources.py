@@ -78,7 +78,8 @@ class Source:
 
 
 def told_apart(sources: list[Source]) -> list[Source]:
-    """Give runs of one name, as trees in one folder are, the name of their tree too: rows and records know a run by its name alone."""
+    """Give runs of one name, as trees in one folder are, the name of their tree too: rows and records know a run by its
+    name alone."""
     counts = Counter(source.run for source in sources)
     return [
         replace(source, run=folder_name(f"{source.run}_{source.data.absolute().name}"))
@@ -100,8 +101,8 @@ def input_names(sources: list[Source]) -> list[dict[str, str]]:
 class Candidate:
     """A flight that a source has: where it stands and what it is called.
 
-    left_out: why the inspection leaves it out, `result: reason`, None where it does not. sha256: of its files as they were inspected; None where no
-    inspection says. five_ray_mean: as it was inspected.
+    left_out: why the inspection leaves it out, `result: reason`, None where it does not. sha256: of its files as they
+    were inspected; None where no inspection says. five_ray_mean: as it was inspected.
     """
 
     source: int
@@ -140,15 +141,18 @@ class Material:
 def gather(
     sources: list[Source], *, include_review: bool, accept_unbound: bool, choice: FlightChoice = ALL_FLIGHTS
 ) -> Material:
-    """Read the inspections of the runs, and list their flights; of a tree without one all. Those that are not chosen are left out.
+    """Read the inspections of the runs, and list their flights; of a tree without one all. Those that are not chosen
+    are left out.
 
     Raises:
-        InputError: a file cannot be read, two runs or flights cannot be told apart, or nobody says of which tree the captions were made.
+        InputError: a file cannot be read, two runs or flights cannot be told apart, or nobody says of which tree the
+        captions were made.
     """
     name, count = Counter(source.run for source in sources).most_common(1)[0]
     if count > 1:  # rows and records know a run by its name alone
         raise InputError(
-            "two runs have one name", got=f"{count} of {name}", expected="trees of different names, or in folders of different names",
+            "two runs have one name", got=f"{count} of {name}",
+            expected="trees of different names, or in folders of different names",
             fix="rename one of the trees, or the folder that it stands in",
         )  # fmt: skip
     wanted = ("accepted", "review") if include_review else ("accepted",)
@@ -159,7 +163,8 @@ def gather(
             raise InputError(
                 "no record says of which tree these captions were made", where=source.captions,
                 expected="stage.json of the stage that made them beside the captions",
-                fix="give them where `cosfly caption` wrote them; if you know that they are of this tree, --set release.unbound=accept",
+                fix="give them where `cosfly caption` wrote them; "
+                "if you know that they are of this tree, --set release.unbound=accept",
             )  # fmt: skip
         if source.inspect is None:
             for folder in find_flights(source.data):
@@ -211,7 +216,8 @@ def _inspected_place(source: Source, flight: FlightInspection) -> Place:
 
 
 def _place(source: Source, folder: Path) -> Place:
-    """Tell a place by a flight's folder in its tree. Folders above the town, in a tree of several, count as part of the run's name."""
+    """Tell a place by a flight's folder in its tree. Folders above the town, in a tree of several, count as part of the
+    run's name."""
     town, trajectory, variant = ("", "", *folder.parts)[-3:]
     return Place("_".join((source.run, *folder.parts[:-3])), town, trajectory, variant)
 
@@ -228,7 +234,8 @@ def _sum_of(inspections: list[Inspection]) -> TrajectoryFunnel:
 
 
 def choose_licence(licence: str | None, maps: list[tuple[str, str]]) -> str:
-    """Give the licence of the data set: `licence` where it is given, else that of the maps, of each its name and licence.
+    """Give the licence of the data set: `licence` where it is given, else that of the maps, of each its name and
+    licence.
 
     Raises:
         ConfigError: it is not given, and the maps' are unknown or differ.
@@ -239,6 +246,6 @@ def choose_licence(licence: str | None, maps: list[tuple[str, str]]) -> str:
             "nobody says under which licence this may be released", where="release.licence",
             got=", ".join(f"{name}: {one}" for name, one in maps),
             expected="a licence identifier as the hub spells it",
-            fix="give yours, for instance --set release.licence=cc-by-4.0",
+            fix="--set release.licence=... (cc-by-4.0, apache-2.0, ...)",
         )  # fmt: skip
     return chosen

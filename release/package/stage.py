@@ -1,7 +1,8 @@
 """`cosfly release build`: flights and captions to a folder that `datasets.load_dataset` opens.
 
-Reads the playback trees, captions and inspections of one run or several; writes `dataset/` (parquet shards, README.md, release.json,
-croissant.json, checksums.sha256), which is what gets published: all of it, or nothing. Around it stand the stage's own records, which hold local paths and do not.
+Reads the playback trees, captions and inspections of one run or several; writes `dataset/` (parquet shards, README.md,
+release.json, croissant.json, checksums.sha256), which is what gets published: all of it, or nothing. Around it stand
+the stage's own records, which hold local paths and do not.
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ from cosfly.work.stage_folder import Failed, Resume, StageFolder, Tally, result_
 from cosfly.work.store import CHECKSUMS, atomic_folder
 from release.card.numbers import compute_numbers
 from release.package.config import ReleaseConfig
-from release.package.plan import Findings, Plan, make_plan
+from release.package.plan import Faults, ReleasePlan, make_plan
 from release.package.records import (
     DATASET,
+    OF_SHARD,
     PARTS,
-    Finished,
     check_parts,
     make_record,
     name_shards,
@@ -30,8 +31,9 @@ from release.package.records import (
     write_records,
 )
 from release.package.rows import ShardPlan
-from release.package.shards import Written, write_shard
+from release.package.shards import ShardResult, write_shard
 from release.package.sources import Source, input_names, told_apart
+from release.record import Shard
 from release.verify.verify import verify
 
 
@@ -58,10 +60,12 @@ def run(
     watch: Watch = Watch(),
     resume: Resume = "if-same",
 ) -> Path:
-    """Read the playback tree, the captions and, where there is one, the inspection of each run; write `dataset/` and give its path.
+    """Read the playback tree, the captions and, where there is one, the inspection of each run; write `dataset/` and
+    give its path.
 
     Raises:
-        InputError, VerifyError: something is wrong with the material; nothing is published, and what was finished stays for the next run.
+        InputError, VerifyError: something is wrong with the material; nothing is published, and what was finished stays
+        for the next run.
     """
     sources = told_apart(sources)
     names = input_names(sources)
@@ -89,15 +93,8 @@ def _build(
         shards = name_shards(_finished(plan, written, parts), folder)
         numbers = compute_numbers([folder / shard.path for shard in shards], cfg.num_frames)
         provenance = provenance_of(sources, read_stage_record(out).inputs, plan.account)
-        record = make_record(
-            cfg,
-            plan,
-            written,
-            shards,
-            numbers,
-            provenance,
-            {source.run: source.questions for source in sources if source.questions},
-        )
+        prompts = {source.run: source.questions for source in sources if source.questions}
+        record = make_record(cfg, plan, written, shards, numbers, provenance, prompts)
         write_records(folder, record)
         _check_release(folder)
     # checksums.sha256 speaks for the shards: hashing them again would only cost time.
@@ -110,34 +107,31 @@ def _build(
 
 
 def _write_parts(
-    cfg: ReleaseConfig, plan: Plan, stage: StageFolder, parts: Path, workers: int, watch: Watch
-) -> list[Written]:
+    cfg: ReleaseConfig, plan: ReleasePlan, stage: StageFolder, parts: Path, workers: int, watch: Watch
+) -> list[ShardResult]:
     """Write all shards that are not written yet.
 
     Raises:
         InputError, VerifyError: a flight cannot be released.
     """
     how = ShardPlan(
-        num_frames=cfg.num_frames,
-        window_frames=plan.window_frames,
-        uniform_stride=cfg.uniform_stride,
-        files=cfg.modalities,
-        depth=cfg.depth,
-        row_group_bytes=cfg.row_group_bytes,
-    )
+        num_frames=cfg.num_frames, window_frames=plan.window_frames, uniform_stride=cfg.uniform_stride,
+        files=cfg.modalities, depth=cfg.depth, row_group_bytes=cfg.row_group_bytes,
+    )  # fmt: skip
     items = [Item(shard.name, shard.parts, num_steps=shard.num_frames) for shard in plan.shards]
     finished = run_items(stage, items, make_worker, (how, parts), workers=workers, watch=watch, label="release: frames")
-    findings = Findings(stage)
-    findings.failures += [record for record in finished.records if isinstance(record, Failed)]
-    findings.check()
-    written = [result_of(record, Written) for record in finished.kept]
+    faults = Faults(stage)
+    faults.failures += [record for record in finished.records if isinstance(record, Failed)]
+    faults.check()
+    written = [result_of(record, ShardResult) for record in finished.kept]
     check_parts(_finished(plan, written, parts), stage.path)
     return written
 
 
-def _finished(plan: Plan, written: list[Written], parts: Path) -> list[Finished]:
+def _finished(plan: ReleasePlan, written: list[ShardResult], parts: Path) -> list[tuple[Path, Shard]]:
+    """Give the shards that are written, and where they stand until the release has its name."""
     return [
-        Finished(shard.split, part_path(parts, shard.name), result.rows, result.bytes, result.sha256)
+        (part_path(parts, shard.name), Shard(path="", split=shard.split, **result.model_dump(include=OF_SHARD)))
         for shard, result in zip(plan.shards, written, strict=True)
     ]
 

@@ -1,4 +1,5 @@
-"""Every flight read once, before anything is written: what it is, what it cannot be, and how flights divide into pairs and splits."""
+"""Every flight read once, before anything is written: what it is, what it cannot be, and how flights divide into pairs
+and splits."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from cosfly.products.places import Track
 from cosfly.products.playback import Flight, read_flight
 from cosfly.products.splits import Course, town_family, walks_of
 from cosfly.work.console import progress_bar
-from release.columns import SplitName
+from release.columns import Placement, SplitName
 from release.package.sources import Candidate
 from release.record import Pairs, SplitBy
 from release.rules import split_groups
@@ -24,33 +25,21 @@ MOST_NAMED = 3  # flights of each kind in a message
 
 @dataclass(frozen=True)
 class Surveyed:
-    """A flight that is released, as far as all of it must be known at once."""
+    """A flight that is released, as far as all of it must be known at once. size_px: width, height; version: of
+    `trajectory.json`."""
 
     candidate: Candidate
     track: Track
     num_frames: int
-    size_px: tuple[int, int]  # width, height
-    version: str  # schema and version of `trajectory.json`
+    size_px: tuple[int, int]
+    version: str
 
     @property
     def name(self) -> str:
         return self.candidate.name
 
 
-@dataclass(frozen=True)
-class Placing:
-    """Where a flight belongs: its walk, its split, and the name of its twin."""
-
-    walk: str
-    split: SplitName
-    pair: str | None
-
-
 Tell = Callable[[str, InputError], None]
-ALIKE: dict[str, Callable[[Surveyed], str]] = {
-    "size of pictures": lambda flight: "{} x {} px".format(*flight.size_px),
-    "version of trajectory.json": lambda flight: flight.version,
-}
 
 
 def survey(
@@ -81,9 +70,9 @@ def survey(
                 if track not in tracks:
                     left_out[f"track {track} not wanted"] += 1
                     continue
-                camera = flight.camera
+                size_px = (flight.camera.width_px, flight.camera.height_px)
                 version = f"{flight.raw.get('schema')} {flight.raw.get('schema_version')}"
-                found.append(Surveyed(candidate, track, len(flight), (camera.width_px, camera.height_px), version))
+                found.append(Surveyed(candidate, track, len(flight), size_px, version))
                 yield Course(
                     candidate.trajectory,
                     candidate.place.town,
@@ -133,7 +122,8 @@ def _check_frames(flight: Flight) -> None:
     if missing:
         raise InputError(
             "frames are missing", where=folder, got=f"{len(missing)} of {len(flight)}, the first {missing[0]}",
-            expected="a folder for each point of trajectory.json", fix="render them again, or have the inspection reject the flight",
+            expected="a folder for each point of trajectory.json",
+            fix="render them again, or have the inspection reject the flight",
         )  # fmt: skip
 
 
@@ -150,13 +140,8 @@ def keep_pairs(
     groups: dict[str, dict[str, Surveyed]] = defaultdict(dict)
     for flight in flights:
         if flight.track in groups[flight.candidate.trajectory]:
-            expected = "one flight of each track in a trajectory"
-            tell(
-                flight.name,
-                InputError(
-                    "two flights of one track", where=flight.candidate.folder, got=flight.track, expected=expected
-                ),
-            )
+            what, expected = "two flights of one track", "one flight of each track in a trajectory"
+            tell(flight.name, InputError(what, where=flight.candidate.folder, got=flight.track, expected=expected))
         groups[flight.candidate.trajectory][flight.track] = flight
     for group in groups.values():
         lengths = {flight.num_frames for flight in group.values()}
@@ -165,43 +150,39 @@ def keep_pairs(
             tell(next(iter(group.values())).name, InputError("twins of different lengths", got=f"{got} frames"))
     if pairs == "any" or len(tracks) < 2:
         return flights, Counter()
-    has_both = {
-        number
-        for number in {f.candidate.source for f in flights}
-        if len({f.track for f in flights if f.candidate.source == number}) > 1
-    }
-    kept, left_out = list[Surveyed](), Counter[str]()
+    tracks_of: dict[int, set[Track]] = defaultdict(set)
     for flight in flights:
-        if len(groups[flight.candidate.trajectory]) == 2 or flight.candidate.source not in has_both:
-            kept.append(flight)
-        else:
-            left_out["its twin is not released"] += 1
-    return kept, left_out
+        tracks_of[flight.candidate.source].add(flight.track)
+    kept = [
+        flight
+        for flight in flights
+        if len(groups[flight.candidate.trajectory]) == 2 or len(tracks_of[flight.candidate.source]) == 1
+    ]
+    num_alone = len(flights) - len(kept)
+    return kept, Counter({"its twin is not released": num_alone} if num_alone else {})
 
 
 def check_alike(flights: list[Surveyed], tell: Tell) -> None:
     """See that all flights have pictures of one size and files of one version; `tell` takes what differs."""
-    for what, value_of in ALIKE.items():
+    for what, name in (("size of pictures", "size_px"), ("version of trajectory.json", "version")):
         groups: dict[str, list[str]] = defaultdict(list)
         for flight in flights:
-            groups[value_of(flight)].append(flight.name)
+            groups[str(getattr(flight, name))].append(flight.name)
         if len(groups) > 1:
             parts = (
                 f"{value}: {len(names)} flights, as {', '.join(names[:MOST_NAMED])}"
                 for value, names in sorted(groups.items())
             )
-            error = InputError(
-                f"flights of more than one {what}",
-                got="; ".join(parts),
-                expected="the same for all flights of a release",
-            )
+            expected = "the same for all flights of a release"
+            error = InputError(f"flights of more than one {what}", got="; ".join(parts), expected=expected)
             tell(min(groups.values(), key=len)[0], error)
 
 
 def place_flights(
     flights: list[Surveyed], walks: dict[str, str], by: SplitBy, fractions: dict[SplitName, float], seed: int
-) -> dict[str, Placing]:
-    """Hand out whole walks, or whole towns, to splits: flight -> where it belongs. Too few of them fill train first, then validation."""
+) -> dict[str, Placement]:
+    """Hand out whole walks, or whole towns, to splits: flight -> where it belongs. Too few of them fill train first,
+    then validation."""
     group_of = {
         f.name: walks[f.candidate.trajectory] if by == "walk" else town_family(f.candidate.place.town) for f in flights
     }
@@ -209,10 +190,10 @@ def place_flights(
     by_track = {(f.candidate.trajectory, f.track): f.name for f in flights}
     other: dict[Track, Track] = {"clean": "perturbed", "perturbed": "clean"}
     return {
-        f.name: Placing(
-            walks[f.candidate.trajectory],
-            splits[group_of[f.name]],
-            by_track.get((f.candidate.trajectory, other[f.track])),
+        f.name: Placement(
+            walk=walks[f.candidate.trajectory],
+            split=splits[group_of[f.name]],
+            pair=by_track.get((f.candidate.trajectory, other[f.track])),
         )
         for f in flights
     }

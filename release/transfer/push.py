@@ -32,7 +32,7 @@ LOGIN = "log in with `hf auth login`, or set HF_TOKEN to a token that may write"
 
 @dataclass(frozen=True)
 class Parcel:
-    """What goes, and what does not. files: name -> bytes, shards first; stays: files that are not of the release."""
+    """What goes, and what does not. files: name -> bytes, shards first; stays: files of the folder that are not of the release."""
 
     folder: Path
     files: dict[str, int]
@@ -100,7 +100,7 @@ def verified(parcel: Parcel, level: Level, *, workers: int, reader: CaptionReade
 
 
 def push(parcel: Parcel, repo: str, *, private: bool = True) -> str:
-    """Send a parcel to a data-set repository, made if there is none: shards first, card and records last.
+    """Send a parcel to a data-set repository, which is made if there is none: the shards first, the card and the records last.
 
     What is there already, with the same sha256, is not sent again, so the same command goes on after a break.
 
@@ -109,8 +109,7 @@ def push(parcel: Parcel, repo: str, *, private: bool = True) -> str:
     Returns:
         the repository's address.
     Raises:
-        ConfigError: the name is none. EnvironmentMissing: huggingface_hub is not installed.
-        TeacherError: the hub refuses, or cannot be reached.
+        ConfigError: the name is none. EnvironmentMissing: huggingface_hub is not installed. TeacherError: the hub refuses, or cannot be reached.
     """
     try:
         from huggingface_hub import CommitOperationAdd, HfApi, constants
@@ -142,12 +141,12 @@ def push(parcel: Parcel, repo: str, *, private: bool = True) -> str:
     wrong = [name for name, size in parcel.files.items() if arrived.get(name) != size]
     if wrong:
         raise TeacherError(
-            "the hub does not show what was sent", where=repo, got=", ".join(wrong)[:300],
-            expected="the files with their sizes", fix="run the same command again",
+            "the hub does not show what was sent", where=repo, got=", ".join(wrong)[:300], expected="the files with their sizes",
+            fix="run the same command again",
         )  # fmt: skip
     if others := [name for name in arrived if SHARD_NAME.fullmatch(name) and name not in parcel.files]:
         log.warning(
-            "%s: %d shards of another release are still there, not named by the card: %s; remove what nobody needs",
+            "%s: %d shards of another release are still there, which the card does not name: %s; remove them on the hub if nobody needs them",
             repo, len(others), ", ".join(sorted(others)[:3]),
         )  # fmt: skip
     return without_secrets(address)
@@ -158,8 +157,7 @@ def _hub_errors(repo: str, endpoint: str) -> Iterator[None]:
     """Turn what the library raises of a hub into one line; none of these texts holds the token."""
     from huggingface_hub import errors
 
-    # HTTPError of whichever client this version of the library uses.
-    client: type[Exception] = errors.HfHubHTTPError.__bases__[0]  # type: ignore[assignment]
+    client: type[Exception] = errors.HfHubHTTPError.__bases__[0]  # type: ignore[assignment]  # HTTPError of whichever client this version of the library uses
     where = f"{without_secrets(endpoint)}: {repo}"
     try:
         yield

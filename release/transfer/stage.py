@@ -1,12 +1,11 @@
 """`cosfly release get`: a release, or a part of it, from another place.
 
-Reads release.json and the shards of a release that lies somewhere else; writes `dataset/`, which is a release: all of
-it byte for byte, or a part with a record of its own. Of a part only the wanted rows and columns travel.
+Reads release.json and the shards of a release that lies somewhere else; writes `dataset/`, which is a release: all of it byte for byte, or a
+part with a record of its own. Of a part only the wanted rows and columns travel.
 
-What is checked: release.json against checksums.sha256 and against itself, and with `expected` against a digest that the
-user has from elsewhere; the sha256 of shards that are taken whole; of others the sizes, columns, rows and flights that
-the record tells of, and then, as of every release, all that `cosfly release verify` finds in rows. The pictures of a
-shard of which a part is taken are bound by no digest.
+What is checked: release.json against checksums.sha256 and against itself, and with `expected` against a digest that the user has from elsewhere;
+the sha256 of shards that are taken whole; of others the sizes, columns, rows and flights that the record tells of, and then, as of every
+release, all that `cosfly release verify` finds in rows. The pictures of a shard of which a part is taken are bound by no digest.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ from cosfly.work.store import (
 )
 from release.card.numbers import compute_numbers
 from release.columns import PLACE, SPLIT_NAMES, SplitName, flight_name, flight_spans, schema
-from release.package.records import DATASET, PARTS, Finished, check_parts, name_shards, write_records
+from release.package.records import DATASET, OF_SHARD, PARTS, check_parts, name_shards, write_records
 from release.package.rows import open_writer
 from release.record import (
     RECORD,
@@ -60,6 +59,7 @@ from release.record import (
 )
 from release.sign import MOST_SIGNATURE_BYTES, SIGNATURE
 from release.transfer.remote import CHUNK, Remote, RemoteFile, open_remote, published_address
+from release.verify.findings import Verified
 from release.verify.verify import verify
 
 MOST_RECORD_BYTES = 64_000_000  # some 400 bytes a flight
@@ -220,7 +220,7 @@ def fetch_shard(remote: Remote, shard: Shard, path: Path, plan: _Plan) -> _Got:
     """Fetch the wanted part of one shard.
 
     Raises:
-        InputError: another size, other columns or rows than the record says. VerifyError: another sha256.
+        InputError: the other side has another size, other columns, or other rows than the record says. VerifyError: another sha256.
     """
     where = f"{remote.shown}/{shard.path}"
     if (size := remote.size(shard.path)) != shard.bytes:
@@ -311,7 +311,7 @@ def _checked(got: _Got, plan: _Plan, where: str) -> _Got:
 
 
 def _copy(remote: Remote, shard: Shard, path: Path) -> str:
-    """Copy a whole shard; give its sha256, which is the record's. What was broken off goes on.
+    """Copy a whole shard; give its sha256, which is the record's. One that was broken off goes on with the bytes that are here.
 
     Raises:
         InputError: bytes are not to be had; those that came stay. VerifyError: another sha256; none stay.
@@ -366,7 +366,7 @@ def run(
     """Fetch a release or a part of it from a folder or an address; give the folder that holds it.
 
     Args:
-        findings: of `release verify` in its rows. accept: the release is kept, and `findings.json` beside it says them.
+        findings: of what `release verify` finds in its rows. accept: the release is kept as it is, and `findings.json` beside it says what.
     """
     remote = open_remote(address)
     record, data = fetch_record(remote, choice.expected)
@@ -377,12 +377,7 @@ def run(
     if stage.is_complete:
         shutil.rmtree(parts, ignore_errors=True)  # a kill came before they were gone
         return dataset
-    there = record.settings.modalities
-    plan = _Plan(
-        address=address, shown=remote.shown, columns=schema(there).names,
-        modalities=[name for name in there if choice.modalities is None or name in choice.modalities],
-        flights={flight.flight: flight.frames for flight in flights},
-    )  # fmt: skip
+    plan = _plan_of(record, choice, flights, address, remote.shown)
     splits = {flight.split for flight in flights}
     shards = [shard for shard in record.shards if shard.split in splits]
     items = [Item(shard.path, shard, shard.rows) for shard in shards]
@@ -396,28 +391,22 @@ def run(
         )  # fmt: skip
     taken = _taken(shards, {kept.id: result_of(kept, _Got) for kept in finished.kept}, flights)
     done = [
-        Finished(shard.split, parts / Path(shard.path).name, one.rows, one.bytes, one.sha256) for shard, one in taken
+        (parts / Path(shard.path).name, shard.model_copy(update=one.model_dump(include=OF_SHARD)))
+        for shard, one in taken
     ]
     check_parts(done, out)
     is_whole = len(taken) == len(record.shards) and all(shard.sha256 == one.sha256 for shard, one in taken)
     with atomic_folder(dataset) as folder:
         named = name_shards(done, folder)
         if is_whole:
-            for name in ONE_FILE_EACH:
-                write_bytes(folder / name, data if name == RECORD else _small_file(remote, name))
+            _copy_records(remote, folder, data)
             _copy_signature(remote, folder)
         else:
-            part = PartOf(  # the digest that was asked for is of the whole, and no part of the choice
-                name=record.name, content_digest=record.content_digest, source=published_address(remote.shown),
-                choice=choice.model_dump(mode="json", exclude={"expected"}),
-            )  # fmt: skip
+            part = _part_of(record, choice, published_address(remote.shown))
             write_records(folder, part_record(record, part, flights, plan.modalities, named, taken, folder))
         report = verify(folder, level="rows", workers=workers)
         if not report.is_ok and findings == "refuse":
-            raise VerifyError(
-                "what was fetched does not verify, so it is not kept", where=remote.shown, got=str(report),
-                fix="ask who made it; --findings accept keeps it, with what was found (nothing is fetched again)",
-            )  # fmt: skip
+            raise _not_kept(report, remote.shown)
     outputs = [dataset / name for name in ("README.md", RECORD, CHECKSUMS)]
     if not report.is_ok:
         log.warning("%s is kept, and does not verify: %s", dataset, report)
@@ -426,6 +415,19 @@ def run(
     stage.finish(outputs, finished.tally, whole=is_whole)
     shutil.rmtree(parts, ignore_errors=True)
     return dataset
+
+
+def _plan_of(
+    record: ReleaseRecord, choice: Selection, flights: list[ReleasedFlight], address: str, shown: str
+) -> _Plan:
+    there = record.settings.modalities
+    return _Plan(
+        address=address,
+        shown=shown,
+        columns=schema(there).names,
+        modalities=[name for name in there if choice.modalities is None or name in choice.modalities],
+        flights={flight.flight: flight.frames for flight in flights},
+    )
 
 
 def _taken(shards: Sequence[Shard], got: Mapping[str, _Got], flights: list[ReleasedFlight]) -> list[tuple[Shard, _Got]]:
@@ -437,6 +439,18 @@ def _taken(shards: Sequence[Shard], got: Mapping[str, _Got], flights: list[Relea
     return taken
 
 
+def _not_kept(report: Verified, where: str) -> VerifyError:
+    return VerifyError(
+        "what was fetched does not verify, so it is not kept", where=where, got=str(report),
+        fix="ask who made it; to keep it as it is, with what was found beside it: --findings accept (nothing is fetched again)",
+    )  # fmt: skip
+
+
+def _copy_records(remote: Remote, folder: Path, record: bytes) -> None:
+    for name in ONE_FILE_EACH:
+        write_bytes(folder / name, record if name == RECORD else _small_file(remote, name))
+
+
 def _copy_signature(remote: Remote, folder: Path) -> None:
     """Take the signature along, where there is one; who signed is asked by `release verify --public-key`."""
     try:
@@ -445,6 +459,12 @@ def _copy_signature(remote: Remote, folder: Path) -> None:
         return
     if size <= MOST_SIGNATURE_BYTES:
         write_bytes(folder / SIGNATURE, remote.read(SIGNATURE, 0, size))
+
+
+def _part_of(record: ReleaseRecord, choice: Selection, source: str) -> PartOf:
+    """Say of which release something is a part. The digest that was asked for is of that release, and no part of the choice."""
+    chosen = choice.model_dump(mode="json", exclude={"expected"})
+    return PartOf(name=record.name, content_digest=record.content_digest, source=source, choice=chosen)
 
 
 def part_record(

@@ -1,17 +1,21 @@
-"""What verification finds: one line for each kind of problem, with its count and the first places; flat in memory however much is wrong."""
+"""What verification finds: one line for each kind of problem, with its count and the first places; flat in memory
+however much is wrong."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from cosfly.escaping import cut, for_terminal
 from cosfly.products.issues import SEVERITIES, Issue, Report, Severity, sort_key
+from release.verify.rows import FlightRows
 
 EXAMPLES = 3  # places of a kind that are named
+Words = str | Callable[[int], Any]  # of all rows alike, or of each
 
 
 class Kind(BaseModel):
@@ -42,12 +46,10 @@ class Findings:
     facts: list[str] = field(default_factory=list)
 
     def add(self, severity: Severity, code: str, where: object, got: object, expected: str) -> None:
-        kind = self.kinds.setdefault((severity, code), Kind(severity=severity, code=code))
-        if not kind.count:
-            kind.got, kind.expected = cut(str(got)), expected
-        kind.count += 1
-        if len(kind.examples) < EXAMPLES:
-            kind.examples.append(cut(str(where)))
+        found = Kind(
+            severity=severity, code=code, count=1, got=cut(str(got)), expected=expected, examples=[cut(str(where))]
+        )
+        self._merge(found)
 
     def error(self, code: str, where: object, got: object, expected: str) -> None:
         self.add("error", code, where, got, expected)
@@ -58,32 +60,40 @@ class Findings:
     def note(self, code: str, where: object, got: object, expected: str) -> None:
         self.add("note", code, where, got, expected)
 
+    def judge(self, flight: FlightRows, rules: Iterable[tuple[str, str, np.ndarray, Words, Words]]) -> None:
+        """Add an error for each row that is wrong. rules: code, column, which rows are wrong (n,) bool, what was found,
+        what was expected."""
+        for code, column, wrong, *words in rules:
+            for i in np.flatnonzero(wrong).tolist():
+                got, expected = (one if isinstance(one, str) else one(i) for one in words)
+                self.error(code, flight.where(i, column), got, str(expected))
+
     def merge(self, kinds: Iterable[dict[str, Any]]) -> None:
         """Add what a worker found, as `dumped` gives it."""
         for values in kinds:
-            new = Kind.model_validate(values)
-            kind = self.kinds.setdefault((new.severity, new.code), Kind(severity=new.severity, code=new.code))
-            if not kind.count:
-                kind.got, kind.expected = new.got, new.expected
+            self._merge(Kind.model_validate(values))
+
+    def _merge(self, new: Kind) -> None:
+        kind = self.kinds.setdefault((new.severity, new.code), new)
+        if kind is not new:
             kind.count += new.count
             kind.examples = (kind.examples + new.examples)[:EXAMPLES]
 
     def dumped(self) -> list[dict[str, Any]]:
         return [kind.model_dump() for kind in self.kinds.values()]
 
-    def report(self) -> Verified:
+    def report(self, level: str = "") -> Verified:
         """Give the report of all that was found."""
-        issues = [
-            Issue(severity=k.severity, code=k.code, where=k.examples[0], got=k.got, expected=k.expected, count=k.count)
-            for k in self.kinds.values()
-        ]
         kinds = sorted(self.kinds.values(), key=lambda kind: (SEVERITIES.index(kind.severity), kind.code))
-        return Verified(issues=sorted(issues, key=sort_key), facts=self.facts, kinds=kinds)
+        values = ({**kind.model_dump(exclude={"examples"}), "where": kind.examples[0]} for kind in kinds)
+        issues = sorted((Issue(**value) for value in values), key=sort_key)
+        return Verified(issues=issues, facts=self.facts, kinds=kinds, level=level)
 
 
 @dataclass
 class Verified(Report):
-    """The report of a verification. `issues` has one entry a kind, the first occurrence's with the count; kinds the first places too."""
+    """The report of a verification. `issues` has one entry a kind, the first occurrence's with the count; kinds the
+    first places too."""
 
     kinds: list[Kind] = field(default_factory=list)
     level: str = ""
@@ -91,17 +101,46 @@ class Verified(Report):
     def as_json(self) -> dict[str, Any]:
         """Give what `--json` writes."""
         return {
-            "schema": "cosfly.verification",
-            "schema_version": "1.0",
-            "level": self.level,
-            "ok": self.is_ok,
-            "facts": self.facts,
-            "findings": [kind.model_dump() for kind in self.kinds],
+            "schema": "cosfly.verification", "schema_version": "1.0", "level": self.level, "ok": self.is_ok,
+            "facts": self.facts, "findings": [kind.model_dump() for kind in self.kinds],
+        }  # fmt: skip
+
+    def repair_plan(self) -> list[str]:
+        """Give one line for each kind of error: whether it could be mended, and how; nothing is changed."""
+        told = {
+            kind.code: (kind.count, *REPAIRS.get(kind.code, ELSE)) for kind in self.kinds if kind.severity == "error"
         }
+        return [
+            f"{code} ({count:,}): {'could be mended' if can_be else 'not to be mended here'}: {how}"
+            for code, (count, can_be, how) in told.items()
+        ]
 
     def __str__(self) -> str:
-        counts = ", ".join(
-            f"{self.num(severity):,} {severity}{'' if self.num(severity) == 1 else 's'}" for severity in SEVERITIES
-        )
+        counts = ((severity, self.num(severity)) for severity in SEVERITIES)
+        told = ", ".join(f"{count:,} {severity}{'' if count == 1 else 's'}" for severity, count in counts)
         verdict = "OK" if self.is_ok else "NOT OK"
-        return "\n".join([*map(for_terminal, self.facts), *map(str, self.kinds), f"{verdict}: {counts}"])
+        return "\n".join([*map(for_terminal, self.facts), *map(str, self.kinds), f"{verdict}: {told}"])
+
+
+AGAIN, REBUILD = "fetch the file again from where the release is published", "build the release again from its runs"
+# code -> (can it be mended without making anything anew, how)
+REPAIRS: dict[str, tuple[bool, str]] = {
+    **dict.fromkeys(
+        ("missing", "size", "checksum", "unreadable"), (True, f"{AGAIN} (cosfly release get resumes), or {REBUILD}")
+    ),
+    "unexpected": (True, "move it out of the folder"),
+    "card": (True, "write README.md again: cosfly release card gives it from release.json"),
+    **dict.fromkeys(("columns", "rows", "shard_name", "digest"), (False, REBUILD)),
+    **dict.fromkeys(
+        ("number", "sum", "split", "frames", "flight"), (False, f"{REBUILD}: its record is not of its shards")
+    ),
+    "picture": (False, "render the frame again, inspect, and build again"),
+    **dict.fromkeys(
+        ("prompt", "caption_text", "languages", "label", "verdict", "window", "caption", "decision", "sentences"),
+        (False, "caption the flight again from its tree, and build again"),
+    ),
+    "leak": (False, "build again: splits are handed out by walk"),
+    "signature": (False, f"{AGAIN}, or ask its maker to sign it: cosfly release sign"),
+    "licence": (True, "name licence and credits of the maps: release.licence and release.credits of the build"),
+}
+ELSE = (False, "no file of the folder tells what was true: render or build the flights that are named again")

@@ -1,12 +1,13 @@
-"""What stands in a folder of files with a list of checksums: names, sizes, links, and, dearest, the checksums themselves.
+"""What stands in a folder of files with a list of checksums: names, sizes, links, and, dearest, the checksums
+themselves.
 
-Nothing is followed out of the folder but links of the hub client's cache into its blobs; a loop of links ends at its first link.
+Nothing is followed out of the folder but links of the hub client's cache into its blobs; a loop of links ends at its
+first link.
 """
 
 from __future__ import annotations
 
 import os
-import stat
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
@@ -21,7 +22,8 @@ SMALL_BYTES = 64_000_000  # a file whose checksum is compared with the cheap che
 
 
 def files_below(folder: Path) -> Iterator[str]:
-    """Yield the names of everything that is no folder, and of empty folders, relative, without following links to folders."""
+    """Yield the names of everything that is no folder, and of empty folders, relative, without following links to
+    folders."""
     for place, folders, names in os.walk(folder, onerror=None, followlinks=False):
         here = Path(place)
         relative = here.relative_to(folder)
@@ -44,39 +46,27 @@ def check_names(folder: Path, expected: Mapping[str, int | None], findings: Find
     found: dict[str, int] = {}
     for name in files_below(folder):
         if name not in expected and name not in LICENCES:
-            findings.error(
-                "unexpected",
-                name,
-                "an empty folder" if name.endswith("/") else "a file",
-                "nothing that no record knows",
-            )
+            got = "an empty folder" if name.endswith("/") else "a file"
+            findings.error("unexpected", name, got, "nothing that no record knows")
             continue
-        size = _size(folder, name, findings)
-        if size is not None and name in expected:
+        try:
+            with open_file(folder / name, tree=folder) as file:
+                size = os.fstat(file.fileno()).st_size
+        except InputError as error:
+            findings.error("unreadable", name, error.got or error.what, "a regular file of the folder")
+            continue
+        if name in expected:
             found[name] = size
-    for name in expected:
+    good = []
+    for name, wanted in expected.items():
         if name not in found and not os.path.lexists(folder / name):
             findings.error("missing", name, "no such file", "a file of the release")
-    good = []
-    for name, size in found.items():
-        wanted = expected[name]
-        if wanted is not None and size != wanted:
-            findings.error("size", name, f"{size:,} bytes", f"{wanted:,} bytes")
-        else:
+        elif name in found and wanted not in (None, found[name]):
+            findings.error("size", name, f"{found[name]:,} bytes", f"{wanted:,} bytes")
+        elif name in found:
             good.append(name)
     findings.facts.append(f"{len(found):,} files, {sum(found.values()):,} bytes")
-    return [name for name in expected if name in set(good)]
-
-
-def _size(folder: Path, name: str, findings: Findings) -> int | None:
-    """Give the size of a regular file that may be read; None, with a finding, for anything else."""
-    try:
-        with open_file(folder / name, tree=folder) as file:
-            about = os.fstat(file.fileno())
-    except InputError as error:
-        findings.error("unreadable", name, error.got or error.what, "a regular file of the folder")
-        return None
-    return about.st_size if stat.S_ISREG(about.st_mode) else None
+    return good
 
 
 def read_digests(folder: Path, findings: Findings) -> dict[str, str]:
@@ -91,13 +81,8 @@ def read_digests(folder: Path, findings: Findings) -> dict[str, str]:
 def check_digests(folder: Path, digests: Mapping[str, str], names: Collection[str], findings: Findings) -> None:
     """Read files and compare their checksums with the list."""
     for name in names:
-        digest = digests.get(name)
-        if digest is None:
-            continue
         try:
-            found = sha256_file(folder / name, tree=folder)
+            if name in digests and (found := sha256_file(folder / name, tree=folder)) != digests[name]:
+                findings.error("checksum", name, found, digests[name])
         except InputError as error:
             findings.error("unreadable", name, error.got or error.what, "a file that can be read")
-            continue
-        if found != digest:
-            findings.error("checksum", name, found, digest)

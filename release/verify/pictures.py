@@ -10,7 +10,7 @@ from cosfly.errors import InputError
 from cosfly.geometry import BODY_FROM_CAMERA
 from cosfly.products.frames import SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.products.kinds import KINDS
-from cosfly.products.png import Png, parse_png
+from cosfly.products.png import parse_png
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.space.reprojection import FLAT, View, median_of
 from release.columns import PICTURES
@@ -24,8 +24,8 @@ from release.verify.sources import Pictures
 SURFACE_M = PERSON_HALF_EXTENTS_M[2] + 0.3  # between the hip and the visible surface of a person along the optical axis
 LEAST_BOX_PX2 = 24.0  # a box of fewer pixels can lose the person between two pixel centres
 MOST_RAYS, LEAST_RAYS = 900, 30  # through the box of a person: the score is a share of them
-# Of the visibility. Where a ray goes through each pixel of the box it is the renderer's own number: honest 0.000, of depth as float16 0.002.
-# Of fewer rays, three deviations of a share of so many; honest 0.021.
+# Of the visibility. Where a ray goes through each pixel of the box it is the renderer's own number: honest 0.000, of
+# depth as float16 0.002. Of fewer rays, three deviations of a share of so many; honest 0.021.
 SCORE, SCORE_OF_FEWER = 0.02, 0.06
 STEP_PIXELS = 20_000  # of a frame
 PERSON, MOST_KIND = KINDS["Pedestrians"], max(KINDS.values())
@@ -37,7 +37,7 @@ Decoded = tuple[np.ndarray, np.ndarray]  # depth, instance
 BESIDE_M, BESIDE_PX, LEAST_GROUND = 0.6, 60, 12  # from the feet; columns and rows that are looked at; pixels of ground
 
 
-def decode(flight: FlightRows, i: int, files: Pictures, coding: DepthCoding, findings: Findings) -> Decoded | None:  # fmt: skip
+def decode(flight: FlightRows, i: int, files: Pictures, coding: DepthCoding, findings: Findings) -> Decoded | None:
     """Unpack the pictures of a row; None, with findings, where one is not a whole picture of the row's size."""
     width, height = (int(n) for n in flight.size_px[i])
     found: dict[FrameFile, np.ndarray] = {}
@@ -47,41 +47,42 @@ def decode(flight: FlightRows, i: int, files: Pictures, coding: DepthCoding, fin
             if not data:
                 raise InputError("no picture", got="null" if data is None else "0 bytes")
             if file == "depth":
-                is_raw = coding.coding == "float32"
-                found[file] = (
-                    depth_values(memoryview(data), Path(where)) if is_raw else depth_of(bytes(data), coding, where)
-                )
-                found[file].flags.writeable = False  # the compiled checks are compiled for such, once
+                found[file] = _depth(data, coding, where)
                 size = found[file].shape[::-1]
             else:
-                png = parse_png(data, where)
-                size = (png.width_px, png.height_px)
-                if png.channels < 3:
-                    raise InputError("not a colour picture", got=f"{png.channels} channels")
-                _check_cargo(flight, png, where, findings)
-                if file == "rgb":
-                    found[file] = png.lines
-                    if png.channels == 4 and (png.pixels()[..., 3] != 255).any():
-                        findings.error("blank", where, "pixels that one sees through", "a picture that hides what is behind it")  # fmt: skip
-                else:
-                    found[file] = np.ascontiguousarray(png.pixels()[..., :3])
+                found[file], size = _colours(flight, data, where, file == "instance", findings)
         except InputError as error:
             findings.error("picture", where, f"{error.what}: {error.got}", f"a {file} picture of {width} x {height} px")
             continue
         if size != (width, height):
             findings.error("picture", where, f"{size[0]} x {size[1]} px", f"{width} x {height} px, as the row says")
             found.pop(file)
-    if len(found) < len(files):
-        return None
-    return found.get("depth", NOTHING), found.get("instance", NO_IDS)
+    return (found.get("depth", NOTHING), found.get("instance", NO_IDS)) if len(found) == len(files) else None
 
 
-def _check_cargo(flight: FlightRows, png: Png, where: str, findings: Findings) -> None:
-    """A picture is its pixels: nothing behind its end, and of cosfly's own no words and no other meaning of its colours."""
+def _depth(data: bytes | memoryview, coding: DepthCoding, where: str) -> np.ndarray:
+    is_raw = coding.coding == "float32"
+    depth = depth_values(memoryview(data), Path(where)) if is_raw else depth_of(bytes(data), coding, where)
+    depth.flags.writeable = False  # the compiled checks are compiled for such, once
+    return depth
+
+
+def _colours(
+    flight: FlightRows, data: bytes | memoryview, where: str, is_mask: bool, findings: Findings
+) -> tuple[np.ndarray, tuple[int, int]]:
+    """Unpack a PNG, whose pixels only a mask needs. It is its pixels: nothing behind its end, of cosfly's own no words
+    and no other meaning of its colours, and nothing that one sees through."""
+    png = parse_png(data, where)
+    if png.channels < 3:
+        raise InputError("not a colour picture", got=f"{png.channels} channels")
     if png.num_behind:
         findings.error("cargo", where, f"{png.num_behind:,} bytes behind the picture's end", "nothing")
     if png.others and not flight.is_foreign:
         findings.error("cargo", where, f"chunks {', '.join(png.others)}", "pixels alone, as cosfly writes them")
+    if not is_mask and png.channels == 4 and (png.pixels()[..., 3] != 255).any():
+        findings.error("blank", where, "pixels that one sees through", "a picture that hides what is behind it")
+    pixels = np.ascontiguousarray(png.pixels()[..., :3]) if is_mask else png.lines
+    return pixels, (png.width_px, png.height_px)
 
 
 def view_of(flight: FlightRows, i: int, decoded: Decoded) -> View:
@@ -94,9 +95,12 @@ def check_picture(flight: FlightRows, i: int, decoded: Decoded, findings: Findin
     """Check depth and mask of a row with each other and with the row; False where the depth is no depth."""
     depth, instance = decoded
     found = survey(depth, instance)
-    good = not depth.size or _check_depth(flight, i, found.low_m, found.high_m, findings)
+    good = not depth.size or _check_depth(flight.where(i, "depth"), found.low_m, found.high_m, findings)
     if instance.size:
-        _check_instance(flight, i, instance, found, bool(depth.size), findings)
+        if flight.is_foreign:
+            _check_foreign_person(flight, i, instance, findings)
+        else:
+            _check_instance(flight, i, found, bool(depth.size), findings)
         if depth.size and good:
             _check_person_depth(flight, i, instance, depth, findings)
             if not flight.is_foreign:
@@ -104,8 +108,7 @@ def check_picture(flight: FlightRows, i: int, decoded: Decoded, findings: Findin
     return good
 
 
-def _check_depth(flight: FlightRows, i: int, low: float, high: float, findings: Findings) -> bool:
-    where = flight.where(i, "depth")
+def _check_depth(where: str, low: float, high: float, findings: Findings) -> bool:
     if np.isnan(low):
         findings.error("depth_range", where, "pixels that are not finite", "metres in every pixel")
     elif low < 0.0 or high > SKY_DEPTH_M:
@@ -117,34 +120,32 @@ def _check_depth(flight: FlightRows, i: int, low: float, high: float, findings: 
     return False
 
 
-def _check_instance(
-    flight: FlightRows, i: int, instance: np.ndarray, found: Survey, has_depth: bool, findings: Findings
-) -> None:
+def _check_foreign_person(flight: FlightRows, i: int, instance: np.ndarray, findings: Findings) -> None:
+    low, high = np.floor(flight.box[i, :2]), np.ceil(flight.box[i, 2:])
+    visible = bool(flight.rows[i].get("target_visible"))
+    if visible and not np.isnan(low).any() and np.prod(high - low) >= LEAST_BOX_PX2:
+        (x0, y0), (x1, y1) = np.maximum(low, 0).astype(int), high.astype(int)
+        if not (instance[y0 : y1 + 1, x0 : x1 + 1, 0] == PERSON).any():
+            got = "no pedestrian at target_bbox" if (instance[..., 0] == PERSON).any() else "no pedestrian"
+            findings.error("mask", flight.where(i, "instance"), got, "pixels of the person, who is visible")
+
+
+def _check_instance(flight: FlightRows, i: int, found: Survey, has_depth: bool, findings: Findings) -> None:
     """Check the mask: the person where the row has it, kinds that exist, sky where the depth is the sky's."""
-    where = flight.where(i, "instance")
-    if flight.is_foreign:
-        low, high = np.floor(flight.box[i, :2]), np.ceil(flight.box[i, 2:])
-        visible = bool(flight.rows[i].get("target_visible"))
-        if visible and not np.isnan(low).any() and np.prod(high - low) >= LEAST_BOX_PX2:
-            (x0, y0), (x1, y1) = np.maximum(low, 0).astype(int), high.astype(int)
-            if not (instance[y0 : y1 + 1, x0 : x1 + 1, 0] == PERSON).any():
-                got = "no pedestrian at target_bbox" if (instance[..., 0] == PERSON).any() else "no pedestrian"
-                findings.error("mask", where, got, "pixels of the person, who is visible")
-        return
+    where, recorded = flight.where(i, "instance"), flight.mask_box[i]
     box = found.box.astype(np.float64) if found.num_person else np.full(4, np.nan)
-    if not np.array_equal(box, flight.mask_box[i], equal_nan=True):
-        got = "no pixel of the person" if not found.num_person else f"pixels in {box.tolist()}"
-        recorded = flight.mask_box[i]
-        expected = (
-            "none: target_mask_bbox is null" if np.isnan(recorded).any() else f"{recorded.tolist()}, target_mask_bbox"
-        )
+    if not np.array_equal(box, recorded, equal_nan=True):
+        got = f"pixels in {box.tolist()}" if found.num_person else "no pixel of the person"
+        is_null = np.isnan(recorded).any()
+        expected = "none: target_mask_bbox is null" if is_null else f"{recorded.tolist()}, target_mask_bbox"
         findings.error("mask", where, got, expected)
     if found.num_odd_person:
         findings.error("mask", where, f"{found.num_odd_person} pixels of the person of another kind", f"kind {PERSON}")
     if found.most_kind > MOST_KIND:
         findings.error("mask", where, f"kind {found.most_kind}", f"kinds of 0 to {MOST_KIND}")
     if has_depth and found.num_odd_sky:
-        findings.error("sky", where, f"{found.num_odd_sky:,} pixels are sky in one of instance and depth", "the same sky in both")  # fmt: skip
+        got = f"{found.num_odd_sky:,} pixels are sky in one of instance and depth"
+        findings.error("sky", where, got, "the same sky in both")
 
 
 def _check_person_depth(
@@ -153,29 +154,28 @@ def _check_person_depth(
     """The surface of the person is about as far as the row says its hip is."""
     expected = flight.rows[i].get("target_depth_m")
     box = flight.box[i] if flight.is_foreign or np.isnan(flight.mask_box[i]).any() else flight.mask_box[i]
-    if expected is None or np.isnan(expected) or np.isnan(box).any() or not flight.rows[i].get("target_visible"):
+    if expected is None or np.isnan([expected, *box]).any() or not flight.rows[i].get("target_visible"):
         return
-    height, width = depth.shape
-    x0, y0 = np.clip(np.floor(box[:2]), 0, [width, height]).astype(int)
-    x1, y1 = np.clip(np.ceil(box[2:]), 0, [width, height]).astype(int)
-    is_ours = not flight.is_foreign
-    surface = depths_of_person(depth, instance, np.array([x0, y0, x1, y1]), is_ours)
+    size = depth.shape[::-1]
+    low, high = (np.clip(end, 0, size).astype(int) for end in (np.floor(box[:2]), np.ceil(box[2:])))
+    surface = depths_of_person(depth, instance, np.concatenate([low, high]), not flight.is_foreign)
     if len(surface) and abs((found := median_of(surface)) - expected) > SURFACE_M:
-        got, wanted = f"{found:.2f} m at the person", f"{expected:.2f} m (target_depth_m) within {SURFACE_M:.1f} m"  # fmt: skip
-        findings.error("depth", flight.where(i, "depth"), got, wanted)
+        wanted = f"{expected:.2f} m (target_depth_m) within {SURFACE_M:.1f} m"
+        findings.error("depth", flight.where(i, "depth"), f"{found:.2f} m at the person", wanted)
 
 
 def _check_visibility(flight: FlightRows, i: int, instance: np.ndarray, depth: np.ndarray, findings: Findings) -> None:
-    """The score is the share of the person's box that nothing hides: rays through it, as the renderer casts them, but fewer."""
-    score = flight.rows[i].get("visibility")
-    corners = flight.projected_corners[i]
+    """The score is the share of the person's box that nothing hides: rays through it, as the renderer casts them, but
+    fewer."""
+    score, corners = flight.rows[i].get("visibility"), flight.projected_corners[i]
     if score is None or np.isnan(corners).any() or not flight.rows[i].get("target_in_view"):
         return
     (x0, y0), (x1, y1) = np.floor(corners.min(axis=0)), np.ceil(corners.max(axis=0))
     stride = max(1.0, float(np.sqrt((x1 - x0) * (y1 - y0) / MOST_RAYS)))
+    columns, rows = (np.floor(np.arange(begin, end, stride)) for begin, end in ((x0, x1), (y0, y1)))
     num_hits, num_seen = rays_to_person(
-        depth, instance, np.floor(np.arange(x0, x1, stride)), np.floor(np.arange(y0, y1, stride)), flight.intrinsics[i],
-        flight.rotations[i] @ BODY_FROM_CAMERA, flight.target_m[i] - flight.pose[i, :3], PERSON_HALF_M,
+        depth, instance, columns, rows, flight.intrinsics[i], flight.rotations[i] @ BODY_FROM_CAMERA,
+        flight.target_m[i] - flight.pose[i, :3], PERSON_HALF_M,
     )  # fmt: skip
     if num_hits < LEAST_RAYS:
         return
@@ -185,7 +185,8 @@ def _check_visibility(flight: FlightRows, i: int, instance: np.ndarray, depth: n
 
 
 def ground_beside(flight: FlightRows, i: int, depth: np.ndarray, instance: np.ndarray) -> float:
-    """Give how far the ground that is drawn round the person's feet lies above them, m; NaN where too little of it is seen.
+    """Give how far the ground that is drawn round the person's feet lies above them, m; NaN where too little of it is
+    seen.
 
     Of a kerb the half that is nearer counts: a person walks on either.
 
@@ -201,17 +202,14 @@ def ground_beside(flight: FlightRows, i: int, depth: np.ndarray, instance: np.nd
     reach_px = min(BESIDE_PX, int(np.ceil(fx * BESIDE_M / z)) + 1)
     x0, x1 = np.clip([u - reach_px, u + reach_px + 1], 0, width).astype(int)
     y0, y1 = np.clip([v - reach_px, v + reach_px + 1], 0, height).astype(int)
-    part, seen = np.s_[y0:y1, x0:x1], depth[y0:y1, x0:x1].astype(np.float64)
+    seen, mask = depth[y0:y1, x0:x1].astype(np.float64), instance[y0:y1, x0:x1]
     columns, rows = np.meshgrid((np.arange(x0, x1) + 0.5 - cx) / fx, (np.arange(y0, y1) + 0.5 - cy) / fy)
     points = np.stack([columns, rows, np.ones_like(seen)], axis=-1) * seen[..., None]
-    is_slab = FLAT[instance[part][..., 0]] & (instance[part][..., 1:] != 0).any(
-        axis=-1
-    )  # the plane below everything has no id
+    is_slab = FLAT[mask[..., 0]] & (mask[..., 1:] != 0).any(axis=-1)  # the plane below everything has no id
     heights_m = (points @ rotation[2] + flight.pose[i, 2] - feet[2])[is_slab]
     if len(heights_m) < LEAST_GROUND:
         return np.nan
-    low, high = np.percentile(heights_m, [25, 75])
-    return float(np.clip(0.0, low, high))
+    return float(np.clip(0.0, *np.percentile(heights_m, [25, 75])))
 
 
 def least_step(depth: np.ndarray) -> float:

@@ -1,4 +1,4 @@
-"""What each picture of a release is measured by, compiled: every pixel of mask and depth, rays to the person."""
+"""What each picture of a release is measured by: every pixel of mask and depth, rays to the person."""
 
 from __future__ import annotations
 
@@ -17,15 +17,12 @@ NUM_IDS = 65536
 PERSON, SKY = KINDS["Pedestrians"], KINDS["Sky"]
 NEAR_M = 0.3  # where rays begin: the renderers' near plane
 SURFACE_SLACK_M = 0.05  # how far before a person's box what is drawn may lie and not hide it
-# Numbers of a float's bits are ordered as floats above 0 are, and compared several at once, as no bits are not a number.
-FAR_BITS = np.float32(SKY_DEPTH_M).view(np.int32)
-INFINITE_BITS = np.float32(np.inf).view(np.int32)
 
 
 class Survey(NamedTuple):
-    """A frame's mask and depth. low_m, high_m: least and greatest depth, NaN where one is not finite; num_odd_sky: pixels of sky by one of
-    depth and kind alone; num_person: of the person; num_odd_person: of the person's id with another kind; most_kind: the greatest there is;
-    box: (4,) of the person's pixels, edges at pixel borders."""
+    """A frame's mask and depth. low_m, high_m: least and greatest depth, NaN where one is not finite; num_odd_sky:
+    pixels of sky by one of depth and kind alone; num_person: of the person; num_odd_person: of the person's id with
+    another kind; most_kind: the greatest there is; box: (4,) of the person's pixels, edges at pixel borders."""
 
     low_m: float
     high_m: float
@@ -42,19 +39,11 @@ def survey(depth: np.ndarray, instance: np.ndarray) -> Survey:
     Args:
         depth: (h, w) float32, or (0, 0) where there is none; instance: (h, w, 3) uint8, or (0, 0, 3).
     """
-    kinds_alone = np.zeros(instance.shape[1] * 3, np.uint8)
-    kinds_alone[::3] = 255
-    bits = depth.view(np.int32)
-    counts, box = _survey(bits, np.ascontiguousarray(instance).reshape(len(instance), len(kinds_alone)), kinds_alone)
-    low, high = counts[:2].tolist()
-    if 0 <= low <= high < INFINITE_BITS:
-        limits = counts[:2].astype(np.int32).view(np.float32).tolist()
-    else:  # not positive, not finite, or nothing
-        limits = [float(depth.min()), float(depth.max())] if depth.size else [0.0, 0.0]
-    if not np.isfinite(limits).all():
-        limits = [np.nan, np.nan]
-    num_odd_sky, num_person, num_odd_person, most_kind = counts[2:].tolist()
-    return Survey(limits[0], limits[1], num_odd_sky, num_person, num_odd_person, most_kind, box)
+    limits = np.array([depth.min(initial=np.inf), depth.max(initial=-np.inf)]) if depth.size else np.zeros(2)
+    low, high = limits.tolist() if np.isfinite(limits).all() else (np.nan, np.nan)
+    counts, box = _survey(depth, np.ascontiguousarray(instance))
+    num_odd_sky, num_person, num_odd_person, most_kind = counts.tolist()
+    return Survey(low, high, num_odd_sky, num_person, num_odd_person, most_kind, box)
 
 
 def new_kinds(instance: np.ndarray, known: np.ndarray) -> list[int]:
@@ -63,80 +52,50 @@ def new_kinds(instance: np.ndarray, known: np.ndarray) -> list[int]:
     Args:
         known: (NUM_IDS,) int16, -1: not seen yet.
     """
-    return np.unique(_new_kinds(instance, known)).tolist()
-
-
-@njit(cache=True, nogil=True)
-def _survey(bits, mask, kinds_alone):  # type: ignore[no-untyped-def]
-    """Row by row: what most rows have not is looked for in all their bytes at once, and pixel by pixel only where it is. Give the numbers of
-    a `Survey`, the first two as bits, and its box."""
-    most, least = np.int32(2147483647), np.int32(-2147483648)
-    low, high, most_kind = most, least, np.uint8(0)
-    num_odd_sky, num_person, num_odd_person = np.int64(0), np.int64(0), np.int64(0)
-    box = np.array([1 << 30, 1 << 30, -1, -1], np.int64)
-    for y in range(max(len(bits), len(mask))):
-        num_far = np.int32(0)
-        if len(bits) > 0:
-            row = bits[y]
-            for x in range(len(row)):
-                low, high = min(low, row[x]), max(high, row[x])
-            for x in range(len(row)):
-                num_far = np.int32(num_far + np.int32(row[x] == FAR_BITS))
-        if len(mask) == 0:
-            continue
-        own, after = mask[y, :-1], mask[y, 1:]  # the last byte is no kind
-        of_person, of_sky = np.uint8(0), np.uint8(0)
-        # Numba makes each result 64 bits wide, so that fewer are computed at once, where nothing says that it is a byte.
-        for k in range(len(own)):
-            kind = np.uint8(own[k] & kinds_alone[k])
-            most_kind = np.uint8(max(most_kind, kind))
-            of_sky = np.uint8(of_sky | np.uint8(kind == SKY))
-            of_person = np.uint8(max(of_person, np.uint8(own[k] & after[k])))  # 255 only where both bytes of an id are
-        if len(bits) > 0 and (of_sky > 0 or num_far > 0):
-            for x in range(len(bits[y])):
-                num_odd_sky += (own[3 * x] == SKY) != (bits[y, x] == FAR_BITS)
-        if of_person == 255:
-            for x in range(len(mask[y]) // 3):
-                if after[3 * x] == 255 and after[3 * x + 1] == 255:
-                    num_person += 1
-                    num_odd_person += own[3 * x] != PERSON
-                    box[0], box[1] = min(box[0], x), min(box[1], y)
-                    box[2], box[3] = max(box[2], x + 1), max(box[3], y + 1)
-    return np.array([low, high, num_odd_sky, num_person, num_odd_person, np.int64(most_kind)]), box
-
-
-@njit(cache=True, nogil=True)
-def _new_kinds(instance, known):  # type: ignore[no-untyped-def]
     height, width = instance.shape[:2]
-    found, num = np.empty(COLUMNS * GRID_ROWS, np.int64), 0
-    for j in range(GRID_ROWS):
-        for i in range(COLUMNS):
-            pixel = instance[int((j + 0.5) * height / GRID_ROWS), int((i + 0.5) * width / COLUMNS)]
-            own = np.int64(pixel[1]) | np.int64(pixel[2]) << 8
-            if own != NOBODY and own != SHARED_ID and known[own] != pixel[0]:
-                found[num] = own << 8 | np.int64(pixel[0])
-                num += 1
-    return found[:num]
+    rows = ((np.arange(GRID_ROWS) + 0.5) * height / GRID_ROWS).astype(int)
+    columns = ((np.arange(COLUMNS) + 0.5) * width / COLUMNS).astype(int)
+    kinds, low, high = np.moveaxis(instance[np.ix_(rows, columns)].astype(np.int64), 2, 0)
+    ids = low | high << 8
+    is_new = (ids != NOBODY) & (ids != SHARED_ID) & (known[ids] != kinds)
+    return np.unique((ids << 8 | kinds)[is_new]).tolist()
 
 
-@njit(cache=True, nogil=True)
-def depths_of_person(depth, instance, box, is_ours):  # type: ignore[no-untyped-def]
-    """Give the depths, (k,) float32 m, of the person's pixels in a box (4,) of whole pixels. is_ours: those of the person's id alone."""
+def depths_of_person(depth: np.ndarray, instance: np.ndarray, box: np.ndarray, is_ours: bool) -> np.ndarray:
+    """Give the depths, (k,) float32 m, of the person's pixels in a box (4,) of whole pixels. is_ours: those of the
+    person's id alone."""
     x0, y0, x1, y1 = box
-    found, num = np.empty((y1 - y0) * (x1 - x0), np.float32), 0
-    for y in range(y0, y1):
-        for x in range(x0, x1):
-            kind, low, high = instance[y, x, 0], instance[y, x, 1], instance[y, x, 2]
-            if kind == PERSON and (not is_ours or (low == 255 and high == 255)):
-                found[num] = depth[y, x]
-                num += 1
-    return found[:num]
+    part = instance[y0:y1, x0:x1]
+    is_person = part[..., 0] == PERSON
+    return depth[y0:y1, x0:x1][is_person & (part[..., 1:] == 255).all(axis=-1) if is_ours else is_person]
 
 
 @njit(cache=True, nogil=True)
-def rays_to_person(depth, instance, columns, rows, intrinsics, world_from_camera, away_m, half_m):  # type: ignore[no-untyped-def]
-    """Cast rays through the middles of pixels (columns, rows), also beyond the picture, to a box that stands upright, `away_m` (3,) from the
-    camera with `half_m` (3,) to each side: how many hit it, and how many of these nothing hides."""
+def _survey(depth, instance):  # type: ignore[no-untyped-def]
+    """Give the counts of a `Survey` (4,), and its box."""
+    num_odd_sky, num_person, num_odd_person, most_kind = 0, 0, 0, 0
+    box = np.array([1 << 30, 1 << 30, -1, -1], np.int64)
+    for y in range(len(instance)):
+        for x in range(instance.shape[1]):
+            kind = instance[y, x, 0]
+            most_kind = max(most_kind, kind)
+            if len(depth) > 0:
+                num_odd_sky += (kind == SKY) != (depth[y, x] == SKY_DEPTH_M)
+            if instance[y, x, 1] == 255 and instance[y, x, 2] == 255:
+                num_person += 1
+                num_odd_person += kind != PERSON
+                box[0], box[1] = min(box[0], x), min(box[1], y)
+                box[2], box[3] = max(box[2], x + 1), max(box[3], y + 1)
+    return np.array([num_odd_sky, num_person, num_odd_person, most_kind], np.int64), box
+
+
+@njit(cache=True, nogil=True)
+def rays_to_person(  # type: ignore[no-untyped-def]
+    depth, instance, columns, rows, intrinsics, world_from_camera, away_m, half_m
+):
+    """Cast rays through the middles of pixels (columns, rows), also beyond the picture, to a box that stands upright,
+    `away_m` (3,) from the camera with `half_m` (3,) to each side: how many hit it, and how many of these nothing
+    hides."""
     height, width = depth.shape
     fx, fy, cx, cy = intrinsics
     num_hits, num_seen = np.int64(0), np.int64(0)

@@ -1,4 +1,5 @@
-"""`release.json`, the card and the shards' footers: do they agree with each other, and does what is counted twice give one number?"""
+"""`release.json`, the card and the shards' footers: do they agree with each other, and does what is counted twice give
+one number?"""
 
 from __future__ import annotations
 
@@ -7,188 +8,190 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
 from cosfly.errors import InputError
 from cosfly.products.boxes import UNKNOWN_LICENCE
-from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
+from cosfly.products.frames import FILE_NAMES, INVALID_DEPTH_M, SKY_DEPTH_M
 from cosfly.reading.files import read_bytes
-from cosfly.reading.tables import open_table
+from cosfly.reading.tables import arrow_errors, open_table, read_row_group
 from cosfly.work.stage_folder import flattened
 from release import columns
 from release.card.croissant import CROISSANT, render_croissant
 from release.card.numbers import compute_numbers
 from release.card.render import render_card
+from release.columns import PICTURES, SCALAR_NAMES
 from release.depth import SKY_MM
 from release.record import DepthCoding, ReleaseRecord, content_digest, shard_path
 from release.rules import RULE, select_frames
 from release.verify.across import Summary, frames_digest
 from release.verify.findings import Findings
 
-HALF_STEP = 2.0**-11  # of float16, of a number
 MOST_FRAMES = 2**31  # of a flight: their indices are int32
+HALF_STEP = 2.0**-11  # of float16, of a number
+SHARE = 1e-3  # of captions: rounded to four digits
 
 
 def check_record(record: ReleaseRecord, findings: Findings) -> None:
     """Check what release.json says against itself and against what every release says."""
-    _check_contract(record, findings)
-    _check_sums(record, findings)
-    _check_shards(record, findings)
-    _check_splits(record, findings)
-    _check_provenance(record, findings)
+    told = [*_contract(record), *_sums(record), *_shards(record), *_splits(record), *_provenance(record)]
+    for code, name, got, expected in told:
+        if got != expected:
+            findings.error(code, f"release.json: {name}", got, str(expected))
+    _check_signs(record, findings)
+    if record.depth is not None:
+        _check_coding_error(record.depth, findings)
+    _check_teachers(record, findings)
     _check_maps(record, findings)
 
 
-def _differ(findings: Findings, code: str, name: str, got: object, expected: object) -> None:
-    if got != expected:
-        findings.error(code, f"release.json: {name}", got, str(expected))
+Comparison = tuple[str, str, object, object]  # code, name, got, expected
 
 
-def _check_contract(record: ReleaseRecord, findings: Findings) -> None:
+def _contract(record: ReleaseRecord) -> Iterator[Comparison]:
     """The convention of axes is one for all releases, and readers go by it."""
     for name in sorted(record.coordinates.keys() | columns.CONTRACT.keys()):
-        _differ(findings, "coordinates", f"coordinates.{name}", record.coordinates.get(name), columns.CONTRACT.get(name))  # fmt: skip
-    _differ(findings, "rule", "frame_selection", record.frame_selection, RULE)
-    if (record.depth is not None) != ("depth" in record.settings.modalities):
-        findings.error("depth_coding", "release.json: depth", record.depth, "how depth is stored exactly where it is released")  # fmt: skip
-    elif record.depth is not None:
+        yield "coordinates", f"coordinates.{name}", record.coordinates.get(name), columns.CONTRACT.get(name)
+    yield "rule", "frame_selection", record.frame_selection, RULE
+    yield "depth_coding", "depth", record.depth is not None, "depth" in record.settings.modalities
+    if record.depth is not None:
         is_png = record.depth.coding == "millimetre_png"
-        told = {
-            "unit": "millimetre" if is_png else "metre",
-            "sky": SKY_MM if is_png else SKY_DEPTH_M,
-            "invalid": INVALID_DEPTH_M,
-        }
-        for name, value in told.items():
-            _differ(findings, "depth_coding", f"depth.{name}", getattr(record.depth, name), value)
-        _check_coding_error(record.depth, findings)
+        yield "depth_coding", "depth.unit", record.depth.unit, "millimetre" if is_png else "metre"
+        yield "depth_coding", "depth.sky", record.depth.sky, SKY_MM if is_png else SKY_DEPTH_M
+        yield "depth_coding", "depth.invalid", record.depth.invalid, INVALID_DEPTH_M
 
 
 def _check_coding_error(depth: DepthCoding, findings: Findings) -> None:
-    """The error of a coding is at most its rounding: none of float32, half a step of millimetres, of float16 a share of the greatest depth."""
+    """The error of a coding is at most its rounding: none of float32, half a step of millimetres, of float16 a share of
+    the greatest depth."""
     most_m = {"float32": 0.0, "millimetre_png": 0.5e-3, "float16": (depth.max_m or 0.0) * HALF_STEP}[depth.coding]
     if not 0.0 <= depth.max_error_m <= most_m * (1.0 + 1e-3) + 1e-5 * bool(most_m):
         findings.error("depth_coding", "release.json: depth.max_error_m", depth.max_error_m, f"at most {most_m:g} m")
 
 
-def _check_sums(record: ReleaseRecord, findings: Findings) -> None:
+def _sums(record: ReleaseRecord) -> Iterator[Comparison]:
     """What the shards cannot tell must at least add up."""
     planned, flights, captions = record.history.trajectories, record.history.flights, record.history.captions
+    gone = captions.frame_not_selected + captions.window_not_whole + captions.flight_left_out
     sums = [
         ("flights.found", flights.found, flights.released + sum(flights.left_out.values())),
         ("flights.released", flights.released, record.numbers.flights),
         ("captions.read", captions.read, captions.accepted + sum(captions.dropped.values())),
-        ("captions.accepted", captions.accepted,
-         captions.released + captions.frame_not_selected + captions.window_not_whole + captions.flight_left_out),
+        ("captions.accepted", captions.accepted, captions.released + gone),
         ("captions.released", captions.released, record.numbers.captions.frames_with),
-    ]  # fmt: skip
+    ]
     if planned is not None:
-        sums += [
-            ("trajectories.planned", planned.planned, sum(planned.dropped.values()) + planned.not_rendered + planned.rendered),
-            ("trajectories.rendered", planned.rendered, planned.accepted + planned.review + planned.rejected),
-        ]  # fmt: skip
-    for name, whole, parts in sums:
-        if whole != parts:
-            findings.error("sum", f"release.json: history.{name}", whole, f"{parts}, the sum of its parts")
-    for name, value in flattened(record.history.model_dump()).items():
+        not_planned = sum(planned.dropped.values()) + planned.not_rendered
+        sums.append(("trajectories.planned", planned.planned, not_planned + planned.rendered))
+        results = planned.accepted + planned.review + planned.rejected
+        sums.append(("trajectories.rendered", planned.rendered, results))
+    yield from (("sum", f"history.{name}", whole, parts) for name, whole, parts in sums)
+
+
+def _check_signs(record: ReleaseRecord, findings: Findings) -> None:
+    counts = {
+        "history": record.history.model_dump(),
+        "provenance": {"tokens": record.provenance.tokens, "asks": record.provenance.asks},
+    }
+    for name, value in flattened(counts).items():
         if isinstance(value, int) and value < 0:
-            findings.error("sum", f"release.json: history.{name}", value, "0 or more")
+            findings.error("sum", f"release.json: {name}", value, "0 or more")
 
 
-def _check_shards(record: ReleaseRecord, findings: Findings) -> None:
+def _shards(record: ReleaseRecord) -> Iterator[Comparison]:
     """Shards are named by the digest of their content and their number in their split."""
-    _differ(findings, "digest", "content_digest", record.content_digest, content_digest((s.split, s.sha256) for s in record.shards))  # fmt: skip
-    counts = Counter(shard.split for shard in record.shards)
-    numbers: Counter[str] = Counter()
+    digest = content_digest((shard.split, shard.sha256) for shard in record.shards)
+    yield "digest", "content_digest", record.content_digest, digest
+    counts, numbers = Counter(shard.split for shard in record.shards), Counter[str]()
     for shard in record.shards:
-        expected = shard_path(shard.split, record.content_digest, numbers[shard.split], counts[shard.split])
+        name = shard_path(shard.split, record.content_digest, numbers[shard.split], counts[shard.split])
+        yield "shard_name", shard.path, shard.path, name
         numbers[shard.split] += 1
-        if shard.path != expected:
-            findings.error("shard_name", f"release.json: {shard.path}", shard.path, f"{expected}, of split, digest and number")  # fmt: skip
-    _differ(findings, "sum", "numbers.frames", record.numbers.frames, sum(shard.rows for shard in record.shards))
-    _differ(findings, "sum", "numbers.frames", record.numbers.frames, sum(flight.frames for flight in record.flights))
-    _differ(findings, "sum", "numbers.flights", record.numbers.flights, len(record.flights))
+    yield "sum", "numbers.frames", record.numbers.frames, sum(shard.rows for shard in record.shards)
+    yield "sum", "numbers.frames", record.numbers.frames, sum(flight.frames for flight in record.flights)
+    yield "sum", "numbers.flights", record.numbers.flights, len(record.flights)
 
 
-def _check_splits(record: ReleaseRecord, findings: Findings) -> None:
+def _splits(record: ReleaseRecord) -> Iterator[Comparison]:
     """Each split's numbers are those of the flights and shards that the record lists."""
     for name in sorted({*record.splits.splits, *(flight.split for flight in record.flights)}):
-        told = record.splits.splits.get(name)
-        flights = [flight for flight in record.flights if flight.split == name]
+        told, flights = record.splits.splits.get(name), [flight for flight in record.flights if flight.split == name]
         if told is None:
-            findings.error("split", f"release.json: splits.{name}", "nothing", f"numbers of {len(flights)} flights")
+            yield "split", f"splits.{name}", "nothing", f"numbers of {len(flights)} flights"
             continue
+        towns = {flight.flight.split("/")[1] for flight in flights if flight.flight.count("/") == 3}
         counted = {
-            "frames": sum(flight.frames for flight in flights),
-            "flights": len(flights),
+            "frames": sum(flight.frames for flight in flights), "flights": len(flights),
             "trajectories": len({flight.flight.rpartition("/")[0] for flight in flights}),
-            "walks": sorted({flight.walk for flight in flights}),
-            "towns": sorted({flight.flight.split("/")[1] for flight in flights if flight.flight.count("/") == 3}),
-        }
+            "walks": sorted({flight.walk for flight in flights}), "towns": sorted(towns),
+        }  # fmt: skip
         for key, value in counted.items():
             own = getattr(told, key)
-            _differ(findings, "split", f"splits.{name}.{key}", sorted(own) if isinstance(own, list) else own, value)
-        _differ(findings, "split", f"splits.{name}.frames", told.frames, sum(s.rows for s in record.shards if s.split == name))  # fmt: skip
+            yield "split", f"splits.{name}.{key}", sorted(own) if isinstance(own, list) else own, value
+        yield "split", f"splits.{name}.frames", told.frames, sum(s.rows for s in record.shards if s.split == name)
     total = sum(split.captions for split in record.splits.splits.values())
-    _differ(findings, "split", "splits: captions", total, record.numbers.captions.frames_with)
+    yield "split", "splits: captions", total, record.numbers.captions.frames_with
 
 
-def _check_provenance(record: ReleaseRecord, findings: Findings) -> None:
-    """Who was asked and what was repaired agrees with the captions that are released."""
-    told, captions, history = record.provenance, record.numbers.captions, record.history.captions
-    repairs = told.repairs
-    _differ(findings, "provenance", "provenance.repairs.accepted", repairs.accepted, history.accepted)
-    _differ(findings, "provenance", "provenance.repairs", repairs.first_answers + sum(repairs.repaired_by_rung.values()), repairs.accepted)  # fmt: skip
+def _provenance(record: ReleaseRecord) -> Iterator[Comparison]:
+    """What was repaired and asked agrees with the captions that are released."""
+    told, history, repairs = record.provenance, record.history.captions, record.provenance.repairs
+    counts = {
+        "first_answers": repairs.first_answers,
+        **{f"repaired: {k}": n for k, n in repairs.repaired_by_rung.items()},
+    }
+    yield "provenance", "provenance.repairs.accepted", repairs.accepted, history.accepted
+    yield "provenance", "provenance.repairs", sum(counts.values()), repairs.accepted
     for name, share in repairs.shares.items():
-        count = repairs.first_answers if name == "first_answers" else repairs.repaired_by_rung.get(name.removeprefix("repaired: "), 0)  # fmt: skip
-        if abs(share - count / max(repairs.accepted, 1)) > 1e-3:
-            findings.error("provenance", f"release.json: provenance.repairs.shares.{name}", share, f"{count / max(repairs.accepted, 1):.4f}")  # fmt: skip
-    _differ(
-        findings, "provenance", "provenance.teachers: captions", sum(t.captions for t in told.teachers), history.read
-    )
+        own = counts.get(name, 0) / max(repairs.accepted, 1)
+        yield "provenance", f"provenance.repairs.shares.{name}", share, share if abs(share - own) <= SHARE else own
+    yield "provenance", "provenance.teachers: captions", sum(t.captions for t in told.teachers), history.read
+    yield "provenance", "made_by", record.made_by, f"cosfly {told.versions.get('cosfly')}"
+
+
+def _check_teachers(record: ReleaseRecord, findings: Findings) -> None:
+    """Whoever made a released caption was asked, and every flight is of a source."""
+    told, captions = record.provenance, record.numbers.captions
     for column, attribute in (("teacher_kind", "kind"), ("teacher_model", "model")):
-        known = {getattr(teacher, attribute) for teacher in told.teachers}
+        asked = Counter[str]()
+        for teacher in told.teachers:
+            asked[getattr(teacher, attribute)] += teacher.captions
         for name, count in captions.frames_by[column].items():
-            if name not in known:
-                findings.error("provenance", f"release.json: numbers.captions.frames_by.{column}", f"{name}: {count}", f"a teacher of the provenance: {', '.join(sorted(known))}")  # fmt: skip
-            elif count > sum(t.captions for t in told.teachers if getattr(t, attribute) == name):
-                findings.error("provenance", f"release.json: provenance.teachers: {name}", f"{count} released", "no more than were read")  # fmt: skip
+            if name not in asked or count > asked[name]:
+                expected = f"no more than the provenance's teachers read: {dict(sorted(asked.items()))}"
+                where = f"release.json: numbers.captions.frames_by.{column}"
+                findings.error("provenance", where, f"{name}: {count}", expected)
     runs = {source.run for source in told.sources}
     for flight in record.flights:
         run = flight.flight.split("/")[0]
         if not any(run == own or run.startswith(f"{own}_") for own in runs):
-            findings.error("provenance", f"release.json: flights: {flight.flight}", run, f"a run of the sources: {', '.join(sorted(runs))}")  # fmt: skip
+            expected = f"a run of the sources: {', '.join(sorted(runs))}"
+            findings.error("provenance", f"release.json: flights: {flight.flight}", run, expected)
             break
-    if any(count < 0 for count in (*told.tokens.values(), told.asks)):
-        findings.error("provenance", "release.json: provenance.tokens", told.tokens, "0 or more")
-    _differ(findings, "provenance", "made_by", record.made_by, f"cosfly {told.versions.get('cosfly')}")
 
 
 def _check_maps(record: ReleaseRecord, findings: Findings) -> None:
     """Every town has a map, and what the stages that made the maps say of licence and credits stands there."""
-    towns, shown = set(record.numbers.frames_by.town), {town.town for town in record.maps}
-    for town in sorted(towns - shown):
-        findings.error(
-            "licence", f"release.json: maps: {town}", "no map", "name, licence and credits of each town's map"
-        )
+    for town in sorted(set(record.numbers.frames_by.town) - {one.town for one in record.maps}):
+        expected = "name, licence and credits of each town's map"
+        findings.error("licence", f"release.json: maps: {town}", "no map", expected)
     for one in record.maps:
         if not one.licence or not one.name:
             findings.error("licence", f"release.json: maps: {one.town}", repr(one.licence), "a name and a licence")
-    if not record.licence or record.licence == UNKNOWN_LICENCE:
+    if record.licence in ("", UNKNOWN_LICENCE):
         findings.error("licence", "release.json: licence", repr(record.licence), "the licence of the data set")
     named = " ".join((record.credits, *(f"{town.licence} {town.credits}" for town in record.maps)))
-    for key, words in _said_of_maps(record):
-        if words not in named:
-            findings.error("licence", f"release.json: provenance: maps: {key}", words, f"the same {key} in `maps` or `credits`")  # fmt: skip
-
-
-def _said_of_maps(record: ReleaseRecord) -> Iterator[tuple[str, str]]:
-    """Yield licence and credits that the settings of the stages that made maps name, of the source that was used."""
-    for source in record.provenance.sources:
-        for stage in source.stages:
-            chosen = stage.config.get(str(stage.config.get("source")))
-            if stage.stage != "maps" or not isinstance(chosen, dict):
-                continue
-            for key in ("licence", "credits"):
-                if isinstance(chosen.get(key), str) and chosen[key] and chosen[key] != UNKNOWN_LICENCE:
-                    yield key, chosen[key]
+    stages = (stage for source in record.provenance.sources for stage in source.stages if stage.stage == "maps")
+    for config in (stage.config for stage in stages):
+        chosen = config.get(str(config.get("source")))  # of the source that was used
+        for key in ("licence", "credits"):
+            words = chosen.get(key) if isinstance(chosen, dict) else None
+            if isinstance(words, str) and words != UNKNOWN_LICENCE and words not in named:
+                expected = f"the same {key} in `maps` or `credits`"
+                findings.error("licence", f"release.json: provenance: maps: {key}", words, expected)
 
 
 # --- the card and the shards ------------------------------------------------------------------------------------------
@@ -226,10 +229,13 @@ def check_footers(folder: Path, record: ReleaseRecord, names: list[str], finding
         except InputError as error:
             findings.error("unreadable", name, error.got or error.what, "a parquet file")
             continue
-        has_features = (schema.metadata or {}).get(b"huggingface") == expected.metadata[b"huggingface"]
-        if not schema.equals(expected) or not has_features:
+        if (
+            not schema.equals(expected)
+            or (schema.metadata or {}).get(b"huggingface") != expected.metadata[b"huggingface"]
+        ):
             wrong = ", ".join(m.name for m in schema if m not in list(expected))
-            findings.error("columns", name, wrong or "the order, or the features in the metadata", "the columns of the release")  # fmt: skip
+            got = wrong or "the order, or the features in the metadata"
+            findings.error("columns", name, got, "the columns of the release")
         elif num_rows != rows[name]:
             findings.error("rows", name, num_rows, str(rows[name]))
         else:
@@ -253,17 +259,82 @@ def check_flights(record: ReleaseRecord, flights: list[Summary], findings: Findi
     listed, found = {entry.flight: entry for entry in record.flights}, {flight.name: flight for flight in flights}
     for name in sorted(listed.keys() ^ found.keys()):
         findings.error("flight", name, "only in one of release.json and the shards", "the same flights in both")
+    asked, num_cut, num_absent = record.settings, 0, 0
     for name in sorted(listed.keys() & found.keys()):
         entry, flight = listed[name], found[name]
         for key in ("split", "walk", "pair"):
-            if getattr(entry, key) != getattr(flight, key):
-                findings.error("flight", f"{name}: {key}", getattr(flight, key), f"{getattr(entry, key)}, as in release.json")  # fmt: skip
-        asked, available = record.settings, entry.frames_available
+            got, told = getattr(flight, key), getattr(entry, key)
+            if got != told:
+                findings.error("flight", f"{name}: {key}", got, f"{told}, as in release.json")
+        available = entry.frames_available
         wanted = available if asked.num_frames is None else min(available, asked.num_frames)
         is_right = wanted == flight.num_rows == entry.frames and 0 < available <= MOST_FRAMES
         if is_right:
             rule = select_frames(available, asked.num_frames, asked.window_frames, asked.uniform_stride)
             is_right = flight.frames_digest == frames_digest(rule)
+            w = asked.window_frames - 1
+            num_whole = np.count_nonzero(rule[w:] - rule[: len(rule) - w] == w)
+            num_cut += int(np.count_nonzero(rule >= w)) - int(num_whole)
+            num_absent += available - len(rule)
         if not is_right:
             got = f"{flight.num_rows} of {available} frames, first {flight.first_frames}"
             findings.error("frames", name, got, f"{wanted} frames by the rule of release.json")
+    captions = record.history.captions
+    for name, most in (("window_not_whole", num_cut), ("frame_not_selected", num_absent)):
+        if record.part_of is None and (told := getattr(captions, name)) > most:
+            expected = f"at most {most}, the frames that a caption could have lost by the choice of frames"
+            findings.error("sum", f"release.json: history.captions.{name}", told, expected)
+
+
+def check_shards(folder: Path, record: ReleaseRecord, findings: Findings) -> None:
+    """Check what a shard says of its rows beside them: the least and greatest value of each column, the names of
+    pictures, who wrote it.
+
+    Programs go by these without a look at the rows: a filter skips what the statistics exclude, a viewer shows the
+    name.
+
+    Raises:
+        InputError: a shard cannot be read.
+    """
+    named = {PICTURES[file].name: FILE_NAMES[file] for file in record.settings.modalities if file != "depth"}
+    writers = set()
+    for shard in record.shards:
+        path = folder / shard.path
+        with open_table(path, tree=folder) as table:
+            writers.add(str(table.metadata.created_by))
+            for k in range(table.num_row_groups):
+                rows = read_row_group(path, table, k, [*SCALAR_NAMES, *(f"{column}.path" for column in named)])
+                with arrow_errors(path):
+                    about = table.metadata.row_group(k)
+                    for j in range(about.num_columns):
+                        _check_statistics(f"{shard.path}: row group {k}", about.column(j), rows, findings)
+                    ids = rows.column("sample_id").to_pylist()
+                    for column, file in named.items():
+                        paths = pc.struct_field(rows.column(column), ["path"]).to_pylist()
+                        for own, found in zip(ids, paths, strict=True):  # a picture is called by its row's id
+                            if found != f"{own}_{file}":
+                                findings.error("name", f"{own}: {column}.path", repr(found), f"{own}_{file}")
+    told = record.provenance.versions.get("pyarrow")
+    if record.part_of is None and told and writers and not any(f"version {told}" in one for one in writers):
+        # A build that was broken off may have gone on with another version.
+        expected = f"that of the shards, {', '.join(sorted(writers))}"
+        findings.warn("provenance", "release.json: provenance.versions.pyarrow", told, expected)
+
+
+def _check_statistics(where: str, chunk: pq.ColumnChunkMetaData, rows: pa.Table, findings: Findings) -> None:
+    """All values lie between the footer's least and greatest: rows beyond them would be skipped. Wider bounds cost time
+    alone."""
+    first, *members = chunk.path_in_schema.split(".")  # `decision`, `pose.x_m`, `caption_window.list.element`
+    told = chunk.statistics if chunk.is_stats_set else None
+    if told is None or not told.has_min_max or first not in rows.column_names or len(members) > 2:
+        return
+    values = rows.column(first)
+    if members:
+        values = pc.list_flatten(values) if members[0] == "list" else pc.struct_field(values, members)
+    found = pc.min_max(values).as_py()
+    if found["min"] is not None and not told.min <= found["min"] <= found["max"] <= told.max:
+        got, expected = (
+            f"{told.min!r} to {told.max!r} in the footer",
+            f"{found['min']!r} to {found['max']!r}, of the rows",
+        )
+        findings.error("statistics", f"{where}: {chunk.path_in_schema}", got, expected)

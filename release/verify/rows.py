@@ -20,17 +20,28 @@ from release.columns import BOX, INTRINSICS, PICTURE_PX, POINT, POSE, WINDOW, ma
 Row = dict[str, Any]
 LANGUAGES: tuple[Language, ...] = get_args(Language)
 NEAR_M = 0.3  # the renderers' near plane
-
-
 LEAST_ZOOMED = 3  # rows whose camera is not that of most rows
+
+
+def _vectors(name: str, members: tuple[str, ...]) -> cached_property[np.ndarray]:
+    """A column of groups, (n, members) float64, NaN where null or incomplete."""
+
+    def found(flight: FlightRows) -> np.ndarray:
+        groups = (group or {} for group in flight.column(name))
+        values = [[np.nan if group.get(m) is None else group[m] for m in members] for group in groups]
+        return np.array(values, dtype=np.float64).reshape(-1, len(members))
+
+    return cached_property(found)
 
 
 @dataclass(frozen=True)
 class FlightRows:
-    """The rows of one flight in the order of their frames, with the columns of a release; a column that a format lacks is None everywhere.
+    """The rows of one flight in the order of their frames, with the columns of a release; a column that a format lacks
+    is None everywhere.
 
-    name: `run/town/trajectory/variant`. given_id: what its sample ids must begin with, None where nobody knows. is_foreign: nothing says
-    that cosfly drew it, so that its person may be of another size. num_frames: of the whole flight, None where nobody says.
+    name: `run/town/trajectory/variant`. given_id: what its sample ids must begin with, None where nobody knows.
+    is_foreign: nothing says that cosfly drew it, so that its person may be of another size. num_frames: of the whole
+    flight, None where nobody says.
     """
 
     name: str
@@ -54,57 +65,21 @@ class FlightRows:
         """A column of numbers, (n,) float64, NaN where null."""
         return np.array([np.nan if value is None else value for value in self.column(name)], dtype=np.float64)
 
-    def vectors(self, name: str, members: tuple[str, ...]) -> np.ndarray:
-        """A column of groups, (n, members) float64, NaN where null or incomplete."""
-        nothing = (np.nan,) * len(members)
-        groups = [
-            nothing if group is None else [np.nan if group.get(m) is None else group[m] for m in members]
-            for group in self.column(name)
-        ]
-        return np.array(groups, dtype=np.float64).reshape(-1, len(members))
-
     def flags(self, name: str) -> np.ndarray:
         return np.array([bool(value) for value in self.column(name)])
 
-    @cached_property
-    def index(self) -> np.ndarray:
-        return np.array([-1 if value is None else value for value in self.column("frame_index")], dtype=np.int64)
-
-    @cached_property
-    def time_s(self) -> np.ndarray:
-        return self.numbers("time_s")
-
-    @cached_property
-    def pose(self) -> np.ndarray:
-        return self.vectors("pose", POSE)
-
-    @cached_property
-    def target_m(self) -> np.ndarray:
-        return self.vectors("target", POINT)
-
-    @cached_property
-    def drone_offset(self) -> np.ndarray:
-        return self.vectors("drone_offset", POSE)
-
-    @cached_property
-    def target_offset(self) -> np.ndarray:
-        return self.vectors("target_offset", POINT)
-
-    @cached_property
-    def uv(self) -> np.ndarray:
-        return self.vectors("target_uv", ("u_px", "v_px"))
-
-    @cached_property
-    def box(self) -> np.ndarray:
-        return self.vectors("target_bbox", BOX)
-
-    @cached_property
-    def mask_box(self) -> np.ndarray:
-        return self.vectors("target_mask_bbox", BOX)
-
-    @cached_property
-    def intrinsics(self) -> np.ndarray:
-        return self.vectors("intrinsics", INTRINSICS)
+    index = cached_property(
+        lambda self: np.array([-1 if i is None else i for i in self.column("frame_index")], np.int64)
+    )
+    time_s = cached_property(lambda self: self.numbers("time_s"))
+    pose = _vectors("pose", POSE)
+    target_m = _vectors("target", POINT)
+    drone_offset = _vectors("drone_offset", POSE)
+    target_offset = _vectors("target_offset", POINT)
+    uv = _vectors("target_uv", ("u_px", "v_px"))
+    box = _vectors("target_bbox", BOX)
+    mask_box = _vectors("target_mask_bbox", BOX)
+    intrinsics = _vectors("intrinsics", INTRINSICS)
 
     @cached_property
     def zooms(self) -> bool:
@@ -124,7 +99,8 @@ class FlightRows:
 
     @cached_property
     def is_foreign(self) -> bool:
-        """Nothing in the rows is what only cosfly writes: the box of the person's pixels, or what became of a perturbation."""
+        """Nothing in the rows is what only cosfly writes: the box of the person's pixels, or what became of a
+        perturbation."""
         return bool(np.isnan(self.mask_box).all()) and not any(self.events)
 
     @cached_property
@@ -152,7 +128,8 @@ class FlightRows:
         """Positions k of rows whose successor in the rows is the next frame of the flight."""
         return np.flatnonzero(np.diff(self.index) == 1)
 
-    # --- for who reads captions -------------------------------------------------------------------------------------------
+    # --- for who reads captions
+    # -------------------------------------------------------------------------------------------
 
     @cached_property
     def flight(self) -> Flight:
@@ -184,7 +161,8 @@ class FlightRows:
 
 
 def shown_caption(row: Row) -> ShownCaption:
-    """Give the caption of a row. Raises KeyError and TypeError where the row has not all of one, which is found elsewhere."""
+    """Give the caption of a row. Raises KeyError and TypeError where the row has not all of one, which is found
+    elsewhere."""
     states = {language: row.get(f"sentence_states_{language}") for language in LANGUAGES}
     return ShownCaption(
         sample_id=row["sample_id"],

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -21,10 +21,10 @@ from cosfly.errors import InputError
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import FILE_NAMES, FrameFile, frame_path
 from cosfly.products.places import Place, flight_ids
-from cosfly.products.playback import read_flight
+from cosfly.products.playback import Flight, read_flight
 from cosfly.reading.files import read_bytes
 from cosfly.reading.tables import open_table, read_row_group, row_batches
-from release.columns import PICTURES, PLACE, SCALAR_NAMES, SCALARS, Placed, flight_name, flight_spans
+from release.columns import PICTURES, PLACE, SCALAR_NAMES, SCALARS, Placement, flight_name, flight_spans
 from release.verify.rows import FlightRows, Row
 
 BATCH_ROWS = 2  # whose pictures are in memory at once
@@ -33,7 +33,8 @@ Pictures = dict[FrameFile, bytes | memoryview | None]
 
 @dataclass(frozen=True)
 class Entry:
-    """A flight of a source. parts: where its rows are, in the source's own terms. num_frames: of the whole flight, None where nobody says."""
+    """A flight of a source. parts: where its rows are, in the source's own terms. num_frames: of the whole flight, None
+    where nobody says."""
 
     name: str
     parts: tuple[Any, ...]
@@ -50,7 +51,8 @@ def with_ids(entries: list[Entry], shown: Mapping[str, str] | None = None) -> li
     """Give the entries what their sample ids must begin with; None where two flights have one name.
 
     Args:
-        shown: of a part of a release, which another town or run with a trajectory of the same name may have been left out of, the sample id
+        shown: of a part of a release, which another town or run with a trajectory of the same name may have been left
+        out of, the sample id
             of a row of each entry.
     """
     places = [entry.place for entry in entries]
@@ -61,11 +63,12 @@ def with_ids(entries: list[Entry], shown: Mapping[str, str] | None = None) -> li
         ids = flight_ids([*places, *{place for place in elsewhere if place is not None}])
     except (InputError, TypeError):
         return entries
-    return [Entry(e.name, e.parts, e.num_rows, ids[e.place], e.num_frames) for e in entries]
+    return [replace(entry, given_id=ids[entry.place]) for entry in entries]
 
 
 def _left_out(place: Place, sample_id: str) -> Place | None:
-    """Give a flight that must have stood beside this one where its rows have such an id: of another town, or of another run."""
+    """Give a flight that must have stood beside this one where its rows have such an id: of another town, or of another
+    run."""
     own = f"{place.trajectory}_{place.variant}_frame_"
     if sample_id.startswith(f"{place.run}_{place.town}_{own}"):
         return Place("", place.town, place.trajectory, place.variant)
@@ -79,7 +82,8 @@ def _left_out(place: Place, sample_id: str) -> Place | None:
 
 @dataclass(frozen=True)
 class Shards:
-    """Parquet files of a release folder. A part is (shard, row group, first row, row behind the last). is_part: of a whole release."""
+    """Parquet files of a release folder. A part is (shard, row group, first row, row behind the last). is_part: of a
+    whole release."""
 
     folder: Path
     files: tuple[FrameFile, ...]
@@ -144,7 +148,8 @@ def rows_of_table(table: Any, path: Path) -> list[Row]:
 
 
 def pictures_of(batch: pa.RecordBatch, names: dict[FrameFile, str]) -> list[Pictures]:
-    """Give the pictures of a batch's rows where they lie in its memory, since a value that Arrow gives is a copy. names: of their columns."""
+    """Give the pictures of a batch's rows where they lie in its memory, since a value that Arrow gives is a copy.
+    names: of their columns."""
     found: list[Pictures] = [{} for _ in range(len(batch))]
     for file, name in names.items():
         column = batch.column(name)
@@ -162,29 +167,23 @@ def pictures_of(batch: pa.RecordBatch, names: dict[FrameFile, str]) -> list[Pict
 
 
 @dataclass(frozen=True)
-class Tree:
+class TreeFlights:
     """A playback tree, ours or the public one. A part is the flight's folder, relative to the tree."""
 
     folder: Path
     files: tuple[FrameFile, ...]
-    broken: dict[str, str] = field(default_factory=dict)  # flights that could not be read -> why
 
     @classmethod
-    def found(cls, folder: Path) -> tuple[Tree, list[Entry]]:
+    def found(cls, folder: Path) -> tuple[TreeFlights, list[Entry]]:
         """Find the flights of a tree; of the kinds of pictures, those that any frame of it has.
 
         Raises:
             InputError: it is none.
         """
         folders = find_flights(folder)
-        has = {
-            file
-            for flight in folders
-            for frame in sorted(flight.glob("frames_playback/*"))[:1]
-            for file, name in FILE_NAMES.items()
-            if frame_path(frame, name).exists()
-        }
-        tree = cls(folder, tuple(file for file in FILE_NAMES if file in has))
+        frames = [frame for flight in folders for frame in sorted(flight.glob("frames_playback/*"))[:1]]
+        files = (file for file, name in FILE_NAMES.items() if any(frame_path(frame, name).exists() for frame in frames))
+        tree = cls(folder, tuple(files))
         entries = []
         for path in folders:
             *above, town, trajectory, variant = ("", "", "", *path.relative_to(folder).parts)
@@ -193,31 +192,29 @@ class Tree:
         return tree, with_ids(entries)
 
     def rows(self, entry: Entry) -> list[Row]:
-        flight = read_flight(self.folder / entry.parts[0], strict=False)
-        run, *_ = entry.name.split("/")
-        # Who made the split and told the walks is not said in a tree.
-        nobody = Placed(walk="", split="train")
-        given = entry.given_id
-        rows = []
-        for i in range(len(flight)):
-            row = {column.name: column.cell(flight, i, None, nobody) for column in SCALARS}
-            row |= {"run": run, "walk": None, "split": None, "look": None}
-            rows.append(row | ({"sample_id": f"{given}_frame_{i:05d}"} if given else {}))
+        flight = replace(self._flight(entry), run=entry.place.run)
+        nobody = Placement(walk="", split="train")  # who made the split and told the walks is not said in a tree
+        rows = [{column.name: column.cell(flight, i, None, nobody) for column in SCALARS} for i in range(len(flight))]
+        for i, row in enumerate(rows):
+            row |= {"walk": None, "split": None}
+            if entry.given_id:
+                row["sample_id"] = f"{entry.given_id}_frame_{i:05d}"
         return rows
 
     def pictures(self, entry: Entry) -> Iterator[Pictures]:
-        folder = self.folder / entry.parts[0]
-        flight = read_flight(folder, strict=False)
+        flight = self._flight(entry)
         for i in range(len(flight)):
-            frame = flight.frame_folder(i)
+            paths = {file: frame_path(flight.frame_folder(i), FILE_NAMES[file]) for file in self.files}
             yield {
                 file: read_bytes(path, what="frame's file", tree=self.folder) if path.is_file() else None
-                for file in self.files
-                for path in [frame_path(frame, FILE_NAMES[file])]
+                for file, path in paths.items()
             }
 
+    def _flight(self, entry: Entry) -> Flight:
+        return read_flight(self.folder / entry.parts[0], strict=False)
 
-FlightSource = Shards | Tree
+
+FlightSource = Shards | TreeFlights
 
 
 def flight_rows(source: FlightSource, entry: Entry) -> FlightRows:

@@ -1,8 +1,10 @@
-"""`cosfly release verify`: is a folder what its records say, and can it be true? From cheap to dear, reading nothing but the folder.
+"""`cosfly release verify`: is a folder what its records say, and can it be true? From cheap to dear, reading nothing
+but the folder.
 
     structure   names, sizes, links, records against each other and against the shards' footers, the card
-    rows        every row: ids, ranges, geometry, motion, captions; flights against each other; every number computed again
-    pixels      checksums of all files; every picture: whole, of its row, and one world with the pictures beside it
+    rows        every row: ids, ranges, geometry, motion, captions; flights against each other; every number computed
+    again pixels      checksums of all files; every picture: whole, of its row, and one world with the pictures beside
+    it
 
 A release, a playback tree (ours or the public one), and what `cosfly release export` writes.
 """
@@ -10,14 +12,12 @@ A release, a playback tree (ours or the public one), and what `cosfly release ex
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cosfly.errors import InputError
 from cosfly.products.playback import ORIGINAL
 from cosfly.products.shown_captions import CaptionReader
-from cosfly.reading.files import read_bytes
 from cosfly.work import in_place
 from cosfly.work.config import Config
 from cosfly.work.items import Item
@@ -26,22 +26,19 @@ from cosfly.work.stage_folder import Failed, Kept, StageFolder
 from cosfly.work.store import CHECKSUMS
 from release.card.croissant import CROISSANT
 from release.export.contract import FORMATS
-from release.export.stage import ExportRecord, read_export, render_readme
 from release.record import RECORD, DepthCoding, ReleaseRecord, read_record, release_folder
 from release.sign import SIGNATURE, is_signed, signature_fault
 from release.verify import by_rule, records
 from release.verify.across import RowFiles, Summary, check_across
-from release.verify.drawn_again import Drawn
+from release.verify.exports import EXPORT, check_export
 from release.verify.findings import Findings, Verified
-from release.verify.flights import LOSSLESS, SENSELESS, Job, Level, Told, make_worker
+from release.verify.flights import LOSSLESS, SENSELESS, Context, FlightJob, Level, make_worker
 from release.verify.folder import SMALL_BYTES, check_digests, check_names, read_digests
-from release.verify.made_again import check_made_again
-from release.verify.shards import check_shards
-from release.verify.sources import Entry, FlightSource, Shards, Tree
+from release.verify.sources import Entry, FlightSource, Shards, TreeFlights
 
-EXPORT = "export.json"
 RECORDS = ("README.md", RECORD, CROISSANT, CHECKSUMS)
 LEVELS: tuple[Level, ...] = ("structure", "rows", "pixels")
+ANYTHING = "a release, a playback tree, or an export of a release"
 
 
 @dataclass(frozen=True)
@@ -76,29 +73,27 @@ def verify(
         source: of an export the release that it was made of, to make it again and compare.
         public_key: of who should have signed the release; all checksums are then compared at every level.
     Returns:
-        the report; `is_ok` is False when anything is wrong. Later checks are left out where earlier ones make them senseless.
+        the report; `is_ok` is False when anything is wrong. Later checks are left out where earlier ones make them
+        senseless.
     """
     findings, how = Findings(), _How(level, reader, workers, watch, source, public_key)
     if not any((folder / name).is_file() for name in (RECORD, EXPORT)):
         exports = (folder / name / EXPORT for name in FORMATS)  # in the stage's folder
         folder = next((path.parent for path in exports if path.is_file()), release_folder(folder))
+    is_release = (folder / RECORD).is_file()
     if not folder.is_dir():
-        findings.error("missing", folder, "no such folder", "a release, a playback tree, or an export of a release")
+        findings.error("missing", folder, "no such folder", ANYTHING)
     elif (folder / EXPORT).is_file():
-        _verify_export(folder, how, findings)
-    elif (folder / RECORD).is_file() or ((folder / CHECKSUMS).is_file() and not _is_tree(folder)):
+        record = check_export(folder, level != "structure", source, workers, watch, findings)
+        if record is not None and record.format == "tree":
+            _verify_tree(folder, how, findings, record.depth)
+    elif is_release or ((folder / CHECKSUMS).is_file() and next(folder.rglob("trajectory.json"), None) is None):
         _verify_release(folder, how, findings)
     else:
-        _verify_tree(folder, how, findings)
-    if public_key is not None and not (folder / RECORD).is_file():
+        _verify_tree(folder, how, findings, None)
+    if public_key is not None and not is_release:
         findings.error("signature", folder, "no release", "a signed release: exports and trees carry no signature")
-    report = findings.report()
-    report.level = level
-    return report
-
-
-def _is_tree(folder: Path) -> bool:
-    return next(folder.rglob("trajectory.json"), None) is not None
+    return findings.report(level)
 
 
 # --- a release --------------------------------------------------------------------------------------------------------
@@ -116,11 +111,11 @@ def _verify_release(folder: Path, how: _How, findings: Findings) -> None:
 
 
 def _verify_record(folder: Path, record: ReleaseRecord, how: _How, findings: Findings) -> None:
-    expected: dict[str, int | None] = dict.fromkeys(RECORDS)
+    expected: dict[str, int | None] = dict.fromkeys(RECORDS) | {shard.path: shard.bytes for shard in record.shards}
     _check_signature(folder, record, how, findings)
     if is_signed(folder):
         expected[SIGNATURE] = None
-    good = check_names(folder, expected | {shard.path: shard.bytes for shard in record.shards}, findings)
+    good = check_names(folder, expected, findings)
     digests = read_digests(folder, findings)
     _check_lists(record, digests, findings)
     small = [name for name in good if (folder / name).stat().st_size <= SMALL_BYTES and name in RECORDS]
@@ -129,10 +124,11 @@ def _verify_record(folder: Path, record: ReleaseRecord, how: _How, findings: Fin
     by_rule.check_rules(record, findings)
     readable = records.check_footers(folder, record, good, findings)
     records.check_card(folder, record, findings)
-    shards = [shard.path for shard in record.shards]
-    findings.facts.append(f"structure: {len(shards):,} shards, {record.numbers.frames:,} frames by their record")
-    if how.level != "structure":
-        _verify_rows(folder, record, readable == shards, how, findings)
+    findings.facts.append(f"structure: {len(record.shards):,} shards, {record.numbers.frames:,} frames by their record")
+    if how.level != "structure" and len(readable) < len(record.shards):
+        findings.note("not_checked", "data", "shards that are missing or of other columns", "rows of all shards")
+    elif how.level != "structure":
+        _verify_rows(folder, record, how, findings)
     if how.level == "pixels" or how.public_key is not None:  # a signature is over the list of digests
         check_digests(folder, digests, [name for name in good if name not in small], findings)
 
@@ -151,31 +147,6 @@ def _check_signature(folder: Path, record: ReleaseRecord, how: _How, findings: F
     findings.facts.append(f"signature: {state}")
 
 
-def _verify_rows(folder: Path, record: ReleaseRecord, is_readable: bool, how: _How, findings: Findings) -> None:
-    """Check rows, and at level `pixels` pictures, of a release whose shards are all there and have its columns."""
-    shards = [shard.path for shard in record.shards]
-    source = Shards(folder, tuple(record.settings.modalities), record.part_of is not None)
-    if not is_readable:
-        findings.note("not_checked", "data", "shards that are missing or of other columns", "rows of all shards")
-        return
-    try:
-        entries = source.entries(shards)
-    except InputError as error:
-        findings.error("unreadable", str(error.where).replace(f"{folder}/", ""), error.got or error.what, "rows")
-        return
-    available = {flight.flight: flight.frames_available for flight in record.flights}
-    entries = [Entry(e.name, e.parts, e.num_rows, e.given_id, available.get(e.name)) for e in entries]
-    flights = check_all(source, entries, _told(record), how, findings)
-    records.check_flights(record, flights, findings)
-    _check_shard_splits(record, entries, flights, findings)
-    try:
-        records.check_numbers(folder, record, findings)
-        by_rule.check_clock(folder, record, findings)
-        check_shards(folder, record, findings)
-    except (InputError, *SENSELESS) as error:  # rows that no number comes of, which are found above
-        findings.error("number", "release.json: numbers", f"{type(error).__name__}: {error}", "numbers of the rows")
-
-
 def _check_lists(record: ReleaseRecord, digests: dict[str, str], findings: Findings) -> None:
     """The list of checksums and release.json name the same files with the same digests."""
     listed = {shard.path: shard.sha256 for shard in record.shards}
@@ -187,109 +158,55 @@ def _check_lists(record: ReleaseRecord, digests: dict[str, str], findings: Findi
             findings.error("checksum", f"release.json: shards: {name}", digest, digests[name])
 
 
-def _told(record: ReleaseRecord) -> Told:
-    """Give what of the record the checks of flights need."""
-    settings = {
-        (source.run, stage.stage): stage.config for source in record.provenance.sources for stage in source.stages
-    }
-    asked, coded = record.settings, record.depth or LOSSLESS
-    return Told(
-        asked.window_frames, coded, settings, by_town=record.splits.by == "town", rounded_as=coded.coding,
-        both=asked.pairs == "both" and len(asked.tracks) == 2, prompts=record.prompts,
-        is_reviewed=any(source.review_sha256 for source in record.provenance.sources),
-        drawn={source.run: Drawn.of_stages(source.stages) for source in record.provenance.sources},
-    )  # fmt: skip
-
-
-def _check_shard_splits(
-    record: ReleaseRecord, entries: list[Entry], flights: list[Summary], findings: Findings
-) -> None:
-    """The rows of a shard are of its split, and a flight stands in one piece."""
-    split_of = {shard.path: shard.split for shard in record.shards}
-    splits = {flight.name: flight.split for flight in flights}
+def _verify_rows(folder: Path, record: ReleaseRecord, how: _How, findings: Findings) -> None:
+    """Check rows, and at level `pixels` pictures, of a release whose shards are all there and have its columns."""
+    source = Shards(folder, tuple(record.settings.modalities), record.part_of is not None)
+    try:
+        entries = source.entries([shard.path for shard in record.shards])
+    except InputError as error:
+        findings.error("unreadable", str(error.where).replace(f"{folder}/", ""), error.got or error.what, "rows")
+        return
+    available = {flight.flight: flight.frames_available for flight in record.flights}
+    entries = [replace(entry, num_frames=available.get(entry.name)) for entry in entries]
+    flights = _check_all(source, entries, Context.of_record(record), how, findings)
+    records.check_flights(record, flights, findings)
+    split_of, splits = {shard.path: shard.split for shard in record.shards}, {one.name: one.split for one in flights}
     for entry in entries:
         for shard in dict.fromkeys(part[0] for part in entry.parts):
             if splits.get(entry.name, split_of[shard]) != split_of[shard]:
                 got = f"rows of {splits[entry.name]} in {shard}"
                 findings.error("leak", entry.name, got, f"{split_of[shard]}, the shard's split")
-
-
-# --- an export --------------------------------------------------------------------------------------------------------
-
-
-def _verify_export(folder: Path, how: _How, findings: Findings) -> None:
-    """Check an export: its record, its files against its list of checksums, and where its release is given against what that gives."""
     try:
-        record = read_export(folder / EXPORT)
-    except InputError as error:
-        findings.error("record", EXPORT, error.got or error.what, error.expected or "a record of an export")
-        return
-    is_tree = record.format == "tree"
-    digests = read_digests(folder, findings)
-    flights = folder.rglob("trajectory.json") if is_tree else ()  # each lists its own files
-    inner = [path.relative_to(folder).parent for path in flights]
-    own = [
-        (place / name).as_posix() for place in inner for name in (*read_digests(folder / place, findings), CHECKSUMS)
-    ]
-    good = check_names(folder, dict.fromkeys((*digests, *own, "README.md", CHECKSUMS)), findings)
-    if EXPORT not in digests:
-        findings.error("checksum", f"{CHECKSUMS}: {EXPORT}", "no line", "one line per file")
-    _check_readme(folder, record, findings)
-    if how.level != "structure":
-        check_digests(folder, digests, good, findings)
-    if how.source is not None:
-        check_made_again(folder, record, how.source, workers=how.workers, watch=how.watch, findings=findings)
-    if is_tree:
-        _verify_tree(folder, how, findings, record.depth)
-    elif how.source is None:
-        expected = "--source RELEASE, to make it again and compare every file"
-        findings.note("not_checked", EXPORT, "rows and pictures of another format", expected)
-
-
-def _check_readme(folder: Path, record: ExportRecord, findings: Findings) -> None:
-    """README.md is what export.json gives, to the letter."""
-    try:
-        found = read_bytes(folder / "README.md", what="README", tree=folder)
-    except InputError as error:
-        findings.error("card", "README.md", error.got or error.what, "what export.json says, in words")
-        return
-    if found != render_readme(record).encode():
-        findings.error("card", "README.md", "other words", "what export.json says, in words")
+        records.check_numbers(folder, record, findings)
+        records.check_shards(folder, record, findings)
+    except (InputError, *SENSELESS) as error:  # rows that no number comes of, which are found above
+        findings.error("number", "release.json: numbers", f"{type(error).__name__}: {error}", "numbers of the rows")
 
 
 # --- a playback tree --------------------------------------------------------------------------------------------------
 
 
-def _verify_tree(folder: Path, how: _How, findings: Findings, coded: DepthCoding | None = None) -> None:
+def _verify_tree(folder: Path, how: _How, findings: Findings, coded: DepthCoding | None) -> None:
     """Check a playback tree. coded: how the release that it was made of coded the depth, which is float32 here."""
     try:
-        source, entries = Tree.found(folder)
+        source, entries = TreeFlights.found(folder)
     except InputError as error:
-        what = f"{error.what}: {error.got}" if error.got else error.what
-        findings.error("missing", folder, what, "a release, a playback tree, or an export of a release")
+        findings.error("missing", folder, f"{error.what}: {error.got}" if error.got else error.what, ANYTHING)
         return
     findings.facts.append(f"structure: a playback tree of {len(entries):,} flights, with {', '.join(source.files)}")
-    digests = _tree_digests(folder, entries, findings)
+    digests: dict[str, dict[str, str]] = {}  # the flights' own lists, where they have them
+    for flight in (entry.parts[0] for entry in entries if (folder / entry.parts[0] / CHECKSUMS).is_file()):
+        digests[flight] = read_digests(folder / flight, findings)
+        for name in digests[flight]:
+            if not (folder / flight / name).is_file():
+                findings.error("missing", f"{flight}/{name}", "no such file", f"a file of {CHECKSUMS}")
     if how.level == "structure":
         return
-    told = Told(rounded_as=(coded or LOSSLESS).coding)
-    check_all(source, entries, told, replace(how, reader=None), findings)
+    context = Context(rounded_as=(coded or LOSSLESS).coding)
+    _check_all(source, entries, context, replace(how, reader=None), findings)
     if how.level == "pixels":
         for flight, own in digests.items():
             check_digests(folder / flight, own, list(own), findings)
-
-
-def _tree_digests(folder: Path, entries: Iterable[Entry], findings: Findings) -> dict[str, dict[str, str]]:
-    """Read the flights' own lists of checksums, where they have them, and see that their files are there."""
-    found = {}
-    for entry in entries:
-        flight = folder / entry.parts[0]
-        if (flight / CHECKSUMS).is_file():
-            found[entry.parts[0]] = read_digests(flight, findings)
-            for name in found[entry.parts[0]]:
-                if not (flight / name).is_file():
-                    findings.error("missing", f"{entry.parts[0]}/{name}", "no such file", f"a file of {CHECKSUMS}")
-    return found
 
 
 # --- all flights ------------------------------------------------------------------------------------------------------
@@ -299,19 +216,21 @@ class _Settings(Config):
     """A verification has no settings that a product would depend on."""
 
 
-def check_all(source: FlightSource, entries: list[Entry], told: Told, how: _How, findings: Findings) -> list[Summary]:
+def _check_all(
+    source: FlightSource, entries: list[Entry], context: Context, how: _How, findings: Findings
+) -> list[Summary]:
     """Check every flight, by several processes, and all of them against each other; gives what was kept of each."""
     clean = {e.name.rpartition("/")[0]: e for e in entries if e.name.rpartition("/")[2] == ORIGINAL}
     items = []
     for number, entry in enumerate(entries):
         twin = clean.get(entry.name.rpartition("/")[0])
-        job = Job(entry, f"{number:07d}.rows", twin if twin is not None and twin is not entry else None)
+        job = FlightJob(entry, f"{number:07d}.rows", None if twin is entry else twin)
         items.append(Item(entry.name, job, entry.num_rows if how.level == "pixels" and entry.num_rows else None))
     flights = []
     with tempfile.TemporaryDirectory(prefix="cosfly-verify-") as place:
         stage = StageFolder.open(Path(place) / "verify", "verify", config=_Settings(), inputs={}, seed=0)
         rows = RowFiles(Path(place) / "rows")
-        started = (source, how.level, told, how.reader, rows)
+        started = (source, how.level, context, how.reader, rows)
         done = run_items(stage, items, make_worker, started, workers=how.workers, watch=how.watch, label="verify")
         for record in done.records:
             if isinstance(record, Kept):
@@ -320,9 +239,9 @@ def check_all(source: FlightSource, entries: list[Entry], told: Told, how: _How,
                     flights.append(Summary(**record.result["summary"]))
             elif isinstance(record, Failed):
                 findings.error("not_checked", record.id, record.message, "a flight that can be checked")
-        check_across(flights, rows, by_town=told.by_town, both=told.both, findings=findings)
-    num_rows = sum(flight.num_rows for flight in flights)
+        check_across(flights, rows, by_town=context.by_town, both=context.both, findings=findings)
     words = f"texts of captions {'read' if how.reader is not None else 'not read against the flight'}"
     pictures = f", all their {', '.join(source.files)} pictures" if how.level == "pixels" else ""
+    num_rows = sum(flight.num_rows for flight in flights)
     findings.facts.append(f"{num_rows:,} rows of {len(flights):,} flights{pictures}; {words}")
     return flights

@@ -20,7 +20,7 @@ from cosfly.products.places import folder_name, place_of, town_folder
 from cosfly.products.playback import Flight, read_flight
 from cosfly.products.review import read_settled
 from cosfly.work.console import progress_bar
-from release.columns import Placed, caption_values, scalar_row
+from release.columns import Placement, caption_values, scalar_row
 from release.viewer.content import (
     PageBox,
     PageCaption,
@@ -177,7 +177,7 @@ def _frame(flight: Flight, index: int, caption: Caption | None, pictures: PagePi
         view: partial(read_view, folder, view) for view in VIEWS if frame_path(folder, VIEW_FILES[view]).exists()
     }
     values = None if caption is None else caption_values(caption)
-    row = scalar_row(flight, index, values, Placed(walk="", split="train"))
+    row = scalar_row(flight, index, values, Placement(walk="", split="train"))
     return frame_of(row, pictures.of_frame(views), None if caption is None else _caption(caption, row))
 
 
