@@ -37,30 +37,25 @@ def ramp(dtype: type, shape: tuple[int, int] = (72, 128)) -> np.ndarray:
     return np.random.default_rng(0).permutation(values).reshape(shape).astype(dtype)
 
 
-BITS_OF = {"8-bit": 8, "10-bit": 10, "12-bit": 12, "16-bit": 16}
-
-
 def rows_of(study: Study) -> dict:
     return {row.coding: row for row in study.rows}
 
 
-@pytest.mark.parametrize(
-    ("coding", "max_cm", "mean_cm", "rmse_cm", "psnr_db"),
-    [
+def test_depths_spread_evenly_give_the_papers_errors(tmp_path):
+    """Its scene is nearly so: half a step at most, a quarter of one on average; its print is within 3 % of that."""
+    np.save(tmp_path / "depth.npy", ramp(np.float64, (360, 640)))
+    rows = rows_of(run(tmp_path / "depth.npy", tmp_path / "out"))
+    for coding, *errors_cm, psnr_db in (
         ("8-bit", 4.5019, 2.2494, 2.5979, 58.9),
         ("10-bit", 1.1222, 0.5543, 0.6418, 71.1),
         ("12-bit", 0.2803, 0.1436, 0.1646, 82.9),
         ("16-bit", 0.0175, 0.0088, 0.0101, 107.1),
-    ],
-)
-def test_depths_spread_evenly_give_the_papers_errors(tmp_path, coding, max_cm, mean_cm, rmse_cm, psnr_db):
-    """Its scene is nearly so: half a step at most, a quarter of one on average; what it prints is within 3 % of
-    that."""
-    np.save(tmp_path / "depth.npy", ramp(np.float64, (360, 640)))
-    row = rows_of(run(tmp_path / "depth.npy", tmp_path / "out"))[coding]
-    assert (row.max_cm, row.mean_cm, row.rmse_cm) == pytest.approx((max_cm, mean_cm, rmse_cm), rel=0.03)
-    assert row.psnr_db == pytest.approx(psnr_db, abs=0.3)
-    assert row.kilobytes == pytest.approx(360 * 640 * BITS_OF[coding] / 8 / 1024), "as the paper's column counts them"
+    ):
+        row = rows[coding]
+        assert [row.max_cm, row.mean_cm, row.rmse_cm] == pytest.approx(errors_cm, rel=0.03)
+        assert row.psnr_db == pytest.approx(psnr_db, abs=0.3)
+        kib = 360 * 640 * int(coding.removesuffix("-bit")) / 8 / 1024
+        assert row.kilobytes == pytest.approx(kib), "as the paper's column counts them"
 
 
 def test_float32_against_float64(tmp_path):
@@ -113,25 +108,18 @@ def test_what_cannot_hold_the_depths_is_named(tmp_path):
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("hole", [np.nan, np.inf, -np.inf])
-def test_pixels_without_depth_of_others_are_invalid_ones(tmp_path, hole):
+def test_pixels_without_depth_of_others_are_invalid_ones(tmp_path):
     """Their figures are those of a frame whose invalid pixels are 0, in every coding."""
     values = ramp(np.float64)
-    for name, invalid in (("ours", 0.0), ("theirs", hole)):
-        values[:, :7] = invalid
-        (tmp_path / name).mkdir()
-        np.save(tmp_path / name / "depth.npy", values)
-    ours, theirs = (run(tmp_path / name, tmp_path / f"of {name}") for name in ("ours", "theirs"))
-    assert theirs.rows == ours.rows
-    assert theirs.left_out == {}
-    assert theirs.share_measured == 1 - 7 / 128
-
-
-def test_whole_numbers_are_asked_for_their_unit(tmp_path):
-    np.save(tmp_path / "depth.npy", (ramp(np.float64) * 1000).astype(np.uint16))
-    with pytest.raises(InputError, match=r"unit.*uint16.*metres as float32 or float64.*/ 1000") as caught:
-        run(tmp_path / "depth.npy", tmp_path / "out")
-    assert caught.value.where == tmp_path / "depth.npy"
+    studies = []
+    for number, hole in enumerate((0.0, np.nan, np.inf, -np.inf)):
+        values[:, :7] = hole
+        np.save(tmp_path / "depth.npy", values)
+        studies.append(run(tmp_path / "depth.npy", tmp_path / str(number)))
+    for theirs in studies:
+        assert theirs.rows == studies[0].rows
+        assert theirs.left_out == {}
+        assert theirs.share_measured == 1 - 7 / 128
 
 
 def test_the_profile_is_where_steps_are_seen():
@@ -147,18 +135,19 @@ def test_the_profile_is_where_steps_are_seen():
     assert PROFILE_STEPS / 2 < abs(part[-1] - part[0]) / (90 / 255) < PROFILE_STEPS * 2
 
 
-@pytest.mark.parametrize(
-    "values",
-    [np.full((4, 5), 7, np.float32), np.full((4, 5), 1000, np.float32), np.full((4, 5), np.nan, np.float32),
-     np.ones((4, 5), np.int32), np.linspace(-1, 1, 20, dtype=np.float32).reshape(4, 5)],
-    ids=["one_depth", "sky", "nan", "integers", "negative"],
-)  # fmt: skip
-def test_a_frame_without_anything_to_study_is_one_error(tmp_path, values):
-    np.save(tmp_path / "depth.npy", values)
-    with pytest.raises(InputError, match="depth"):
-        run(tmp_path / "depth.npy", tmp_path / "out")
+def test_a_frame_without_anything_to_study_is_one_error(tmp_path):
+    path, shape = tmp_path / "depth.npy", (4, 5)
+    sky, negative = np.full(shape, 1000, np.float32), np.linspace(-1, 1, 20, dtype=np.float32).reshape(shape)
+    for values in (np.full(shape, 7, np.float32), sky, np.full(shape, np.nan, np.float32), negative):
+        np.save(path, values)
+        with pytest.raises(InputError, match="depth"):
+            run(path, tmp_path / "out")
     with pytest.raises(InputError):
         run(tmp_path / "no such frame", tmp_path / "out")
+    np.save(path, (ramp(np.float64) * 1000).astype(np.uint16))
+    with pytest.raises(InputError, match=r"unit.*uint16.*metres as float32 or float64.*/ 1000") as caught:
+        run(path, tmp_path / "out")
+    assert caught.value.where == path
 
 
 @given(st.sampled_from(BITS), st.integers(0, 2**31))

@@ -1,5 +1,4 @@
-"""Weather and time of day: presets, modes, the seed formula, pools, records, coverage; and that a picture changes and
-its labels never."""
+"""Weather and time of day: presets, modes, seeds, pools, records, coverage; a picture changes, its labels never."""
 
 from __future__ import annotations
 
@@ -57,12 +56,9 @@ def test_the_presets_are_those_of_the_paper():
     assert times == {"morning": (15, 90), "noon": (75, 180), "dusk": (0, 270), "night": (-30, 0)}
 
 
-@pytest.mark.parametrize(("seed", "index", "wanted"), [(0, 0, 11), (1, 0, 1_000_014), (20260423, 7, 20260483836713)])
-def test_the_seed_formula(seed, index, wanted):
-    assert path_seed(seed, index) == wanted == seed * 1_000_003 + index * 7_919 + 11
-
-
 def test_a_draw_is_that_of_the_formula_and_uniform():
+    for seed, index, wanted in ((0, 0, 11), (1, 0, 1_000_014), (20260423, 7, 20260483836713)):
+        assert path_seed(seed, index) == wanted == seed * 1_000_003 + index * 7_919 + 11
     cfg = config(**RANDOM)
     pools = read_pools(cfg)
     drawn = [weather_of(cfg, pools, index) for index in range(3000)]
@@ -85,10 +81,7 @@ def test_off_is_the_default_and_leaves_no_trace():
     assert config(**RANDOM).recorded()["weather_seed"] == 20260423
 
 
-@pytest.mark.parametrize("name", ["heavy_rain", "heavy rain", "Heavy-Rain"])
-def test_fixed_takes_the_named_presets(name):
-    cfg = config(weather_mode="fixed", weather_name=name, tod_name="night")
-    record = weather_of(cfg, read_pools(cfg), 3)
+def test_fixed_takes_the_named_presets():
     params = {
         "cloudiness": 95,
         "precipitation": 90,
@@ -97,25 +90,26 @@ def test_fixed_takes_the_named_presets(name):
         "sun_altitude_angle": -30,
         "sun_azimuth_angle": 0,
     }
-    assert record.model_dump() == {"mode": "fixed", "weather_name": "heavy_rain", "tod_name": "night", "params": params}
+    wanted = {"mode": "fixed", "weather_name": "heavy_rain", "tod_name": "night", "params": params}
+    for name in ("heavy_rain", "heavy rain", "Heavy-Rain"):
+        cfg = config(weather_mode="fixed", weather_name=name, tod_name="night")
+        assert weather_of(cfg, read_pools(cfg), 3).model_dump() == wanted
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
+def test_settings_that_cannot_be_are_one_error():
+    near = ["did you mean 'heavy_rain'", "did you mean 'morning'"]
+    for settings, words in (
         ({"weather_mode": "fixed"}, ["weather_name is needed", "tod_name is needed"]),
         ({"weather_name": "mist"}, ["weather_name is for weather_mode fixed"]),
-        ({"weather_mode": "fixed", "weather_name": "hevy_rain", "tod_name": "mornin"}, ["'heavy_rain'", "'morning'"]),
+        ({"weather_mode": "fixed", "weather_name": "hevy_rain", "tod_name": "mornin"}, near),
         ({"weather_mode": "sometimes"}, ["random_per_path"]),
         ({**RANDOM, "backend": "pyrender"}, ["draws no weather"]),
         ({**RANDOM, "look": {"exposure": 1.0}}, ["look is for flights without weather"]),
         ({"weather_pool": "sky.yaml"}, ["weather_pool is given, and weather_mode is off"]),
-    ],
-)  # fmt: skip
-def test_settings_that_cannot_be_are_one_error(settings, words):
-    with pytest.raises(ConfigError) as caught:
-        config(**settings)
-    assert all(word in str(caught.value) for word in words)
+    ):
+        with pytest.raises(ConfigError) as caught:
+            config(**settings)
+        assert all(word in str(caught.value) for word in words)
 
 
 POOL = "presets:\n  sleet: {cloudiness: 90, precipitation: 40, fog_density: 20, fog_distance: 25}\n"
@@ -133,34 +127,29 @@ def test_presets_of_ones_own(tmp_path):
         read_pools(config(weather_mode="fixed", weather_name="sleat", tod_name="late", **files))
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
+def test_pools_that_cannot_be_are_one_error_with_all_problems(tmp_path):
+    sky, tod = tmp_path / "sky.yaml", tmp_path / "tod.yaml"
+    rest = "precipitation: 0, fog_density: 0, fog_distance: 9}"
+    many = ["a.cloudiness", "presets.a.precipitation", "finite", "a.fog_density", "a.fog_distance", "4 to mend"]
+    outside = "cloudiness: 101, precipitation: .nan, fog_density: -1, fog_distance: 0"
+    for text, words in (
         ("presets: {a: {cloudiness: 1, fog_density: 5, fog_distance: 9}}", ["presets.a.precipitation", "required"]),
-        ("presets: {a: {cloudiness: 101, precipitation: .nan, fog_density: -1, fog_distance: 0}}",
-         [".cloudiness", "presets.a.precipitation", "finite", ".fog_density", ".fog_distance", "4 to mend"]),
-        ("presets: {a: {cloudyness: 1, precipitation: 0, fog_density: 0, fog_distance: 9}}", ["mean 'cloudiness'"]),
-        ("presets: {a: {cloudiness: on, precipitation: 0, fog_density: 0, fog_distance: 9}}", ["presets.a.cloudiness"]),
+        (f"presets: {{a: {{{outside}}}}}", many),
+        (f"presets: {{a: {{cloudyness: 1, {rest}}}", ["did you mean 'cloudiness'"]),
+        (f"presets: {{a: {{cloudiness: on, {rest}}}", ["presets.a.cloudiness"]),
         ("presets: {}", ["presets"]),
         ("{}", ["presets"]),
         ("presets: [1]", ["presets"]),
-        ("presets: {a b: &x {cloudiness: 1, precipitation: 0, fog_density: 0, fog_distance: 9}, a_b: *x}",
-         ["two presets have one name"]),
+        (f"presets: {{a b: &x {{cloudiness: 1, {rest}, a_b: *x}}", ["two presets have one name"]),
         ("!!python/object:os.system {}", ["tag"]),
-    ],
-)  # fmt: skip
-def test_a_pool_that_cannot_be_is_one_error_with_all_problems(tmp_path, text, words):
-    (tmp_path / "sky.yaml").write_text(text)
-    with pytest.raises(ConfigError) as caught:
-        read_pools(config(**RANDOM, weather_pool=str(tmp_path / "sky.yaml")))
-    assert all(word in str(caught.value) for word in [*words, "sky.yaml"])
-
-
-def test_problems_of_both_pools_are_told_together(tmp_path):
-    (tmp_path / "tod.yaml").write_text("presets: {late: {sun_altitude_angle: 91, sun_azimuth_angle: 360}}")
-    files = {"weather_pool": str(tmp_path / "none.yaml"), "tod_pool": str(tmp_path / "tod.yaml")}
-    with pytest.raises(ConfigError) as caught:
-        read_pools(config(**RANDOM, **files))
+    ):
+        sky.write_text(text)
+        with pytest.raises(ConfigError) as caught:
+            read_pools(config(**RANDOM, weather_pool=str(sky)))
+        assert [word for word in [*words, "sky.yaml"] if word not in str(caught.value)] == []
+    tod.write_text("presets: {late: {sun_altitude_angle: 91, sun_azimuth_angle: 360}}")
+    with pytest.raises(ConfigError) as caught:  # problems of both pools together
+        read_pools(config(**RANDOM, weather_pool=str(tmp_path / "none.yaml"), tod_pool=str(tod)))
     assert all(word in str(caught.value) for word in ("none.yaml", "sun_altitude_angle", "sun_azimuth_angle"))
 
 
@@ -178,6 +167,7 @@ def test_the_sun_stands_where_its_knobs_say():
     np.testing.assert_allclose(light_direction(params())[:2] / np.cos(np.radians(75)), [0, -1], atol=1e-12)
     assert light_direction(params(time="dusk"))[0] < -0.99
     assert light_direction(params(time="night"))[2] > 0.5, "the moon"
+    assert [lights_on(params(time=time)) > 0.5 for time in TIMES] == [False, False, True, True], "lamps in the dark"
 
 
 @given(st.floats(0, 100), st.floats(0, 100), st.floats(0, 100))
@@ -187,10 +177,6 @@ def test_more_fog_and_more_rain_hide_more(low, high, rain):
         params(fog_density=high, precipitation=rain)
     )
     assert fog_extinction(params(precipitation=low)) <= fog_extinction(params(precipitation=high))
-
-
-def test_lamps_burn_when_it_is_dark():
-    assert [lights_on(params(time=time)) > 0.5 for time in TIMES] == [False, False, True, True]
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
@@ -427,29 +413,27 @@ def test_a_negative_seed_draws_one_and_a_resumed_run_keeps_it(trees, tmp_path):
     assert {flight["weather_seed"] for flight in again} == seeds
 
 
-@pytest.mark.parametrize(
-    ("change", "where"),
-    [
+def test_a_record_that_breaks_the_schema_is_refused_or_noted(trees, tmp_path):
+    (_, tree), _ = trees
+    whole = read_flight(find_flights(tree)[0]).raw["weather"]
+    folder = tmp_path / "Town_Street/trajectory_1776000000/ORI"
+    folder.mkdir(parents=True)
+    for change, where in (
         ({"mode": "sometimes"}, "weather: mode"),
         ({"weather_name": ""}, "weather: weather_name"),
         ({"params": {}}, "weather: params.cloudiness"),
         ({"params": {**params().model_dump(), "fog_distance": 0}}, "weather: params.fog_distance"),
         ({"params": {**params().model_dump(), "sun_azimuth_angle": 360}}, "weather: params.sun_azimuth_angle"),
         ({"colour": "red"}, "weather: colour"),
-    ],
-)
-def test_a_record_that_breaks_the_schema_is_refused_or_noted(trees, tmp_path, change, where):
-    (_, tree), _ = trees
-    flight = read_flight(find_flights(tree)[0])
-    folder = tmp_path / "Town_Street/trajectory_1776000000/ORI"
-    folder.mkdir(parents=True)
-    flight.raw["weather"] = flight.raw["weather"] | change
-    write_flight(folder, flight)
-    with pytest.raises(InputError, match=where.replace(".", r"\.")):
-        read_flight(folder)
-    noted = read_flight(folder, strict=False)
-    assert any(where in issue for issue in noted.issues)
-    assert noted.weather_record is None
+    ):
+        flight = read_flight(find_flights(tree)[0])
+        flight.raw["weather"] = whole | change
+        write_flight(folder, flight)
+        with pytest.raises(InputError, match=where.replace(".", r"\.")):
+            read_flight(folder)
+        noted = read_flight(folder, strict=False)
+        assert any(where in issue for issue in noted.issues)
+        assert noted.weather_record is None
 
 
 def test_the_gallery_has_nine_pictures_and_a_sheet_of_all(trees, tmp_path):

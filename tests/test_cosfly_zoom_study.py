@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from cosfly.cli import app
 from cosfly.geometry import intrinsic_matrix
 from cosfly.products.frames import Camera
-from cosfly.studies.zoom import ZoomStudyConfig, compare, digital_zoom, enlarged_camera, spread, ssim, text_rows
+from cosfly.studies.zoom import compare, digital_zoom, enlarged_camera, spread, ssim, text_rows
 from cosfly.work.stage_folder import read_manifest
 
 LEVELS = [110.0, 60.0, 30.0]
@@ -33,16 +33,11 @@ def checks(width: int = 64, height: int = 48) -> np.ndarray:
     return np.repeat(grey[..., None], 3, axis=2)
 
 
-def test_a_picture_is_like_itself():
-    found = compare(checks(), checks())
-    assert (found.psnr_db, found.ssim, found.sharpness) == (99.0, pytest.approx(1.0), pytest.approx(1.0))
-
-
 def test_psnr_by_hand():
     """Every value 5 off: 10 log10(255^2 / 25) = 34.15 dB; a constant hides no edge."""
-    found = compare(checks() + 5, checks())
-    assert found.psnr_db == pytest.approx(34.151, abs=1e-3)
-    assert found.sharpness == pytest.approx(1.0)
+    same, found = compare(checks(), checks()), compare(checks() + 5, checks())
+    assert (same.psnr_db, same.ssim, same.sharpness) == (99.0, pytest.approx(1.0), pytest.approx(1.0))
+    assert (found.psnr_db, found.sharpness) == (pytest.approx(34.151, abs=1e-3), pytest.approx(1.0))
 
 
 def test_ssim_of_a_constant_is_that_of_its_brightness():
@@ -52,19 +47,15 @@ def test_ssim_of_a_constant_is_that_of_its_brightness():
     assert ssim(one, two) == pytest.approx((2 * 100 * 120 + c1) / (100**2 + 120**2 + c1))
 
 
-@pytest.mark.parametrize("kernel", ["bilinear", "bicubic"])
-def test_digital_zoom_enlarges_about_the_middle(kernel):
-    """A ramp stays a ramp, half as steep at twice the size, with its middle where it was."""
+def test_digital_zoom_enlarges_about_the_middle():
+    """A ramp stays one, half as steep at twice the size, with its middle where it was; once as large is the picture."""
     ramp = np.repeat(np.tile(np.arange(10, 210, 4, dtype=np.uint8), (40, 1))[..., None], 3, axis=2)
-    found = digital_zoom(ramp, 2.0, kernel)[20, :, 0].astype(float)
-    middle = (found[24] + found[25]) / 2
-    assert middle == pytest.approx(ramp[20, 24:26, 0].astype(float).mean(), abs=1.0)
-    assert np.diff(found[5:45]).mean() == pytest.approx(2.0, abs=0.1)
-
-
-@pytest.mark.parametrize("kernel", ["bilinear", "bicubic"])
-def test_once_as_large_is_the_picture(kernel):
-    np.testing.assert_array_equal(digital_zoom(checks(), 1.0, kernel), checks())
+    for kernel in ("bilinear", "bicubic"):
+        found = digital_zoom(ramp, 2.0, kernel)[20, :, 0].astype(float)
+        middle = (found[24] + found[25]) / 2
+        assert middle == pytest.approx(ramp[20, 24:26, 0].astype(float).mean(), abs=1.0)
+        assert np.diff(found[5:45]).mean() == pytest.approx(2.0, abs=0.1)
+        np.testing.assert_array_equal(digital_zoom(checks(), 1.0, kernel), checks())
 
 
 def test_a_longer_lens_shows_the_middle_as_large():
@@ -89,10 +80,6 @@ def test_a_spread_lies_round_its_mean(values):
 def test_a_flight_that_is_never_seen_is_in_no_mean():
     assert spread([None, 4.0, None], np.random.default_rng(0))["mean"] == 4.0
     assert spread([None], np.random.default_rng(0)) == {"mean": None, "std": None, "low": None, "high": None}
-
-
-def test_levels_are_the_settings_from_wide_to_long():
-    assert ZoomStudyConfig(fovs_deg=(30.0, 110.0, 30.0)).levels_deg == [110.0, 30.0]
 
 
 # --- the study --------------------------------------------------------------------------------------------------------
@@ -125,21 +112,13 @@ def test_the_target_grows_as_the_lens_does(studied):
     assert long["visibility"]["mean"] == pytest.approx(wide["visibility"]["mean"], abs=0.05)
     assert 0.2 < long["track_quality"]["mean"] < 1.0
     assert set(found["by_flight"]) == {"path_000", "path_002"}
-
-
-@needs_gl
-def test_optical_zoom_is_sharper_than_digital(studied):
-    fidelity = json.loads((studied[0] / "zoom_study.json").read_text())["fidelity"]
+    fidelity = found["fidelity"]  # optical zoom is sharper than digital
     assert set(fidelity) == {"2", "5"}
     for kernels in fidelity.values():
-        assert all(found["sharpness"]["mean"] < 0.9 for found in kernels.values())
+        assert all(one["sharpness"]["mean"] < 0.9 for one in kernels.values())
         assert kernels["bicubic"]["sharpness"]["mean"] > kernels["bilinear"]["sharpness"]["mean"]
     assert fidelity["5"]["bicubic"]["ssim"]["mean"] < fidelity["2"]["bicubic"]["ssim"]["mean"]
-
-
-@needs_gl
-def test_a_bad_flight_is_counted_and_stops_no_other(studied):
-    counts = read_manifest(studied[0]).counts
+    counts = read_manifest(out).counts  # a bad flight is counted and stops no other
     assert (counts.input, counts.kept, dict(counts.failed)) == (3, 2, {"render": 1})
 
 
