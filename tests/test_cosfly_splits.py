@@ -77,21 +77,14 @@ def test_builds_of_a_town_are_one_and_other_towns_are_not():
     ]  # fmt: skip
 
 
-def test_walks_that_cross_at_the_same_moment_are_two():
+def test_walks_that_cross_or_follow_or_begin_together_are_two():
     along = walk(80)
     across = walk(80, begin=(1.4 * 20, -1.4 * 20), heading_deg=90.0)  # both at (28, 0) after 20 s
     assert np.abs(along[1][40] - across[1][40]).max() < 1e-9
     assert groups(course("along", along), course("across", across)) == [{"across"}, {"along"}]
-
-
-def test_walks_on_one_route_at_other_times_are_two():
-    points = walk(80)
-    later = (points[0], points[1] - [1.4 * 10, 0, 0])  # ten seconds behind on the same way
+    later = (along[0], along[1] - [1.4 * 10, 0, 0])  # ten seconds behind on the same way
     faster = walk(80, speed_mps=2.0)
-    assert groups(course("a", points), course("b", later), course("c", faster)) == [{"a"}, {"b"}, {"c"}]
-
-
-def test_short_flights_that_begin_at_one_place_are_two():
+    assert groups(course("a", along), course("b", later), course("c", faster)) == [{"a"}, {"b"}, {"c"}]
     there, back = walk(8, speed_mps=0.4), walk(8, speed_mps=0.4, heading_deg=180.0)  # near for one second of four
     assert groups(course("there", there), course("back", back)) == [{"back"}, {"there"}]
 
@@ -126,6 +119,7 @@ def test_one_name_is_one_walk_whatever_is_known_of_it():
 def test_times_far_apart_cost_nothing():
     points = np.array([0.0, 0.5, 1e12]), np.zeros((3, 3))
     assert groups(course("a", points), course("b", walk(4, speed_mps=0.0))) == [{"a", "b"}]
+    assert walks_of([]) == {}
 
 
 @given(st.randoms(use_true_random=False), st.integers(0, 3))
@@ -165,10 +159,6 @@ def test_walks_agree_with_a_slow_plain_comparison():
     assert 1 < len(set(walk_id.values())) < 30
 
 
-def test_nothing_has_no_walks():
-    assert walks_of([]) == {}
-
-
 # --- splits -----------------------------------------------------------------------------------------------------------
 
 
@@ -187,12 +177,8 @@ def test_splits_cover_all_and_none_is_empty(num_groups, val, test, seed):
     assert set(counts) == {split for split in SPLITS if split == "train" or shares[split] > 0}
     assert abs(counts["val"] - val * num_groups) <= 1
     assert split_of == assign_splits(list(reversed(names)) * 2, shares, seed, too_few="refuse")  # order, repeats
-
-
-def test_another_seed_gives_other_splits():
-    names = [f"walk_{i}" for i in range(30)]
-    one, other = (assign_splits(names, {"val": 0.1, "test": 0.1}, seed, too_few="refuse") for seed in (0, 1))
-    assert one != other
+    if num_groups > 30 and min(val, test) > 0.05:
+        assert split_of != assign_splits(names, shares, seed + 1, too_few="refuse")
 
 
 def test_too_few_groups_are_refused_unless_told():
