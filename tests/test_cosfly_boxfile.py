@@ -246,15 +246,19 @@ def test_what_can_be_meant_and_hardly_is_gets_a_warning(tmp_path, caplog, subtes
             assert re.search(words, caplog.text)
 
 
-def test_degrees_as_radians_and_a_town_wholly_below_its_ground_are_refused(tmp_path):
+def test_degrees_as_radians_and_a_town_off_its_ground_are_refused(tmp_path):
     words = r"line 3: yaw_rad is more than a full turn of 6\.2832; .* yaw_deg \(and 21 more\)"
     with pytest.raises(InputError, match=words):
         loaded(tmp_path, town_table(yaw="yaw_rad"))
-    houses = [f"Buildings,{30 * k},0,-45,9,9,10" for k in range(5)]
-    low = "\n".join(["type,x,y,z,length,width,height", "Roads,0,0,-50,90,7,0.2", *houses])
-    with pytest.raises(InputError, match=r"below the ground; got 5 boxes, the highest ends 40 m .*ground_z_m=-50$"):
-        loaded(tmp_path, low)
-    assert len(loaded(tmp_path, low, ground_z_m=-50.0)) == 6
+    for middle_m, words in (
+        (-45, "lies below the ground; got 5 boxes, the highest ends 40 m below it"),
+        (45, "lies high above the ground; got 5 boxes, the lowest begins 40 m above it"),
+    ):
+        houses = [f"Buildings,{30 * k},0,{middle_m},9,9,10" for k in range(5)]
+        town = "\n".join(["type,x,y,z,length,width,height", "Roads,0,0,-50,90,7,0.2", *houses])
+        with pytest.raises(InputError, match=rf"{words}.*--set maps.boxes.ground_z_m={middle_m - 5}$"):
+            loaded(tmp_path, town)
+        assert len(loaded(tmp_path, town, ground_z_m=middle_m - 5.0)) == 6
 
 
 def test_a_file_is_needed_and_known_by_its_suffix(tmp_path):

@@ -62,6 +62,7 @@ TYPES = [kind for kind in KINDS if kind != "NONE"]
 SLAB_M = 0.3  # thickness of a surface whose outline has no height: its top is the ground
 WIDEST_M, TALL_M = 20_000.0, 400.0  # no map is wider, the usual building is lower: else the file is in centimetres
 MOST_AT_A_PLACE = 10  # buildings with one middle: a body, its roof, rooms inside; more is a mistake in x and y
+HANGS_M = 5.0  # a town whose every foot is higher over its ground is told from another level, as of the sea
 FEWEST_TURNED = 3  # boxes, for their yaws to look like radians
 EARTH_M, EARTH_E2 = 6_378_137.0, 0.00669437999014  # WGS 84: equatorial radius, squared eccentricity
 
@@ -203,16 +204,18 @@ def _warn(box_map: BoxMap, path: Path) -> None:
 
 
 def _check_heights(box_map: BoxMap, path: Path) -> None:
-    """Refuse a map of whose obstacles none reaches above the ground."""
+    """Refuse a map of whose obstacles none reaches above the ground, or none comes near it."""
     box_map = box_map.select(~box_map.is_any_of(SURFACE_KINDS))
-    tops_m = box_map.maxs[:, 2] - box_map.ground.height_at(box_map.centers)
-    if len(tops_m) and tops_m.max() <= 0.0:
-        foot_m, is_ours = np.median(box_map.mins[:, 2]), path.suffix.lower() == ".json"
+    ground_m = box_map.ground.height_at(box_map.centers)
+    feet_m, tops_m = box_map.mins[:, 2] - ground_m, box_map.maxs[:, 2] - ground_m
+    if len(tops_m) and (tops_m.max() <= 0.0 or feet_m.min() >= HANGS_M):
+        is_below, foot_m = tops_m.max() <= 0.0, float(np.median(box_map.mins[:, 2]))
+        end = f"the highest ends {-tops_m.max():.6g} m" if is_below else f"the lowest begins {feet_m.min():.6g} m"
+        fix = f"mend z, or tell where the ground is: --set maps.boxes.ground_z_m={foot_m:.6g}"
         raise InputError(
-            "all that stands lies below the ground", where=path,
-            got=f"{len(tops_m)} boxes, the highest ends {-tops_m.max():.6g} m below it", expected="boxes above it",
-            fix=f"mend ground_z_m of the header, or z; most feet are at {foot_m:.6g} m" if is_ours
-            else f"mend z, or tell where the ground is: --set maps.boxes.ground_z_m={foot_m:.6g}",
+            f"all that stands lies {'below' if is_below else 'high above'} the ground", where=path,
+            got=f"{len(tops_m)} boxes, {end} {'below' if is_below else 'above'} it", expected="boxes that stand on it",
+            fix=fix if path.suffix.lower() != ".json" else f"mend z, or ground_z_m of the header to {foot_m:.6g}",
         )  # fmt: skip
 
 
