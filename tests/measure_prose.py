@@ -2,11 +2,13 @@
 
     python tests/measure_prose.py claims|prose|reader [--sets N...] [--show]
 
-Sets are those of caption/truth/gold.py, by default those whose writers gave claims (1 and 2). Figures by where the error was planted
-(text, claims, both), language and kind; --show prints the true captions that were flagged and the errors that were missed.
+Sets are those of caption/truth/gold.py, by default those whose writers gave claims (1 and 2). Figures by where the
+error was planted (text, claims, both), language and kind; --show prints the true captions that were flagged and the
+errors that were missed.
 
-`reader` stands for language models, of which none could be had: `cosfly caption reader-check` asks a served endpoint that answers with the
-writers' claims (a perfect reader), or with those after a fault at a stated rate. Their writers had read the captions and no code of ours.
+`reader` stands for language models, of which none could be had: `cosfly caption reader-check` asks a served endpoint
+that answers with the writers' claims (a perfect reader), or with those after a fault at a stated rate. Their writers
+had read the captions and no code of ours.
 """
 
 from __future__ import annotations
@@ -124,7 +126,7 @@ def show(score: Score, *, in_full: bool) -> None:
             print("missed ", place, name, error.model_dump(exclude_none=True))
 
 
-# --- readers that are no models ----------------------------------------------------------------------------------------
+# --- readers that are no models ---------------------------------------------------------------------------------------
 
 
 def _quoted(claim: Claim, sentence: str, language: Language) -> dict[str, Any]:
@@ -139,7 +141,8 @@ def _quoted(claim: Claim, sentence: str, language: Language) -> dict[str, Any]:
 
 
 def perfect_readings(gold: Iterable[GoldCaption]) -> dict[str, list[dict]]:
-    """Give what a perfect reader answers to each text, by its sentences: the claims of its writer, with the planted error in them."""
+    """Give what a perfect reader answers to each text, by its sentences: the claims of its writer, with the planted
+    error in them."""
     found: dict[str, list[dict]] = {}
     for caption in gold:
         texts = [(caption.coc, caption.claims)]
@@ -188,7 +191,8 @@ FAULTS: dict[str, Fault | None] = {
 
 
 def answers_of(readings: dict[str, list[dict]], fault: Fault | None, *, alike: bool = False) -> Callable[[dict], str]:
-    """Give what a reader with a fault answers to a request; alike: it errs in the same way whatever the order of the question."""
+    """Give what a reader with a fault answers to a request; alike: it errs in the same way whatever the order of the
+    question."""
 
     def answer(body: dict) -> str:
         lines = body["messages"][1]["content"].split("\n")

@@ -26,7 +26,8 @@ from cosfly.work.journal import Journal
 MODEL = "test-teacher"
 ENGLISH = {
     "critical_components": "The target pedestrian is {visibility} and walks on the road ahead of the drone.",
-    "reasoning_trace": "The line of sight is free and the motion is regular, so this manoeuvre keeps the target in frame.",
+    "reasoning_trace": "The line of sight is free and the motion is regular, so this manoeuvre keeps the target in "
+    "frame.",
 }
 CLAIMS = [
     {"sentence": "C1", "quantity": "visibility", "at": "t4", "value": "visible", "unit": "", "modality": "observed"},
@@ -53,8 +54,10 @@ TEXT_FAULTS: dict[str, Callable[[dict], str]] = {
     "empty_text": lambda answer: "",
 }
 FAULTS = (
-    *STATUS_FAULTS, *TEXT_FAULTS, "reset", "truncated_body", "not_json", "false_gzip", "empty_choices", "null_content", "slow", "drip",
-    "schema_refused", "schema_ignored", "wrong_mirror_decision", "wrong_mirror_number", "wrong_therefore", "wrong_claims",
+    *STATUS_FAULTS, *TEXT_FAULTS, "reset", "truncated_body", "not_json", "false_gzip", "empty_choices", "null_content",
+    "slow", "drip",
+    "schema_refused", "schema_ignored", "wrong_mirror_decision", "wrong_mirror_number", "wrong_therefore",
+    "wrong_claims",
     "echo_key",
 )  # fmt: skip
 
@@ -180,7 +183,8 @@ def obedient_answer(server: TeacherServer, body: dict, fault: str | None = None)
 
 
 def written_answer(body: dict, can: Collection[str]) -> dict:
-    """Give a real answer in the way of writing that a request asks for; one that cannot puts a value where it must not stand."""
+    """Give a real answer in the way of writing that a request asks for; one that cannot puts a value where it must not
+    stand."""
     system = body["messages"][0]["content"]
     text = " ".join(part.get("text", "") for part in body["messages"][1]["content"])
     way = "claims" if '"claims"' in system else "slots" if "{distance}" in system else "prose"

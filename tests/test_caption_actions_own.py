@@ -1,4 +1,5 @@
-"""An eighteenth action, from a file alone: labels, captions, students, release, verification, tables. No line of code names it."""
+"""An eighteenth action, from a file alone: labels, captions, students, release, verification, tables. No line of code
+names it."""
 
 from __future__ import annotations
 
@@ -20,21 +21,18 @@ from caption.run.own_files import own_files
 from caption.run.released import read_released
 from caption.run.stage import run as caption_run
 from caption.schema import CaptionConfig, LabelConfig
-from caption.truth.actions import Motion, is_contradicted, label_of, measure, table_of
+from caption.truth.actions import is_contradicted, label_of, measure, table_of
 from caption.truth.reach import never_labels
 from cosfly.app import pipeline
 from cosfly.app.settings import RunConfig
 from cosfly.cli import app
-from cosfly.errors import ConfigError, InputError, ResumeError
+from cosfly.errors import ConfigError, InputError
 from cosfly.products.actions import (
     ACTIONS_FILE,
-    MEASURES,
     OWN_ACTIONS,
-    THRESHOLDS,
     action_tokens,
     actions_beside,
     kin_of,
-    one_set,
     read_actions,
     shipped_actions,
 )
@@ -58,7 +56,6 @@ from release.package import stage as package
 from release.package.config import ReleaseConfig
 from release.package.sources import Source
 from release.record import read_record
-from release.stats import stats
 from release.verify.verify import verify
 
 OWN = "cruise_along"
@@ -101,11 +98,6 @@ def whole(tmp_path_factory, mine) -> Path:
 # --- the file ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_names_that_rules_may_use_are_those_that_are_measured_and_set():
-    assert set(MEASURES) - {"ordered"} == set(Motion.__dataclass_fields__) - {"order"}
-    assert set(THRESHOLDS) == set(LabelConfig.model_fields) - {"absent_share"}
-
-
 def test_the_file_that_ships_can_be_written_and_checked(tmp_path):
     path = tmp_path / "actions.yaml"
     for words in (["--export", str(path)], ["--check", str(path)]):
@@ -116,7 +108,8 @@ def test_the_file_that_ships_can_be_written_and_checked(tmp_path):
 
 
 WRONG = [
-    ("mean_speed_mps / 0.5]}\n    implied", "meen_speed / 0.9]}\n    implied", r"'meen_speed' is not measured \(did you mean 'mean_speed_mps'\?\)"),
+    ("mean_speed_mps / 0.5]}\n    implied", "meen_speed / 0.9]}\n    implied",
+    r"'meen_speed' is not measured \(did you mean 'mean_speed_mps'\?\)"),
     ("2 * label.altitude_m", "label.altitude", r"no threshold 'label\.altitude' \(did you mean 'altitude_m'\?\)"),
     ("visible_now >= 1", "visible_now = 1", r"compares nothing"),
     ("{size: [mean_speed_mps / 0.5]}", "{size: [mean_speed_mps]}", r"has no threshold"),
@@ -127,7 +120,8 @@ WRONG = [
     ("en: cruise along", "en: hover", r"one English name: hover"),
     ("    zh: 巡航伴飞\n", "", r"actions\.cruise_along\.zh: Field required"),
     ("reads_like: track_straight", "reads_like: trak_straight", r"does not ship \(did you mean 'track_straight'\?\)"),
-    ("  - [cruise_along]", "  - [cruise]", r"precedence names 'cruise', which is no action.*cruise_along is implied by something"),
+    ("  - [cruise_along]", "  - [cruise]", r"precedence names 'cruise', which is no action.*cruise_along is implied by "
+    r"something"),
     ("  - [cruise_along]", "  - [cruise_along, hover]", r"precedence names hover twice"),
     ('schema_version: "1.0"', 'schema_version: "9.0"', r"schema_version"),
     ("schema: cosfly.actions\n", "", r"schema: Field required"),
@@ -161,7 +155,8 @@ def test_all_that_is_wrong_with_a_file_is_told_at_once(tmp_path):
     with pytest.raises(ConfigError) as caught:
         read_actions(path)
     for words in (
-        "'yow_deg' is not measured", "no threshold 'label.hard'", "compares nothing", "has no threshold", "'meen_speed'", "precedence names 'cruise'",
+        "'yow_deg' is not measured", "no threshold 'label.hard'", "compares nothing", "has no threshold",
+        "'meen_speed'", "precedence names 'cruise'",
         "cruise_along is implied by something",
     ):  # fmt: skip
         assert words in str(caught.value), words
@@ -274,11 +269,6 @@ def test_it_is_labelled_decided_and_written_in_both_languages(whole, mine):
     assert action_tokens() == read_actions(ACTIONS_FILE).tokens  # nothing stays behind
 
 
-def test_captions_of_another_set_are_not_gone_on_with(whole):
-    with pytest.raises(ResumeError, match="the action table changed"):
-        caption_run(CaptionConfig(), whole / "render", whole / "caption")
-
-
 def test_the_release_says_so_and_verify_goes_by_that(whole, tmp_path):
     dataset = whole / "release/dataset"
     record = read_record(dataset / "release.json")
@@ -310,14 +300,6 @@ def test_exports_take_it_along(whole, tmp_path, form):
     assert report.is_ok, str(report)
 
 
-def test_the_tables_show_it(whole, tmp_path):
-    stats.run(whole / "release/dataset", tmp_path / "stats", pixels=0)
-    rows = {table["key"]: table["rows"] for table in read_json(tmp_path / "stats/stats.json")["tables"]}
-    own = next(row for row in rows["decisions"] if row[0] == OWN)
-    assert own[1] > 0
-    assert own[-1] == "tracking"
-
-
 def test_runs_of_two_sets_go_into_no_release_and_no_training_set(whole, tmp_path):
     plain = caption_run(CaptionConfig(), whole / "render", tmp_path / "plain")
     mixed = [Source.of_run(whole), Source("other", whole / "render", plain)]
@@ -335,13 +317,6 @@ def test_runs_of_two_sets_go_into_no_release_and_no_training_set(whole, tmp_path
             [Prepared("run", whole / "render", bare)],
             tmp_path / "none",
         )
-
-
-def test_one_set_is_one_set(mine):
-    assert one_set([]) is None
-    assert one_set([("a", None), ("b", None)]) is None
-    with pytest.raises(InputError, match="of the same tokens"):
-        one_set([("a", None), ("b", read_actions(ACTIONS_FILE).model_copy(update={"terms": ()}))])
 
 
 def test_students_are_asked_and_scored_with_it(whole, tmp_path):

@@ -1,4 +1,5 @@
-"""The worst answers of tests/test_cosfly_answers.py through `cosfly caption`, and again: no window is lost, none is wrong."""
+"""The worst answers of tests/test_cosfly_answers.py through `cosfly caption`, and again: no window is lost, none is
+wrong."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ def said(text: str | None, reason: object = "stop", **more: object) -> dict:
 SHAPES = [
     (lambda answer: said(answer), True),
     (lambda answer: said(f"{answer}\n</think>\n```json\n{answer}\n```\nHope it helps {{you}}"), True),
-    (lambda answer: said(f"<|channel|>analysis<|message|>{answer}<|end|><|channel|>final<|message|>{answer}<|return|>"), True),
+    (lambda answer: said(f"<|channel|>analysis<|message|>{answer}<|end|><|channel|>final<|message|>{answer}<|return|>"),
+    True),
     (lambda answer: said("", "tool_calls", tool_calls=[{"function": {"name": "f", "arguments": answer}}]), True),
     (lambda answer: said(json.dumps(answer)), True),
     (lambda answer: said(answer.replace('"', "'")), True),

@@ -16,17 +16,16 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
-from specimens_distill import make_caption
 from teacher_server import TeacherServer, is_mirror, kept_answers
 
-from caption.run.progress import Display, duration
+from caption.run.progress import Display
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from cosfly.chat import answers
 from cosfly.chat.answers import Answer, AnswerBook, journal_name
 from cosfly.chat.budget import Budget, BudgetConfig, BudgetSpent
 from cosfly.chat.protocol import encode_body, with_image_ids
-from cosfly.errors import ConfigError, TeacherError
+from cosfly.errors import TeacherError
 from cosfly.products.captions import Usage, read_captions
 from cosfly.work.journal import Journal
 from specimens import make_playback_tree
@@ -79,14 +78,6 @@ def test_a_larger_limit_goes_on_where_a_smaller_one_stopped(tree, tmp_path, whol
             assert len(server.bodies) == 2 * num_windows  # nothing is asked twice
         run(settings(server.url, limit=5), tree, out)  # the folder holds more already: that is no reason to lose it
     assert path.read_bytes() == whole
-
-
-def test_a_larger_limit_goes_on_with_the_rule_teacher_too(tree, tmp_path):
-    out = tmp_path / "out"
-    expected = run(CaptionConfig(), tree, tmp_path / "whole").read_bytes()
-    for limit in (3, 15, None):
-        path = run(CaptionConfig(limit=limit), tree, out)
-    assert path.read_bytes() == expected
 
 
 @pytest.mark.parametrize(
@@ -214,12 +205,6 @@ def test_retry_failed_leaves_alone_what_was_never_asked(tree, tmp_path, whole):
         assert run(settings(server.url), tree, out).read_bytes() == whole
 
 
-def test_the_rule_teacher_has_nothing_to_retry(tree, tmp_path):
-    with pytest.raises(ConfigError, match="never fails"):
-        run(CaptionConfig(), tree, tmp_path / "out", retry_failed=True)
-    assert not (tmp_path / "out").exists()
-
-
 def test_the_total_timeout_bounds_all_tries(tree, tmp_path):
     endpoint = {
         "max_tries": 50,
@@ -282,37 +267,10 @@ def test_log_lines_stand_in_for_the_display(tree, tmp_path, caplog, monkeypatch)
     assert "tokens 44,000 in 4,400 out, cost 0.44" in last
 
 
-class Clock:
-    now_s = 0.0
-
-    def __call__(self) -> float:
-        return self.now_s
-
-
-def test_rate_and_time_left():
-    clock = Clock()
-    budget = Budget(BudgetConfig(), Counter(prompt_tokens=500), first_prompt=1, first_completion=1)
-    display = Display(100, budget, clock)
-    assert display.left_s is None
-    display.skip(40)
-    clock.now_s = 20.0
-    for _ in range(10):
-        display.miss()
-    assert display.rate_per_s == 0.5
-    assert display.left_s is None  # nothing is known of how long a window takes
-    with display.window(), display.window(), display.window(), display.window():
-        for seconds in (30.0, 50.0):
-            display.finish(make_caption("Town01", "trajectory_1", "ORI", 4), seconds)
-        # 48 to do, of which 4 are half done, 4 at a time, each in 40 s; those of earlier runs do not count as speed.
-        assert display.left_s == 46 * 40.0 / 4
-    assert display.tokens() == (0, 0)
-    assert [duration(seconds) for seconds in (42, 420, 12_240, 200_000)] == ["42 s", "7 min", "3.4 h", "2.3 days"]
-
-
 def test_the_panel_shows_the_bar_and_every_figure_on_lines_of_their_own():
     used = Counter()
     budget = Budget(BudgetConfig(price_prompt=2.0), used, first_prompt=1, first_completion=1)
-    display = Display(100, budget, Clock())
+    display = Display(100, budget, lambda: 5.0)
     display.num_accepted, display.num_repaired = 40, 3
     display.dropped.update(structure_cut_short=2, bilingual_number=1)
     used.update(prompt_tokens=100_000, completion_tokens=9_000, answers=88)
@@ -343,7 +301,8 @@ def record(flight: int, window: int, purpose: str = "free/0") -> Answer:
 
 
 def fill(folder: Path, num_flights: int, num_windows: int, unfinished: set[int]) -> None:
-    """Write journals as a run does, the answers of neighbouring flights in any order; an unfinished flight is cut off by a kill."""
+    """Write journals as a run does, the answers of neighbouring flights in any order; an unfinished flight is cut off
+    by a kill."""
 
     async def write() -> None:
         book = AnswerBook(folder)
@@ -405,18 +364,6 @@ def test_only_flights_that_are_worked_on_are_in_memory(tmp_path):
         assert book.totals["answers"] == 15
 
 
-@pytest.mark.parametrize("damage", ["remove", "garbage", "torn"])
-def test_a_lost_line_of_totals_costs_time_only(tmp_path, damage):
-    fill(tmp_path, 5, 4, set())
-    for path in tmp_path.iterdir():
-        lines = path.read_bytes().splitlines(keepends=True)
-        lines[-1] = {"remove": b"", "garbage": b"not a line\n", "torn": lines[-1][:20]}[damage]
-        path.write_bytes(b"".join(lines))
-    with AnswerBook(tmp_path) as book:
-        assert book.totals["answers"] == 20
-        assert book.get(flight_name(3), record(3, 2).key) == record(3, 2)
-
-
 def test_a_disk_that_fails_in_its_own_way_holds_nobody_up(tmp_path, monkeypatch):
     def fails(_) -> None:
         raise OSError(errno.ESTALE, "stale file handle")
@@ -429,29 +376,6 @@ def test_a_disk_that_fails_in_its_own_way_holds_nobody_up(tmp_path, monkeypatch)
     monkeypatch.setattr(Journal, "sync", fails)
     with pytest.raises(OSError, match="stale file handle"):
         asyncio.run(put())
-
-
-def test_answers_after_a_line_of_totals_count_whatever_a_kill_left(tmp_path):
-    fill(tmp_path, 1, 4, set())
-    path = tmp_path / journal_name(flight_name(0))
-
-    async def go_on(window: int) -> None:
-        # And is killed before the next line of totals.
-        await AnswerBook(tmp_path).put(flight_name(0), record(0, window))
-
-    for window in (4, 5):
-        asyncio.run(go_on(window))
-        assert AnswerBook(tmp_path).totals == {
-            "answers": window + 1,
-            "prompt_tokens": 10 * window + 10,
-            "completion_tokens": 2 * window + 2,
-        }
-    with AnswerBook(tmp_path) as book:
-        assert all(book.get(flight_name(0), record(0, window).key) for window in range(6))
-    assert list(Journal(path).read())[-1]["totals"]["answers"] == 6
-    with AnswerBook(tmp_path) as book:
-        assert book.totals["answers"] == 6
-    assert len(list(Journal(path).read())) == 8
 
 
 def test_many_flights_at_once_do_not_use_up_the_open_files(tmp_path, monkeypatch):
@@ -487,11 +411,12 @@ def test_any_flight_has_a_journal_inside_its_folder(tmp_path, flight):
         assert book.get(flight, record(0, 0).key) == record(0, 0)
 
 
-# --- the disk ------------------------------------------------------------------------------------------------------------
+# --- the disk ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_disk_that_fills_up_costs_nothing_that_was_written(tree, tmp_path, whole):
-    """The limit on a file's size stands for the disk: the system cuts the line that passes it short, as a full disk does."""
+    """The limit on a file's size stands for the disk: the system cuts the line that passes it short, as a full disk
+    does."""
     out = tmp_path / "out"
     with hovering() as server:
         config = settings(server.url)

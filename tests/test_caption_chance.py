@@ -1,4 +1,5 @@
-"""What chance gives: the worked-out shares are those of a teacher that guesses, and a run no better than that says so."""
+"""What chance gives: the worked-out shares are those of a teacher that guesses, and a run no better than that says
+so."""
 
 from __future__ import annotations
 
@@ -89,7 +90,8 @@ def test_a_teacher_that_guesses_is_told_apart(captions):
 
 
 def test_a_teacher_below_one_constant_decision_is_told(captions):
-    """Of windows that mostly call for one decision, a teacher that looks may still be right less often than one that does not."""
+    """Of windows that mostly call for one decision, a teacher that looks may still be right less often than one that
+    does not."""
     common = [(caption, motion) for caption, motion in captions if caption.label == "move_backward"]
     wrong = len(common) // 6
     others = [(c, m) for c, m in captions if c.label not in (None, "move_backward")][: wrong - 1]

@@ -1,4 +1,5 @@
-"""Claims: true ones of a true text pass, and one thing wrong in the text, in the claims or in both is a problem that names it."""
+"""Claims: true ones of a true text pass, and one thing wrong in the text, in the claims or in both is a problem that
+names it."""
 
 from __future__ import annotations
 

@@ -6,13 +6,11 @@ import json
 
 import pytest
 from teacher_server import TeacherServer
-from typer.testing import CliRunner
 
-from caption.run.compare import STRATEGIES, compare, run, text_distance
+from caption.run.compare import STRATEGIES, compare, run
 from caption.run.window_loop import Trial
 from caption.schema import CaptionConfig
-from cosfly.cli import app
-from cosfly.errors import InputError, TeacherError
+from cosfly.errors import TeacherError
 from cosfly.products.captions import Coc
 from specimens import make_playback_tree
 
@@ -32,13 +30,6 @@ def test_a_budget_that_is_used_up_is_one_clear_error(tmp_path):
         cfg = CaptionConfig.model_validate({"teacher": server.url, "budget": {"max_tokens": 5_000}})
         with pytest.raises(TeacherError, match=r"budget.max_tokens: .* of at most 5,000 tokens are used; raise it"):
             run(cfg, tree, tmp_path / "out")
-
-
-def test_text_distance():
-    assert text_distance(coc("a b c"), coc("a b c")) == 0.0
-    # The reasoning, one word of four, is shared.
-    assert text_distance(coc("a b c"), coc("x y z")) == pytest.approx(0.75)
-    assert 0.0 < text_distance(coc("a b c d"), coc("a b x d")) < 0.5
 
 
 def test_a_comparison_by_hand():
@@ -83,18 +74,3 @@ def test_a_server_is_asked_once_for_the_first_answers(tree, tmp_path):
         again = run(cfg, tree, tmp_path / "out", conflicts=6)
         assert {c.strategy: c for c in again} == found
         assert len(server.bodies) == num_asked
-
-
-def test_no_conflict_is_an_error_not_a_table_of_zeros(tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 1, 12, with_images=False)
-    cfg = CaptionConfig.model_validate(SETTINGS | {"repair": {"hard_conflict": "keep"}})
-    with pytest.raises(InputError, match="no conflict to repair"):
-        run(cfg, tree, tmp_path / "out")
-
-
-def test_the_command_prints_the_table(tree, tmp_path):
-    words = ["caption", "compare-strategies", "--data", str(tree), "--out", str(tmp_path / "out")]
-    result = CliRunner().invoke(app, [*words, "--set", "caption.window.require_images=false"])
-    assert result.exit_code == 0, result.output
-    assert all(strategy in result.output for strategy in STRATEGIES)
-    assert "100.0 %" in result.output

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Callable, Collection
 from typing import Any
 
@@ -17,11 +16,11 @@ from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.doctor import ODD_WORD, Finding, examine_endpoint, largest_messages
 from caption.teachers.images import pictures_of
-from caption.teachers.trials import SCENES, Drawn, Result, best_way, trial_window
+from caption.teachers.trials import SCENES, Drawn, trial_window
 from caption.truth.facts import measure_facts
 from caption.writing.contract import WAYS
 from cosfly.cli import app
-from cosfly.errors import ConfigError, NothingKept
+from cosfly.errors import NothingKept
 from specimens import make_playback_tree
 
 TOKENS_PER_IMAGE, CONTEXT = 220, 8192
@@ -64,8 +63,10 @@ def patient(
 ) -> Callable[[dict], tuple[int, dict]]:
     """A server's behaviour: what it answers to any request.
 
-    poisons: after a prompt that was too long, 500 to any with a picture of it. shortens: the answer to fit the context, in silence.
-    status: of a refusal for too many pictures. in_parts: the answer is a list of parts. takes_null: where a field may be null.
+    poisons: after a prompt that was too long, 500 to any with a picture of it. shortens: the answer to fit the context,
+    in silence.
+    status: of a refusal for too many pictures. in_parts: the answer is a list of parts. takes_null: where a field may
+    be null.
     """
     poisoned: set[str] = set()
 
@@ -124,7 +125,8 @@ def test_a_sound_endpoint_passes_every_check():
     findings = examine(patient())
     assert {finding.state for finding in findings.values()} == {"ok"}
     assert list(findings) == [
-        "model", "answers", "token usage", "thinking", "finish reason", "JSON schema", "image input", "images per prompt",
+        "model", "answers", "token usage", "thinking", "finish reason", "JSON schema", "image input",
+        "images per prompt",
         "largest prompt", "answer to it", *(f"writes {way}" for way in WAYS), "writing",
     ]  # fmt: skip
     assert f"{TOKENS_PER_IMAGE} tokens" in findings["image input"].detail
@@ -179,11 +181,6 @@ def test_a_defect_is_found(defect, name, state, words):
     assert words in findings[name].detail
 
 
-def test_five_tiled_images_pass_where_fifteen_do_not():
-    findings = examine(patient(max_images=5), image={"layout": "tiled"})
-    assert findings["images per prompt"].state == "ok"
-
-
 def test_an_endpoint_that_is_none_and_a_missing_model(tmp_path):
     with TeacherServer() as server:
         found = examine_endpoint(server.url, CaptionConfig.model_validate({"endpoint": {"model": "other"}}))
@@ -209,11 +206,6 @@ def test_the_doctor_finds_out_what_a_teacher_can_write(can):
         assert f"--set caption.writing={able[0]}" in findings["writing"].detail
 
 
-def test_the_most_common_reason_is_told():
-    assert "claims_false" in examine(patient(can={"prose"}))["writes claims"].detail
-    assert "decision_against_reasoning" in examine(patient(can={"claims"}))["writes prose"].detail
-
-
 def test_an_answer_that_is_cut_short_asks_for_more_tokens():
     whole = patient()
 
@@ -233,13 +225,6 @@ def test_an_answer_that_is_cut_short_asks_for_more_tokens():
 def test_a_server_without_schemas_may_write_all_the_same():
     findings = examine(patient(refuses_schema=True))
     assert findings["writes claims"].state == "ok"
-
-
-def test_of_ways_that_none_masters_the_better_one_is_taken():
-    results = [Result("claims", 0, 3, Counter()), Result("prose", 1, 3, Counter())]
-    assert best_way(results) == "prose"
-    assert best_way(results[:1]) is None
-    assert best_way([Result("claims", 2, 3, Counter()), Result("prose", 3, 3, Counter())]) == "claims"
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.name)
@@ -312,20 +297,6 @@ def test_the_plan_knows_the_images_share(tree, tmp_path):
     assert forecast.image_tokens is not None
     asks = forecast.image_tokens.expected / (15 * TOKENS_PER_IMAGE * forecast.num_windows)
     assert asks == round(asks)  # whole asks of 15 pictures
-
-
-def test_a_plan_needs_an_endpoint(tree, tmp_path):
-    with pytest.raises(ConfigError, match="needs an endpoint"):
-        make_forecast(CaptionConfig(), tree, tmp_path / "out")
-
-
-def test_plan_on_the_command_line_asks_a_few_and_stops(tree, tmp_path):
-    with TeacherServer(decision=lambda body: "hover") as server:
-        words = ["caption", "--teacher", server.url, "--data", str(tree), "--out", str(tmp_path / "out"), "--plan"]
-        result = CliRunner().invoke(app, [*words, "--no-check", "--set", "caption.image.max_side_px=32"])
-        assert result.exit_code == 0, result.output
-    assert any((tmp_path / "out" / "answers").iterdir())
-    assert not (tmp_path / "out" / "captions.jsonl").exists()
 
 
 @pytest.mark.parametrize("writing", ["slots", "claims", "prose"])

@@ -1,7 +1,7 @@
 """Faults of servers, and what a run must make of each. The tables are where the next one is added.
 
-A run loses nothing: what a server refuses for a reason of its own ends it and is no window's fault, what it refuses of one window is kept in
-the server's words, and asked again by `--retry-failed`.
+A run loses nothing: what a server refuses for a reason of its own ends it and is no window's fault, what it refuses of
+one window is kept in the server's words, and asked again by `--retry-failed`.
 """
 
 from __future__ import annotations
@@ -11,14 +11,11 @@ import json
 import logging
 import re
 import threading
-import time
-from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from teacher_server import MODEL, TeacherServer, is_mirror, kept_answers, refusal
+from teacher_server import MODEL, TeacherServer, is_mirror, refusal
 from typer.testing import CliRunner
 
 from caption.run.flights import allot, named_flights
@@ -26,15 +23,13 @@ from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.prompts import make_question
 from caption.teachers.teacher import AskingTeacher, first_budget
-from cosfly.chat import client, throttle
+from cosfly.chat import client
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import NoAnswer, Reply, Request, started
-from cosfly.chat.throttle import Throttle
 from cosfly.cli import app
 from cosfly.errors import ResumeError, TeacherError
 from cosfly.products.captions import read_captions
-from cosfly.reading.objects import CONTEXT_FULL
 from specimens import make_playback_tree
 
 ENDPOINT = {"max_tries": 3, "backoff_s": 0.01, "max_backoff_s": 0.02, "timeout_s": 5.0, "concurrency": 4}
@@ -107,12 +102,14 @@ class Switched:
 # What a server says to every window from some time on: status, words, and what the error must say beside them.
 SERVER_FAULTS = {
     "a lower image limit": (400, IMAGES, "--limit-mm-per-prompt"),
-    "no vision": (500, "image input is not supported - hint: if this is unexpected, you may need to provide the mmproj", "--mmproj"),
+    "no vision": (500, "image input is not supported - hint: if this is unexpected, you may need to provide the mmproj",
+    "--mmproj"),
     "another model": (404, f"The model `{MODEL}` does not exist.", "--model"),
     "a parameter": (400, "Unsupported parameter: 'max_tokens' is not supported with this model.", "extra_body"),
     "no credit": (429, "You exceeded your current quota. insufficient_quota", "account"),
     "a shorter context": (400, TOO_LONG, "--max-model-len"),
-    "a shorter context, TGI": (422, "Input validation error: `inputs` must have less than 4096 tokens. Given: 4545", "max-model-len"),
+    "a shorter context, TGI": (422, "Input validation error: `inputs` must have less than 4096 tokens. Given: 4545",
+    "max-model-len"),
     "a shorter context, llama.cpp": (500, "Context size has been exceeded.", "--ctx-size"),
     "a filter that stops all": (400, FILTERED, "filter"),
     "a proxy with a small body": (413, "<html>413 Request Entity Too Large</html>", "see to the server"),
@@ -140,25 +137,14 @@ def test_what_is_the_servers_fault_ends_the_run_and_is_no_windows(tree, tmp_path
         assert run(settings(server.url), tree, out).read_bytes() == whole.product
 
 
-TOLD_APART = ("a lower image limit", "a shorter context", "words that nobody knows", "a schema that is not the cause")
-
-
-@pytest.mark.parametrize("name", TOLD_APART)
-def test_a_server_that_is_at_fault_from_the_start_ends_the_run_at_once(tree, tmp_path, name):
-    status, text, words = SERVER_FAULTS[name]
-    with hovering(Switched(status, text, 0)) as server, pytest.raises(TeacherError, match=words):
-        run(settings(server.url), tree, tmp_path / "out")
-    assert len(server.bodies) < 30
-    assert kept_answers(tmp_path / "out") == []
-
-
 # --- the window's fault -----------------------------------------------------------------------------------------------
 
 # What a server says to some windows while it answers the others: status, words, and the reason they are dropped for.
 WINDOW_FAULTS = {
     "too long": (400, TOO_LONG, "refused_too_long"),
     "too long, llama.cpp": (500, "Context size has been exceeded.", "refused_too_long"),
-    "too long, LM Studio": (200, "Trying to keep the first 9136 tokens when context the overflows. However, the model is loaded with context length of only 4096 tokens.", "refused_too_long"),
+    "too long, LM Studio": (200, "Trying to keep the first 9136 tokens when context the overflows. However, the model "
+    "is loaded with context length of only 4096 tokens.", "refused_too_long"),
     "filtered": (400, FILTERED, "refused_content"),
     "flagged": (403, "Your chosen model requires moderation and your input was flagged.", "refused_content"),
     "a picture": (400, "cannot identify image file <_io.BytesIO object at 0x7f2a>", "refused_picture"),
@@ -215,19 +201,6 @@ def test_retry_failed_asks_about_what_was_refused_and_nothing_else(tree, tmp_pat
     assert (out / "manifest.json").exists()
 
 
-def test_seven_windows_that_are_too_long_cost_seven(tree, tmp_path, caplog, whole):
-    out = tmp_path / "out"
-    with hovering(Picky(400, TOO_LONG, whole.seeds[:7])) as server:
-        path = run(settings(server.url), tree, out)
-        num_asked = len(server.bodies)
-    assert Counter(caption.status for caption in read_captions(path)) == {"accepted": 3, "dropped": 7}
-    assert report_of(out)["structured"] == {"json_schema": 3, "none": 7}
-    assert num_asked - 7 - 3 * 2 <= 7  # trial prompts: one answers for all that were refused before it
-    assert (
-        sum("7 windows were dropped: refused_too_long (HTTP 400 This model's" in line for line in caplog.messages) == 1
-    )
-
-
 def test_refusals_between_which_windows_are_answered_cost_one_trial_prompt(tree, tmp_path, whole):
     """Asked one after the other, so that it is plain which answer came before which refusal; every third is refused."""
 
@@ -266,17 +239,6 @@ def test_a_filter_that_stops_a_trial_prompt_by_chance_ends_no_run(tree, tmp_path
     assert report_of(tmp_path / "out")["windows"]["dropped"] == {"refused_content": 1}
 
 
-def test_a_retry_that_is_refused_again_changes_nothing(tree, tmp_path, whole):
-    out = tmp_path / "out"
-    with hovering(Picky(400, FILTERED, whole.seeds[:2])) as server:
-        before = run(settings(server.url), tree, out).read_bytes()
-        held = quarantine(out)
-        assert run(settings(server.url), tree, out, retry_failed=True).read_bytes() == before
-    assert quarantine(out) == held
-    assert len(held) == 2
-    assert (out / "manifest.json").exists()
-
-
 def test_a_retry_with_a_smaller_limit_is_refused_and_leaves_the_folder_complete(tree, tmp_path, whole):
     out = tmp_path / "out"
     with hovering(Picky(400, FILTERED, whole.seeds[:1])) as server:
@@ -288,7 +250,8 @@ def test_a_retry_with_a_smaller_limit_is_refused_and_leaves_the_folder_complete(
 
 
 def test_a_server_that_answers_no_trial_prompt_leaves_it_open_whose_fault_it_was(tree, tmp_path):
-    """It goes away right after a refusal: then the window has no answer, which is asked for again, and is not dropped."""
+    """It goes away right after a refusal: then the window has no answer, which is asked for again, and is not
+    dropped."""
     seen: set[int] = set()
 
     def respond(body):
@@ -367,18 +330,6 @@ def test_an_answer_that_the_server_had_no_room_for_is_named_and_not_asked_for_th
     assert path.read_bytes() == whole.product
 
 
-@pytest.mark.parametrize(("context", "fault", "expected"), [
-    (1100, "no_room", CONTEXT_FULL), (None, "no_room", CONTEXT_FULL), (8192, "no_room", "length"), (1100, "cut", "length"),
-    (1100, None, "stop"),
-])  # fmt: skip
-def test_an_answer_is_said_to_fill_the_context_where_it_does(context, fault, expected):
-    facts = {} if context is None else {"max_model_len": context}
-    with hovering(fault=lambda number, body: fault, model_facts=facts) as server:
-        reply = ask(server.url)
-    assert isinstance(reply, Reply)
-    assert reply.finish_reason == expected
-
-
 def ask(url: str, **changes) -> Reply | NoAnswer:
     cfg = EndpointConfig(**{**ENDPOINT, "max_tries": 2, **changes})
     request = cfg.request(
@@ -442,65 +393,7 @@ def test_an_outage_is_shown_with_the_servers_last_word(tree, tmp_path, caplog, m
     ]
 
 
-def test_the_log_does_not_promise_a_try_that_does_not_come(caplog):
-    with hovering(lambda body: refusal(503, "Loading model")) as server:
-        assert isinstance(ask(server.url, max_tries=1), NoAnswer)
-        assert isinstance(ask(server.url, total_timeout_s=0.001, backoff_s=1.0, max_backoff_s=1.0), NoAnswer)
-    words = [f"{server.url}: HTTP 503 Loading model; given up, failed tries so far: 1"]
-    assert [line for line in caplog.messages if "failed tries" in line] == 2 * words
-
-
-def test_a_silent_server_is_shown_too(tree, tmp_path, caplog, monkeypatch):
-    monkeypatch.setattr("caption.run.asking.SECONDS_BETWEEN_LINES", 0.05)
-    monkeypatch.setattr("caption.run.progress.SECONDS_BETWEEN_LINES", 0.05)
-    caplog.set_level(logging.INFO)
-    with hovering(delay_s=0.4) as server:
-        run(settings(server.url, limit=1), tree, tmp_path / "out")
-    assert sum("0 of 1 windows" in line for line in caplog.messages) >= 3
-
-
 # --- the ramp ---------------------------------------------------------------------------------------------------------
-
-
-def num_at_once(monkeypatch, ceiling: int, ramp_s: float, expected: int, note: Callable[[Throttle], object]) -> int:
-    """Give how many slots are held where no answer comes back: once they are as many as expected, or after 10 s."""
-    monkeypatch.setattr(throttle, "RAMP_S", ramp_s)
-
-    async def hold(one: Throttle) -> None:
-        async with one.slot():
-            note(one)
-            await asyncio.sleep(60)
-
-    async def fill() -> int:
-        one = Throttle(ceiling)
-        tasks = [asyncio.create_task(hold(one)) for _ in range(ceiling)]
-        end_s = time.monotonic() + 10.0
-        await asyncio.sleep(0.2)
-        while one.num_active < expected and time.monotonic() < end_s:
-            await asyncio.sleep(0.02)
-        count = one.num_active
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        assert one.num_active == 0
-        return count
-
-    return asyncio.run(fill())
-
-
-def test_the_limit_doubles_while_no_answer_has_come_yet(monkeypatch):
-    assert num_at_once(monkeypatch, 256, 60.0, 8, lambda one: None) == 8
-    assert num_at_once(monkeypatch, 256, 0.02, 256, lambda one: None) == 256
-
-
-def test_a_busy_server_and_one_that_fails_stop_the_growth(monkeypatch):
-    assert num_at_once(monkeypatch, 64, 0.02, 1, lambda one: one.was_busy(0.0, None)) <= 8
-
-    def fail_for_ever(one: Throttle) -> None:
-        asyncio.get_running_loop().call_later(0.001, fail_for_ever, one)
-        one.failed()
-
-    assert num_at_once(monkeypatch, 64, 1.0, 8, fail_for_ever) == 8
 
 
 def test_retry_failed_leaves_a_folder_complete_in_which_a_flight_cannot_be_read(tmp_path):

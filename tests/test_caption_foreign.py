@@ -1,4 +1,5 @@
-"""Captions of somebody else: a file in a teacher's place is judged, reported and recorded as answers are, and asked nothing again."""
+"""Captions of somebody else: a file in a teacher's place is judged, reported and recorded as answers are, and asked
+nothing again."""
 
 from __future__ import annotations
 
@@ -10,12 +11,11 @@ from specimens_distill import prepared
 from teacher_server import MODEL, TeacherServer
 from typer.testing import CliRunner
 
-from caption.run.compare import run as compare_strategies
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.foreign import read_foreign, read_student
 from cosfly.cli import app
-from cosfly.errors import ConfigError, InputError, NothingKept, ResumeError
+from cosfly.errors import InputError, NothingKept
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.settings import InspectConfig
 from cosfly.products.captions import Caption, Language, read_captions, write_captions
@@ -91,12 +91,6 @@ def test_a_file_is_judged_as_answers_are(tree, rules, tmp_path):
         {},
         None,
     )  # no server, and nothing that --retry-failed could mend
-
-
-def test_another_file_does_not_go_on_where_one_stopped(tree, rules, tmp_path):
-    captions_of([line(caption) for caption in rules], tree, tmp_path / "a", limit=2)
-    with pytest.raises(ResumeError):
-        captions_of([line(caption, decision="hover") for caption in rules], tree, tmp_path / "a")
 
 
 def test_a_contradiction_is_on_record_and_drops_its_window_unless_the_settings_say_otherwise(tree, rules, tmp_path):
@@ -194,12 +188,7 @@ def test_captions_of_no_window_are_told(tree, rules, tmp_path, caplog):
     assert "1 captions of" in caplog.text
 
 
-def test_strategies_are_not_compared_on_a_file(tree, tmp_path):
-    with pytest.raises(ConfigError, match="cannot be asked"):
-        compare_strategies(CaptionConfig(teacher=f"file:{tmp_path / 'x'}"), tree, tmp_path / "out")
-
-
-# --- a student's predictions --------------------------------------------------------------------------------------------
+# --- a student's predictions ------------------------------------------------------------------------------------------
 
 
 def predicted(caption: Caption, language: Language, text: str | None = None, *, is_finished: bool = True) -> Prediction:

@@ -8,19 +8,18 @@ from collections import Counter
 
 import pytest
 from teacher_server import TeacherServer
-from typer.testing import CliRunner
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig, JudgeConfig
 from caption.teachers.judge import JUDGEMENTS, UNJUDGED, check_judge, gold_conflicts, judge_messages, parse_judgement
-from cosfly.cli import app
-from cosfly.errors import InputError, TeacherError
+from cosfly.errors import TeacherError
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
 
 
 def judging_server(answer):
-    """A chat server whose text is `answer(body)`. It takes its time, so that requests meet there on a busy machine too."""
+    """A chat server whose text is `answer(body)`. It takes its time, so that requests meet there on a busy machine
+    too."""
 
     server = TeacherServer(delay_s=0.05)
     server.text = answer
@@ -196,17 +195,3 @@ def test_a_judge_that_takes_the_first_option_is_found_out():
 def test_a_judge_that_cannot_be_read_is_counted_and_agrees_with_nothing():
     found = checked(lambda body: "yes, fine")
     assert (found.agreement, found.num_unjudged) == (0.0, 387)
-
-
-def test_a_check_needs_a_judge():
-    with pytest.raises(InputError, match="no judge to check"):
-        asyncio.run(check_judge(JudgeConfig(), gold_conflicts()))
-
-
-def test_the_command_prints_the_figures():
-    known = gold_answers()
-    with judging_server(lambda body: say(known[body["messages"][1]["content"]])) as server:
-        result = CliRunner().invoke(app, ["caption", "judge-check", server.url])
-    assert result.exit_code == 0, result.output
-    for words in ("agreement", "100.0 %", "position bias", "unparsable"):
-        assert words in result.output

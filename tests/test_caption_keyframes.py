@@ -74,9 +74,3 @@ def test_a_run_reports_what_it_saved(tmp_path):
         caption.checks.keyframe = None
         assert caption == every[caption.sample_id]
     assert json.loads((tmp_path / "plain" / "caption_report.json").read_text())["keyframes"] is None
-
-
-def test_limit_counts_keyframes(tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 2, 40, with_images=False)
-    settings = {"window": {"require_images": False, "keyframes": True}, "limit": 7}
-    assert len(list(read_captions(run(CaptionConfig.model_validate(settings), tree, tmp_path / "out")))) == 7

@@ -1,4 +1,5 @@
-"""Orders of a mission in captions: they give labels, and a teacher is told of them from the frame on at which the drone knows."""
+"""Orders of a mission in captions: they give labels, and a teacher is told of them from the frame on at which the drone
+knows."""
 
 import dataclasses
 import shutil

@@ -1,5 +1,5 @@
-"""A real model behind a real server: random weights, so noise, but decoded under our schema. Every answer must parse, and every
-window must end somewhere."""
+"""A real model behind a real server: random weights, so noise, but decoded under our schema. Every answer must parse,
+and every window must end somewhere."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Prompts of somebody's own: exported, checked line by line, asked with, kept beside the captions, and followed by students."""
+"""Prompts of somebody's own: exported, checked line by line, asked with, kept beside the captions, and followed by
+students."""
 
 from __future__ import annotations
 
@@ -13,8 +14,7 @@ from typer.testing import CliRunner
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig
-from caption.teachers.prompt_files import PROMPTS, export_prompts, own_prompts, prompt_format, read_prompt
-from caption.teachers.prompts import system_prompt
+from caption.teachers.prompt_files import PROMPTS, export_prompts, own_prompts
 from cosfly.chat.student_chat import write_taught
 from cosfly.cli import app
 from cosfly.errors import ConfigError, ResumeError
@@ -131,14 +131,6 @@ def test_captions_are_asked_with_them_and_keep_them(tree, mine, tmp_path):
         run(CaptionConfig(prompts=mine), tree, out)
 
 
-def test_where_the_folder_stands_makes_no_difference(tree, tmp_path):
-    out = tmp_path / "out"
-    run(CaptionConfig(prompts=export(tmp_path / "one")), tree, out)
-    before = (out / "captions.jsonl").stat().st_mtime_ns
-    run(CaptionConfig(prompts=export(tmp_path / "two")), tree, out)
-    assert (out / "captions.jsonl").stat().st_mtime_ns == before
-
-
 def test_a_teacher_is_sent_them(tree, mine, tmp_path):
     with TeacherServer(decision=lambda body: "track_straight") as server:
         cfg = {"teacher": server.url, "prompts": mine, "writing": "prose", "limit": 2, "endpoint": {"max_tries": 1}}
@@ -169,12 +161,3 @@ def test_training_sets_and_students_follow(tree, mine, tmp_path):
             run(CaptionConfig.model_validate(asked), tree, tmp_path / "no")
         run(CaptionConfig.model_validate(asked | {"prompts": mine}), tree, tmp_path / "yes")
         assert OWN_LINE.replace("$$", "$") in json.loads(server.bodies[0])["messages"][0]["content"]
-
-
-def test_what_is_kept_is_forgotten_when_another_file_takes_its_place():
-    before = system_prompt("en"), prompt_format("user_en")
-    with in_place.put(prompts={"system_en": "# version: 9\nBe $actions\n", "user_en": "# version: 9\n$speed%\n"}):
-        assert system_prompt("en").startswith("Be track_straight, ")
-        assert prompt_format("user_en") == "%(speed)s%%"
-        assert read_prompt("hint_en").template  # what is not given is what ships
-    assert (system_prompt("en"), prompt_format("user_en")) == before

@@ -1,4 +1,5 @@
-"""Prose read into claims by a language model: a perfect reader, readers with stated faults, and a run with one. No real model is asked."""
+"""Prose read into claims by a language model: a perfect reader, readers with stated faults, and a run with one. No real
+model is asked."""
 
 from __future__ import annotations
 
@@ -107,7 +108,8 @@ def reading_of(body: dict) -> str:
     """Read a made-up text of one sentence each: the altitude that it gives."""
     lines = re.findall(r"^(\w\d): (.*)$", body["messages"][1]["content"], re.MULTILINE)
     claims = [
-        {"sentence": name, "quantity": "altitude", "at": "t4", "value": float(found[1]), "unit": "m", "modality": "observed",
+        {"sentence": name, "quantity": "altitude", "at": "t4", "value": float(found[1]), "unit": "m",
+        "modality": "observed",
          "quote": found[0]}
         for name, text in lines if (found := re.search(r"([\d.]+) m", text))
     ]  # fmt: skip

@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from caption.run.ledger import NUM_CARDS, CaptionReport, Shelf
+from caption.run.ledger import NUM_CARDS, CaptionReport
 from caption.run.report import page_html
 from caption.run.stage import run
 from caption.schema import CaptionConfig
@@ -97,19 +97,6 @@ def test_cost_is_told_when_there_are_prices(done):
     page = page_html(report, [], {}, BudgetConfig(price_prompt=0.5, price_completion=3.0), "x")
     assert ">1.30<" in page
     assert "no prices set" in page_html(report, [], {}, BudgetConfig(), "x")
-
-
-def test_cards_do_not_depend_on_the_order_and_show_every_kind(done):
-    captions = list(read_captions(done / "captions.jsonl"))
-    forward, backward = Shelf(), Shelf()
-    for caption in captions:
-        forward.add(caption)
-    for caption in reversed(captions):
-        backward.add(caption)
-    assert forward.cards() == backward.cards()
-    shown = {"repaired" if caption.repair else caption.verdict for caption in forward.cards()}
-    assert shown == {"repaired" if caption.repair else caption.verdict for caption in captions}
-    assert len({caption.sample_id for caption in forward.cards()}) == NUM_CARDS
 
 
 def test_sentences_are_marked_by_what_was_read_of_them(done):

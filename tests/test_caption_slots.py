@@ -21,7 +21,7 @@ from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig, WindowConfig
 from caption.teachers.statements import describe
 from caption.truth.facts import Facts, measure_facts
-from caption.truth.mirror import check_mirror, check_translation
+from caption.truth.mirror import check_translation
 from caption.truth.references import Fact, look_up, parse_reference
 from caption.writing.contract import Draft, Refused
 from caption.writing.filling import Filler
@@ -150,12 +150,6 @@ def test_what_is_refused_says_why_and_what_is_allowed(language, text, reason, wo
     assert words in found.complaint
 
 
-def test_a_decision_without_a_side_has_none():
-    found = filled("It goes to the {side:decision}.", decision="hover")
-    assert isinstance(found, Refused)
-    assert found.reason == "slots_no_side"
-
-
 # --- good templates are not refused -----------------------------------------------------------------------------------
 
 # Written before the checks were tried on them: what a careful writer puts down who has read the prompt.
@@ -258,10 +252,11 @@ def test_natural_templates_are_not_refused(language):
     assert len(refused) <= 0.05 * len(texts), refused
 
 
-# --- right by construction: the filler against an oracle of its own ----------------------------------------------------
+# --- right by construction: the filler against an oracle of its own ---------------------------------------------------
 
 SERIES = {  # slot -> field, digits, unit in both languages
-    "speed": ("speed_mps", 2, "m/s", "米/秒"), "altitude": ("altitude_m", 1, "m", "米"), "pitch": ("pitch_deg", 1, "deg", "度"),
+    "speed": ("speed_mps", 2, "m/s", "米/秒"), "altitude": ("altitude_m", 1, "m", "米"), "pitch": ("pitch_deg", 1, "deg",
+    "度"),
     "yaw": ("yaw_deg", 1, "deg", "度"), "distance": ("distance_m", 1, "m", "米"), "slant": ("slant_m", 1, "m", "米"),
     "box_width": ("box_width_px", 0, "px", "像素"), "offset_x": ("offset_x_px", 0, "px", "像素"),
     "travelled": ("travelled_m", 1, "m", "米"), "bearing": ("bearing_deg", 1, "deg", "度"),
@@ -331,12 +326,6 @@ def test_a_size_and_its_side_are_its_sign(facts, name, frame):
     assert "-" not in text
 
 
-@given(st.text(max_size=80), st.sampled_from(["en", "zh"]))
-def test_no_text_breaks_the_reader(text, language):
-    found = read_sentence(text, language, 5, 0.5)
-    assert isinstance(found, Sentence | Refused)
-
-
 # --- the mirror -------------------------------------------------------------------------------------------------------
 
 
@@ -367,19 +356,6 @@ def test_the_mirror_holds_the_same_slots_sentence_by_sentence(english, chinese, 
     assert (found.reason if isinstance(found, Refused) else None) == reason
     if isinstance(found, Refused):
         assert found.complaint
-
-
-def test_an_english_text_is_no_chinese_mirror():
-    coc = Coc(
-        critical_components="The walker is in sight of it.",
-        reasoning_trace="Nothing has to change at all.",
-        flight_decision="hover",
-    )
-    assert check_mirror(coc, coc, {}) == "script"
-    half = coc.model_copy(
-        update={"critical_components": "行人在视野内。", "reasoning_trace": "没有变化。 Nothing has to change at all."}
-    )
-    assert check_mirror(coc, half, {}) == "script"
 
 
 def test_a_translation_has_the_same_sentences_and_the_glossarys_words():
@@ -439,7 +415,8 @@ def test_a_sentence_is_proved_only_where_its_words_are_true_with_its_slots():
 
 
 def test_the_words_of_a_comparison_a_place_and_a_way_are_those_of_the_window():
-    """FOLLOW: the drone does 3.4 m/s and the walker 1.4; he is 52 px right of the middle and walks ahead of the drone."""
+    """FOLLOW: the drone does 3.4 m/s and the walker 1.4; he is 52 px right of the middle and walks ahead of the
+    drone."""
     cases = {
         ("en", "The walker is {compare:target_speed,drone_speed} the drone."): "The walker is slower than the drone.",
         ("zh", "行人{compare:target_speed,drone_speed}无人机。"): "行人慢于无人机。",
@@ -543,8 +520,8 @@ def test_an_answer_that_stays_wrong_drops_its_window_for_that_reason(tree, tmp_p
 def test_the_question_shows_what_is_known_by_its_slot(tree, tmp_path):
     table = fact_table(FACTS)
     assert (
-        "{distance@t0} to {distance@t4}: 20.0, 20.5, 21.0, -, 18.0 m; {change:distance} -2.0 m; {trend:distance} decreases"
-        in table
+        "{distance@t0} to {distance@t4}: 20.0, 20.5, 21.0, -, 18.0 m; {change:distance} -2.0 m; {trend:distance} "
+        "decreases" in table
     )
     assert "{side:offset_x} left" in table
     # Not known.
@@ -562,12 +539,6 @@ def test_every_slot_of_the_table_can_be_written():
             if text != "to":
                 found = filled(f"it {{{address}}} it", "en", facts)
                 assert found == f"it {text} it" or text.startswith("to {"), address
-
-
-@pytest.mark.parametrize("writing", ["prose", "claims"])
-def test_the_rule_teacher_writes_slots(writing):
-    with pytest.raises(ValueError, match="rule teacher writes slots"):
-        CaptionConfig.model_validate({"writing": writing})
 
 
 def test_actions_named_in_words_are_those_of_the_answer():

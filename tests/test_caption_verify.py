@@ -1,4 +1,5 @@
-"""Evidence and mirror checks: the paper's own sample passes, planted contradictions fail, clean captions raise no alarm."""
+"""Evidence and mirror checks: the paper's own sample passes, planted contradictions fail, clean captions raise no
+alarm."""
 
 from __future__ import annotations
 
@@ -32,8 +33,8 @@ PAPER_EN = Coc(
     reasoning_trace=(
         "The target motion is visually stable and straight. The earlier increase in distance indicates the drone was "
         "briefly slower than the pedestrian, but the current speed of 1.02 m/s now matches the target's 1.00 m/s, "
-        "stabilizing the gap. Since yaw is aligned and the path is obstacle-free, the correct action is to maintain the "
-        "current trajectory."
+        "stabilizing the gap. Since yaw is aligned and the path is obstacle-free, the correct action is to maintain "
+        "the current trajectory."
     ),
     flight_decision="track_straight",
 )
@@ -131,11 +132,6 @@ def test_mirror_check(en, zh, reason):
     assert check_mirror(*pair(en, zh), {}) == reason
 
 
-def test_another_decision_fails():
-    other = PAPER_ZH.model_copy(update={"flight_decision": "hover"})
-    assert check_mirror(PAPER_EN, other, FLIGHT) == "decision"
-
-
 def test_plain_prose_is_unread_but_for_what_is_surely_wrong():
     cases = {
         "The horizontal distance increases from 20.0 m to 21.4 m": [],
@@ -198,7 +194,7 @@ def test_rule_captions_are_one_record_in_two_languages():
         assert check_mirror(en, bad, flight_numbers(facts)) == "number"
 
 
-# --- the rule teacher ---------------------------------------------------------------------------------------------------
+# --- the rule teacher -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("decision", action_tokens())
@@ -235,10 +231,3 @@ def test_the_rule_teacher_decides_from_what_it_sees():
         {"distance_m": (20.0, 21.0, 19.0, 23.0, 22.0), "target_speed_mps": 2.0},
     ):
         assert decide(dataclasses.replace(base, **change)) == "track_straight"
-
-
-def test_wording_varies_with_the_sample_and_not_with_the_run():
-    facts = clean_captions(1)[0][0]
-    texts = {write_answers(facts, np.random.default_rng(seed))[0].critical_components for seed in range(30)}
-    assert len(texts) >= 10
-    assert write_answers(facts, np.random.default_rng(1)) == write_answers(facts, np.random.default_rng(1))

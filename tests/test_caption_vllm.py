@@ -1,8 +1,8 @@
 """The vLLM engine without vLLM: what it asks of the engine, how it reads what the engine gives back, and its absence.
 
-The stand-in behaves as vLLM 0.26 did on one H200: `enqueue_chat` gives an id with a random part that the output lacks and raises
-ValueError for a prompt that is too long, `step` gives what is finished in any order, a dead engine raises an Exception of its own,
-and `disable_any_whitespace` is refused unless a backend is named.
+The stand-in behaves as vLLM 0.26 did on one H200: `enqueue_chat` gives an id with a random part that the output lacks
+and raises ValueError for a prompt that is too long, `step` gives what is finished in any order, a dead engine raises an
+Exception of its own, and `disable_any_whitespace` is refused unless a backend is named.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ from teacher_server import CHINESE, ENGLISH, is_mirror
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.teacher import make_engine
-from cosfly.chat.contract import Reply
-from cosfly.chat.vllm_engine import VllmEngine, read_output
-from cosfly.errors import ConfigError, EnvironmentMissing, InputError, TeacherError
+from cosfly.chat.vllm_engine import VllmEngine
+from cosfly.errors import ConfigError, EnvironmentMissing, TeacherError
 from cosfly.products.captions import Usage, read_captions
 from cosfly.products.predictions import read_predictions
 from distill.inference import stage as infer
@@ -133,12 +132,6 @@ def test_without_vllm_one_line_says_what_to_install(model, tmp_path):
         run(CaptionConfig(teacher=f"vllm:{model}"), tree, tmp_path / "out")
 
 
-def test_a_folder_that_is_no_model(tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 1, 12, with_augmented=False)
-    with pytest.raises(InputError, match="not a model folder"):
-        run(CaptionConfig(teacher=f"vllm:{tmp_path}"), tree, tmp_path / "out")
-
-
 def test_the_engine_gets_our_images_and_no_free_whitespace(model):
     own = {"max_model_len": 8192, "engine": {"gdn_prefill_backend": "triton"}}
     arguments = engine_of(model, vllm=own).arguments()
@@ -166,11 +159,6 @@ def test_a_request_holds_sampling_and_schema(stand_in, model):
     more = parameters_of(extra_body={"top_k": 20, "chat_template_kwargs": {"enable_thinking": False}})
     assert more["top_k"] == 20
     assert "chat_template_kwargs" not in more  # goes to the call itself: see the templates below
-
-
-def test_an_output_is_read():
-    found = read_output(output("{}", 10, "length"), "json_schema")
-    assert found == Reply("{}", Usage(prompt_tokens=10, completion_tokens=7), "json_schema", "length")
 
 
 def test_what_vllm_does_not_know_is_a_setting_not_a_crash(stand_in, model):

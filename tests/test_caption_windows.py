@@ -57,15 +57,6 @@ def test_current_frames_have_a_whole_past_and_future(num_points, stride, expecte
     assert list(current_frames(num_points, WindowConfig(stride=stride))) == expected
 
 
-def test_samples_carry_their_frames_and_ids(tree):
-    samples = list(cut_windows(flight_in(tree), WindowConfig(stride=2)))
-    assert [sample.observed.indices[-1] for sample in samples] == [4, 6, 8, 10]
-    assert samples[0].observed.sample_id == "trajectory_1776047127_ORI_frame_00004"
-    assert samples[1].observed.indices == (2, 3, 4, 5, 6)
-    assert samples[1].future.indices == (7, 8, 9, 10, 11)
-    assert next(folder.name for folder in samples[1].observed.frame_folders) == "frame_00002"
-
-
 def test_the_observed_type_has_no_future_and_shares_no_memory_with_it(tree):
     flight = flight_in(tree)
     sample = next(cut_windows(flight, WindowConfig()))
@@ -279,7 +270,8 @@ NUM_POINTS = 160
 
 @pytest.fixture(scope="module")
 def two_tracks(tmp_path_factory):
-    """A clean flight and what the renderer's own perturbation makes of it, on disk; the person is hidden at other times."""
+    """A clean flight and what the renderer's own perturbation makes of it, on disk; the person is hidden at other
+    times."""
     clean, scene = make_flight(NUM_POINTS, seed=5)
     boxes = make_box_map(
         scene.centers,

@@ -14,7 +14,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from caption.teachers.judge import parse_judgement
 from cosfly.chat.contract import Reply, Request
 from cosfly.chat.protocol import error_words, read_body, read_completion, read_models
 from cosfly.chat.wire import Response
@@ -79,37 +78,50 @@ BODIES: list[tuple[str, bytes, str | tuple[str]]] = [
     ("vLLM, Qwen3 and R1: the JSON in the reasoning", assistant(content=None, reasoning_content=TEXT), ""),
     ("vLLM, Gemma 4: channel left open", assistant(content="", reasoning=f"thought {TEXT}"), ""),
     ("Ollama: field thinking", assistant(content="", thinking="still at it"), ""),
-    ("vLLM, DeepSeek V4: thoughts up to max_tokens", completion({"content": None, "reasoning": "so"}, finish_reason="length"), ""),
+    ("vLLM, DeepSeek V4: thoughts up to max_tokens", completion({"content": None, "reasoning": "so"},
+    finish_reason="length"), ""),
     ("gpt-oss on vLLM: neither content nor reasoning", assistant(content=None, reasoning=None), ("no text",)),
     ("proxies: no content", assistant(), ("no text",)),
     ("proxies: empty content", assistant(content=""), ""),
     ("proxies: a number", assistant(content=17), ("no text",)),
-    ("OpenAI SDK servers: parts", assistant(content=[{"type": "text", "text": TEXT[:9]}, {"type": "text", "text": TEXT[9:]}]), TEXT),
-    ("Mistral, Magistral: thinking part", assistant(content=[{"type": "thinking", "thinking": [{"type": "text", "text": "{}"}]}, {"type": "text", "text": TEXT}]), TEXT),
-    ("proxies of Anthropic: thinking part", assistant(content=[{"type": "thinking", "thinking": "{}"}, {"type": "text", "text": TEXT}]), TEXT),
-    ("gateways: a reasoning part that has a text", assistant(content=[{"type": "reasoning", "text": "{}"}, {"type": "output_text", "text": TEXT}]), TEXT),
+    ("OpenAI SDK servers: parts", assistant(content=[{"type": "text", "text": TEXT[:9]}, {"type": "text",
+    "text": TEXT[9:]}]), TEXT),
+    ("Mistral, Magistral: thinking part", assistant(content=[{"type": "thinking", "thinking": [{"type": "text",
+    "text": "{}"}]}, {"type": "text", "text": TEXT}]), TEXT),
+    ("proxies of Anthropic: thinking part", assistant(content=[{"type": "thinking", "thinking": "{}"}, {"type": "text",
+    "text": TEXT}]), TEXT),
+    ("gateways: a reasoning part that has a text", assistant(content=[{"type": "reasoning", "text": "{}"},
+    {"type": "output_text", "text": TEXT}]), TEXT),
     ("gateways: parts without a type", assistant(content=[{"text": TEXT}]), TEXT),
     ("gateways: parts that are texts", assistant(content=[TEXT]), TEXT),
     ("gateways: one part that is no list", assistant(content={"type": "text", "text": TEXT}), TEXT),
     ("gateways: the object itself", assistant(content=GOOD), json.dumps(GOOD, separators=(",", ":"))),
-    ("gateways: parts of other kinds", assistant(content=[{"type": "image_url"}, None, 3, {"type": "text", "text": 3}]), ""),
+    ("gateways: parts of other kinds", assistant(content=[{"type": "image_url"}, None, 3, {"type": "text", "text": 3}]),
+    ""),
     ("LiteLLM: a schema served by a function", assistant(content=None, tool_calls=[called(TEXT)]), TEXT),
-    ("Groq, Kimi K2: the same", completion({"content": None, "tool_calls": [called(TEXT)]}, finish_reason="tool_calls"), TEXT),
-    ("Ollama: arguments that are an object", assistant(content="", tool_calls=[called(GOOD)]), json.dumps(GOOD, separators=(",", ":"))),
+    ("Groq, Kimi K2: the same", completion({"content": None, "tool_calls": [called(TEXT)]}, finish_reason="tool_calls"),
+    TEXT),
+    ("Ollama: arguments that are an object", assistant(content="", tool_calls=[called(GOOD)]), json.dumps(GOOD,
+    separators=(",", ":"))),
     ("the old way: function_call", assistant(content=None, function_call={"name": "answer", "arguments": TEXT}), TEXT),
-    ("Llama: two calls, nobody knows which", assistant(content=None, tool_calls=[called(TEXT), called(TEXT)]), ("no text",)),
+    ("Llama: two calls, nobody knows which", assistant(content=None, tool_calls=[called(TEXT), called(TEXT)]),
+    ("no text",)),
     ("vLLM: a call without arguments", assistant(content=None, tool_calls=[{"function": None}, 3]), ("no text",)),
-    ("OpenAI: refusal", assistant(content=None, refusal="I'm sorry, I can't help with that."), "I'm sorry, I can't help with that."),
+    ("OpenAI: refusal", assistant(content=None, refusal="I'm sorry, I can't help with that."),
+    "I'm sorry, I can't help with that."),
     ("gateways: leading white space to keep the line open", b"\n\n  \n" + assistant(content=TEXT), TEXT),
     ("gateways on Windows: BOM", b"\xef\xbb\xbf" + assistant(content=TEXT), TEXT),
     ("llama.cpp: half a pair of surrogates", assistant(content="on \ud83d"), "on \ufffd"),
     ("OpenRouter: raw bytes of half a pair", assistant(content="on Q").replace(b"Q", b"\xed\xa0\xbd"), "on \ufffd"),
     ("any server: a whole pair", assistant(content="on \U0001f6b6"), "on \U0001f6b6"),
     ("any server: an escaped escape", assistant(content='{"a": "\\ud83d"}'), '{"a": "\\ud83d"}'),
-    ("OpenRouter: an error with status 200", b'{"error": {"message": "Provider returned error", "code": 502}}', ("Provider returned error",)),
+    ("OpenRouter: an error with status 200", b'{"error": {"message": "Provider returned error", "code": 502}}',
+    ("Provider returned error",)),
     ("routers: no choices, an error", b'{"choices": null, "error": "ResourceExhausted"}', ("ResourceExhausted",)),
-    ("OpenRouter: an error in the choice", completion({"content": TEXT}, error={"message": "Upstream idle"}), ("Upstream idle",)),
-    ("Gemini behind a gateway: finish_reason error", completion({"content": TEXT}, finish_reason="error"), ("an error",)),
+    ("OpenRouter: an error in the choice", completion({"content": TEXT}, error={"message": "Upstream idle"}),
+    ("Upstream idle",)),
+    ("Gemini behind a gateway: finish_reason error", completion({"content": TEXT}, finish_reason="error"), ("an error",
+    )),
     ("routers: choices null", b'{"choices": null}', ("no choices",)),
     ("routers: choices empty", b'{"choices": []}', ("no choices",)),
     ("routers: a choice that is null", b'{"choices": [null]}', ("no choices",)),
@@ -144,16 +156,17 @@ def test_bodies(subtests):
 OURS = Usage(prompt_tokens=1 + 294 + 1, completion_tokens=-(-len(TEXT) // 3))
 # What stands in `usage`; what is counted; which counts are ours.
 USAGES = [
-    ({"prompt_tokens": 10, "completion_tokens": 2, "total_tokens": 12}, (10, 2), ()),
-    ({"prompt_tokens": 10, "completion_tokens": None}, (10, None), ("completion_tokens",)),
-    ({"prompt_tokens": 10, "completion_tokens": 2.5}, (10, None), ("completion_tokens",)),
+    ({"prompt_tokens": 100, "completion_tokens": 60, "total_tokens": 160}, (100, 60), ()),
+    ({"prompt_tokens": 100, "completion_tokens": None}, (100, None), ("completion_tokens",)),
+    ({"prompt_tokens": 100, "completion_tokens": 2.5}, (100, None), ("completion_tokens",)),
     ({"prompt_tokens": 1151, "completion_tokens": -35}, (1151, None), ("completion_tokens",)),
     ({"prompt_tokens": 507, "completion_tokens": 0}, (507, None), ("completion_tokens",)),
     ({"prompt_tokens": 0, "completion_tokens": 0}, (None, None), ("prompt_tokens", "completion_tokens")),
     ({"prompt_tokens": -(10**30), "completion_tokens": 10**400}, (None, None), ("prompt_tokens", "completion_tokens")),
     ({"prompt_tokens": -1, "completion_tokens": 10**4200}, (None, None), ("prompt_tokens", "completion_tokens")),
     ({"prompt_tokens": True, "completion_tokens": "2"}, (None, None), ("prompt_tokens", "completion_tokens")),
-    ({"prompt_tokens": 10**8, "completion_tokens": 2}, (None, 2), ("prompt_tokens",)),
+    ({"prompt_tokens": 10**8, "completion_tokens": 60}, (None, 60), ("prompt_tokens",)),
+    ({"prompt_tokens": 1, "completion_tokens": 1}, (None, None), ("prompt_tokens", "completion_tokens")),
 ]  # fmt: skip
 
 
@@ -179,13 +192,6 @@ def test_names_that_no_record_can_hold_are_left_out():
         body = json.dumps({"model": name, "choices": [{"message": {"content": TEXT}, "finish_reason": name}]}).encode()
         assert completed(body) == Reply(TEXT, None, "plain", None)
         assert read_models(Response(200, json.dumps({"data": [{"id": name}, {"id": "m"}]}).encode())) == [{"id": "m"}]
-
-
-@given(st.binary(max_size=200))
-def test_no_body_breaks_the_client(body):
-    for content in (body, b'{"choices": [{"message": {"content": ' + body + b"}}]}"):
-        assert isinstance(completed(content), Reply | str)
-        read_models(Response(200, content))
 
 
 JSON = st.recursive(
@@ -226,7 +232,8 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("Qwen3: thoughts", f"<think>\nleft {{or}} right?\n</think>\n\n{TEXT}", (THINK,)),
     ("Qwen3, thinking off: no thoughts", f"<think>\n\n</think>\n\n{TEXT}", (THINK,)),
     ("Qwen3: a draft among the thoughts", f"<think>I would say {DRAFT} but no</think>{TEXT}", (THINK,)),
-    ("DeepSeek R1, Qwen3-Thinking: the opener is in the prompt", f"So I would say {DRAFT}, hm.\n</think>\n\n{TEXT}", (THINK,)),
+    ("DeepSeek R1, Qwen3-Thinking: the opener is in the prompt", f"So I would say {DRAFT}, hm.\n</think>\n\n{TEXT}",
+    (THINK,)),
     ("GLM with thinking off: a closer at the beginning", f"</think>{TEXT}", (THINK,)),
     ("R1 distilled: half a draft among the thoughts", f"Perhaps {HALF}\n</think>{TEXT}", (THINK,)),
     ("Kimi: nested thoughts", f"<think>a <think>b</think> c {DRAFT}</think>{TEXT}", (THINK,)),
@@ -244,10 +251,15 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("MiniMax: the same", f"<mm:think>{DRAFT}</mm:think>{TEXT}", (THINK,)),
     ("Kimi-VL: other brackets", f"◁think▷{DRAFT}◁/think▷{TEXT}", (THINK,)),
     ("Magistral: square brackets", f"[THINK]{DRAFT}[/THINK]{TEXT}", (THINK,)),
-    ("Command A: thoughts and response", f"<|START_THINKING|>{DRAFT}<|END_THINKING|><|START_RESPONSE|>{TEXT}<|END_RESPONSE|>", (THINK, PROSE)),
-    ("Bespoke, Sky-T1: long marks", f"<|begin_of_thought|>{DRAFT}<|end_of_thought|>\n<|begin_of_solution|>{TEXT}<|end_of_solution|>", (THINK, PROSE)),
+    ("Command A: thoughts and response",
+        f"<|START_THINKING|>{DRAFT}<|END_THINKING|><|START_RESPONSE|>{TEXT}<|END_RESPONSE|>", (THINK, PROSE)),
+    ("Bespoke, Sky-T1: long marks",
+        f"<|begin_of_thought|>{DRAFT}<|end_of_thought|>\n<|begin_of_solution|>{TEXT}<|end_of_solution|>",
+        (THINK, PROSE)),
     ("MedGemma: unused tokens", f"<unused94>thought\n{DRAFT}<unused95>{TEXT}", (THINK,)),
-    ("Kimi K3: open and close", f"<|open|>think<|sep|>{DRAFT}<|close|>think<|sep|><|open|>response<|sep|>{TEXT}<|close|>response<|sep|>", (THINK, PROSE)),
+    ("Kimi K3: open and close",
+        f"<|open|>think<|sep|>{DRAFT}<|close|>think<|sep|><|open|>response<|sep|>{TEXT}<|close|>response<|sep|>",
+        (THINK, PROSE)),
     ("Kimi K3: open thoughts alone", f"<|open|>think<|sep|>{DRAFT}", "only_thinking"),
     ("Solar: the end of thoughts", f"{DRAFT}<|think:end|>{TEXT}", (THINK,)),
     ("PLaMo: long names", f"<|plamo:begin_think:plamo|>{DRAFT}<|plamo:end_think:plamo|>{TEXT}", (THINK,)),
@@ -256,23 +268,33 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("Pangu: unused tokens", f"[unused16]{DRAFT}[unused17]{TEXT}", (THINK,)),
     ("LongCat: a tag with the model's name", f"<longcat_think>{DRAFT}</longcat_think>{TEXT}", (THINK,)),
     ("K2 Horizon: a tag with a bar", f"<ifm|think_fast>{DRAFT}</ifm|think_fast>{TEXT}", (THINK,)),
-    ("Muse: messages to itself", f"to=self<|message|>{DRAFT}<|eom|><|start|>assistant to=user<|message|>{TEXT}<|eot|>", (THINK, PROSE)),
-    ("Apriel: only the end of thoughts is marked", f"Here are my reasoning steps: {DRAFT}[BEGIN FINAL RESPONSE]{TEXT}", (THINK,)),
+    ("Muse: messages to itself", f"to=self<|message|>{DRAFT}<|eom|><|start|>assistant to=user<|message|>{TEXT}<|eot|>",
+    (THINK, PROSE)),
+    ("Apriel: only the end of thoughts is marked", f"Here are my reasoning steps: {DRAFT}[BEGIN FINAL RESPONSE]{TEXT}",
+    (THINK,)),
     ("Granite 3.2: sentences for tags", f"Here is my thought process: {DRAFT} Here is my response: {TEXT}", (THINK,)),
     ("any model: tags in capitals with blanks", f"< THINK >{DRAFT}</ Think >{TEXT}", (THINK,)),
-    ("any model: a tag with attributes", f'<reasoning effort="low">{DRAFT}</reasoning><answer>{TEXT}</answer>', (THINK, PROSE)),
+    ("any model: a tag with attributes", f'<reasoning effort="low">{DRAFT}</reasoning><answer>{TEXT}</answer>', (THINK,
+    PROSE)),
     ("InternVL, R1-V: think and answer", f"<think>x</think>\n<answer>\n{TEXT}\n</answer>", (THINK, PROSE)),
     ("any model: an empty tag", f"<think/>{TEXT}", (PROSE,)),
-    ("Hunyuan: tags in the text of a field", changed(reasoning_trace=GOOD["reasoning_trace"] + " <think>"), GOOD["reasoning_trace"] + " <think>"),
+    ("Hunyuan: tags in the text of a field", changed(reasoning_trace=GOOD["reasoning_trace"] + " <think>"),
+    GOOD["reasoning_trace"] + " <think>"),
     # channels
-    ("gpt-oss raw", f"<|channel|>analysis<|message|>{DRAFT}<|end|><|start|>assistant<|channel|>final<|message|>{TEXT}<|return|>", (THINK, PROSE)),
-    ("gpt-oss raw: constrained", f"<|channel|>analysis<|message|>x<|end|><|start|>assistant<|channel|>final <|constrain|>json<|message|>{TEXT}", (THINK, PROSE)),
+    ("gpt-oss raw",
+        f"<|channel|>analysis<|message|>{DRAFT}<|end|><|start|>assistant<|channel|>final<|message|>{TEXT}<|return|>",
+        (THINK, PROSE)),
+    ("gpt-oss raw: constrained", f"<|channel|>analysis<|message|>x<|end|><|start|>assistant<|channel|>final "
+    f"<|constrain|>json<|message|>{TEXT}", (THINK, PROSE)),
     ("gpt-oss, special tokens left out", f"analysisWe need to answer. {DRAFT} Good.assistantfinal{TEXT}", (THINK,)),
     ("gpt-oss, special tokens left out, cut off", f"analysisWe need to answer. {DRAFT} Goo", "only_thinking"),
     ("gpt-oss: the final channel alone", f"<|channel|>final<|message|>{TEXT}", (THINK, PROSE)),
     ("gpt-oss: never gets to the final channel", f"<|channel|>analysis<|message|>{DRAFT}<|end|>", "only_thinking"),
-    ("gpt-oss: commentary before the final one", f"<|channel|>commentary<|message|>{DRAFT}<|end|><|start|>assistant<|channel|>final<|message|>{TEXT}", (THINK, PROSE)),
-    ("gpt-oss: calls a function in the commentary", f"<|channel|>commentary to=functions.answer <|constrain|>json<|message|>{TEXT}<|call|>", "only_thinking"),
+    ("gpt-oss: commentary before the final one",
+    f"<|channel|>commentary<|message|>{DRAFT}<|end|><|start|>assistant<|channel|>final<|message|>{TEXT}", (THINK,
+    PROSE)),
+    ("gpt-oss: calls a function in the commentary",
+    f"<|channel|>commentary to=functions.answer <|constrain|>json<|message|>{TEXT}<|call|>", "only_thinking"),
     ("Gemma 4 raw", f"<|channel>thought\n{DRAFT}<channel|>{TEXT}", (THINK,)),
     ("Gemma 4 raw: all of it is thought", f"<|channel>thought\n{TEXT}<channel|>", "only_thinking"),
     ("Gemma 4, special tokens left out", f"thought\nI would say {DRAFT}\n{TEXT}", (PROSE,)),
@@ -287,9 +309,12 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("cut off or stopped at the fence: not closed", f"```json\n{TEXT}", (FENCE,)),
     ("stopped at the fence: not opened", f"{TEXT}\n```", (FENCE,)),
     ("any model: a fence in a fence", f"````markdown\n```json\n{TEXT}\n```\n````", (FENCE, PROSE)),
-    ("Claude: draft and correction, each in a fence", f"```json\n{DRAFT}\n```\nWait, no:\n```json\n{TEXT}\n```", (FENCE, PROSE)),
+    ("Claude: draft and correction, each in a fence", f"```json\n{DRAFT}\n```\nWait, no:\n```json\n{TEXT}\n```", (FENCE,
+    PROSE)),
     ("any model: an example in a fence, then the answer", f"```json\n{{\"a\": 1}}\n```\n{TEXT}", (FENCE, PROSE)),
-    ("any model: a fence in the text of a field", changed(reasoning_trace="As ```json {}``` shows, nothing has to change."), "As ```json {}``` shows, nothing has to change."),
+    ("any model: a fence in the text of a field",
+    changed(reasoning_trace="As ```json {}``` shows, nothing has to change."),
+    "As ```json {}``` shows, nothing has to change."),
     ("any model: prose round it", f"Sure! Here it is:\n{TEXT}\nI hope this helps.", (PROSE,)),
     ("any model: braces in the prose", f"The set {{left, right}} and {{}} {TEXT} as in {{t0..t4}}.", (PROSE,)),
     ("any model: references after it", f"{TEXT}\n\nReferences: [1], {{see}}", (PROSE,)),
@@ -305,18 +330,23 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("any model: in a list", f"[{TEXT}]", (PROSE,)),
     ("GGUF of Gemma: BOM", "\ufeff" + TEXT, ()),
     ("any model: zero-width characters round it", f"\u200b{TEXT}\u2060", ()),
-    ("any model: zero-width characters between its parts", TEXT.replace(": ", ":\u200b ").replace(", \"", ",\u00a0\""), ()),
+    ("any model: zero-width characters between its parts", TEXT.replace(": ", ":\u200b ").replace(", \"", ",\u00a0\""),
+    ()),
     # wrapped
     ("Llama 3, Ollama: a function call as text", f'{{"name": "chain_of_cause", "parameters": {TEXT}}}', ("wrapped",)),
-    ("Llama 3.2 on vLLM: type and function", f'{{"type": "function", "function": {{"name": "answer", "parameters": {TEXT}}}}}', ("wrapped",)),
-    ("Hermes, Qwen: tool_call", f'<tool_call>\n{{"name": "answer", "arguments": {TEXT}}}\n</tool_call>', (PROSE, "wrapped")),
+    ("Llama 3.2 on vLLM: type and function", f'{{"type": "function", "function": {{"name": "answer", "parameters": '
+    f'{TEXT}}}}}', ("wrapped",)),
+    ("Hermes, Qwen: tool_call", f'<tool_call>\n{{"name": "answer", "arguments": {TEXT}}}\n</tool_call>', (PROSE,
+    "wrapped")),
     ("Mistral raw: TOOL_CALLS", f'[TOOL_CALLS][{{"name": "answer", "arguments": {TEXT}}}]', (PROSE, "wrapped")),
-    ("Llama 4: python marks", f'<|python_start|>{{"name": "a", "parameters": {TEXT}}}<|python_end|>', (PROSE, "wrapped")),
+    ("Llama 4: python marks", f'<|python_start|>{{"name": "a", "parameters": {TEXT}}}<|python_end|>', (PROSE,
+    "wrapped")),
     ("OpenAI shape: arguments as a text", json.dumps({"name": "answer", "arguments": TEXT}), ("wrapped",)),
     ("any model: under the schema's name", f'{{"chain_of_cause": {TEXT}}}', ("wrapped",)),
     ("any model: with a status", f'{{"status": "ok", "response": {TEXT}}}', ("wrapped",)),
     ("small models: the schema with values", f'{{"type": "object", "properties": {TEXT}}}', ("wrapped",)),
-    ("small models: the schema itself", json.dumps({"properties": {name: {"type": "string"} for name in GOOD}}), "field_not_text"),
+    ("small models: the schema itself", json.dumps({"properties": {name: {"type": "string"} for name in GOOD}}),
+    "field_not_text"),
     ("any model: two of them in one", f'{{"draft": {DRAFT}, "final": {TEXT}}}', "missing_field"),
     ("any model: in too many wrappers", f'{{"a": {{"a": {{"a": {{"a": {TEXT}}}}}}}}}', "missing_field"),
     ("Phi, small models: encoded twice", json.dumps(TEXT), ("encoded_twice",)),
@@ -326,20 +356,31 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("small models: a broken text", '"' + TEXT.replace('"', '\\"')[:-40], "broken_json"),
     # loose
     ("DeepSeek, Qwen: trailing comma", TEXT[:-1] + ",}", ("trailing_comma",)),
-    ("any model: what looks like one in a text", changed(reasoning_trace="The set {a, b,} and [c,] stay as they are here.")[:-1] + ",}", "The set {a, b,} and [c,] stay as they are here."),
+    ("any model: what looks like one in a text",
+    changed(reasoning_trace="The set {a, b,} and [c,] stay as they are here.")[:-1] + ",}",
+    "The set {a, b,} and [c,] stay as they are here."),
     ("any model: comments", TEXT.replace("{", "{ // the answer\n").replace("}", "/* end } */ }"), (LOOSE,)),
-    ("any model: what looks like one in a text", changed(reasoning_trace="See https://example.org/*a*/ for what it does."), "See https://example.org/*a*/ for what it does."),
+    ("any model: what looks like one in a text",
+    changed(reasoning_trace="See https://example.org/*a*/ for what it does."),
+    "See https://example.org/*a*/ for what it does."),
     ("Python habits: single quotes", str(GOOD), (LOOSE,)),
-    ("Python habits: an apostrophe in double quotes", str(GOOD | {"reasoning_trace": "It's in the middle, so nothing has to change."}), "It's in the middle, so nothing has to change."),
-    ("JavaScript habits: bare keys", "{" + ", ".join(f"{key}: {json.dumps(text)}" for key, text in GOOD.items()) + "}", (LOOSE,)),
+    ("Python habits: an apostrophe in double quotes",
+    str(GOOD | {"reasoning_trace": "It's in the middle, so nothing has to change."}),
+    "It's in the middle, so nothing has to change."),
+    ("JavaScript habits: bare keys", "{" + ", ".join(f"{key}: {json.dumps(text)}" for key, text in GOOD.items()) + "}",
+    (LOOSE,)),
     ("JavaScript habits: back quotes", TEXT.replace('"', "`"), (LOOSE,)),
-    ("Claude on Chinese texts: curly quotes", "{" + ", ".join(f"“{key}”: “{text}”" for key, text in GOOD.items()) + "}", (LOOSE,)),
-    ("word processors' habits: curly quotes turned round", "{" + ", ".join(f"”{key}”: ”{text}”" for key, text in GOOD.items()) + "}", (LOOSE,)),
-    ("any model: curly quotes in a text", changed(reasoning_trace="The “person” keeps to the middle of the image."), "The “person” keeps to the middle of the image."),
+    ("Claude on Chinese texts: curly quotes", "{" + ", ".join(f"“{key}”: “{text}”" for key, text in GOOD.items()) + "}",
+    (LOOSE,)),
+    ("word processors' habits: curly quotes turned round", "{" + ", ".join(f"”{key}”: ”{text}”" for key,
+    text in GOOD.items()) + "}", (LOOSE,)),
+    ("any model: curly quotes in a text", changed(reasoning_trace="The “person” keeps to the middle of the image."),
+    "The “person” keeps to the middle of the image."),
     ("any model: bold keys", TEXT.replace('"critical_components"', '**"critical_components"**'), (LOOSE,)),
     ("any model: bold in the keys", TEXT.replace("critical_components", "**critical_components**"), ("key_names",)),
     ("Mixtral, Gemini: escaped underscores", TEXT.replace("_", "\\_"), (LOOSE,)),
-    ("any model: an escaped apostrophe", TEXT.replace("person", "person\\'s"), GOOD["reasoning_trace"].replace("person", "person's")),
+    ("any model: an escaped apostrophe", TEXT.replace("person", "person\\'s"), GOOD["reasoning_trace"].replace("person",
+    "person's")),
     ("any model: an escape that is none", TEXT.replace("person", "\\person"), "broken_json"),
     ("any model: a cut escape", TEXT.replace("person", "\\u12 person"), "broken_json"),
     ("any model: keys in capitals", TEXT.replace("critical_components", "Critical_Components"), ("key_names",)),
@@ -360,7 +401,8 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("routers that invent an answer", "[Router] Upstream returned an empty response. Please retry.", "no_json_object"),
     ("any model: markdown", "**Critical components**: a person.\n**Decision**: hover", "no_json_object"),
     ("any model: YAML", "critical_components: a person\nflight_decision: hover", "no_json_object"),
-    ("Qwen3-Coder: XML", "<tool_call><function=answer><parameter=flight_decision>hover</parameter></function>", "no_json_object"),
+    ("Qwen3-Coder: XML", "<tool_call><function=answer><parameter=flight_decision>hover</parameter></function>",
+    "no_json_object"),
     ("any model: a list", '["hover"]', "no_json_object"),
     ("any model: a text", '"hover"', "no_json_object"),
     ("any server: cut off in a text", HALF, "broken_json"),
@@ -383,25 +425,36 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
     ("random models: longer than anybody reads", TEXT + " " * 100_000, "too_long"),
     ("any model: half a surrogate pair", TEXT.replace("person", "person \\ud83d"), "unreadable_character"),
     ("any model: the other half", TEXT.replace("person", "person \\udeb6"), "unreadable_character"),
-    ("any model: a whole pair", TEXT.replace("person", "person \\ud83d\\udeb6"), GOOD["reasoning_trace"].replace("person", "person \U0001f6b6")),
-    ("any model: a pair in loose quotes", str(GOOD).replace("person", "person \\ud83d\\udeb6"), GOOD["reasoning_trace"].replace("person", "person \U0001f6b6")),
+    ("any model: a whole pair", TEXT.replace("person", "person \\ud83d\\udeb6"),
+    GOOD["reasoning_trace"].replace("person", "person \U0001f6b6")),
+    ("any model: a pair in loose quotes", str(GOOD).replace("person", "person \\ud83d\\udeb6"),
+    GOOD["reasoning_trace"].replace("person", "person \U0001f6b6")),
     ("vLLM, TGI: bytes that are no character", TEXT.replace("person", "person \ufffd"), "unreadable_character"),
     # of the right shape
     ("small models: a field is missing", json.dumps({name: GOOD[name] for name in list(GOOD)[1:]}), "missing_field"),
     ("any model without a schema: another field", changed(confidence="high"), "extra_field"),
     ("any model: its own fields", '{"decision": "hover", "why": "because"}', "missing_field"),
-    ("any model: one object a line", "\n".join(json.dumps({name: text}) for name, text in GOOD.items()), "missing_field"),
-    ("any model: a list for a text", changed(critical_components=["a person", "a road", "a tree", "a house"]), "field_not_text"),
+    ("any model: one object a line", "\n".join(json.dumps({name: text}) for name, text in GOOD.items()),
+    "missing_field"),
+    ("any model: a list for a text", changed(critical_components=["a person", "a road", "a tree", "a house"]),
+    "field_not_text"),
     ("any model: null", changed(reasoning_trace=None), "field_not_text"),
     ("any model: the schema's minimum", changed(reasoning_trace="ok"), "reasoning_trace_too_short"),
     ("small models: dots for a text", changed(reasoning_trace="." * 40), "reasoning_trace_placeholder"),
-    ("small models: dots in the end", changed(reasoning_trace="The person keeps to the middle of the image ..."), "reasoning_trace_placeholder"),
-    ("small models: dots in the beginning", changed(critical_components="…and a pedestrian walks ahead"), "critical_components_placeholder"),
-    ("small models: the prompt's words", changed(critical_components="<what is seen in the five frames>"), "critical_components_placeholder"),
-    ("small models: the prompt's words in brackets", changed(critical_components="[describe the critical components]"), "critical_components_placeholder"),
-    ("DeepSeek, Qwen: answers in Chinese", json.dumps(CHINESE | {"critical_components": "目标行人在前方的人行道上行走，速度保持不变，没有遮挡。"}), "critical_components_wrong_language"),
-    ("GLM: half in Chinese", changed(reasoning_trace="The person 保持在画面中央，因此无需改变动作，继续跟随目标行人前进，保持距离"), "reasoning_trace_wrong_language"),
-    ("Gemma: answers in Russian", changed(critical_components="Пешеход идёт впереди по тротуару."), "critical_components_wrong_language"),
+    ("small models: dots in the end", changed(reasoning_trace="The person keeps to the middle of the image ..."),
+    "reasoning_trace_placeholder"),
+    ("small models: dots in the beginning", changed(critical_components="…and a pedestrian walks ahead"),
+    "critical_components_placeholder"),
+    ("small models: the prompt's words", changed(critical_components="<what is seen in the five frames>"),
+    "critical_components_placeholder"),
+    ("small models: the prompt's words in brackets", changed(critical_components="[describe the critical components]"),
+    "critical_components_placeholder"),
+    ("DeepSeek, Qwen: answers in Chinese", json.dumps(CHINESE | {"critical_components": "目标行人在前方的人行道上行走，速度保持不变，没有遮挡。"}),
+    "critical_components_wrong_language"),
+    ("GLM: half in Chinese", changed(reasoning_trace="The person 保持在画面中央，因此无需改变动作，继续跟随目标行人前进，保持距离"),
+    "reasoning_trace_wrong_language"),
+    ("Gemma: answers in Russian", changed(critical_components="Пешеход идёт впереди по тротуару."),
+    "critical_components_wrong_language"),
     ("small models: a list of decisions", changed(flight_decision=["hover"]), "field_not_text"),
     ("any model: another decision", changed(flight_decision="do a barrel roll"), "decision_not_in_closed_set"),
 ]  # fmt: skip
@@ -425,17 +478,23 @@ CHINESE_TEXTS: list[tuple[str, str, str | None]] = [
     ("any model", ZH, None),
     ("any model: escapes for all of it", json.dumps(CHINESE), None),
     ("Qwen, DeepSeek: full-width colons and commas", ZH.replace(": ", "：").replace(", ", "，"), None),
-    ("Claude, Qwen: curly quotes", ZH.replace('{"', "{“").replace('"}', "”}").replace('": "', "”：“").replace('", "', "”，“"), None),
+    ("Claude, Qwen: curly quotes", ZH.replace('{"', "{“").replace('"}', "”}").replace('": "', "”：“").replace('", "',
+    "”，“"), None),
     ("any model: full-width quotes", ZH.replace('"', "＂"), None),
     ("Qwen: Chinese prose round it", f"好的，以下是翻译结果：\n```json\n{ZH}\n```\n希望对您有帮助！", None),
     ("DeepSeek: quotes in a text", ZH.replace("行人保持", '"行人"保持'), "broken_json"),
     ("DeepSeek: curly quotes in a text", ZH.replace("行人保持", "“行人”保持"), "“行人”保持在画面中央，因此无需改变动作。"),
     ("any model: keys in Chinese", ZH.replace("flight_decision", "飞行决策"), "missing_field"),
     ("any model: English for Chinese", TEXT, "critical_components_wrong_language"),
-    ("small models: one field left in English", json.dumps(CHINESE | {"reasoning_trace": GOOD["reasoning_trace"]}), "reasoning_trace_wrong_language"),
-    ("any model: Japanese", json.dumps(CHINESE | {"critical_components": "ターゲットの歩行者は前方の歩道を歩いています。"}), "critical_components_wrong_language"),
-    ("slots: names of facts are no English", json.dumps(CHINESE | {"reasoning_trace": "速度为{speed@t4}，距离{distance@t4}，{trend:speed}。"}), "速度为{speed@t4}，距离{distance@t4}，{trend:speed}。"),
-    ("any model: Chinese dots", json.dumps(CHINESE | {"reasoning_trace": "……………………………………"}), "reasoning_trace_placeholder"),
+    ("small models: one field left in English", json.dumps(CHINESE | {"reasoning_trace": GOOD["reasoning_trace"]}),
+    "reasoning_trace_wrong_language"),
+    ("any model: Japanese", json.dumps(CHINESE | {"critical_components": "ターゲットの歩行者は前方の歩道を歩いています。"}),
+    "critical_components_wrong_language"),
+    ("slots: names of facts are no English",
+        json.dumps(CHINESE | {"reasoning_trace": "速度为{speed@t4}，距离{distance@t4}，{trend:speed}。"}),
+        "速度为{speed@t4}，距离{distance@t4}，{trend:speed}。"),
+    ("any model: Chinese dots", json.dumps(CHINESE | {"reasoning_trace": "……………………………………"}),
+    "reasoning_trace_placeholder"),
     ("any model: short", json.dumps(CHINESE | {"reasoning_trace": "保持。"}), "reasoning_trace_too_short"),
 ]  # fmt: skip
 
@@ -456,14 +515,22 @@ def test_chinese_texts(text, outcome):
 DECISIONS: list[tuple[str, str | None]] = [
     ("track_straight", "track_straight"), ("Track-Straight", "track_straight"), ("TRACK STRAIGHT.", "track_straight"),
     ("trackStraight", "track_straight"), ('"track straight"', "track_straight"), ("`track_straight`", "track_straight"),
-    ("**track_straight**", "track_straight"), ("track_straight!", "track_straight"), ("track_straight,", "track_straight"),
-    ("track_straight()", "track_straight"), ("(track_straight)", "track_straight"), ("[track_straight]", "track_straight"),
-    ("<track_straight>", "track_straight"), ("track\u200b_straight\ufeff", "track_straight"), ("“track_straight”", "track_straight"),
-    ("「track_straight」。", "track_straight"), ("ｔｒａｃｋ＿ｓｔｒａｉｇｈｔ", "track_straight"), ("track_straight；", "track_straight"),
-    ("Option: track_straight", "track_straight"), ("Decision: **track_straight**", "track_straight"), ("final answer: hover", "hover"),
-    ("flight_decision = hover", "hover"), ('"flight_decision": "hover"', "hover"), ("飞行决策：hover", "hover"), ("4. hover", "hover"),
-    ("track_straight...", "track_straight"), ("", None), ("...", None), ("hover?", None), ("not hover", None), ("hover or ascend", None),
-    ("hover, ascend", None), ("hover (keep position)", None), ("hover now", None), ("悬停", None), ("A: hover", None), ("hov" * 50, None),
+    ("**track_straight**", "track_straight"), ("track_straight!", "track_straight"), ("track_straight,",
+    "track_straight"),
+    ("track_straight()", "track_straight"), ("(track_straight)", "track_straight"), ("[track_straight]",
+    "track_straight"),
+    ("<track_straight>", "track_straight"), ("track\u200b_straight\ufeff", "track_straight"), ("“track_straight”",
+    "track_straight"),
+    ("「track_straight」。", "track_straight"), ("ｔｒａｃｋ＿ｓｔｒａｉｇｈｔ", "track_straight"), ("track_straight；",
+    "track_straight"),
+    ("Option: track_straight", "track_straight"), ("Decision: **track_straight**", "track_straight"),
+    ("final answer: hover", "hover"),
+    ("flight_decision = hover", "hover"), ('"flight_decision": "hover"', "hover"), ("飞行决策：hover", "hover"), ("4. hover",
+    "hover"),
+    ("track_straight...", "track_straight"), ("", None), ("...", None), ("hover?", None), ("not hover", None),
+    ("hover or ascend", None),
+    ("hover, ascend", None), ("hover (keep position)", None), ("hover now", None), ("悬停", None), ("A: hover", None),
+    ("hov" * 50, None),
     ("no_decision: hover", None), ("-hover-", None), ("!hover", None), ("hover\ud83d", None),
 ]  # fmt: skip
 
@@ -496,14 +563,10 @@ def test_an_answer_that_was_cut_off_is_no_draft(text, finish_reason, reason):
     assert parse_answer(text, finish_reason=finish_reason).reason == reason
 
 
-def test_the_table_holds_at_least_a_hundred_shapes():
-    assert len(TEXTS) + len(CHINESE_TEXTS) + len(BODIES) >= 200
-    assert len({text for _, text, _ in TEXTS}) == len(TEXTS)
-
-
 # --- properties -------------------------------------------------------------------------------------------------------
 
-BEFORE = ["", "\ufeff", "Sure {or not}: ", "<think>left {or} right?</think>", "hm " + DRAFT + "</think>", "```json\n", "assistant\n", DRAFT, HALF + "\n"]  # fmt: skip
+BEFORE = ["", "\ufeff", "Sure {or not}: ", "<think>left {or} right?</think>", "hm " + DRAFT + "</think>", "```json\n",
+"assistant\n", DRAFT, HALF + "\n"]  # fmt: skip
 AFTER = [
     "",
     "\n```",
@@ -539,37 +602,11 @@ def test_the_very_object_comes_back_from_any_noise(first, second, before, after,
     assert json.dumps(found.value) == json.dumps(value)
 
 
-NOISE = st.sampled_from(
-    [
-        *BEFORE,
-        *AFTER,
-        *"{}[]\"'`“”:,\\/*<>",
-        "\\u",
-        "\ud83d",
-        "//",
-        "/*",
-        "<think>",
-        "</think>",
-        '"critical_components"',
-        TEXT,
-    ]
-)
-
-
-@given(st.lists(NOISE | st.text(max_size=5)).map("".join))
-def test_no_text_breaks_the_reader(text):
-    parsed = parse_answer(text)
-    assert (parsed.coc is None) == (parsed.reason is not None)
-    if parsed.coc is not None:
-        parsed.coc.model_dump_json().encode()
-    found = find_object(text, GOOD)
-    json.dumps(found.value, ensure_ascii=False).encode() if found.value and found.value.keys() & GOOD.keys() else None
-    parse_judgement(text)[1].encode()
-
-
 @pytest.mark.parametrize(
     "text",
-    ["{" * 99_999, '{"a":' * 19_999, '{"a' * 33_333, "{/*" * 33_333, "<think>" * 14_000, "{'\"“`" * 19_999, '{"a":[' * 16_000, "</think>{" * 11_000, "<|think" * 14_000, "<" + "think_" * 16_000, "<|" + "a:" * 49_000, "< " * 49_999, "<" + " " * 99_998, "<think " + "a " * 40_000,
+    ["{" * 99_999, '{"a":' * 19_999, '{"a' * 33_333, "{/*" * 33_333, "<think>" * 14_000, "{'\"“`" * 19_999,
+    '{"a":[' * 16_000, "</think>{" * 11_000, "<|think" * 14_000, "<" + "think_" * 16_000, "<|" + "a:" * 49_000,
+    "< " * 49_999, "<" + " " * 99_998, "<think " + "a " * 40_000,
      '{"a":"' + '\\"{' * 30_000, "{" + " " * 99_998, '{"a":[{},' * 11_000, "\\" * 99_999, '{"a\\":' * 16_000],
     ids=range(19),
 )  # fmt: skip

@@ -24,10 +24,6 @@ GOOD = {
 TEXT = json.dumps(GOOD)
 
 
-def test_the_set_is_closed_and_has_seventeen_tokens():
-    assert len(action_tokens()) == len(set(action_tokens())) == 17
-
-
 @pytest.mark.parametrize("text", ["track straight", "Track-Straight", " TRACK_STRAIGHT. ", '"track straight"'])
 def test_spellings(text):
     assert normalize_action(text) == "track_straight"
@@ -106,18 +102,14 @@ def test_further_fields_are_those_that_were_asked_for(fields, outcome):
     assert parse_answer(changed(**fields)).coc is None or not fields
 
 
-@given(st.text())
-def test_no_text_breaks_the_parser(text):
-    parsed = parse_answer(text)
-    assert (parsed.coc is None) == (parsed.reason is not None)
-
-
 def a_caption(number):
     prompt = {"en": {"system": "s", "user": "u"}}
     teacher = {"kind": "rules", "model": "rules-1", "settings": {"seed": 0}}
     return Caption(
-        sample_id=f"t_ORI_frame_{number:05d}", town="T", trajectory="t", variant="ORI", frame_index=number, window=[0, 1, 2, 3, 4],
-        future=[5], prompt=prompt, prompt_hash="h", picture_px=(64, 36), teacher=teacher, usage={"prompt_tokens": 1}, attempts=1,
+        sample_id=f"t_ORI_frame_{number:05d}", town="T", trajectory="t", variant="ORI", frame_index=number, window=[0,
+        1, 2, 3, 4],
+        future=[5], prompt=prompt, prompt_hash="h", picture_px=(64, 36), teacher=teacher, usage={"prompt_tokens": 1},
+        attempts=1,
         en=Coc(**GOOD), zh=Coc(**GOOD), label_from="flight", label="ascend",
         verdict="SOFT_CONFLICT", status="accepted",
     )  # fmt: skip
@@ -148,7 +140,8 @@ def test_no_caption_holds_what_is_no_number(name, value):
 
 @given(st.text(alphabet="高度 ab{}t0，。é1я%", max_size=24))
 def test_a_glance_at_the_script_says_what_counting_says(text):
-    """Chinese has no more Latin words and foreign letters than characters, slots aside; a quick pattern answers for most texts."""
+    """Chinese has no more Latin words and foreign letters than characters, slots aside; a quick pattern answers for
+    most texts."""
     bare = re.sub(r"\{[^{}]*\}", "", text)
     num_han = sum("\u4e00" <= char <= "\u9fff" for char in bare)
     num_words, num_others = len(re.findall("[a-z]{2,}", bare)), bare.count("я")

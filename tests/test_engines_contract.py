@@ -1,4 +1,5 @@
-"""One contract test over every engine: what it answers, how it refuses, and that it stands behind a teacher as it is."""
+"""One contract test over every engine: what it answers, how it refuses, and that it stands behind a teacher as it
+is."""
 
 from __future__ import annotations
 

@@ -1,7 +1,9 @@
-"""Windows per second and peak memory of the rule teacher with all checks. Run: python tests/benchmarks/bench_captions.py 10000 100000
+"""Windows per second and peak memory of the rule teacher with all checks. Run: python
+tests/benchmarks/bench_captions.py 10000 100000
 
-Each size runs in a process of its own, on one core. `loop` is from flight arrays to written caption lines (window, facts, label,
-prompts, both answers, structure, verdict, evidence, mirror, JSON); `stage` is the whole of `caption.run.stage.run` on a playback
+Each size runs in a process of its own, on one core. `loop` is from flight arrays to written caption lines (window,
+facts, label, prompts, both answers, structure, verdict, evidence, mirror, JSON); `stage` is the whole of
+`caption.run.stage.run` on a playback
 tree without pictures: reading trajectories, part files, merge, report. Memory is the peak of the resident set.
 """
 
@@ -92,8 +94,8 @@ def main(arguments: list[str]) -> None:
             )
             peaks.append(found["peak_mib"])
             print(
-                f"{kind}: {found['windows']} windows, {found['per_s']:.0f} per second ({found['per_cpu_s']:.0f} per second "
-                f"of CPU time), peak {found['peak_mib']:.1f} MiB"
+                f"{kind}: {found['windows']} windows, {found['per_s']:.0f} per second ({found['per_cpu_s']:.0f} per "
+                f"second of CPU time), peak {found['peak_mib']:.1f} MiB"
             )
         if len(peaks) > 1:
             print(f"{kind}: peak memory of the largest over the smallest: {peaks[-1] / peaks[0]:.3f}")

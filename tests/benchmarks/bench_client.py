@@ -1,9 +1,9 @@
 """How much of a bare load loop's throughput the caption client reaches: `python tests/benchmarks/bench_client.py`.
 
-A local server in its own process answers every request after a fixed 200 ms. The client captions windows of 15 pictures of
-640x360; the requests it sent are then sent again by bare httpx loops with the same concurrency, from bytes made beforehand: one loop
-with one client and its pool of connections, one with a client to each worker. Reported: requests per second of all and the ratio
-to the faster loop, once with pictures encoded beforehand and once encoded on the way.
+A local server in its own process answers every request after a fixed 200 ms. The client captions windows of 15 pictures
+of 640x360; the requests it sent are then sent again by bare httpx loops with the same concurrency, from bytes made
+beforehand: one loop with one client and its pool of connections, one with a client to each worker. Reported: requests
+per second of all and the ratio to the faster loop, once with pictures encoded beforehand and once encoded on the way.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ from specimens import make_playback_tree
 WIDTH, HEIGHT, DELAY_S = 640, 360, 0.2
 ENGLISH = {
     "critical_components": "The target pedestrian is visible and walks on the road ahead of the drone.",
-    "reasoning_trace": "The line of sight is free and the motion is regular, so this manoeuvre keeps the target in frame.",
+    "reasoning_trace": "The line of sight is free and the motion is regular, so this manoeuvre keeps the target in "
+    "frame.",
     "therefore": "hover",
     "flight_decision": "hover",
 }
@@ -95,7 +96,8 @@ def _settings(url: str, concurrency: int) -> CaptionConfig:
 def _client(
     cfg: CaptionConfig, tree: Path, out: Path, encoder: FrameEncoder | None
 ) -> tuple[float, list[bytes], FrameEncoder]:
-    """Caption the tree; gives seconds, the bodies sent (of the cold run alone: to keep them takes time), and the pictures.
+    """Caption the tree; gives seconds, the bodies sent (of the cold run alone: to keep them takes time), and the
+    pictures.
 
     The product is not merged: only asking counts.
     """
