@@ -161,11 +161,10 @@ def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
     for path in data:
         run = run_of.get(fingerprint(path))
         if run is None:
-            raise InputError(
-                "the training set was not made of this playback tree", where=path, got=fingerprint(path),
-                expected=", ".join(f"{tree.run}: {tree.sha256}" for tree in record.trees),
-                fix="give the trees that it was made of as they were then, or prepare it anew from this one",
-            )  # fmt: skip
+            words = "the training set was not made of this playback tree"
+            expected = ", ".join(f"{tree.run}: {tree.sha256}" for tree in record.trees)
+            fix = "give the trees that it was made of as they were then, or prepare it anew from this one"
+            raise InputError(words, where=path, got=fingerprint(path), expected=expected, fix=fix)
         trees[run] = path
     if missing := [tree.run for tree in record.trees if tree.run not in trees]:
         words, fix = "a playback tree of the training set is not given", "give --data once for each of its trees"
@@ -191,11 +190,9 @@ def arrow_type(of: Any) -> pa.DataType:
 
 def columns_of(model: type[SplitMember], **changed: pa.DataType) -> pa.Schema:
     """Give the columns of a file of samples: their fields, and where a file holds something else its type."""
-    types = {name: field.annotation for name, field in model.model_fields.items()}
-    return pa.schema([
-        pa.field(name, changed.get(name, arrow_type(of)), nullable=type(None) in get_args(of))
-        for name, of in types.items()
-    ] + [pa.field(name, of, nullable=False) for name, of in changed.items() if name not in types])  # fmt: skip
+    own = {name: field.annotation for name, field in model.model_fields.items()}
+    types = {name: arrow_type(of) for name, of in own.items()} | changed
+    return pa.schema([pa.field(n, of, nullable=type(None) in get_args(own.get(n))) for n, of in types.items()])
 
 
 COLUMNS = columns_of(Sample, prompt=pa.string(), system=pa.int32())  # system: number of one of the record's

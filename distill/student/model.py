@@ -135,10 +135,9 @@ def student_folder(name: str) -> Path:
     try:
         return Path(snapshot_download(name, allow_patterns=MODEL_FILES))
     except (OSError, ValueError, RuntimeError) as error:  # no network, no such repository, no permission
-        raise InputError(
-            "no such folder, and the repository of that name cannot be loaded", where=name, got=str(error)[:300],
-            fix="check name and network, or download it elsewhere and give its folder",
-        ) from error  # fmt: skip
+        words = "no such folder, and the repository of that name cannot be loaded"
+        fix = "check name and network, or download it elsewhere and give its folder"
+        raise InputError(words, where=name, got=str(error)[:300], fix=fix) from error
 
 
 def weight_files(folder: Path) -> dict[str, Path]:

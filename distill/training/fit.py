@@ -209,10 +209,9 @@ def train_step(lesson: Lesson, optimizer: Any, ready: ReadyStep, rate: float) ->
             parameter.grad /= weight
     norm = float(torch.nn.utils.clip_grad_norm_(parameters, cfg.max_gradient_norm or math.inf))
     if not math.isfinite(total) or not math.isfinite(norm):
-        raise ConfigError(
-            "the loss or its gradient is not finite", where="learning_rate", got=f"{cfg.learning_rate}",
-            fix="lower learning_rate and choose another --out; the last checkpoint stays usable",
-        )  # fmt: skip
+        words, got = "the loss or its gradient is not finite", f"{cfg.learning_rate}"
+        fix = "lower learning_rate and choose another --out; the last checkpoint stays usable"
+        raise ConfigError(words, where="learning_rate", got=got, fix=fix)
     for group in optimizer.param_groups:
         group["lr"] = rate
     optimizer.step()

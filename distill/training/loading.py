@@ -384,8 +384,10 @@ def choose_over_all(samples: Sequence[Sample], count: int, rng: np.random.Genera
     for index, sample in enumerate(samples):
         flights = by_decision.setdefault(sample.decision, {})
         flights.setdefault(flight_of(sample.sample_id), []).append(index)
-    queues = [_by_turns([_shuffled(f, rng) for f in _shuffled(list(flights.values()), rng)])
-              for _, flights in sorted(by_decision.items())]  # fmt: skip
+    queues = []
+    for _, flights in sorted(by_decision.items()):
+        own = [_shuffled(indices, rng) for indices in _shuffled(list(flights.values()), rng)]
+        queues.append(_by_turns(own))
     return sorted(_by_turns(queues)[:count])
 
 
