@@ -1,11 +1,13 @@
-"""How fast `release build` stores pictures, beside a copy of the same bytes, plain and with the digests that a release needs, and how much memory it takes.
+"""How fast `release build` stores pictures, beside a copy of the same bytes, plain and with the digests that a release
+needs, and how much memory it takes.
 
     python tests/benchmarks/bench_release.py speed 4000             # 1280x720, two processes for either
     python tests/benchmarks/bench_release.py memory 10000 100000    # small pictures
 
-The tree is made of few frames, linked many times, so that it needs little disk; release and copy are written in full. The copy reads the
-tree's files and writes them one after the other into one file a flight, flushed to disk at its end as a shard is: the least that any copy does.
-It goes through the page cache, as copies do; a shard goes past it where the file system can. Both read files that are in the page cache.
+The tree is made of few frames, linked many times, so that it needs little disk; release and copy are written in full.
+The copy reads the tree's files and writes them one after the other into one file a flight, flushed to disk at its end
+as a shard is: the least that any copy does. It goes through the page cache, as copies do; a shard goes past it where
+the file system can. Both read files that are in the page cache.
 """
 
 from __future__ import annotations
@@ -179,7 +181,8 @@ def measure_speed(num_frames: int, folder: Path, rounds: int) -> None:
     raw = few * SIZES["speed"][0] * SIZES["speed"][1] * 4 / MB
     stored = sum(p.stat().st_size for p in (folder / "depth/dataset/data").iterdir()) / MB
     print(
-        f"depth, one core: {raw / seconds:.0f} MB/s of float32 on the clock, {raw / used_s:.0f} by CPU, {few / seconds:.0f} frames/s, "
+        f"depth, one core: {raw / seconds:.0f} MB/s of float32 on the clock, {raw / used_s:.0f} by CPU, "
+        f"{few / seconds:.0f} frames/s, "
         f"to {100 * stored / raw:.0f} % of its size"
     )
 
