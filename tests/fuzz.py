@@ -1,7 +1,8 @@
 """Gives mutated files to every reader, and says which ended in anything but success or one clear line: `make fuzz`.
 
-A child process does the reading: what takes more than CPU_S seconds of its time is ended by the system, what takes MEMORY_MB more than
-before is found by the peak that the kernel keeps. An input is made from (reader, seed, number) alone, so each can be made again.
+A child process does the reading: what takes more than CPU_S seconds of its time is ended by the system, what takes
+MEMORY_MB more than before is found by the peak that the kernel keeps. An input is made from (reader, seed, number)
+alone, so each can be made again.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ SHOW_EVERY_S = 10.0
 
 
 class Reader(NamedTuple):
-    """files: what is changed, one at a time. call: reads it, with a scratch folder for what it writes. share: of the inputs.
+    """files: what is changed, one at a time. call: reads it, with a scratch folder for what it writes. share: of the
+    inputs.
 
     hashes: it reads every byte of a file, however large, for its digest: its files are not made huge.
     """
@@ -233,7 +235,8 @@ def run(
     """Give inputs to readers in child processes, and begin a new one where one was ended.
 
     Args:
-        module: of tests/, with the table READERS. root: specimens; they are the same afterwards, and beside them stands `scratch`.
+        module: of tests/, with the table READERS. root: specimens; they are the same afterwards, and beside them stands
+            `scratch`.
         numbers: reader -> which inputs.
     """
     summary, todo = Summary(), {reader: list(wanted) for reader, wanted in numbers.items()}

@@ -1,4 +1,4 @@
-"""Everything that cosfly, caption, distill and release read, in one folder of honest specimens, and how each is read: READERS."""
+"""Everything that is read, in one folder of honest specimens, and how each is read: READERS."""
 
 from __future__ import annotations
 
@@ -117,7 +117,8 @@ from release.viewer.content import ViewerConfig
 from specimens import make_playback_tree, pack_depth
 
 ANSWER = {
-    "critical_components": "The pedestrian walks 12.4 m ahead, 3 px left of the centre; the drone flies 1.2 m/s at 8 m.",
+    "critical_components": "The pedestrian walks 12.4 m ahead, 3 px left of the centre; "
+    "the drone flies 1.2 m/s at 8 m.",
     "reasoning_trace": "The pedestrian keeps its heading from t0 to t4, so the drone tracks straight.",
     "flight_decision": "track_straight",
 }
@@ -127,40 +128,52 @@ PLAIN = {
     "flight_decision": "hover",
 }
 REPLY = {
-    "id": "1", "model": "m", "choices": [{"index": 0, "finish_reason": "stop", "message": {"role": "assistant", "content": json.dumps(ANSWER), "reasoning_content": "so"}}],
-    "usage": {"prompt_tokens": 10, "completion_tokens": 20, "total_tokens": 30}, "error": None, "data": [{"id": "m", "max_model_len": 4096}],
+    "id": "1", "model": "m", "choices": [{"index": 0, "finish_reason": "stop",
+    "message": {"role": "assistant", "content": json.dumps(ANSWER), "reasoning_content": "so"}}],
+    "usage": {"prompt_tokens": 10, "completion_tokens": 20, "total_tokens": 30}, "error": None,
+    "data": [{"id": "m", "max_model_len": 4096}],
 }  # fmt: skip
 CITY = {
-    "type": "CityJSON", "version": "2.0", "metadata": {"referenceSystem": "https://www.opengis.net/def/crs/EPSG/0/7415"},
+    "type": "CityJSON", "version": "2.0",
+    "metadata": {"referenceSystem": "https://www.opengis.net/def/crs/EPSG/0/7415"},
     "transform": {"scale": [0.001] * 3, "translate": [1000.0, 0.0, 0.0]},
     "vertices": [[x, y, z] for z in (2000, 14_000) for x, y in ((0, 0), (9000, 0), (9000, 8000), (0, 8000))]
     + [[x, y, 2000] for x, y in ((-9000, -9000), (60_000, -9000), (60_000, -3000), (-9000, -3000))],
     "CityObjects": {
         "house": {"type": "Building", "attributes": {"fclass": "x"}, "children": ["part"]},
-        "part": {"type": "BuildingPart", "parents": ["house"], "geometry": [{"type": "Solid", "lod": "1.2", "boundaries": [
+        "part": {"type": "BuildingPart", "parents": ["house"],
+        "geometry": [{"type": "Solid", "lod": "1.2", "boundaries": [
             [[[3, 2, 1, 0]], [[4, 5, 6, 7]], [[0, 1, 5, 4]], [[1, 2, 6, 5]], [[2, 3, 7, 6]], [[3, 0, 4, 7]]]]}]},
         "road": {"type": "Road", "geometry": [{"type": "MultiSurface", "lod": "1", "boundaries": [[[8, 9, 10, 11]]]}]},
-        "tree": {"type": "SolitaryVegetationObject", "geometry": [{"type": "GeometryInstance", "template": 0, "boundaries": [1],
+        "tree": {"type": "SolitaryVegetationObject", "geometry": [{"type": "GeometryInstance", "template": 0,
+        "boundaries": [1],
             "transformationMatrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}]},
     },
-    "geometry-templates": {"templates": [{"type": "MultiSurface", "lod": "1", "boundaries": [[[0, 1, 2]], [[0, 1, 3]]]}],
+    "geometry-templates": {"templates": [{"type": "MultiSurface", "lod": "1",
+    "boundaries": [[[0, 1, 2]], [[0, 1, 3]]]}],
         "vertices-templates": [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 5.0]]},
 }  # fmt: skip
 FRAME = "frames_playback/frame_00006"
 TREE = "render/Town01/trajectory_1776047127"
 TEXTS = {
     "answer.json": json.dumps(ANSWER),
-    "answer.txt": f"<think>The {{\"draft\": 1}}</think>\nHere it is:\n```json\n{json.dumps(ANSWER, indent=1)}\n``` // done",
-    "answer_zh.txt": "｛“critical_components”：“行人位于前方12.4米”，“reasoning_trace”：“因此直线跟踪”，“flight_decision”：“track_straight”，｝",
-    "prose.txt": f"{ANSWER['critical_components']} It turned 14.5 degrees to the left over the last three frames, twice as far as before.\n{ANSWER['reasoning_trace']}",
+    "answer.txt": "<think>The {\"draft\": 1}</think>\nHere it is:\n"
+    f"```json\n{json.dumps(ANSWER, indent=1)}\n``` // done",
+    "answer_zh.txt": "｛“critical_components”：“行人位于前方12.4米”，“reasoning_trace”：“因此直线跟踪”，"
+    "“flight_decision”：“track_straight”，｝",
+    "prose.txt": f"{ANSWER['critical_components']} It turned 14.5 degrees to the left over the last three frames, "
+    f"twice as far as before.\n{ANSWER['reasoning_trace']}",
     "prose_zh.txt": "行人位于前方12.4米，偏左3像素；无人机以1.2米每秒飞行，高度约为八米。\n最近三帧向左转了十四点五度，因此无人机左偏航跟随。",
-    "slots.txt": "The pedestrian is {distance_m@t4} m ahead, {offset_x_px@t0..t4:trend}.\nIt walks on, so the drone tracks straight {speed_mps@t3}.",
-    "set.txt": "pedestrians.num_paths=3", "set_url.txt": "caption.teacher=https://host:8000/v1", "set_list.txt": "caption.endpoint={extra_body: {a: &a [x, 1.5e3], b: *a}}",
+    "slots.txt": "The pedestrian is {distance_m@t4} m ahead, {offset_x_px@t0..t4:trend}.\n"
+    "It walks on, so the drone tracks straight {speed_mps@t3}.",
+    "set.txt": "pedestrians.num_paths=3", "set_url.txt": "caption.teacher=https://host:8000/v1",
+    "set_list.txt": "caption.endpoint={extra_body: {a: &a [x, 1.5e3], b: *a}}",
     "url.txt": "https://[::1]:8000/v1/chat/completions",
     "header.txt": "120",
     "reply.json": json.dumps(REPLY),
     "signature.json": json.dumps({
-        "schema": sign.SCHEMA, "schema_version": sign.VERSION, "algorithm": "ed25519", "signed_file": "checksums.sha256",
+        "schema": sign.SCHEMA, "schema_version": sign.VERSION, "algorithm": "ed25519",
+        "signed_file": "checksums.sha256",
         "public_key": f"{'A' * 43}=", "signature": f"{'A' * 86}==",
     }),
 }  # fmt: skip
@@ -402,7 +415,9 @@ def _records(root: Path) -> None:
         "  haze: {cloudiness: 9, precipitation: 0, fog_density: 70, fog_distance: 12.5}\n"
     )
     (root / "run.yaml").write_text(
-        "name: a\nseed: 3\npedestrians: {num_paths: 3}\ncaption:\n  teacher: http://host/v1\n  window: {num_frames: 5}\nrelease: {licence: cc-by-4.0}\n"
+        "name: a\nseed: 3\npedestrians: {num_paths: 3}\n"
+        "caption:\n  teacher: http://host/v1\n  window: {num_frames: 5}\n"
+        "release: {licence: cc-by-4.0}\n"
     )
     write_json(
         root / "summary.json",
@@ -617,7 +632,7 @@ def _viewed(root: Path, scratch: Path, folder: Path) -> None:
 
 
 def _changed_release(root: Path, scratch: Path) -> Path:
-    """A copy of the release with the changed shard in its place, and its size on record: what only differs in size is refused at the door."""
+    """A copy of the release with the changed shard in its place and its size on record, so that it is read."""
     dataset = shutil.copytree(root / "release/dataset", scratch / "dataset")
     shard, changed = min((dataset / "data").iterdir()), root / "shard.parquet"
     shard.unlink()
@@ -662,7 +677,9 @@ PICTURES = tuple(f"{TREE}/ORI/{FRAME}/{name}" for name in ("rgb.png", "depth.npy
 READERS: dict[str, Reader] = {
     "boxes": _one("boxes_3d.json", read_boxes),
     "meshes, glTF": _one("mesh.glb", lambda path: read_meshes(path, tree=path.parent)),
-    "meshes, glTF as text": Reader(("mesh.gltf", "mesh.bin"), lambda root, _: read_meshes(root / "mesh.gltf", tree=root)),
+    "meshes, glTF as text": Reader(
+        ("mesh.gltf", "mesh.bin"), lambda root, _: read_meshes(root / "mesh.gltf", tree=root)
+    ),
     "meshes, OBJ": Reader(("mesh.obj", "mesh.mtl"), lambda root, _: read_meshes(root / "mesh.obj", tree=root)),
     "region of interest": _one("roi.json", read_roi),
     "region of interest, GeoJSON": _one("roi.geojson", read_roi),
@@ -674,25 +691,57 @@ READERS: dict[str, Reader] = {
     "city model": _one("city.json", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
     "city model, lines": _one("city.jsonl", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
     "city model, packed": _one("city.json.gz", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
-    "SimWorld": Reader(("world.json", "Bbox.json"), lambda root, _: simworld.load(simworld.SimWorldConfig(world=root / "world.json"))),
+    "SimWorld": Reader(
+        ("world.json", "Bbox.json"), lambda root, _: simworld.load(simworld.SimWorldConfig(world=root / "world.json"))
+    ),
     "simplify": Reader(("boxes_3d.json",), _simplified, share=0.2, hashes=True),
     "pedestrians": Reader(("boxes_3d.json", "roi.json"), _walked, share=0.1, hashes=True),
     "flight": Reader(FLIGHT, lambda root, _: read_flight(root / TREE / "ORI")),
     "flight, tolerant": Reader(FLIGHT, lambda root, _: read_flight(root / TREE / "ORI", strict=False)),
-    "flight and its twin": Reader(FLIGHT, lambda root, _: read_twin(read_flight(root / TREE / "aug_001", strict=False))),
+    "flight and its twin": Reader(
+        FLIGHT, lambda root, _: read_twin(read_flight(root / TREE / "aug_001", strict=False))
+    ),
     "annotation": _one(f"{TREE}/ORI/{FRAME}/meta.json", lambda path: read_meta(path.parent)),
     "rgb": _one(PICTURES[0], lambda path: read_rgb(path.parent)),
     "depth": _one(PICTURES[1], lambda path: read_depth(path.parent)),
     "depth, packed": _one(f"{TREE}/aug_001/{FRAME}/{DEPTH_PNG}", lambda path: read_depth(path.parent)),
     "instance": _one(PICTURES[2], lambda path: read_instance(path.parent)),
-    "PNG, by rows": Reader(PICTURES[::2], lambda root, _: [parse_png(read_bytes(root / name, what="picture"), name).pixels() for name in PICTURES[::2]]),
+    "PNG, by rows": Reader(
+        PICTURES[::2],
+        lambda root, _: [parse_png(read_bytes(root / name, what="picture"), name).pixels() for name in PICTURES[::2]],
+    ),
     "instance_ids": _one(f"render/Town01/{IDS_FILE}", lambda path: read_instance_ids(path.parent)),
     "town": _one("render/Town01/map.json", lambda path: read_town_map(path.parent)),
-    "flight's checksums": Reader((f"{TREE}/ORI/{CHECKSUMS}",), lambda root, _: provenance.folder_digests(root / TREE / "ORI"), hashes=True),
+    "flight's checksums": Reader(
+        (f"{TREE}/ORI/{CHECKSUMS}",), lambda root, _: provenance.folder_digests(root / TREE / "ORI"), hashes=True
+    ),
     "gallery": Reader((*FLIGHT, *PICTURES), _tree, share=0.1),
-    "inspect": Reader((*FLIGHT, *PICTURES, f"{TREE}/ORI/{FRAME}/meta.json", f"{TREE}/ORI/{CHECKSUMS}", "drone_trace.json", "boxes_3d.json"), _inspected, share=0.2, hashes=True),
+    "inspect": Reader(
+        (
+            *FLIGHT,
+            *PICTURES,
+            f"{TREE}/ORI/{FRAME}/meta.json",
+            f"{TREE}/ORI/{CHECKSUMS}",
+            "drone_trace.json",
+            "boxes_3d.json",
+        ),
+        _inspected,
+        share=0.2,
+        hashes=True,
+    ),
     "caption": Reader(FLIGHT, _captioned, share=0.1, hashes=True),
-    "caption, of a file": Reader(("foreign.jsonl",), lambda root, scratch: _captioned(root, scratch, teacher=f"file:{root}/foreign.jsonl", writing="prose", repair={"hard_conflict": "keep", "soft_conflict": "keep"}), share=0.2, hashes=True),
+    "caption, of a file": Reader(
+        ("foreign.jsonl",),
+        lambda root, scratch: _captioned(
+            root,
+            scratch,
+            teacher=f"file:{root}/foreign.jsonl",
+            writing="prose",
+            repair={"hard_conflict": "keep", "soft_conflict": "keep"},
+        ),
+        share=0.2,
+        hashes=True,
+    ),
     "captions": _one("captions.jsonl", lambda path: list(read_captions(path))),
     "foreign captions": _one("foreign.jsonl", read_foreign),
     "gold captions": _one("gold.jsonl", lambda path: [(gold.coc, gold.facts) for gold in read_gold(path)]),
@@ -705,56 +754,142 @@ READERS: dict[str, Reader] = {
     ),
     "evaluation's scores": _one("evaluation/scores.parquet", read_scores),
     "evaluation": _one("evaluation/report.json", lambda path: read_report(path.parent)),
-    "samples": Reader((f"train/{RECORD}", "train/train.parquet"), lambda root, _: list(open_split(root / "train", "train")), hashes=True),
-    "track_samples": Reader((f"tracks/{TRACKS}", "tracks/train.parquet"), lambda root, _: list(read_track_samples(root / "tracks", "train")), hashes=True),
-    "windows of a tree": Reader(("captions.jsonl", *FLIGHT, *PICTURES), lambda root, _: _looked_at(root / "render", root / "captions.jsonl"), share=0.2),
+    "samples": Reader(
+        (f"train/{RECORD}", "train/train.parquet"),
+        lambda root, _: list(open_split(root / "train", "train")),
+        hashes=True,
+    ),
+    "track_samples": Reader(
+        (f"tracks/{TRACKS}", "tracks/train.parquet"),
+        lambda root, _: list(read_track_samples(root / "tracks", "train")),
+        hashes=True,
+    ),
+    "windows of a tree": Reader(
+        ("captions.jsonl", *FLIGHT, *PICTURES),
+        lambda root, _: _looked_at(root / "render", root / "captions.jsonl"),
+        share=0.2,
+    ),
     "windows, of a record": _one("release/dataset/release.json", lambda path: _looked_at(path.parent)),
-    "windows of a release": Reader(("shard.parquet",), lambda root, scratch: _looked_at(_changed_release(root, scratch)), share=0.3, hashes=True),
-    "prepare": Reader(("captions.jsonl",), lambda root, scratch: _prepare(root / "captions.jsonl", root / "render", scratch / "train"), share=0.3, hashes=True),
+    "windows of a release": Reader(
+        ("shard.parquet",), lambda root, scratch: _looked_at(_changed_release(root, scratch)), share=0.3, hashes=True
+    ),
+    "prepare": Reader(
+        ("captions.jsonl",),
+        lambda root, scratch: _prepare(root / "captions.jsonl", root / "render", scratch / "train"),
+        share=0.3,
+        hashes=True,
+    ),
     "evaluate": Reader(("predictions.jsonl", "train/val.parquet", "train/train.parquet"), _evaluated, hashes=True),
     "checkpoint": Reader(("checkpoints/step_000002/state.json", f"checkpoints/step_000002/{CHECKSUMS}"), _checkpoint),
     "training log": Reader(("log.jsonl",), _log),
-    "adapter": _one(f"model/{checkpoint.ADAPTER_FACTS}", lambda path: checkpoint.read_adapter_facts(path.parent, path.parent)),
+    "adapter": _one(
+        f"model/{checkpoint.ADAPTER_FACTS}", lambda path: checkpoint.read_adapter_facts(path.parent, path.parent)
+    ),
     "merge": Reader(
-        ("adapter/adapter_config.json", "adapter/adapter_model.safetensors", "base/config.json",
-         "base/model-00001-of-00001.safetensors", "base/model.safetensors.index.json"), _merged, share=0.5, hashes=True,
+        (
+            "adapter/adapter_config.json",
+            "adapter/adapter_model.safetensors",
+            "base/config.json",
+            "base/model-00001-of-00001.safetensors",
+            "base/model.safetensors.index.json",
+        ),
+        _merged,
+        share=0.5,
+        hashes=True,
     ),
     "student's teaching": _one(f"model/{TAUGHT}", lambda path: read_taught(path.parent)),
     "student model": _one("model/config.json", lambda path: student.weight_files(path.parent)),
     "inspection": _one("inspect.json", read_inspection),
     "decisions": Reader(("inspect/review.jsonl",), lambda root, _: review.read_settled(root / "inspect/inspect.json")),
     "decisions, filled in": _one("decisions.json", read_filled),
-    "depth study": Reader(PICTURES[:2], lambda root, scratch: study_depth(root / TREE / "ORI" / FRAME, scratch / "study"), share=0.2),
-    "release, build": Reader(("inspect.json", "captions.jsonl", *FLIGHT, *PICTURES, "render/Town01/map.json"), _released, share=0.1, hashes=True),
+    "depth study": Reader(
+        PICTURES[:2], lambda root, scratch: study_depth(root / TREE / "ORI" / FRAME, scratch / "study"), share=0.2
+    ),
+    "release, build": Reader(
+        ("inspect.json", "captions.jsonl", *FLIGHT, *PICTURES, "render/Town01/map.json"),
+        _released,
+        share=0.1,
+        hashes=True,
+    ),
     "release record": _one("release/dataset/release.json", read_record),
-    "signature": _one("signature.json", lambda path: read_model(path, sign.Signature, schema=sign.SCHEMA, version=sign.VERSION, what="signature")),
+    "signature": _one(
+        "signature.json",
+        lambda path: read_model(path, sign.Signature, schema=sign.SCHEMA, version=sign.VERSION, what="signature"),
+    ),
     "release, verify": Reader(
-        ("shard.parquet", *(f"release/dataset/{name}" for name in ("release.json", "croissant.json", CHECKSUMS, "README.md"))),
-        lambda root, _: _verified(root), share=0.4, hashes=True),
+        (
+            "shard.parquet",
+            *(f"release/dataset/{name}" for name in ("release.json", "croissant.json", CHECKSUMS, "README.md")),
+        ),
+        lambda root, _: _verified(root),
+        share=0.4,
+        hashes=True,
+    ),
     "release, stats": Reader(("shard.parquet", "release/dataset/release.json"), _counted, share=0.4, hashes=True),
-    "release, viewer": Reader(("shard.parquet", "release/dataset/release.json"), lambda root, scratch: _viewed(root, scratch, root / "release"), share=0.4, hashes=True),
-    "tree, viewer": Reader(("captions.jsonl", *FLIGHT, *PICTURES), lambda root, scratch: _viewed(root, scratch, root / "render"), share=0.2),
+    "release, viewer": Reader(
+        ("shard.parquet", "release/dataset/release.json"),
+        lambda root, scratch: _viewed(root, scratch, root / "release"),
+        share=0.4,
+        hashes=True,
+    ),
+    "tree, viewer": Reader(
+        ("captions.jsonl", *FLIGHT, *PICTURES), lambda root, scratch: _viewed(root, scratch, root / "render"), share=0.2
+    ),
     **{
-        f"release, export to {name}": Reader(("shard.parquet",), lambda root, scratch, name=name: _exported(root, scratch, name), share=0.1, hashes=True)
+        f"release, export to {name}": Reader(
+            ("shard.parquet",), lambda root, scratch, name=name: _exported(root, scratch, name), share=0.1, hashes=True
+        )
         for name in ("tree", "webdataset", "lerobot")
     },
-    "release, captions": Reader(("shard.parquet",), lambda root, scratch: export_captions(_changed_release(root, scratch), scratch / "c.csv", "csv"), share=0.2, hashes=True),
-    "release, get": Reader(("release/dataset/release.json", f"release/dataset/{CHECKSUMS}"), lambda root, scratch: _fetched(root / "release/dataset", scratch), share=0.2, hashes=True),
-    "release, get a part": Reader(("shard.parquet",), lambda root, scratch: _fetched(_changed_release(root, scratch), scratch, modalities=["rgb"]), share=0.1, hashes=True),
+    "release, captions": Reader(
+        ("shard.parquet",),
+        lambda root, scratch: export_captions(_changed_release(root, scratch), scratch / "c.csv", "csv"),
+        share=0.2,
+        hashes=True,
+    ),
+    "release, get": Reader(
+        ("release/dataset/release.json", f"release/dataset/{CHECKSUMS}"),
+        lambda root, scratch: _fetched(root / "release/dataset", scratch),
+        share=0.2,
+        hashes=True,
+    ),
+    "release, get a part": Reader(
+        ("shard.parquet",),
+        lambda root, scratch: _fetched(_changed_release(root, scratch), scratch, modalities=["rgb"]),
+        share=0.1,
+        hashes=True,
+    ),
     "export record": _one("export/webdataset/webdataset/export.json", read_export),
     **{
-        f"release, verify {name}": Reader(tuple(f"export/{name}/{name}/{file}" for file in files), lambda root, _, name=name: verify(root / f"export/{name}/{name}"), share=0.2, hashes=True)
+        f"release, verify {name}": Reader(
+            tuple(f"export/{name}/{name}/{file}" for file in files),
+            lambda root, _, name=name: verify(root / f"export/{name}/{name}"),
+            share=0.2,
+            hashes=True,
+        )
         for name, files in EXPORTED.items()
     },
     "shard": Reader(("shard.parquet",), lambda root, _: _shard(root)),
     "manifest": _one("inspect/manifest.json", lambda path: read_manifest(path.parent)),
-    "stage record": Reader(("inspect/stage.json", "inspect/manifest.json", "inspect/items.jsonl"), _resumed, share=0.4, hashes=True),
-    "verify": Reader(("inspect/stage.json", "inspect/manifest.json", f"{TREE}/ORI/{CHECKSUMS}"), lambda root, _: provenance.verify([root / "inspect", root / "render"]), share=0.3, hashes=True),
+    "stage record": Reader(
+        ("inspect/stage.json", "inspect/manifest.json", "inspect/items.jsonl"), _resumed, share=0.4, hashes=True
+    ),
+    "verify": Reader(
+        ("inspect/stage.json", "inspect/manifest.json", f"{TREE}/ORI/{CHECKSUMS}"),
+        lambda root, _: provenance.verify([root / "inspect", root / "render"]),
+        share=0.3,
+        hashes=True,
+    ),
     "failures": _one("failures.jsonl", read_failures),
     "events": _one("events.jsonl", lambda path: read_events(path.parent)),
     "summary": _one("summary.json", read_json),
     "comparison": Reader(("compare/compare.json", "compare/manifest.json"), _tables),
-    "presets of weather": _one("sky.yaml", lambda path: read_pools(build(RenderConfig, {"weather_mode": "random_per_path", "weather_pool": str(path)}, "x"))),
+    "presets of weather": _one(
+        "sky.yaml",
+        lambda path: read_pools(
+            build(RenderConfig, {"weather_mode": "random_per_path", "weather_pool": str(path)}, "x")
+        ),
+    ),
     "actions": _one("actions.yaml", read_actions),
     "actions beside captions": _one("actions.json", lambda path: actions_beside(path)),
     "prompts": Reader(("prompts/user_en.txt", "prompts/system_zh.txt"), lambda root, _: own_prompts(root / "prompts")),
@@ -771,7 +906,7 @@ READERS: dict[str, Reader] = {
     "prose": Reader(("prose.txt",), lambda root, _: _prose(root, "prose.txt")),
     "prose in Chinese": Reader(("prose_zh.txt",), lambda root, _: _prose(root, "prose_zh.txt", "zh")),
     "slots": Reader(("slots.txt",), lambda root, _: _slots(root)),
-}  # fmt: skip
+}
 
 
 def _shard(root: Path) -> None:

@@ -1,7 +1,8 @@
 """Makes hostile files of honest ones: `mutated(name, data, rng)`. What is made depends on the generator alone.
 
-Half of the changes know nothing of the format; the others keep it: JSON, JSON lines (with the checksums of a journal), YAML, `.npy`, PNG,
-gzip, parquet, checksums. What is broken in structure never gets past a parser; what is broken in meaning does.
+Half of the changes know nothing of the format; the others keep it: JSON, JSON lines (with the checksums of a journal),
+YAML, `.npy`, PNG, gzip, parquet, checksums. What is broken in structure never gets past a parser; what is broken in
+meaning does.
 """
 
 from __future__ import annotations
@@ -32,16 +33,24 @@ HUGE: Instead = "20 GB of nothing"
 Random = random.Random
 
 TOKENS = [
-    b"NaN", b"-Infinity", b"1e999", b"-1e-999", b"7" * 400, b"9" * 39, b"18446744073709551616", b"-1", b"0", b"null", b"true",
-    b"\0", b"\xff\xfe", b"\xef\xbb\xbf", b"\xc3\x28", b"\xed\xa0\x80", b"\\ud800", b"\x1b[31m", b"\r", b"\n", b"\n\n", b"\xe2\x80\xa8",
-    b"[" * 300, b"]" * 300, b'{"a":' * 300, b'"', b"'", b"{", b"}", b"[", b"]", b",", b":", b"\\", b"&a [*a]", b"!!python/name:os.system ",
-    b"<<: *a", b"../" * 20 + b"etc/passwd", b"/dev/zero", b"<script>", b"[bold]", b"%s%n", b"x" * 70_000, b" " * 70_000, b"PAR1",
-    b"\x89PNG\r\n\x1a\n", b"\x93NUMPY\1\0", b"\x1f\x8b\x08\0", b"<think>" * 200, b"```json", b"{{" * 200, b"//", b"/*", b"#", b"---\n",
+    b"NaN", b"-Infinity", b"1e999", b"-1e-999", b"7" * 400, b"9" * 39, b"18446744073709551616", b"-1", b"0", b"null",
+    b"true",
+    b"\0", b"\xff\xfe", b"\xef\xbb\xbf", b"\xc3\x28", b"\xed\xa0\x80", b"\\ud800", b"\x1b[31m", b"\r", b"\n", b"\n\n",
+    b"\xe2\x80\xa8",
+    b"[" * 300, b"]" * 300, b'{"a":' * 300, b'"', b"'", b"{", b"}", b"[", b"]", b",", b":", b"\\", b"&a [*a]",
+    b"!!python/name:os.system ",
+    b"<<: *a", b"../" * 20 + b"etc/passwd", b"/dev/zero", b"<script>", b"[bold]", b"%s%n", b"x" * 70_000, b" " * 70_000,
+    b"PAR1",
+    b"\x89PNG\r\n\x1a\n", b"\x93NUMPY\1\0", b"\x1f\x8b\x08\0", b"<think>" * 200, b"```json", b"{{" * 200, b"//", b"/*",
+    b"#", b"---\n",
 ]  # fmt: skip
 WHOLE = [
-    b"", b"\0", b"\n", b"null", b"[]", b"{}", b"0", b'""', b'"word"', b"[NaN,[[[", b"[" * 100_000, b'{"a":' * 50_000, b"[" * 60 + b"]" * 60,
-    "{}".encode("utf-16"), b"\xff" * 1000, b"7" * 5000, b"a: &a [x, x]\n" + b"".join(b"%c: &%c [*%c, *%c, *%c]\n" % (k, k, k - 1, k - 1, k - 1) for k in range(98, 120)),
-    gzip.compress(b"0" * 200_000_000, 9, mtime=0), b"\x1f\x8b\x08\0", b"PAR1" + b"\0" * 40 + b"\xff\xff\xff\x7fPAR1", b"# " * 40_000, b"[[]," * 50_000,
+    b"", b"\0", b"\n", b"null", b"[]", b"{}", b"0", b'""', b'"word"', b"[NaN,[[[", b"[" * 100_000, b'{"a":' * 50_000,
+    b"[" * 60 + b"]" * 60,
+    "{}".encode("utf-16"), b"\xff" * 1000, b"7" * 5000, b"a: &a [x, x]\n" + b"".join(b"%c: &%c [*%c, *%c, *%c]\n" % (k,
+    k, k - 1, k - 1, k - 1) for k in range(98, 120)),
+    gzip.compress(b"0" * 200_000_000, 9, mtime=0), b"\x1f\x8b\x08\0", b"PAR1" + b"\0" * 40 + b"\xff\xff\xff\x7fPAR1",
+    b"# " * 40_000, b"[[]," * 50_000,
 ]  # fmt: skip
 
 
@@ -53,15 +62,20 @@ class Raw:
 
 
 VALUES: list[Any] = [
-    None, True, False, 0, -1, 1, 2, 1.5, -0.0, 1e308, -1e308, 5e-324, 1e18, 2**31, 2**53 + 1, 2**63, 2**64, 10**39, 10**9, "", "x", "0", "nan", "1e999",
-    "\0", "\x1b[31m", "../../../etc/passwd", "/dev/zero", "/", ".", "..", "a/b", "a" * 300, "<script>alert(1)</script>", "[bold]", "行人", "\u202e", "x" * 100_000,
-    "2026-01-01", [], {}, [[]], [None], [0, 0, 0], ["x"], {"x": 0}, [{}], {"": ""}, [1e308] * 4, list(range(2000)), Raw("NaN"), Raw("1e999"), Raw("-Infinity"),
-    Raw("7" * 400), Raw("-" + "7" * 5000), Raw('"\\ud800"'), Raw("[" * 70 + "]" * 70), Raw("[" * 50 + "]" * 50), Raw("[" * 5000 + "]" * 5000), Raw("1E400"), Raw("01"),
+    None, True, False, 0, -1, 1, 2, 1.5, -0.0, 1e308, -1e308, 5e-324, 1e18, 2**31, 2**53 + 1, 2**63, 2**64, 10**39,
+    10**9, "", "x", "0", "nan", "1e999",
+    "\0", "\x1b[31m", "../../../etc/passwd", "/dev/zero", "/", ".", "..", "a/b", "a" * 300, "<script>alert(1)</script>",
+    "[bold]", "行人", "\u202e", "x" * 100_000,
+    "2026-01-01", [], {}, [[]], [None], [0, 0, 0], ["x"], {"x": 0}, [{}], [{}] * 20_000, {"": ""}, [1e308] * 4,
+    list(range(2000)),
+    Raw("NaN"), Raw("1e999"), Raw("-Infinity"),
+    Raw("7" * 400), Raw("-" + "7" * 5000), Raw('"\\ud800"'), Raw("[" * 70 + "]" * 70), Raw("[" * 50 + "]" * 50),
+    Raw("[" * 5000 + "]" * 5000), Raw("1E400"), Raw("01"),
 ]  # fmt: skip
 
 
 def mutated(name: str, data: bytes, rng: Random) -> bytes | Instead:
-    """Give what stands in the place of a file: other bytes, or something that is no file. One change, seldom two or three."""
+    """Give what stands in the place of a file: other bytes, or no file. One change, seldom two or three."""
     if rng.random() < 0.03:
         return rng.choice(INSTEAD)
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
@@ -92,13 +106,8 @@ def put(path: Path, content: bytes | Instead) -> None:
         with open(path, "wb") as file:
             file.truncate(20_000_000_000)
     elif content != "nothing":
-        targets = {
-            "device": "/dev/zero",
-            "link out": "/etc/passwd",
-            "link to itself": path.name,
-            "link to nothing": "gone",
-        }
-        path.symlink_to(targets[content])
+        targets = {"device": "/dev/zero", "link out": "/etc/passwd", "link to itself": path.name}
+        path.symlink_to(targets.get(content, "gone"))
 
 
 def clear(path: Path) -> None:
@@ -267,8 +276,10 @@ def _npy(data: bytes, rng: Random) -> bytes:
     header, body = data[10 : 10 + length], data[10 + length :]
     pattern, news = rng.choice(
         [
-            (rb"\(\d+, *\d+\)", [b"(1000000, 1000000)", b"(0, 0)", b"(36,)", b"()", b"(-1, -1)", b"(9999999999999999999, 0)", b"(2304, 1)", b"(36, 64, 1)", b"(1, 36, 64)", b"(1e9, 1)"]),
-            (rb"'<f4'", [b"'<f8'", b"'|O8'", b"'>f4'", b"'<i4'", b"'|V4'", b"'<U1'", b"[('a', '<f4')]", b"'<m8[s]'", b"'<c8'", b"'|b1'"]),
+            (rb"\(\d+, *\d+\)", [b"(1000000, 1000000)", b"(0, 0)", b"(36,)", b"()", b"(-1, -1)",
+            b"(9999999999999999999, 0)", b"(2304, 1)", b"(36, 64, 1)", b"(1, 36, 64)", b"(1e9, 1)"]),
+            (rb"'<f4'", [b"'<f8'", b"'|O8'", b"'>f4'", b"'<i4'", b"'|V4'", b"'<U1'", b"[('a', '<f4')]", b"'<m8[s]'",
+            b"'<c8'", b"'|b1'"]),
             (rb"False", [b"True", b"None", b"__import__('os')", b"1"]),
         ]
     )  # fmt: skip
@@ -366,43 +377,24 @@ def _other_table(table: pa.Table, rng: Random) -> pa.Table:
         return table.set_column(k, field.name, pa.array([str(row) for row in rows]))
 
 
+NAMES = [
+    b"../" * 8 + b"etc/passwd", b"/etc/passwd", b"", b".", b"a\0b", b"\xff", b"a" * 300, b"trajectory.json", b"//",
+    b"frames_playback",
+]  # fmt: skip
+
+
 def _checksums(data: bytes, rng: Random) -> bytes:
-    lines = data.splitlines(keepends=True)
-    digest, name = (
-        b"0" * 64,
-        rng.choice(
-            (
-                b"../" * 8 + b"etc/passwd",
-                b"/etc/passwd",
-                b"",
-                b".",
-                b"a\0b",
-                b"\xff",
-                b"a" * 300,
-                b"trajectory.json",
-                b"//",
-                b"frames_playback",
-            )
-        ),
-    )
-    line = (
-        rng.choice(
-            (
-                digest + b"  " + name,
-                b"0" * 63 + b"  x",
-                digest + name,
-                b"G" * 64 + b"  x",
-                digest.upper() + b" *" + name,
-            )
-        )
-        + b"\n"
-    )
-    lines.insert(rng.randrange(len(lines) + 1), line)
+    lines, digest, name = data.splitlines(keepends=True), b"0" * 64, rng.choice(NAMES)
+    line = rng.choice([
+        digest + b"  " + name, b"0" * 63 + b"  x", digest + name, b"G" * 64 + b"  x", digest.upper() + b" *" + name,
+    ])  # fmt: skip
+    lines.insert(rng.randrange(len(lines) + 1), line + b"\n")
     return b"".join(lines) if rng.random() < 0.6 else _words(data, rng)
 
 
 _BY_ENDING: dict[str, Callable[[bytes, Random], bytes]] = {
-    ".json": _json, ".jsonl": _json_lines, ".yaml": _yaml, ".npy": _npy, ".png": _png, ".gz": _gzip, ".parquet": _parquet, ".sha256": _checksums,
+    ".json": _json, ".jsonl": _json_lines, ".yaml": _yaml, ".npy": _npy, ".png": _png, ".gz": _gzip,
+    ".parquet": _parquet, ".sha256": _checksums,
 }  # fmt: skip
 
 

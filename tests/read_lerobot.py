@@ -1,4 +1,4 @@
-"""Opens a data set with LeRobot itself and prints as JSON what it sees; run by the interpreter of an environment that has it."""
+"""Opens a data set with LeRobot itself and prints as JSON what it sees; run where LeRobot is installed."""
 
 import hashlib
 import json
@@ -41,7 +41,8 @@ def main(root: str, *indices: str) -> None:
     windows = LeRobotDataset("cosfly/flights", root=root, delta_timestamps={"observation.state": [-0.5, 0.0]})
     batch = next(iter(torch.utils.data.DataLoader(data, batch_size=4, shuffle=False)))
     told = {
-        "frames": len(data), "episodes": data.meta.total_episodes, "fps": data.meta.fps, "splits": data.meta.info["splits"],
+        "frames": len(data), "episodes": data.meta.total_episodes, "fps": data.meta.fps,
+        "splits": data.meta.info["splits"],
         "items": {index: look(data[int(index)]) for index in indices},
         "before": windows[int(indices[-1])]["observation.state"].tolist(), "stats": stats,
         "batch": list(batch["observation.images.rgb"].shape),

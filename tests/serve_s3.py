@@ -1,7 +1,7 @@
 """An S3 server that holds a folder: `serve_s3.py FOLDER SECONDS LOG`.
 
-Prints its address when all of it is there, answers every GET so many seconds late, writes a line of JSON for each request, and ends with its input.
-Runs in an environment of its own (tests/owners.py).
+Prints its address when all of it is there, answers every GET so many seconds late, writes a line of JSON for each
+request, and ends with its input. Runs in an environment of its own (tests/owners.py).
 """
 
 import json

@@ -266,7 +266,8 @@ def city_file(path: Path) -> Path:
         "vertices": [list(v) for v in (*ROOF, *road)],
         "CityObjects": {
             "house": {"type": "Building", "geometry": house},
-            "road": {"type": "Road", "geometry": [{"type": "MultiSurface", "lod": "1", "boundaries": [[[10, 11, 12, 13]]]}]},
+            "road": {"type": "Road", "geometry": [{"type": "MultiSurface", "lod": "1",
+            "boundaries": [[[10, 11, 12, 13]]]}]},
         },
     }))  # fmt: skip
     return path
@@ -367,7 +368,8 @@ def test_depth_and_ids_are_those_of_trimesh_rays(tmp_path: Path, name: str) -> N
     box_map = scene_map(tmp_path)
     solids = solids_of(box_map)
     boxes = [
-        trimesh.creation.box(2 * box_map.half_extents[row], trimesh.transformations.translation_matrix(box_map.centers[row])
+        trimesh.creation.box(2 * box_map.half_extents[row],
+        trimesh.transformations.translation_matrix(box_map.centers[row])
         @ trimesh.transformations.rotation_matrix(np.radians(box_map.rotations_deg[row, 1]), (0, 0, 1)))
         for row in (0, 5)
     ]  # fmt: skip

@@ -148,8 +148,10 @@ def test_a_second_release_of_the_exported_tree_has_the_same_rows(whole, dataset,
     again = build(tmp_path, tmp_path / "release", CFG.model_copy(update={"num_frames": 400}))
     first, second = rows_by_id(dataset), rows_by_id(again)
     assert first.keys() == second.keys()
-    told_elsewhere = {name for name in next(iter(first.values())) if name.startswith(("caption_", "proved", "prompt_", "system_"))} | {
-        "has_caption", "decision", "label", "label_from", "verdict", "repair_strategy", "teacher_kind", "teacher_model", "writing", "evidence", "look",
+    told_elsewhere = {name for name in next(iter(first.values())) if name.startswith(("caption_", "proved", "prompt_",
+    "system_"))} | {
+        "has_caption", "decision", "label", "label_from", "verdict", "repair_strategy", "teacher_kind", "teacher_model",
+        "writing", "evidence", "look",
     }  # fmt: skip
     for name, row in first.items():
         for column in row.keys() - told_elsewhere:

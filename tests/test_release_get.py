@@ -506,8 +506,10 @@ def test_a_redirect_is_followed_without_user_and_password(dataset, tmp_path, mon
 @pytest.mark.parametrize(
     "place",
     [
-        "http://localhost:{port}/there/{path}", "http://169.254.169.254/{path}", "http://10.0.0.1/", "http://[::1]:{port}/x", "http://[::ffff:127.0.0.1]/",
-        "http://0x7f000001:{port}/x", "http://0/", "file:///etc/passwd", "http://[::1", "//", "ftp://example.org/", "http://x:99999/", "\x1b[31m", "",
+        "http://localhost:{port}/there/{path}", "http://169.254.169.254/{path}", "http://10.0.0.1/",
+        "http://[::1]:{port}/x", "http://[::ffff:127.0.0.1]/",
+        "http://0x7f000001:{port}/x", "http://0/", "file:///etc/passwd", "http://[::1", "//", "ftp://example.org/",
+        "http://x:99999/", "\x1b[31m", "",
         "/{path}", "http://xn--0/",
     ],
 )  # fmt: skip
@@ -691,8 +693,10 @@ def test_finished_shards_that_are_gone_are_told_of(dataset, tmp_path):
 @pytest.mark.parametrize(
     "address",
     [
-        "http://[::1", "reference://x", "", "http://", "http://host:99999/x", "http://xn--0/", "http://127.0.0.1:9/", "zip://", "::", "nosuchprotocol://x",
-        "data:text/plain,x", "x" * 100_000, "http://\0/", "a\0b", "\ud800", "hf://", "memory://nothing", "simplecache::reference://",
+        "http://[::1", "reference://x", "", "http://", "http://host:99999/x", "http://xn--0/", "http://127.0.0.1:9/",
+        "zip://", "::", "nosuchprotocol://x",
+        "data:text/plain,x", "x" * 100_000, "http://\0/", "a\0b", "\ud800", "hf://", "memory://nothing",
+        "simplecache::reference://",
         "file:///proc/self",
     ],
     ids=lambda address: repr(address[:30]),

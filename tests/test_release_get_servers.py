@@ -205,7 +205,8 @@ class Hub(http.server.BaseHTTPRequestHandler):
         name = asked.partition("/resolve/main/")[2]
         if "/tree/main" in asked:
             folder = self.server.folder / asked.partition("/tree/main")[2].strip("/")
-            return self.answer([self.told(path.relative_to(self.server.folder).as_posix()) for path in folder.iterdir()])  # fmt: skip
+            names = [path.relative_to(self.server.folder).as_posix() for path in folder.iterdir()]
+            return self.answer([self.told(name) for name in names])
         if not name:
             return self.answer({"id": "me/town", "sha": "0" * 40, "siblings": []})
         data = (self.server.folder / name).read_bytes()
@@ -233,7 +234,8 @@ def test_the_hubs_own_client(dataset, part, tmp_path):
     server.daemon_threads = True
     server.folder, server.sent = dataset, []
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    env = os.environ | {"HF_ENDPOINT": f"http://127.0.0.1:{server.server_port}", "HF_HOME": str(tmp_path / "home"), "HF_HUB_OFFLINE": "0"}  # fmt: skip
+    env = os.environ | {"HF_ENDPOINT": f"http://127.0.0.1:{server.server_port}", "HF_HOME": str(tmp_path / "home"),
+    "HF_HUB_OFFLINE": "0"}  # fmt: skip
     try:
         done(command(sys.executable, "hf://datasets/me/town", tmp_path / "out", *PART_WORDS), env)
     finally:

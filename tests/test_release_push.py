@@ -1,4 +1,4 @@
-"""A release on its way to a hub: the library's real client against a server of ours that speaks as much of the protocol as an upload needs."""
+"""A release on its way to a hub: the library's real client against a server of ours."""
 
 import base64
 import contextlib
@@ -25,7 +25,7 @@ NAME = "me/town"
 
 
 def is_public(made: dict) -> bool:
-    """How a repository was asked for: versions of the library say it in two ways, and a hub takes neither for public."""
+    """How a repository was asked for: versions of the library say it in two ways; a hub takes neither for public."""
     return made.get("private") is not True and made.get("visibility") != "private"
 
 
@@ -62,7 +62,8 @@ class Hub(http.server.BaseHTTPRequestHandler):
         if path == "/api/whoami-v2":
             return self.answer(200, {"name": "me", "type": "user"})
         siblings = [
-            {"rfilename": name, "size": len(data), **({"lfs": {"sha256": hashlib.sha256(data).hexdigest(), "size": len(data), "pointerSize": 130}} if name.endswith(".parquet") else {})}
+            {"rfilename": name, "size": len(data), **({"lfs": {"sha256": hashlib.sha256(data).hexdigest(),
+            "size": len(data), "pointerSize": 130}} if name.endswith(".parquet") else {})}
             for name, data in hub.files.items()
         ]  # fmt: skip
         return self.answer(200, {"id": NAME, "private": not is_public(hub.made), "siblings": siblings})
@@ -133,7 +134,8 @@ def command(folder: Path, home: Path, *more: str, address: str = "http://127.0.0
     """Run the command as a user does; the library reads its environment when it is loaded."""
     env = {
         **{name: value for name, value in os.environ.items() if not name.startswith("HF_")},
-        "HF_ENDPOINT": address, "HF_HUB_DISABLE_XET": "1", "HF_HOME": str(home), "HOME": str(home), **({"HF_TOKEN": key} if key else {}),
+        "HF_ENDPOINT": address, "HF_HUB_DISABLE_XET": "1", "HF_HOME": str(home), "HOME": str(home),
+        **({"HF_TOKEN": key} if key else {}),
     }  # fmt: skip
     words = ["release", "push", str(folder), "--repo", NAME, "--level", "structure", *more]
     return subprocess.run(

@@ -1,5 +1,4 @@
-"""`release verify` on exports: rows and pictures of each format are read again, and lies in them are found whatever its
-checksums say."""
+"""`release verify` on exports: made again from their release, so that lies are found whatever checksums say."""
 
 from __future__ import annotations
 

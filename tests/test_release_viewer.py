@@ -1,4 +1,4 @@
-"""The viewer: what it chooses, how large it gets, that foreign text stays text, and, in a real browser, that it works."""
+"""The viewer: what it chooses, how large it gets, that foreign text stays text, and that it works in a browser."""
 
 from __future__ import annotations
 
@@ -48,12 +48,15 @@ from release.viewer.page import page_html, run
 from specimens import make_playback_tree
 
 NUM_POINTS = 24
-EVIL = "</script><script>window.hacked=1</script><img src=x onerror='window.hacked=2'>\u202e\x1b]0;owned\x07 {\"a\":1} <!-- ${1}"
+EVIL = (
+    "</script><script>window.hacked=1</script><img src=x onerror='window.hacked=2'>"
+    '\u202e\x1b]0;owned\x07 {"a":1} <!-- ${1}'
+)
 
 
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory) -> Path:
-    """A run of four flights in two towns with captions, among them a conflict, a repaired, a dropped and a hostile one, and a map."""
+    """A run of four flights in two towns with a map and captions: a conflict, a repaired, a dropped, a hostile one."""
     folder = tmp_path_factory.mktemp("runs") / "one"
     tree = make_playback_tree(folder / "render", 2, NUM_POINTS, width_px=96, height_px=54, towns=("Town01", "Town02"))
     captions = []
@@ -439,7 +442,8 @@ def test_keys_and_the_slider_move_in_time(tab, page):
     assert "aug_001" in tab.run(WHERE)
     tab.press("ArrowUp")
     tab.run(
-        "(() => { const one = document.getElementById('time'); one.value = one.max; one.dispatchEvent(new Event('input')); })()"
+        "(() => { const one = document.getElementById('time'); one.value = one.max; "
+        "one.dispatchEvent(new Event('input')); })()"
     )
     assert f"frame {NUM_POINTS - 2}" in tab.run(WHERE)
     assert f"frame={NUM_POINTS - 2}" in tab.run("location.hash")

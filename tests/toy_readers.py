@@ -59,6 +59,8 @@ def _recurse(path: Path) -> None:
 
 
 READERS = {
-    "good": _bad(_refuse, once=False), "traceback": _bad(_divide, once=False), "hang": _bad(_hang), "blocked": _bad(lambda path: time.sleep(1000)),
-    "memory": _bad(_allocate), "two lines": _bad(_refuse_at_length), "killed": _bad(lambda path: os.kill(os.getpid(), signal.SIGKILL)), "recursion": _bad(_recurse),
+    "good": _bad(_refuse, once=False), "traceback": _bad(_divide, once=False), "hang": _bad(_hang),
+    "blocked": _bad(lambda path: time.sleep(1000)),
+    "memory": _bad(_allocate), "two lines": _bad(_refuse_at_length),
+    "killed": _bad(lambda path: os.kill(os.getpid(), signal.SIGKILL)), "recursion": _bad(_recurse),
 }  # fmt: skip
