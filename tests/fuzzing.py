@@ -309,7 +309,7 @@ def _png(data: bytes, rng: Random) -> bytes:
     way = rng.randrange(6)
     if way == 0:
         width, height, *rest = struct.unpack(">IIBBBBB", chunks[0][1])
-        sizes = (0, 1, width, height, width + 1, 7000, 32_000, 2**31 - 1, 2**32 - 1)
+        sizes = (0, 1, width, height, (width + 1) % 2**32, 7000, 32_000, 2**31 - 1, 2**32 - 1)
         rest[rng.randrange(5)] = rng.choice((0, 1, 2, 3, 4, 6, 8, 16, 255))
         chunks[0] = (b"IHDR", struct.pack(">IIBBBBB", rng.choice(sizes), rng.choice(sizes), *rest))
     elif way == 1:
