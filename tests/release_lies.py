@@ -325,10 +325,10 @@ def not_a_number(row: Row) -> None:
     set_depth(row, depth)
 
 
-def boxed(depth: np.ndarray, row: Row) -> np.ndarray:
-    depth = depth.copy()
-    depth[5:25, 5:25] = 3.0
-    return depth
+def boxed(row: Row) -> None:
+    depth = depth_of(row)
+    depth[5:25, 5:25] = 3.0  # also where the sky is
+    set_depth(row, depth)
 
 
 def one_thing_farther(row: Row) -> None:
@@ -496,7 +496,7 @@ LIES_OF_PIXELS: dict[str, Lie] = {
     "depth_set_off": change(everything, with_depth(lambda depth, _: depth + 0.3)),
     "depth_of_a_flight_scaled": change(clean, with_depth(lambda depth, _: depth * 1.02)),
     "noise_in_one_depth": change(middle, with_depth(noise)),
-    "obstacle_that_is_not_there": change(middle, with_depth(boxed)),
+    "obstacle_that_is_not_there": change(middle, boxed),
     "thing_farther_in_one_frame": change(middle, one_thing_farther),
     "empty_instances": change(at(seen, 2), with_ids(lambda pixels, _: pixels.fill(0))),
     "person_painted_over": change(at(seen, 2), with_ids(without_the_person((1, 0, 0)))),
