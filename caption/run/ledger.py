@@ -18,6 +18,11 @@ from cosfly.work.store import sha256_bytes
 TEXT_FIELDS = ("critical_components", "reasoning_trace")
 BIN_CHARACTERS = {"en": 25, "zh": 10}  # a Chinese character carries about as much as two or three Latin letters
 NUM_CARDS = 24
+# Fields of the report that count captions by a word.
+WORDS = (
+    "structured", "verdicts_of_first_answers", "verdicts_of_accepted", "labels", "label_from", "judgements",
+    "bilingual", "writing", "evidence_contradictions", "recovered",
+)  # fmt: skip
 
 
 # --- the report -------------------------------------------------------------------------------------------------------
@@ -144,20 +149,11 @@ class Ledger:
         self.teacher: TeacherRecord | None = None
         self.shelf = Shelf()
         self.chance = ChanceCounts()
-        self.first_verdicts: Counter[str] = Counter()
-        self.final_verdicts: Counter[str] = Counter()
-        self.labels: Counter[str] = Counter()
-        self.label_from: Counter[str] = Counter()
-        self.judgements: Counter[str] = Counter()
+        self.words = {name: Counter[str]() for name in WORDS}
         self.keyframes: Counter[str] = Counter()
         self.repairs: Counter[str] = Counter()
-        self.evidence: Counter[str] = Counter()
-        self.bilingual: Counter[str] = Counter()
-        self.writing: Counter[str] = Counter()
         self.sentences: Counter[tuple[str, str]] = Counter()  # language, state
-        self.recovered: Counter[str] = Counter()
         self.refusals: dict[str, str] = {}
-        self.structured: Counter[str] = Counter()
         self.tokens: Counter[str] = Counter()
         self.repair_asks: Counter[int] = Counter()
         self.confusion: Counter[tuple[str, str]] = Counter()  # label, first decision
@@ -169,12 +165,12 @@ class Ledger:
         self.num_asks += caption.attempts
         self.teacher = caption.teacher.model_copy(update={"structured": None})
         self.tokens.update(caption.usage.model_dump())
-        self.labels[caption.label or "none"] += 1
-        self.label_from[caption.label_from] += 1
+        self.words["labels"][caption.label or "none"] += 1
+        self.words["label_from"][caption.label_from] += 1
         if caption.status == "accepted":
             self.windows.kept += 1
-            self.final_verdicts[str(caption.verdict)] += 1
-            self.writing[caption.writing] += 1
+            self.words["verdicts_of_accepted"][str(caption.verdict)] += 1
+            self.words["writing"][caption.writing] += 1
             for language, states in (caption.checks.sentences or {}).items():
                 self.sentences.update((language, state) for state in states)
         else:
@@ -183,7 +179,7 @@ class Ledger:
                 self.refusals[str(caption.drop_reason)] = caption.checks.refusal
         repair = caption.repair
         if caption.en is not None:
-            self.first_verdicts[str(repair.first_verdict if repair else caption.verdict)] += 1
+            self.words["verdicts_of_first_answers"][str(repair.first_verdict if repair else caption.verdict)] += 1
             decision = repair.first_decision if repair else caption.en.flight_decision
             self.confusion[caption.label or "none", decision] += 1
         if repair:
@@ -198,9 +194,9 @@ class Ledger:
         self.shelf.add(caption)
         self.chance.add(caption)
         if caption.judge:
-            self.judgements[caption.judge.verdict] += 1
+            self.words["judgements"][caption.judge.verdict] += 1
             if caption.judge.overruled_by is not None:
-                self.judgements[f"overruled_by_{caption.judge.overruled_by}"] += 1
+                self.words["judgements"][f"overruled_by_{caption.judge.overruled_by}"] += 1
         self._add_checks(caption)
 
     def _add_checks(self, caption: Caption) -> None:
@@ -210,12 +206,12 @@ class Ledger:
             self.num_skipped += checks.keyframe.skipped
             self.num_missed += checks.keyframe.missed
         if isinstance(checks.evidence, list):
-            self.evidence.update({problem.partition(":")[0] for problem in checks.evidence})
-            self.evidence["samples"] += 1
+            self.words["evidence_contradictions"].update({problem.partition(":")[0] for problem in checks.evidence})
+            self.words["evidence_contradictions"]["samples"] += 1
         if checks.bilingual is not None:
-            self.bilingual[checks.bilingual] += 1
-        self.recovered.update(checks.recovered or ())
-        self.structured[caption.teacher.structured or "none"] += 1
+            self.words["bilingual"][checks.bilingual] += 1
+        self.words["recovered"].update(checks.recovered or ())
+        self.words["structured"][caption.teacher.structured or "none"] += 1
 
     def tally(self, num_unanswered: int) -> Tally:
         """Give the windows' tally and check that nothing was lost."""
@@ -232,13 +228,9 @@ class Ledger:
             teacher=self.teacher,
             flights=flights,
             windows=windows,
+            **{name: _sorted(counts) for name, counts in self.words.items()},
             asks=self.num_asks,
             tokens=dict(sorted(self.tokens.items())),
-            structured=_sorted(self.structured),
-            verdicts_of_first_answers=_sorted(self.first_verdicts),
-            verdicts_of_accepted=_sorted(self.final_verdicts),
-            labels=_sorted(self.labels),
-            label_from=_sorted(self.label_from),
             confusion=confusion,
             chance=self.chance.report(),
             repair=RepairCounts(
@@ -248,13 +240,8 @@ class Ledger:
                 asks={str(asks): count for asks, count in sorted(self.repair_asks.items())},
             ),
             lengths=self._lengths(),
-            judgements=_sorted(self.judgements),
             keyframes=self._keyframes(),
-            bilingual=_sorted(self.bilingual),
-            writing=_sorted(self.writing),
             sentences=_nested(self.sentences),
-            evidence_contradictions=_sorted(self.evidence),
-            recovered=_sorted(self.recovered),
             refusals=dict(sorted(self.refusals.items())),
             judge_tokens=judge_tokens,
         )

@@ -61,40 +61,19 @@ _WORDS = {**_SMALL, **{word: 10 * number for number, word in enumerate(_TENS.spl
 _WORDS |= {"hundred": 100, "a hundred": 100, "single": 1, "a single": 1, "an": 1, "a": 1}
 _WORDS |= {"half a dozen": 6, "a dozen": 12, "two dozen": 24}
 _PARTS = {
-    "half": 0.5,
-    "third": 1 / 3,
-    "quarter": 0.25,
-    "fourth": 0.25,
-    "fifth": 0.2,
-    "sixth": 1 / 6,
-    "eighth": 0.125,
+    "half": 0.5, "third": 1 / 3, "quarter": 0.25, "fourth": 0.25, "fifth": 0.2, "sixth": 1 / 6, "eighth": 0.125,
     "tenth": 0.1,
-}
+}  # fmt: skip
 _TURNS = {
-    "twice": 2.0,
-    "double": 2.0,
-    "doubled": 2.0,
-    "doubles": 2.0,
-    "doubling": 2.0,
-    "thrice": 3.0,
-    "triple": 3.0,
+    "twice": 2.0, "double": 2.0, "doubled": 2.0, "doubles": 2.0, "doubling": 2.0, "thrice": 3.0, "triple": 3.0,
     "tripled": 3.0,
-}
+}  # fmt: skip
 _TURNS |= {"halved": 0.5, "halves": 0.5, "halving": 0.5, "quadruple": 4.0, "quadrupled": 4.0}
 _ZH_DIGITS = {character: value for value, character in enumerate("零一二三四五六七八九")} | {"两": 2, "〇": 0}
 _ZH_TURNS = {
-    "一半": 0.5,
-    "减半": 0.5,
-    "对半": 0.5,
-    "翻倍": 2.0,
-    "翻了一番": 2.0,
-    "翻了一倍": 2.0,
-    "翻一倍": 2.0,
-    "增加了一倍": 2.0,
-    "快了一倍": 2.0,
-    "加倍": 2.0,
-    "翻番": 2.0,
-}
+    "一半": 0.5, "减半": 0.5, "对半": 0.5, "翻倍": 2.0, "翻了一番": 2.0, "翻了一倍": 2.0, "翻一倍": 2.0, "增加了一倍": 2.0, "快了一倍": 2.0,
+    "加倍": 2.0, "翻番": 2.0,
+}  # fmt: skip
 
 _ONE = "|".join(sorted(_SMALL, key=len, reverse=True))
 _ENGLISH = (
