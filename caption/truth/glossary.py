@@ -76,15 +76,6 @@ class Unit(NamedTuple):
     factor: float
 
 
-class Number(NamedTuple):
-    """A number in a text: `unit` is a key of the glossary's units, "" where none; `digits` after the point."""
-
-    value: float
-    unit: str
-    digits: int
-    start: int
-
-
 class Glossary:
     """The glossary with its patterns compiled."""
 
@@ -99,7 +90,6 @@ class Glossary:
         self.written_units: dict[Language, dict[str, str]] = {
             language: {unit: spellings[0] for unit, spellings in _by_unit(file, language)} for language in LANGUAGES
         }
-        self._numbers = {language: _number_pattern(self._units[language], language) for language in LANGUAGES}
         self._poles: dict[Language, dict[str, tuple[str, int]]] = {"en": {}, "zh": {}}
         for name, pair in file.polarity.items():
             for language in LANGUAGES:
@@ -143,21 +133,6 @@ class Glossary:
         found = dict.fromkeys(match.group() for match in self._translated.finditer(english.lower()))
         return tuple((term, self._translations[term]) for term in found)
 
-    def numbers(self, text: str, language: Language) -> list[Number]:
-        """Find the numbers of a text with their units; a unit after a list or a product holds for all of it."""
-        found: list[Number] = []
-        for match in self._numbers[language].finditer(text):
-            digits = match["number"]
-            places = len(digits.partition(".")[2])
-            value, unit = float(digits.replace("−", "-")), self._units[language].get(match["unit"] or "", "")
-            found.append(Number(value, unit, places, match.start()))
-        # "34 x 59 px", "20.0 to 21.4 m": the unit stands once, after the last number.
-        for i in range(len(found) - 2, -1, -1):
-            between = text[found[i].start : found[i + 1].start]
-            if not found[i].unit and found[i + 1].unit and _JOINED.search(between):
-                found[i] = Number(found[i].value, found[i + 1].unit, found[i].digits, found[i].start)
-        return found
-
     def poles(self, text: str, language: Language) -> list[tuple[str, int, int]]:
         """Find opposites in a text: (pair, +1 or -1, position), negations applied."""
         text = text.lower() if language == "en" else text
@@ -188,16 +163,6 @@ class Glossary:
 
 def _by_unit(file: _GlossaryFile, language: Language) -> Iterator[tuple[str, list[str]]]:
     return ((unit, getattr(spellings, language)) for unit, spellings in file.units.items())
-
-
-_JOINED = re.compile(r"^[-+−]?\d+(?:\.\d+)?\s*(?:x|×|by|to|and|,|、|-|–|至|到|和|乘|→|~)\s*$")
-
-
-def _number_pattern(units: dict[str, str], language: Language) -> re.Pattern[str]:
-    spellings = sorted(units, key=len, reverse=True)
-    # An ASCII unit must end where the word ends: "3 m" but not "3 more".
-    options = "|".join(re.escape(s) + (r"(?![A-Za-z/])" if s[-1].isalpha() and s.isascii() else "") for s in spellings)
-    return re.compile(rf"(?<![\w.])(?P<number>[-+−]?\d+(?:\.\d+)?)(?!\d)(?:\s*(?P<unit>{options}))?")
 
 
 def _term_pattern(poles: dict[str, tuple[str, int]], not_terms: list[str], language: Language) -> re.Pattern[str]:

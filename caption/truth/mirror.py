@@ -11,7 +11,8 @@ from collections import Counter
 from collections.abc import Iterable
 
 from caption.truth.facts import Facts
-from caption.truth.glossary import Number, load_glossary
+from caption.truth.glossary import load_glossary
+from caption.truth.numerals import Numeral, read_numerals
 from caption.truth.references import Series
 from cosfly.products.answer_text import is_in_script
 from cosfly.products.captions import Coc, Language
@@ -64,8 +65,10 @@ def check_mirror(english: Coc, chinese: Coc, flight: dict[str, list[Series]]) ->
     return None
 
 
-def _numbers(coc: Coc, language: Language) -> list[Number]:
-    return [number for name in TEXTS for number in load_glossary().numbers(getattr(coc, name), language)]
+def _numbers(coc: Coc, language: Language) -> list[Numeral]:
+    """Give the numbers in digits; the other language may write one in words otherwise."""
+    found = (numeral for name in TEXTS for numeral in read_numerals(getattr(coc, name), language))
+    return [numeral for numeral in found if numeral.kind == "number" and any(map(str.isdigit, numeral.text))]
 
 
 def _pole_counts(coc: Coc, language: Language) -> Counter[tuple[str, int]]:
@@ -73,7 +76,7 @@ def _pole_counts(coc: Coc, language: Language) -> Counter[tuple[str, int]]:
     return Counter((pair, sign) for pair, sign, _ in poles)
 
 
-def _is_shared(number: Number, theirs: list[Number], flight: dict[str, list[Series]]) -> bool:
+def _is_shared(number: Numeral, theirs: list[Numeral], flight: dict[str, list[Series]]) -> bool:
     value = abs(number.value)
     if not number.unit and number.digits == 0 and value < 10:
         return True  # a count ("5 frames"), which the other language may write as a word
