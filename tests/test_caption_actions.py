@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tables import each
 
 from caption.schema import FutureMotion, LabelConfig
 from caption.truth.actions import is_contradicted, label_of, measure, table_of, verdict_of
@@ -92,7 +93,7 @@ LABELS = [
 ]
 
 
-@pytest.mark.parametrize(("motion", "label"), LABELS)
+@each(("motion", "label"), LABELS)
 def test_label_of_a_known_future(motion, label):
     assert label_of(measure(future(**motion)), CFG) == label
 
@@ -140,7 +141,7 @@ HARD = [  # the opposite, then what is plainly not there
 ]
 
 
-@pytest.mark.parametrize(("decision", "motion"), HARD)
+@each(("decision", "motion"), HARD)
 def test_contradiction_of_each_action(decision, motion):
     measured = measure(future(**motion))
     assert verdict_of(decision, measured, CFG, label_of(measured, CFG)) == "HARD_CONFLICT"
@@ -169,7 +170,7 @@ SOFT = [
 ]
 
 
-@pytest.mark.parametrize(("decision", "motion"), SOFT)
+@each(("decision", "motion"), SOFT)
 def test_another_decision_of_which_there_is_something_is_a_soft_conflict(decision, motion):
     measured = measure(future(**motion))
     assert verdict_of(decision, measured, CFG, label_of(measured, CFG)) == "SOFT_CONFLICT"

@@ -7,6 +7,7 @@ import dataclasses
 
 import pytest
 from measure_prose import claims_problems, measure, planted
+from tables import each
 
 from caption.schema import EvidenceConfig
 from caption.truth.claims import judge_claims
@@ -166,9 +167,7 @@ SENTENCES: list[tuple[Language, str, list[Claim], list[tuple[str, str, str]]]] =
 ]
 
 
-@pytest.mark.parametrize(
-    ("language", "text", "claims", "errors"), SENTENCES, ids=[text[:24] for _, text, _, _ in SENTENCES]
-)
+@each(("language", "text", "claims", "errors"), SENTENCES, ids=[text[:24] for _, text, _, _ in SENTENCES])
 def test_a_true_sentence_is_proved_and_one_wrong_word_is_named(language, text, claims, errors):
     first = judged(text, claims, language)[0]
     assert (first.state, first.problems) == ("proved", ())
@@ -232,14 +231,14 @@ TRUE: list[tuple[Language, str, list[Claim]]] = [
 ]
 
 
-@pytest.mark.parametrize(("language", "text", "claims"), TRUE, ids=[text[:24] for _, text, _ in TRUE])
+@each(("language", "text", "claims"), TRUE, ids=[text[:24] for _, text, _ in TRUE])
 def test_what_states_nothing_wrong_is_not_flagged(language, text, claims):
     facts = dataclasses.replace(FACTS, travelled_m=(0.0, 1.5, 3.0, 5.0, 7.2), displacement_m=(0.0, 1.5, 3.0, 4.9, 6.9))
     coc = Coc(critical_components=text, reasoning_trace=FILLER, flight_decision="hover")
     assert judge_claims(coc, claims, facts, EvidenceConfig(), language)[0].problems == ()
 
 
-@pytest.mark.parametrize(
+@each(
     ("wrong", "words"),
     [
         (claim("C1", "distance", 18.4, "t4", "m"), "false: distance@t4 = 18.4 m"),
@@ -272,7 +271,7 @@ def test_a_number_in_the_place_of_a_claim_is_a_problem_even_where_another_fact_h
     assert judged("The walker is 22.0 m away, the drone at 22.0 m.", [DISTANCE, height])[0].state == "contradicted"
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "claims", "is_true"),
     [
         ("The walker is 59 ft away.", [DISTANCE], True),
@@ -339,7 +338,7 @@ def test_the_gold_sets_hold_their_bounds(number):
     assert judged("The walker keeps to the pavement here.", [])[0].state == "unread"
 
 
-@pytest.mark.parametrize(
+@each(
     ("planned", "decision", "is_problem"),
     [
         (claim("R1", "decision", "yaw_left_to_follow", modality="predicted"), "yaw_left_to_follow", False),

@@ -7,6 +7,7 @@ import json
 from collections import Counter
 
 import pytest
+from tables import each
 from teacher_server import TeacherServer
 
 from caption.run.stage import run
@@ -31,7 +32,7 @@ def tree(tmp_path_factory):
     return make_playback_tree(tmp_path_factory.mktemp("tree"), 2, 18)
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "verdict"),
     [
         ('{"verdict": "FIX_LABEL", "reason": "the text argues for the label"}', "FIX_LABEL"),

@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 
 import pytest
+from tables import each
 
 from caption.run.windows import cut_windows
 from caption.schema import WindowConfig
@@ -36,7 +37,7 @@ FACTS = Facts(
 )
 
 
-@pytest.mark.parametrize(
+@each(
     ("address", "fact"),
     [
         ("distance", Fact(18.0, "m", 1)),
@@ -79,7 +80,7 @@ def test_the_fact_at_an_address(address, fact):
     assert parse_reference(str(reference)) == reference
 
 
-@pytest.mark.parametrize(
+@each(
     "address",
     [
         "",
@@ -97,7 +98,7 @@ def test_what_names_nothing(address):
     assert parse_reference(address) is None
 
 
-@pytest.mark.parametrize(
+@each(
     ("address", "word", "holds"),
     [
         ("trend:altitude", "increasing", True),
@@ -130,7 +131,7 @@ def test_a_series_that_ends_where_it_began_has_no_trend():
         assert word_holds("mixed", parse_reference("trend:distance"), facts)
 
 
-@pytest.mark.parametrize(
+@each(
     ("quantity", "at", "value", "unit", "state"),
     [
         ("distance", "t4", 18.0, "m", "proved"),

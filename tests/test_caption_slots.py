@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from specimens_prose import FOLLOW
+from tables import each
 from teacher_server import CHINESE, ENGLISH, TeacherServer, is_mirror
 
 from caption.run.stage import run
@@ -59,7 +60,7 @@ def filled(
     return sentence if isinstance(sentence, Refused) else Filler(facts, decision, language).fill(sentence)
 
 
-@pytest.mark.parametrize(
+@each(
     ("template", "text"),
     [
         ("The gap {trend:distance} from {distance@t0} to {distance}.", "The gap decreases from 20.0 m to 18.0 m."),
@@ -90,7 +91,7 @@ def test_what_a_template_becomes(template, text):
     assert filled(template) == text
 
 
-@pytest.mark.parametrize(
+@each(
     ("template", "text"),
     [
         ("水平距离从 {distance@t0}{trend:distance}到 {distance}。", "水平距离从 20.0 米减小到 18.0 米。"),
@@ -142,7 +143,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("language", "text", "reason", "words"), REFUSED)
+@each(("language", "text", "reason", "words"), REFUSED)
 def test_what_is_refused_says_why_and_what_is_allowed(language, text, reason, words):
     found = filled(text, language)
     assert isinstance(found, Refused)
@@ -337,7 +338,7 @@ def drafts(english: str, chinese: str) -> Draft | Refused:
     return Slots().read_mirror(Parsed(zh), first, FACTS)
 
 
-@pytest.mark.parametrize(
+@each(
     ("english", "chinese", "reason"),
     [
         ("The gap {trend:distance} to {distance}.", "距离{trend:distance}到 {distance}。", None),
@@ -370,7 +371,7 @@ def test_a_translation_has_the_same_sentences_and_the_glossarys_words():
     assert check_translation(english, other) == ("glossary", 'write "无人机" for "drone"')
 
 
-@pytest.mark.parametrize(
+@each(
     ("reasons", "decision", "is_taken"),
     [
         ("Braking is the safe choice here.", "speed_up", False),

@@ -11,6 +11,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+from tables import each
 from teacher_server import MODEL, TeacherServer, is_mirror, kept_answers
 from typer.testing import CliRunner
 
@@ -356,7 +357,7 @@ BAD_URLS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("url", "words"), BAD_URLS, ids=range(len(BAD_URLS)))
+@each(("url", "words"), BAD_URLS, ids=range(len(BAD_URLS)))
 def test_what_is_wrong_with_a_url_is_one_line_without_a_secret(url, words):
     with pytest.raises(ValueError, match=words) as caught:
         check_url(url)

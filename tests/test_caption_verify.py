@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from specimens_captions import write_answers
+from tables import each
 
 from caption.run.windows import cut_windows
 from caption.schema import WindowConfig
@@ -82,7 +83,7 @@ def altered(coc: Coc, old: str, new: str) -> Coc:
     return Coc(**changed, flight_decision=coc.flight_decision)
 
 
-@pytest.mark.parametrize(
+@each(
     ("old", "new", "reason"),
     [
         ("20.6", "26.0", "number"),
@@ -106,7 +107,7 @@ def pair(en: str, zh: str) -> tuple[Coc, Coc]:
     )
 
 
-@pytest.mark.parametrize(
+@each(
     ("en", "zh", "reason"),
     [
         ("the target is on the left", "目标在左侧", None),
@@ -197,7 +198,7 @@ def test_rule_captions_are_one_record_in_two_languages():
 # --- the rule teacher -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("decision", action_tokens())
+@each("decision", action_tokens())
 def test_the_rule_teacher_justifies_any_given_decision_without_contradiction(decision):
     for facts, _, _ in clean_captions(2)[::7]:
         english, chinese = write_answers(facts, np.random.default_rng(3), decision)

@@ -9,6 +9,7 @@ import time
 from contextlib import nullcontext
 
 import pytest
+from tables import each
 from teacher_server import TeacherServer
 from test_caption_asking import settings
 from test_caption_claims import FACTS
@@ -75,7 +76,7 @@ def test_an_answer_without_claims_is_taken_where_it_is_true_and_proves_nothing()
     assert {one.state for one in WAY.judge(draft, FACTS, settings("http://x").evidence, "en")} == {"unread"}
 
 
-@pytest.mark.parametrize(
+@each(
     ("fields", "found"),
     [
         ({"unit": "metres"}, {"unit": "m"}),
@@ -95,7 +96,7 @@ def test_spellings_of_a_claim_are_read_in_one_way(fields, found):
     assert {name: getattr(claim, name) for name in found} == found
 
 
-@pytest.mark.parametrize(
+@each(
     ("answer", "reason", "words"),
     [
         (changed(0, value=21), "claims_false", "C1 false: distance@t4 = 21 m"),

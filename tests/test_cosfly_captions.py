@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 from specimens_distill import make_caption
+from tables import each
 
 from cosfly.errors import InputError
 from cosfly.products.actions import action_tokens
@@ -35,7 +36,7 @@ def test_nothing_else_is_an_action(text):
     assert normalize_action(text + " quickly") is None
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "recovered"),
     [
         (TEXT, ()),
@@ -57,7 +58,7 @@ def changed(**fields):
     return json.dumps({k: v for k, v in {**GOOD, **fields}.items() if v is not None})
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "reason"),
     [
         ("", "empty"),

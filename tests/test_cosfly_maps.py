@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import shapely
 from shapely.geometry import Point, Polygon, box
+from tables import each
 
 from cosfly.errors import ConfigError, InputError, ResumeError
 from cosfly.look.topview import TopView, draw_map, draw_text
@@ -141,7 +142,7 @@ def test_what_is_given_wins_over_the_preset():
     assert build(MapsConfig, {"synthetic": cfg.model_dump(mode="json")}, "x").synthetic == cfg  # as `run.yaml` is read
 
 
-@pytest.mark.parametrize(
+@each(
     ("given", "words"),
     [({"preset": "rivers"}, "did you mean 'river'"), ({"blocks": {"markt": 1}}, "did you mean 'market'"),
      ({"blocks": {"park": -1, "market": 2}}, "negative"), ({"blocks": {"park": 0}}, "more than 0"),

@@ -4,6 +4,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tables import each
 
 from cosfly.errors import ConfigError, NoPathError, NothingKept
 from cosfly.geometry import DT_S
@@ -208,7 +209,7 @@ def test_a_map_without_ground_boxes_does_not_say_where_the_ground_is():
     assert counts["cells_walkable"] == counts["cells_free"]
 
 
-@pytest.mark.parametrize(
+@each(
     ("box_map", "settings", "roi", "words"),
     [
         (plain(30.0, ((15, 15, 1), (15, 15, 1))), {}, None, "the map leaves no walkable cell.*1 boxes.*ground type"),
@@ -347,7 +348,7 @@ def test_no_goal_for_any_start_is_an_error_that_names_the_path():
     assert caught.value.where == "path_00007"
 
 
-@pytest.mark.parametrize(
+@each(
     ("settings", "words"),
     [
         ({"min_distance_m": 100.0}, "min_distance_m 100.0 is not below"),

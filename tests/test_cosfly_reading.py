@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from shapely.geometry import Polygon
+from tables import each
 
 from cosfly.errors import ConfigError, CosflyError, InputError
 from cosfly.maps import cityjson
@@ -297,7 +298,7 @@ def test_arrays_are_read_as_numpy_reads_them(tmp_path, order):
 GOOD = _npy(np.zeros((7, 5), np.float32))
 
 
-@pytest.mark.parametrize(
+@each(
     "data",
     [
         GOOD[:-1], GOOD + b"\0", GOOD[:40], b"", GOOD.replace(b"(7, 5)", b"(5, 7, 1)"), GOOD.replace(b"<f4", b"<f8"),

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from public_reader import read_public
+from tables import each
 from test_renderers_contract import circling, pose_towards, street, write_inputs
 
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, NothingKept
@@ -515,7 +516,7 @@ def test_ground_height_finds_the_pavement():
 # --- settings ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each(
     ("data", "word"),
     [
         ({"fovs_deg": [0]}, "field of view"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tables import each
 
 from cosfly.errors import InputError, ResumeError
 from cosfly.products.boxes import BoxMap, make_box_map, read_boxes, write_boxes
@@ -56,7 +57,7 @@ def random_map(seed: int, count: int, size_m: float = 30.0) -> BoxMap:
 # --- merge ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each(
     ("kind", "gap", "count"),
     [
         ("Vegetation", (2.0, 0, 0), 1),  # a gap equal to the threshold counts

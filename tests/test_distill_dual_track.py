@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tables import each
 
 from cosfly.products.playback import STATES, read_flight
 from cosfly.products.splits import SPLITS
@@ -44,9 +45,7 @@ def run(tree: Path, out: Path, **settings: object) -> Path:
     return dual_track.run(DualTrackConfig.model_validate({"too_few": "fill", **settings}), [tree], out)
 
 
-@pytest.mark.parametrize(
-    ("num_frames", "expected"), [(9, []), (10, [0]), (12, [0]), (13, [0, 3]), (170, 54), (200, 64)]
-)
+@each(("num_frames", "expected"), [(9, []), (10, [0]), (12, [0]), (13, [0, 3]), (170, 54), (200, 64)])
 def test_the_papers_windows(num_frames, expected):
     """Windows of 10 frames, one every 3: (N - 10) / 3 + 1, which the paper calls 50 to 60 of 170 to 200 frames."""
     found = list(windows_of(num_frames, DualTrackConfig()))

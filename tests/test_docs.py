@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import typer
 import yaml
+from tables import each
 
 import cosfly
 from cosfly.cli import app
@@ -100,7 +101,7 @@ def test_the_rooms_of_the_architecture_are_the_disk():
     assert sorted(told) == sorted(disk - {"cosfly"})
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@each("page", PAGES, ids=lambda page: page.name)
 def test_paths_exist(page):
     text = page.read_text(encoding="utf-8")
     words = set(

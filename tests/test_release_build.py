@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 from specimens_foreign import write_foreign_tree
+from tables import each
 from test_release_package import FREE, all_bytes, make_caption, make_inspection, rewrite_captions, source_of
 
 from caption.run import stage as caption_stage
@@ -211,7 +212,7 @@ def test_the_record_says_where_it_comes_from_and_nothing_of_this_machine(materia
     assert {row["teacher_model"] for row in table_of(tmp_path / "r/dataset", ["teacher_model"])} == {"teacher-7", None}
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "public"),
     [
         ("/data/models/Qwen", "Qwen"), ("vllm:/data/models/Qwen", "vllm:Qwen"), ("Qwen/Qwen3.5-2B", "Qwen/Qwen3.5-2B"),

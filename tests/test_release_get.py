@@ -19,6 +19,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 from release_tampering import errors_in, forge
+from tables import each
 from test_release_export import NUM_POINTS, TOWNS, TWO_SPLITS, make_release, rows_by_id
 from test_release_package import CFG, all_bytes, build, make_caption, make_inspection
 from typer.testing import CliRunner
@@ -634,7 +635,7 @@ def test_a_shard_of_garbage_is_an_error_of_one_line(dataset, tmp_path):
 # --- addresses --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each(
     ("address", "shown"),
     [
         ("https://me:hush@host:8/a/b?token=hush#x", "https://host:8/a/b"),

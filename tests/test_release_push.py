@@ -12,6 +12,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from tables import each
 from test_release_export import TWO_SPLITS, make_release
 
 from cosfly.errors import ConfigError
@@ -226,9 +227,7 @@ def test_a_changed_release_does_not_go_out(dataset, tmp_path):
     assert server.asked == []
 
 
-@pytest.mark.parametrize(
-    "name", ["town", "me/", "/x", "me/a b", "me/../x", "me/x.git", "https://hub/me/x", "me/x/y", ""]
-)
+@each("name", ["town", "me/", "/x", "me/a b", "me/../x", "me/x.git", "https://hub/me/x", "me/x/y", ""])
 def test_a_name_that_is_none_is_refused(name):
     with pytest.raises(ConfigError, match="OWNER/NAME"):
         check_name(name)

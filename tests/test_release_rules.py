@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tables import each
 
 from release.rules import is_whole, select_frames
 
@@ -62,7 +63,7 @@ def test_a_short_flight_is_kept_whole(num_points, num_frames):
     assert select_frames(num_points, None, WINDOW).tolist() == list(range(num_points))
 
 
-@pytest.mark.parametrize(
+@each(
     ("num_points", "num_frames", "window", "expected"),
     [
         (10, 4, 1, [0, 3, 6, 9]),

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from tables import each
 
 from release.verify.pixels import NUM_IDS, PERSON, SKY, new_kinds, rays_to_person, survey
 
@@ -57,7 +58,7 @@ def test_pixels_at_corners_are_seen(corner):
     assert survey(depth, mask).most_kind == 200
 
 
-@pytest.mark.parametrize(
+@each(
     ("odd", "limits"),
     [
         (np.nan, (np.nan, np.nan)), (-np.nan, (np.nan, np.nan)), (np.inf, (np.nan, np.nan)),

@@ -26,7 +26,7 @@ SCHEMA, VERSION = "cosfly.bench", "1.1"
 STAGES = ("pedestrians", "plan", "render", "inspect", "caption", "release")  # those that do items
 
 
-class Measurement(BaseModel):
+class BenchRun(BaseModel):
     """Figures of one run of the stage.
 
     attempted: frames of render, or items of another stage, that were done, and those that were lost with a worker.
@@ -61,7 +61,7 @@ class Bench(BaseModel):
 
     stage: str
     cores: int
-    rows: list[Measurement]
+    rows: list[BenchRun]
     stages: list[StageRow] = []
 
 
@@ -95,7 +95,7 @@ def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterab
     return bench
 
 
-def _measured(cfg: RunConfig, run_folder: Path, folder: Path, stage: str, workers: int) -> Measurement:
+def _measured(cfg: RunConfig, run_folder: Path, folder: Path, stage: str, workers: int) -> BenchRun:
     """Run the stage once; gives its figures."""
     log.info("bench: %s with %d worker%s", stage, workers, "s" if workers > 1 else "")
     cfg = cfg.model_copy(update={"workers": workers})
@@ -106,13 +106,13 @@ def _measured(cfg: RunConfig, run_folder: Path, folder: Path, stage: str, worker
     return row
 
 
-def row_of(events: list[Event], manifest: Manifest, workers: int, *, counts_frames: bool) -> Measurement:
+def row_of(events: list[Event], manifest: Manifest, workers: int, *, counts_frames: bool) -> BenchRun:
     """Give the figures of one run from what its events and its manifest say."""
     done = [event for event in events if event.event == "item_done"]
     lost = [event for event in events if event.event in LOSSES]
     probes = [event for event in events if event.event == "probe"]
     size = (lambda event: event.steps or 0) if counts_frames else (lambda event: 1)
-    return Measurement(
+    return BenchRun(
         workers=workers,
         seconds=manifest.seconds,
         attempted=sum(map(size, [*done, *lost])),

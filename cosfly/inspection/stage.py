@@ -35,7 +35,7 @@ from cosfly.products.playback import read_flight
 from cosfly.products.review import how_to_decide
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.work.provenance import recorded_digests
-from cosfly.work.runner import Item, Outcome, Results, Watch, Work, run_items
+from cosfly.work.runner import Item, Outcome, ItemOutcomes, Watch, Work, run_items
 from cosfly.work.stage_folder import Failed, Resume, StageFolder, result_of
 from cosfly.work.store import write_bytes
 
@@ -123,7 +123,7 @@ def _num_frames(folder: Path) -> int:
 
 
 def assemble(
-    finished: Results, planned: list[DroneTrace] | None, cfg: InspectConfig, data: Path
+    finished: ItemOutcomes, planned: list[DroneTrace] | None, cfg: InspectConfig, data: Path
 ) -> tuple[Inspection, dict[str, FlightView]]:
     """Put the outcomes of all flights together: the inspection, and the report's material by flight folder."""
     flights: list[FlightInspection] = []

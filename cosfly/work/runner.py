@@ -22,13 +22,13 @@ from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Kept, StageFol
 from cosfly.work.store import remove_partials
 from cosfly.work.worker_pool import Watch, WorkerPool
 
-__all__ = ["Item", "Outcome", "Results", "Watch", "Work", "advance", "run_items"]
+__all__ = ["Item", "Outcome", "ItemOutcomes", "Watch", "Work", "advance", "run_items"]
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Results:
+class ItemOutcomes:
     """All outcomes of a stage, in the order of the items."""
 
     records: list[ItemRecord]
@@ -48,7 +48,7 @@ def run_items(
     workers: int = 0,
     watch: Watch = Watch(),
     label: str | None = None,
-) -> Results:
+) -> ItemOutcomes:
     """Do all items that the stage's journal does not hold yet.
 
     An item whose work raises is recorded as failed and counted; a fatal CosflyError (full disk, no GL) stops the stage,
@@ -94,7 +94,7 @@ def run_items(
             got=f"{tally.failed['worker_died']} of {len(ordered)} items without an outcome",
             fix="free some memory or use fewer --workers, then run the same command again: finished items are kept",
         )
-    return Results(ordered, tally)
+    return ItemOutcomes(ordered, tally)
 
 
 def _tell(stage: str, record: ItemRecord) -> None:
