@@ -137,7 +137,7 @@ class SourceRecord(Strict):
     stages: list[MadeBy]
 
 
-class TeacherRecord(Strict):
+class ReleasedTeacher(Strict):
     """Who was asked, and how: of all captions that were read, the released ones and the others."""
 
     kind: str
@@ -161,7 +161,7 @@ class Provenance(Strict):
 
     versions: dict[str, str]
     sources: list[SourceRecord]
-    teachers: list[TeacherRecord]
+    teachers: list[ReleasedTeacher]
     repairs: Repairs
     tokens: Counts
     asks: int

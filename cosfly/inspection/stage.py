@@ -35,7 +35,7 @@ from cosfly.products.playback import read_flight
 from cosfly.products.review import how_to_decide
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.work.provenance import recorded_digests
-from cosfly.work.runner import Item, Outcome, ItemOutcomes, Watch, Work, run_items
+from cosfly.work.runner import Item, ItemOutcomes, Outcome, Watch, Work, run_items
 from cosfly.work.stage_folder import Failed, Resume, StageFolder, result_of
 from cosfly.work.store import write_bytes
 

@@ -22,7 +22,7 @@ from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Kept, StageFol
 from cosfly.work.store import remove_partials
 from cosfly.work.worker_pool import Watch, WorkerPool
 
-__all__ = ["Item", "Outcome", "ItemOutcomes", "Watch", "Work", "advance", "run_items"]
+__all__ = ["Item", "ItemOutcomes", "Outcome", "Watch", "Work", "advance", "run_items"]
 
 log = logging.getLogger(__name__)
 

@@ -38,6 +38,7 @@ from release.record import (
     Numbers,
     Provenance,
     ReleasedFlight,
+    ReleasedTeacher,
     ReleaseRecord,
     Repairs,
     Settings,
@@ -45,7 +46,6 @@ from release.record import (
     SourceRecord,
     SplitNumbers,
     Splits,
-    TeacherRecord,
     content_digest,
     shard_path,
     write_record,
@@ -75,7 +75,7 @@ def provenance_of(sources: list[Source], inputs: Mapping[str, StageInput], accou
         },
         sources=[_source(source, names, inputs) for source, names in zip(sources, input_names(sources), strict=True)],
         teachers=[
-            TeacherRecord(kind=kind, model=model, settings=published(teacher_settings(settings)), captions=count)
+            ReleasedTeacher(kind=kind, model=model, settings=published(teacher_settings(settings)), captions=count)
             for (kind, model, settings), count in sorted(account.teachers.items())
         ],
         repairs=Repairs(
