@@ -77,7 +77,8 @@ class ModelServer(TeacherServer):
         with torch.inference_mode():
             output = own.model.generate(
                 **inputs, max_new_tokens=max_tokens, do_sample=body["temperature"] > 0,
-                temperature=body["temperature"] or None, top_p=body.get("top_p", 1.0), top_k=0, eos_token_id=own.end_token_id, pad_token_id=own.pad_token_id,
+                temperature=body["temperature"] or None, top_p=body.get("top_p", 1.0), top_k=0,
+                eos_token_id=own.end_token_id, pad_token_id=own.pad_token_id,
                 sequence_bias=bias or None, logits_processor=processors,
             )  # fmt: skip
         ids = output[0, length:].tolist()

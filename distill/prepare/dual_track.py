@@ -83,9 +83,10 @@ def _page_of(record: TrackSet) -> bytes:
     runs = json.dumps([tree.run for tree in record.trees], ensure_ascii=False)
     return page_of(
         "Windows over two tracks", record.samples,
-        f"Windows of {record.observed} frames that were observed on a perturbed flight (`observed_*`), where drone\n"
-        f"and person really were in them (`clean_*`) and in the {record.predicted} frames after (`future_*`); a window\n"
-        f"begins every {record.stride} frames. No two splits share a {record.split_by}. Axes: {record.axes}.\n"
+        f"Windows of {record.observed} frames that were observed on a perturbed flight (`observed_*`), where\n"
+        f"drone and person really were in them (`clean_*`) and in the {record.predicted} frames after (`future_*`);\n"
+        f"a window begins every {record.stride} frames. No two splits share a {record.split_by}.\n"
+        f"Axes: {record.axes}.\n"
         f"The pictures are frames `window` of the playback trees of {runs}, which are not part of it.\n",
     )  # fmt: skip
 
