@@ -51,10 +51,12 @@ def main(run: Path, sample_id: str, out: Path) -> None:
         f"<p><b>{coc.flight_decision}</b></p></div>"
         for name, coc in (("English", caption.en), ("中文", caption.zh))
     )
-    facts = f"{sample_id} · label from the future geometry ({caption.label_from}): {caption.label} · verdict: {caption.verdict} · teacher: {caption.teacher.kind}"
+    facts = f"{sample_id} · label from the future geometry ({caption.label_from}): {caption.label}"
+    facts += f" · verdict: {caption.verdict} · teacher: {caption.teacher.kind}"
     if caption.repair:
         facts += f" · repaired: {caption.repair.strategy}, first decision {caption.repair.first_decision}"
-    page = f"<!doctype html><meta charset=utf-8><style>{STYLE}</style><div class=frames>{frames}</div><div class=texts>{texts}</div><div class=meta>{facts}</div>"
+    page = f"<!doctype html><meta charset=utf-8><style>{STYLE}</style><div class=frames>{frames}</div>"
+    page += f"<div class=texts>{texts}</div><div class=meta>{facts}</div>"
     out.write_text(page, encoding="utf-8")
 
 

@@ -199,7 +199,7 @@ def test_a_picture_of_another_shape_is_refused(frame):
 
 @pytest.mark.parametrize("max_side_px", [640, 500])
 def test_a_size_read_off_the_picture_is_the_measured_one(tmp_path, max_side_px):
-    """The red person (some 20 x 60 px) of the segmentation that is sent, against the facts, where all of it is shown."""
+    """The red person (some 20 x 60 px) of the segmentation that is sent, against the facts, where it is whole."""
     make_playback_tree(tmp_path, 1, 10, seed=1, width_px=640, height_px=360, with_augmented=False)
     observed = next(cut_windows(read_flight(find_flights(tmp_path)[0]), WindowConfig())).observed
     cfg = ImageConfig(modalities=("segmentation",), max_side_px=max_side_px)

@@ -1,9 +1,11 @@
-"""Rendering with workers that are killed and one that is stopped, all in one run: the finished set against an undisturbed run's.
+"""Rendering with workers that are killed and one that is stopped, all in one run: the finished set against an
+undisturbed run's.
 
-    cosfly run quickstart --out RUN --set pedestrians.num_paths=7 --set render.width_px=64 --set render.height_px=36   # or stop it after plan
-    python tests/benchmarks/bench_faults.py RUN                              # 20 kills, 1 stop
+cosfly run quickstart --out RUN --set pedestrians.num_paths=7 --set render.width_px=64 --set render.height_px=36 # or
+stop it after plan python tests/benchmarks/bench_faults.py RUN # 20 kills, 1 stop
 
-Small pictures, as what counts is what becomes of the files. Where so many workers are lost that the stage gives up, it is started again, as a user would.
+Small pictures, as what counts is what becomes of the files. Where so many workers are lost that the stage gives up, it
+is started again, as a user would.
 """
 
 from __future__ import annotations
@@ -76,9 +78,9 @@ def main() -> None:
         counts = read_manifest(broken).counts
         ours, theirs = digests(plain), digests(broken)
         rows = [
-            [len(list(plain.rglob("rgb.png"))), *(len(m) for m in moments), events["worker_died"], events["heartbeat_lost"],
-             events["restarted"], events["retried"], attempts, counts.failed.total(), len(ours), "yes" if ours == theirs else "NO",
-             plain_s, broken_s]
+            [len(list(plain.rglob("rgb.png"))), *(len(m) for m in moments), events["worker_died"],
+             events["heartbeat_lost"], events["restarted"], events["retried"], attempts, counts.failed.total(),
+             len(ours), "yes" if ours == theirs else "NO", plain_s, broken_s]
         ]  # fmt: skip
         names = [
             "frames",

@@ -1,6 +1,8 @@
-"""Which labels the styles of planned flights give, without a picture: `python tests/benchmarks/bench_styles.py DRONE_TRACE.json ...`.
+"""Which labels the styles of planned flights give, without a picture: `python tests/benchmarks/bench_styles.py
+DRONE_TRACE.json ...`.
 
-What the camera sees is told from the five rays and a field of view of 60 degrees, so a rendered flight has a few labels of search more.
+What the camera sees is told from the five rays and a field of view of 60 degrees, so a rendered flight has a few labels
+of search more.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Kills and stops workers of a stage at random moments, as from outside: it knows them from the stage's events alone."""
+"""Kills and stops workers of a stage at random moments, known from the stage's events alone."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Faults:
 
 
 def is_running_child(pid: int) -> bool:
-    """Tell whether a process runs, is not stopped, and is a child of this one: after its end another may get its number."""
+    """Tell whether a process runs, is not stopped, and is a child of this one, not another of its number."""
     try:
         state, parent, *_ = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
@@ -42,7 +42,7 @@ def is_running_child(pid: int) -> bool:
 
 @contextlib.contextmanager
 def planted(faults: Faults | None, folder: Path) -> Iterator[list[float]]:
-    """Plant faults while the block works in a stage folder; yields the moments (s, from the first worker on) as they come."""
+    """Plant faults while the block works in a stage folder; yields the moments (s, from the first worker on)."""
     moments_s: list[float] = []
     if faults is None:
         yield moments_s
