@@ -1,8 +1,8 @@
 """Rendering with workers that are killed and one that is stopped, all in one run: the finished set against an
 undisturbed run's.
 
-cosfly run quickstart --out RUN --set pedestrians.num_paths=7 --set render.width_px=64 --set render.height_px=36 # or
-stop it after plan python tests/benchmarks/bench_faults.py RUN # 20 kills, 1 stop
+    cosfly run quickstart --out RUN --set pedestrians.num_paths=7 --set render.width_px=64  # or stop it after plan
+    python tests/benchmarks/bench_faults.py RUN  # 20 kills, 1 stop
 
 Small pictures, as what counts is what becomes of the files. Where so many workers are lost that the stage gives up, it
 is started again, as a user would.
