@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from cosfly.chat.student_chat import Look, Taught, write_taught
+from cosfly.chat.student_chat import FrameLook, Taught, write_taught
 from cosfly.products.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.places import sample_id
@@ -105,7 +105,7 @@ def make_captions(path: Path, tree: Path) -> list[Caption]:
 ADAPTER_PIXELS = 64 * 64
 TEACHING = Taught.model_validate({
     "prompts": {"en": {"system": "You fly.", "user": "Five frames."}}, "num_frames": 5, "max_pixels": ADAPTER_PIXELS,
-    "looks": [Look(views=("rgb",), size_px=(64, 36), depth_range_m=100.0)],
+    "looks": [FrameLook(views=("rgb",), size_px=(64, 36), depth_range_m=100.0)],
 })  # fmt: skip
 
 

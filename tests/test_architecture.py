@@ -245,17 +245,13 @@ def test_no_drawers_for_everything():
     assert not names & {"utils", "helpers", "common", "misc", "inspect", "types"}
 
 
-# Class names that still stand for two things; the list may only become shorter.
-TWICE = {"Coverage", "Look", "Place", "Scene", "Table", "Way"}
-
-
 def test_no_public_class_name_stands_twice():
     found: dict[str, list[str]] = {}
     for name, path in SOURCES.items():
         for node in _tree(path).body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 found.setdefault(node.name, []).append(name)
-    assert {name: places for name, places in found.items() if len(places) > 1 and name not in TWICE} == {}
+    assert {name: places for name, places in found.items() if len(places) > 1} == {}
 
 
 def test_help_is_instant():

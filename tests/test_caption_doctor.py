@@ -16,7 +16,7 @@ from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.doctor import ODD_WORD, Finding, examine_endpoint, largest_messages
 from caption.teachers.images import pictures_of
-from caption.teachers.trials import SCENES, Drawn, trial_window
+from caption.teachers.trials import SCENES, TrialFrames, trial_window
 from caption.truth.facts import measure_facts
 from caption.writing.contract import WAYS
 from cosfly.cli import app
@@ -238,7 +238,7 @@ def test_trial_windows_are_consistent_flights(scene):
         assert 0 < left < right < 1280
         assert 0 < top < bottom < 720
     pictures = pictures_of(window, CaptionConfig().image)
-    encoded = [Drawn(window, CaptionConfig().image).encode(folder, pictures) for folder in window.frame_folders]
+    encoded = [TrialFrames(window, CaptionConfig().image).encode(folder, pictures) for folder in window.frame_folders]
     assert [len(images) for images in encoded] == [3] * 5
 
 

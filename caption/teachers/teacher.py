@@ -26,7 +26,7 @@ from caption.teachers.images import EncodedImage, FrameEncoder
 from caption.teachers.prompts import Question, mirror_messages, question_messages
 from caption.teachers.rules import MODEL, write_templates
 from caption.teachers.students import TaughtStudent
-from caption.teachers.trials import SCENES, Drawn, Scene, trial_question
+from caption.teachers.trials import SCENES, TrialFrames, TrialScene, trial_question
 from caption.writing.contract import Draft, more_fields, way_of
 from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget
@@ -238,12 +238,12 @@ class AskingTeacher:
         what = "the server refuses trial prompts as it does the windows, so the fault is not theirs"
         raise TeacherError(what, where=self.engine.where, got=refused.detail, fix=refused.fix or None)
 
-    async def _try_scene(self, question: Question, scene: Scene) -> None:
+    async def _try_scene(self, question: Question, scene: TrialScene) -> None:
         """Ask about a made-up window, in the name of the question's: its tokens count, its answer is none of the
         run's."""
         trial = trial_question(question, self.all_cfg, scene)
         sample_id, purpose = question.window.sample_id, f"trial/{time.time_ns()}"  # never one that the book holds
-        messages, digests = question_messages(trial, Drawn(trial.window, self.all_cfg.image))
+        messages, digests = question_messages(trial, TrialFrames(trial.window, self.all_cfg.image))
         schema = answer_schema(more=more_fields(way_of(trial.writing)))
         request = self.cfg.request(messages, digests, schema, sampling_seed(self.seed, sample_id, purpose))
         await self.kept.ask(request, flight_of(sample_id), sample_id, purpose)

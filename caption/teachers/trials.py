@@ -36,7 +36,7 @@ Ask = Callable[[list[dict], dict], Awaitable[tuple[str, bool] | None]]
 
 
 @dataclass(frozen=True)
-class Scene:
+class TrialScene:
     """A made-up flight: of the drone its height, speed, climb and turn, of the person speed, and the frames in which it
     is hidden."""
 
@@ -50,9 +50,9 @@ class Scene:
 
 
 SCENES = (
-    Scene("trial1", altitude_m=15.0, speed_mps=2.0, climb_mps=0.0, turn_dps=0.0, walking_mps=1.2),
-    Scene("trial2", altitude_m=12.0, speed_mps=3.0, climb_mps=2.0, turn_dps=6.0, walking_mps=1.5),
-    Scene("trial3", altitude_m=20.0, speed_mps=0.1, climb_mps=0.0, turn_dps=-4.0, walking_mps=0.0, hidden=(3,)),
+    TrialScene("trial1", altitude_m=15.0, speed_mps=2.0, climb_mps=0.0, turn_dps=0.0, walking_mps=1.2),
+    TrialScene("trial2", altitude_m=12.0, speed_mps=3.0, climb_mps=2.0, turn_dps=6.0, walking_mps=1.5),
+    TrialScene("trial3", altitude_m=20.0, speed_mps=0.1, climb_mps=0.0, turn_dps=-4.0, walking_mps=0.0, hidden=(3,)),
 )
 
 
@@ -96,7 +96,7 @@ async def _reason(ask: Ask, cfg: CaptionConfig, window: ObservedWindow, writing:
     more = more_fields(way)
     reason = ""
     for number in range(cfg.correction_asks + 1):
-        messages, _ = question_messages(question, Drawn(window, cfg.image))
+        messages, _ = question_messages(question, TrialFrames(window, cfg.image))
         answered = await ask(messages, answer_schema(more=more))
         if answered is None:
             return NO_ANSWER
@@ -129,13 +129,13 @@ def best_way(results: list[Result]) -> Writing | None:
 # --- made-up windows --------------------------------------------------------------------------------------------------
 
 
-def trial_question(question: Question, cfg: CaptionConfig, scene: Scene) -> Question:
+def trial_question(question: Question, cfg: CaptionConfig, scene: TrialScene) -> Question:
     """Give a question about a made-up window, with pictures of the number, views and size of another question's."""
     made_up = make_question(trial_window(scene, cfg.window.num_frames), cfg.image, question.writing)
     return replace(made_up, pictures=question.pictures)
 
 
-def trial_window(scene: Scene, count: int) -> ObservedWindow:
+def trial_window(scene: TrialScene, count: int) -> ObservedWindow:
     """Make the observed frames of a scene: the drone flies north behind a person who walks ahead of it."""
     time_s = STEP_S * np.arange(count)
     yaw = 90.0 + scene.turn_dps * time_s
@@ -172,7 +172,7 @@ def trial_window(scene: Scene, count: int) -> ObservedWindow:
     )
 
 
-class Drawn:
+class TrialFrames:
     """Pictures of a made-up window: the ground, the person as an upright box, a wall where it is hidden."""
 
     def __init__(self, window: ObservedWindow, cfg: ImageConfig) -> None:

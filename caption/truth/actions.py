@@ -83,7 +83,7 @@ Measure = Callable[[Motion], float]
 
 
 @dataclass(frozen=True)
-class Table:
+class ActionTable:
     """The rules of a set of actions with their thresholds put in.
 
     implied: in order of precedence, groups of actions and how much there is of what makes each the label, from 1 on.
@@ -96,7 +96,7 @@ class Table:
 
 
 @in_place.kept(16)
-def table_of(cfg: LabelConfig) -> Table:
+def table_of(cfg: LabelConfig) -> ActionTable:
     """Give the rules of the actions in use."""
     actions = actions_in_use()
     groups = [
@@ -110,7 +110,7 @@ def table_of(cfg: LabelConfig) -> Table:
         )
         for token, action in actions.actions.items()
     }
-    return Table(tuple(map(tuple, groups)), shown)
+    return ActionTable(tuple(map(tuple, groups)), shown)
 
 
 _COMPARE = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}

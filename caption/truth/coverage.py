@@ -50,7 +50,7 @@ _OPPOSITES = {**dict(_PAIRS), **{other: one for one, other in _PAIRS}}
 
 
 @dataclass(frozen=True)
-class Coverage:
+class ClaimCoverage:
     """What the claims of a sentence leave over. is_whole: every number and every opposite of it has a claim."""
 
     problems: tuple[str, ...]
@@ -59,7 +59,7 @@ class Coverage:
 
 def cover(
     sentence: str, claims: Sequence[Claim], facts: Facts, language: Language, beside: Sequence[Claim] = ()
-) -> Coverage:
+) -> ClaimCoverage:
     """Say what of a sentence neither a claim covers nor the facts bear out, and which claims it says the opposite of.
 
     A word or a number without a claim is no problem where it is true of the window, unless a claim of its kind is
@@ -80,7 +80,7 @@ def cover(
     problems += [f"claims disagree: {name}" for name in said.turned_comparisons()]
     problems += [f"text says otherwise: {words}" for words in denied_numbers(stated, said)]
     problems += [f"not in the text: scene {number}" for number in said.absent_scenery(stated)]
-    return Coverage(tuple(problems), not uncovered and not poles)
+    return ClaimCoverage(tuple(problems), not uncovered and not poles)
 
 
 def _wrong_numerals(stated: Stated, said: Said, around: Said, uncovered: Sequence[Numeral]) -> Iterator[str]:

@@ -1,7 +1,7 @@
 """What a way of writing is: how a teacher states its reasons so that they can be held against the facts.
 
-The window loop asks, reads and records; what differs between slots, claims and prose stands behind `Way`, and WAYS
-names them.
+The window loop asks, reads and records; what differs between slots, claims and prose stands behind
+`WayOfWriting`, and WAYS names them.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Refused:
     draft: Draft | None = None
 
 
-class Way(Protocol):
+class WayOfWriting(Protocol):
     """One way of writing. All are stateless.
 
     system, mirror_system: prompt files (`system` is asked in English). fields: further fields of an answer, name ->
@@ -86,12 +86,12 @@ class Way(Protocol):
 
 
 @cache
-def way_of(name: Writing) -> Way:
+def way_of(name: Writing) -> WayOfWriting:
     module, _, attribute = WAYS[name].partition(":")
     return getattr(importlib.import_module(module), attribute)()
 
 
-def more_fields(way: Way) -> dict[str, dict]:
+def more_fields(way: WayOfWriting) -> dict[str, dict]:
     """Give the fields of an answer beyond the paper's three. `therefore` is free even where the decision is given."""
     return {**way.fields, "therefore": {"type": "string", "enum": list(action_tokens())}}
 

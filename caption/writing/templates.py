@@ -110,7 +110,7 @@ def has_sides(quantity: str) -> bool:
     return bool(QUANTITIES[quantity].sides) and quantity not in ANGLES
 
 
-class Place(NamedTuple):
+class SlotPlace(NamedTuple):
     """A slot where it stands, and what is needed to fill it at a glance.
 
     fact_key: what it is looked up by. read, frame, form: the series of which it is a plain value,
@@ -137,7 +137,7 @@ class Sentence:
     """
 
     pattern: str
-    places: tuple[Place, ...]
+    places: tuple[SlotPlace, ...]
     names: tuple[str, ...]
     sizes: tuple[tuple[Slot, tuple[Slot, ...]], ...]
     begins_with_slot: bool
@@ -206,17 +206,17 @@ def _with_article(slot: Slot, texts: list[str], number: int) -> Slot:
     return replace(slot, article=match[1])
 
 
-def _place(slot: Slot, language: Language) -> Place:
+def _place(slot: Slot, language: Language) -> SlotPlace:
     quantity = slot.quantity
     if slot.article:
-        return Place(slot.fact_key, slot)
+        return SlotPlace(slot.fact_key, slot)
     if quantity is None:
         words = _words_written(language, slot.form, not (slot.is_size or slot.needs_side)) if slot.is_word else {}
-        return Place(slot.fact_key, slot, words=words)
+        return SlotPlace(slot.fact_key, slot, words=words)
     assert slot.reference is not None
     frame = -1 if slot.reference.first is None else slot.reference.first
     form = f"%.{quantity.digits}f{units_behind(language)[quantity.unit]}"
-    return Place(slot.fact_key, slot, quantity.read, frame, form)
+    return SlotPlace(slot.fact_key, slot, quantity.read, frame, form)
 
 
 @in_place.kept()

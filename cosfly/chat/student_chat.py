@@ -101,7 +101,7 @@ def _bounded(picture: np.ndarray, max_pixels: int) -> np.ndarray:
 TAUGHT, TAUGHT_SCHEMA, TAUGHT_VERSION = "cosfly_student.json", "cosfly.student", "1.0"
 
 
-class Look(BaseModel):
+class FrameLook(BaseModel):
     """How frames were shown: their views in this order, (width, height) of each picture, and the dark end of those of
     depth."""
 
@@ -124,7 +124,7 @@ class Taught(BaseModel):
 
     prompts: dict[Language, Prompt] = Field(min_length=1)
     num_frames: int = Field(ge=1)
-    looks: list[Look] = Field(min_length=1)
+    looks: list[FrameLook] = Field(min_length=1)
     max_pixels: int = Field(ge=1)
 
 

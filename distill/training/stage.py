@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from cosfly.chat.student_chat import Look, Taught, write_taught
+from cosfly.chat.student_chat import FrameLook, Taught, write_taught
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import Language, Prompt
 from cosfly.work.chance import rng_for
@@ -38,11 +38,11 @@ def taught_by(samples: Iterable[Sample], max_pixels: int) -> Taught:
         InputError: their windows are of different lengths.
     """
     prompts: dict[Language, Prompt] = {}
-    looks: set[Look] = set()
+    looks: set[FrameLook] = set()
     lengths: set[int] = set()
     for sample in samples:
         prompts.setdefault(sample.language, sample.prompt)
-        looks.add(Look(views=sample.views, size_px=sample.picture_px, depth_range_m=sample.depth_range_m))
+        looks.add(FrameLook(views=sample.views, size_px=sample.picture_px, depth_range_m=sample.depth_range_m))
         lengths.add(len(sample.frames))
     if len(lengths) != 1:
         raise InputError("a training set of windows of different lengths", got=f"{sorted(lengths)} frames")
