@@ -103,7 +103,8 @@ def test_two_processes_give_what_one_gives(place, alone, tmp_path):
     assert finish(start(place, tmp_path / "out", 2)) == [0, 0]
     assert losses_of(tmp_path / "out") == pytest.approx(losses_of(alone), rel=1e-5)
     for mine, other in zip(log_of(tmp_path / "out", "validation"), log_of(alone, "validation"), strict=True):
-        assert mine["validation"] == pytest.approx(other["validation"], rel=1e-5)
+        found, wanted = ({n: v for n, v in each["validation"].items() if v is not None} for each in (mine, other))
+        assert found == pytest.approx(wanted, rel=1e-5)
     adapters = [load_file(out / "adapter" / "adapter_model.safetensors") for out in (tmp_path / "out", alone)]
     for name, tensor in adapters[0].items():
         assert np.allclose(tensor, adapters[1][name], atol=1e-4), name
