@@ -1,8 +1,9 @@
-"""Pictures and NumPy arrays: the header is read first, and nothing is allocated for what it claims before that is checked.
+"""Pictures and NumPy arrays: the header is read first, and nothing is allocated for what it claims before that is
+checked.
 
-PNG is the only picture format of a data set, so no other decoder is ever given a file. NumPy's own reader evaluates headers as Python
-literals, which a crafted one makes slow and two threads at once make fail (Python before 3.11.8, its issue 106905); the three fields are
-found by their patterns here. Format: numpy.lib.format, versions 1 to 3.
+PNG is the only picture format of a data set, so no other decoder is ever given a file. NumPy's own reader evaluates
+headers as Python literals, which a crafted one makes slow and two threads at once make fail (Python before 3.11.8, its
+issue 106905); the three fields are found by their patterns here. Format: numpy.lib.format, versions 1 to 3.
 """
 
 from __future__ import annotations
@@ -155,7 +156,9 @@ def picture_size(path: Path, *, tree: Path | None = None) -> tuple[int, int] | N
 
 
 def read_picture(path: Path, *, tree: Path | None = None) -> np.ndarray:
-    """Read a PNG file, (h, w, 3) uint8 in OpenCV's order of colours; raises as `parse_picture`, and where it cannot be read."""
+    """Read a PNG file, (h, w, 3) uint8 in OpenCV's order of colours; raises as `parse_picture`, and where it cannot be
+    read.
+    """
     return parse_picture(read_bytes(path, what="image", tree=tree), path)
 
 
@@ -177,7 +180,9 @@ def parse_picture(data: bytes, where: str | Path, *, flags: int = cv2.IMREAD_COL
 
 
 def _holds_its_chunks(data: bytes) -> bool:
-    """Tell whether no chunk of a PNG says that it goes on beyond the file: OpenCV makes room for what a chunk says, up to gigabytes."""
+    """Tell whether no chunk of a PNG says that it goes on beyond the file: OpenCV makes room for what a chunk says, up
+    to gigabytes.
+    """
     place = len(PNG_SIGNATURE)
     while place + 8 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, place)
@@ -189,7 +194,9 @@ def _holds_its_chunks(data: bytes) -> bool:
 
 @contextlib.contextmanager
 def decoder_errors(where: str | Path) -> Iterator[None]:
-    """Turn what OpenCV raises on a file that it cannot decode into an InputError; only the call of a decoder stands in it."""
+    """Turn what OpenCV raises on a file that it cannot decode into an InputError; only the call of a decoder stands in
+    it.
+    """
     try:
         yield
     except cv2.error as error:

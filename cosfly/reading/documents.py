@@ -1,7 +1,9 @@
-"""JSON on disk: into plain values, and into models. Whatever stands there, a reader gets what it asked for or an InputError.
+"""JSON on disk: into plain values, and into models. Whatever stands there, a reader gets what it asked for or an
+InputError.
 
-Refused beyond what JSON forbids: numbers that are not finite (NaN, 1e999) or whole with more than DIGITS digits, nesting deeper than
-DEPTH, half a surrogate pair, which no file could hold again, more brackets than such a text has, and in files of ours a key that is given twice.
+Refused beyond what JSON forbids: numbers that are not finite (NaN, 1e999) or whole with more than DIGITS digits,
+nesting deeper than DEPTH, half a surrogate pair, which no file could hold again, more brackets than such a text has,
+and in files of ours a key that is given twice.
 """
 
 from __future__ import annotations
@@ -185,7 +187,8 @@ def read_object(path: Path, *, what: str = "file", tree: Path | None = None) -> 
 
 
 def validated(model: type[Model], value: Any, where: str | Path) -> Model:
-    """Give what a JSON value says as a model. It ends at the first wrong member of a list or object: each error takes kilobytes.
+    """Give what a JSON value says as a model. It ends at the first wrong member of a list or object: each error takes
+    kilobytes.
 
     Raises:
         InputError: names the file and the first wrong field.

@@ -1,6 +1,7 @@
 """Opening files: regular ones only, of a bounded size, and not through links that lead out of their tree.
 
-A pipe would block for ever, a device never end. What the disk says against a file becomes an InputError here and nowhere else.
+A pipe would block for ever, a device never end. What the disk says against a file becomes an InputError here and
+nowhere else.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ def open_file(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Pa
 
     Args:
         what, fix: for the message.
-        tree: the folder whose files are being read: a link that leads out of it is refused. None: the user named this file.
+        tree: the folder whose files are being read: a link that leads out of it is refused. None: the user named this
+        file.
     Raises:
         InputError: it is missing, no regular file, not readable, or not below its tree.
     """
@@ -111,7 +113,9 @@ def read_into(
 
 
 def read_span(path: Path, first: int, size: int, *, what: str = "file", fix: str = CHECK_PATH) -> bytes:
-    """Read `size` bytes from byte `first` on of a file that the user named; raises as `read_bytes`, and where it ends before."""
+    """Read `size` bytes from byte `first` on of a file that the user named; raises as `read_bytes`, and where it ends
+    before.
+    """
     if size > limits().file_mb * MB:
         raise over_limit("file_mb", path, f"{size / MB:,.0f} MB", " MB")
     with open_file(path, what=what, fix=fix) as file, disk_errors(path, what, fix):
@@ -194,10 +198,11 @@ def sha256_file(path: Path, *, tree: Path | None = None) -> str:
 
 
 def files_named(tree: Path, name: str) -> list[Path]:
-    """Find the files of a name below a tree, sorted; what begins with a dot is left out, and nothing is looked for below a folder that has one.
+    """Find the files of a name below a tree, sorted; what begins with a dot is left out, and nothing is looked for
+    below a folder that has one.
 
-    A folder that is a link is gone into where it leads to a place inside the tree's parent folder, or anywhere with `reading.follow_links`;
-    of others the log tells.
+    A folder that is a link is gone into where it leads to a place inside the tree's parent folder, or anywhere with
+    `reading.follow_links`; of others the log tells.
     """
     found: list[Path] = []
     waiting: list[tuple[Path, tuple[str, ...]]] = [(tree, (os.path.realpath(tree),))]
@@ -227,10 +232,11 @@ def files_named(tree: Path, name: str) -> list[Path]:
 
 
 def check_stays_below(path: Path, tree: Path, *, beside: bool = False) -> None:
-    """Check that no symbolic link leads from a tree to a file outside; `beside`: out of the folder that the tree stands in.
+    """Check that no symbolic link leads from a tree to a file outside; `beside`: out of the folder that the tree stands
+    in.
 
-    The tree itself may be a link. Where it is a snapshot in the cache of the hub's client, whose files are links to blobs, these are
-    part of it.
+    The tree itself may be a link. Where it is a snapshot in the cache of the hub's client, whose files are links to
+    blobs, these are part of it.
 
     Raises:
         InputError: it leads out; names the setting that allows it.
@@ -249,7 +255,9 @@ def check_stays_below(path: Path, tree: Path, *, beside: bool = False) -> None:
 
 
 def real_path(path: Path) -> str:
-    """As `os.path.realpath`, which looks at every folder on the way, by asking the system, where there is such a file and it can be asked."""
+    """As `os.path.realpath`, which looks at every folder on the way, by asking the system, where there is such a file
+    and it can be asked.
+    """
     try:
         number = os.open(path, os.O_PATH | os.O_CLOEXEC)
     except (OSError, AttributeError):  # not there, or another system
@@ -268,7 +276,9 @@ def is_below(path: str, root: str) -> bool:
 
 
 def _blobs(root: Path) -> list[str]:
-    """The folder of blobs of a tree in the hub client's cache: `<repository>/snapshots/<revision>/...` links to `<repository>/blobs`."""
+    """The folder of blobs of a tree in the hub client's cache: `<repository>/snapshots/<revision>/...` links to
+    `<repository>/blobs`.
+    """
     snapshots = next((folder for folder in root.parents if folder.name == "snapshots"), None)
     if snapshots is None:
         return []

@@ -1,7 +1,7 @@
 """How much a file may ask of this machine before it is refused, and which links are followed: settings `reading.*`.
 
-They decide what is refused and never what is made, so they are the process's and not a stage's; workers get those of the process that
-started them (worker_pool.py).
+They decide what is refused and never what is made, so they are the process's and not a stage's; workers get those of
+the process that started them (worker_pool.py).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Limits(BaseModel):
     polygon_crossings: int = Field(
         500,
         ge=0,
-        description="how often the outline of one polygon may cross itself; mending takes a second for 1,000, a minute for 10,000",
+        description="how often the outline of one polygon may cross itself; mending 1,000 takes a second",
     )
 
 

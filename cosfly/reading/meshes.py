@@ -1,8 +1,10 @@
-"""Meshes of glTF 2.0 (.glb, .gltf) and Wavefront OBJ (.obj): triangles and their plain colours, a node each. No textures.
+"""Meshes of glTF 2.0 (.glb, .gltf) and Wavefront OBJ (.obj): triangles and their plain colours, a node each. No
+textures.
 
-What a file names or counts is checked before anything is opened or made of it. glTF is then read by trimesh, which gets neither names of files nor
-what is not needed; OBJ is read here, since trimesh counts relative indices from the end of the file. glTF's +y is up and becomes +z; OBJ has
-no rule, and is taken as it stands, z up. Source: Khronos glTF 2.0; the OBJ appendix of Wavefront's manual.
+What a file names or counts is checked before anything is opened or made of it. glTF is then read by trimesh, which gets
+neither names of files nor what is not needed; OBJ is read here, since trimesh counts relative indices from the end of
+the file. glTF's +y is up and becomes +z; OBJ has no rule, and is taken as it stands, z up. Source: Khronos glTF 2.0;
+the OBJ appendix of Wavefront's manual.
 """
 
 from __future__ import annotations
@@ -41,7 +43,9 @@ LARGEST_M = 1e7
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles, k of them: corners_m (k, 3, 3) float64, z up, counter-clockwise from outside; colors (k, 3) linear RGB, NaN where the file tells none."""
+    """Triangles, k of them: corners_m (k, 3, 3) float64, z up, counter-clockwise from outside; colors (k, 3) linear
+    RGB, NaN where the file tells none.
+    """
 
     corners_m: np.ndarray
     colors: np.ndarray
@@ -128,8 +132,8 @@ def _malformed(path: Path, field: str, what: str, got: str | None = None, expect
 
 
 def _nodes(document: dict, binary: bytes | None, path: Path, tree: Path) -> Iterator[tuple[str, Mesh]]:
-    """Let trimesh read a document of which only what is drawn is left, and in which each drawn node has one triangle mesh and both have numbers
-    for names."""
+    """Let trimesh read a document of which only what is drawn is left, and in which each drawn node has one triangle
+    mesh and both have numbers for names."""
     if unknown := set(document.get("extensionsRequired", ())) - {DRACO}:
         got = ", ".join(sorted(unknown))[:80]
         raise _malformed(path, "extensionsRequired", "needs what is not read here", got, "plain glTF 2.0, or Draco")

@@ -1,7 +1,8 @@
 """The JSON object in what a model wrote: the last complete one of its final message.
 
-Thoughts, drafts, fences and prose round it are passed over. Read is JSON, and what differs from it in punctuation alone: trailing commas,
-comments, other quotes round a string, full-width colons and commas. The inside of a string stays as it is, and nothing is completed
+Thoughts, drafts, fences and prose round it are passed over. Read is JSON, and what differs from it in punctuation
+alone: trailing commas, comments, other quotes round a string, full-width colons and commas. The inside of a string
+stays as it is, and nothing is completed
 or chosen: an object that ends in the middle, or has a key twice, is a failure with a reason.
 """
 
@@ -33,8 +34,8 @@ _COMMAS, _COLONS = (",", "，"), (":", "：")
 MAX_CHARACTERS = 100_000  # more than any reasoning and answer take; what is longer is not read
 MAX_WRAPPERS = 3  # round the object that was asked for
 
-# How models mark where their thoughts begin and end: tags, special tokens, channels, sentences. What stands before the last end that has
-# no beginning was thought, too: templates put the beginning into the prompt.
+# How models mark where their thoughts begin and end: tags, special tokens, channels, sentences. What stands before the
+# last end that has no beginning was thought, too: templates put the beginning into the prompt.
 _THOUGHT = r"(?:think(?:ing|_fast|_faster)?|thoughts?|reasoning|reflection|analysis|scratchpad)"
 _TAG = rf"(?:[\w|:]{{1,20}}[_:|]|ant)?{_THOUGHT}"  # bounded, as all here: else the worst texts take quadratic time
 _END = r"(?=[\w:]{0,20}end)"
@@ -68,7 +69,9 @@ _UNREADABLE = re.compile("[\ud800-\udfff\ufffd]")
 
 @dataclass(frozen=True)
 class Found:
-    """The object, or None and the reason; `mended` names what stood in the way. is_end: nothing was written after it."""
+    """The object, or None and the reason; `mended` names what stood in the way. is_end: nothing was written after
+    it.
+    """
 
     value: dict[str, Any] | None
     reason: str | None = None
@@ -79,9 +82,9 @@ class Found:
 def find_object(text: str, names: Collection[str], finish_reason: str | None = None) -> Found:
     """Find the last complete object of the final message that has one of these names, which its keys are spelled as.
 
-    Reasons: empty, too_long, no_json_object, only_thinking, broken_json, duplicate_key, not_finite, unreadable_character, and of a message
-    that was cut off (an object that was not the end of it may be a draft) cut_short, content_filter, context_full. An object that has none of the
-    names is given where there is no other.
+    Reasons: empty, too_long, no_json_object, only_thinking, broken_json, duplicate_key, not_finite,
+    unreadable_character, and of a message that was cut off (an object that was not the end of it may be a draft)
+    cut_short, content_filter, context_full. An object that has none of the names is given where there is no other.
     """
     if len(text) > MAX_CHARACTERS:
         return Found(None, "too_long")
@@ -128,14 +131,15 @@ def _finite(number: str) -> float:
 _STRICT = json.JSONDecoder(object_pairs_hook=_distinct, parse_float=_finite, parse_constant=_no_constant)
 
 
-# --- where the object is ------------------------------------------------------------------------------------------------
+# --- where the object is ----------------------------------------------------------------------------------------------
 
 
 @dataclass
 class _Message:
     """What was found of the final message up to some place.
 
-    start: where it begins. objects: complete ones and their readers. broken_at: of the last object that ends in the middle.
+    start: where it begins. objects: complete ones and their readers. broken_at: of the last object that ends in the
+    middle.
     """
 
     start: int = 0
@@ -213,11 +217,13 @@ def _unescaped_object(text: str, names: Collection[str]) -> Found | None:
     return None if found.value is None else Found(found.value, None, (*found.mended, "encoded_twice"), found.is_end)
 
 
-# --- which object it is -------------------------------------------------------------------------------------------------
+# --- which object it is -----------------------------------------------------------------------------------------------
 
 
 def _plain(name: str) -> str:
-    """Give the letters of a name, however it is spelled: criticalComponents, Critical-Components, **critical components**."""
+    """Give the letters of a name, however it is spelled: criticalComponents, Critical-Components, **critical
+    components**.
+    """
     return re.sub(r"[\W_]+", "", name).lower()
 
 
@@ -272,7 +278,7 @@ def _may_be_unreadable(text: str) -> bool:
     return "\\u" in text or "\ufffd" in text
 
 
-# --- one object, as models write it -------------------------------------------------------------------------------------
+# --- one object, as models write it -----------------------------------------------------------------------------------
 
 
 class Broken(Exception):
@@ -408,7 +414,9 @@ class ObjectReader:
         return text, found.end()
 
     def _character(self, escape: re.Match[str]) -> str:
-        """Read an escape. A backslash before punctuation stands for it (`\\_`, `\\'`); before a letter it is no escape that anybody knows."""
+        """Read an escape. A backslash before punctuation stands for it (`\\_`, `\\'`); before a letter it is no escape
+        that anybody knows.
+        """
         if escape[1]:
             return chr(int(escape[1], 16))
         if escape[2] in _ESCAPED:

@@ -1,7 +1,8 @@
 """YAML of settings: what JSON can say, in YAML's spelling, with comments and with anchors that stay small.
 
-Refused: tags (`!!binary`), a key that is given twice, keys that are no plain words, and more than a settings file can need. A date is
-the text that it looks like. Aliases are counted at the size of what they stand for: nine lines can stand for a billion values.
+Refused: tags (`!!binary`), a key that is given twice, keys that are no plain words, and more than a settings file can
+need. A date is the text that it looks like. Aliases are counted at the size of what they stand for: nine lines can
+stand for a billion values.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ import yaml
 
 from cosfly.errors import ConfigError
 
-# A run's settings are about 400 nodes; the longest word list that ships is 4,000. They are of nobody's data, so nothing raises them.
+# A run's settings are about 400 nodes; the longest word list that ships is 4,000. They are of nobody's data, so nothing
+# raises them.
 MOST_BYTES, MOST_NODES, MOST_DEPTH, MOST_DIGITS = 1_000_000, 20_000, 32, 40
 
 

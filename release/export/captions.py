@@ -1,7 +1,7 @@
 """Captions alone, for tools of others: a table, JSON lines, ShareGPT, LLaVA. Pictures are named, not copied.
 
-Names of pictures are relative to the playback tree that the captions are of; those of a release, to the tree that `cosfly release export
---format tree` makes of it.
+Names of pictures are relative to the playback tree that the captions are of; those of a release, to the tree that
+`cosfly release export --format tree` makes of it.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ LAST: dict[Language, str] = {
 
 @dataclass(frozen=True)
 class CaptionLine:
-    """One accepted caption as it leaves. images: of the frames of its window, oldest first. texts: language -> FIELDS -> text."""
+    """One accepted caption as it leaves. images: of the frames of its window, oldest first. texts: language -> FIELDS
+    -> text.
+    """
 
     sample_id: str
     run: str
@@ -71,7 +73,8 @@ class CaptionLine:
 
 
 def read_lines(source: Path, left_out: Counter[str]) -> Iterator[CaptionLine]:
-    """Yield the accepted captions of a run folder, a captions.jsonl (or the folder it stands in) or a release, in their order.
+    """Yield the accepted captions of a run folder, a captions.jsonl (or the folder it stands in) or a release, in their
+    order.
 
     Args:
         left_out: counts the others by reason.
@@ -115,8 +118,8 @@ def _of_caption(caption: Caption, images: list[str], run: str) -> CaptionLine:
     texts = {language: coc.model_dump() for language in LANGUAGES if (coc := answers[language]) is not None}
     first = next(iter(texts.values()), {})
     return CaptionLine(
-        sample_id=caption.sample_id, run=run, town=caption.town, trajectory=caption.trajectory, variant=caption.variant, split="",
-        frame_index=caption.frame_index, window=caption.window, images=images, picture_px=caption.picture_px,
+        sample_id=caption.sample_id, run=run, town=caption.town, trajectory=caption.trajectory, variant=caption.variant,
+        split="", frame_index=caption.frame_index, window=caption.window, images=images, picture_px=caption.picture_px,
         decision=first.get("flight_decision", ""), label=caption.label, verdict=caption.verdict,
         repair_strategy=None if caption.repair is None else caption.repair.strategy,
         teacher=f"{caption.teacher.kind}: {caption.teacher.model}", texts=texts,
@@ -125,8 +128,8 @@ def _of_caption(caption: Caption, images: list[str], run: str) -> CaptionLine:
 
 
 _COLUMNS = [
-    "sample_id", "frame_index", "split", "has_caption", "caption_window", "caption_picture_px", "decision", "label", "verdict",
-    "repair_strategy", "teacher_kind", "teacher_model",
+    "sample_id", "frame_index", "split", "has_caption", "caption_window", "caption_picture_px", "decision", "label",
+    "verdict", "repair_strategy", "teacher_kind", "teacher_model",
     *(f"caption_{language}_{name}" for language in LANGUAGES for name in FIELDS),
     *(f"{part}_{language}" for language in LANGUAGES for part in ("system", "prompt")),
 ]  # fmt: skip
@@ -167,10 +170,12 @@ def _of_row(row: dict[str, Any], flight: Any, images: list[str]) -> CaptionLine:
     }
     width_px, height_px = row["caption_picture_px"]
     return CaptionLine(
-        sample_id=row["sample_id"], run=flight.run, town=flight.town, trajectory=flight.trajectory, variant=flight.variant,
-        split=row["split"] or "", frame_index=row["frame_index"], window=row["caption_window"], images=images,
-        picture_px=(width_px, height_px), decision=row["decision"] or "", label=row["label"], verdict=row["verdict"],
-        repair_strategy=row["repair_strategy"], teacher=f"{row['teacher_kind']}: {row['teacher_model']}", texts=texts, prompts=prompts,
+        sample_id=row["sample_id"], run=flight.run, town=flight.town, trajectory=flight.trajectory,
+        variant=flight.variant, split=row["split"] or "", frame_index=row["frame_index"], window=row["caption_window"],
+        images=images, picture_px=(width_px, height_px),
+        decision=row["decision"] or "", label=row["label"], verdict=row["verdict"],
+        repair_strategy=row["repair_strategy"], teacher=f"{row['teacher_kind']}: {row['teacher_model']}", texts=texts,
+        prompts=prompts,
     )  # fmt: skip
 
 
@@ -199,13 +204,15 @@ def export(
     split: SplitName | None = None,
     overwrite: bool = False,
 ) -> CaptionTally:
-    """Write the accepted captions of a source to one file; a table or JSON lines have a row a window, the others a sample a window and language.
+    """Write the accepted captions of a source to one file; a table or JSON lines have a row a window, the others a
+    sample a window and language.
 
     Args:
         shown: pictures of a sample in ShareGPT and LLaVA: those of all frames, or of the last one alone.
         split: the captions of this one alone. overwrite: replace a file that stands at `out`.
     Raises:
-        StorageError: something stands at `out`. InputError: there is nothing to read, or conversations would mix splits.
+        StorageError: something stands at `out`. InputError: there is nothing to read, or conversations would mix
+        splits.
         NothingKept: no caption can go out.
     """
     if out.exists() and not (overwrite and out.is_file()):
@@ -239,9 +246,10 @@ def _of_split(
 
 def _row(line: CaptionLine, languages: list[Language]) -> dict[str, Any]:
     row: dict[str, Any] = {
-        "sample_id": line.sample_id, "run": line.run, "town": line.town, "trajectory": line.trajectory, "variant": line.variant,
-        "split": line.split, "frame_index": line.frame_index, "window": line.window, "images": line.images,
-        "picture_px": list(line.picture_px), "decision": line.decision, "label": line.label, "verdict": line.verdict,
+        "sample_id": line.sample_id, "run": line.run, "town": line.town, "trajectory": line.trajectory,
+        "variant": line.variant, "split": line.split, "frame_index": line.frame_index, "window": line.window,
+        "images": line.images, "picture_px": list(line.picture_px),
+        "decision": line.decision, "label": line.label, "verdict": line.verdict,
         "repair_strategy": line.repair_strategy, "teacher": line.teacher,
     }  # fmt: skip
     for language in languages:
@@ -272,7 +280,9 @@ def _csv(
 
 
 def cell(value: Any) -> str:
-    """Give a value as a spreadsheet may show it: a list as JSON, nothing for None, and no text that it would calculate."""
+    """Give a value as a spreadsheet may show it: a list as JSON, nothing for None, and no text that it would
+    calculate.
+    """
     text = "" if value is None else value if isinstance(value, str) else dump_json(value)
     return f"'{text}" if isinstance(value, str) and text.lstrip(" ").startswith(FORMULA) else text
 
@@ -288,7 +298,9 @@ def _jsonl(
 def _sharegpt(
     file: IO[bytes], lines: Iterable[CaptionLine], languages: list[Language], shown: ImageChoice, told: CaptionTally
 ) -> None:
-    """As LLaMA-Factory reads it: roles in turns, human first; as many marks as `images`, which are joined to its media_dir."""
+    """As LLaMA-Factory reads it: roles in turns, human first; as many marks as `images`, which are joined to its
+    media_dir.
+    """
 
     def sample(name: str, prompt: Prompt, images: list[str], asked: str, answer: str) -> dict[str, Any]:
         turns = [{"from": "human", "value": asked}, {"from": "gpt", "value": answer}]
@@ -300,7 +312,8 @@ def _sharegpt(
 def _llava(
     file: IO[bytes], lines: Iterable[CaptionLine], languages: list[Language], shown: ImageChoice, told: CaptionTally
 ) -> None:
-    """As LLaVA's trainers read it: `image` below its image folder, one name, or a list, which the first LLaVA does not take.
+    """As LLaVA's trainers read it: `image` below its image folder, one name, or a list, which the first LLaVA does not
+    take.
 
     It has no place for a system prompt, so that stands in front of the question.
     """
@@ -347,6 +360,5 @@ def _write_array(file: IO[bytes], samples: Iterable[dict[str, Any]]) -> None:
     file.write(b"\n]\n")
 
 
-WRITERS: dict[FormatName, Callable[[IO[bytes], Iterable[CaptionLine], list[Language], ImageChoice, CaptionTally], None]] = {
-    "csv": _csv, "jsonl": _jsonl, "sharegpt": _sharegpt, "llava": _llava,
-}  # fmt: skip
+LineWriter = Callable[[IO[bytes], Iterable[CaptionLine], list[Language], ImageChoice, CaptionTally], None]
+WRITERS: dict[FormatName, LineWriter] = {"csv": _csv, "jsonl": _jsonl, "sharegpt": _sharegpt, "llava": _llava}

@@ -1,8 +1,9 @@
 """What a format of `cosfly release export` is: a module with three functions, and a row in FORMATS.
 
-    plan(release, flights, cfg) -> list[ExportUnit]              the work, cut so that units can be done in any order by several processes
-    write(release, unit, folder, cfg) -> UnitFiles           one unit: its files, each whole or absent, below `folder`
-    finish(release, units, written, folder, cfg) -> FormatFacts  what speaks of all units: indices, statistics; called once, in order of units
+    plan(release, flights, cfg) -> list[ExportUnit]              the work, cut so that units can be done in any order by
+    several processes write(release, unit, folder, cfg) -> UnitFiles           one unit: its files, each whole or
+    absent, below `folder` finish(release, units, written, folder, cfg) -> FormatFacts  what speaks of all units:
+    indices, statistics; called once, in order of units
 
 The bytes of a unit depend on the release, the unit and the settings alone.
 """

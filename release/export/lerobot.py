@@ -1,9 +1,11 @@
 """LeRobot v3.0: a flight is an episode, or several where the release leaves frames of it out.
 
-    data/chunk-000/file-000.parquet of several episodes, meta/{info.json, stats.json, tasks.parquet, episodes/chunk-000/file-000.parquet}
+    data/chunk-000/file-000.parquet of several episodes, meta/{info.json, stats.json, tasks.parquet,
+    episodes/chunk-000/file-000.parquet}
 
-LeRobot counts time by frames, so an episode holds frames that follow each other without a gap. Pictures are the released PNG bytes in the
-parquet files; depth is TIFF of float32, LeRobot's own lossless form. The task of a frame is its caption's decision in words.
+LeRobot counts time by frames, so an episode holds frames that follow each other without a gap. Pictures are the
+released PNG bytes in the parquet files; depth is TIFF of float32, LeRobot's own lossless form. The task of a frame is
+its caption's decision in words.
 `observation.*` is what a policy sees, `action` what it answers, `timestamp` counts from the start of an episode.
 """
 
@@ -51,13 +53,17 @@ def sampled(num_frames: int) -> set[int]:
 
 
 def thinned(picture: np.ndarray) -> np.ndarray:
-    """Give every fourth pixel of a picture, (k, channels) float64: colours from 0 to 1, depth (two dimensions) as it is."""
+    """Give every fourth pixel of a picture, (k, channels) float64: colours from 0 to 1, depth (two dimensions) as it
+    is.
+    """
     few = picture[::PIXEL_STEP, ::PIXEL_STEP]
     return few.reshape(-1, 1).astype(np.float64) if picture.ndim == 2 else few.reshape(-1, 3) / 255.0
 
 
 def summarize(values: np.ndarray, count: int, *, is_picture: bool = False) -> Summary:
-    """Summarize (k, d) values, NaN left out; `count` is the number of frames they are of. Without any value all is zero, and so is count."""
+    """Summarize (k, d) values, NaN left out; `count` is the number of frames they are of. Without any value all is
+    zero, and so is count.
+    """
     known = ~np.isnan(values)
     has_any = known.any(axis=0)
     filled = np.where(has_any, values, 0.0)
@@ -71,7 +77,9 @@ def summarize(values: np.ndarray, count: int, *, is_picture: bool = False) -> Su
 
 
 def merged(summaries: Sequence[Summary]) -> Summary:
-    """Summarize what was summarized: exact but for the quantiles, which are means of quantiles, as LeRobot's own are."""
+    """Summarize what was summarized: exact but for the quantiles, which are means of quantiles, as LeRobot's own
+    are.
+    """
     parts = [part for part in summaries if part["count"][0]] or summaries
     counts = np.array([part["count"][0] for part in parts], dtype=np.float64)
     weights = counts / counts.sum() if counts.sum() else np.full(len(parts), 1 / len(parts))
@@ -177,7 +185,8 @@ def schema_of(features: dict[str, LeRobotFeature]) -> pa.Schema:
 
 
 def values_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Give the values of all features of an episode but pictures and LeRobot's own: arrays (n,) or (n, d), and lists of texts.
+    """Give the values of all features of an episode but pictures and LeRobot's own: arrays (n,) or (n, d), and lists of
+    texts.
 
     What a frame does not have is NaN, or the empty text.
     """
@@ -192,7 +201,8 @@ def values_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def moves(poses: np.ndarray) -> np.ndarray:
-    """Give what takes each pose to the next, (n, 4): the way in the drone's own level axes, m, and the turn, degrees; zero at the last.
+    """Give what takes each pose to the next, (n, 4): the way in the drone's own level axes, m, and the turn, degrees;
+    zero at the last.
 
     Args:
         poses: (n, 6) x, y, z in m, pitch, yaw, roll in degrees, right-handed.
@@ -230,7 +240,9 @@ VERSION = "v3.0"
 
 @dataclass(frozen=True)
 class Layout:
-    """What a unit must know of the whole. episode, index: the numbers of its first episode and frame; file: its own number."""
+    """What a unit must know of the whole. episode, index: the numbers of its first episode and frame; file: its own
+    number.
+    """
 
     split: str
     file: int
@@ -325,7 +337,9 @@ def _size(release: Release) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode of a unit: its number, its flight, rows [start, stop) of that, the number of its first frame in the whole."""
+    """One episode of a unit: its number, its flight, rows [start, stop) of that, the number of its first frame in the
+    whole.
+    """
 
     number: int
     flight: ReleasedRows
@@ -358,7 +372,9 @@ def write(release: Release, unit: ExportUnit, folder: Path, cfg: ExportConfig) -
 def _tables(
     release: Release, episode: Episode, layout: Layout, features: dict[str, LeRobotFeature], about: list[dict[str, Any]]
 ) -> Iterator[pa.Table]:
-    """Yield an episode's rows, a row group of the release at a time; at its end `about` has what the records say of it."""
+    """Yield an episode's rows, a row group of the release at a time; at its end `about` has what the records say of
+    it.
+    """
     flight, n = episode.flight, episode.stop - episode.start
     scalars = [
         row for i, row in enumerate(rows_of_flight(release, flight, COLUMNS)) if episode.start <= i < episode.stop
@@ -499,24 +515,26 @@ def finish(
     files.put("meta/tasks.parquet", _parquet_bytes(_tasks_table(tasks)))
     files.put("meta/info.json", dump_json(info, indent=4).encode())
     num_flights = sum(len(unit.flights) for unit in units)
+    codings = dict.fromkeys(release.modalities, "PNG, the released bytes")
+    if "depth" in codings:
+        codings["depth"] = depth_in_words(release.record.depth, "TIFF, the released numbers")
+    rounded = "float32 of the released float64: a coordinate of 1,000 m is rounded by at most 0.00003 m"
     return FormatFacts(
         version=VERSION,
-        codings={
-            file: depth_in_words(release.record.depth, "TIFF, the released numbers") if file == "depth" else "PNG, the released bytes"
-            for file in release.modalities
-        }
-        | {"poses and points": "float32 of the released float64: a coordinate of 1,000 m is rounded by at most 0.00003 m"},
+        codings=codings | {"poses and points": rounded},
         notes=[
-            f"{info['total_episodes']} episodes of {num_flights} flights at {layout.fps} frames a second; a flight of which frames were left out "
-            "is cut there. meta/episodes says of each its flight, split and first frame.",
-            "action is what takes a frame's pose to the next one's: forward, left, up in m in the drone's level axes, yaw in degrees "
-            "(counter-clockwise); that of an episode's last frame is zero, for what follows is not in the release (next.done).",
-            "task is the caption's decision in words; frames without a caption have the plain order. What a frame has not is NaN, or an empty text.",
+            f"{info['total_episodes']} episodes of {num_flights} flights at {layout.fps} frames a second; a flight of "
+            "which frames were left out is cut there. meta/episodes says of each its flight, split and first frame.",
+            "action is what takes a frame's pose to the next one's: forward, left, up in m in the drone's level axes, "
+            "yaw in degrees (counter-clockwise); that of an episode's last frame is zero, for what follows is not in "
+            "the release (next.done).",
+            "task is the caption's decision in words; frames without a caption have the plain order. What a frame has "
+            "not is NaN, or an empty text.",
         ],
         how_to_open="from lerobot.datasets.lerobot_dataset import LeRobotDataset\n"
         "frames = LeRobotDataset('cosfly/flights', root='.')",
         files=files.digests,
-    )  # fmt: skip
+    )
 
 
 def _info(release: Release, units: Sequence[ExportUnit], counts: list[int], cfg: ExportConfig) -> dict[str, Any]:
@@ -531,8 +549,8 @@ def _info(release: Release, units: Sequence[ExportUnit], counts: list[int], cfg:
     features = features_of(release.modalities, layout.size_px)
     info: dict[str, Any] = {
         "codebase_version": VERSION, "robot_type": "cosfly_drone", "total_episodes": total,
-        "total_frames": sum(unit.frames for unit in units), "total_tasks": len(layout.tasks), "chunks_size": CHUNK, "fps": layout.fps,
-        "splits": splits, "data_path": DATA_PATH, "video_path": None,
+        "total_frames": sum(unit.frames for unit in units), "total_tasks": len(layout.tasks), "chunks_size": CHUNK,
+        "fps": layout.fps, "splits": splits, "data_path": DATA_PATH, "video_path": None,
         "features": {name: feature.declared() for name, feature in features.items()},
     }  # fmt: skip
     return info | {"data_files_size_in_mb": cfg.shard_mb, "video_files_size_in_mb": cfg.shard_mb}

@@ -1,4 +1,6 @@
-"""The release that an export is made of: its flights, where their rows stand, and the rows themselves, read a row group at a time."""
+"""The release that an export is made of: its flights, where their rows stand, and the rows themselves, read a row group
+at a time.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,8 @@ class Span:
 
 @dataclass
 class ReleasedRows:
-    """One flight of a release, n frames. frames (n,) int32, rising; time_s (n,) float64; decisions: of the captions, "" where none.
+    """One flight of a release, n frames. frames (n,) int32, rising; time_s (n,) float64; decisions: of the captions, ""
+    where none.
 
     num_bytes: of its rows, unpacked.
     """
@@ -120,7 +123,8 @@ def scan(release: Release) -> list[ReleasedRows]:
     """Find the flights of a release and where their rows stand, splits in their order; reads no picture.
 
     Raises:
-        InputError: a shard cannot be read, has other columns, or a flight cannot be (frames that do not rise, two splits, a name
+        InputError: a shard cannot be read, has other columns, or a flight cannot be (frames that do not rise, two
+        splits, a name
             that is no part of a path); names them.
     """
     flights: dict[Place, ReleasedRows] = {}
@@ -135,7 +139,8 @@ def scan(release: Release) -> list[ReleasedRows]:
             names = table.schema_arrow.names
             if differing := [m.name for m in wanted if found.get(m.name) != m.type or names.count(m.name) != 1]:
                 raise InputError(
-                    "not a shard of this version", where=path, got=f"missing, twice there or of another type: {', '.join(differing)}",
+                    "not a shard of this version", where=path,
+                    got=f"missing, twice there or of another type: {', '.join(differing)}",
                     fix="build the release again with this version of cosfly",
                 )  # fmt: skip
             for k in range(table.num_row_groups):
@@ -231,7 +236,8 @@ def picture(row: dict[str, Any], file: FrameFile) -> bytes:
 
 
 def depth_npy(row: dict[str, Any], coding: DepthCoding | None) -> bytes:
-    """Give the depth of a row as the bytes of a `depth.npy` of float32: the released ones, or decoded where the release has coded it.
+    """Give the depth of a row as the bytes of a `depth.npy` of float32: the released ones, or decoded where the release
+    has coded it.
 
     Raises:
         InputError: it is not what the record of the release says.
@@ -247,8 +253,9 @@ def depth_in_words(coding: DepthCoding | None, stored: str) -> str:
     if coding is None or coding.coding == "float32":
         return f"{stored}: float32, metres, lossless"
     return (
-        f"{stored}: of {coding.coding} in the release ({coding.unit}, {coding.min_m} to {coding.max_m} m; {coding.sky:g} sky, {coding.invalid:g} invalid), "
-        f"whose greatest error, measured over all pixels, is {coding.max_error_m:g} m"
+        f"{stored}: of {coding.coding} in the release ({coding.unit}, {coding.min_m} to {coding.max_m} m; "
+        f"{coding.sky:g} sky, {coding.invalid:g} invalid), whose greatest error, "
+        f"measured over all pixels, is {coding.max_error_m:g} m"
     )
 
 

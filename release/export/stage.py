@@ -1,7 +1,7 @@
 """`cosfly release export`: a release in another format.
 
-Reads a release folder; writes `<format>/` with the format's files, `export.json` (which release it came from, how things are stored),
-README.md and checksums.sha256.
+Reads a release folder; writes `<format>/` with the format's files, `export.json` (which release it came from, how
+things are stored), README.md and checksums.sha256.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class SourceRelease(Strict):
 
 
 class ExportRecord(Strict):
-    """`export.json`. depth: how the release codes it; null where it has none. actions, prompts: the closed set of decisions (null: the one
-    that ships) and the questions, as the release's record has them."""
+    """`export.json`. depth: how the release codes it; null where it has none. actions, prompts: the closed set of
+    decisions (null: the one that ships) and the questions, as the release's record has them."""
 
     format: str
     format_version: str
@@ -124,8 +124,9 @@ def render_readme(record: ExportRecord) -> str:
     lines = [
         "---", yaml.safe_dump(front, sort_keys=True, allow_unicode=True).rstrip(), "---", "",
         f"# {for_markdown(record.release.name)}: {record.format} {record.format_version}", "",
-        f"{record.frames:,} frames of the release {for_markdown(record.release.name)} (content {record.release.digest}), "
-        f"exported by {for_markdown(record.made_by)}. `export.json` says the same to programs; `checksums.sha256` lists the files.", "",
+        f"{record.frames:,} frames of the release {for_markdown(record.release.name)} "
+        f"(content {record.release.digest}), exported by {for_markdown(record.made_by)}. `export.json` says the same "
+        "to programs; `checksums.sha256` lists the files.", "",
         "```python", record.how_to_open, "```", "",
         "## How things are stored", "",
         *(f"- {name}: {for_markdown(text)}" for name, text in record.codings.items()), "",
@@ -180,7 +181,8 @@ def run(
     if finished.tally.failed:  # nothing half is published
         raise InputError(
             "parts of the release could not be exported", where=out / "failures.jsonl", got=str(finished.tally),
-            fix="mend what that file names (`cosfly release verify`) and run the same command again: only those are done again",
+            fix="mend what that file names (`cosfly release verify`) and run the same command again: only those are "
+            "done again",
         )  # fmt: skip
     written = [result_of(kept, UnitFiles) for kept in finished.kept]
     _check_parts(parts, written)

@@ -1,11 +1,12 @@
-"""The playback tree (CosFly-Track v7) of a release: what other people's loaders of that layout, and `cosfly caption`, read.
+"""The playback tree (CosFly-Track v7) of a release: what other people's loaders of that layout, and `cosfly caption`,
+read.
 
     Town*/trajectory_*/{ORI, aug_001}/trajectory.json
     Town*/trajectory_*/{ORI, aug_001}/frames_playback/frame_00000/{rgb.png, depth.npy, instance.png}
 
-Pictures are the released bytes; every number of `trajectory.json` is the release's, its axes the tree's (products/playback.py). Frames are
-counted from 0, as the layout asks; which frame of the flight each was says `source.released_frames`. A release of several runs becomes
-a tree a run, in a folder of its name.
+Pictures are the released bytes; every number of `trajectory.json` is the release's, its axes the tree's
+(products/playback.py). Frames are counted from 0, as the layout asks; which frame of the flight each was says
+`source.released_frames`. A release of several runs becomes a tree a run, in a folder of its name.
 """
 
 from __future__ import annotations
@@ -125,12 +126,14 @@ def finish(
 
 def _notes(units: Sequence[ExportUnit], written: Sequence[UnitFiles]) -> Iterator[str]:
     yield (
-        "Frames are counted from 0 as the layout asks; source.released_frames of trajectory.json says which frame of the flight each was. "
-        "The layout has no captions: they stand in the release. meta.json and the order of missions are not in it."
+        "Frames are counted from 0 as the layout asks; source.released_frames of trajectory.json says which frame of "
+        "the flight each was. The layout has no captions: they stand in the release. meta.json and the order of "
+        "missions are not in it."
     )
     gaps = sum(one.facts["has_gaps"] for one in written)
     if gaps:
-        yield f"{gaps} of {len(units)} flights are parts of a flight: steps between their frames are uneven, which strict readers of time refuse."
+        parts = f"{gaps} of {len(units)} flights are parts of a flight"
+        yield f"{parts}: steps between their frames are uneven, which strict readers of time refuse."
     tracks = defaultdict(set)
     for unit, one in zip(units, written, strict=True):
         tracks[unit.extra[0].rpartition("/")[0]].add(one.facts["is_original"])
@@ -191,7 +194,9 @@ def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight
 
 
 def _point(row: Row) -> dict[str, Any]:
-    """What a point says of its perturbation beside the offsets: what became of it, or that there was one whose offsets nobody knows."""
+    """What a point says of its perturbation beside the offsets: what became of it, or that there was one whose offsets
+    nobody knows.
+    """
     told = {name: text for name, text in (row["perturbation"] or {}).items() if text is not None}
     if row["is_perturbed"] and row["drone_offset"] is None:
         told |= {"drone_position": True, "drone_rotation": True}

@@ -2,8 +2,8 @@
 
     train-00000.tar     trajectory_1_ORI_frame_00000.depth.npy, .instance.png, .json, .rgb.png, then the next frame
 
-A shard is a run of row groups of the release, so its size is bounded by the setting and one row group; its bytes depend on the rows alone
-(no times, no owners). The JSON holds every column but the pictures.
+A shard is a run of row groups of the release, so its size is bounded by the setting and one row group; its bytes depend
+on the rows alone (no times, no owners). The JSON holds every column but the pictures.
 """
 
 from __future__ import annotations

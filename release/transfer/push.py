@@ -32,7 +32,9 @@ LOGIN = "log in with `hf auth login`, or set HF_TOKEN to a token that may write"
 
 @dataclass(frozen=True)
 class Parcel:
-    """What goes, and what does not. files: name -> bytes, shards first; stays: files of the folder that are not of the release."""
+    """What goes, and what does not. files: name -> bytes, shards first; stays: files of the folder that are not of the
+    release.
+    """
 
     folder: Path
     files: dict[str, int]
@@ -100,7 +102,8 @@ def verified(parcel: Parcel, level: Level, *, workers: int, reader: CaptionReade
 
 
 def push(parcel: Parcel, repo: str, *, private: bool = True) -> str:
-    """Send a parcel to a data-set repository, which is made if there is none: the shards first, the card and the records last.
+    """Send a parcel to a data-set repository, which is made if there is none: the shards first, the card and the
+    records last.
 
     What is there already, with the same sha256, is not sent again, so the same command goes on after a break.
 
@@ -109,7 +112,8 @@ def push(parcel: Parcel, repo: str, *, private: bool = True) -> str:
     Returns:
         the repository's address.
     Raises:
-        ConfigError: the name is none. EnvironmentMissing: huggingface_hub is not installed. TeacherError: the hub refuses, or cannot be reached.
+        ConfigError: the name is none. EnvironmentMissing: huggingface_hub is not installed. TeacherError: the hub
+        refuses, or cannot be reached.
     """
     try:
         from huggingface_hub import CommitOperationAdd, HfApi, constants
@@ -141,12 +145,13 @@ def push(parcel: Parcel, repo: str, *, private: bool = True) -> str:
     wrong = [name for name, size in parcel.files.items() if arrived.get(name) != size]
     if wrong:
         raise TeacherError(
-            "the hub does not show what was sent", where=repo, got=", ".join(wrong)[:300], expected="the files with their sizes",
-            fix="run the same command again",
+            "the hub does not show what was sent", where=repo, got=", ".join(wrong)[:300],
+            expected="the files with their sizes", fix="run the same command again",
         )  # fmt: skip
     if others := [name for name in arrived if SHARD_NAME.fullmatch(name) and name not in parcel.files]:
         log.warning(
-            "%s: %d shards of another release are still there, which the card does not name: %s; remove them on the hub if nobody needs them",
+            "%s: %d shards of another release are still there, which the card does not name: %s; "
+            "remove them on the hub if nobody needs them",
             repo, len(others), ", ".join(sorted(others)[:3]),
         )  # fmt: skip
     return without_secrets(address)
@@ -157,7 +162,8 @@ def _hub_errors(repo: str, endpoint: str) -> Iterator[None]:
     """Turn what the library raises of a hub into one line; none of these texts holds the token."""
     from huggingface_hub import errors
 
-    client: type[Exception] = errors.HfHubHTTPError.__bases__[0]  # type: ignore[assignment]  # HTTPError of whichever client this version of the library uses
+    # HTTPError of whichever client this version of the library uses
+    client: type[Exception] = errors.HfHubHTTPError.__bases__[0]  # type: ignore[assignment]
     where = f"{without_secrets(endpoint)}: {repo}"
     try:
         yield

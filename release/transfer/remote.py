@@ -1,8 +1,9 @@
-"""Bytes of files that lie somewhere else: a folder, an http(s) address, or anything that fsspec opens (zip, memory, hf, s3 ...).
+"""Bytes of files that lie somewhere else: a folder, an http(s) address, or anything that fsspec opens (zip, memory, hf,
+s3 ...).
 
-Whoever answers may lie: no answer is read beyond what was asked for, sizes are compared before anything is trusted, and names come
-only from here. Addresses may hold secrets (user:password@, ?token=): `Remote.shown` is the address without them, and the only form
-that is logged, recorded or put in an error.
+Whoever answers may lie: no answer is read beyond what was asked for, sizes are compared before anything is trusted, and
+names come only from here. Addresses may hold secrets (user:password@, ?token=): `Remote.shown` is the address without
+them, and the only form that is logged, recorded or put in an error.
 """
 
 from __future__ import annotations
@@ -124,8 +125,8 @@ class FolderRemote:
 class HttpRemote:
     """Files below an http(s) address, by ranges.
 
-    Redirects are followed, as hubs need it: never from https to http, never with user and password, and to a private address only on the
-    host that was named.
+    Redirects are followed, as hubs need it: never from https to http, never with user and password, and to a private
+    address only on the host that was named.
     """
 
     def __init__(self, address: str) -> None:

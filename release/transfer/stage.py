@@ -1,11 +1,12 @@
 """`cosfly release get`: a release, or a part of it, from another place.
 
-Reads release.json and the shards of a release that lies somewhere else; writes `dataset/`, which is a release: all of it byte for byte, or a
-part with a record of its own. Of a part only the wanted rows and columns travel.
+Reads release.json and the shards of a release that lies somewhere else; writes `dataset/`, which is a release: all of
+it byte for byte, or a part with a record of its own. Of a part only the wanted rows and columns travel.
 
-What is checked: release.json against checksums.sha256 and against itself, and with `expected` against a digest that the user has from elsewhere;
-the sha256 of shards that are taken whole; of others the sizes, columns, rows and flights that the record tells of, and then, as of every
-release, all that `cosfly release verify` finds in rows. The pictures of a shard of which a part is taken are bound by no digest.
+What is checked: release.json against checksums.sha256 and against itself, and with `expected` against a digest that the
+user has from elsewhere; the sha256 of shards that are taken whole; of others the sizes, columns, rows and flights that
+the record tells of, and then, as of every release, all that `cosfly release verify` finds in rows. The pictures of a
+shard of which a part is taken are bound by no digest.
 """
 
 from __future__ import annotations
@@ -220,7 +221,8 @@ def fetch_shard(remote: Remote, shard: Shard, path: Path, plan: _Plan) -> _Got:
     """Fetch the wanted part of one shard.
 
     Raises:
-        InputError: the other side has another size, other columns, or other rows than the record says. VerifyError: another sha256.
+        InputError: the other side has another size, other columns, or other rows than the record says. VerifyError:
+        another sha256.
     """
     where = f"{remote.shown}/{shard.path}"
     if (size := remote.size(shard.path)) != shard.bytes:
@@ -311,7 +313,8 @@ def _checked(got: _Got, plan: _Plan, where: str) -> _Got:
 
 
 def _copy(remote: Remote, shard: Shard, path: Path) -> str:
-    """Copy a whole shard; give its sha256, which is the record's. One that was broken off goes on with the bytes that are here.
+    """Copy a whole shard; give its sha256, which is the record's. One that was broken off goes on with the bytes that
+    are here.
 
     Raises:
         InputError: bytes are not to be had; those that came stay. VerifyError: another sha256; none stay.
@@ -366,7 +369,8 @@ def run(
     """Fetch a release or a part of it from a folder or an address; give the folder that holds it.
 
     Args:
-        findings: of what `release verify` finds in its rows. accept: the release is kept as it is, and `findings.json` beside it says what.
+        findings: of what `release verify` finds in its rows. accept: the release is kept as it is, and `findings.json`
+        beside it says what.
     """
     remote = open_remote(address)
     record, data = fetch_record(remote, choice.expected)
@@ -442,7 +446,8 @@ def _taken(shards: Sequence[Shard], got: Mapping[str, _Got], flights: list[Relea
 def _not_kept(report: Verified, where: str) -> VerifyError:
     return VerifyError(
         "what was fetched does not verify, so it is not kept", where=where, got=str(report),
-        fix="ask who made it; to keep it as it is, with what was found beside it: --findings accept (nothing is fetched again)",
+        fix="ask who made it; to keep it as it is, with what was found beside it: --findings accept "
+        "(nothing is fetched again)",
     )  # fmt: skip
 
 
@@ -462,7 +467,9 @@ def _copy_signature(remote: Remote, folder: Path) -> None:
 
 
 def _part_of(record: ReleaseRecord, choice: Selection, source: str) -> PartOf:
-    """Say of which release something is a part. The digest that was asked for is of that release, and no part of the choice."""
+    """Say of which release something is a part. The digest that was asked for is of that release, and no part of the
+    choice.
+    """
     chosen = choice.model_dump(mode="json", exclude={"expected"})
     return PartOf(name=record.name, content_digest=record.content_digest, source=source, choice=chosen)
 

@@ -1,4 +1,6 @@
-"""What stands on the viewer's page, and what of much goes on it: flights, frames, pictures, paths, boxes. The page's script reads these names."""
+"""What stands on the viewer's page, and what of much goes on it: flights, frames, pictures, paths, boxes. The page's
+script reads these names.
+"""
 
 from __future__ import annotations
 
@@ -47,8 +49,8 @@ class PageSentence(BaseModel):
 
 
 class PageCaption(BaseModel):
-    """A caption. facts: what the columns say of it; repair: how a rejected answer was mended; problems: what was found wrong; dropped: why it is
-    not accepted."""
+    """A caption. facts: what the columns say of it; repair: how a rejected answer was mended; problems: what was found
+    wrong; dropped: why it is not accepted."""
 
     decision: str | None
     label: str | None
@@ -61,8 +63,9 @@ class PageCaption(BaseModel):
 
 
 class PageFrame(BaseModel):
-    """A frame. drone: x, y, z, m, and yaw, degrees; target: x, y, z, m; events: what became of its perturbation; facts: what else the columns
-    say; box: of the person, xmin, ymin, xmax, ymax as shares of the picture; pictures: JPEG in base64."""
+    """A frame. drone: x, y, z, m, and yaw, degrees; target: x, y, z, m; events: what became of its perturbation; facts:
+    what else the columns say; box: of the person, xmin, ymin, xmax, ymax as shares of the picture; pictures: JPEG in
+    base64."""
 
     index: int
     time_s: float
@@ -79,8 +82,8 @@ class PageFrame(BaseModel):
 
 
 class PageFlight(BaseModel):
-    """A flight. fovs_deg: the least and the greatest of its frames. group: what both tracks of a trajectory share; map: key of its map; result: of
-    the inspection; paths from above."""
+    """A flight. fovs_deg: the least and the greatest of its frames. group: what both tracks of a trajectory share; map:
+    key of its map; result: of the inspection; paths from above."""
 
     name: str
     group: str
@@ -165,7 +168,9 @@ def _facts(columns: Sequence[Column], row: Mapping[str, Any]) -> dict[str, str]:
 
 
 def page_sentences(coc: Coc, states: Sequence[str] | None) -> list[PageSentence]:
-    """Give the sentences of an answer, each with its state; None where the states are those of another number of sentences."""
+    """Give the sentences of an answer, each with its state; None where the states are those of another number of
+    sentences.
+    """
     named = list(sentences_of(coc))
     known: Sequence[str | None] = states if states is not None and len(states) == len(named) else [None] * len(named)
     return [
@@ -188,7 +193,9 @@ JPEG_QUALITY = 72
 
 
 class PagePictures:
-    """Encodes pictures until the page is full, then every frame goes without; `left_out` and `unreadable` count frames."""
+    """Encodes pictures until the page is full, then every frame goes without; `left_out` and `unreadable` count
+    frames.
+    """
 
     def __init__(self, cfg: ViewerConfig, num_flights: int, num_frames: int) -> None:
         self.cfg = cfg
@@ -229,7 +236,8 @@ class PagePictures:
         notes = []
         if self.left_out:
             notes.append(
-                f"{self.left_out:,} of {self.asked:,} shown frames have no pictures, to keep the page below {self.cfg.max_mb} MB"
+                f"{self.left_out:,} of {self.asked:,} shown frames have no pictures, to keep the page below "
+                f"{self.cfg.max_mb} MB"
             )
         if self.unreadable:
             notes.append(f"of {self.unreadable:,} frames a picture cannot be read")
@@ -249,7 +257,9 @@ def spread(count: int, most: int) -> list[int]:
 
 
 def choose_flights(flights: Sequence[Flight], groups: Sequence[Hashable], most: int) -> list[Flight]:
-    """Choose whole groups (the tracks of a trajectory), spread evenly, as many as give no more than `most` flights, and one at least."""
+    """Choose whole groups (the tracks of a trajectory), spread evenly, as many as give no more than `most` flights, and
+    one at least.
+    """
     by_group: dict[Hashable, list[Flight]] = defaultdict(list)
     for flight, group in zip(flights, groups, strict=True):
         by_group[group].append(flight)
@@ -281,13 +291,17 @@ def choose_frames(frames: Sequence[int], kinds: Mapping[int, Hashable], most: in
 
 
 def path_of(points_m: np.ndarray) -> list[Point2]:
-    """Give a path from above, (n, 2 or 3) m, by at most PATH_POINTS of its points; those that are not known are left out."""
+    """Give a path from above, (n, 2 or 3) m, by at most PATH_POINTS of its points; those that are not known are left
+    out.
+    """
     known = points_m[~np.isnan(points_m).any(axis=1)]
     return [(round(float(known[k, 0]), 1), round(float(known[k, 1]), 1)) for k in spread(len(known), PATH_POINTS)]
 
 
 def boxes_of(box_map: BoxMap, near: Sequence[Point2]) -> list[PageBox]:
-    """Give the footprints of the boxes of a map round some places, the largest ones, those that lie below others first."""
+    """Give the footprints of the boxes of a map round some places, the largest ones, those that lie below others
+    first.
+    """
     places = np.array(near, dtype=np.float64).reshape(-1, 2)
     if not len(places):
         return []

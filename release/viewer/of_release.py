@@ -37,13 +37,15 @@ from release.viewer.content import (
 Place = tuple[str, ...]  # PLACE
 VIEW_OF: dict[FrameFile, View] = {"rgb": "rgb", "depth": "depth", "instance": "segmentation"}
 SCAN = [
-    *PLACE, "sample_id", "track", "split", "frame_index", "time_s", "width_px", "height_px", "fov_deg", "pose", "target", "visibility",
-    "has_caption", "verdict", "decision",
+    *PLACE, "sample_id", "track", "split", "frame_index", "time_s", "width_px", "height_px", "fov_deg", "pose",
+    "target", "visibility", "has_caption", "verdict", "decision",
 ]  # fmt: skip
 
 
 class FlightScan:
-    """What the first pass keeps of a flight that is shown: its places, the captions' kinds, and where its rows stand."""
+    """What the first pass keeps of a flight that is shown: its places, the captions' kinds, and where its rows
+    stand.
+    """
 
     def __init__(self, row: Mapping[str, Any]) -> None:
         self.row = row

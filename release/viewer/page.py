@@ -1,7 +1,7 @@
 """`cosfly release viewer`: one self-contained page of a release or run, for a browser without a network.
 
-The page holds its data as JSON; its one script (`viewer.js`) writes every foreign text as text, never as markup, and the page's policy lets no
-other script run.
+The page holds its data as JSON; its one script (`viewer.js`) writes every foreign text as text, never as markup, and
+the page's policy lets no other script run.
 """
 
 from __future__ import annotations
