@@ -342,5 +342,5 @@ def test_students_are_asked_and_scored_with_it(whole, tmp_path):
     assert any(OWN in row for row in confusion.values())
     floors = write_floors(tmp_path / "set", split, tmp_path / "floors", 0)
     other = evaluate.run(evaluate.EvaluateConfig(resamples=100), floors[0], tmp_path / "set", tmp_path / "two")
-    compare.run(compare.CompareConfig(resamples=100), [tmp_path / "one", other.parent], tmp_path / "side")
+    compare.run(compare.ReportConfig(resamples=100), [tmp_path / "one", other.parent], tmp_path / "side")
     assert OWN in (tmp_path / "side/comparison.html").read_text(encoding="utf-8")
