@@ -187,7 +187,7 @@ def written_answer(body: dict, can: Collection[str]) -> dict:
     stand."""
     system = body["messages"][0]["content"]
     text = " ".join(part.get("text", "") for part in body["messages"][1]["content"])
-    way = "claims" if '"claims"' in system else "slots" if "{distance}" in system else "prose"
+    way = "slots" if "{distance}" in system else "claims" if '"claims"' in system else "prose"
     answer: dict = {"reasoning_trace": "Nothing else has to change, and this manoeuvre is as good as any other."}
     if way == "claims":
         speed = re.findall(r"^speed: .*?([\d.]+) mps$", text, re.MULTILINE)[-1]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -17,9 +18,10 @@ from specimens_prose import FOLLOW
 from tables import each
 from teacher_server import CHINESE, ENGLISH, TeacherServer, is_mirror
 
+from caption.run.released import state_lies
 from caption.run.stage import run
 from caption.run.windows import cut_windows
-from caption.schema import CaptionConfig, WindowConfig
+from caption.schema import CaptionConfig, EvidenceConfig, WindowConfig
 from caption.teachers.statements import describe
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.mirror import check_translation
@@ -32,6 +34,10 @@ from cosfly.errors import NothingKept
 from cosfly.products.actions import action_tokens
 from cosfly.products.answer_text import Parsed
 from cosfly.products.captions import Coc, Language, read_captions
+from cosfly.products.flights import find_flights
+from cosfly.products.playback import read_flight
+from release.columns import caption_values
+from release.verify.rows import shown_caption
 from specimens import make_flight, make_playback_tree
 
 FACTS = Facts(
@@ -433,6 +439,55 @@ def test_the_words_of_a_comparison_a_place_and_a_way_are_those_of_the_window():
 # --- through the loop -------------------------------------------------------------------------------------------------
 
 
+def claimed(quantity: str, value: str, quote: str, at: str = "t4") -> dict[str, str]:
+    return {"sentence": "R1", "quantity": quantity, "at": at, "value": value, "unit": "", "modality": "observed",
+            "quote": quote}  # fmt: skip
+
+
+FASTER, SLOWER = (partial(claimed, "comparison:speed", value) for value in ("faster", "slower"))
+STEADY = partial(claimed, "trend:pitch", "steady", at="t0-t4")
+
+
+@each(
+    ("language", "reasons", "claims", "state"),
+    [
+        ("en", "The drone at {speed} outpaces the walker.", [FASTER("outpaces")], "proved"),
+        ("en", "The drone at {speed} outpaces the walker.", [SLOWER("outpaces")], "contradicted"),
+        ("en", "The drone at {speed} outpaces the walker.", [], "unread"),
+        ("en", "The drone at {speed} outpaces the lazy walker.", [FASTER("outpaces")], "unread"),  # not covered
+        ("en", "The drone at {speed} outpaces the walker.", [FASTER("outruns")], "unread"),  # not what stands there
+        ("en", "The drone at {speed} outpaces the walker.", [STEADY("outpaces")], "unread"),  # of another kind
+        ("en", "The drone at {speed} is outpaced by the walker.", [FASTER("is outpaced by")], "unread"),
+        ("en", "The drone at {speed} is not outpacing the walker.", [FASTER("is not outpacing")], "unread"),
+        ("en", "The walker outpaces the drone at {speed}.", [FASTER("outpaces")], "unread"),  # the other order
+        ("en", "The walker at {speed} is what the drone outpaces.", [FASTER("outpaces")], "unread"),  # not its slot
+        ("en", "The pitch is steady.", [STEADY("is steady")], "proved"),
+        ("en", "The altitude of {altitude} is steady.", [STEADY("is steady")], "unread"),  # another series
+        ("en", "The altitude is steady.", [STEADY("The altitude is steady")], "unread"),
+        ("en", "The pitch is steady.", [{**STEADY("is steady"), "quantity": "trend:distance"}], "contradicted"),
+        ("en", "The pitch is steady.", "is steady", "unread"),  # no list
+        ("zh", "俯仰角为 {pitch}，保持稳定。", [STEADY("保持稳定")], "proved"),
+        ("zh", "俯仰角为 {pitch}，保持稳定。", [], "unread"),
+        ("zh", "高度为 {altitude}，保持稳定。", [STEADY("保持稳定")], "unread"),
+        ("zh", "距离为 {distance}，行人站立不动。", [claimed("target_motion", "standing", "站立不动")], "contradicted"),
+    ],
+)
+def test_a_word_beside_slots_needs_a_claim_that_holds(language, reasons, claims, state):
+    coc = Coc(critical_components="{visibility}", reasoning_trace=reasons, flight_decision="hover")
+    if language == "en":
+        found = Slots().read(Parsed(coc, therefore="hover", more={"claims": claims}), FACTS)
+    else:
+        english = coc.model_copy(update={"reasoning_trace": "With {" + re.search(r"\{(\w+)\}", reasons)[1] + "}."})
+        first = Slots().read(Parsed(english, therefore="hover"), FACTS)
+        found = Slots().read_mirror(Parsed(coc, more={"claims": claims}), first, FACTS)
+    assert isinstance(found, Draft), found
+    [_, judged] = Slots().judge(found, FACTS, EvidenceConfig(), language)
+    assert judged.state == state
+    assert (state == "contradicted") == bool(judged.problems)
+    asked_again = isinstance(claims, list) and len(found.template.claims or ()) > 0 and state == "unread"
+    assert bool(found.doubt) >= asked_again
+
+
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory) -> Path:
     return make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 14, with_augmented=False)
@@ -484,6 +539,45 @@ def test_a_measurable_word_that_no_slot_says_is_asked_for_once_and_then_left_unr
         assert [caption.checks.sentences["en"][1] for caption in captions] == [state] * 2
         assert [caption.checks.refused for caption in captions] == [["unread"]] * 2
         assert sum(not is_mirror(json.loads(body)) for body in server.bodies) == 4
+
+
+def test_claims_beside_slots_stand_in_record_report_and_evidence_and_are_judged_again_from_a_release(tree, tmp_path):
+    """The distance of these flights is steady; the Chinese claim comes with the mirror."""
+    server = TeacherServer()
+
+    def text(body: dict) -> str:
+        schema = body["response_format"]["json_schema"]["schema"]["properties"]
+        assert "quote" in schema["claims"]["items"]["properties"]  # the mirror is asked for them, too
+        if is_mirror(body):
+            [english] = json.loads(body["messages"][-1]["content"])["claims"]
+            reasons = {
+                "reasoning_trace": "水平距离为 {distance}，目前保持稳定。",
+                "claims": [english | {"quote": "保持稳定"}],
+            }
+            return json.dumps({**CHINESE, **reasons, "flight_decision": "hover"})
+        reasons = {
+            "reasoning_trace": "The distance of {distance} is steady now.",
+            "claims": [STEADY("is steady") | {"quantity": "trend:distance"}],
+        }
+        return json.dumps({**ENGLISH, **reasons, "therefore": "hover", "flight_decision": "hover"})
+
+    server.text = text
+    with server:
+        captions = list(read_captions(run(settings(server.url), tree, tmp_path / "out")))
+    report = json.loads((tmp_path / "out" / "caption_report.json").read_text())
+    assert report["proved_by_claims"] == {"en": 2, "zh": 2}
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "proved by slots 0 (0.0 %), proved by claims 2 (50.0 %)" in page
+    windows = cut_windows(read_flight(find_flights(tree)[0]), WindowConfig())
+    for caption, window in zip(captions, windows, strict=False):
+        assert caption.checks.sentences["en"] == ["unread", "proved"]
+        assert [claim.quote for claim in caption.evidence.slots["zh"].claims] == ["保持稳定"]
+        row = caption_values(caption) | {"sample_id": caption.sample_id, "frame_index": caption.frame_index}
+        facts = measure_facts(window.observed, caption.picture_px)
+        assert state_lies(shown_caption(row), facts, EvidenceConfig()) == []
+        lie = row | {"evidence": row["evidence"].replace('"value":"steady"', '"value":"increasing"')}
+        [found, *_] = state_lies(shown_caption(lie), facts, EvidenceConfig())
+        assert found.expected.startswith("contradicted, by flight and evidence")
 
 
 def test_a_refused_answer_is_mended_when_it_is_told_what_was_wrong(tree, tmp_path):

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from caption.run.chance import ChanceCounts, ChanceReport
 from cosfly.products.actions import action_tokens, actions_in_use, shipped_actions
-from cosfly.products.captions import Caption, TeacherRecord, Usage
+from cosfly.products.captions import Caption, Language, SentenceState, TeacherRecord, Usage
+from cosfly.products.sentences import sentences_of
 from cosfly.work.stage_folder import Tally
 from cosfly.work.store import sha256_bytes
 
@@ -85,6 +86,7 @@ class CaptionReport(_Record):
     bilingual: dict[str, int]
     writing: dict[str, int]  # of accepted captions: how the texts were made
     sentences: dict[str, dict[str, int]]  # of accepted captions: language -> proved, contradicted, unread
+    proved_by_claims: dict[str, int] = {}  # of the proved sentences those that slots alone do not prove, by language
     evidence_contradictions: dict[str, int]
     recovered: dict[str, int]
     refusals: dict[str, str] = {}  # of dropped windows: reason -> what the server said last
@@ -153,6 +155,7 @@ class Ledger:
         self.keyframes: Counter[str] = Counter()
         self.repairs: Counter[str] = Counter()
         self.sentences: Counter[tuple[str, str]] = Counter()  # language, state
+        self.proved_by_claims: Counter[str] = Counter()
         self.refusals: dict[str, str] = {}
         self.tokens: Counter[str] = Counter()
         self.repair_asks: Counter[int] = Counter()
@@ -173,6 +176,7 @@ class Ledger:
             self.words["writing"][caption.writing] += 1
             for language, states in (caption.checks.sentences or {}).items():
                 self.sentences.update((language, state) for state in states)
+                self.proved_by_claims[language] += _proved_by_claims(caption, language, states)
         else:
             self.windows.dropped[str(caption.drop_reason)] += 1
             if caption.checks.refusal is not None:
@@ -242,6 +246,7 @@ class Ledger:
             lengths=self._lengths(),
             keyframes=self._keyframes(),
             sentences=_nested(self.sentences),
+            proved_by_claims={language: count for language, count in sorted(self.proved_by_claims.items()) if count},
             refusals=dict(sorted(self.refusals.items())),
             judge_tokens=judge_tokens,
         )
@@ -279,3 +284,15 @@ def _nested(
 
 def _sorted(counts: Counter[str]) -> dict[str, int]:
     return dict(sorted(counts.items(), key=lambda pair: (-pair[1], pair[0])))
+
+
+def _proved_by_claims(caption: Caption, language: Language, states: Sequence[SentenceState]) -> int:
+    """Count the proved sentences of a text that its claims prove; a template holds those of such sentences alone."""
+    template = (caption.slots or {}).get(language)
+    if template is None:
+        return states.count("proved")
+    coc = caption.en if language == "en" else caption.zh
+    if not template.claims or coc is None:
+        return 0
+    claimed = {claim.sentence for claim in template.claims}
+    return sum(s == "proved" and name in claimed for (name, _), s in zip(sentences_of(coc), states, strict=True))

@@ -159,7 +159,10 @@ def drafts_of(
         claims = tuple(evidence.claims or ()) if writing == "claims" else ()
         return {language: Draft(coc, claims=claims) for language, coc in answers.items()}
     written: dict[Language, Parsed] = {
-        language: Parsed(Coc(**template.model_dump(), flight_decision=answers[language].flight_decision))
+        language: Parsed(
+            Coc(**template.model_dump(exclude={"claims"}), flight_decision=answers[language].flight_decision),
+            more=template.model_dump(include={"claims"}),
+        )
         for language, template in (evidence.slots or {}).items()
         if language in answers
     }

@@ -52,7 +52,8 @@ def page_html(
         "caption/run/report.html", title=name, style=STYLE, report=report, meanings=VERDICTS, states=STATES,
         who=f"teacher: {teacher.kind}, model {teacher.model}" if teacher else "teacher: none, model unknown",
         is_rules=teacher is not None and teacher.kind == "rules", tiles=_tiles(report), verdicts=verdicts, share=_share,
-        language_names=LANGUAGE_NAMES, chance=_chance(report), confusion=_confusion(report.confusion),
+        proved_by=_proved_by(report), language_names=LANGUAGE_NAMES, chance=_chance(report),
+        confusion=_confusion(report.confusion),
         repairs=_repairs(report), checks=_checks(report),
         cost=_cost(report, budget),
         lengths=[_histogram(language, *one) for language, fields in report.lengths.items() for one in fields.items()],
@@ -78,6 +79,16 @@ def _tiles(report: CaptionReport) -> list[tuple[str, int]]:
 def _share(counts: Mapping[str, int], name: str) -> str:
     total = sum(counts.values())
     return f"{counts.get(name, 0):,} ({100 * counts.get(name, 0) / total:.1f} %)" if total else "-"
+
+
+def _proved_by(report: CaptionReport) -> dict[str, str]:
+    """Say of the proved sentences of each language whether slots alone prove them or claims."""
+    found = {}
+    for language, counts in report.sentences.items():
+        total, count = sum(counts.values()), report.proved_by_claims.get(language, 0)
+        parts = (("slots", counts.get("proved", 0) - count), ("claims", count))
+        found[language] = ", ".join(f"proved by {name} {n:,} ({100 * n / total:.1f} %)" for name, n in parts)
+    return found
 
 
 def _chance(report: CaptionReport) -> dict[str, Any]:

@@ -459,8 +459,8 @@ class _Loop:
         if reply.usage is not None:
             self.usage += reply.usage
         self.structured = reply.structured
-        more = self.terms.fields if language == "en" else ()
-        parsed = parse_answer(reply.text, language, more, reply.finish_reason)
+        more = self.terms.fields if language == "en" else tuple(self.way.optional)
+        parsed = parse_answer(reply.text, language, more, reply.finish_reason, self.way.optional)
         if parsed.reason == CONTEXT_FULL:
             usage = reply.usage or Usage()
             self.checks["refusal"] = (

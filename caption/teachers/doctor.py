@@ -328,7 +328,8 @@ class _Examination:
         """Send a prompt as long as ours get, with our answer limit and schema."""
         limit = self.cfg.endpoint.max_tokens
         messages = largest_messages(self.cfg, self._pictures(self.num_images))
-        more = more_fields(way_of(self.cfg.writing))
+        way = way_of(self.cfg.writing)
+        more = more_fields(way)
         schema = answer_schema(more=more) if self.takes_schema else None
         probe = await self._ask(messages, limit, schema)
         length = self.client.context
@@ -348,7 +349,7 @@ class _Examination:
             self._add("largest prompt", "unusable", f"its answer was cut after {written} of {limit} tokens: {fix}")
             return False
         self._add("largest prompt", "ok", f"{used or 'unknown'} tokens and {limit} for the answer{known}")
-        parsed = parse_answer(probe.text, more=more)
+        parsed = parse_answer(probe.text, more=more, optional=way.optional)
         state: State = "ok" if parsed.coc is not None else "warning"
         mended = f", after mending {', '.join(parsed.recovered)}" if parsed.recovered else ""
         detail = f"{parsed.reason or 'of the right structure'}{mended}; {probe.seconds:.1f} s, {probe.finish_reason!r}"

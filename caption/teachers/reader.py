@@ -25,10 +25,10 @@ from caption.truth.gold import GoldCaption
 from caption.truth.references import QUANTITIES
 from caption.truth.said import SCENE
 from caption.truth.sentences import Judged
-from caption.truth.sizes import numeral_of, same_size
+from caption.truth.sizes import numeral_of
 from caption.truth.stated import read_stated
-from caption.writing.claims import CLAIM_SCHEMA, MAX_CLAIMS, read_claims
-from caption.writing.contract import Draft, Refused, way_of
+from caption.writing.claims import QUOTED_SCHEMA, read_quoted
+from caption.writing.contract import Draft, way_of
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.budget import Budget, BudgetConfig
 from cosfly.chat.contract import NoAnswer, Troubles
@@ -40,15 +40,9 @@ from cosfly.reading.objects import find_object
 from cosfly.work.store import sha256_bytes
 
 READINGS = 2
-MAX_QUOTE = 200  # characters
-
-_CLAIM = CLAIM_SCHEMA | {
-    "properties": CLAIM_SCHEMA["properties"] | {"quote": {"type": "string", "minLength": 1, "maxLength": MAX_QUOTE}},
-    "required": [*CLAIM_SCHEMA["required"], "quote"],
-}
 SCHEMA = {
     "type": "object",
-    "properties": {"claims": {"type": "array", "maxItems": MAX_CLAIMS, "items": _CLAIM}},
+    "properties": {"claims": QUOTED_SCHEMA},
     "required": ["claims"],
     "additionalProperties": False,
 }
@@ -80,25 +74,7 @@ def read_reading(text: str, finish_reason: str | None, coc: Coc, language: Langu
     found = find_object(text, ("claims",), finish_reason).value
     if found is None or not isinstance(found.get("claims"), list):
         return None
-    sentences, claims = dict(sentences_of(coc)), list[Claim]()
-    for item in found["claims"][:MAX_CLAIMS]:
-        quote = item.get("quote") if isinstance(item, dict) else None
-        if not isinstance(quote, str) or not 0 < len(quote) <= MAX_QUOTE:
-            continue
-        read = read_claims([{name: value for name, value in item.items() if name != "quote"}])
-        if isinstance(read, Refused):
-            continue
-        claim = read[0].model_copy(update={"quote": quote})
-        if quote in sentences.get(claim.sentence, "") and _is_quoted(claim, quote, language):
-            claims.append(claim)
-    return claims
-
-
-def _is_quoted(claim: Claim, quote: str, language: Language) -> bool:
-    """Tell whether a claim's number stands in its quote."""
-    if isinstance(claim.value, str):
-        return True
-    return any(same_size(numeral, claim) for numeral in read_stated(quote, language).numerals)
+    return read_quoted(found["claims"], dict(sentences_of(coc)), language)
 
 
 def agreed(one: Iterable[Claim], other: Iterable[Claim], num_frames: int) -> list[Claim]:

@@ -195,7 +195,9 @@ class AskingTeacher:
             frames = await self.frames.pictures(question)
             request = self.student.mirror_request(question, english, frames, ask)
         else:
-            schema = answer_schema(english.coc.flight_decision, "zh")
+            optional = way_of(question.writing).optional.items()
+            more = {name: schema for name, schema in optional if name in english.written}
+            schema = answer_schema(english.coc.flight_decision, "zh", more)
             messages = mirror_messages(english, question.writing, complaint)
             request = self.cfg.request(messages, [], schema, sampling_seed(self.seed, sample_id, purpose))
         return await self._kept_answer(question, request, purpose)

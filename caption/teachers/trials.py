@@ -101,7 +101,7 @@ async def _reason(ask: Ask, cfg: CaptionConfig, window: ObservedWindow, writing:
         if answered is None:
             return NO_ANSWER
         text, is_cut = answered
-        parsed = parse_answer(text, more=tuple(more))
+        parsed = parse_answer(text, more=tuple(more), optional=way.optional)
         if parsed.coc is None:
             return CUT_SHORT if is_cut else f"structure_{parsed.reason}"
         answer = refuse_decision(parsed) or way.read(parsed, question.facts)

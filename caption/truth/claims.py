@@ -52,7 +52,7 @@ def judge_claims(
     for name, text in sentences:
         own = [claim for claim in claims if of_names[claim.sentence] == name]
         beside = [claim for claim in claims if claim not in own and _is_beside(of_names[claim.sentence], name)]
-        judged.append(_judge_sentence(name, text, own, beside, coc.flight_decision, facts, cfg, language))
+        judged.append(judge_sentence(name, text, own, beside, coc.flight_decision, facts, cfg, language))
     if stray and judged:
         first = judged[0]
         judged[0] = Judged(first.name, first.text, "contradicted", (*first.problems, *dict.fromkeys(stray)))
@@ -75,7 +75,7 @@ def _is_beside(one: str | None, other: str) -> bool:
     return one is not None and one[0] == other[0] and abs(int(one[1:]) - int(other[1:])) == 1
 
 
-def _judge_sentence(
+def judge_sentence(
     name: str,
     text: str,
     claims: Sequence[Claim],
@@ -85,6 +85,7 @@ def _judge_sentence(
     cfg: EvidenceConfig,
     language: Language,
 ) -> Judged:
+    """Judge one sentence by its claims; beside: those of the sentences before and after it."""
     about = cfg if read_stated(text, language).is_approximate else None
     problems, states = [], []
     for claim in claims:

@@ -21,6 +21,8 @@ from caption.truth.glossary import written_units
 from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.references import QUANTITIES
 from caption.truth.sentences import Judged
+from caption.truth.sizes import same_size
+from caption.truth.stated import read_stated
 from caption.writing.contract import Draft, Refused
 from cosfly.errors import plain
 from cosfly.products.answer_text import Parsed
@@ -29,6 +31,7 @@ from cosfly.products.sentences import sentences_of
 
 MAX_CLAIMS = 60
 MAX_TEXT = 48  # characters of a claim's texts
+MAX_QUOTE = 200  # characters
 MAX_COMPLAINTS = 8  # named at once
 UNITS = ("m", "mps", "deg", "dps", "px", "percent", "times")
 
@@ -45,6 +48,17 @@ CLAIM_SCHEMA: dict[str, Any] = {
     },
     "required": ["sentence", "quantity", "at", "value", "unit", "modality"],
     "additionalProperties": False,
+}
+
+QUOTED_SCHEMA: dict[str, Any] = {
+    "type": "array",
+    "maxItems": MAX_CLAIMS,
+    "items": CLAIM_SCHEMA
+    | {
+        "properties": CLAIM_SCHEMA["properties"]
+        | {"quote": {"type": "string", "minLength": 1, "maxLength": MAX_QUOTE}},
+        "required": [*CLAIM_SCHEMA["required"], "quote"],
+    },
 }
 
 # What a problem of judge_claims begins with -> the reason that is counted.
@@ -69,6 +83,7 @@ class Claims:
     system = "system_claims_en"
     mirror_system = "mirror_system"
     fields: Mapping[str, dict] = {"claims": {"type": "array", "maxItems": MAX_CLAIMS, "items": CLAIM_SCHEMA}}
+    optional: Mapping[str, dict] = {}
 
     def table(self, facts: Facts) -> str:
         return "Table of facts:\n" + "\n".join(measured_series(facts))
@@ -126,6 +141,30 @@ def read_claims(value: Any) -> tuple[Claim, ...] | Refused:
             return Refused("claims_malformed", f"Claim {number}: {claim}.")
         claims.append(claim)
     return tuple(claims)
+
+
+def read_quoted(value: Any, sentences: Mapping[str, str], language: Language) -> list[Claim]:
+    """Read a list of claims that quote the words they stand for. Left out are claims that are malformed, that quote
+    what their sentence does not hold, or whose number their quote does not hold."""
+    claims = list[Claim]()
+    for item in value[:MAX_CLAIMS] if isinstance(value, list) else ():
+        quote = item.get("quote") if isinstance(item, dict) else None
+        if not isinstance(quote, str) or not 0 < len(quote) <= MAX_QUOTE:
+            continue
+        read = _claim({name: part for name, part in item.items() if name != "quote"})
+        if isinstance(read, str):
+            continue
+        claim = read.model_copy(update={"quote": quote})
+        if quote in sentences.get(claim.sentence, "") and _is_quoted(claim, quote, language):
+            claims.append(claim)
+    return claims
+
+
+def _is_quoted(claim: Claim, quote: str, language: Language) -> bool:
+    """Tell whether a claim's number stands in its quote."""
+    if isinstance(claim.value, str):
+        return True
+    return any(same_size(numeral, claim) for numeral in read_stated(quote, language).numerals)
 
 
 def _claim(item: Any) -> Claim | str:

@@ -10,14 +10,14 @@ import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Protocol
+from typing import Any, Protocol
 
 from caption.schema import EvidenceConfig
 from caption.truth.facts import Facts
 from caption.truth.sentences import Judged
 from cosfly.products.actions import action_tokens
 from cosfly.products.answer_text import Parsed
-from cosfly.products.captions import Claim, Coc, Language, SentenceState, Template, Writing
+from cosfly.products.captions import Claim, Coc, Language, Template, Writing
 
 WAYS: dict[Writing, str] = {
     "slots": "caption.writing.slots:Slots",
@@ -31,19 +31,19 @@ DECISION_REASON = "decision_against_reasoning"
 class Draft:
     """A caption in one language: its plain text, and what that came from. therefore: of the English alone.
 
-    states: of its sentences, where making the text has told them. doubt: what its writer is asked to mend once, though
-    it is taken as it stands.
+    judged: its sentences, where making the text has told their states. doubt: what its writer is asked to mend once,
+    though it is taken as it stands.
     """
 
     coc: Coc
     therefore: str | None = None
     template: Template | None = None
-    states: tuple[SentenceState, ...] = ()
+    judged: tuple[Judged, ...] = ()
     doubt: str = ""
     claims: tuple[Claim, ...] = ()
 
     @property
-    def written(self) -> dict[str, str]:
+    def written(self) -> dict[str, Any]:
         """What was written, as the teacher's answer had it: the template where there is one."""
         return self.coc.model_dump() | (self.template.model_dump() if self.template else {})
 
@@ -65,12 +65,14 @@ class WayOfWriting(Protocol):
     """One way of writing. All are stateless.
 
     system, mirror_system: prompt files (`system` is asked in English). fields: further fields of an answer, name ->
-    JSON schema, in the order in which they stand between the texts and `therefore`.
+    JSON schema, in the order in which they stand between the texts and `therefore`. optional: more of them, which an
+    answer in either language may leave out.
     """
 
     system: str
     mirror_system: str
     fields: Mapping[str, dict]
+    optional: Mapping[str, dict]
 
     def table(self, facts: Facts) -> str:
         """Give what the question shows beside the flight data; "" for nothing."""
@@ -93,7 +95,7 @@ def way_of(name: Writing) -> WayOfWriting:
 
 def more_fields(way: WayOfWriting) -> dict[str, dict]:
     """Give the fields of an answer beyond the paper's three. `therefore` is free even where the decision is given."""
-    return {**way.fields, "therefore": {"type": "string", "enum": list(action_tokens())}}
+    return {**way.fields, **way.optional, "therefore": {"type": "string", "enum": list(action_tokens())}}
 
 
 def refuse_decision(answer: Parsed) -> Refused | None:

@@ -10,8 +10,9 @@ unread.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
+from types import MappingProxyType
 from typing import NamedTuple
 
 from caption.truth.glossary import words_beside
@@ -35,13 +36,15 @@ _OTHER = {"drone": "target", "target": "drone"}
 
 
 class Token(NamedTuple):
-    """A word or a slot of a sentence. kind: as in the glossary, or slot | frame. clause: its number. frame: t0 is 0."""
+    """A word or a slot of a sentence. kind: as in the glossary, or slot | frame | claimed. clause: its number. frame:
+    t0 is 0. claimed: where a claim proves it, the series whose trend that states, else ""."""
 
     kind: str
     clause: int
     names: frozenset[str] = frozenset()
     reference: Reference | None = None
     frame: int = 0
+    claimed: str | None = None
 
 
 @cache
@@ -51,38 +54,52 @@ def _pattern(language: Language) -> re.Pattern[str]:
     return re.compile(rf"(?P<slot>¤)|(?P<frame>t\d{{1,2}})|(?P<break>{_BREAK.pattern})|(?P<word>{words})|\s+", re.I)
 
 
-def is_earned(beside: str, references: Sequence[Reference | None], num_frames: int, language: Language) -> bool:
-    """Tell whether a sentence is proved by its slots.
+def is_earned(
+    beside: str,
+    references: Sequence[Reference | None],
+    num_frames: int,
+    language: Language,
+    claimed: Mapping[int, str] = MappingProxyType({}),
+) -> bool:
+    """Tell whether a sentence is proved by its slots, and by claims of the words that they leave over.
 
     Args:
         beside: its text, a mark in the place of each slot. references: of the slots, in order; None: the decision.
+        claimed: characters of words that claims have proved, each with the series whose trend they state, else "".
+            Such words may be any, and stand beside the others.
     """
-    tokens = _read(beside, references, language)
-    if tokens is None or not references:
+    tokens = _read(beside, references, language, claimed)
+    if tokens is None or not (references or claimed):
         return False
     return all(_Word(tokens, i, num_frames - 1).fits() for i in range(len(tokens)))
 
 
-def _read(beside: str, references: Sequence[Reference | None], language: Language) -> list[Token] | None:
-    """Cut a sentence into known words; None where a word is not known."""
+def _read(
+    beside: str, references: Sequence[Reference | None], language: Language, claimed: Mapping[int, str]
+) -> list[Token] | None:
+    """Cut a sentence into known words; None where a word is not known. claimed: places of words that may be any."""
     if beside.count("¤") != len(references):  # a text that holds the mark itself
         return None
     listed, tokens, at, clause, slots = words_beside(language), [], 0, 0, iter(references)
     while at < len(beside):
         match = _pattern(language).match(beside, at)
-        if match is None:
+        if match is None and at not in claimed:
             return None
-        at = match.end()
+        if match is None:
+            tokens.append(Token("claimed", clause, claimed=claimed[at]))
+            at += 1
+            continue
+        claim, at = claimed.get(at), match.end()
         if match["slot"]:
             tokens.append(Token("slot", clause, reference=next(slots)))
         elif match["frame"]:
-            tokens.append(Token("frame", clause, frame=int(match["frame"][1:])))
+            tokens.append(Token("frame", clause, frame=int(match["frame"][1:]), claimed=claim))
         elif match["break"]:
             clause += 1
         elif match["word"]:
             word = match["word"].lower()
             kind, names = listed.get(word) or listed[word.removesuffix("'s")]
-            tokens.append(Token(kind, clause, names))
+            tokens.append(Token(kind, clause, names, claimed=claim))
     return tokens
 
 
@@ -103,6 +120,10 @@ class _Word:
 
     def fits(self) -> bool:
         """Ask the rule of its kind; a kind without one states nothing."""
+        if self.token.claimed and not self._has_series(self.token.claimed):
+            return False
+        if self.token.claimed is not None and self.token.kind not in ("motion", "claimed"):
+            return True
         rule = getattr(self, f"_{self.token.kind}", None)
         return rule is None or rule()
 
@@ -115,10 +136,22 @@ class _Word:
         rules = (self._has_owner, self._has_name, self._has_date, self._has_aspect, self._has_side)
         return all(rule(reference) for rule in rules)
 
+    def _has_series(self, series: str) -> bool:
+        """Tell whether the series of a claimed trend is named, and no other in its clause or else before it."""
+
+        def names(tokens: Sequence[Token]) -> list[bool]:
+            named = [one.names for one in tokens if one.kind == "quantity"]
+            slots = [frozenset({one.reference.quantity}) for one in tokens if one.reference is not None]
+            return [series in name for name in (*named, *slots)]
+
+        found = names((self.token, *self.beside)) or names(self.earlier)
+        return bool(found) and all(found)
+
     # --- words ------------------------------------------------------------------------------------------------------
 
     def _quantity(self) -> bool:
-        return any(reference.quantity in self.token.names for reference in self.references)
+        is_claimed = any(one.claimed in self.token.names for one in self.beside if one.claimed)
+        return is_claimed or any(reference.quantity in self.token.names for reference in self.references)
 
     def _middle(self) -> bool:
         """Tell whether the image centre is that from which something is measured, not where it is."""
@@ -146,6 +179,8 @@ class _Word:
     def _motion(self) -> bool:
         """Tell whether nothing says where a motion goes but a turn."""
         return self._is_turn() or not any(reference.aspect == "side" for reference in self.references)
+
+    _claimed = _motion
 
     def _to(self) -> bool:
         """Tell whether it leads to a value, or is of a distance to somebody; "turned to the walker" is neither."""

@@ -20,6 +20,7 @@ class Prose:
     system = "system_prose_en"
     mirror_system = "mirror_system"
     fields: Mapping[str, dict] = {}
+    optional: Mapping[str, dict] = {}
 
     def table(self, facts: Facts) -> str:
         return ""

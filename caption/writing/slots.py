@@ -1,30 +1,41 @@
 """Slots: the teacher names facts, their values are filled in from the flight, in both languages.
 
 Numbers, units, sides, trends and the mirror are right by construction. A sentence is proved if its words beside slots
-are known and fit them (earned.py); else it is unread.
+are known and fit them (earned.py), or if claims that quote the others hold; else it is unread.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import get_args
+from typing import Any, get_args
 
 from caption.schema import EvidenceConfig
+from caption.truth.claims import judge_sentence
 from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
 from caption.truth.mirror import TEXTS, lacking
 from caption.truth.references import QUANTITIES
 from caption.truth.sentences import Judged
+from caption.truth.stated import Pole, read_stated
+from caption.writing.claims import QUOTED_SCHEMA, read_quoted
 from caption.writing.contract import Draft, Refused
+from caption.writing.earned import is_earned
 from caption.writing.filling import Filler, facts_of
+from caption.writing.outside import SLOT_MARK
 from caption.writing.templates import Sentence, read_sentence
 from cosfly.products.answer_text import Parsed
-from cosfly.products.captions import Coc, Language, SentenceState, Template
+from cosfly.products.captions import Claim, Coc, Language, SentenceState, Template
 from cosfly.products.sentences import cut_sentences
 from cosfly.work import in_place
 
 MAX_COMPLAINTS = 6  # named at once
-# Nothing that was filled in is contradicted, so nobody asks which sentence it was.
+CONTRADICTIONS = ("false", "text says otherwise", "claims disagree", "decision")  # among the problems of claims
+# Dimension of a word -> what claims of it begin with.
+CLAIMED_BY: dict[str, tuple[str, ...]] = {
+    "course": ("trend",), "pace": ("comparison", "compared"), "motion": ("target_motion", "drone_motion"),
+    "gap": ("trend", "walking"), "seen": ("visibility",), "centre": ("framing", "side"),
+}  # fmt: skip
+# By slots alone nothing is contradicted, so nobody asks which sentence it was.
 _JUDGED = {state: Judged("", "", state) for state in get_args(SentenceState)}
 
 
@@ -34,13 +45,14 @@ class Slots:
     system = "system_slots_en"
     mirror_system = "mirror_slots_system"
     fields: Mapping[str, dict] = {}
+    optional: Mapping[str, dict] = {"claims": QUOTED_SCHEMA}
 
     def table(self, facts: Facts) -> str:
         return fact_table(facts)
 
     def read(self, answer: Parsed, facts: Facts) -> Draft | Refused:
         assert answer.coc is not None
-        return _fill(answer.coc, facts, "en", answer.therefore)
+        return _fill(answer.coc, facts, "en", answer.more.get("claims"), answer.therefore)
 
     def read_mirror(self, answer: Parsed, english: Draft, facts: Facts) -> Draft | Refused:
         assert answer.coc is not None
@@ -50,14 +62,14 @@ class Slots:
         problem = _compare(english.template, answer.coc, facts)
         if problem is not None:
             return problem
-        found = _fill(answer.coc, facts, "zh")
+        found = _fill(answer.coc, facts, "zh", answer.more.get("claims"))
         if isinstance(found, Refused):
             return found
         missing = lacking(_terms(english.template, facts), found.coc)
         return Refused("glossary", missing, found) if missing else found
 
     def judge(self, draft: Draft, facts: Facts, cfg: EvidenceConfig, language: Language) -> list[Judged]:
-        return [_JUDGED[state] for state in draft.states]
+        return list(draft.judged)
 
 
 @in_place.kept(64)  # an English text is read again when its mirror is held against it
@@ -66,10 +78,17 @@ def read_text(text: str, language: Language, num_frames: int, step_s: float) -> 
     return tuple([read_sentence(part, language, num_frames, step_s) for part in cut_sentences(text)])
 
 
-def _fill(written: Coc, facts: Facts, language: Language, therefore: str | None = None) -> Draft | Refused:
-    """Fill the templates of an answer, or tell all that is wrong with their sentences."""
+def _fill(
+    written: Coc, facts: Facts, language: Language, claimed: Any, therefore: str | None = None
+) -> Draft | Refused:
+    """Fill the templates of an answer, or tell all that is wrong with their sentences.
+
+    Args:
+        claimed: the claims of the answer, as they came. Those of sentences that slots prove are not kept.
+    """
     filler, num_frames = Filler(facts, written.flight_decision, language), len(facts)
-    states: list[SentenceState] = []
+    judged: list[Judged] = []
+    claims: list[Claim] = []
     problems: list[Refused] = []
     doubts: list[str] = []
     texts: dict[str, str] = {}
@@ -81,23 +100,72 @@ def _fill(written: Coc, facts: Facts, language: Language, therefore: str | None 
                 sentence if isinstance(sentence, Refused) else filler.fill(sentence, is_reasoning=is_reasoning)
             )
             if isinstance(plain, str) and isinstance(sentence, Sentence):
-                states.append(sentence.state)
-                if sentence.doubtful and sentence.state == "unread":
-                    doubts.append(f'{name}, sentence {number}: "{sentence.doubtful[0]}" is said by no slot.')
+                found, own = _JUDGED[sentence.state], list[Claim]()
+                if claimed and sentence.state == "unread":
+                    key = f"{name[0].upper()}{number}"
+                    own = read_quoted(claimed, {key: sentence.beside}, language)
+                    found = (
+                        found
+                        if not own
+                        else _judge_beside(key, sentence, own, written.flight_decision, facts, language)
+                    )
+                judged.append(found)
+                claims += own
+                words = (*sentence.doubtful, *(claim.quote for claim in own))
+                if words and found.state == "unread":
+                    doubts.append(
+                        f'{name}, sentence {number}: "{words[0]}" is said by no slot and no claim that holds.'
+                    )
                 filled.append(plain)
             elif isinstance(plain, Refused):
                 problems.append(Refused(plain.reason, f"{name}, sentence {number}: {plain.complaint}."))
         texts[name] = "".join(filled)
     if problems:
         return Refused(problems[0].reason, " ".join(problem.complaint for problem in problems[:MAX_COMPLAINTS]))
-    template = Template(critical_components=written.critical_components, reasoning_trace=written.reasoning_trace)
+    template = Template(
+        critical_components=written.critical_components,
+        reasoning_trace=written.reasoning_trace,
+        claims=claims or None,
+    )
     return Draft(
         Coc(**texts, flight_decision=written.flight_decision),
         therefore,
         template,
-        tuple(states),
+        tuple(judged),
         " ".join(doubts[:MAX_COMPLAINTS]),
     )
+
+
+def _judge_beside(
+    name: str, sentence: Sentence, claims: Sequence[Claim], decision: str, facts: Facts, language: Language
+) -> Judged:
+    """Judge a sentence that its slots do not prove by claims of the words beside them."""
+    beside, references = sentence.beside, [place.slot.reference for place in sentence.places]
+    found = judge_sentence(name, beside, claims, (), decision, facts, EvidenceConfig(), language)
+    problems = tuple(one for one in found.problems if one.startswith(CONTRADICTIONS))
+    if problems:
+        return Judged(name, "", "contradicted", problems)
+    poles = read_stated(beside, language).poles
+    claimed = {
+        at: claim.quantity.partition("trend:")[2]
+        for claim in claims
+        for pole in _words_of(claim, beside, poles)
+        for at in range(pole.start, pole.start + len(pole.word))
+    }
+    is_proved = found.state == "proved" and claimed and is_earned(beside, references, len(facts), language, claimed)
+    return Judged(name, "", "proved" if is_proved else "unread")
+
+
+def _words_of(claim: Claim, beside: str, poles: Sequence[Pole]) -> list[Pole]:
+    """Give the measurable words of a claim's quote; none where one is of another kind or another's, denied or
+    wished."""
+    start, quote = beside.find(claim.quote or ""), claim.quote or ""
+    own = [pole for pole in poles if start <= pole.start and pole.start + len(pole.word) <= start + len(quote)]
+    whose = {"target_motion": "drone", "drone_motion": "target"}.get(claim.quantity)  # of the other one
+    kind = claim.quantity.partition(":")[0]
+    is_of_kind = all(kind in CLAIMED_BY.get(one.dimension, ()) and one.about != whose for one in own)
+    is_stated = claim.modality == "observed" and not any(one.is_negated or one.is_plan for one in own)
+    return own if SLOT_MARK not in quote and is_of_kind and is_stated else []
 
 
 def _terms(english: Template, facts: Facts) -> list[tuple[str, str]]:

@@ -130,13 +130,14 @@ class SlotPlace(NamedTuple):
 class Sentence:
     """A sentence that may be filled.
 
-    pattern: its text for `%`, with a place for each of the slots. names: of the slots, sorted. sizes: the numbers
-    without a sign, each with the words that state its direction. state: proved or unread (earned.py); doubtful: its
-    words for what a slot could say. decisions: that its words come to, as they stand there. opposed: those that it
-    argues against, were it of the reasoning.
+    pattern: its text for `%`, with a place for each of the slots. beside: its text, a mark for each of them. names: of
+    the slots, sorted. sizes: the numbers without a sign, each with the words that state its direction. state: proved or
+    unread (earned.py); doubtful: its words for what a slot could say. decisions: that its words come to, as they stand
+    there. opposed: those that it argues against, were it of the reasoning.
     """
 
     pattern: str
+    beside: str
     places: tuple[SlotPlace, ...]
     names: tuple[str, ...]
     sizes: tuple[tuple[Slot, tuple[Slot, ...]], ...]
@@ -184,6 +185,7 @@ def read_sentence(text: str, language: Language, num_frames: int, step_s: float)
         slots = [_with_article(slot, texts, number) for number, slot in enumerate(slots)]
     return Sentence(
         pattern="%s".join(part.replace("%", "%%") for part in texts),
+        beside=beside,
         places=tuple(_place(slot, language) for slot in slots),
         names=tuple(sorted(slot.name for slot in slots)),
         sizes=tuple((slot, _words_of(slot, slots)) for slot in slots if slot.is_size and not slot.is_word),

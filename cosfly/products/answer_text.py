@@ -88,7 +88,11 @@ _OTHER_LETTER = re.compile(r"[^\W\d_a-zA-Z\u00c0-\u024f\u4e00-\u9fff]")
 
 
 def parse_answer(
-    text: str, language: Language = "en", more: Collection[str] = (), finish_reason: str | None = None
+    text: str,
+    language: Language = "en",
+    more: Collection[str] = (),
+    finish_reason: str | None = None,
+    optional: Collection[str] = (),
 ) -> Parsed:
     """Check the structure of a raw answer (phase 3 of sec:appendix_e).
 
@@ -99,11 +103,16 @@ def parse_answer(
     Args:
         more: names of the further fields that were asked for.
         finish_reason: why the writer ended, where it is known.
+        optional: those of `more` that an answer may leave out.
     """
     names = (*FIELDS, *more)
     found = find_object(text, names, finish_reason)
     recovered = list(found.mended)
-    parsed = Parsed(None, found.reason) if found.value is None else _checked(found.value, language, names, recovered)
+    if found.value is None:
+        parsed = Parsed(None, found.reason)
+    else:
+        names = tuple(name for name in names if name in found.value or name not in optional)
+        parsed = _checked(found.value, language, names, recovered)
     return replace(parsed, recovered=tuple(recovered)) if recovered else parsed
 
 

@@ -167,7 +167,8 @@ class Claim(BaseModel):
 
     sentence: `C1` is the first of critical_components, `R1` of reasoning_trace. quantity: what is claimed, with its
     aspect (`distance`, `trend:speed`), or `decision`. at: `t4`, `t0-t4`; empty: the current frame, the whole window.
-    unit: m, mps, deg ... quote: the words of the sentence that it stands for, where a reader made it.
+    unit: m, mps, deg ... quote: the words of the sentence that it stands for, of a reader or
+    beside slots.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -198,12 +199,13 @@ class ReaderRecord(BaseModel):
 
 
 class Template(BaseModel):
-    """The two texts of an answer with slots in place of facts."""
+    """The two texts of an answer with slots in place of facts. claims: of words beside slots, which they quote."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     critical_components: str
     reasoning_trace: str
+    claims: _Given[list[Claim]] = None
 
 
 class Evidence(BaseModel):
