@@ -328,6 +328,7 @@ def test_a_claim_of_the_sentence_beside_counts_and_one_far_outside_is_a_problem(
     assert judged("We fly at two and a half times his speed. He walks on.", [ratio])[0].problems == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 2])
 def test_the_gold_sets_hold_their_bounds(number):
     score = measure((caption for caption in read_gold() if caption.set == number), claims_problems)

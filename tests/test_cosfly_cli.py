@@ -109,6 +109,7 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, subtests):
             assert [part for part in parts if part not in line] == []
 
 
+@pytest.mark.slow
 def test_an_output_that_is_full_or_closed_is_no_bug(tmp_path):
     full = "error: cannot write the output; got No space left on device"
     for words, redirect, status, told in (

@@ -230,6 +230,7 @@ def test_a_malformed_sequence_or_template_names_the_line_and_the_field(tmp_path:
             load(tmp_path, data)
 
 
+@pytest.mark.slow
 def test_a_real_sequence_of_buildings_is_read(shared_data: Path):
     """99 buildings of 3D BAG, CityJSON 1.1: outlines at level 0, parts at 1.2, 1.3 and 2.2."""
     path = shared_data / "tudelft-3dbag" / "extension.city.jsonl.gz"

@@ -363,6 +363,7 @@ def traced(triangles: np.ndarray, owners: np.ndarray, pose: np.ndarray, intrinsi
     return depth.reshape(SIZE[::-1]), ids.reshape(SIZE[::-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(RENDERERS))
 def test_depth_and_ids_are_those_of_trimesh_rays(tmp_path: Path, name: str) -> None:
     box_map = scene_map(tmp_path)

@@ -216,6 +216,7 @@ def labels(frame) -> str:
     return hashlib.sha256(frame.depth.tobytes() + frame.kinds.tobytes() + frame.ids.tobytes()).hexdigest()
 
 
+@pytest.mark.slow
 def test_labels_never_change_and_every_pair_of_presets_is_another_picture(renderer):
     plain = drawn(renderer, None)
     pictures = {}

@@ -46,6 +46,7 @@ def test_workers_that_die_and_stall_once_cost_nothing_but_time(tmp_path, workers
     assert all((tmp_path / "s" / record.id / "frame").read_text() == record.id for record in finished.kept)
 
 
+@pytest.mark.slow
 def test_an_item_that_never_ends_has_failed_and_the_others_are_done(tmp_path, caplog):
     finished = work_on(tmp_path, ["loop", "slow", "nothing"], workers=2)
     assert [record.id for record in finished.kept] == ["i1", "i2"]

@@ -225,6 +225,7 @@ def test_whole_weights_need_no_merge(base, tmp_path):
         merge.run(MergeConfig(), base, tmp_path, tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_line_and_leaves_nothing_half(base, adapter, tmp_path):
     """By a real limit on the size of files, in a process of its own."""
     program = (

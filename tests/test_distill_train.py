@@ -227,6 +227,7 @@ def test_adapter_reloads_equal(place, trained):
     assert not torch.allclose(logits[0], logits[2], atol=0.1)  # and it does something
 
 
+@pytest.mark.slow
 def test_stopped_and_continued_is_the_same(place, tmp_path):
     """Stop after 7 of 8 steps, cut a line of the log short, damage a newer checkpoint, then go on: the same log and the
     same adapter."""

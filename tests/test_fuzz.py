@@ -43,6 +43,7 @@ def specimens(tmp_path_factory) -> Path:
 # --- files ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_every_reader_refuses_in_one_line_what_it_cannot_read(specimens):
     numbers = {name: range(max(1, round(INPUTS * READERS[name].share))) for name in NAMES}
     summary = run("fuzz_readers", specimens, numbers, cpu_s=4 * CPU_S)  # a slow machine is no finding

@@ -456,6 +456,7 @@ def towns(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_several_towns_are_runs_of_their_own_and_one_release(towns):
     assert sorted(path.name for path in towns.iterdir()) == ["one", "release", "run.yaml", "summary.json", "two"]
     for town, paths in (("one", 2), ("two", 1)):

@@ -95,6 +95,7 @@ def test_the_wish_of_parts_has_no_jumps_and_keeps_to_the_speed_limit():
 # --- flights ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("style", NAMES)
 @pytest.mark.parametrize("planner", PLANNERS)
 def test_every_planner_flies_every_style_safely(planner, style):

@@ -169,6 +169,7 @@ def test_without_yes_nothing_is_sent(dataset, tmp_path):
     assert server.asked == []
 
 
+@pytest.mark.slow
 def test_what_arrives_is_the_release_and_the_key_stands_nowhere(dataset, tmp_path):
     log = tmp_path / "push.log"
     with hub() as server:
@@ -188,6 +189,7 @@ def test_what_arrives_is_the_release_and_the_key_stands_nowhere(dataset, tmp_pat
     assert verify(arrived, level="rows").is_ok
 
 
+@pytest.mark.slow
 def test_a_push_that_was_refused_half_way_goes_on(dataset, tmp_path):
     with hub() as server:
         server.commits_left = 1

@@ -197,6 +197,7 @@ def test_an_empty_table_is_drawn():
     assert "<table>" in page_html(Stats(name="x", runs=[], content_digest="", tables=empty, absent=[]), Coverage())
 
 
+@pytest.mark.slow
 def test_nothing_is_kept_a_frame():
     """Counts of ten times the frames hold as much memory."""
 
