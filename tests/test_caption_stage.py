@@ -6,6 +6,7 @@ import asyncio
 import json
 import shutil
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 
@@ -13,8 +14,10 @@ from caption.run import stage
 from caption.run.flights import allot, named_flights
 from caption.run.stage import run
 from caption.run.windows import cut_windows
-from caption.schema import CaptionConfig
+from caption.schema import CaptionConfig, ImageConfig
+from caption.teachers.prompts import Correction, make_question
 from caption.teachers.teacher import RuleTeacher
+from caption.teachers.trials import SCENES, trial_window
 from caption.truth.actions import label_of, measure
 from cosfly.errors import InputError, NothingKept, ResumeError
 from cosfly.products.captions import read_captions
@@ -178,3 +181,11 @@ def test_a_perturbed_flight_waits_for_a_clean_one_that_cannot_be_read(tmp_path):
     clean.write_bytes(whole)
     found = list(read_captions(run(CaptionConfig(), tree, tmp_path / "again")))
     assert Counter(caption.label_from for caption in found) == {"flight": 5, "twin": 5}
+
+
+def test_the_rule_teachers_mirror_is_of_its_answer_to_a_correction_too():
+    """The mirror is asked with the question alone; other slots in both languages dropped 2 of quickstart's windows."""
+    question = make_question(trial_window(SCENES[0], 5), ImageConfig(), "slots")
+    corrected = replace(question, correction=Correction("", "", 1))
+    texts = [asyncio.run(RuleTeacher(0).ask(one)).text for one in (question, corrected)]
+    assert texts[0] == texts[1]

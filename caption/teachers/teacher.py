@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractAsyncContextManager, nullcontext
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Protocol
@@ -69,7 +70,8 @@ class RuleTeacher:
         self._last: tuple[str, tuple[dict[str, str], dict[str, str]]] | None = None
 
     def _answers(self, question: Question) -> tuple[dict[str, str], dict[str, str]]:
-        key = f"{question.window.sample_id}/{question.purpose}"
+        # Corrections have the same answer: the Chinese of `mirror` is of the question alone.
+        key = f"{question.window.sample_id}/{replace(question, correction=None).purpose}"
         if self._last is None or self._last[0] != key:
             draws = draws_for(self.seed, "caption", key)
             self._last = (key, write_templates(question.facts, draws, question.decision))
