@@ -47,7 +47,11 @@ def imports(name: str, *, top_level_only: bool = False) -> set[str]:
 
 @cache
 def _tree(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
+    text = path.read_text(encoding="utf-8")
+    try:
+        return ast.parse(text)
+    except SystemError:  # Python before 3.11.8 (its issue 106905), where a thread prints a traceback meanwhile
+        return ast.parse(text)
 
 
 @cache

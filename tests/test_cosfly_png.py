@@ -10,7 +10,7 @@ import zlib
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -71,12 +71,12 @@ def test_a_picture_of_grey_and_opacity_is_read():
 
 @settings(max_examples=150, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.booleans())
-def test_a_changed_byte_is_found_or_changes_nothing(seed, is_mended):
-    """Also where the chunk's checksum is made right again."""
+@example(5273062, True)
+def test_a_changed_byte_is_found_or_read_as_others_read_it(seed, is_mended):
+    """Where the chunk's checksum is made right again, Adler-32 is left, which some changes leave as it is."""
     rng = np.random.default_rng(seed)
     lines = content(rng, 30, 1 + 40 * 3)
     data = bytearray(png_of(lines, 3, 6, zlib.Z_RLE, 1 << 20))
-    expected = parse_png(bytes(data), "x").pixels()
     (length,) = struct.unpack_from(">I", data, 33)
     data[41 + int(rng.integers(0, length))] ^= int(rng.integers(1, 256))
     if is_mended:
@@ -86,7 +86,7 @@ def test_a_changed_byte_is_found_or_changes_nothing(seed, is_mended):
     except InputError:
         return
     assert is_mended
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(found, np.asarray(Image.open(io.BytesIO(data)).convert("RGB")))
 
 
 def test_a_picture_that_is_not_what_its_header_says_is_refused():
