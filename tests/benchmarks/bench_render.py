@@ -8,8 +8,7 @@ frames.
     python tests/benchmarks/bench_render.py memory --frames 5000
 
 1280x720, all files, the synthetic town and the SimWorld city, flights of the default planner; `disk` at 90 degrees, one
-flight a process. On a machine with a GPU the same commands use it (the device is printed); `bench_render_workers.py` is
-made for a host of many cores.
+flight a process. On a machine with a GPU the same commands use it (the device is printed).
 """
 
 from __future__ import annotations
