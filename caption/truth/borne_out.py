@@ -18,7 +18,7 @@ from caption.truth.stated import Pole
 
 _RATES = {"mps": "m", "dps": "deg", "px": "px"}  # pixels per second are written as pixels
 _SHARE_SLACK = 0.02
-_SIGNS = {"up": "increasing", "down": "decreasing", "steady": "steady"}
+_TRENDS = ("increasing", "decreasing", "steady")
 _GAPS = {"near": "decreasing", "far": "increasing"}
 _SIDED = ("yaw", "bearing", "offset_x", "target_heading")
 
@@ -112,16 +112,16 @@ def _known(quantity: Quantity, facts: Facts) -> list[tuple[int, float]]:
 def bears_out_pole(pole: Pole, facts: Facts) -> bool:
     """Tell whether a word of side, course, state ... is true of the window in a way that its sentence could mean."""
     match pole.dimension, pole.value:
-        case "seen", _:
+        case "visibility", _:
             return _is_seen(pole, facts)
         case "motion", "standing":
             return _holds_any("standing", ["target_motion"], facts) or _holds_any("hovering", ["drone_motion"], facts)
         case "motion", _:
             return _holds_any("walking", ["target_motion"], facts) or _holds_any("moving", ["drone_motion"], facts)
-        case "course", "mixed":
+        case "trend", "mixed":
             return _holds_any("mixed", QUANTITIES, facts, "trend")
-        case "course", value:
-            return _has_trend(_SIGNS[value], [name for name, q in QUANTITIES.items() if not q.sides], facts)
+        case "trend", value:
+            return _has_trend(value, [name for name, q in QUANTITIES.items() if not q.sides], facts)
         case "gap", value:
             return _has_trend(_GAPS[value], ["distance", "slant"], facts)
         case "pace", value:
@@ -140,11 +140,7 @@ _OF_HEIGHT = re.compile(
 
 def bears_out_own(pole: Pole, facts: Facts) -> bool:
     """Tell whether a word that names its quantity ("lost altitude") is true of just that."""
-    return (
-        pole.value in _SIGNS
-        and bool(_OF_HEIGHT.search(pole.word))
-        and _has_trend(_SIGNS[pole.value], ["altitude"], facts)
-    )
+    return pole.value in _TRENDS and bool(_OF_HEIGHT.search(pole.word)) and _has_trend(pole.value, ["altitude"], facts)
 
 
 def _holds_any(word: str, names: Iterable[str], facts: Facts, aspect: str = "") -> bool:

@@ -44,7 +44,7 @@ _OF_CHANGE = re.compile(
 
 
 _PAIRS = (
-    ("up", "down"), ("left", "right"), ("faster", "slower"), ("near", "far"), ("visible", "hidden"), ("above", "below"),
+    ("increasing", "decreasing"), ("left", "right"), ("faster", "slower"), ("near", "far"), ("visible", "hidden"), ("above", "below"),
 )  # fmt: skip
 _OPPOSITES = {**dict(_PAIRS), **{other: one for one, other in _PAIRS}}
 
@@ -143,12 +143,12 @@ def _uncovered_poles(stated: Stated, said: Said, facts: Facts, language: Languag
             is_covered = not _denies(pole, covers)
         elif said.denies_frames(pole):
             is_covered = False
-        elif pole.dimension == "seen" and pole.frames and not said.names_frames(pole):
+        elif pole.dimension == "visibility" and pole.frames and not said.names_frames(pole):
             is_covered = bears_out_pole(pole, facts)
         elif pole.dimension == "pace" and pole.value != "matching":
             is_covered = _covers_pace(pole, said)
-        elif pole.dimension == "course" and (pole.is_than or pole.word.lower() in COMPARATIVES):
-            is_covered = pole.value in covers or (said.compares and not covers & {"up", "down"})
+        elif pole.dimension == "trend" and (pole.is_than or pole.word.lower() in COMPARATIVES):
+            is_covered = pole.value in covers or (said.compares and not covers & {"increasing", "decreasing"})
         else:
             # Mostly what a side is told from.
             is_covered = pole.value in covers or pole.dimension == "centre" or pole.value == "glimpsed"
@@ -168,7 +168,7 @@ def _uncovered_poles(stated: Stated, said: Said, facts: Facts, language: Languag
         lost = set() if pole.is_plan and pole.dimension != "side" else lost
         observed = {value for dimension, value in said.observed if dimension == pole.dimension}
         is_true = bears_out_pole(pole, facts) and (
-            pole.dimension == "seen"
+            pole.dimension == "visibility"
             or pole.value == "mixed"
             or not observed - {pole.value}
             or bears_out_own(pole, facts)
@@ -181,12 +181,12 @@ def _uncovered_poles(stated: Stated, said: Said, facts: Facts, language: Languag
 
 def _is_led(pole: Pole, said: Said, facts: Facts) -> bool | None:
     """Tell whether the number that "fell by" or "climbed to" leads bears the word out; None where it is no claim's."""
-    if pole.number is None or pole.is_negated or pole.value not in ("up", "down", "steady"):
+    if pole.number is None or pole.is_negated or pole.value not in ("increasing", "decreasing", "steady"):
         return None
     claims = [claim for claim in said.numbers if same_size(pole.number, claim)]
     changes = [c for c in claims if c.quantity.partition(":")[0] in ("change", "rate", "growth") and c.value]
     if changes and pole.value != "steady":
-        return any(("course", pole.value) in poles_of(claim) for claim in changes)
+        return any(("trend", pole.value) in poles_of(claim) for claim in changes)
     if pole.is_than or pole.word.startswith("比") or pole.word.lower() in COMPARATIVES:
         return None
     verdicts = [_has_come(pole.value, claim, facts) for claim in claims]
@@ -209,7 +209,7 @@ def _has_come(word: str, claim: Claim, facts: Facts) -> bool | None:
         return None
     if word == "steady":
         return True if abs(now - earlier[-1]) <= quantity.allowed_spread([now, earlier[-1]]) else None
-    return any((now > before) == (word == "up") and now != before for before in (earlier[0], earlier[-1]))
+    return any((now > before) == (word == "increasing") and now != before for before in (earlier[0], earlier[-1]))
 
 
 def _denies(pole: Pole, covers: set[str]) -> bool:
@@ -235,7 +235,7 @@ def _covers_pace(pole: Pole, said: Said) -> bool:
 
 def _denied_words(stated: Stated, said: Said) -> Iterator[str]:
     """Yield the claims in words whose opposite the text says instead."""
-    told = [pole for pole in stated.poles if pole.dimension == "seen"]
+    told = [pole for pole in stated.poles if pole.dimension == "visibility"]
     seen = {(pole.value, pole.is_negated) for pole in told}
     mentions = [pole.value for pole in stated.poles if pole.dimension == "side"]
     claimed = [side for claim in said.words for side in ("left", "right") if side in str(claim.value)]
@@ -260,7 +260,7 @@ def _denied_words(stated: Stated, said: Said) -> Iterator[str]:
                 for pole in stated.poles
                 if pole.dimension == "centre" and not (pole.is_negated or pole.is_plan)
             }
-            if "off" in places and not _is_off_somewhere(said):
+            if "off_centre" in places and not _is_off_somewhere(said):
                 yield _name(claim)
         elif claim.quantity == "decision" and claim.modality == "predicted":
             word = ACTION_WORDS.get(kin_of(str(claim.value)))

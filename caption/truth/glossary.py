@@ -1,12 +1,12 @@
-"""The bilingual glossary (`glossary.yaml`, and the names and terms of the actions in use): words, units, opposites.
+"""The words of both languages (`glossary.yaml`, and the names and terms of the actions in use): the one reader of them.
 
-One reader, one frozen record with its patterns compiled; everything that writes or compares the two languages takes it.
+Everything that writes, reads or compares the two languages takes its words here; what a sentence states: stated.py.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -20,16 +20,26 @@ from cosfly.work.config import Config, build, read_yaml
 
 GLOSSARY_FILE = Path(__file__).with_name("glossary.yaml")
 LANGUAGES: tuple[Language, Language] = ("en", "zh")
+ASPECTS = ("mean", "min", "max", "change")  # of a quantity, for which words of its own stand beside slots
 
 
-class _Pair(Config):
-    en: str = Field(description="English")
-    zh: str = Field(description="Chinese")
+class Words(Config):
+    en: list[str] = Field([], description="English")
+    zh: list[str] = Field([], description="Chinese")
+
+    def __getitem__(self, language: Language) -> list[str]:
+        return self.en if language == "en" else self.zh
 
 
-class _Spellings(Config):
-    en: list[str] = Field(description="English")
-    zh: list[str] = Field(description="Chinese")
+class _Value(Config):
+    """Words of one value of a notion, by who takes them: as `glossary.yaml` says."""
+
+    slot: Words = Field(Words(), description="forms that a slot is filled with")
+    opposite: Words = Field(Words(), description="spellings of an opposite")
+    said: Words = Field(Words(), description="patterns that a claim must cover")
+    beside: Words = Field(Words(), description="words beside slots with which a sentence may be proved")
+    argued: Words = Field(Words(), description="patterns that may argue for an action")
+    named: Words = Field(Words(), description="patterns that name an action alone")
 
 
 class _Factors(Config):
@@ -37,36 +47,14 @@ class _Factors(Config):
     zh: dict[str, dict[str | int | float, str]] = Field(description="and Chinese")
 
 
-class _Opposites(Config):
-    positive: _Spellings = Field(description="one side")
-    negative: _Spellings = Field(description="the other side")
-
-
-class _Forms(Config):
-    en: list[str] = Field(min_length=1, description="forms of a word in English")
-    zh: list[str] = Field(min_length=1, description="and in Chinese")
-
-
-class _Beside(Config):
-    quantities: dict[str, _Pair] = Field(description="quantities, or the aspect of one, -> words that speak of them")
-    kinds: dict[str, _Pair] = Field(description="kind -> its words")
-
-
-class _GlossaryFile(Config):
+class GlossaryFile(Config):
     schema_: str = Field(alias="schema", description="cosfly.glossary")
     schema_version: str = Field(description="version of this layout")
-    visibility: dict[str, _Pair] = Field(description="visibility words")
-    units: dict[str, _Spellings] = Field(description="unit -> spellings, the first is written")
+    notions: dict[str, dict[str, _Value]] = Field(description="notion -> value -> its words")
+    strict: list[str] = Field(description="notions or notion.value that a claim must cover")
+    lists: dict[str, Words] = Field(description="words that change what others mean")
+    units: dict[str, Words] = Field(description="unit -> spellings, the first is written")
     written_units: _Factors = Field(description="every way a unit is written in running text")
-    polarity: dict[str, _Opposites] = Field(description="opposites")
-    negations: _Spellings = Field(description="words that turn a term round")
-    not_terms: _Spellings = Field(description="spellings that hold a term but do not mean it")
-    slot_words: dict[str, dict[str, _Forms]] = Field(
-        description="kind -> what is true -> the words that a slot is filled with"
-    )
-    states: _Spellings = Field(description="words beside slots for what a slot can say")
-    beside: _Beside = Field(description="words beside slots with which a sentence may be proved")
-    idioms: _Spellings = Field(description="patterns in which an opposite states nothing of this window")
 
 
 class Unit(NamedTuple):
@@ -79,42 +67,28 @@ class Unit(NamedTuple):
 class Glossary:
     """The glossary with its patterns compiled."""
 
-    def __init__(self, file: _GlossaryFile, actions: ActionSet) -> None:
+    def __init__(self, file: GlossaryFile, actions: ActionSet) -> None:
         self.actions = {token: {"en": action.en, "zh": action.zh} for token, action in actions.actions.items()}
-        self.visibility = {word: {"en": pair.en, "zh": pair.zh} for word, pair in file.visibility.items()}
         self.terms = [(pair.en, pair.zh) for pair in actions.terms]
-        self._units: dict[Language, dict[str, str]] = {"en": {}, "zh": {}}
-        for unit, spellings in file.units.items():
-            for language in LANGUAGES:
-                self._units[language].update(dict.fromkeys(getattr(spellings, language), unit))
-        self.written_units: dict[Language, dict[str, str]] = {
-            language: {unit: spellings[0] for unit, spellings in _by_unit(file, language)} for language in LANGUAGES
-        }
-        self._poles: dict[Language, dict[str, tuple[str, int]]] = {"en": {}, "zh": {}}
-        for name, pair in file.polarity.items():
-            for language in LANGUAGES:
-                self._poles[language].update(dict.fromkeys(getattr(pair.positive, language), (name, 1)))
-                self._poles[language].update(dict.fromkeys(getattr(pair.negative, language), (name, -1)))
-        self._negations_en, self._negations_zh = set(file.negations.en), tuple(file.negations.zh)
-        self._terms = {
-            language: _term_pattern(self._poles[language], getattr(file.not_terms, language), language)
-            for language in LANGUAGES
-        }
+        self._translations = dict([*((action.en, action.zh) for action in actions.actions.values()), *self.terms])
+        self._translated = _term_pattern(self._translations, "en")
         self.slot_words = {
-            word: {"en": tuple(forms.en), "zh": tuple(forms.zh)}
-            for words in file.slot_words.values()
-            for word, forms in words.items()
+            value: {language: tuple(words.slot[language]) for language in LANGUAGES}
+            for values in file.notions.values()
+            for value, words in values.items()
+            if words.slot.en
         }
-        self._states = {
-            language: _term_pattern(dict.fromkeys(getattr(file.states, language), ("", 0)), [], language)
-            for language in LANGUAGES
+        seen = (word for word in file.notions["visibility"] if word in self.slot_words)
+        self.visibility = {word: {one: self.slot_words[word][one][0] for one in LANGUAGES} for word in seen}
+        self.written_units = {one: {unit: words[one][0] for unit, words in file.units.items()} for one in LANGUAGES}
+        self._units = {
+            one: {spelling: unit for unit, words in file.units.items() for spelling in words[one]} for one in LANGUAGES
         }
-        self._idioms = {
-            language: re.compile("|".join(getattr(file.idioms, language)), re.IGNORECASE) for language in LANGUAGES
-        }
-        pairs = [*((action.en, action.zh) for action in actions.actions.values()), *self.terms]
-        self._translations = dict(pairs)
-        self._translated = _term_pattern(dict.fromkeys(self._translations, ("", 0)), [], "en")
+        self._denials, lists = file.lists["denials"], file.lists
+        self._poles = {one: _opposites(file, one) for one in LANGUAGES}
+        self._terms = {one: _term_pattern([*self._poles[one], *lists["not_terms"][one]], one) for one in LANGUAGES}
+        self._states = {one: _term_pattern(lists["states"][one], one) for one in LANGUAGES}
+        self._idioms = {one: re.compile("|".join(lists["idioms"][one]), re.IGNORECASE) for one in LANGUAGES}
 
     def spellings(self, language: Language) -> dict[str, str]:
         """Give every spelling of a unit and the unit."""
@@ -148,9 +122,9 @@ class Glossary:
     def is_negated(self, text: str, start: int, language: Language) -> bool:
         """Tell whether a negation stands just before a place of a text (English in small letters)."""
         if language == "zh":
-            return text[max(0, start - 4) : start].endswith(self._negations_zh)
+            return text[max(0, start - 4) : start].endswith(tuple(self._denials.zh))
         words = re.findall(r"[a-z']+", re.split(r"[.,;:]", text[max(0, start - 24) : start])[-1])
-        return bool(self._negations_en.intersection(words[-2:]))
+        return bool(set(self._denials.en).intersection(words[-2:]))
 
     def quoted(self) -> str:
         """Give the glossary as lines for a translation prompt."""
@@ -161,26 +135,31 @@ class Glossary:
         return "\n".join(f"{en} = {zh}" for en, zh in pairs + self.terms)
 
 
-def _by_unit(file: _GlossaryFile, language: Language) -> Iterator[tuple[str, list[str]]]:
-    return ((unit, getattr(spellings, language)) for unit, spellings in file.units.items())
+def _opposites(file: GlossaryFile, language: Language) -> dict[str, tuple[str, int]]:
+    """Give the spellings of opposites: word -> its notion, and 1 for the first of the two, -1 for the other."""
+    return {
+        word: (notion, sign)
+        for notion, values in file.notions.items()
+        for words, sign in zip((one.opposite for one in values.values() if one.opposite.en), (1, -1), strict=False)
+        for word in words[language]
+    }
 
 
-def _term_pattern(poles: dict[str, tuple[str, int]], not_terms: list[str], language: Language) -> re.Pattern[str]:
-    words = sorted([*poles, *not_terms], key=len, reverse=True)
-    options = "|".join(re.escape(word) for word in words)
+def _term_pattern(words: Iterable[str], language: Language) -> re.Pattern[str]:
+    options = "|".join(re.escape(word) for word in sorted(words, key=len, reverse=True))
     return re.compile(rf"(?<![a-z_])(?:{options})(?![a-z_])" if language == "en" else options)
 
 
 @cache
-def _file() -> _GlossaryFile:
-    return build(_GlossaryFile, read_yaml(GLOSSARY_FILE), GLOSSARY_FILE)
+def glossary_file() -> GlossaryFile:
+    return build(GlossaryFile, read_yaml(GLOSSARY_FILE), GLOSSARY_FILE)
 
 
 @cache
 def written_units(language: Language) -> dict[str, Unit]:
     """Give every spelling of a unit in running text, foreign ones too."""
     units: dict[str, Unit] = {}
-    for name, factors in getattr(_file().written_units, language).items():
+    for name, factors in getattr(glossary_file().written_units, language).items():
         for factor, spellings in factors.items():
             for spelling in filter(None, map(str.strip, spellings.split(","))):
                 units.setdefault(spelling, Unit(name, float(factor)))
@@ -191,16 +170,16 @@ def written_units(language: Language) -> dict[str, Unit]:
 def words_beside(language: Language) -> dict[str, tuple[str, frozenset[str]]]:
     """Give the words with which a sentence with slots may be proved: word -> kind, and the quantities that it speaks
     of."""
-    beside, found = _file().beside, dict[str, tuple[str, frozenset[str]]]()
-    for names, pair in (beside.kinds | beside.quantities).items():
-        kind = names if names in beside.kinds else "aspect" if names in ("mean", "min", "max", "change") else "quantity"
-        kind = "middle" if names.startswith("middle") else kind
-        words = filter(None, map(str.strip, getattr(pair, language).split(",")))
-        found |= dict.fromkeys(words, (kind, frozenset(names.split())))
+    notions, found = glossary_file().notions, dict[str, tuple[str, frozenset[str]]]()
+    for names, one in (notions["subject"] | notions["kind"]).items():
+        found |= dict.fromkeys(one.beside[language], (names, frozenset((names,))))
+    for names, one in notions["quantity"].items():
+        kind = "aspect" if names in ASPECTS else "middle" if names.startswith("middle") else "quantity"
+        found |= dict.fromkeys(one.beside[language], (kind, frozenset(names.split())))
     return found
 
 
 @in_place.kept()
 def load_glossary() -> Glossary:
     """Read the glossary, and put the actions in use into it."""
-    return Glossary(_file(), actions_in_use())
+    return Glossary(glossary_file(), actions_in_use())

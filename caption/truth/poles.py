@@ -1,4 +1,4 @@
-"""The opposites that claims stand for: dimension and value, as stated.yaml names them for the words of a text."""
+"""The opposites that claims stand for: dimension and value, as glossary.yaml names them for the words of a text."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ _SIDED = {"yaw": 1, "heading": 1, "yaw_rate": 1, "bearing": 1, "target_heading":
 _SPEEDS = ("speed", "target_speed", "speed_ratio", "speed_difference", "travelled", "displacement", "target_travelled")
 _NEAR = {"distance": -1, "slant": -1, "box_width": 1, "box_height": 1, "depression": 1}  # sign of coming nearer
 _DECISIONS: dict[str, tuple[Pair, ...]] = {
-    "ascend": (("course", "up"), ("level", "above")),
-    "descend": (("course", "down"), ("level", "below")),
+    "ascend": (("trend", "increasing"), ("level", "above")),
+    "descend": (("trend", "decreasing"), ("level", "below")),
     "slow_down": (
         ("pace", "slower"),
         ("paced", "slower"),
         ("pace", "matching"),
         ("gap", "far"),
-        ("course", "down"),
-        ("course", "up"),
+        ("trend", "decreasing"),
+        ("trend", "increasing"),
     ),
     "speed_up": (
         ("pace", "faster"),
         ("paced", "faster"),
         ("pace", "matching"),
         ("gap", "near"),
-        ("course", "up"),
-        ("course", "down"),
+        ("trend", "increasing"),
+        ("trend", "decreasing"),
     ),
-    "hover": (("paced", "slower"), ("motion", "standing"), ("course", "steady"), ("pace", "slower")),
-    "move_forward": (("gap", "near"), ("course", "down"), ("motion", "walking"), ("bend", "straight")),
-    "move_backward": (("gap", "far"), ("course", "up")),
-    "track_straight": (("bend", "straight"), ("course", "steady"), ("centre", "centred"), ("pace", "matching")),
-    "search_to_reacquire_target": (("seen", "hidden"), ("seen", "gone"), ("seen", "visible")),
+    "hover": (("paced", "slower"), ("motion", "standing"), ("trend", "steady"), ("pace", "slower")),
+    "move_forward": (("gap", "near"), ("trend", "decreasing"), ("motion", "walking"), ("bend", "straight")),
+    "move_backward": (("gap", "far"), ("trend", "increasing")),
+    "track_straight": (("bend", "straight"), ("trend", "steady"), ("centre", "centred"), ("pace", "matching")),
+    "search_to_reacquire_target": (("visibility", "hidden"), ("visibility", "gone"), ("visibility", "visible")),
 }
 ACTION_WORDS = {
     "track_straight": "straight", "yaw_left_to_follow": "yaw", "yaw_right_to_follow": "yaw", "circle_left": "circle",
@@ -55,17 +55,22 @@ def poles_of(claim: Claim) -> set[Pair]:
     if name == "decision":
         return set(_decision_poles(str(value)))
     if name == "framing":
-        return {("centre", "centred" if value == "centred" else "off")}
+        return {("centre", "centred" if value == "centred" else "off_centre")}
     if name == "walking":
         return {("gap", "near" if value == "towards" else "far")} if value != "across" else set()
     if name == "visibility":
         return {
-            "visible": {("seen", "visible"), ("seen", "full"), ("seen", "glimpsed")},
-            "partly_occluded": {("seen", "partly"), ("seen", "visible"), ("seen", "hidden"), ("seen", "glimpsed")},
-        }.get(str(value), {("seen", "hidden"), ("seen", "gone")})
+            "visible": {("visibility", "visible"), ("visibility", "full"), ("visibility", "glimpsed")},
+            "partly_occluded": {
+                ("visibility", "partly"),
+                ("visibility", "visible"),
+                ("visibility", "hidden"),
+                ("visibility", "glimpsed"),
+            },
+        }.get(str(value), {("visibility", "hidden"), ("visibility", "gone")})
     if name in ("target_motion", "drone_motion"):
         is_still = value in ("standing", "hovering")
-        still: set[Pair] = {("motion", "standing"), ("course", "steady"), ("pace", "slower")}
+        still: set[Pair] = {("motion", "standing"), ("trend", "steady"), ("pace", "slower")}
         return still if is_still else {("motion", "walking"), ("pace", "faster")}
     if aspect == "compared":  # of the target against the drone
         value = TURNED.get(str(value), value)
@@ -77,8 +82,8 @@ def poles_of(claim: Claim) -> set[Pair]:
         signs = {"increasing": (1,), "decreasing": (-1,), "mixed": (1, -1)}.get(str(value), ())
         found = {pole for sign in signs for pole in _course_poles(name, sign)}
         if value == "mixed":
-            found.add(("course", "mixed"))
-        return found or {("course", "steady"), ("bend", "straight"), ("pace", "matching")}
+            found.add(("trend", "mixed"))
+        return found or {("trend", "steady"), ("bend", "straight"), ("pace", "matching")}
     return number_poles(aspect, name, float(value)) if isinstance(value, float) else set()
 
 
@@ -91,10 +96,14 @@ def _decision_poles(action: str) -> Iterator[Pair]:
 
 def _side_poles(value: str) -> set[Pair]:
     if value in ("centred", "straight"):
-        return {("centre", "centred"), ("course", "steady"), ("bend", "straight")}
+        return {("centre", "centred"), ("trend", "steady"), ("bend", "straight")}
     if value in ("above", "below"):
-        return {("level", value), ("course", "up" if value == "above" else "down"), ("centre", "off")}
-    return {("side", value), ("centre", "off"), ("bend", "turning")}
+        return {
+            ("level", value),
+            ("trend", "increasing" if value == "above" else "decreasing"),
+            ("centre", "off_centre"),
+        }
+    return {("side", value), ("centre", "off_centre"), ("bend", "turning")}
 
 
 def side_word(name: str, value: float) -> str:
@@ -108,7 +117,7 @@ def number_poles(aspect: str, name: str, value: float) -> set[Pair]:
     sign = (value > 0) - (value < 0)
     if not sign:
         still: set[Pair] = {("motion", "standing")} if name in ("speed", "target_speed") else set()
-        return still | {("course", "steady"), ("centre", "centred"), ("pace", "matching")}
+        return still | {("trend", "steady"), ("centre", "centred"), ("pace", "matching")}
     if name in _SIDED and aspect in ("", "change", "rate", "mean", "min", "max"):
         found.update({("side", "left" if sign == _SIDED[name] else "right"), ("bend", "turning")})
     if name == "offset_y":
@@ -116,7 +125,7 @@ def number_poles(aspect: str, name: str, value: float) -> set[Pair]:
     if aspect in ("change", "rate", "growth"):
         found.update(_course_poles(name, sign))
     elif name == "climb_rate":
-        found.add(("course", "up" if sign > 0 else "down"))
+        found.add(("trend", "increasing" if sign > 0 else "decreasing"))
     elif name == "speed_ratio":
         faster = "faster" if value > 1 else "slower" if value < 1 else "matching"
         found.update({("pace", faster), ("compared", faster)})
@@ -127,7 +136,7 @@ def number_poles(aspect: str, name: str, value: float) -> set[Pair]:
     elif name in ("height_over_target", "altitude"):
         found.add(("level", "above"))
         if name == "height_over_target":
-            found.add(("course", "up"))  # "20 m higher than the person"
+            found.add(("trend", "increasing"))  # "20 m higher than the person"
     elif name in ("pitch", "depression"):
         found.add(("level", "below"))
     return found
@@ -135,9 +144,9 @@ def number_poles(aspect: str, name: str, value: float) -> set[Pair]:
 
 def _course_poles(name: str, sign: int) -> set[Pair]:
     """Give the opposites of a quantity that grows or falls. Where its sign is a side, "grows" may mean its size."""
-    found: set[Pair] = {("course", "up" if sign > 0 else "down")}
+    found: set[Pair] = {("trend", "increasing" if sign > 0 else "decreasing")}
     if name in _SIDED or name in ("offset_y", "pitch", "climb_rate", "speed_difference"):
-        found.add(("course", "down" if sign > 0 else "up"))
+        found.add(("trend", "decreasing" if sign > 0 else "increasing"))
     if name in _SIDED:
         found.add(("side", "left" if sign == _SIDED[name] else "right"))
     if name in ("altitude", "height_over_target"):  # "2 m beneath the last frame"
@@ -148,7 +157,7 @@ def _course_poles(name: str, sign: int) -> set[Pair]:
     if name in _NEAR:
         found.add(("gap", "near" if sign == _NEAR[name] else "far"))
     if name in ("offset_x", "offset_y"):
-        found.update({("gap", "near"), ("gap", "far"), ("centre", "off")})
+        found.update({("gap", "near"), ("gap", "far"), ("centre", "off_centre")})
     return found
 
 
@@ -161,6 +170,6 @@ def poles_between(numbers: Sequence[Claim]) -> Iterator[Pair]:
         if {one.quantity, other.quantity} == {"speed", "target_speed"} and one.at == other.at:
             ours, theirs = (a, b) if one.quantity == "speed" else (b, a)
             word = "faster" if ours > theirs else "slower" if ours < theirs else "matching"
-            yield from (("pace", word), ("compared", word), ("course", "up"), ("course", "down"))
+            yield from (("pace", word), ("compared", word), ("trend", "increasing"), ("trend", "decreasing"))
         if one.quantity.rpartition(":")[0] in ("min", "max"):
-            yield from (("course", "mixed"), ("course", "up"), ("course", "down"))
+            yield from (("trend", "mixed"), ("trend", "increasing"), ("trend", "decreasing"))

@@ -34,7 +34,7 @@ _OTHER = {
         r"《|§|第\s?\d*条|规定|手册|限制|阈值|如果|若|假如|将|应|会|可以|宜|需|最好|下一|安全|目标值|预计"
     ),
 }
-_RISES = {"up": 1, "down": -1}
+_RISES = {"increasing": 1, "decreasing": -1}
 _ENDS = {"en": re.compile(r"\bfrom\b[^,;.]{0,24}$", re.I), "zh": re.compile(r"[从由自][^，；。]{0,12}$")}
 _TO = {
     "en": re.compile(r"[^,;]{0,12}\b(?:to|down to|up to)\b[^,;\d]{0,16}", re.I),
@@ -92,7 +92,7 @@ def _is_of_nothing(numeral: Numeral, facts: Facts) -> bool:
 
 def _runs_against(pole: Pole, stated: Stated, language: Language) -> bool:
     """Tell whether "decreases from 20 m to 21 m" contradicts itself."""
-    sign = _RISES.get(pole.value, 0) if pole.dimension == "course" and not pole.is_negated else 0
+    sign = _RISES.get(pole.value, 0) if pole.dimension == "trend" and not pole.is_negated else 0
     pairs = list(zip(stated.numerals, stated.numerals[1:], strict=False))
     if not sign or len(pairs) != 1:
         return False

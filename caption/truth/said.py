@@ -73,7 +73,7 @@ class Said:
     def denies_frames(self, pole: Pole) -> bool:
         """Tell whether claims of the frames that stand beside a word of visibility say another."""
         of_frames = [c for c in self.words if c.quantity == "visibility" and pole.frames.intersection(frames_of(c))]
-        return bool(of_frames) and not any(("seen", pole.value) in poles_of(claim) for claim in of_frames)
+        return bool(of_frames) and not any(("visibility", pole.value) in poles_of(claim) for claim in of_frames)
 
     def covers_numeral(self, numeral: Numeral, stated: Stated) -> bool:
         if numeral.kind == "clock":
@@ -85,10 +85,12 @@ class Said:
             return not is_share_of or self.is_scenery or bears_out_number(numeral, self.facts)
         if is_share_of:
             is_all = (
-                numeral.unit == "percent" and numeral.value in (0, 100) and any(of == "seen" for of, _ in self.poles)
+                numeral.unit == "percent"
+                and numeral.value in (0, 100)
+                and any(of == "visibility" for of, _ in self.poles)
             )
             return is_all or is_share(numeral, self._ratios(numeral), stated)
-        is_steady = any(pole.dimension == "course" and pole.value == "steady" for pole in stated.poles)
+        is_steady = any(pole.dimension == "trend" and pole.value == "steady" for pole in stated.poles)
         return numeral.unit == "px" and numeral.value == 1 and is_steady  # "not by a single pixel"
 
     def _is_of_scene(self, numeral: Numeral) -> bool:

@@ -1,6 +1,6 @@
 """What a sentence states in its words: the numerals that measure something, and its words of side, course and state.
 
-Claims must cover all of it (claims.py). The words stand in stated.yaml. Nothing here knows facts or claims.
+Claims must cover all of it (claims.py). The words stand in glossary.yaml. Nothing here knows facts or claims.
 """
 
 from __future__ import annotations
@@ -8,15 +8,10 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from pathlib import Path
 
-from pydantic import Field
-
+from caption.truth.glossary import GlossaryFile, glossary_file
 from caption.truth.numerals import Numeral, read_numerals
 from cosfly.products.captions import Language
-from cosfly.work.config import Config, build, read_yaml
-
-STATED_FILE = Path(__file__).with_name("stated.yaml")
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,28 +55,6 @@ class Stated:
     is_more: bool
 
 
-class _Words(Config):
-    en: list[str] = Field(description="English patterns")
-    zh: list[str] = Field(description="Chinese patterns")
-
-
-class _StatedFile(Config):
-    schema_: str = Field(alias="schema", description="cosfly.stated")
-    schema_version: str = Field(description="version of this layout")
-    skipped: _Words = Field(description="spellings that hold a word without meaning it")
-    poles: dict[str, dict[str, _Words]] = Field(description="dimension -> value -> words")
-    strict: list[str] = Field(description="dimensions or dimension.value that a claim must cover")
-    negations: _Words = Field(description="words that turn the next one round")
-    subjects: dict[str, _Words] = Field(description="who a clause speaks of")
-    actions: dict[str, _Words] = Field(description="words of an action")
-    named: dict[str, _Words] = Field(description="words that name an action alone")
-    plans: _Words = Field(description="words before what is wanted")
-    scenery: _Words = Field(description="things that stand about")
-    about: _Words = Field(description="words that make a number approximate")
-    less: _Words = Field(description="words that make a share an upper bound")
-    more: _Words = Field(description="words that make a share a lower bound")
-
-
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 _FRAME = (
@@ -108,36 +81,35 @@ _THAN = re.compile(r"\s+than\s+(?!at\b|before\b|an?\s|half\b|in\s|t\d|it was|ear
 
 
 class Lexicon:
-    """stated.yaml with its patterns compiled, for one language."""
+    """The words of glossary.yaml for what is stated, with their patterns compiled, for one language."""
 
-    def __init__(self, file: _StatedFile, language: Language) -> None:
-        self.language = language
-        self.skipped = self._any(getattr(file.skipped, language))
+    def __init__(self, file: GlossaryFile, language: Language) -> None:
+        self.language, lists, notions = language, file.lists, file.notions
+        self.skipped, self._scenery, self._about, self._less, self._more = (
+            self._any(lists[name][language]) for name in ("skipped", "scenery", "about", "less", "more")
+        )
         self.strict = frozenset(file.strict)
+        self.subjects = {who: self._any(words.said[language]) for who, words in notions["subject"].items()}
+        self._actions = {token: self._any(words.argued[language]) for token, words in notions["action"].items()}
+        self._named = {
+            token: self._any(words.named[language]) for token, words in notions["action"].items() if words.named.en
+        }
         self._pole_names: dict[str, tuple[str, str]] = {}
-        parts: list[tuple[str, str, str]] = []
-        # Within a dimension the more special words stand first ("fully visible" before "visible").
-        for dimension, values in file.poles.items():
+        # Within a notion the more special words stand first ("fully visible" before "visible").
+        parts: dict[str, list[str]] = {}
+        for notion, values in notions.items():
             for value, words in values.items():
-                name = f"p{len(parts)}"
-                self._pole_names[name] = (dimension, value)
-                parts.append((name, dimension, self._option(getattr(words, language))))
-        self._poles = [
-            re.compile("|".join(f"(?P<{name}>{words})" for name, of, words in parts if of == dimension), re.I)
-            for dimension in file.poles
-        ]
-        self.subjects = {who: self._any(getattr(words, language)) for who, words in file.subjects.items()}
-        self._actions = {action: self._any(getattr(words, language)) for action, words in file.actions.items()}
-        self._named = {action: self._any(getattr(words, language)) for action, words in file.named.items()}
-        plans = "|".join(getattr(file.plans, language))
+                if notion != "subject" and words.said.en:
+                    name = f"p{len(self._pole_names)}"
+                    self._pole_names[name] = (notion, value)
+                    parts.setdefault(notion, []).append(f"(?P<{name}>{self._option(words.said[language])})")
+        self._poles = [re.compile("|".join(part), re.I) for part in parts.values()]
+        plans = "|".join(lists["plans"][language])
         self._any_plan = re.compile(rf"\b(?:{plans})\s" if language == "en" else rf"(?:{plans})", re.I)
         self._plan = re.compile(
             rf"{_SEEMING}\b(?:{plans})(?:\s+[\w']+){{0,2}}\s+$" if language == "en" else rf"(?:{plans}).{{0,3}}$", re.I
         )
-        self._scenery = self._any(getattr(file.scenery, language))
-        self._about = self._any(getattr(file.about, language))
-        self._less, self._more = self._any(getattr(file.less, language)), self._any(getattr(file.more, language))
-        self._negation = self._negations(getattr(file.negations, language))
+        self._negation = self._negations(lists["negations"][language])
 
     def _option(self, words: list[str]) -> str:
         options = "|".join(sorted(words, key=len, reverse=True))
@@ -207,9 +179,9 @@ class Lexicon:
                         is_than=bool(_THAN.match(text, match.end())),
                         is_plan=bool(self._plan.search(clause)),
                         is_after_plan=bool(self._any_plan.search(text[: match.start()])),
-                        number=led[0] if led and dimension == "course" else None,
+                        number=led[0] if led and dimension == "trend" else None,
                         frames=_frames_round(sentence, match.start(), match.end())
-                        if dimension == "seen"
+                        if dimension == "visibility"
                         else frozenset(),
                     )
                 )
@@ -260,7 +232,7 @@ def _frames_round(sentence: str, start: int, end: int) -> frozenset[int]:
 
 @cache
 def lexicon_of(language: Language) -> Lexicon:
-    return Lexicon(build(_StatedFile, read_yaml(STATED_FILE), STATED_FILE), language)
+    return Lexicon(glossary_file(), language)
 
 
 def subject_before(text: str, end: int, language: Language) -> str:

@@ -32,8 +32,8 @@ MAX_COMPLAINTS = 6  # named at once
 CONTRADICTIONS = ("false", "text says otherwise", "claims disagree", "decision")  # among the problems of claims
 # Dimension of a word -> what claims of it begin with.
 CLAIMED_BY: dict[str, tuple[str, ...]] = {
-    "course": ("trend",), "pace": ("comparison", "compared"), "motion": ("target_motion", "drone_motion"),
-    "gap": ("trend", "walking"), "seen": ("visibility",), "centre": ("framing", "side"),
+    "trend": ("trend",), "pace": ("comparison", "compared"), "motion": ("target_motion", "drone_motion"),
+    "gap": ("trend", "walking"), "visibility": ("visibility",), "centre": ("framing", "side"),
 }  # fmt: skip
 # By slots alone nothing is contradicted, so nobody asks which sentence it was.
 _JUDGED = {state: Judged("", "", state) for state in get_args(SentenceState)}
