@@ -479,7 +479,9 @@ def _facts() -> Facts:
 
 def _answer(root: Path, name: str, language: Any = "en") -> None:
     text = _bytes(root / name).decode("utf-8", "replace")
-    parse_answer(text, language, ("claims",) if len(text) % 2 else (), "length" if len(text) % 3 == 0 else None)
+    more, finish_reason = ("claims",) if len(text) % 2 else (), "length" if len(text) % 3 == 0 else None
+    parsed = parse_answer(text, language, more, finish_reason)
+    assert (parsed.coc is None) == (parsed.reason is not None)
 
 
 def _prose(root: Path, name: str, language: Any = "en") -> None:
@@ -511,7 +513,8 @@ def _reply(root: Path) -> None:
 
 
 def _header(root: Path) -> None:
-    retry_after_s(_bytes(root / "header.txt").decode("latin-1"), 0.0)
+    wait_s = retry_after_s(_bytes(root / "header.txt").decode("latin-1"), 0.0)
+    assert wait_s is None or 0.0 <= wait_s < float("inf")
 
 
 def _setting(root: Path, name: str) -> None:

@@ -17,7 +17,6 @@ from typer.testing import CliRunner
 
 from cosfly import cli
 from cosfly.app import doctor
-from cosfly.app.doctor import Check
 from cosfly.app.settings import RunConfig
 from cosfly.chat.wire import Connections, Response
 from cosfly.cli.options import Job, resolve
@@ -222,14 +221,6 @@ def test_failed_items_make_the_command_exit_1_unless_the_settings_accept_them(ca
 
 
 # --- the doctor -------------------------------------------------------------------------------------------------------
-
-
-def test_the_doctor_shows_brackets_as_they_are(capfd, monkeypatch):
-    monkeypatch.setattr(doctor, "examine", lambda *given: [Check("x", "optional", 'pip install "cosfly[vllm]"')])
-    monkeypatch.setattr(sys, "argv", ["cosfly", "doctor"])
-    with pytest.raises(SystemExit):
-        cli.main()
-    assert "cosfly[vllm]" in capfd.readouterr().out
 
 
 def test_the_doctor_asks_for_the_models_where_captions_do_or_says_what_is_wrong(tmp_path, monkeypatch):

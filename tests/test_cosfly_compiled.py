@@ -7,18 +7,27 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import cosfly
 from cosfly.work import compiled
 
 DAY_S = 86400.0
 
 
-def test_a_caller_sees_a_change_of_what_it_calls(tmp_path):
-    """Its own file stays as it is: numba alone would go on with the old function."""
-    package = tmp_path / "src" / "cosfly"
+def make_package(root: Path) -> Path:
+    """A package of our name that compiles as ours does."""
+    package = root / "src" / "cosfly"
     (package / "work").mkdir(parents=True)
     for name in ("__init__.py", "work/__init__.py", "work/compiled.py"):
         shutil.copy(Path(cosfly.__file__).parent / name, package / name)
+    return package
+
+
+@pytest.mark.slow
+def test_a_caller_sees_a_change_of_what_it_calls(tmp_path):
+    """Its own file stays as it is: numba alone would go on with the old function."""
+    package = make_package(tmp_path)
     (package / "upper.py").write_text(
         "from cosfly.work.compiled import njit\nfrom cosfly.lower import f\n\n\n"
         "@njit(cache=True)\ndef g(x):\n    return f(x)\n"
@@ -94,11 +103,9 @@ print(g(7))
 """
 
 
+@pytest.mark.slow
 def test_of_two_processes_one_compiles_and_the_other_loads(tmp_path):
-    package = tmp_path / "src" / "cosfly"
-    (package / "work").mkdir(parents=True)
-    for name in ("__init__.py", "work/__init__.py", "work/compiled.py"):
-        shutil.copy(Path(cosfly.__file__).parent / name, package / name)
+    package = make_package(tmp_path)
     (package / "upper.py").write_text(
         "from cosfly.work.compiled import njit\n\n\n@njit(cache=True)\ndef f(x):\n    return 2 * x\n\n\n"
         "@njit(cache=True)\ndef g(x):\n    return f(x)\n"

@@ -103,6 +103,7 @@ def test_linked_flights_are_those_that_they_lead_to_under_the_names_of_the_tree(
 # --- all the way ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_some_flights_of_a_public_tree_behind_a_link_reach_a_release_with_their_windows(tree, tmp_path):
     tree = shutil.copytree(tree, tmp_path / "mine")
     shutil.move(tree / "Town01" / NAMES[0], tmp_path / "disk")

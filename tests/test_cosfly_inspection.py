@@ -504,28 +504,6 @@ def slimmer(image: np.ndarray) -> np.ndarray:
     return image
 
 
-@pytest.mark.parametrize("defect", TO_REVIEW)
-def test_a_planted_defect_puts_a_flight_before_a_person(workplace, defect):
-    broken = first_flight(workplace)
-    before = codes_of(inspect(workplace, NO_SUMS, "before"), broken)
-    TO_REVIEW[defect](broken)
-    with contextlib.suppress(NothingKept):
-        inspect(workplace, NO_SUMS)
-    found = read_inspection(workplace / "out" / "inspect.json")
-    code = defect.split()[0]
-    assert code not in before
-    assert codes_of(found, broken).get(code) == "warning", codes_of(found, broken)
-    first = next(i for f in found.flights for i in f.issues if i.code == code)
-    assert str(workplace) not in first.where
-    others = {
-        c
-        for f in found.flights
-        if not f.folder.endswith(f"{broken.parent.name}/ORI")
-        for c in codes_of(found, Path(f.folder))
-    }
-    assert code not in others
-
-
 def test_colours_hold_no_flight_back(workplace):
     """Night falls and rain sets in from frame to frame: depth, ids and poses are those of one world."""
     flight, rng = read_flight(first_flight(workplace)), np.random.default_rng(0)
@@ -565,6 +543,46 @@ def test_a_flight_that_its_tree_does_not_list(workplace):
     assert found.funnel.flights.accepted == 2
 
 
+def plant(specimen: Path, root: Path, defects: dict) -> None:
+    """Write a tree with a trajectory for each defect, in its clean track, after one without any; their plans; a map."""
+    pair = first_flight(specimen).parent
+    plan, plans = plan_of(pair / "ORI"), []
+    for number, defect in enumerate(["", *defects]):
+        trajectory = shutil.copytree(pair, root / f"tree/Town01/trajectory_{1_776_000_000 + number}")
+        for folder in trajectory.iterdir():
+            edit(folder, lambda t, name=str(number): t["source"].update(scenario_id=name))
+        plans.append(replace(plan, path_id=str(number)))
+        list_files(trajectory)
+        if defect:
+            defects[defect](trajectory / "ORI")
+    write_traces(root / "drone_trace.json", plans, {})
+    write_map(root)
+
+
+@pytest.mark.parametrize(
+    ("defects", "cfg", "severity"),
+    [(DEFECTS, CFG, "error"), (TO_REVIEW, NO_SUMS, "warning")],
+    ids=["DEFECTS", "REVIEW"],
+)
+def test_a_planted_defect_is_found_in_that_flight_alone(specimen, tmp_path, subtests, defects, cfg, severity):
+    plant(specimen, tmp_path, defects)
+    found = inspect(tmp_path, cfg)
+    flights = sorted(found.flights, key=lambda f: f.folder)
+    clean, *pairs = zip(flights[::2], flights[1::2], strict=True)
+    assert [flight.issues for flight in clean] == [[], []]
+    assert severity == "warning" or found.funnel.trajectories.rejected == len(defects)
+    for defect, (broken, twin) in zip(defects, pairs, strict=True):
+        with subtests.test(defect):
+            code = defect.split()[0]
+            issue = next(issue for issue in broken.issues if issue.code == code)
+            assert issue.severity == severity
+            assert str(tmp_path) not in issue.where  # a report can be handed on
+            if severity == "error":
+                assert FRAME in issue.where or "points[3]" in issue.where or code in ("layout", "checksum")
+                assert (broken.result, twin.result) == ("rejected", "accepted")
+            assert code not in {issue.code for issue in twin.issues}
+
+
 def test_every_check_has_a_planted_defect():
     """Codes are found in the sources; `elsewhere` names those whose defects are planted in tests of their own."""
     sources = "".join(path.read_text() for path in Path(frames.__file__).parent.glob("*.py"))
@@ -576,20 +594,6 @@ def test_every_check_has_a_planted_defect():
     planted = {name.split()[0] for name in (*DEFECTS, *TO_REVIEW)}
     assert not planted & elsewhere
     assert codes == planted | elsewhere
-
-
-@pytest.mark.parametrize("defect", DEFECTS)
-def test_a_planted_defect_rejects_that_flight_alone(workplace, defect):
-    broken = first_flight(workplace)
-    DEFECTS[defect](broken)
-    found = inspect(workplace)
-    code = defect.split()[0]
-    assert codes_of(found, broken).get(code) == "error", codes_of(found, broken)
-    assert [f.result for f in found.flights].count("accepted") == 3
-    assert found.funnel.flights.rejected == found.funnel.trajectories.rejected == 1
-    issue = next(i for f in found.flights for i in f.issues if i.code == code)
-    assert "frame_00003" in issue.where or "points[3]" in issue.where or code in ("layout", "checksum")
-    assert str(workplace) not in issue.where  # a report can be handed on
 
 
 def test_recorded_boxes_of_the_pixels_are_accepted(workplace):
@@ -678,16 +682,6 @@ def test_a_clean_flight_of_other_frames_leaves_the_perturbed_one_to_a_person(wor
     assert codes_of(inspect(workplace), first_flight(workplace, "aug_001")) == {"no_twin": "warning"}
 
 
-def test_what_a_person_must_decide_goes_to_review(workplace):
-    flight = first_flight(workplace)
-    shutil.copytree(flight / frame_name(0), flight / frame_name(99))
-    edit(first_flight(workplace, "aug_001"), lambda t: t["source"].update(scenario_id="another"))
-    found = inspect(workplace, CFG.model_copy(update={"check_checksums": False}))
-    assert codes_of(found, flight)["stray_frame"] == "warning"
-    assert codes_of(found, first_flight(workplace, "aug_001"))["no_trace"] == "warning"
-    assert [f.result for f in found.flights].count("review") == 2
-
-
 def test_the_funnel_counts_prefiltered_and_unrendered_plans(workplace):
     plans = [plan_of(f) for f in find_flights(workplace / "tree") if f.name == "ORI"]
     extra = [
@@ -757,14 +751,6 @@ def test_reports_sort_and_merge():
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
-
-
-def test_same_bytes_with_one_and_two_workers(workplace):
-    one, two = (workplace / number / "out" for number in ("one", "two"))  # the page's title is the folder's name
-    inspect(workplace, out="one/out")
-    inspect(workplace, out="two/out", workers=2)
-    for name in ("inspect.json", "report.html"):
-        assert (one / name).read_bytes() == (two / name).read_bytes()
 
 
 def test_the_page_stands_alone_and_shows_every_flight(workplace):

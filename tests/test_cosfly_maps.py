@@ -531,6 +531,7 @@ def delft() -> BoxMap:
     return load_map(MapsConfig(source="cityjson", cityjson=CityJsonConfig(name="Delft", path=path)))
 
 
+@pytest.mark.slow
 def test_delft_is_cut_up(delft: BoxMap):
     assert delft.header.num_objects == 570
     assert delft.header.dropped_objects == {}
@@ -546,6 +547,7 @@ def test_delft_is_cut_up(delft: BoxMap):
     np.testing.assert_allclose(sum(delft.bounds())[:2], 0, atol=25)
 
 
+@pytest.mark.slow
 def test_delft_stays_walkable(delft: BoxMap):
     walkable = cross_validate(delft, simplify(delft, SimplifyConfig()).box_map)
     assert walkable["simplified_largest_part_m2"] > 0.9 * walkable["simplified_walkable_m2"]

@@ -123,16 +123,6 @@ def test_a_narrow_beam_looks_less_and_costs_no_less():
 # --- flights ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("world", WORLDS)
-def test_flights_keep_the_nominal_distance_and_see(world):
-    scenario, obstacles = scenario_of(world)
-    made = track_astar.plan(scenario, obstacles, CFG, np.random.default_rng(0))
-    assert kernels.signed_distances(obstacles, made.positions_m)[0].min() >= 3.0 - 1e-6
-    seen = kernels.visibility(obstacles, made.positions_m, scenario.targets_m)
-    assert seen.mean() >= 0.95
-    assert made.solver["smooth"]
-
-
 def test_a_slit_needs_the_relaxed_distance():
     walls = [((0, side * 302.7, 60), (500, 300, 60)) for side in (-1, 1)]  # 5.4 m between them, 120 m high
     obstacles = kernels.obstacle_index(town_of(*walls))

@@ -47,6 +47,7 @@ def untidy(out: Path) -> None:
     write_bytes(out / f"{len(list(out.iterdir()))}.json", b"{}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("work", "words"),
     [(careless, "product.json: 8 bytes, not 16"), (impatient, "exit 1"), (untidy, "too much: 1.json"), (careful, None)],
@@ -73,9 +74,10 @@ def test_a_product_without_its_records_that_another_stage_would_take_is_found(tm
     "asked",
     [
         pytest.param(("maps", "caption actions"), id="at every step"),
-        pytest.param(("--few", "--twice", *OF_A_RUN), id="twice", marks=[pytest.mark.slow, pytest.mark.timeout(1800)]),
+        pytest.param(("--few", "--twice", *OF_A_RUN), id="twice", marks=pytest.mark.timeout(1800)),
     ],
 )
+@pytest.mark.slow
 def test_killed_commands_go_on(asked):
     done = subprocess.run([sys.executable, SWEEP, *asked], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

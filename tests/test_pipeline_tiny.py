@@ -470,6 +470,7 @@ def test_several_towns_are_runs_of_their_own_and_one_release(towns):
     assert stages == [*(f"one/{name}" for name in STAGES[:-1]), *(f"two/{name}" for name in STAGES[:-1]), "release"]
 
 
+@pytest.mark.slow
 def test_towns_differ_in_more_than_their_maps(towns):
     """The same walk ids in both; were their seed the same, so were their draws."""
     first = [read_walks(towns / town / "pedestrians/path.json")[0].positions_m for town in ("one", "two")]
@@ -478,6 +479,7 @@ def test_towns_differ_in_more_than_their_maps(towns):
     assert seeds[0] != seeds[1]
 
 
+@pytest.mark.slow
 def test_a_run_of_towns_goes_on_from_its_own_run_yaml(towns):
     before = {path: path.stat().st_mtime_ns for path in towns.rglob("manifest.json")}
     again = pipeline.run(load(RunConfig, towns / "run.yaml"), towns)
