@@ -66,6 +66,30 @@ def students(tmp_path_factory) -> Path:
     return make_place(tmp_path_factory.mktemp("students"))
 
 
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory) -> Path:
+    """A release of six flights in two towns, a split each, several shards; read by many tests."""
+    from specimens_release import TWO_SPLITS, make_release
+
+    return make_release(tmp_path_factory.mktemp("two_splits"), **TWO_SPLITS)
+
+
+@pytest.fixture(scope="session")
+def release_inputs(tmp_path_factory) -> Path:
+    """tree/, captions.jsonl and inspect.json of six flights, two of which are not accepted; read by many tests."""
+    from specimens_release import make_inputs
+
+    return make_inputs(tmp_path_factory.mktemp("inputs"))
+
+
+@pytest.fixture(scope="session")
+def built(release_inputs, tmp_path_factory) -> Path:
+    """What `release_inputs` become: a release of eight frames of each of four flights; read by many tests."""
+    from specimens_release import build
+
+    return build(release_inputs, tmp_path_factory.mktemp("built") / "release")
+
+
 @pytest.fixture(scope="module")
 def one_thread() -> Iterator[None]:
     """PyTorch in one thread: sums then do not depend on the machine, and a tiny model is faster so."""

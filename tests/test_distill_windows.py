@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_release_package import CFG, build, make_caption, make_inspection
+from specimens_release import CFG, build, make_caption, make_inspection
 
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import write_captions

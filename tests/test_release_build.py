@@ -18,8 +18,8 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 from specimens_foreign import write_foreign_tree
+from specimens_release import FREE, all_bytes, make_caption, make_inspection, rewrite_captions, source_of
 from tables import each
-from test_release_package import FREE, all_bytes, make_caption, make_inspection, rewrite_captions, source_of
 
 from caption.run import stage as caption_stage
 from caption.schema import CaptionConfig
@@ -30,7 +30,7 @@ from cosfly.products.captions import read_captions, write_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import depth_bytes, read_depth
 from cosfly.products.inspection import write_inspection
-from cosfly.products.playback import Flight, read_flight, write_flight
+from cosfly.products.playback import read_flight, write_flight
 from cosfly.reading.arrays import parse_picture
 from cosfly.reading.files import sha256_file
 from release.depth import encoded
@@ -45,23 +45,29 @@ POINTS = 14
 
 @pytest.fixture(scope="module")
 def material(tmp_path_factory) -> Path:
-    """tree/ of eight walks in four towns, each clean and perturbed, with captions and an inspection that accepts
-    all."""
-    root = tmp_path_factory.mktemp("material")
-    towns = ("Town01", "Town02", "Town02_Opt", "Town03")
-    tree = make_playback_tree(root / "tree", 8, POINTS, width_px=48, height_px=27, towns=towns)
-    captions = [
-        make_caption(flight, i) for flight in map(read_flight, find_flights(tree)) for i in range(4, POINTS - 1)
-    ]
-    write_captions(root / "captions.jsonl", captions)
+    """tree/ of eight walks in four towns, each clean and perturbed."""
+    return make_material(tmp_path_factory.mktemp("material"), 8, ("Town01", "Town02", "Town02_Opt", "Town03"))
+
+
+def make_material(root: Path, num_walks: int, towns: tuple[str, ...] = ("Town01",)) -> Path:
+    """Write a tree with a caption of every window and an inspection that accepts all."""
+    tree = make_playback_tree(root / "tree", num_walks, POINTS, width_px=48, height_px=27, towns=towns)
+    flights = map(read_flight, find_flights(tree))
+    write_captions(root / "captions.jsonl", [make_caption(f, i) for f in flights for i in range(4, POINTS - 1)])
     write_inspection(root / "inspect.json", make_inspection(tree, {}))
     return root
 
 
+@pytest.fixture(scope="module")
+def few(tmp_path_factory) -> Path:
+    """The material of two walks."""
+    return make_material(tmp_path_factory.mktemp("few"), 2)
+
+
 @pytest.fixture
-def copy(material, tmp_path) -> Path:
-    """A copy that may be changed."""
-    return shutil.copytree(material, tmp_path / "material")
+def copy(few, tmp_path) -> Path:
+    """A copy of it that may be changed."""
+    return shutil.copytree(few, tmp_path / "material")
 
 
 def split_cfg(**changes) -> ReleaseConfig:
@@ -120,17 +126,17 @@ def test_a_tiny_release_has_as_many_splits_as_walks(material, tmp_path):
         assert list(record_of(root, tmp_path / f"r{count}", split_cfg()).splits.splits) == names
 
 
-def test_neither_twin_goes_without_the_other_unless_asked(material, copy, tmp_path):
+def test_neither_twin_goes_without_the_other_unless_asked(copy, tmp_path):
     names = [folder.relative_to(copy / "tree").as_posix() for folder in find_flights(copy / "tree")]
     write_inspection(copy / "inspect.json", make_inspection(copy / "tree", {names[0]: ("rejected", "jerk")}))
     record = record_of(copy, tmp_path / "both")
     assert record.history.flights.left_out == {"its twin is not released": 1, "rejected: jerk": 1}
-    assert len(record.flights) == 14
+    assert len(record.flights) == 2
     alone = record_of(copy, tmp_path / "any", split_cfg(pairs="any"))
-    assert len(alone.flights) == 15
+    assert len(alone.flights) == 3
     assert [flight.pair for flight in alone.flights].count(None) == 1
     clean = record_of(copy, tmp_path / "clean", split_cfg(tracks=("clean",)))
-    assert len(clean.flights) == 7
+    assert len(clean.flights) == 1
     assert {flight.pair for flight in clean.flights} == {None}
 
 
@@ -177,8 +183,8 @@ def test_a_public_tree_without_an_inspection_is_released(tmp_path):
 # --- what a row and the record hold -----------------------------------------------------------------------------------
 
 
-def test_rows_hold_prompts_and_the_state_of_each_sentence(material, tmp_path):
-    run(split_cfg(), [source_of(material)], tmp_path / "r")
+def test_rows_hold_prompts_and_the_state_of_each_sentence(few, tmp_path):
+    run(split_cfg(), [source_of(few)], tmp_path / "r")
     names = ["has_caption", "frame_index", "system_en", "prompt_zh", "sentence_states_en", "sentence_states_zh"]
     counts = ["proved_sentences_en", "contradicted_sentences_en", "unread_sentences_en", "proved_sentences_zh"]
     for row in table_of(tmp_path / "r/dataset", names + counts):
@@ -192,7 +198,7 @@ def test_rows_hold_prompts_and_the_state_of_each_sentence(material, tmp_path):
         assert row["sentence_states_zh"] is None
 
 
-def test_the_record_says_where_it_comes_from_and_nothing_of_this_machine(material, copy, tmp_path):
+def test_the_record_says_where_it_comes_from_and_nothing_of_this_machine(copy, tmp_path):
     def local(lines):
         for line in lines:
             line["teacher"].update(model="/home/somebody/models/teacher-7", kind="endpoint")
@@ -203,8 +209,8 @@ def test_the_record_says_where_it_comes_from_and_nothing_of_this_machine(materia
     record = read_record(tmp_path / "r/dataset/release.json")
     origin = record.provenance
     assert [(one.kind, one.model) for one in origin.teachers] == [("endpoint", "teacher-7")]
-    assert origin.tokens == {"completion_tokens": 10 * 16 * 9, "prompt_tokens": 100 * 16 * 9}
-    assert origin.repairs.accepted == 16 * 9
+    assert origin.tokens == {"completion_tokens": 10 * 4 * 9, "prompt_tokens": 100 * 4 * 9}
+    assert origin.repairs.accepted == 4 * 9
     assert {"cosfly", "pyarrow"} <= origin.versions.keys()
     for data in all_bytes(tmp_path / "r/dataset").values():
         assert b"/home/somebody" not in data
@@ -404,19 +410,19 @@ def test_all_that_is_wrong_is_listed(copy, tmp_path):
     assert len((tmp_path / "r/failures.jsonl").read_text().splitlines()) == 3
 
 
-def test_captions_that_nothing_binds_to_the_tree_are_refused(material, tmp_path):
+def test_captions_that_nothing_binds_to_the_tree_are_refused(few, tmp_path):
     with pytest.raises(InputError, match=r"no record says of which tree.*release\.unbound=accept"):
-        run(split_cfg(unbound="refuse"), [source_of(material)], tmp_path / "r")
+        run(split_cfg(unbound="refuse"), [source_of(few)], tmp_path / "r")
 
 
-def test_a_folder_that_holds_something_else_is_left_alone(material, tmp_path):
+def test_a_folder_that_holds_something_else_is_left_alone(few, tmp_path):
     (tmp_path / "r/dataset").mkdir(parents=True)
     (tmp_path / "r/dataset/README.md").write_text("mine")
     with pytest.raises(ResumeError, match="not cosfly's"):
-        run(split_cfg(), [source_of(material)], tmp_path / "r")
-    record_of(material, tmp_path / "one")
+        run(split_cfg(), [source_of(few)], tmp_path / "r")
+    record_of(few, tmp_path / "one")
     with pytest.raises(ResumeError, match="other settings"):
-        record_of(material, tmp_path / "one", split_cfg(num_frames=6))
+        record_of(few, tmp_path / "one", split_cfg(num_frames=6))
     assert (tmp_path / "r/dataset/README.md").read_text() == "mine"
     assert (tmp_path / "one/dataset/release.json").is_file()
 
@@ -429,7 +435,8 @@ def test_splits_of_nothing_are_refused():
 # --- kills, and a second run ------------------------------------------------------------------------------------------
 
 
-def test_after_a_failed_flight_the_finished_shards_are_not_done_again(copy, tmp_path, monkeypatch):
+def test_after_a_failed_flight_the_finished_shards_are_not_done_again(tmp_path, monkeypatch):
+    copy = make_material(tmp_path / "material", 3)
     from release.package import config
     from release.package import stage as package
 
@@ -458,12 +465,14 @@ def test_after_a_failed_flight_the_finished_shards_are_not_done_again(copy, tmp_
 # --- its readers ------------------------------------------------------------------------------------------------------
 
 
-def test_two_releases_opened_one_after_another_give_each_its_own_rows(material, copy, tmp_path):
+def test_two_releases_opened_one_after_another_give_each_its_own_rows(tmp_path):
     """The library's cache goes by the name of the folder and the card's pattern: a digest in these tells releases
     apart."""
     datasets = pytest.importorskip("datasets")
+    material = make_material(tmp_path / "material", 3)
+    copy = shutil.copytree(material, tmp_path / "copy")
     flight = read_flight(first_flight(copy))
-    write_flight(first_flight(copy), shifted(flight))
+    write_flight(first_flight(copy), replace(flight, time_s=flight.time_s + 0.25))
     place, found = tmp_path / "dataset", []
     for root in (material, copy):
         shutil.rmtree(place, ignore_errors=True)
@@ -480,7 +489,3 @@ def test_two_releases_opened_one_after_another_give_each_its_own_rows(material, 
             assert [row["sample_id"] for row in seen] == parts[split]["sample_id"][:]
             assert np.asarray(seen[0]["image"]).shape == (27, 48, 3)
     assert found[0] != found[1]
-
-
-def shifted(flight: Flight) -> Flight:
-    return replace(flight, time_s=flight.time_s + 0.25)

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_release_export import TWO_SPLITS, make_release
-from test_release_package import CFG, build, make_caption, make_inspection
+from specimens_release import CFG, TWO_SPLITS, build, make_caption, make_inspection, make_release
 from typer.testing import CliRunner
 
 from cosfly.cli import app

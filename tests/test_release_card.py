@@ -16,7 +16,6 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from specimens_rows import make_row
-from test_release_package import build, make_inputs
 from typer.testing import CliRunner
 
 from cosfly.cli import app
@@ -132,14 +131,8 @@ def test_memory_does_not_grow_with_the_number_of_frames():
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("release")
-    return build(make_inputs(root / "inputs"), root / "release")
-
-
-@pytest.fixture(scope="module")
-def record(dataset):
-    return read_record(dataset / "release.json")
+def record(built):
+    return read_record(built / "release.json")
 
 
 def card_of(record, **change) -> str:
@@ -206,10 +199,10 @@ def test_limits_are_those_of_the_numbers(record):
     assert "rule teacher" not in bare
 
 
-def test_every_snippet_of_the_card_runs(record, dataset, tmp_path, monkeypatch):
+def test_every_snippet_of_the_card_runs(record, built, tmp_path, monkeypatch):
     datasets = pytest.importorskip("datasets")
     monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
-    values: dict = {"FOLDER": str(dataset)}
+    values: dict = {"FOLDER": str(built)}
     blocks = re.findall(r"```python\n(.*?)```", render_card(record), re.DOTALL)
     assert len(blocks) == 3
     for block in blocks:
@@ -224,10 +217,10 @@ def test_every_snippet_of_the_card_runs(record, dataset, tmp_path, monkeypatch):
     assert len(values["places"]) == min(10, values["poses"].num_rows)
 
 
-def test_the_command_renders_what_verify_expects(dataset, tmp_path):
-    shown = CliRunner().invoke(app, ["release", "card", str(dataset)])
+def test_the_command_renders_what_verify_expects(built, tmp_path):
+    shown = CliRunner().invoke(app, ["release", "card", str(built)])
     assert shown.exit_code == 0, shown.output
-    assert shown.output == (dataset / "README.md").read_text(encoding="utf-8")
-    written = CliRunner().invoke(app, ["release", "card", str(dataset.parent), "--out", str(tmp_path / "card.md")])
+    assert shown.output == (built / "README.md").read_text(encoding="utf-8")
+    written = CliRunner().invoke(app, ["release", "card", str(built.parent), "--out", str(tmp_path / "card.md")])
     assert written.exit_code == 0, written.output
-    assert (tmp_path / "card.md").read_bytes() == (dataset / "README.md").read_bytes()
+    assert (tmp_path / "card.md").read_bytes() == (built / "README.md").read_bytes()

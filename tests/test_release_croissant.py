@@ -7,22 +7,16 @@ import json
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-from test_release_export import TWO_SPLITS, make_release, rows_by_id
+from specimens_release import rows_by_id
 
 from cosfly.reading.arrays import parse_picture
 from release.card.croissant import CROISSANT, render_croissant
 from release.columns import schema
 from release.record import read_record
 from release.verify.verify import verify
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory) -> Path:
-    return make_release(tmp_path_factory.mktemp("croissant"), **TWO_SPLITS)
 
 
 def test_it_is_what_the_record_gives(dataset, tmp_path):

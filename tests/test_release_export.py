@@ -17,7 +17,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from public_reader import read_public
-from test_release_package import CFG, all_bytes, build, make_caption, make_inspection
+from specimens_release import (
+    CFG,
+    NUM_POINTS,
+    TOWNS,
+    TWO_SPLITS,
+    all_bytes,
+    build,
+    make_inspection,
+    make_release,
+    release_of,
+    rows_by_id,
+)
 from typer.testing import CliRunner
 
 from cosfly.cli import app
@@ -35,7 +46,7 @@ from cosfly.work.config import build as build_config
 from cosfly.work.store import CHECKSUMS, read_checksums
 from release.export.contract import FORMATS, ExportConfig, ExportUnit, Files, FormatFacts
 from release.export.lerobot import merged, moves, runs_of, summarize, tiff_of_depth
-from release.export.source import ReleasedRows, Span, depth_npy, open_release, read_span, rows_of_flight, scan
+from release.export.source import ReleasedRows, Span, depth_npy, open_release, rows_of_flight, scan
 from release.export.stage import read_export
 from release.export.stage import run as export
 from release.package import stage as package
@@ -43,31 +54,9 @@ from release.package.sources import Source
 from release.verify.verify import verify
 from specimens import make_playback_tree
 
-NUM_POINTS = 12
-TOWNS = ("Town01", "Town02")
-TWO_SPLITS = {"split_by": "town", "validation_fraction": 0.4, "test_fraction": 0.0}
-
 
 def config(format: str, **more) -> ExportConfig:
     return build_config(ExportConfig, {"format": format, "shard_mb": 1, **more}, "test")
-
-
-def make_release(root: Path, num_frames: int = 400, window: int = 5, **change) -> Path:
-    make_playback_tree(root / "tree", 3, NUM_POINTS, width_px=96, height_px=54, towns=TOWNS)
-    return release_of(root, window=window, num_frames=num_frames, **change)
-
-
-def release_of(root: Path, window: int = 5, **change) -> Path:
-    """Release `tree/` with captions of windows of so many frames."""
-    flights = [read_flight(folder) for folder in find_flights(root / "tree")]
-    captions = [
-        make_caption(flight, i, window=list(range(i - window + 1, i + 1)))
-        for flight in flights
-        for i in range(4, NUM_POINTS - 1)
-    ]
-    write_captions(root / "captions.jsonl", captions)
-    write_inspection(root / "inspect.json", make_inspection(root / "tree", {}))
-    return build(root, root / "release", CFG.model_copy(update={"num_frames": 400, **change}))
 
 
 @pytest.fixture(scope="module")
@@ -81,13 +70,6 @@ def whole(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def dataset(whole) -> Path:
     return whole / "release" / "dataset"
-
-
-def rows_by_id(dataset: Path) -> dict[str, dict]:
-    release = open_release(dataset)
-    return {
-        row["sample_id"]: row for flight in scan(release) for span in flight.spans for row in read_span(release, span)
-    }
 
 
 # --- the playback tree ------------------------------------------------------------------------------------------------

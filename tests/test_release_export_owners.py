@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from owners import LEROBOT, python_with
-from test_release_export import config, make_release, rows_by_id
+from specimens_release import make_release, rows_by_id
+from test_release_export import config
 
 from cosfly.reading.arrays import parse_picture
 from release.columns import POSE

@@ -19,9 +19,18 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 from release_tampering import errors_in, forge
+from specimens_release import (
+    CFG,
+    NUM_POINTS,
+    TOWNS,
+    TWO_SPLITS,
+    all_bytes,
+    build,
+    make_caption,
+    make_inspection,
+    rows_by_id,
+)
 from tables import each
-from test_release_export import NUM_POINTS, TOWNS, TWO_SPLITS, make_release, rows_by_id
-from test_release_package import CFG, all_bytes, build, make_caption, make_inspection
 from typer.testing import CliRunner
 
 from cosfly.cli import app
@@ -47,12 +56,6 @@ from specimens import make_playback_tree
 
 def choice(**wanted) -> Selection:
     return build_config(Selection, wanted, "test")
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory) -> Path:
-    """Six flights, two towns, a split each; small shards, so that there are several."""
-    return make_release(tmp_path_factory.mktemp("get"), **TWO_SPLITS)
 
 
 # --- a server ---------------------------------------------------------------------------------------------------------

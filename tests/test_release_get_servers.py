@@ -18,8 +18,7 @@ from pathlib import Path
 import pytest
 from owners import S3, python_with
 from specimens_foreign import hub_snapshot
-from test_release_export import TWO_SPLITS, make_release
-from test_release_package import all_bytes
+from specimens_release import all_bytes
 
 from cosfly.work.config import build
 from release.record import read_record
@@ -33,12 +32,6 @@ PART_WORDS = ["--town", "Town01", "--split", "train", "--modality", "rgb"]
 
 def choice(**wanted) -> Selection:
     return build(Selection, wanted, "test")
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory) -> Path:
-    """Six flights, two towns, a split each, several shards."""
-    return make_release(tmp_path_factory.mktemp("servers"), **TWO_SPLITS)
 
 
 @pytest.fixture(scope="module")

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import re
 import shutil
-from collections import Counter, defaultdict
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,24 +14,18 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from specimens_release import CFG, FREE, NUM_POINTS, all_bytes, build, make_inspection, source_of
 from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.errors import ConfigError, InputError, NothingKept
 from cosfly.products.boxes import MapHeader
-from cosfly.products.captions import PICTURES_MARK, Caption, Coc, Prompt, read_captions, write_captions
+from cosfly.products.captions import read_captions, write_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import read_depth, read_instance, read_rgb
 from cosfly.products.inspection import (
-    RESULTS,
-    FlightFunnel,
-    FlightInspection,
-    Funnel,
-    Inspection,
-    TrajectoryFunnel,
     write_inspection,
 )
-from cosfly.products.issues import Issue
 from cosfly.products.places import sample_id
 from cosfly.products.playback import read_flight
 from cosfly.products.review import Choice, add_decisions
@@ -48,108 +40,9 @@ from release.package.sources import Source
 from release.package.stage import run
 from release.record import read_record
 from release.verify.verify import verify
-from specimens import make_flight, make_playback_tree
-
-NUM_POINTS = 12
-FREE = {"licence": "cc-by-4.0", "unbound": "accept", "pairs": "any", "validation_fraction": 0, "test_fraction": 0}
-CFG = ReleaseConfig(num_frames=8, shard_mb=1, row_group_mb=1, credits="Map: a specimen.", **FREE)
+from specimens import make_flight
 
 PLACED = Placement("a walk", "train")
-REPAIR = {"strategy": "anchored", "asks": 1, "first_decision": "hover", "first_verdict": "HARD_CONFLICT"}
-
-
-def make_caption(flight, index: int, **change) -> Caption:
-    decision = ("track_straight", "ascend", "yaw_left_to_follow")[index % 3]
-    prompt = Prompt(system="s", user=f"u {PICTURES_MARK}")
-    values = {
-        "sample_id": sample_id(flight.flight_id, index),
-        "town": flight.town,
-        "trajectory": flight.trajectory,
-        "variant": flight.variant,
-        "frame_index": index,
-        "window": list(range(index - 4, index + 1)),
-        "future": [index + 1],
-        "prompt": {"en": prompt, "zh": prompt},
-        "prompt_hash": "0" * 64,
-        "picture_px": (96, 54),
-        "teacher": {"kind": "rules", "model": "rules-1", "settings": {"seed": 0}},
-        "usage": {"prompt_tokens": 0, "completion_tokens": 0},
-        "attempts": 1,
-        "en": Coc(
-            critical_components=f"A person walks {index} m ahead",
-            reasoning_trace="The person walks on, so fly on behind",
-            flight_decision=decision,
-        ),
-        "zh": Coc(
-            critical_components=f"前方 {index} 米处的行人",
-            reasoning_trace="行人继续直行, 因此跟随",
-            flight_decision=decision,
-        ),
-        "label_from": "flight" if flight.is_original else "twin",
-        "label": "track_straight",
-        "verdict": "CONSISTENT" if decision == "track_straight" else "SOFT_CONFLICT",
-        "repair": REPAIR if index % 4 == 0 else None,
-        "writing": "slots",
-        "checks": {"sentences": {"en": ["proved", "unread"]}} if index % 2 else {},
-        "status": "accepted",
-    }
-    return Caption(**{**values, **change})
-
-
-def make_inspection(tree: Path, rejected: dict[str, tuple[str, str]]) -> Inspection:
-    """An inspection of a specimen tree; `rejected` maps a folder name to (result, code)."""
-    flights = []
-    for folder in find_flights(tree):
-        name = folder.relative_to(tree).as_posix()
-        town, trajectory, variant = folder.parts[-3:]
-        result, code = rejected.get(name, ("accepted", ""))
-        issues = [Issue(severity="error", code=code, where="x", got="y", expected="z")] if code else []
-        place = {"town": town, "trajectory": trajectory, "variant": variant, "folder": name, "trace_id": trajectory}
-        flights.append(FlightInspection(**place, result=result, issues=issues, metrics={}))
-    results: dict[tuple[str, str], set[str]] = defaultdict(set)
-    for flight in flights:
-        results[flight.town, flight.trajectory].add(flight.result)
-    n, worst = len(results), Counter(max(found, key=RESULTS.index) for found in results.values())
-    parts = {result: worst[result] for result in RESULTS}
-    trajectories = TrajectoryFunnel(planned=n + 3, dropped={"smoothness": 2}, not_rendered=1, rendered=n, **parts)
-    counts = {r: sum(f.result == r for f in flights) for r in ("accepted", "review", "rejected")}
-    funnel = FlightFunnel(inspected=len(flights), without_trace=0, reasons={}, **counts)
-    return Inspection(settings={}, funnel=Funnel(trajectories=trajectories, flights=funnel), flights=flights)
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory) -> Path:
-    return make_inputs(tmp_path_factory.mktemp("inputs"))
-
-
-def make_inputs(root: Path) -> Path:
-    """Write tree/ of six flights (two not accepted), captions.jsonl, inspect.json."""
-    tree = make_playback_tree(
-        root / "tree", num_flights=3, num_points=NUM_POINTS, width_px=96, height_px=54, towns=("Town01", "Town02")
-    )
-    captions = []
-    for folder in find_flights(tree):
-        flight = read_flight(folder)
-        captions += [make_caption(flight, index) for index in range(4, NUM_POINTS - 1)]
-        captions.append(make_caption(flight, 11, status="dropped", drop_reason="hard_conflict", en=None, zh=None))
-    write_captions(root / "captions.jsonl", captions)
-    names = [folder.relative_to(tree).as_posix() for folder in find_flights(tree)]
-    gone = {names[1]: ("rejected", "missing_file"), names[4]: ("review", "stray_frame")}
-    write_inspection(root / "inspect.json", make_inspection(tree, gone))
-    return root
-
-
-def build(inputs: Path, out: Path, cfg: ReleaseConfig = CFG, **more) -> Path:
-    return run(cfg, [source_of(inputs)], out, **more)
-
-
-def source_of(inputs: Path, run: str = "one") -> Source:
-    return Source(run, inputs / "tree", inputs / "captions.jsonl", inputs / "inspect.json")
-
-
-@pytest.fixture(scope="module")
-def built(inputs, tmp_path_factory) -> Path:
-    return build(inputs, tmp_path_factory.mktemp("built") / "release")
 
 
 @pytest.fixture
@@ -171,18 +64,14 @@ def rows_of(folder: Path) -> list[dict]:
     return [row for shard in record.shards for row in pq.read_table(folder / shard.path).to_pylist()]
 
 
-def all_bytes(folder: Path) -> dict[str, bytes]:
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-
-
 # --- what is in it ----------------------------------------------------------------------------------------------------
 
 
-def test_load_dataset_gives_pictures_poses_and_both_languages(loaded, inputs):
+def test_load_dataset_gives_pictures_poses_and_both_languages(loaded, release_inputs):
     assert len(loaded) == 4 * 8
     assert set(loaded["town"]) == {"Town01", "Town02"}
     for row in (loaded[0], loaded[9], loaded[31]):
-        folder = inputs / "tree" / row["town"] / row["trajectory"] / row["variant"]
+        folder = release_inputs / "tree" / row["town"] / row["trajectory"] / row["variant"]
         flight, i = read_flight(folder), row["frame_index"]
         frame = flight.frame_folder(i)
         assert (np.asarray(row["image"]) == read_rgb(frame)).all()
@@ -271,8 +160,8 @@ def test_the_account_names_every_flight_and_caption(built):
     assert captions["frame_not_selected"] == 4
 
 
-def test_short_flights_are_kept_whole_and_recorded(inputs, tmp_path):
-    folder = build(inputs, tmp_path / "r", ReleaseConfig(num_frames=400, modalities=("rgb",), **FREE))
+def test_short_flights_are_kept_whole_and_recorded(release_inputs, tmp_path):
+    folder = build(release_inputs, tmp_path / "r", ReleaseConfig(num_frames=400, modalities=("rgb",), **FREE))
     record = read_json(folder / "release.json")
     assert [flight["frames"] for flight in record["flights"]] == [NUM_POINTS] * 4
     assert record["numbers"]["flights_shorter_than_num_frames"] == 4
@@ -280,8 +169,8 @@ def test_short_flights_are_kept_whole_and_recorded(inputs, tmp_path):
     assert verify(folder).is_ok
 
 
-def test_the_papers_stride_is_a_setting_and_leaves_no_window_whole(inputs, tmp_path):
-    folder = build(inputs, tmp_path / "r", CFG.model_copy(update={"uniform_stride": True, "num_frames": 6}))
+def test_the_papers_stride_is_a_setting_and_leaves_no_window_whole(release_inputs, tmp_path):
+    folder = build(release_inputs, tmp_path / "r", CFG.model_copy(update={"uniform_stride": True, "num_frames": 6}))
     assert verify(folder).is_ok
     record = read_record(folder / "release.json")
     flight = [row["frame_index"] for row in rows_of(folder)][:6]
@@ -291,9 +180,9 @@ def test_the_papers_stride_is_a_setting_and_leaves_no_window_whole(inputs, tmp_p
     assert record.history.captions.window_not_whole == 4 * 3
 
 
-def test_tracks_and_review_are_settings(inputs, tmp_path):
+def test_tracks_and_review_are_settings(release_inputs, tmp_path):
     cfg = CFG.model_copy(update={"tracks": ("clean",), "include_review": True, "modalities": ("depth",)})
-    record = read_json(build(inputs, tmp_path / "r", cfg) / "release.json")
+    record = read_json(build(release_inputs, tmp_path / "r", cfg) / "release.json")
     assert record["numbers"]["flights_by_track"] == {"clean": 3}
     assert sum(record["history"]["flights"]["left_out"].values()) == 3
 
@@ -315,15 +204,15 @@ def test_shards_hold_whole_row_groups_in_order(built):
 # --- whose it is ------------------------------------------------------------------------------------------------------
 
 
-def with_maps(inputs: Path, copy: Path, **licences: str) -> Path:
-    shutil.copytree(inputs, copy)
+def with_maps(release_inputs: Path, copy: Path, **licences: str) -> Path:
+    shutil.copytree(release_inputs, copy)
     for town, licence in licences.items():
         write_town_map(copy / "tree" / town, MapHeader(name=f"A {town}", licence=licence, credits="Made by M."))
     return copy
 
 
-def test_a_release_takes_the_licence_of_its_maps(inputs, tmp_path):
-    source = with_maps(inputs, tmp_path / "in", Town01="mit", Town02="mit")
+def test_a_release_takes_the_licence_of_its_maps(release_inputs, tmp_path):
+    source = with_maps(release_inputs, tmp_path / "in", Town01="mit", Town02="mit")
     folder = build(source, tmp_path / "r", CFG.model_copy(update={"licence": None}))
     record = read_json(folder / "release.json")
     card = (folder / "README.md").read_text(encoding="utf-8")
@@ -335,8 +224,8 @@ def test_a_release_takes_the_licence_of_its_maps(inputs, tmp_path):
     assert verify(folder).is_ok
 
 
-def test_another_licence_for_the_data_set_still_names_the_maps(inputs, tmp_path):
-    source = with_maps(inputs, tmp_path / "in", Town01="mit")
+def test_another_licence_for_the_data_set_still_names_the_maps(release_inputs, tmp_path):
+    source = with_maps(release_inputs, tmp_path / "in", Town01="mit")
     card = (build(source, tmp_path / "r") / "README.md").read_text(encoding="utf-8")
     assert "license: cc-by-4.0\n" in card
     assert "licence mit. Made by M." in card
@@ -348,18 +237,18 @@ def test_another_licence_for_the_data_set_still_names_the_maps(inputs, tmp_path)
     [({}, "Town01: unknown, Town02: unknown"), ({"Town01": "mit"}, "Town02: unknown"),
      ({"Town01": "mit", "Town02": "cc0-1.0"}, "Town01: mit, Town02: cc0-1.0")],
 )  # fmt: skip
-def test_a_release_without_a_licence_is_refused(inputs, tmp_path, licences, got):
-    source = with_maps(inputs, tmp_path / "in", **licences)
+def test_a_release_without_a_licence_is_refused(release_inputs, tmp_path, licences, got):
+    source = with_maps(release_inputs, tmp_path / "in", **licences)
     with pytest.raises(ConfigError, match=r"release\.licence") as caught:
         build(source, tmp_path / "r", CFG.model_copy(update={"licence": None}))
     assert got in str(caught.value)
     assert not (tmp_path / "r" / "dataset").exists()
 
 
-def test_a_tree_may_stand_deeper_and_a_town_twice_in_it(inputs, tmp_path):
+def test_a_tree_may_stand_deeper_and_a_town_twice_in_it(release_inputs, tmp_path):
     """Two maps of one town's name are two maps: the licence of neither is lost."""
     for name, licence in (("a", "mit"), ("b", "cc0-1.0")):
-        shutil.copytree(inputs / "tree", tmp_path / "in" / "tree" / name)
+        shutil.copytree(release_inputs / "tree", tmp_path / "in" / "tree" / name)
         for town in ("Town01", "Town02"):
             write_town_map(tmp_path / "in" / "tree" / name / town, MapHeader(licence=licence))
     (tmp_path / "in/captions.jsonl").write_text("")
@@ -376,9 +265,9 @@ def test_a_tree_may_stand_deeper_and_a_town_twice_in_it(inputs, tmp_path):
 # --- several runs -----------------------------------------------------------------------------------------------------
 
 
-def other_run(inputs: Path, target: Path, rename: dict[str, str]) -> Path:
+def other_run(release_inputs: Path, target: Path, rename: dict[str, str]) -> Path:
     """Give a run like another, its town folders renamed, and captions and inspection with them."""
-    shutil.copytree(inputs, target)
+    shutil.copytree(release_inputs, target)
     for old, new in rename.items():
         (target / "tree" / old).rename(target / "tree" / new)
     captions = [
@@ -393,9 +282,9 @@ def ids_of(folder: Path) -> list[str]:
     return pq.read_table(folder / "data", columns=["sample_id"]).column(0).to_pylist()
 
 
-def test_runs_of_other_towns_go_into_one_release_under_ids_of_their_own(inputs, built, tmp_path):
-    other = other_run(inputs, tmp_path / "in", {"Town01": "Town03", "Town02": "Town04"})
-    folder = run(CFG, [source_of(inputs), source_of(other, "two")], tmp_path / "r")
+def test_runs_of_other_towns_go_into_one_release_under_ids_of_their_own(release_inputs, built, tmp_path):
+    other = other_run(release_inputs, tmp_path / "in", {"Town01": "Town03", "Town02": "Town04"})
+    folder = run(CFG, [source_of(release_inputs), source_of(other, "two")], tmp_path / "r")
     assert verify(folder).is_ok
     ids, alone = ids_of(folder), ids_of(built)
     assert len(ids) == len(set(ids)) == 8 * (4 + 6)
@@ -416,9 +305,9 @@ def test_runs_of_other_towns_go_into_one_release_under_ids_of_their_own(inputs, 
     )
 
 
-def test_runs_of_the_same_town_are_told_apart_by_their_names(inputs, built, tmp_path):
-    other = other_run(inputs, tmp_path / "in", {})
-    folder = run(CFG, [source_of(inputs), source_of(other, "two")], tmp_path / "r")
+def test_runs_of_the_same_town_are_told_apart_by_their_names(release_inputs, built, tmp_path):
+    other = other_run(release_inputs, tmp_path / "in", {})
+    folder = run(CFG, [source_of(release_inputs), source_of(other, "two")], tmp_path / "r")
     assert verify(folder).is_ok
     ids = ids_of(folder)
     assert len(ids) == len(set(ids)) == 8 * (4 + 6)
@@ -426,16 +315,16 @@ def test_runs_of_the_same_town_are_told_apart_by_their_names(inputs, built, tmp_
     assert read_record(folder / "release.json").numbers.flights == 4 + 6
 
 
-def test_two_runs_of_one_name_are_refused(inputs, tmp_path):
-    other = other_run(inputs, tmp_path / "in", {"Town01": "Town03", "Town02": "Town04"})
+def test_two_runs_of_one_name_are_refused(release_inputs, tmp_path):
+    other = other_run(release_inputs, tmp_path / "in", {"Town01": "Town03", "Town02": "Town04"})
     with pytest.raises(InputError, match=r"two runs have one name.*different names"):
-        run(CFG, [source_of(inputs), source_of(other)], tmp_path / "r2")
+        run(CFG, [source_of(release_inputs), source_of(other)], tmp_path / "r2")
 
 
-def test_two_trees_in_one_folder_go_by_their_own_names(inputs, tmp_path):
-    other = other_run(inputs, tmp_path / "in", {"Town01": "Town03", "Town02": "Town04"})
+def test_two_trees_in_one_folder_go_by_their_own_names(release_inputs, tmp_path):
+    other = other_run(release_inputs, tmp_path / "in", {"Town01": "Town03", "Town02": "Town04"})
     (other / "tree").rename(other / "second")
-    trees = [source_of(inputs), replace(source_of(other), data=other / "second")]
+    trees = [source_of(release_inputs), replace(source_of(other), data=other / "second")]
     folder = run(CFG, trees, tmp_path / "r")
     assert verify(folder).is_ok
     assert {one.flight.partition("/")[0] for one in read_record(folder / "release.json").flights} == {
@@ -444,19 +333,19 @@ def test_two_trees_in_one_folder_go_by_their_own_names(inputs, tmp_path):
     }
 
 
-def test_one_run_keeps_the_ids_of_its_tree(inputs, built):
-    flights = [read_flight(folder) for folder in find_flights(inputs / "tree")]
+def test_one_run_keeps_the_ids_of_its_tree(release_inputs, built):
+    flights = [read_flight(folder) for folder in find_flights(release_inputs / "tree")]
     assert set(ids_of(built)) < {sample_id(flight.flight_id, i) for flight in flights for i in range(NUM_POINTS)}
 
 
-def test_runs_are_given_as_folders_or_file_by_file(inputs, tmp_path):
+def test_runs_are_given_as_folders_or_file_by_file(release_inputs, tmp_path):
     for name in ("a", "b"):
         place = tmp_path / "runs" / name
         (place / "caption").mkdir(parents=True)
         (place / "inspect").mkdir()
-        (place / "render").symlink_to(inputs / "tree")
-        shutil.copy(inputs / "captions.jsonl", place / "caption")
-        shutil.copy(inputs / "inspect.json", place / "inspect")
+        (place / "render").symlink_to(release_inputs / "tree")
+        shutil.copy(release_inputs / "captions.jsonl", place / "caption")
+        shutil.copy(release_inputs / "inspect.json", place / "inspect")
     a, b = (tmp_path / "runs" / name for name in ("a", "b"))
     assert [Source.of_run(place).run for place in (a, b)] == ["a", "b"]
     more = [
@@ -477,7 +366,7 @@ def test_runs_are_given_as_folders_or_file_by_file(inputs, tmp_path):
     assert {i.partition("_")[0] for i in ids_of(tmp_path / "out/dataset")} == {"a", "b"}
     assert CliRunner().invoke(app, ["release", "build", *files[:2], *more]).exit_code == 2
     assert CliRunner().invoke(app, ["release", "build", *files, *more, "--frames", "some"]).exit_code == 1
-    refused = CliRunner().invoke(app, ["release", "build", str(inputs), *more])
+    refused = CliRunner().invoke(app, ["release", "build", str(release_inputs), *more])
     assert isinstance(refused.exception, InputError)
     assert "not a run folder" in str(refused.exception)
 
@@ -501,40 +390,34 @@ def test_size_category(frames, name):
 # --- the stage --------------------------------------------------------------------------------------------------------
 
 
-def test_same_bytes_with_two_workers(inputs, built, tmp_path):
-    assert all_bytes(build(inputs, tmp_path / "two", workers=2)) == all_bytes(built)
+def test_same_bytes_with_two_workers(release_inputs, built, tmp_path):
+    assert all_bytes(build(release_inputs, tmp_path / "two", workers=2)) == all_bytes(built)
 
 
-def test_a_second_run_has_nothing_to_do(inputs, built):
+def test_a_second_run_has_nothing_to_do(release_inputs, built):
     before = {path: path.stat().st_mtime_ns for path in built.parent.rglob("*")}
-    assert build(inputs, built.parent) == built
+    assert build(release_inputs, built.parent) == built
     assert {path: path.stat().st_mtime_ns for path in built.parent.rglob("*")} == before
     assert not (built.parent / "parts").exists()
 
 
-def rewrite_captions(root: Path, change) -> None:
-    lines = [json.loads(line) for line in (root / "captions.jsonl").read_text(encoding="utf-8").splitlines()]
-    change(lines)
-    (root / "captions.jsonl").write_text("\n".join(json.dumps(line) for line in lines) + "\n", encoding="utf-8")
-
-
-def test_no_accepted_flight_is_one_clear_error(inputs, tmp_path):
-    names = [folder.relative_to(inputs / "tree").as_posix() for folder in find_flights(inputs / "tree")]
-    everything = make_inspection(inputs / "tree", dict.fromkeys(names, ("rejected", "jerk")))
+def test_no_accepted_flight_is_one_clear_error(release_inputs, tmp_path):
+    names = [folder.relative_to(release_inputs / "tree").as_posix() for folder in find_flights(release_inputs / "tree")]
+    everything = make_inspection(release_inputs / "tree", dict.fromkeys(names, ("rejected", "jerk")))
     write_inspection(tmp_path / "inspect.json", everything)
     with pytest.raises(NothingKept, match="release kept nothing") as caught:
-        run(CFG, [replace(source_of(inputs), inspect=tmp_path / "inspect.json")], tmp_path / "r")
+        run(CFG, [replace(source_of(release_inputs), inspect=tmp_path / "inspect.json")], tmp_path / "r")
     assert "jerk 6" in str(caught.value)
     assert caught.value.where == tmp_path
     assert str(tmp_path / "report.html") in str(caught.value)
 
 
-def test_flights_left_for_review_are_told_with_the_way_out(inputs, tmp_path):
-    names = [folder.relative_to(inputs / "tree").as_posix() for folder in find_flights(inputs / "tree")]
+def test_flights_left_for_review_are_told_with_the_way_out(release_inputs, tmp_path):
+    names = [folder.relative_to(release_inputs / "tree").as_posix() for folder in find_flights(release_inputs / "tree")]
     (tmp_path / "inspect").mkdir()
     product = tmp_path / "inspect/inspect.json"
-    write_inspection(product, make_inspection(inputs / "tree", dict.fromkeys(names, ("review", "z_fighting"))))
-    source = replace(source_of(inputs), inspect=product)
+    write_inspection(product, make_inspection(release_inputs / "tree", dict.fromkeys(names, ("review", "z_fighting"))))
+    source = replace(source_of(release_inputs), inspect=product)
     with pytest.raises(
         NothingKept,
         match=r"review: z_fighting 6.*--inspect \S+/inspect .*--accept FLIGHT --by NAME.*include_review=true",
@@ -599,25 +482,25 @@ def test_no_folder_is_a_finding_not_a_traceback(tmp_path):
     assert codes(tmp_path) == {"missing"}
 
 
-def test_every_flight_can_be_its_own_shard(inputs, tmp_path, monkeypatch):
+def test_every_flight_can_be_its_own_shard(release_inputs, tmp_path, monkeypatch):
     """Parts that fill a shard are linked; the rows and their order are those of the copied shards."""
     from release.package import config
 
     monkeypatch.setattr(config, "MB", 1000)  # so that the specimen's small flights pass shard_mb
-    folder = build(inputs, tmp_path / "r")
+    folder = build(release_inputs, tmp_path / "r")
     record = read_json(folder / "release.json")
     assert len(record["shards"]) == 4
     assert [flight["frames"] for flight in record["flights"]] == [entry["rows"] for entry in record["shards"]]
     assert verify(folder).is_ok
 
 
-def test_a_disk_without_links_gets_copies(inputs, built, tmp_path, monkeypatch):
+def test_a_disk_without_links_gets_copies(release_inputs, built, tmp_path, monkeypatch):
     from release.package import config
 
     def refuse(*args):
         raise OSError("no links here")
 
     monkeypatch.setattr(config, "MB", 1000)
-    linked = build(inputs, tmp_path / "linked")
+    linked = build(release_inputs, tmp_path / "linked")
     monkeypatch.setattr(os, "link", refuse)
-    assert all_bytes(build(inputs, tmp_path / "copied")) == all_bytes(linked)
+    assert all_bytes(build(release_inputs, tmp_path / "copied")) == all_bytes(linked)

@@ -6,6 +6,7 @@ import hashlib
 import http.server
 import json
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -13,7 +14,6 @@ from pathlib import Path
 
 import pytest
 from tables import each
-from test_release_export import TWO_SPLITS, make_release
 
 from cosfly.errors import ConfigError
 from release.transfer.push import check_name, pack
@@ -145,8 +145,9 @@ def command(folder: Path, home: Path, *more: str, address: str = "http://127.0.0
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory) -> Path:
-    return make_release(tmp_path_factory.mktemp("push"), **TWO_SPLITS)
+def dataset(dataset, tmp_path_factory) -> Path:
+    """A copy: some tests change it for a moment."""
+    return shutil.copytree(dataset, tmp_path_factory.mktemp("push") / "dataset")
 
 
 def contents(folder: Path) -> dict[str, bytes]:

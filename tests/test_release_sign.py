@@ -11,7 +11,6 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from test_release_export import TWO_SPLITS, make_release
 from typer.testing import CliRunner
 
 pytest.importorskip("cryptography")
@@ -53,14 +52,10 @@ def call(*command: str, cwd: Path) -> None:
     subprocess.run(command, cwd=cwd, check=True, capture_output=True)
 
 
-@pytest.fixture(scope="module")
-def unsigned(tmp_path_factory) -> Path:
-    return make_release(tmp_path_factory.mktemp("sign"), **TWO_SPLITS)
-
-
 @pytest.fixture
-def dataset(unsigned, tmp_path) -> Path:
-    return shutil.copytree(unsigned, tmp_path / "dataset")
+def dataset(dataset, tmp_path) -> Path:
+    """A copy that may be changed."""
+    return shutil.copytree(dataset, tmp_path / "dataset")
 
 
 def findings(dataset: Path, key: Path | None, level: str = "structure") -> set[str]:

@@ -8,14 +8,13 @@ import math
 import shutil
 import tracemalloc
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from specimens_release import build, make_inputs
 from specimens_rows import make_row
-from test_release_package import build, make_inputs
 from typer.testing import CliRunner
 
 from cosfly.cli import app
@@ -219,18 +218,12 @@ def test_nothing_is_kept_a_frame():
 # --- a whole release --------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("release")
-    return build(make_inputs(root / "inputs"), root / "release")
-
-
-def test_a_release_is_counted_again(dataset, tmp_path):
-    result = CliRunner().invoke(app, ["release", "stats", str(dataset.parent), "--out", str(tmp_path), "--pixels", "5"])
+def test_a_release_is_counted_again(built, tmp_path):
+    result = CliRunner().invoke(app, ["release", "stats", str(built.parent), "--out", str(tmp_path), "--pixels", "5"])
     assert result.exit_code == 0, result.output
     written = Stats.model_validate({k: v for k, v in read_json(tmp_path / "stats.json").items() if k != "coverage"})
     tables = {table.key: {row[0]: row[1:] for row in table.rows} for table in written.tables}
-    numbers, record = read_json(dataset / "release.json")["numbers"], read_record(dataset / "release.json")
+    numbers, record = read_json(built / "release.json")["numbers"], read_record(built / "release.json")
     assert len(tables) == len(written.tables)
     assert tables["release"]["frames"] == [numbers["frames"]]
     assert tables["release"]["trajectories"] == [numbers["trajectories"]]
@@ -289,11 +282,11 @@ def test_five_ray_visibility_is_what_the_inspection_measured(tmp_path):
     for k, flight in enumerate(inspected.flights):
         values[flight.folder] = flight.metrics["five_ray_mean"] = 0.3 + 0.1 * k
     write_inspection(inputs / "inspect.json", inspected)
-    dataset = build(inputs, tmp_path / "release")
-    record = read_record(dataset / "release.json")
+    built = build(inputs, tmp_path / "release")
+    record = read_record(built / "release.json")
     for flight in record.flights:
         assert flight.five_ray_mean == values[flight.flight.partition("/")[2]]
-    written = read_json(run(dataset, tmp_path / "stats", pixels=0).with_name("stats.json"))
+    written = read_json(run(built, tmp_path / "stats", pixels=0).with_name("stats.json"))
     rows = {row[0]: row[1:] for table in written["tables"] if table["key"] == "dist_stats" for row in table["rows"]}
     clean = [flight.five_ray_mean for flight in record.flights if flight.flight.endswith("ORI")]
     assert rows["five-ray visibility, as inspected"][0] == pytest.approx(np.mean(clean), abs=1e-4)
@@ -312,8 +305,8 @@ def test_weather_is_counted_where_frames_name_it():
     assert grid["clear"] == [0, 0, 0, 0]
 
 
-def test_damage_is_one_error(dataset, tmp_path):
-    broken = shutil.copytree(dataset, tmp_path / "dataset")
+def test_damage_is_one_error(built, tmp_path):
+    broken = shutil.copytree(built, tmp_path / "dataset")
     shard = next((broken / "data").glob("*.parquet"))
     shard.write_bytes(shard.read_bytes()[:-40])
     with pytest.raises(InputError):

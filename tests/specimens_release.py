@@ -1,0 +1,135 @@
+"""Small releases of the specimen tree, and what they are made of; those of conftest.py are read by many tests."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter, defaultdict
+from pathlib import Path
+
+from specimens_distill import make_caption as caption_of_frame
+
+from cosfly.products.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
+from cosfly.products.flights import find_flights
+from cosfly.products.inspection import (
+    RESULTS,
+    FlightFunnel,
+    FlightInspection,
+    Funnel,
+    Inspection,
+    TrajectoryFunnel,
+    write_inspection,
+)  # fmt: skip
+from cosfly.products.issues import Issue
+from cosfly.products.playback import read_flight
+from release.export.source import open_release, read_span, scan
+from release.package.config import ReleaseConfig
+from release.package.sources import Source
+from release.package.stage import run
+from specimens import make_playback_tree
+
+NUM_POINTS = 12
+TOWNS = ("Town01", "Town02")
+TWO_SPLITS = {"split_by": "town", "validation_fraction": 0.4, "test_fraction": 0.0}
+FREE = {"licence": "cc-by-4.0", "unbound": "accept", "pairs": "any", "validation_fraction": 0, "test_fraction": 0}
+CFG = ReleaseConfig(num_frames=8, shard_mb=1, row_group_mb=1, credits="Map: a specimen.", **FREE)
+REPAIR = {"strategy": "anchored", "asks": 1, "first_decision": "hover", "first_verdict": "HARD_CONFLICT"}
+
+
+def make_caption(flight, index: int, **change) -> Caption:
+    """Give a caption in slots of one frame; every fourth was repaired, of every second sentences were read."""
+    decision = ("track_straight", "ascend", "yaw_left_to_follow")[index % 3]
+    prompt = Prompt(system="s", user=f"u {PICTURES_MARK}")
+    english = f"A person walks {index} m ahead", "The person walks on, so fly on behind"
+    chinese = f"前方 {index} 米处的行人", "行人继续直行, 因此跟随"
+    texts = [
+        Coc(critical_components=first, reasoning_trace=last, flight_decision=decision)
+        for first, last in (english, chinese)
+    ]
+    own = {
+        "future": [index + 1], "prompt": {"en": prompt, "zh": prompt}, "picture_px": (96, 54), "en": texts[0],
+        "zh": texts[1], "teacher": {"kind": "rules", "model": "rules-1", "settings": {"seed": 0}},
+        "label_from": "flight" if flight.is_original else "twin", "label": "track_straight",
+        "verdict": "CONSISTENT" if decision == "track_straight" else "SOFT_CONFLICT",
+        "repair": REPAIR if index % 4 == 0 else None, "writing": "slots",
+        "checks": {"sentences": {"en": ["proved", "unread"]}} if index % 2 else {},
+    }  # fmt: skip
+    own["sample_id"] = f"{flight.flight_id}_frame_{index:05d}"
+    return caption_of_frame(flight.town, flight.trajectory, flight.variant, index, **{**own, **change})
+
+
+def make_inspection(tree: Path, rejected: dict[str, tuple[str, str]]) -> Inspection:
+    """An inspection of a specimen tree; `rejected` maps a folder name to (result, code)."""
+    flights = []
+    for folder in find_flights(tree):
+        name = folder.relative_to(tree).as_posix()
+        town, trajectory, variant = folder.parts[-3:]
+        result, code = rejected.get(name, ("accepted", ""))
+        issues = [Issue(severity="error", code=code, where="x", got="y", expected="z")] if code else []
+        place = {"town": town, "trajectory": trajectory, "variant": variant, "folder": name, "trace_id": trajectory}
+        flights.append(FlightInspection(**place, result=result, issues=issues, metrics={}))
+    results: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for flight in flights:
+        results[flight.town, flight.trajectory].add(flight.result)
+    n, worst = len(results), Counter(max(found, key=RESULTS.index) for found in results.values())
+    parts = {result: worst[result] for result in RESULTS}
+    trajectories = TrajectoryFunnel(planned=n + 3, dropped={"smoothness": 2}, not_rendered=1, rendered=n, **parts)
+    counts = {r: sum(f.result == r for f in flights) for r in ("accepted", "review", "rejected")}
+    funnel = FlightFunnel(inspected=len(flights), without_trace=0, reasons={}, **counts)
+    return Inspection(settings={}, funnel=Funnel(trajectories=trajectories, flights=funnel), flights=flights)
+
+
+def make_inputs(root: Path) -> Path:
+    """Write tree/ of six flights (two not accepted), captions.jsonl, inspect.json."""
+    tree = make_playback_tree(root / "tree", 3, NUM_POINTS, width_px=96, height_px=54, towns=TOWNS)
+    captions = []
+    for flight in map(read_flight, find_flights(tree)):
+        captions += [make_caption(flight, index) for index in range(4, NUM_POINTS - 1)]
+        captions.append(make_caption(flight, 11, status="dropped", drop_reason="hard_conflict", en=None, zh=None))
+    write_captions(root / "captions.jsonl", captions)
+    names = [folder.relative_to(tree).as_posix() for folder in find_flights(tree)]
+    gone = {names[1]: ("rejected", "missing_file"), names[4]: ("review", "stray_frame")}
+    write_inspection(root / "inspect.json", make_inspection(tree, gone))
+    return root
+
+
+def source_of(inputs: Path, run: str = "one") -> Source:
+    return Source(run, inputs / "tree", inputs / "captions.jsonl", inputs / "inspect.json")
+
+
+def build(inputs: Path, out: Path, cfg: ReleaseConfig = CFG, **more) -> Path:
+    return run(cfg, [source_of(inputs)], out, **more)
+
+
+def make_release(root: Path, num_frames: int = 400, window: int = 5, **change) -> Path:
+    """Release a tree of three trajectories in two towns with captions of windows of so many frames."""
+    make_playback_tree(root / "tree", 3, NUM_POINTS, width_px=96, height_px=54, towns=TOWNS)
+    return release_of(root, window=window, num_frames=num_frames, **change)
+
+
+def release_of(root: Path, window: int = 5, **change) -> Path:
+    """Release `tree/` with a caption of every window and an inspection that accepts all."""
+    captions = [
+        make_caption(flight, i, window=list(range(i - window + 1, i + 1)))
+        for flight in map(read_flight, find_flights(root / "tree"))
+        for i in range(4, len(flight) - 1)
+    ]
+    write_captions(root / "captions.jsonl", captions)
+    write_inspection(root / "inspect.json", make_inspection(root / "tree", {}))
+    return build(root, root / "release", CFG.model_copy(update={"num_frames": 400, **change}))
+
+
+def rewrite_captions(root: Path, change) -> None:
+    lines = [json.loads(line) for line in (root / "captions.jsonl").read_text(encoding="utf-8").splitlines()]
+    change(lines)
+    (root / "captions.jsonl").write_text("\n".join(json.dumps(line) for line in lines) + "\n", encoding="utf-8")
+
+
+def rows_by_id(dataset: Path) -> dict[str, dict]:
+    release = open_release(dataset)
+    return {
+        row["sample_id"]: row for flight in scan(release) for span in flight.spans for row in read_span(release, span)
+    }
+
+
+def all_bytes(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
