@@ -67,6 +67,14 @@ def students(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def tree(tmp_path_factory) -> Path:
+    """A tree of one flight of fourteen frames, which are five windows; read by many tests."""
+    from specimens import make_playback_tree
+
+    return make_playback_tree(tmp_path_factory.mktemp("five"), 1, 14, with_augmented=False)
+
+
+@pytest.fixture(scope="session")
 def dataset(tmp_path_factory) -> Path:
     """A release of six flights in two towns, a split each, several shards; read by many tests."""
     from specimens_release import TWO_SPLITS, make_release

@@ -212,10 +212,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
         lambda place, out: copy_stage(place, out, "inspect"),
         f"inspect review --inspect {{out}} --reject {FLIGHTS} --by somebody --reason 'too near'",
     ],
-    "inspect review, page": [
-        lambda place, out: copy_stage(place, out, "inspect"),
-        "inspect review --inspect {out}",
-    ],
+    "inspect review, page": [lambda place, out: copy_stage(place, out, "inspect"), "inspect review --inspect {out}"],
     "pedestrians, repaired": [
         lambda place, out: copy_stage(place, out, "pedestrians", damaged="items.jsonl"),
         "pedestrians --map {simple} --out {out} {tiny} --set pedestrians.ground=paved --repair",
@@ -227,9 +224,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
         "caption --data {tree} --out {out} {tiny}",
     ],
     "caption, served": ["caption --data {tree} --out {out} {asked}"],
-    "caption, judged": [
-        "caption --data {tree} --out {out} {asked} --judge {judge} --set caption.judge.concurrency=1",
-    ],
+    "caption, judged": ["caption --data {tree} --out {out} {asked} --judge {judge} --set caption.judge.concurrency=1"],
     "caption prompts": ["caption prompts --export {out}/prompts"],
     "caption actions": ["caption actions --export {out}/actions.yaml"],
     "compare-strategies": [
@@ -270,7 +265,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "run, more": ["run quickstart --out {out} {tiny}", "run {out} --set pedestrians.num_paths=2"],
     "run, towns": ["run quickstart --out {out} {tiny} {towns}"],
     "run, towns, release": ["run quickstart --out {out} {tiny} {towns}", lose_release, "run {out}"],
-}
+}  # fmt: skip
 
 
 def words_of(text: str, place: Place, out: Path) -> list[str]:

@@ -182,12 +182,9 @@ def turns(claim: dict, rng: random.Random) -> dict:
 
 
 FAULTS: dict[str, Fault | None] = {
-    "perfect": None,
-    "loses 20 % of claims": loses,
-    "misreads 10 % of numbers": misreads,
-    "misquotes 10 %": misquotes,
+    "perfect": None, "loses 20 % of claims": loses, "misreads 10 % of numbers": misreads, "misquotes 10 %": misquotes,
     "swaps 5 % of sides and trends": turns,
-}
+}  # fmt: skip
 
 
 def answers_of(readings: dict[str, list[dict]], fault: Fault | None, *, alike: bool = False) -> Callable[[dict], str]:

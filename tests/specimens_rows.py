@@ -5,12 +5,8 @@ from __future__ import annotations
 from release.columns import CAPTION_FIELDS, COUNTED, POINT, POSE, SCALAR_NAMES
 
 WORDS = {
-    "decision": "hover",
-    "label": "ascend",
-    "label_from": "flight",
-    "verdict": "SOFT_CONFLICT",
-    "teacher_kind": "rules",
-}
+    "decision": "hover", "label": "ascend", "label_from": "flight", "verdict": "SOFT_CONFLICT", "teacher_kind": "rules",
+}  # fmt: skip
 
 
 def make_row(i: int, variant: str = "ORI", trajectory: str = "trajectory_1", **change) -> dict:

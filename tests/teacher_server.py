@@ -274,12 +274,8 @@ def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:
             choice["finish_reason"] = "length" if fault in ("cut", "no_room") else "stop"
             usage = {"prompt_tokens": 1000, "completion_tokens": body["max_tokens"] if fault == "cut" else 100}
             reply = {
-                "id": "x",
-                "object": "chat.completion",
-                "model": body["model"],
-                "choices": [choice],
-                "usage": usage,
-            }
+                "id": "x", "object": "chat.completion", "model": body["model"], "choices": [choice], "usage": usage,
+            }  # fmt: skip
             data = json.dumps(reply, ensure_ascii=False).encode()
             if fault == "truncated_body":
                 self._send_bytes(200, data[: len(data) // 2])

@@ -16,11 +16,11 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
-from teacher_server import TeacherServer, is_mirror, kept_answers
+from specimens_captions import deciding, report_of, settings
+from teacher_server import is_mirror, kept_answers
 
 from caption.run.progress import Display
 from caption.run.stage import run
-from caption.schema import CaptionConfig
 from cosfly.chat import answers
 from cosfly.chat.answers import Answer, AnswerBook, journal_name
 from cosfly.chat.budget import Budget, BudgetConfig, BudgetSpent
@@ -30,18 +30,6 @@ from cosfly.products.captions import Usage, read_captions
 from cosfly.work.journal import Journal
 from specimens import make_playback_tree
 
-ENDPOINT = {"max_tries": 2, "backoff_s": 0.01, "max_backoff_s": 0.02, "timeout_s": 5.0, "concurrency": 4}
-
-
-def settings(url: str, **changes) -> CaptionConfig:
-    endpoint = {**ENDPOINT, **changes.pop("endpoint", {})}
-    base = {"teacher": url, "endpoint": endpoint, "repair": {"hard_conflict": "keep"}, "image": {"max_side_px": 32}}
-    return CaptionConfig.model_validate(base | changes)
-
-
-def hovering(fault=None, **options) -> TeacherServer:
-    return TeacherServer(fault, decision=lambda body: "hover", **options)
-
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory) -> Path:
@@ -50,7 +38,7 @@ def tree(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(tree, tmp_path_factory) -> bytes:
-    with hovering() as server:
+    with deciding() as server:
         return run(settings(server.url), tree, tmp_path_factory.mktemp("whole") / "out").read_bytes()
 
 
@@ -70,7 +58,7 @@ def keys_by_flight(out: Path) -> dict[str, list[str]]:
 
 def test_a_larger_limit_goes_on_where_a_smaller_one_stopped(tree, tmp_path, whole):
     out = tmp_path / "out"
-    with hovering() as server:
+    with deciding() as server:
         for limit, num_windows in ((3, 3), (3, 3), (15, 15), (None, 22)):
             path = run(settings(server.url, limit=limit), tree, out)
             assert len(list(read_captions(path))) == num_windows
@@ -89,7 +77,7 @@ def test_a_budget_stops_the_run_before_it_is_passed_and_a_larger_one_goes_on(tre
     out = tmp_path / "out"
     # One at a time: until an answer tells what a request takes, each one in flight counts as the longest prompt.
     few = {"concurrency": 1}
-    with hovering() as server:  # each answer: 1,000 tokens in, 100 out
+    with deciding() as server:  # each answer: 1,000 tokens in, 100 out
         with pytest.raises(TeacherError, match=r"stopped before the budget was passed.*raise --max-cost"):
             run(settings(server.url, budget=budget, endpoint=few), tree, out)
         answered = len(keys_of(out))
@@ -168,12 +156,13 @@ def test_the_quarantine_is_replayed_alone(tree, tmp_path, whole):
             bad.add(body["seed"])
         return "500" if state["on"] and body["seed"] in bad else None
 
-    with hovering(fault) as server:
+    with deciding(fault=fault) as server:
         with pytest.raises(TeacherError, match=r"3 of 22 windows got no answer.*http_500 3.*--retry-failed"):
             run(settings(server.url), tree, out)
         held = [json.loads(line) for line in (out / "quarantine.jsonl").read_text().splitlines()]
-        assert {record["code"] for record in held} == {"http_500"}
-        assert len(held) == 3
+        assert [record["code"] for record in held] == ["http_500"] * 3
+        assert report_of(out)["windows"]["failed"] == {"no_answer": 3}
+        assert {json.loads(line)["code"] for line in (out / "failures.jsonl").read_text().splitlines()} == {"http_500"}
         state["on"] = False
         asked = len(server.bodies)
         path = run(settings(server.url), tree, out, retry_failed=True)
@@ -190,7 +179,7 @@ def test_retry_failed_leaves_alone_what_was_never_asked(tree, tmp_path, whole):
     def fault(number, body):
         return "500" if state["on"] and number >= 12 else None
 
-    with hovering(fault) as server:
+    with deciding(fault=fault) as server:
         endpoint = {"stop_after_failures": 2, "concurrency": 1}
         with pytest.raises(TeacherError, match="in a row"):
             run(settings(server.url, endpoint=endpoint), tree, out)
@@ -207,13 +196,9 @@ def test_retry_failed_leaves_alone_what_was_never_asked(tree, tmp_path, whole):
 
 def test_the_total_timeout_bounds_all_tries(tree, tmp_path):
     endpoint = {
-        "max_tries": 50,
-        "backoff_s": 0.3,
-        "max_backoff_s": 0.3,
-        "total_timeout_s": 0.5,
-        "stop_after_failures": 1,
-    }
-    with hovering(lambda number, body: "500") as server:
+        "max_tries": 50, "backoff_s": 0.3, "max_backoff_s": 0.3, "total_timeout_s": 0.5, "stop_after_failures": 1,
+    }  # fmt: skip
+    with deciding(fault=lambda number, body: "500") as server:
         start_s = time.monotonic()
         with pytest.raises(TeacherError, match="total_timeout"):
             run(settings(server.url, endpoint=endpoint, limit=1), tree, tmp_path / "out")
@@ -238,7 +223,7 @@ def test_a_body_is_the_json_that_it_stands_for():
 
 def test_image_ids_are_sent_when_asked_for_and_change_no_answer_key(tree, tmp_path):
     out = tmp_path / "out"
-    with hovering() as server:
+    with deciding() as server:
         run(settings(server.url, limit=2), tree, out)
         assert b'"uuid"' not in b"".join(server.bodies)
         keys = keys_of(out)
@@ -260,7 +245,7 @@ def test_image_ids_are_sent_when_asked_for_and_change_no_answer_key(tree, tmp_pa
 def test_log_lines_stand_in_for_the_display(tree, tmp_path, caplog, monkeypatch):
     monkeypatch.setattr("caption.run.progress.SECONDS_BETWEEN_LINES", 0.0)
     caplog.set_level(logging.INFO, "caption.run.progress")
-    with hovering() as server:
+    with deciding() as server:
         run(settings(server.url, budget={"price_prompt": 10.0}), tree, tmp_path / "out")
     last = [record.message for record in caplog.records if record.name == "caption.run.progress"][-1]
     assert "22 of 22 windows; accepted 22 (repaired 0), dropped 0, no answer 0" in last
@@ -418,7 +403,7 @@ def test_a_disk_that_fills_up_costs_nothing_that_was_written(tree, tmp_path, who
     """The limit on a file's size stands for the disk: the system cuts the line that passes it short, as a full disk
     does."""
     out = tmp_path / "out"
-    with hovering() as server:
+    with deciding() as server:
         config = settings(server.url)
         filled = subprocess.run(
             [sys.executable, "-c", LIMITED, "9000", str(tree), str(out), config.model_dump_json()],

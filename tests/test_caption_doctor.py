@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from specimens_captions import deciding, report_of, settings
 from teacher_server import ENGLISH, TeacherServer, is_mirror, written_answer
 from typer.testing import CliRunner
 
@@ -21,7 +22,6 @@ from caption.truth.facts import measure_facts
 from caption.writing.contract import WAYS
 from cosfly.cli import app
 from cosfly.errors import NothingKept
-from specimens import make_playback_tree
 
 TOKENS_PER_IMAGE, CONTEXT = 220, 8192
 
@@ -261,48 +261,36 @@ def test_estimate_is_students_interval():
     assert estimate([4.0, 4.0]).low == estimate([4.0, 4.0]).high == 4.0
 
 
-@pytest.fixture(scope="module")
-def tree(tmp_path_factory):
-    return make_playback_tree(tmp_path_factory.mktemp("tree"), 2, 20, with_augmented=False)
-
-
-def settings(url: str, **changes) -> CaptionConfig:
-    endpoint = {"backoff_s": 0.01, "concurrency": 4, **changes.pop("endpoint", {})}
-    base = {"teacher": url, "endpoint": endpoint, "repair": {"hard_conflict": "keep"}, "image": {"max_side_px": 32}}
-    return CaptionConfig.model_validate(base | changes)
-
-
 def test_the_plan_is_what_the_run_then_takes(tree, tmp_path):
     budget = {"price_prompt": 2.0, "price_completion": 10.0}
-    with TeacherServer(decision=lambda body: "hover", delay_s=0.2) as server:
+    with deciding(delay_s=0.1) as server:
         cfg = settings(server.url, budget=budget)
         forecast = make_forecast(cfg, tree, tmp_path / "out")
         num_trial_requests = len(server.bodies)
         run(cfg, tree, tmp_path / "out")
         asked = len(server.bodies) - 2  # two requests measured the pictures' tokens
-    report = json.loads((tmp_path / "out" / "caption_report.json").read_text())
-    assert forecast.num_windows == report["windows"]["input"] == 22
-    assert forecast.calls.expected == asked == 44
-    assert forecast.prompt_tokens.expected == report["tokens"]["prompt_tokens"] == 44_000
-    assert forecast.completion_tokens.low == report["tokens"]["completion_tokens"] == 4_400
-    assert forecast.cost.expected == pytest.approx((44_000 * 2.0 + 4_400 * 10.0) / 1e6)
+    report = report_of(tmp_path / "out")
+    assert forecast.num_windows == report["windows"]["input"] == 5
+    assert forecast.calls.expected == asked == 10
+    assert forecast.prompt_tokens.expected == report["tokens"]["prompt_tokens"] == 10_000
+    assert forecast.completion_tokens.low == report["tokens"]["completion_tokens"] == 1_000
+    assert forecast.cost.expected == pytest.approx((10_000 * 2.0 + 1_000 * 10.0) / 1e6)
     assert num_trial_requests == 2 * forecast.num_trials + 2  # and the run did not ask about these windows again
     assert 0 < forecast.seconds.low <= forecast.seconds.expected <= forecast.seconds.high
-    assert ("cost", "0.13 (0.13 to 0.13)") in forecast.rows()
+    assert ("cost", "0.03 (0.03 to 0.03)") in forecast.rows()
 
 
 def test_the_plan_knows_the_images_share(tree, tmp_path):
     with TeacherServer(respond=patient(max_images=99)) as server:
-        forecast = make_forecast(settings(server.url, repair={"hard_conflict": "keep"}), tree, tmp_path / "out")
+        forecast = make_forecast(settings(server.url), tree, tmp_path / "out")
     assert forecast.image_tokens is not None
     asks = forecast.image_tokens.expected / (15 * TOKENS_PER_IMAGE * forecast.num_windows)
     assert asks == round(asks)  # whole asks of 15 pictures
 
 
 @pytest.mark.parametrize("writing", ["slots", "claims", "prose"])
-def test_the_largest_prompt_bounds_real_ones_with_their_corrections(tmp_path, writing):
-    tree = make_playback_tree(tmp_path / "tree", 1, 14, with_augmented=False)
-    with TeacherServer(lambda number, body: "wrong_therefore", decision=lambda body: "ascend") as server:
+def test_the_largest_prompt_bounds_real_ones_with_their_corrections(tree, tmp_path, writing):
+    with deciding("ascend", lambda number, body: "wrong_therefore") as server:
         cfg = CaptionConfig.model_validate({"teacher": server.url, "writing": writing, "limit": 2})
         with pytest.raises(NothingKept):
             run(cfg, tree, tmp_path / "out")

@@ -10,11 +10,13 @@ import asyncio
 import json
 import logging
 import re
+import shutil
 import threading
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from specimens_captions import QUICK, deciding, report_of, settings
 from teacher_server import MODEL, TeacherServer, is_mirror, refusal
 from typer.testing import CliRunner
 
@@ -26,13 +28,12 @@ from caption.teachers.teacher import AskingTeacher, first_budget
 from cosfly.chat import client
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.client import ChatClient, EndpointConfig
-from cosfly.chat.contract import NoAnswer, Reply, Request, started
+from cosfly.chat.contract import NoAnswer, Reply, started
 from cosfly.cli import app
 from cosfly.errors import ResumeError, TeacherError
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
 
-ENDPOINT = {"max_tries": 3, "backoff_s": 0.01, "max_backoff_s": 0.02, "timeout_s": 5.0, "concurrency": 4}
 NUM_WINDOWS = 10
 TOO_LONG = "This model's maximum context length is 8192 tokens. However, you requested 8203 tokens."
 IMAGES = "At most 5 image(s) may be provided in one prompt."
@@ -40,14 +41,8 @@ FILTERED = "The response was filtered due to the prompt triggering Azure OpenAI'
 NOT_KNOWN = "Something about this request is not as it should be."
 
 
-def settings(url: str, **changes) -> CaptionConfig:
-    endpoint = {**ENDPOINT, **changes.pop("endpoint", {})}
-    base = {"teacher": url, "endpoint": endpoint, "repair": {"hard_conflict": "keep"}, "image": {"max_side_px": 32}}
-    return CaptionConfig.model_validate(base | changes)
-
-
 def hovering(respond=None, **options) -> TeacherServer:
-    return TeacherServer(options.pop("fault", None), decision=lambda body: "hover", respond=respond, **options)
+    return deciding(respond=respond, **options)
 
 
 @pytest.fixture(scope="module")
@@ -69,10 +64,6 @@ def whole(tree, tmp_path_factory) -> Whole:
         path = run(settings(server.url), tree, tmp_path_factory.mktemp("whole") / "out")
     bodies = [json.loads(body) for body in server.bodies]
     return Whole(path.read_bytes(), sorted(body["seed"] for body in bodies if not is_mirror(body)))
-
-
-def report_of(out: Path) -> dict:
-    return json.loads((out / "caption_report.json").read_text(encoding="utf-8"))
 
 
 def quarantine(out: Path) -> dict[str, dict]:
@@ -330,38 +321,33 @@ def test_an_answer_that_the_server_had_no_room_for_is_named_and_not_asked_for_th
     assert path.read_bytes() == whole.product
 
 
-def ask(url: str, **changes) -> Reply | NoAnswer:
-    cfg = EndpointConfig(**{**ENDPOINT, "max_tries": 2, **changes})
-    request = cfg.request(
-        [{"role": "user", "content": [{"type": "text", "text": "t"}]}], ["digest"], {"type": "object"}, 0
-    )
-    return asyncio.run(asked(ChatClient(url, cfg), request))
+def ask(url: str, num_times: int = 1, **changes) -> Reply | NoAnswer:
+    """Ask the same, one after the other; gives what the last comes to."""
+    cfg = EndpointConfig(**{**QUICK, **changes})
+    messages = [{"role": "user", "content": [{"type": "text", "text": "t"}]}]
+    request, one = cfg.request(messages, ["digest"], {"type": "object"}, 0), ChatClient(url, cfg)
 
+    async def asked() -> Reply | NoAnswer:
+        async with started(one):
+            for _ in range(num_times):
+                try:
+                    found: Reply | NoAnswer = await one.answer(request)
+                except NoAnswer as error:
+                    found = error
+            return found
 
-async def asked(one: ChatClient, *requests: Request) -> Reply | NoAnswer:
-    """Give what the last of some requests, one after the other, comes to."""
-    async with started(one):
-        for request in requests:
-            try:
-                found: Reply | NoAnswer = await one.answer(request)
-            except NoAnswer as error:
-                found = error
-        return found
+    return asyncio.run(asked())
 
 
 def test_a_500_after_a_prompt_that_was_too_long_names_vllms_issue():
     """Its issue 43941: any prompt with the same pictures is answered 500 from then on."""
     replies = iter([refusal(400, TOO_LONG)])
     with hovering(lambda body: next(replies, refusal(500, "Internal Server Error"))) as server:
-        cfg = EndpointConfig(**{**ENDPOINT, "max_tries": 2})
-        messages = [{"role": "user", "content": [{"type": "text", "text": "t"}]}]
-        request = cfg.request(messages, ["digest"], {"type": "object"}, 0)
-        found = asyncio.run(asked(ChatClient(server.url, cfg), request, request))
+        found, plain = ask(server.url, 2), ask(server.url)
         assert isinstance(found, NoAnswer)
+        assert isinstance(plain, NoAnswer)
         assert found.cause == "http_500"
         assert "43941" in found.detail
-        plain = asyncio.run(asked(ChatClient(server.url, cfg), request))
-        assert isinstance(plain, NoAnswer)
         assert "43941" not in plain.detail
 
 
@@ -393,11 +379,11 @@ def test_an_outage_is_shown_with_the_servers_last_word(tree, tmp_path, caplog, m
     ]
 
 
-# --- the ramp ---------------------------------------------------------------------------------------------------------
+# --- again ------------------------------------------------------------------------------------------------------------
 
 
-def test_retry_failed_leaves_a_folder_complete_in_which_a_flight_cannot_be_read(tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 2, 14, with_augmented=False)
+def test_retry_failed_leaves_a_folder_complete_in_which_a_flight_cannot_be_read(tree, tmp_path):
+    tree = shutil.copytree(tree, tmp_path / "tree")
     broken = sorted(tree.rglob("trajectory.json"))[-1]
     broken.write_text("{")
     out = tmp_path / "out"

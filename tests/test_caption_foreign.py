@@ -287,14 +287,8 @@ def test_from_a_students_answers_to_a_release(tree, rules, tmp_path):
         cfg = infer.InferConfig(split="train", engine="endpoint")
         infer.run(cfg, taught, [tree], server.url, tmp_path / "infer")
     words = [
-        "caption",
-        "--teacher",
-        f"student:{tmp_path / 'infer'}",
-        "--data",
-        str(tree),
-        "--out",
-        str(tmp_path / "out"),
-    ]
+        "caption", "--teacher", f"student:{tmp_path / 'infer'}", "--data", str(tree), "--out", str(tmp_path / "out"),
+    ]  # fmt: skip
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0, result.output
     inspected = inspection.run(InspectConfig(), None, None, tree, tmp_path / "inspect")

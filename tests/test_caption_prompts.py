@@ -151,12 +151,9 @@ def test_training_sets_and_students_follow(tree, mine, tmp_path):
     write_taught(tmp_path, taught_by(samples, 600))
     with TeacherServer(decision=lambda body: "hover") as server:
         asked = {
-            "teacher": server.url,
-            "repair": {"hard_conflict": "keep"},
-            "student": {"folder": tmp_path},
-            "endpoint": {"max_tries": 1},
-            "limit": 1,
-        }
+            "teacher": server.url, "repair": {"hard_conflict": "keep"}, "student": {"folder": tmp_path},
+            "endpoint": {"max_tries": 1}, "limit": 1,
+        }  # fmt: skip
         with pytest.raises(ConfigError, match=r"another version of the prompt.*caption\.prompts"):
             run(CaptionConfig.model_validate(asked), tree, tmp_path / "no")
         run(CaptionConfig.model_validate(asked | {"prompts": mine}), tree, tmp_path / "yes")

@@ -7,11 +7,12 @@ import asyncio
 import json
 import re
 from contextlib import nullcontext
-from functools import cache
+from functools import cache, partial
 
 import pytest
 from measure_prose import answers_of, loses, misquotes, misreads, perfect_readings, turns
-from teacher_server import TeacherServer, is_mirror
+from specimens_captions import saying
+from teacher_server import is_mirror
 from typer.testing import CliRunner
 
 from caption.run.forecast import make_forecast
@@ -34,7 +35,6 @@ from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight
 from release.columns import caption_values
 from release.verify.rows import shown_caption
-from specimens import make_playback_tree
 
 
 @cache
@@ -104,6 +104,15 @@ def test_a_claim_must_quote_words_that_hold_its_number():
     assert read_reading("I cannot.", "stop", coc, "en") is None
 
 
+def texts_at(altitude: str, decision: str) -> dict[str, dict[str, str]]:
+    """An answer in both languages that gives an altitude, and nothing else that can be measured."""
+    texts = {
+        "en": (f"We fly at {altitude} m over the road.", "There is nothing to say against this manoeuvre here."),
+        "zh": (f"我们以 {altitude} m 的高度在道路上空飞行。", "此处没有任何理由反对这一机动动作。"),
+    }
+    return {name: dict(zip(TEXTS, own, strict=True)) | {"flight_decision": decision} for name, own in texts.items()}
+
+
 def reading_of(body: dict) -> str:
     """Read a made-up text of one sentence each: the altitude that it gives."""
     lines = re.findall(r"^(\w\d): (.*)$", body["messages"][1]["content"], re.MULTILINE)
@@ -116,31 +125,16 @@ def reading_of(body: dict) -> str:
     return json.dumps({"claims": claims})
 
 
-def test_a_run_reads_prose_of_others_and_keeps_the_claims(tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 1, 14, with_augmented=False)
+def test_a_run_reads_prose_of_others_and_keeps_the_claims(tree, tmp_path):
     rules = list(read_captions(run(CaptionConfig(), tree, tmp_path / "rules")))
     altitudes = [float(re.search(r"Altitude[^\[]*\[(.*?)\]", c.prompt["en"].user)[1].split(",")[-1]) for c in rules]
-    lines = [
-        {
-            "sample_id": caption.sample_id,
-            "en": {
-                "critical_components": f"We fly at {altitude + 5 * (number % 2):.1f} m over the road.",
-                "reasoning_trace": "There is nothing to say against this manoeuvre here.",
-                "flight_decision": caption.label or "hover",
-            },
-            "zh": {
-                "critical_components": f"我们以 {altitude + 5 * (number % 2):.1f} m 的高度在道路上空飞行。",
-                "reasoning_trace": "此处没有任何理由反对这一机动动作。",
-                "flight_decision": caption.label or "hover",
-            },
-        }
-        for number, (caption, altitude) in enumerate(zip(rules, altitudes, strict=True))
-    ]
+    lines = []
+    for number, (caption, altitude) in enumerate(zip(rules, altitudes, strict=True)):
+        texts = texts_at(f"{altitude + 5 * (number % 2):.1f}", caption.label or "hover")
+        lines.append({"sample_id": caption.sample_id, **texts})
     path = tmp_path / "theirs.jsonl"
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    server = TeacherServer()
-    server.text = reading_of
-    with server:
+    with saying(reading_of) as server:
         cfg = CaptionConfig.model_validate({"teacher": f"file:{path}", "reader": {"urls": [server.url]}})
         plan = make_forecast(cfg, tree, tmp_path / "out")
         assert plan.calls.expected == 4 * plan.num_windows  # two readings in each language, and no teacher
@@ -168,8 +162,7 @@ def test_a_run_reads_prose_of_others_and_keeps_the_claims(tmp_path):
     assert lie_of_claim >= len(found) // 2  # what was proved no longer is
 
 
-def test_a_contradicted_caption_is_asked_again_with_the_fact_and_then_dropped(tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 1, 14, with_augmented=False)
+def test_a_contradicted_caption_is_asked_again_with_the_fact_and_then_dropped(tree, tmp_path):
 
     def text(body: dict, mends: bool) -> str:
         words = json.dumps(body["messages"], ensure_ascii=False)
@@ -178,18 +171,13 @@ def test_a_contradicted_caption_is_asked_again_with_the_fact_and_then_dropped(tm
         if is_mirror(body):
             english = json.loads(body["messages"][-1]["content"])
             altitude = re.search(r"[\d.]+", english["critical_components"])[0]
-            texts = f"我们以 {altitude} m 的高度在道路上空飞行。", "此处没有任何理由反对这一机动动作。"
-            return json.dumps({**dict(zip(TEXTS, texts, strict=True)), "flight_decision": english["flight_decision"]})
+            return json.dumps(texts_at(altitude, english["flight_decision"])["zh"])
         fact = re.search(r"It contradicts the facts.*altitude: [^m]*?([\d.]+) m", words) if mends else None
-        altitude = fact[1] if fact else "99.0"
-        texts = f"We fly at {altitude} m over the road.", "There is nothing to say against this manoeuvre here."
-        answer = dict(zip(TEXTS, texts, strict=True))
-        return json.dumps(answer | {"therefore": "track_straight", "flight_decision": "track_straight"})
+        answer = texts_at(fact[1] if fact else "99.0", "track_straight")["en"]
+        return json.dumps(answer | {"therefore": "track_straight"})
 
     for mends in (True, False):
-        server = TeacherServer()
-        server.text = lambda body, mends=mends: text(body, mends)
-        with server, nullcontext() if mends else pytest.raises(NothingKept):
+        with saying(partial(text, mends=mends)) as server, nullcontext() if mends else pytest.raises(NothingKept):
             cfg = {"teacher": server.url, "writing": "prose", "reader": {"urls": [server.url]},
                    "repair": {"hard_conflict": "keep"}, "window": {"require_images": False}}  # fmt: skip
             run(CaptionConfig.model_validate(cfg), tree, tmp_path / str(mends))
@@ -200,9 +188,7 @@ def test_a_contradicted_caption_is_asked_again_with_the_fact_and_then_dropped(tm
 
 
 def test_the_command_measures_an_endpoint():
-    server = TeacherServer()
-    server.text = lambda body: "I cannot."
-    with server:
+    with saying(lambda body: "I cannot.") as server:
         result = CliRunner().invoke(app, ["caption", "reader-check", server.url, "--limit", "2"])
     assert result.exit_code == 0, result.output
     assert "flagged" in result.output
@@ -212,11 +198,11 @@ def test_the_command_measures_an_endpoint():
 def test_the_doctor_tells_a_reader_from_a_model_that_reads_nothing():
     answer = answers_of(perfect_readings([caption for caption in read_gold() if caption.claims][:READ_CAPTIONS]), None)
     for reads, state in ((True, "ok"), (False, "unusable")):
-        server = TeacherServer()
-        server.text = lambda body, reads=reads: (
-            answer(body) if reads and body["messages"][0]["role"] == "system" else "ready"
-        )
-        with server:
+
+        def text(body, reads=reads):
+            return answer(body) if reads and body["messages"][0]["role"] == "system" else "ready"
+
+        with saying(text) as server:
             findings = {f.name: f for f in examine_endpoint(server.url, CaptionConfig(), as_reader=True)}
         assert findings["reads prose"].state == state, findings
         assert "image input" not in findings

@@ -6,35 +6,20 @@ import dataclasses
 from pathlib import Path
 
 import pytest
+from specimens_captions import GAP
 from tables import each
 
 from caption.run.windows import cut_windows
 from caption.schema import WindowConfig
 from caption.truth.claims import judge_claim
-from caption.truth.facts import Facts, measure_facts
+from caption.truth.facts import measure_facts
 from caption.truth.holding import word_holds
 from caption.truth.references import Fact, look_up, parse_reference
 from cosfly.products.captions import Claim, Coc
 from cosfly.products.sentences import sentences_of
 from specimens import make_flight
 
-FACTS = Facts(
-    speed_mps=(None, 2.0, 2.5, 3.0, 4.0),
-    altitude_m=(20.0, 20.0, 20.5, 21.0, 22.0),
-    yaw_deg=(0.0, 1.0, 3.0, 6.0, 10.0),
-    pitch_deg=(-40.0, -40.2, -40.1, -40.0, -40.3),
-    distance_m=(20.0, 20.5, 21.0, None, 18.0),
-    slant_m=(28.0, 28.5, 29.0, None, 28.0),
-    target_speed_mps=1.6,
-    target_turn_deg=-30.0,
-    box_width_px=(30, 30, 31, None, 36),
-    box_height_px=(60, 61, 62, None, 72),
-    offset_x_px=(0, 10, -40, None, -64),
-    offset_y_px=(0, 0, 5, None, 20),
-    visibility=("visible", "visible", "partly_occluded", "occluded", "visible"),
-    width_px=640,
-    height_px=360,
-)
+FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, 6.0, 10.0))
 
 
 @each(
@@ -83,17 +68,10 @@ def test_the_fact_at_an_address(address, fact):
 @each(
     "address",
     [
-        "",
-        "colour",
-        "distance@now",
-        "distance@t0-t4",
-        "trend:visibility",
-        "side:distance",
-        "sum:distance",
-        "change:",
+        "", "colour", "distance@now", "distance@t0-t4", "trend:visibility", "side:distance", "sum:distance", "change:",
         "x" * 9,
     ],
-)
+)  # fmt: skip
 def test_what_names_nothing(address):
     assert parse_reference(address) is None
 

@@ -19,52 +19,29 @@ from pathlib import Path
 from typing import BinaryIO
 
 import pytest
-from teacher_server import MODEL, Sent, TeacherServer, Wild, is_mirror, kept_answers, obedient_answer
+from specimens_captions import deciding
+from specimens_captions import settings as quick
+from teacher_server import MODEL, Sent, Wild, is_mirror, kept_answers, obedient_answer
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from cosfly.chat.client import KEY_VARIABLE
 from cosfly.chat.wire import retry_after_s
 from cosfly.errors import NothingKept, TeacherError
-from specimens import make_playback_tree
 
 TRIES = 2
-# Slow servers are slow for ever: the limit is what a good answer never takes here, however busy the machine is.
-ENDPOINT = {
-    "max_tries": TRIES,
-    "backoff_s": 0.01,
-    "max_backoff_s": 0.02,
-    "timeout_s": 20.0,
-    "concurrency": 1,
-    "max_reply_mb": 0.5,
-}
 
 
 def settings(url: str, **changes) -> CaptionConfig:
-    endpoint = {**ENDPOINT, **changes.pop("endpoint", {})}
-    base = {
-        "teacher": url,
-        "endpoint": endpoint,
-        "repair": {"hard_conflict": "keep"},
-        "image": {"max_side_px": 32},
-        "limit": 1,
-    }
-    return CaptionConfig.model_validate(base | changes)
-
-
-@pytest.fixture(scope="module")
-def tree(tmp_path_factory) -> Path:
-    return make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 10, with_augmented=False)
+    # Slow servers are slow for ever: the limit is what a good answer never takes here, however busy the machine is.
+    endpoint = {"timeout_s": 20.0, "concurrency": 1, "max_reply_mb": 0.5} | changes.pop("endpoint", {})
+    return quick(url, endpoint=endpoint, **{"limit": 1, **changes})
 
 
 @pytest.fixture(scope="module")
 def whole(tree, tmp_path_factory) -> bytes:
-    with good_server() as server:
+    with deciding() as server:
         return run(settings(server.url), tree, tmp_path_factory.mktemp("whole") / "out").read_bytes()
-
-
-def good_server(**options) -> TeacherServer:
-    return TeacherServer(decision=lambda body: "hover", **options)
 
 
 # --- what servers send ------------------------------------------------------------------------------------------------
@@ -84,7 +61,7 @@ def answer(body: dict, **changes) -> dict:
     } | changes
 
 
-_OBEDIENT = good_server()
+_OBEDIENT = deciding()
 
 
 def message(**fields) -> Callable[[dict], Sent]:
@@ -93,26 +70,13 @@ def message(**fields) -> Callable[[dict], Sent]:
     def sent(body: dict) -> Sent:
         value = answer(body)
         value["choices"][0]["message"] |= fields
-        return as_json(value)
-
-    return sent
-
-
-def choice(**fields) -> Callable[[dict], Sent]:
-    def sent(body: dict) -> Sent:
-        value = answer(body)
-        value["choices"][0] |= fields
-        return as_json(value)
+        return Sent(200, json.dumps(value).encode())
 
     return sent
 
 
 def top(**fields) -> Callable[[dict], Sent]:
-    return lambda body: as_json(answer(body, **fields))
-
-
-def as_json(value: object) -> Sent:
-    return Sent(200, json.dumps(value).encode())
+    return lambda body: Sent(200, json.dumps(answer(body, **fields)).encode())
 
 
 def page(status: int, text: str, **headers: str) -> Callable[[dict], Sent]:
@@ -257,13 +221,11 @@ FAULTS: dict[str, tuple] = {
 def test_what_becomes_of_a_run_at_a_server_like_this(tree, tmp_path, caplog, whole, name):
     respond, outcome, *patience = FAULTS[name]
     out = tmp_path / "out"
-    with good_server(respond=respond) as server:
+    with deciding(respond=respond) as server:
         if type(outcome) is Outcome:
             assert run(settings(server.url), tree, out).exists()
             assert outcome.words in caplog.text
-            assert without_tokens(out / "captions.jsonl") == [
-                line | {"usage": 0} for line in map(json.loads, whole.splitlines())
-            ]
+            assert without_tokens((out / "captions.jsonl").read_bytes()) == without_tokens(whole)
         else:
             error_kind = NothingKept if isinstance(outcome, Dropped) else TeacherError
             with pytest.raises(error_kind) as caught:
@@ -282,12 +244,12 @@ def test_what_becomes_of_a_run_at_a_server_like_this(tree, tmp_path, caplog, who
             assert len(server.bodies) == asked
         else:
             path = run(settings(server.url), tree, out)
-            assert without_tokens(path) == [line | {"usage": 0} for line in map(json.loads, whole.splitlines())]
+            assert without_tokens(path.read_bytes()) == without_tokens(whole)
             assert len(server.bodies) == asked + (0 if type(outcome) is Outcome else 2)
 
 
-def without_tokens(path: Path) -> list[dict]:
-    return [json.loads(line) | {"usage": 0} for line in path.read_text(encoding="utf-8").splitlines()]
+def without_tokens(product: bytes) -> list[dict]:
+    return [json.loads(line) | {"usage": 0} for line in product.splitlines()]
 
 
 def windows_of(out: Path) -> Counter[str]:
@@ -341,7 +303,7 @@ def test_what_becomes_of_a_run_at_a_list_of_models_like_this(tree, tmp_path, mon
     monkeypatch.setenv(KEY_VARIABLE, "sk-very-secret")
     respond, words = LISTS[name]
     out = tmp_path / "out"
-    with good_server(list_models=lambda: respond({})) as server:
+    with deciding(list_models=lambda: respond({})) as server:
         if words is not None:
             impatient = {"timeout_s": 0.3} if "0.3 s" in words else {}
             with pytest.raises(TeacherError) as caught:
@@ -361,7 +323,7 @@ def test_what_becomes_of_a_run_at_a_list_of_models_like_this(tree, tmp_path, mon
 
 def test_of_a_bomb_no_more_is_unpacked_than_the_limit(tree, tmp_path):
     bomb = gzip.compress(bytes(200_000_000))
-    with good_server(respond=lambda body: Sent(200, bomb, {"Content-Encoding": "gzip"})) as server:
+    with deciding(respond=lambda body: Sent(200, bomb, {"Content-Encoding": "gzip"})) as server:
         tracemalloc.start()
         with pytest.raises(TeacherError, match="max_reply_mb"):
             run(settings(server.url), tree, tmp_path / "out")
@@ -372,10 +334,10 @@ def test_of_a_bomb_no_more_is_unpacked_than_the_limit(tree, tmp_path):
 
 def test_the_key_does_not_follow_a_redirect(tree, tmp_path, monkeypatch):
     monkeypatch.setenv(KEY_VARIABLE, "sk-very-secret")
-    with good_server() as elsewhere:
+    with deciding() as elsewhere:
         for status in (301, 302, 303, 307, 308):
             sent = Sent(status, b"", {"Location": f"{elsewhere.url}/chat/completions"})
-            with good_server(respond=lambda body, sent=sent: sent) as server, pytest.raises(TeacherError):
+            with deciding(respond=lambda body, sent=sent: sent) as server, pytest.raises(TeacherError):
                 run(settings(server.url), tree, tmp_path / str(status))
             assert len(server.bodies) == 1
         assert not elsewhere.bodies
@@ -384,7 +346,7 @@ def test_the_key_does_not_follow_a_redirect(tree, tmp_path, monkeypatch):
 def test_a_key_that_no_header_can_hold_is_not_shown(tree, tmp_path, monkeypatch):
     for key in ("sk-very-secret\n", "sk-very-sécret", "sk-very-\x1bsecret"):
         monkeypatch.setenv(KEY_VARIABLE, key)
-        with good_server() as server, pytest.raises(TeacherError, match="the key holds what no header can") as caught:
+        with deciding() as server, pytest.raises(TeacherError, match="the key holds what no header can") as caught:
             run(settings(server.url), tree, tmp_path / "out")
         assert "very" not in str(caught.value)
 
@@ -393,7 +355,7 @@ def test_a_key_that_no_header_can_hold_is_not_shown(tree, tmp_path, monkeypatch)
 def test_a_proxy_that_cannot_be_used_is_one_line(tree, tmp_path, monkeypatch, proxy):
     monkeypatch.setenv("HTTP_PROXY", proxy)
     with (
-        good_server() as server,
+        deciding() as server,
         pytest.raises(TeacherError, match=r"PROXY: the proxy cannot be used|cannot reach") as caught,
     ):
         run(settings(server.url), tree, tmp_path / "out")
@@ -410,25 +372,23 @@ def test_a_proxy_that_cannot_be_used_is_one_line(tree, tmp_path, monkeypatch, pr
     ],
     ids=["negative", "zero", "huge", "one"],
 )
-def test_a_budget_holds_where_the_servers_count_cannot_be(tmp_path, usage):
+def test_a_budget_holds_where_the_servers_count_cannot_be(tree, tmp_path, usage):
     """By our own count, which the journal marks; and running it again does not spend the budget twice."""
-    most, tree = 15_000, make_playback_tree(tmp_path / "tree", 1, 14, with_augmented=False)
-    with good_server(respond=top(usage=usage)) as server:
+    most = 15_000
+    with deciding(respond=top(usage=usage)) as server:
         cfg = settings(server.url, limit=None, budget={"max_tokens": most})
         for _ in range(2):
             with pytest.raises(TeacherError, match="stopped before the budget was passed"):
                 run(cfg, tree, tmp_path / "out")
         kept = kept_answers(tmp_path / "out")
-        assert (
-            0 < sum(record["usage"]["prompt_tokens"] + record["usage"]["completion_tokens"] for record in kept) <= most
-        )
+        assert 0 < sum(sum(record["usage"].values()) for record in kept) <= most
         assert {tuple(record["counted"]) for record in kept} == {("prompt_tokens", "completion_tokens")}
         assert len(server.bodies) == len(kept)
         run(settings(server.url, limit=None), tree, tmp_path / "out")  # without a limit it goes on
 
 
 def test_our_count_is_of_texts_and_pictures(tree, tmp_path):
-    with good_server(respond=top(usage={"prompt_tokens": 0, "completion_tokens": 0})) as server:
+    with deciding(respond=top(usage={"prompt_tokens": 0, "completion_tokens": 0})) as server:
         run(settings(server.url), tree, tmp_path / "out")
     [english, chinese] = [record["usage"]["prompt_tokens"] for record in kept_answers(tmp_path / "out")]
     assert 2000 < english < 6000  # 10 KB of text, and 15 pictures of a token each

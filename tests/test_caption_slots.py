@@ -14,14 +14,14 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from specimens_prose import FOLLOW
+from specimens_captions import FOLLOW, GAP, report_of, saying, settings
 from tables import each
 from teacher_server import CHINESE, ENGLISH, TeacherServer, is_mirror
 
 from caption.run.released import state_lies
 from caption.run.stage import run
 from caption.run.windows import cut_windows
-from caption.schema import CaptionConfig, EvidenceConfig, WindowConfig
+from caption.schema import EvidenceConfig, WindowConfig
 from caption.teachers.statements import describe
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.mirror import check_translation
@@ -38,25 +38,9 @@ from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight
 from release.columns import caption_values
 from release.verify.rows import shown_caption
-from specimens import make_flight, make_playback_tree
+from specimens import make_flight
 
-FACTS = Facts(
-    speed_mps=(None, 2.0, 2.5, 3.0, 4.0),
-    altitude_m=(20.0, 20.0, 20.5, 21.0, 22.0),
-    yaw_deg=(0.0, 1.0, 3.0, -6.0, -10.0),
-    pitch_deg=(-40.0, -40.2, -40.1, -40.0, -40.3),
-    distance_m=(20.0, 20.5, 21.0, None, 18.0),
-    slant_m=(28.0, 28.5, 29.0, None, 28.0),
-    target_speed_mps=1.6,
-    target_turn_deg=-30.0,
-    box_width_px=(30, 30, 31, None, 36),
-    box_height_px=(60, 61, 62, None, 72),
-    offset_x_px=(0, 10, 40, None, -64),
-    offset_y_px=(0, 0, 5, None, 20),
-    visibility=("visible", "visible", "partly_occluded", "occluded", "visible"),
-    width_px=640,
-    height_px=360,
-)
+FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, -6.0, -10.0), offset_x_px=(0, 10, 40, None, -64))
 
 
 def filled(
@@ -159,88 +143,6 @@ def test_what_is_refused_says_why_and_what_is_allowed(language, text, reason, wo
 
 # --- good templates are not refused -----------------------------------------------------------------------------------
 
-# Written before the checks were tried on them: what a careful writer puts down who has read the prompt.
-NATURAL: dict[Language, list[str]] = {
-    "en": [
-        "One person walks along the pavement, {visibility} in all five frames.",
-        "The walker keeps to the kerb at {mean:target_speed} while the drone follows at {speed}.",
-        "At t1 the drone was doing {speed@t1}; by t4 it is at {speed@t4}.",
-        "The gap {trend:distance} from {distance@t0} to {distance@t4}.",
-        "The gap is {trending:distance}, now {distance}.",
-        "Horizontal range has {trend:distance} to {distance} over the last two seconds.",
-        "The bounding box measures {box@t4}, after {box@t0} at the first frame.",
-        "The box height {trend:box_height} by {growth:box_height}.",
-        "The pedestrian sits {offset_x} {side:offset_x} of the image centre.",
-        "The pedestrian sits {offset_x} to the {side:offset_x} of the image centre.",
-        "The figure is {side:offset_x} in the picture and {side:offset_y} vertically.",
-        "Since t0 the nose has swung {yaw} to the {side:yaw}.",
-        "The drone has turned {side:yaw} by {yaw@t4}.",
-        "Heading is {heading}, pitch {pitch}.",
-        "Altitude {trend:altitude} near {altitude}; there is no reason to change it.",
-        "Altitude {trend:altitude}: {altitude@t0} at the start, {altitude} now.",
-        "The drone flies {comparison:speed} the pedestrian.",
-        "At {speed}, the drone is {comparison:speed} the person on foot ({mean:target_speed}).",
-        "Its speed is {speed_ratio} that of the walker.",
-        "The walker bends to the {side:target_heading}, so the line of sight swings the same way.",
-        "Visibility went from {visibility@t0} to {visibility@t4}.",
-        "The target was {visibility@t2} at t2 and is {visibility} again now.",
-        "First the speed {trend:speed}, and second the box {trend:box_height}, so the geometry is changing.",
-        "A parked van and two trees line the street, but none of them stands between drone and person.",
-        "Right now nothing in the scene calls for a sharper manoeuvre.",
-        "To keep the person in view the drone should {decision}.",
-        "Therefore the best action is to {decision}, which follows the motion to the {side:decision}.",
-        "If the walker turned left here, the drone would have to react at once.",
-        "With the distance {trending:distance} and the offset at {offset_x}, I would {decision}.",
-        "The vertical speed is {climb_rate}, so the view angle barely moves.",
-        "The camera looks down at {depression} below the horizon.",
-        "The drone has flown {travelled} since t0, of which {displacement} is net displacement.",
-        "The person covered {target_travelled} in the same time.",
-        "The line of sight is clear and the street ahead is empty.",
-        "On the one hand the person is {target_motion}; on the other, the drone is {drone_motion}.",
-        "Between t2 and t4 the yaw moved by {change:yaw@t2-t4}.",
-        "The drone keeps {height_over_target} above the person.",
-        "The slant range is {slant}, hence the small figure in the image.",
-        "In the last half second the speed changed by {change:speed@t3-t4}.",
-        "The target stays close to the middle of the frame, with a bearing of {bearing}.",
-    ],
-    "zh": [
-        "一名行人沿人行道行走，在五帧中均{visibility}。",
-        "行人以 {mean:target_speed} 的速度前行，无人机以 {speed} 跟随。",
-        "t1 时无人机速度为 {speed@t1}，到 t4 时为 {speed@t4}。",
-        "水平距离{trend:distance}，从 {distance@t0} 到 {distance@t4}。",
-        "两者间距正在{trending:distance}，目前为 {distance}。",
-        "最近两秒内水平距离{trend:distance}至 {distance}。",
-        "边界框为 {box@t4}，第一帧时为 {box@t0}。",
-        "边界框高度{trend:box_height}了 {growth:box_height}。",
-        "行人位于画面中心{side:offset_x}侧 {offset_x} 处。",
-        "目标在画面中{side:offset_x}，垂直方向{side:offset_y}。",
-        "自 t0 以来机头已向{side:yaw}转动 {yaw}。",
-        "无人机偏航向{side:yaw}，累计 {yaw@t4}。",
-        "航向为 {heading}，俯仰角为 {pitch}。",
-        "高度{trend:altitude}，约为 {altitude}，没有必要改变。",
-        "无人机{comparison:speed}行人。",
-        "无人机速度为行人的 {speed_ratio}。",
-        "行人向{side:target_heading}转弯，因此视线随之转动。",
-        "可见性由 {visibility@t0} 变为 {visibility@t4}。",
-        "首先速度{trend:speed}，其次边界框{trend:box_height}，说明几何关系正在变化。",
-        "路边停着一辆货车和两棵树，但都没有挡在中间。",
-        "此刻场景中没有任何因素要求更急的动作。",
-        "为了使行人保持在视野内，无人机应{decision}。",
-        "因此最合适的动作是{decision}。",
-        "如果行人此时左转，无人机必须立即反应。",
-        "鉴于距离{trend:distance}且偏移量为 {offset_x}，应当{decision}。",
-        "垂直速度为 {climb_rate}，视角几乎没有变化。",
-        "相机俯视，视线俯角 {depression}。",
-        "自 t0 起无人机飞行了 {travelled}，净位移 {displacement}。",
-        "目标正在{target_motion}，无人机处于{drone_motion}状态。",
-        "一方面目标{visibility}，另一方面无人机速度{trend:speed}。",
-        "视线通畅，前方道路空旷。",
-        "t2 到 t4 之间偏航角变化了 {change:yaw@t2-t4}。",
-        "无人机比行人高 {height_over_target}。",
-        "目标始终接近画面中央，方位角为 {bearing}。",
-    ],
-}
-
 
 def windows_of(num_flights: int) -> list[Facts]:
     found = []
@@ -251,9 +153,22 @@ def windows_of(num_flights: int) -> list[Facts]:
     return found
 
 
+def earned_texts() -> dict[str, list[str]]:
+    """Give the sentences of earned.txt by their heading: `false en`, `true zh` ..."""
+    lines = (Path(__file__).parent / "earned.txt").read_text("utf-8").splitlines()
+    found: dict[str, list[str]] = {}
+    for line in filter(None, lines[2:]):
+        if line.startswith("["):
+            texts = found[line[1:-1]] = []
+        else:
+            texts.append(line)
+    return found
+
+
 @pytest.mark.parametrize("language", ["en", "zh"])
 def test_natural_templates_are_not_refused(language):
-    texts = NATURAL[language]
+    """What a careful writer puts down who has read the prompt; written before the checks were tried on them."""
+    texts = earned_texts()[f"natural {language}"]
     refused = {text: found for text in texts if isinstance(found := read_sentence(text, language, 5, 0.5), Refused)}
     assert len(texts) >= 30
     assert len(refused) <= 0.05 * len(texts), refused
@@ -397,18 +312,6 @@ def test_a_reasoning_that_argues_against_its_decision_is_refused(reasons, decisi
     assert is_taken or found.reason == "decision_against_reasoning"
 
 
-def earned_texts() -> dict[str, list[str]]:
-    """Give the sentences of earned.txt by their heading: `false en`, `true zh` ..."""
-    lines = (Path(__file__).parent / "earned.txt").read_text("utf-8").splitlines()
-    found: dict[str, list[str]] = {}
-    for line in filter(None, lines[2:]):
-        if line.startswith("["):
-            texts = found[line[1:-1]] = []
-        else:
-            texts.append(line)
-    return found
-
-
 def test_a_sentence_is_proved_only_where_its_words_are_true_with_its_slots():
     texts = earned_texts()
     for language in ("en", "zh"):
@@ -488,20 +391,8 @@ def test_a_word_beside_slots_needs_a_claim_that_holds(language, reasons, claims,
     assert bool(found.doubt) >= asked_again
 
 
-@pytest.fixture(scope="module")
-def tree(tmp_path_factory) -> Path:
-    return make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 14, with_augmented=False)
-
-
-def settings(url: str, **changes) -> CaptionConfig:
-    return CaptionConfig.model_validate(
-        {"teacher": url, "limit": 2, "repair": {"hard_conflict": "keep"}, "image": {"max_side_px": 32}, **changes}
-    )
-
-
 def writing_server(english: str, corrected: str | None = None) -> TeacherServer:
     """A teacher whose reasoning is `english`, and `corrected` once it is told what was wrong."""
-    server = TeacherServer()
 
     def text(body: dict) -> str:
         if is_mirror(body):
@@ -515,13 +406,12 @@ def writing_server(english: str, corrected: str | None = None) -> TeacherServer:
         reasons = corrected if corrected and len(body["messages"]) > 2 else english
         return json.dumps({**ENGLISH, "reasoning_trace": reasons, "therefore": "hover", "flight_decision": "hover"})
 
-    server.text = text
-    return server
+    return saying(text)
 
 
 def test_a_record_holds_the_plain_text_and_the_template(tree, tmp_path):
     with writing_server("The gap of {distance} calls for this decision.") as server:
-        captions = list(read_captions(run(settings(server.url), tree, tmp_path / "out")))
+        captions = list(read_captions(run(settings(server.url, limit=2), tree, tmp_path / "out")))
     for caption in captions:
         assert caption.writing == "slots"
         assert caption.slots["en"].reasoning_trace == "The gap of {distance} calls for this decision."
@@ -535,7 +425,7 @@ def test_a_record_holds_the_plain_text_and_the_template(tree, tmp_path):
 def test_a_measurable_word_that_no_slot_says_is_asked_for_once_and_then_left_unread(tree, tmp_path):
     for better, state in (("The gap to the target pedestrian is {distance}.", "proved"), (None, "unread")):
         with writing_server("The gap of {distance} is stable.", better) as server:
-            captions = list(read_captions(run(settings(server.url), tree, tmp_path / state)))
+            captions = list(read_captions(run(settings(server.url, limit=2), tree, tmp_path / state)))
         assert [caption.checks.sentences["en"][1] for caption in captions] == [state] * 2
         assert [caption.checks.refused for caption in captions] == [["unread"]] * 2
         assert sum(not is_mirror(json.loads(body)) for body in server.bodies) == 4
@@ -543,7 +433,6 @@ def test_a_measurable_word_that_no_slot_says_is_asked_for_once_and_then_left_unr
 
 def test_claims_beside_slots_stand_in_record_report_and_evidence_and_are_judged_again_from_a_release(tree, tmp_path):
     """The distance of these flights is steady; the Chinese claim comes with the mirror."""
-    server = TeacherServer()
 
     def text(body: dict) -> str:
         schema = body["response_format"]["json_schema"]["schema"]["properties"]
@@ -561,10 +450,9 @@ def test_claims_beside_slots_stand_in_record_report_and_evidence_and_are_judged_
         }
         return json.dumps({**ENGLISH, **reasons, "therefore": "hover", "flight_decision": "hover"})
 
-    server.text = text
-    with server:
-        captions = list(read_captions(run(settings(server.url), tree, tmp_path / "out")))
-    report = json.loads((tmp_path / "out" / "caption_report.json").read_text())
+    with saying(text) as server:
+        captions = list(read_captions(run(settings(server.url, limit=2), tree, tmp_path / "out")))
+    report = report_of(tmp_path / "out")
     assert report["proved_by_claims"] == {"en": 2, "zh": 2}
     page = (tmp_path / "out" / "report.html").read_text()
     assert "proved by slots 0 (0.0 %), proved by claims 2 (50.0 %)" in page
@@ -582,7 +470,7 @@ def test_claims_beside_slots_stand_in_record_report_and_evidence_and_are_judged_
 
 def test_a_refused_answer_is_mended_when_it_is_told_what_was_wrong(tree, tmp_path):
     with writing_server("The gap of 18.5 m calls for nothing.", "The gap of {distance} calls for nothing.") as server:
-        captions = list(read_captions(run(settings(server.url), tree, tmp_path / "out")))
+        captions = list(read_captions(run(settings(server.url, limit=2), tree, tmp_path / "out")))
     assert [caption.checks.refused for caption in captions] == [["slots_number_outside"]] * 2
     corrections = [json.loads(body)["messages"][-1]["content"] for body in server.bodies]
     complaints = [
@@ -606,8 +494,8 @@ def test_a_refused_answer_is_mended_when_it_is_told_what_was_wrong(tree, tmp_pat
 )
 def test_an_answer_that_stays_wrong_drops_its_window_for_that_reason(tree, tmp_path, reasons, reason):
     with writing_server(reasons) as server, pytest.raises(NothingKept):
-        run(settings(server.url), tree, tmp_path / "out")
-    report = json.loads((tmp_path / "out" / "caption_report.json").read_text())
+        run(settings(server.url, limit=2), tree, tmp_path / "out")
+    report = report_of(tmp_path / "out")
     assert report["windows"]["dropped"] == {reason: 2}
     assert len(server.bodies) == 4  # each asked once more
 
@@ -622,7 +510,7 @@ def test_the_question_shows_what_is_known_by_its_slot(tree, tmp_path):
     # Not known.
     assert "heading}" not in table.replace("{side:target_heading}", "").replace("{change:target_heading}", "")
     with writing_server("The gap of {distance} calls for nothing.") as server:
-        run(settings(server.url), tree, tmp_path / "out")
+        run(settings(server.url, limit=2), tree, tmp_path / "out")
     questions = [body["messages"] for body in map(json.loads, server.bodies) if not is_mirror(body)]
     assert all("{distance@t0} to {distance@t4}: " in user["content"][-1]["text"] for _, user in questions)
     assert len({system["content"] for system, _ in questions}) == 1  # a constant prefix

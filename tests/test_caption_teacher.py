@@ -11,8 +11,10 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+from specimens_captions import deciding, report_of
+from specimens_captions import settings as quick
 from tables import each
-from teacher_server import MODEL, TeacherServer, is_mirror, kept_answers
+from teacher_server import TeacherServer, kept_answers
 from typer.testing import CliRunner
 
 from caption.run.reasons import REASONS, meaning_of
@@ -26,22 +28,13 @@ from cosfly.errors import CosflyError, NothingKept, TeacherError
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
 
+KEEP = {"hard_conflict": "keep"}
 ROOT = Path(__file__).resolve().parents[1]
-ENDPOINT = {"max_tries": 4, "backoff_s": 0.02, "max_backoff_s": 0.05, "timeout_s": 0.5, "concurrency": 4}
 
 
 def settings(url: str, **changes) -> CaptionConfig:
-    endpoint = {**ENDPOINT, **changes.pop("endpoint", {})}
-    return CaptionConfig.model_validate({"teacher": url, "endpoint": endpoint, "image": {"max_side_px": 32}, **changes})
-
-
-@pytest.fixture(scope="module")
-def tree(tmp_path_factory) -> Path:
-    return make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 14, with_augmented=False)
-
-
-def report_of(out: Path) -> dict:
-    return json.loads((out / "caption_report.json").read_text())
+    endpoint = {"max_tries": 4, "timeout_s": 0.5} | changes.pop("endpoint", {})
+    return quick(url, **{"repair": {}, "endpoint": endpoint, **changes})
 
 
 def first(fault: str, count: int = 1):
@@ -63,9 +56,8 @@ PASSING_FAULTS = [
 
 @pytest.mark.parametrize(("fault", "more_requests", "recovered"), PASSING_FAULTS)
 def test_one_fault_is_survived(tree, tmp_path, fault, more_requests, recovered):
-    cfg = {"limit": 2, "repair": {"hard_conflict": "keep"}}
-    with TeacherServer(first(fault), decision=lambda body: "hover") as server:
-        path = run(settings(server.url, **cfg), tree, tmp_path / "out")
+    with deciding("hover", first(fault)) as server:
+        path = run(settings(server.url, limit=2, repair=KEEP), tree, tmp_path / "out")
     captions = list(read_captions(path))
     assert [caption.status for caption in captions] == ["accepted", "accepted"]
     assert len(server.bodies) == 4 + more_requests  # English and Chinese of two windows
@@ -84,34 +76,24 @@ DROPPING_FAULTS = [
 
 @pytest.mark.parametrize(("fault", "reason"), DROPPING_FAULTS)
 def test_a_lasting_fault_drops_windows_with_its_reason(tree, tmp_path, fault, reason):
-    cfg = {"limit": 2, "repair": {"hard_conflict": "keep"}}
-    server = TeacherServer(lambda number, body: fault, decision=lambda body: "ascend")
-    with (
-        server,
-        pytest.raises(
-            NothingKept, match=rf"captions\.jsonl: .*2 dropped .{reason} 2.*; mend .*\({re.escape(meaning_of(reason))}"
-        ),
-    ):
-        run(settings(server.url, **cfg), tree, tmp_path / "out")
+    told = rf"captions\.jsonl: .*2 dropped .{reason} 2.*; mend .*\({re.escape(meaning_of(reason))}"
+    with deciding("ascend", lambda number, body: fault) as server, pytest.raises(NothingKept, match=told):
+        run(settings(server.url, limit=2, repair=KEEP), tree, tmp_path / "out")
     windows = report_of(tmp_path / "out")["windows"]
     assert windows == {"input": 2, "kept": 0, "dropped": {reason: 2}, "failed": {}}
 
 
 def test_a_hopeless_teacher_is_stopped_and_its_commonest_reasons_are_explained(tree, tmp_path):
     """Of its first answers none is accepted; a teacher of whom one was is not stopped, and a setting goes on."""
-    cfg = {"stop_after_dropped": 3, "endpoint": {"concurrency": 1}, "repair": {"hard_conflict": "keep"}}
-    server = TeacherServer(lambda number, body: "short", decision=lambda body: "ascend")
-    with (
-        server,
-        pytest.raises(TeacherError, match=r"none of the first 3 answers.*3 structure_.*\(no answer had the fields"),
-    ):
-        run(settings(server.url, **cfg), tree, tmp_path / "out")
-    server = TeacherServer(lambda number, body: "short", decision=lambda body: "ascend")
-    with server, pytest.raises(NothingKept):
-        run(settings(server.url, **cfg | {"stop_after_dropped": 0}), tree, tmp_path / "out")
-    num = report_of(tmp_path / "out")["windows"]["input"]
-    assert num > 3
-    with TeacherServer(lambda number, body: "short" if number > 20 else None, decision=lambda body: "ascend") as server:
+    cfg = {"stop_after_dropped": 3, "endpoint": {"concurrency": 1}, "repair": KEEP}
+    told = r"none of the first 3 answers.*3 structure_.*\(no answer had the fields"
+    with deciding("ascend", lambda number, body: "short") as server:
+        with pytest.raises(TeacherError, match=told):
+            run(settings(server.url, **cfg), tree, tmp_path / "out")
+        with pytest.raises(NothingKept):
+            run(settings(server.url, **cfg | {"stop_after_dropped": 0}), tree, tmp_path / "out")
+    assert report_of(tmp_path / "out")["windows"]["input"] > 3
+    with deciding("ascend", lambda number, body: "short" if number > 6 else None) as server:
         run(settings(server.url, **cfg), tree, tmp_path / "one")
     assert report_of(tmp_path / "one")["windows"]["kept"] > 0
 
@@ -132,8 +114,8 @@ def test_every_code_of_a_dropped_window_is_explained_in_one_table():
 @pytest.mark.parametrize("writing", ["slots", "claims", "prose"])
 def test_a_decision_against_its_own_reasoning_is_asked_for_again_with_what_was_wrong(tree, tmp_path, writing):
     """In every way of writing the action that the reasoning came to stands before the decision."""
-    with TeacherServer(first("wrong_therefore"), decision=lambda body: "ascend") as server:
-        cfg = settings(server.url, limit=1, repair={"hard_conflict": "keep"}, writing=writing)
+    with deciding("ascend", first("wrong_therefore")) as server:
+        cfg = settings(server.url, limit=1, repair=KEEP, writing=writing)
         captions = list(read_captions(run(cfg, tree, tmp_path / "out")))
     assert [c.status for c in captions] == ["accepted"]
     assert captions[0].checks.refused == ["decision_against_reasoning"]
@@ -148,64 +130,23 @@ def test_a_decision_against_its_own_reasoning_is_asked_for_again_with_what_was_w
     assert corrected["seed"] != asked["seed"]
 
 
-def test_an_anchored_answer_whose_reasoning_leads_elsewhere_is_no_repair(tree, tmp_path):
-    def fault(number, body):
-        return "wrong_therefore" if "Hard constraint" in body["messages"][0]["content"] else None
+@pytest.mark.parametrize(
+    ("fault", "reason", "num_asks"),
+    [
+        ("wrong_therefore", "regeneration_failed", 1 + 2 * 2),  # each anchored ask, and its correction
+        ("no_room", "regeneration_context_full", 1 + 1),  # the server had no room: not the teacher's failure
+    ],
+)
+def test_a_repair_that_fails_drops_its_window_for_that_reason(tree, tmp_path, fault, reason, num_asks):
+    def anchored(number, body):
+        return fault if "Hard constraint" in body["messages"][0]["content"] else None
 
-    with TeacherServer(fault, decision=lambda body: "hover") as server, pytest.raises(NothingKept):
-        run(settings(server.url, limit=2, repair={"max_asks": 2}), tree, tmp_path / "out")
-    assert report_of(tmp_path / "out")["windows"]["dropped"] == {"regeneration_failed": 2}
-    assert len(server.bodies) == 2 * (1 + 2 * 2)  # each anchored ask, and its correction
-
-
-def test_a_repair_that_the_server_had_no_room_for_is_not_one_that_the_teacher_failed_at(tree, tmp_path):
-    def fault(number, body):
-        return "no_room" if "Hard constraint" in body["messages"][0]["content"] else None
-
-    with TeacherServer(fault, decision=lambda body: "hover") as server, pytest.raises(NothingKept):
+    with deciding("hover", anchored) as server, pytest.raises(NothingKept):
         run(settings(server.url, limit=2, repair={"max_asks": 2}), tree, tmp_path / "out")
     report = report_of(tmp_path / "out")
-    assert report["windows"]["dropped"] == {"regeneration_context_full": 2}
-    assert report["refusals"].keys() == {"regeneration_context_full"}
-    assert len(server.bodies) == 2 * 2
-
-
-# Faults that end the run with one line, before or during it.
-ENDING_FAULTS = [("401", "refuses the key"), ("404", "no such model"), ("500", "500"), ("reset", "connection")]
-
-
-@pytest.mark.parametrize(("fault", "words"), ENDING_FAULTS)
-def test_a_lasting_server_fault_ends_the_run(tree, tmp_path, fault, words):
-    with TeacherServer(lambda number, body: fault) as server:
-        cfg = settings(server.url, endpoint={"stop_after_failures": 3})
-        with pytest.raises(TeacherError, match=words) as caught:
-            run(cfg, tree, tmp_path / "out")
-    assert "\n" not in str(caught.value)
-    assert "127.0.0.1" in str(caught.value)
-    assert not (tmp_path / "out" / "manifest.json").exists()
-
-
-def test_windows_without_an_answer_are_listed_and_asked_again(tree, tmp_path):
-    out = tmp_path / "out"
-    bad = {}
-
-    def fault(number, body):  # one window's first question never gets through
-        if not is_mirror(body) and not bad:
-            bad["seed"] = body["seed"]
-        return "500" if bad.get("seed") == body["seed"] and bad.get("on", True) else None
-
-    with TeacherServer(fault, decision=lambda body: "hover") as server:
-        cfg = settings(server.url, repair={"hard_conflict": "keep"})
-        with pytest.raises(TeacherError, match=r"1 of 5 windows got no answer.*http_500 1"):
-            run(cfg, tree, out)
-        assert report_of(out)["windows"]["failed"] == {"no_answer": 1}
-        assert len(list(read_captions(out / "captions.jsonl"))) == 4
-        assert json.loads((out / "failures.jsonl").read_text())["code"] == "http_500"
-        bad["on"] = False
-        asked = len(server.bodies)
-        path = run(cfg, tree, out)
-    assert len(server.bodies) - asked == 2  # the missing window in two languages, nothing else
-    assert len(list(read_captions(path))) == 5
+    assert report["windows"]["dropped"] == {reason: 2}
+    assert ("regeneration_context_full" in report["refusals"]) == (fault == "no_room")
+    assert len(server.bodies) == 2 * num_asks
 
 
 def test_an_unreadable_picture_drops_its_windows_and_asks_nothing(tree, tmp_path):
@@ -213,38 +154,12 @@ def test_an_unreadable_picture_drops_its_windows_and_asks_nothing(tree, tmp_path
     shutil.copytree(tree, root)
     broken = next(root.rglob("frame_00002/rgb.png"))
     broken.write_bytes(broken.read_bytes()[:20])
-    with TeacherServer(decision=lambda body: "hover") as server:
-        run(settings(server.url, repair={"hard_conflict": "keep"}), root, tmp_path / "out")
+    with deciding() as server:
+        run(settings(server.url, repair=KEEP), root, tmp_path / "out")
     # Frame 2 is observed by the windows at 4, 5 and 6 of 4..8.
     windows = report_of(tmp_path / "out")["windows"]
     assert windows == {"input": 5, "kept": 2, "dropped": {"unreadable_frame": 3}, "failed": {}}
     assert len(server.bodies) == 4
-
-
-def test_schema_refused_falls_back_to_plain_asking_and_says_so(tree, tmp_path):
-    with TeacherServer(lambda number, body: "schema_refused") as server:
-        cfg = settings(server.url, limit=2, endpoint={"concurrency": 1}, repair={"hard_conflict": "keep"})
-        run(cfg, tree, tmp_path / "out")
-    with_schema = [b"response_format" in body for body in server.bodies]
-    assert with_schema == [True, False, False, False, False]  # refused once, never sent again
-    assert report_of(tmp_path / "out")["structured"] == {"plain": 2}
-
-
-def test_anchored_repair_enforces_the_label(tree, tmp_path):
-    with TeacherServer() as server:
-        path = run(settings(server.url), tree, tmp_path / "out")
-    repaired = [caption for caption in read_captions(path) if caption.repair]
-    assert repaired, "the seeded decisions must hit a hard conflict for this test to mean anything"
-    for caption in repaired:
-        assert caption.repair.first_verdict == "HARD_CONFLICT"
-        assert caption.repair.strategy == "anchored"
-        assert caption.repair.first_decision != caption.label
-        assert caption.en.flight_decision == caption.zh.flight_decision == caption.label
-        assert caption.verdict == "CONSISTENT"
-    anchored = [json.loads(body) for body in server.bodies if b"Hard constraint" in body]
-    assert len(anchored) == len(repaired)
-    enums = [b["response_format"]["json_schema"]["schema"]["properties"]["flight_decision"]["enum"] for b in anchored]
-    assert all(len(enum) == 1 for enum in enums)
 
 
 @pytest.mark.parametrize(
@@ -258,8 +173,7 @@ def test_anchored_repair_enforces_the_label(tree, tmp_path):
 )
 def test_strategies_ask_by_their_rungs(tree, tmp_path, strategy, rungs):
     """A teacher that insists on hovering: only an enforced decision can mend it."""
-    server = TeacherServer(decision=lambda body: "hover")
-    with server, nullcontext() if "anchored" in rungs else pytest.raises(NothingKept):
+    with deciding() as server, nullcontext() if "anchored" in rungs else pytest.raises(NothingKept):
         run(settings(server.url, repair={"strategy": strategy}), tree, tmp_path / "out")
     repaired = [caption for caption in read_captions(tmp_path / "out" / "captions.jsonl") if caption.repair]
     assert repaired
@@ -269,12 +183,19 @@ def test_strategies_ask_by_their_rungs(tree, tmp_path, strategy, rungs):
         if "anchored" in rungs:
             assert caption.repair.rung == "anchored"
             assert caption.repair.asks == rungs.index("anchored") + 1
-            assert caption.en.flight_decision == caption.label
+            assert (caption.repair.first_verdict, caption.verdict) == ("HARD_CONFLICT", "CONSISTENT")
+            assert caption.en.flight_decision == caption.zh.flight_decision == caption.label
         else:
             assert (caption.repair.rung, caption.repair.asks) == (None, 3)
             assert caption.drop_reason == "regeneration_failed"
     hints = sum(b"Hint: an earlier answer" in body for body in server.bodies)
     assert hints == len(repaired) * rungs[: repaired[0].repair.asks].count("hint")
+    schemas = [
+        body["response_format"]["json_schema"]["schema"]["properties"]["flight_decision"]["enum"]
+        for body in map(json.loads, server.bodies)
+        if "Hard constraint" in body["messages"][0]["content"]
+    ]
+    assert [len(enum) for enum in schemas] == [1] * len(repaired) * ("anchored" in rungs)
     repair = report_of(tmp_path / "out")["repair"]
     assert repair["rejected"] == sum(repair["rungs"].values()) == len(repaired)
 
@@ -286,8 +207,7 @@ def test_a_hint_can_mend_a_conflict(tree, tmp_path):
         return "search_to_reacquire_target" if "Hint:" in body["messages"][0]["content"] else "hover"
 
     with TeacherServer(decision=decide) as server:
-        cfg = settings(server.url, repair={"strategy": "cascade"})
-        path = run(cfg, tree, tmp_path / "out")
+        path = run(settings(server.url, repair={"strategy": "cascade"}), tree, tmp_path / "out")
     repaired = [caption for caption in read_captions(path) if caption.repair]
     assert {"hint", "anchored"} == {caption.repair.rung for caption in repaired}
     # Nor does it stop at a decision that the flight merely does not contradict.
@@ -302,6 +222,7 @@ def test_the_key_reaches_the_header_and_nothing_else(tree, tmp_path, monkeypatch
     assert {headers["authorization"] for headers in server.headers} == {"Bearer sk-very-secret-123"}
     with TeacherServer(lambda number, body: "echo_key") as server, pytest.raises(TeacherError) as caught:
         run(settings(server.url, limit=2), tree, tmp_path / "bad")
+    assert "refuses the key" in str(caught.value)
     assert "sk-very-secret" not in str(caught.value)
     assert "***" in str(caught.value)
     assert "sk-very-secret" not in caplog.text
@@ -325,17 +246,10 @@ def test_unreachable_and_unknown_model_and_not_an_endpoint(tree, tmp_path):
         assert not server.bodies
 
 
-@pytest.mark.parametrize(
-    ("url", "expected"),
-    [
-        ("http://h:8000", "http://h:8000/v1"),
-        ("http://h:8000/", "http://h:8000/v1"),
-        ("https://h/api/v3/", "https://h/api/v3"),
-        ("http://h/v1/chat/completions", "http://h/v1"),
-    ],
-)
-def test_base_url(url, expected):
-    assert base_url(url) == expected
+def test_a_servers_address_is_read_in_the_ways_that_it_is_written():
+    assert base_url("http://h:8000") == base_url("http://h:8000/") == "http://h:8000/v1"
+    assert base_url("http://h/v1/chat/completions") == "http://h/v1"
+    assert base_url("https://h/api/v3/") == "https://h/api/v3"
 
 
 # What is no URL that can be asked, and what is said of it.
@@ -429,16 +343,3 @@ def test_a_server_with_room_for_three_is_not_flooded(tmp_path):
     assert report_of(tmp_path / "out")["windows"]["failed"] == {}
     assert asked - answered < 0.6 * answered  # most requests are answered at once
     assert asked > answered  # the limit was met
-
-
-# --- the journal ------------------------------------------------------------------------------------------------------
-
-
-def test_records_name_the_teacher(tree, tmp_path):
-    with TeacherServer() as server:
-        path = run(settings(server.url, limit=1), tree, tmp_path / "out")
-    caption = next(read_captions(path))
-    assert caption.teacher.kind == "endpoint"
-    assert caption.teacher.model == MODEL
-    assert caption.teacher.structured == "json_schema"
-    assert caption.usage.prompt_tokens == 1000 * caption.attempts

@@ -52,22 +52,12 @@ PAPER_ZH = Coc(
 )
 # The sample's flight data; distances and box from its text.
 PAPER_FACTS = Facts(
-    speed_mps=(None, 2.92, 1.46, 0.87, 1.02),
-    altitude_m=(22.0, 21.2, 20.7, 20.6, 20.6),
-    yaw_deg=(0.0, 3.2, 4.4, 4.8, 4.8),
-    pitch_deg=(-45.0,) * 5,
-    distance_m=(20.0, 20.4, 20.9, 21.2, 21.4),
-    slant_m=(29.0, 29.0, 29.0, 29.0, 29.1),
-    target_speed_mps=1.0,
-    target_turn_deg=0.0,
-    box_width_px=(34,) * 5,
-    box_height_px=(59,) * 5,
-    offset_x_px=(0,) * 5,
-    offset_y_px=(0,) * 5,
-    visibility=("visible",) * 5,
-    width_px=1280,
+    speed_mps=(None, 2.92, 1.46, 0.87, 1.02), altitude_m=(22.0, 21.2, 20.7, 20.6, 20.6),
+    yaw_deg=(0.0, 3.2, 4.4, 4.8, 4.8), pitch_deg=(-45.0,) * 5, distance_m=(20.0, 20.4, 20.9, 21.2, 21.4),
+    slant_m=(29.0, 29.0, 29.0, 29.0, 29.1), target_speed_mps=1.0, target_turn_deg=0.0, box_width_px=(34,) * 5,
+    box_height_px=(59,) * 5, offset_x_px=(0,) * 5, offset_y_px=(0,) * 5, visibility=("visible",) * 5, width_px=1280,
     height_px=720,
-)
+)  # fmt: skip
 FLIGHT = flight_numbers(PAPER_FACTS)
 
 

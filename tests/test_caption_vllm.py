@@ -124,10 +124,9 @@ def engine_of(model, **sections) -> VllmEngine:
 
 
 @pytest.mark.skipif(importlib.util.find_spec("vllm") is not None, reason="vllm is installed here")
-def test_without_vllm_one_line_says_what_to_install(model, tmp_path):
+def test_without_vllm_one_line_says_what_to_install(tree, model, tmp_path):
     with pytest.raises(EnvironmentMissing, match=r"vLLM engine is not installed.*cosfly\[vllm\]"):
         engine_of(model).load()
-    tree = make_playback_tree(tmp_path / "tree", 1, 12, with_augmented=False)
     with pytest.raises(EnvironmentMissing, match="not installed"):
         run(CaptionConfig(teacher=f"vllm:{model}"), tree, tmp_path / "out")
 
@@ -171,26 +170,24 @@ def test_what_vllm_does_not_know_is_a_setting_not_a_crash(stand_in, model):
         engine_of(model, vllm={"engine": whitespace}).load()
 
 
-def test_requests_join_while_others_are_answered_and_every_answer_is_kept(stand_in, model, tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 2, 16, with_augmented=False)
+def test_requests_join_while_others_are_answered_and_every_answer_is_kept(stand_in, tree, model, tmp_path):
     template = {"enable_thinking": False}
     cfg = settings(model, vllm={"batch": 6}, endpoint={"extra_body": {"chat_template_kwargs": template}})
     path = run(cfg, tree, tmp_path / "out")
     captions = list(read_captions(path))
-    assert len(captions) == 14
+    assert len(captions) == 5
     assert {caption.teacher.kind for caption in captions} == {"vllm"}
     assert {caption.teacher.model for caption in captions} == {"model-2b"}
     assert all(caption.usage == Usage(prompt_tokens=2560, completion_tokens=14) for caption in captions)
-    assert len(stand_in.asked) == 28
-    assert stand_in.templates == [template] * 28
+    assert len(stand_in.asked) == 10
+    assert stand_in.templates == [template] * 10
     assert 2 <= max(stand_in.open_at_step) <= 6  # together, and never more than were allowed
     (tmp_path / "out" / "manifest.json").unlink()
     assert run(cfg, tree, tmp_path / "out").read_bytes() == path.read_bytes()
-    assert len(stand_in.asked) == 28  # nothing was asked again
+    assert len(stand_in.asked) == 10  # nothing was asked again
 
 
-def test_a_prompt_that_the_engine_refuses_costs_only_its_window(stand_in, model, tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 1, 14, with_augmented=False)
+def test_a_prompt_that_the_engine_refuses_costs_only_its_window(stand_in, tree, model, tmp_path):
     cfg = settings(model)
     run(cfg, tree, tmp_path / "first")
     assert len(stand_in.asked) == 10
@@ -202,28 +199,26 @@ def test_a_prompt_that_the_engine_refuses_costs_only_its_window(stand_in, model,
 
 
 @pytest.mark.timeout(60)
-def test_an_engine_that_dies_ends_the_run_in_one_line_and_the_next_goes_on(stand_in, model, tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 1, 16, with_augmented=False)
+def test_an_engine_that_dies_ends_the_run_in_one_line_and_the_next_goes_on(stand_in, tree, model, tmp_path):
     cfg = settings(model, vllm={"batch": 2})
-    stand_in.dies_after = 6
+    stand_in.dies_after = 4
     with pytest.raises(TeacherError, match=r"engine broke.*EngineDeadError"):
         run(cfg, tree, tmp_path / "out")
     num_asked = len(stand_in.asked)
     stand_in.dies_after = None
     run(cfg, tree, tmp_path / "out")
-    assert num_asked < 14
-    assert 14 < len(stand_in.asked) <= 14 + 2  # those that were in the engine when it died are asked once more
+    assert num_asked < 10
+    assert 10 < len(stand_in.asked) <= 10 + 2  # those that were in the engine when it died are asked once more
     windows = json.loads((tmp_path / "out" / "caption_report.json").read_text())["windows"]
-    assert windows == {"input": 7, "kept": 7, "dropped": {}, "failed": {}}
+    assert windows == {"input": 5, "kept": 5, "dropped": {}, "failed": {}}
 
 
-def test_an_answer_that_the_engine_gave_up_is_none(stand_in, model, tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 1, 12, with_augmented=False)
+def test_an_answer_that_the_engine_gave_up_is_none(stand_in, tree, model, tmp_path):
     stand_in.finish_reason = "abort"
-    with pytest.raises(TeacherError, match=r"3 of 3 windows got no answer.*engine 3"):
+    with pytest.raises(TeacherError, match=r"5 of 5 windows got no answer.*engine 5"):
         run(settings(model), tree, tmp_path / "out")
     stand_in.finish_reason = "stop"
-    assert len(list(read_captions(run(settings(model), tree, tmp_path / "out")))) == 3
+    assert len(list(read_captions(run(settings(model), tree, tmp_path / "out")))) == 5
 
 
 def test_a_student_answers_in_the_same_engine(stand_in, tmp_path):

@@ -9,10 +9,8 @@ import time
 from contextlib import nullcontext
 
 import pytest
+from specimens_captions import FACTS, deciding, settings
 from tables import each
-from teacher_server import TeacherServer
-from test_caption_asking import settings
-from test_caption_claims import FACTS
 
 from caption.run.stage import run
 from caption.teachers.prompts import way_prompt
@@ -22,7 +20,6 @@ from caption.writing.contract import Draft, Refused, more_fields, way_of
 from cosfly.errors import NothingKept
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import read_captions
-from specimens import make_playback_tree
 
 WAY = way_of("claims")
 MORE = tuple(more_fields(WAY))
@@ -30,21 +27,15 @@ ANSWER = {
     "critical_components": "The walker is 18.0 m away and left of the middle.",
     "reasoning_trace": "The nose has swung 10.0 deg to the right. So hover.",
     "claims": [
-        {"sentence": "C1", "quantity": "distance", "at": "t4", "value": 18, "unit": "m", "modality": "observed"},
-        {
-            "sentence": "C1",
-            "quantity": "side:offset_x",
-            "at": "t4",
-            "value": "left",
-            "unit": "",
-            "modality": "observed",
-        },
-        {"sentence": "R1", "quantity": "yaw", "at": "t4", "value": -10.0, "unit": "deg", "modality": "observed"},
-        {"sentence": "R2", "quantity": "decision", "at": "", "value": "hover", "unit": "", "modality": "predicted"},
+        dict(zip(("sentence", "quantity", "at", "value", "unit", "modality"), row, strict=True))
+        for row in (
+            ("C1", "distance", "t4", 18, "m", "observed"), ("C1", "side:offset_x", "t4", "left", "", "observed"),
+            ("R1", "yaw", "t4", -10.0, "deg", "observed"), ("R2", "decision", "", "hover", "", "predicted"),
+        )
     ],
     "therefore": "hover",
     "flight_decision": "hover",
-}
+}  # fmt: skip
 
 
 def read(answer: dict, facts: Facts = FACTS) -> Draft | Refused:
@@ -63,14 +54,10 @@ def test_a_true_answer_is_taken_with_its_claims():
     assert isinstance(draft, Draft), draft
     assert [claim.value for claim in draft.claims] == [18.0, "left", -10.0, "hover"]
     assert draft.claims[1].unit is None
-    assert [one.state for one in WAY.judge(draft, FACTS, settings("http://x").evidence, "en")] == [
-        "proved",
-        "proved",
-        "unread",
-    ]
+    states = [one.state for one in WAY.judge(draft, FACTS, settings("http://x").evidence, "en")]
+    assert states == ["proved", "proved", "unread"]
 
-
-def test_an_answer_without_claims_is_taken_where_it_is_true_and_proves_nothing():
+    # Without claims it is taken where it is true, and proves nothing.
     draft = read(ANSWER | {"claims": []})
     assert isinstance(draft, Draft), draft
     assert {one.state for one in WAY.judge(draft, FACTS, settings("http://x").evidence, "en")} == {"unread"}
@@ -173,9 +160,8 @@ def test_a_huge_or_deep_answer_is_refused_quickly(text):
     assert time.perf_counter() - start_s < 1.0
 
 
-def test_a_run_writes_claims_and_the_record_keeps_them(tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 1, 12, with_augmented=False)
-    with TeacherServer(decision=lambda body: "hover") as server:
+def test_a_run_writes_claims_and_the_record_keeps_them(tree, tmp_path):
+    with deciding() as server:
         captions = list(read_captions(run(settings(server.url, writing="claims"), tree, tmp_path / "out")))
     accepted = [caption for caption in captions if caption.status == "accepted"]
     assert accepted
@@ -185,17 +171,13 @@ def test_a_run_writes_claims_and_the_record_keeps_them(tmp_path):
         assert (caption.checks.sentences or {})["en"] == ["proved", "unread"]
 
 
-def test_wrong_claims_are_asked_for_once_more_and_then_drop_the_window(tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 1, 12, with_augmented=False)
-
-    def always(number: int, body: dict) -> str | None:
-        return "wrong_claims"
+def test_wrong_claims_are_asked_for_once_more_and_then_drop_the_window(tree, tmp_path):
 
     def at_first(number: int, body: dict) -> str | None:
         return None if "This answer was refused" in json.dumps(body) else "wrong_claims"
 
-    for fault, status, reasons in ((always, "dropped", 2), (at_first, "accepted", 1)):
-        with TeacherServer(fault, decision=lambda body: "hover") as server:
+    for fault, status, reasons in ((lambda *_: "wrong_claims", "dropped", 2), (at_first, "accepted", 1)):
+        with deciding(fault=fault) as server:
             out = tmp_path / status
             with pytest.raises(NothingKept) if status == "dropped" else nullcontext():
                 run(settings(server.url, writing="claims"), tree, out)

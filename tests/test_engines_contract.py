@@ -9,10 +9,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from specimens_captions import settings
 from teacher_server import CHINESE, ENGLISH, TeacherServer, is_mirror, kept_answers
 
 from caption.run.stage import run
-from caption.schema import CaptionConfig
 from caption.teachers import teacher
 from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.client import ChatClient, EndpointConfig
@@ -20,7 +20,6 @@ from cosfly.chat.contract import NoAnswer, Reply, Request, started
 from cosfly.errors import TeacherError
 from cosfly.products.answer_text import answer_schema, parse_answer
 from cosfly.products.captions import Usage, read_captions
-from specimens import make_playback_tree
 
 SAMPLING = EndpointConfig(max_tries=1, max_tokens=64)
 
@@ -148,15 +147,15 @@ def test_an_engine_is_closed_whatever_came_of_its_start():
     assert broken.num_closed == 1
 
 
-def test_the_engine_of_the_recipe_captions_a_flight(tmp_path: Path, monkeypatch):
+def test_the_engine_of_the_recipe_captions_a_flight(tree, tmp_path: Path, monkeypatch):
     engine = PlainEngine()
     monkeypatch.setattr(teacher, "make_engine", lambda cfg, troubles: engine)
-    tree = make_playback_tree(tmp_path / "tree", 1, 14, with_augmented=False)
-    cfg = CaptionConfig.model_validate(
-        {"teacher": "http://plain", "repair": {"hard_conflict": "keep"}, "mirror_asks": 1}
-    )
+    cfg = settings("http://plain", mirror_asks=1)
     captions = list(read_captions(run(cfg, tree, tmp_path / "out")))
     assert len(captions) == 5
-    assert {caption.teacher.model for caption in captions} == {"plain-1"}
+    for caption in captions:
+        teacher_told = caption.teacher.kind, caption.teacher.model, caption.teacher.structured
+        assert teacher_told == ("endpoint", "plain-1", "json_schema")
+        assert caption.usage.prompt_tokens == 1000 * caption.attempts
     assert engine.num_answers == len(kept_answers(tmp_path / "out")) == sum(caption.attempts for caption in captions)
     assert engine.num_closed == 1

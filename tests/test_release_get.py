@@ -725,18 +725,9 @@ def test_a_pipe_in_a_folder_is_not_waited_for(dataset, tmp_path):
 
 def test_the_command(dataset, tmp_path):
     words = [
-        "release",
-        "get",
-        str(dataset),
-        "--town",
-        "Town01",
-        "--modality",
-        "rgb",
-        "--out",
-        str(tmp_path / "out"),
-        "--workers",
-        "1",
-    ]
+        "release", "get", str(dataset), "--town", "Town01", "--modality", "rgb", "--out", str(tmp_path / "out"),
+        "--workers", "1",
+    ]  # fmt: skip
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     found = tmp_path / "out/dataset"

@@ -349,15 +349,9 @@ def test_runs_are_given_as_folders_or_file_by_file(release_inputs, tmp_path):
     a, b = (tmp_path / "runs" / name for name in ("a", "b"))
     assert [Source.of_run(place).run for place in (a, b)] == ["a", "b"]
     more = [
-        "--out",
-        str(tmp_path / "out"),
-        "--set",
-        "release.licence=mit",
-        "--frames",
-        "2",
-        "--set",
+        "--out", str(tmp_path / "out"), "--set", "release.licence=mit", "--frames", "2", "--set",
         "release.unbound=accept",
-    ]
+    ]  # fmt: skip
     files = ["--data", str(b / "render"), "--captions", str(b / "caption/captions.jsonl")]
     result = CliRunner().invoke(
         app, ["release", "build", str(a), *files, "--workers", "1", "--inspect", str(b / "inspect/inspect.json"), *more]

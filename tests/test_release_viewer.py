@@ -70,13 +70,9 @@ def run_folder(tmp_path_factory) -> Path:
                 more["verdict"] = "HARD_CONFLICT"
             if i == 8:
                 more["repair"] = {
-                    "strategy": "cascade",
-                    "rung": "anchored",
-                    "outcome": "repaired",
-                    "asks": 2,
-                    "first_decision": "hover",
-                    "first_verdict": "HARD_CONFLICT",
-                }
+                    "strategy": "cascade", "rung": "anchored", "outcome": "repaired", "asks": 2,
+                    "first_decision": "hover", "first_verdict": "HARD_CONFLICT",
+                }  # fmt: skip
             if i == 9:
                 more |= {"status": "dropped", "drop_reason": "hard_conflict"}
             caption = make_caption(flight.town, flight.trajectory, flight.variant, i, **more)
