@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from cosfly.errors import InputError, RenderError
-from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, depth_bytes, depth_values
+from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, depth_bytes, depth_values, far_clipped
 from cosfly.reading.arrays import parse_array, parse_picture
 from release.record import DepthCoding, DepthCodingName
 
@@ -28,7 +28,8 @@ def depth_of(data: bytes, coded: DepthCoding, where: str) -> np.ndarray:
     """
     if coded.coding != "millimetre_png":
         kind = np.float16 if coded.coding == "float16" else np.float32
-        return parse_array(data, where, dtype=kind, ndim=2, what="depth image").astype(np.float32, copy=False)
+        values = parse_array(data, where, dtype=kind, ndim=2, what="depth image")
+        return far_clipped(values.astype(np.float32, copy=False))
     codes = parse_picture(data, where, flags=cv2.IMREAD_UNCHANGED)
     if codes.dtype != np.uint16 or codes.ndim != 2:
         raise InputError(

@@ -46,6 +46,7 @@ from cosfly.reading.files import sha256_file
 from cosfly.space.kernels import obstacle_index, signed_distances
 from cosfly.work.journal import Journal
 from cosfly.work.store import CHECKSUMS, write_checksums, write_json
+from release.verify.verify import verify
 from specimens import make_playback_tree, pack_depth
 
 NUM_POINTS = 10
@@ -502,6 +503,22 @@ def slimmer(image: np.ndarray) -> np.ndarray:
         is_person[rows[0]] = False
         image[is_person] = (0, 1, KINDS["Roads"])
     return image
+
+
+@pytest.mark.parametrize("form", ["npy", "png"])
+def test_far_is_far(workplace, form):
+    """Beyond 1,000 m is as far as the sky, in anybody's frames: read as such, here and by `release verify`."""
+    folder, path = first_flight(workplace), first_flight(workplace) / FRAME / "depth.npy"
+    depth, top_row = np.load(path), np.arange(108)[:, None] == 0
+    name, data = depth_file(np.where(top_row, np.float32(1000.2), depth), form)
+    path.unlink()
+    (folder / FRAME / name).write_bytes(data)
+    sky = (0, 0, KINDS["Sky"])
+    edit_image(folder / FRAME / "instance.png", lambda image: np.where(top_row[..., None], sky, image).astype(np.uint8))
+    assert codes_of(inspect(workplace, NO_SUMS), folder) == {}
+    assert read_depth(folder / FRAME).max() == 1000.0
+    list_files(workplace / "tree")
+    assert not [one for one in verify(workplace / "tree").issues if one.code in ("depth_range", "sky")]
 
 
 def test_colours_hold_no_flight_back(workplace):

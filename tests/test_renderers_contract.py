@@ -307,6 +307,25 @@ def test_types_ranges_and_sky(renderer):
     assert frame.rgb[sky].std() > 1.0
 
 
+def test_what_stands_as_far_as_the_sky_is_sky(renderer_name):
+    """A layer moves the clip plane: without more, ground of up to 1,000.7 m is drawn, and depth ends at 1,000."""
+    kinds = ["Terrain", "Roads", "Sidewalks", "Buildings"]
+    centers = [(200.0 * k - 300.0, 700.0, -0.1) for k in range(len(kinds))]
+    halves = [(100.0, 700.0, 0.1)] * 3 + [(100.0, 700.0, 3.0)]
+    box_map = make_box_map(centers, halves, np.zeros((4, 3)), [KINDS[kind] for kind in kinds])
+    renderer, far = opened(renderer_name, box_map), 0
+    for height_m in np.arange(180.0, 320.0, 10.0):
+        pose = pose_towards((0.0, 0.0, height_m), (0.0, 990.0, 0.0))
+        frame = renderer.render(pose, intrinsic_matrix(*SIZE, 8.0), None)
+        is_sky = frame.kinds == KINDS["Sky"]
+        assert frame.depth.max() <= FAR_M
+        np.testing.assert_array_equal(is_sky, frame.depth == SKY_DEPTH_M)
+        assert (frame.ids[is_sky] == NO_INSTANCE).all()
+        far += np.count_nonzero(frame.depth[~is_sky] > 995.0)
+    renderer.close()
+    assert far > 1000, "surfaces reach that far"
+
+
 def test_the_person_is_drawn_in_the_projected_box(renderer):
     pose, camera = pose_towards((-4.0, -12.0, 6.0), HIP), Camera(*SIZE, intrinsic_matrix(*SIZE, 60.0))
     walker = PosedPerson(HIP, 0.7, 1.2, 1.0, choose_clothes(np.random.default_rng(3)))

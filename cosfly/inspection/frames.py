@@ -274,7 +274,7 @@ def _check_depth(depth: np.ndarray, place: str, numbers: FrameNumbers, report: R
     if not np.isfinite([low, high]).all():
         report.error("depth_range", place, f"{int((~np.isfinite(depth)).sum())} pixels not finite", "finite metres")
         return False
-    if low < INVALID_DEPTH_M or high > SKY_DEPTH_M:
+    if low < INVALID_DEPTH_M:
         report.error("depth_range", place, f"{low:.3f} to {high:.3f} m", f"{INVALID_DEPTH_M} to {SKY_DEPTH_M} m")
         return False
     if low == high:

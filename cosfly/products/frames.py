@@ -333,11 +333,17 @@ def read_instance(frame: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_depth(frame: Path) -> np.ndarray:
-    """Read the depth of a frame folder, (h, w) float32 z-depth in m; 1000.0 is sky, 0.0 invalid."""
+    """Read the depth of a frame folder, (h, w) float32 z-depth in m; 1000.0 is sky or as far, 0.0 invalid."""
     path = frame_path(frame, DEPTH_NPY)
     if path.name == DEPTH_PNG:
-        return floats_of(read_bytes(path, what="depth image", tree=tree_of(frame)), path)
-    return read_array(path, dtype=np.float32, ndim=2, what="depth image", tree=tree_of(frame))
+        return depth_values(read_bytes(path, what="depth image", tree=tree_of(frame)), path)
+    return far_clipped(read_array(path, dtype=np.float32, ndim=2, what="depth image", tree=tree_of(frame)))
+
+
+def far_clipped(depth: np.ndarray) -> np.ndarray:
+    """Give depths, m, of which those beyond SKY_DEPTH_M are the sky's; unchanged where one is not finite."""
+    is_beyond = SKY_DEPTH_M < depth.max(initial=0.0) < np.inf
+    return np.minimum(depth, np.float32(SKY_DEPTH_M)) if is_beyond else depth
 
 
 def depth_values(data: bytes | memoryview, where: Path) -> np.ndarray:
@@ -348,12 +354,12 @@ def depth_values(data: bytes | memoryview, where: Path) -> np.ndarray:
         InputError: it is no complete image of that type.
     """
     if is_packed(data):
-        return floats_of(data, where)
+        return far_clipped(floats_of(data, where))
     header = parse_array_header(memoryview(data), where, what="depth image")
     if header.dtype != np.float32 or len(header.shape) != 2:
         raise InputError("not a depth image", where=where, got=str(header), expected="float32 of 2 dimensions")
     values = np.frombuffer(data, np.float32, offset=header.offset)
-    return values.reshape(header.shape, order="F" if header.is_fortran else "C")
+    return far_clipped(values.reshape(header.shape, order="F" if header.is_fortran else "C"))
 
 
 def rgb_bytes(rgb: np.ndarray) -> bytes:

@@ -6,7 +6,8 @@ Any renderer draws the same things in the same places, so that depth, kinds and 
 - others that move, people and cars, each with the id that the caller gives it (`other_id`), nobody else's;
 - of a tree that is one box a stem, and foliage only from `crown_low` of `plants_of` up: people walk under it;
 - a ground plane of Terrain under everything (`ground_plane`) or, on ground that slopes, its triangles and surfaces
-  (draping.py) with the plane below their lowest place; and sky where nothing stands between NEAR_M and FAR_M;
+  (draping.py) with the plane below their lowest place; and sky where nothing stands between NEAR_M and FAR_M
+  (`far_as_sky`);
 - of coplanar surfaces the one of the higher layer, and of one layer always the same one (draping.py).
 """
 
@@ -20,12 +21,13 @@ import numpy as np
 
 from cosfly.errors import RenderError
 from cosfly.products.boxes import BoxMap
+from cosfly.products.frames import SKY_DEPTH_M
 from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.products.weather import WeatherParams
 
 DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"  # OpenGL without a window, on a GPU or the CPU
 
-NEAR_M, FAR_M = 0.3, 1000.0  # clip planes (sec:step5)
+NEAR_M, FAR_M = 0.3, SKY_DEPTH_M  # clip planes (sec:step5)
 
 # Instance ids of the 16 bits that instance.png has: 0 is nobody (sky, ground plane).
 PERSON_ID, SHARED_ID, MAX_BOX_ID = 65535, 65534, 65533
@@ -147,6 +149,15 @@ class Renderer(Protocol):
 
 
 # --- the same for all -------------------------------------------------------------------------------------------------
+
+
+def far_as_sky(frame: Frame) -> Frame:
+    """Count as sky what stands at FAR_M or beyond: a clip plane that a layer or rounding moves lets some of it pass."""
+    is_far = frame.depth >= FAR_M
+    if np.count_nonzero(is_far) == np.count_nonzero(frame.kinds == KINDS["Sky"]):
+        return frame
+    frame.depth[is_far], frame.kinds[is_far], frame.ids[is_far] = SKY_DEPTH_M, KINDS["Sky"], NO_INSTANCE
+    return frame
 
 
 def other_id(number: int) -> int:

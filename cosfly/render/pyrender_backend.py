@@ -147,7 +147,8 @@ class PyrenderRenderer:
         ids = np.where(is_sky, np.uint16(NO_INSTANCE), tags[..., 1] | tags[..., 2].astype(np.uint16) << 8)
         clear = np.where(is_sky, 0.0, np.exp(-depth / self._look.haze_m)).astype(np.float32)[..., None]
         sky = _as_byte(SKY_COLOR * self._look.exposure).astype(np.float32)
-        return Frame(cv2.convertScaleAbs(sky + clear * (colors[..., :3] - sky)), depth, kinds, ids)
+        rgb = cv2.convertScaleAbs(sky + clear * (colors[..., :3] - sky))
+        return contract.far_as_sky(Frame(rgb, depth, kinds, ids))
 
     def _mesh(self, triangles: np.ndarray, colors: np.ndarray, tags: np.ndarray) -> Any:
         """Make a mesh of triangles (k, 3, 3) with linear RGB (k, 3) and tags (k, 4): the sun's light is baked in."""

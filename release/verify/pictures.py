@@ -111,7 +111,7 @@ def check_picture(flight: FlightRows, i: int, decoded: Decoded, findings: Findin
 def _check_depth(where: str, low: float, high: float, findings: Findings) -> bool:
     if np.isnan(low):
         findings.error("depth_range", where, "pixels that are not finite", "metres in every pixel")
-    elif low < 0.0 or high > SKY_DEPTH_M:
+    elif low < 0.0:
         findings.error("depth_range", where, f"{low:.3f} to {high:.3f} m", f"0 to {SKY_DEPTH_M:g} m")
     elif low == high:
         findings.error("depth_range", where, f"{low:.3f} m everywhere", "a depth image")

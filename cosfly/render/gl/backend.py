@@ -16,7 +16,7 @@ from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import SKY_DEPTH_M, Look
 from cosfly.products.kinds import KINDS
 from cosfly.products.weather import WeatherParams
-from cosfly.render.contract import FAR_M, NEAR_M, Frame, PosedOther, PosedPerson, check_pose
+from cosfly.render.contract import FAR_M, NEAR_M, Frame, PosedOther, PosedPerson, check_pose, far_as_sky
 from cosfly.render.gl import meshes
 from cosfly.render.gl import parts as part_tables
 from cosfly.render.gl.figure import MOST_CAPSULES, Body, capsules_of, draw_others, make_body, placed
@@ -377,7 +377,7 @@ class GlRenderer:
         self._image.read_into(tag, components=1, attachment=2, dtype="u4")
         rgb = smoothed(cv2.cvtColor(color, cv2.COLOR_RGBA2RGB))
         rgb = rgb if self._weather is None else self._weather.glowing(rgb)
-        return Frame(rgb, depth, (tag & 0xFF).astype(np.uint8), (tag >> 16).astype(np.uint16))
+        return far_as_sky(Frame(rgb, depth, (tag & 0xFF).astype(np.uint8), (tag >> 16).astype(np.uint16)))
 
     def close(self) -> None:
         self.context.release()
