@@ -10,16 +10,18 @@ import pytest
 from numpy.testing import assert_allclose
 
 import cosfly
+from cosfly.app import library
 from cosfly.errors import ConfigError, InputError
 from cosfly.maps import stage as maps_stage
 from cosfly.maps.stage import MapsConfig
 from cosfly.pedestrians import stage as pedestrians_stage
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners import stage as plan_stage
-from cosfly.planners.contract import PlanConfig
+from cosfly.planners.contract import PLANNERS, PlanConfig
 from cosfly.products.boxes import BoxMap, write_boxes
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.render.contract import PERSON_ID
+from cosfly.render.settings import RenderConfig
 from cosfly.simplify import stage as simplify_stage
 from cosfly.simplify.passes import SimplifyConfig
 
@@ -104,9 +106,80 @@ def test_what_is_wrong_is_said_as_on_the_command_line(town):
         (lambda: cosfly.plan(town, planer="muco"), ConfigError, "plan: planer: unknown setting"),
         (lambda: cosfly.render_frames(town, [0, 0, 9]), InputError, "nobody says where to look"),
         (lambda: cosfly.render_frames(town, [0, 9], [0, 0, 0]), InputError, "position_m: not places"),
+        (lambda: cosfly.load_map("a", source="simworld", world="b"), ConfigError, "load_map: world: changes nothing"),
+        (lambda: cosfly.plan(town, track_astar={"beam": 9}), ConfigError, "plan: track_astar: changes nothing"),
     ):
         with pytest.raises(error, match=words):
             call()
+
+
+VIEW = {"rotation_deg": [-30, 0, 0], "size_px": (32, 18)}
+FIXED = {"weather_mode": "fixed", "weather_name": "clear", "tod_name": "night"}
+PATH, HURRY = [[0, 0], [9, 0]], {"pace": {"hurry": 1}}
+# Of each section: what takes its settings, and calls that together read all that are taken.
+TAKING = {
+    "plan": (
+        PlanConfig,
+        PlanConfig.model_fields.keys(),
+        [lambda the_map, n=n: cosfly.plan(the_map, walk=WALK, planner=n, styles={"side": 1}) for n in PLANNERS],
+    ),
+    "walk": (
+        PedestriansConfig,
+        library.OF_WALK,
+        [lambda the_map, p=p, **more: cosfly.plan(the_map, walk=WALK | p | more) for p in ({}, HURRY)],
+    ),
+    "walk on a way": (
+        PedestriansConfig,
+        library.OF_PACE,
+        [lambda the_map, p=p, **more: cosfly.plan(the_map, PATH, walk=p | more) for p in ({}, HURRY)],
+    ),
+    "render": (
+        RenderConfig,
+        library.OF_PICTURE,
+        [
+            lambda the_map, **more: cosfly.render_frames(the_map, [0, 0, 60], **VIEW, **more or FIXED),
+            lambda the_map: cosfly.render_frames(the_map, [0, 0, 60], **VIEW, weather_mode="random_per_path"),
+        ],
+    ),
+}
+
+
+@pytest.mark.parametrize("section", TAKING)
+def test_no_setting_is_ignored(town, monkeypatch, section):
+    """Each setting of a section is read by the function that takes it, or refused."""
+    (model, taken, calls), read, is_built = TAKING[section], set(), False
+
+    def get(self, name):
+        if is_built and name in model.model_fields:
+            read.add(name)
+        return super(watched, self).__getattribute__(name)
+
+    def build(*given):
+        nonlocal is_built
+        is_built = False  # validators read them all
+        cfg = real_build(*given)
+        is_built = True
+        return cfg
+
+    watched, real_build = type(model.__name__, (model,), {"__getattribute__": get}), library.build
+    with monkeypatch.context() as patch:
+        patch.setattr(library, "build", build)
+        patch.setattr(library, model.__name__, watched)
+        for call in calls:
+            call(town)
+    assert set(taken) - read == set(), "taken, and never read"
+    for name in model.model_fields.keys() - taken:
+        with pytest.raises(ConfigError, match=f"{name}: changes nothing here"):
+            calls[0](town, **{name: dict(model())[name]})
+
+
+def test_weather_is_drawn_as_asked(town):
+    def picture(**settings) -> np.ndarray:
+        return cosfly.render_frames(town, [0, 0, 60], **VIEW, **settings)[0].rgb
+
+    night, noon = picture(**FIXED), picture(**FIXED | {"tod_name": "noon"})
+    assert night.mean() < noon.mean() - 50
+    assert (picture(weather_mode="random_per_path", weather_seed=3) != picture(**FIXED)).any()
 
 
 def test_the_notebook_runs_and_its_numbers_fit():

@@ -6,6 +6,7 @@ degrees.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +27,20 @@ from cosfly.render.contract import Frame
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer
+from cosfly.render.weather import WeatherConfig, drawn_seed, read_pools, weather_of
 from cosfly.simplify.passes import SimplifyConfig, simplify
 from cosfly.work.chance import rng_for
 from cosfly.work.config import build
 
 __all__ = ["BoxMap", "DroneTrace", "Frame", "load_map", "plan", "read_captions", "render_frames"]
 
+# Settings that a function makes something of; it refuses the others of the section.
+OF_WALK = PedestriansConfig.model_fields.keys() - {"num_paths", "others", "traffic", "others_reach_m"}
+OF_PACE = {
+    "cruise_speed_mps", "curvature_gain_m", "speed_jitter", "min_speed_mps", "max_speed_mps", "pace", "hurry_speed_mps",
+    "dt_s",
+}  # fmt: skip
+OF_PICTURE = {"backend", "look", *WeatherConfig.model_fields}
 STEP_S = 0.5  # between the places of `render_frames`, for the person's stride
 FILE_SETTING = {"simworld": "world", "cityjson": "path", "boxes": "path"}  # of a source: which setting names its file
 
@@ -61,7 +70,10 @@ def load_map(path: str | Path | None = None, *, source: str | None = None, seed:
             got=str(path),
             fix=f"leave the path out, or give another source than {source}",
         )
-    given = settings if path is None else {FILE_SETTING[source]: Path(path), **settings}
+    given = settings
+    if path is not None:
+        _check_taken(settings, settings.keys() - {FILE_SETTING[source]}, "load_map")
+        given = {FILE_SETTING[source]: Path(path), **settings}
     return load_source(build(MapsConfig, {"source": source, source: given}, "load_map"), seed=seed)
 
 
@@ -75,13 +87,16 @@ def plan(
         walk: settings of the walk, as in `pedestrians` of a configuration.
         settings: as in `plan` of a configuration: `plan(box_map, planner="muco", altitude_max_m=30)`.
     Raises:
-        ConfigError: an unknown setting. InputError: the way is none. NoPathError: there is no way, or no flight.
+        ConfigError: a setting that is unknown, or changes nothing here. InputError: the way is none.
+        NoPathError: there is no way, or no flight.
     """
     from cosfly.planners.reacquire import screens_of
     from cosfly.space.kernels import obstacle_index
 
     walking = build(PedestriansConfig, walk or {}, "plan: walk")
+    _check_taken(walk or {}, OF_WALK if way_m is None else OF_PACE, "plan: walk")
     cfg = build(PlanConfig, settings, "plan")
+    _check_taken(settings, settings.keys() - ({"track_astar"} - {cfg.planner}), "plan")
     if not box_map.header.passes:
         box_map = simplify(box_map, SimplifyConfig()).box_map
     rng = rng_for(seed, "pedestrians", "path_00000")
@@ -122,11 +137,12 @@ def render_frames(
         position_m: (3,) or (n, 3). rotation_deg: pitch, yaw, roll of the same shape; None looks at the target.
         target_m: hip of the person, the same shape; None: nobody is there.
         fov_deg: horizontal. size_px: width and height.
-        settings: as in `render` of a configuration: `look`, `backend`.
+        settings: as in `render` of a configuration: `look`, `backend`, those of weather.
     Returns:
         n frames: rgb (h, w, 3) uint8, depth (h, w) float32 z-depth in m, kinds and instance ids (h, w).
     Raises:
-        ConfigError: an unknown setting. InputError: shapes that do not belong together. EnvironmentMissing: no OpenGL.
+        ConfigError: a setting that is unknown, or changes nothing here. InputError: shapes that do not belong
+            together. EnvironmentMissing: no OpenGL.
     """
     positions = _places(position_m, "position_m")
     targets = None if target_m is None else _places(target_m, "target_m", len(positions))
@@ -139,17 +155,19 @@ def render_frames(
         raise InputError(
             "nobody says where to look", where="render_frames", expected="rotation_deg, or target_m to look at"
         )
-    cfg = build(
-        RenderConfig,
-        {**settings, "width_px": size_px[0], "height_px": size_px[1], "fovs_deg": [fov_deg]},
-        "render_frames",
-    )
+    camera = {"width_px": size_px[0], "height_px": size_px[1], "fovs_deg": [fov_deg]}
+    cfg = build(RenderConfig, settings | camera, "render_frames")
+    _check_taken(settings, OF_PICTURE, "render_frames")
+    if cfg.weather_seed < 0:
+        cfg = cfg.model_copy(update={"weather_seed": drawn_seed()})
+    weather = weather_of(cfg, read_pools(cfg), 0)
     intrinsic = intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg)
     gait = None if targets is None else gait_of(targets, STEP_S * np.arange(len(targets)))
     clothes = choose_clothes(rng_for(seed, "render", "library"))
     renderer = open_renderer(cfg.backend, box_map, cfg.width_px, cfg.height_px, cfg.look)
     try:
-        renderer.prepare(positions.min(axis=0), positions.max(axis=0))
+        knobs = None if weather is None else weather.params
+        renderer.prepare(positions.min(axis=0), positions.max(axis=0), knobs)
         people = [
             None if gait is None or targets is None else gait.posed(i, targets[i], clothes)
             for i in range(len(positions))
@@ -158,6 +176,12 @@ def render_frames(
         return [renderer.render(pose, intrinsic, person) for pose, person in zip(poses, people, strict=True)]
     finally:
         renderer.close()
+
+
+def _check_taken(settings: dict[str, Any], taken: Collection[str], where: str) -> None:
+    if ignored := sorted(settings.keys() - taken):
+        expected = f"settings that do: {', '.join(sorted(taken)) or 'none'}; the function's own arguments"
+        raise ConfigError(f"{', '.join(ignored)}: changes nothing here", where=where, expected=expected)
 
 
 def _places(values: Any, name: str, count: int | None = None) -> np.ndarray:
