@@ -11,6 +11,7 @@ RUN ?= runs/quickstart
 SLOW ?=
 FUZZ_INPUTS ?= 150000
 FUZZ_SEED ?= 1
+LINT := $(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
 
 .PHONY: quickstart test fuzz lint format site audit sbom lock clean
@@ -18,16 +19,18 @@ GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
 quickstart: $(VENV)/.installed  ## Map to release on the embedded synthetic town
 	$(BIN)/cosfly run quickstart --out $(RUN)
 
-test: lint  ## What must hold, without the tests that take long; with SLOW=1 everything
-	$(BIN)/python -m pytest -n 2 --dist loadfile $(if $(SLOW),,-m "not slow")
+test: $(VENV)/.installed-dev  ## What must hold, without the tests that take long; with SLOW=1 everything
+	{ $(LINT); } >$(VENV)/lint.txt 2>&1 & lint=$$!
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(if $(SLOW),,-m "not slow") && failed=0 || failed=1
+	wait $$lint || failed=1
+	cat $(VENV)/lint.txt
+	exit $$failed
 
 fuzz: $(VENV)/.installed-dev  ## Hostile inputs to every reader, about an hour; fewer with FUZZ_INPUTS=5000, others with FUZZ_SEED=2
 	$(BIN)/python tests/fuzz.py --inputs $(FUZZ_INPUTS) --seed $(FUZZ_SEED)
 
 lint: $(VENV)/.installed-dev
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	$(LINT)
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .

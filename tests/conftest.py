@@ -16,6 +16,18 @@ hypothesis.settings.load_profile("cosfly")
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
+# Files that take a minute or more, the longest first: begun last, one of them would leave the other worker without work.
+LONG = (
+    "test_docs_run.py", "test_release_honest.py", "test_crashes.py", "test_fuzz.py", "test_release_verify.py",
+    "test_pipeline_tiny.py", "test_planners_contract.py", "test_release_build.py", "test_release_get.py",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long files first; `--dist loadfile --no-loadscope-reorder` hands files out in this order."""
+    items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
+
+
 @pytest.fixture
 def shared_data() -> Path:
     """The folder of real maps beside the repository; the test is skipped where it is absent."""
