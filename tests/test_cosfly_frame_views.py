@@ -197,19 +197,25 @@ def test_a_picture_of_another_shape_is_refused(frame):
 # --- pixels ---
 
 
+@pytest.fixture(scope="module")
+def large(tmp_path_factory):
+    """A window of a flight in pictures of 640 x 360."""
+    root = tmp_path_factory.mktemp("large")
+    make_playback_tree(root, 1, 10, seed=1, width_px=640, height_px=360, with_augmented=False)
+    return next(cut_windows(read_flight(find_flights(root)[0]), WindowConfig())).observed
+
+
 @pytest.mark.parametrize("max_side_px", [640, 500])
-def test_a_size_read_off_the_picture_is_the_measured_one(tmp_path, max_side_px):
+def test_a_size_read_off_the_picture_is_the_measured_one(large, max_side_px):
     """The red person (some 20 x 60 px) of the segmentation that is sent, against the facts, where it is whole."""
-    make_playback_tree(tmp_path, 1, 10, seed=1, width_px=640, height_px=360, with_augmented=False)
-    observed = next(cut_windows(read_flight(find_flights(tmp_path)[0]), WindowConfig())).observed
     cfg = ImageConfig(modalities=("segmentation",), max_side_px=max_side_px)
-    facts = make_question(observed, cfg, "prose").facts
+    facts = make_question(large, cfg, "prose").facts
     assert facts.width_px == max_side_px
     compared = 0
-    for i, folder in enumerate(observed.frame_folders):
-        [picture] = pictures_of(observed, cfg).read(folder)
+    for i, folder in enumerate(large.frame_folders):
+        [picture] = pictures_of(large, cfg).read(folder)
         rows, columns = np.nonzero((picture == PEDESTRIAN_RGB).all(axis=2))
-        if observed.frames[i].visibility < 1.0 or not len(rows):
+        if large.frames[i].visibility < 1.0 or not len(rows):
             continue
         left, top, right, bottom = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
         assert right - left == pytest.approx(facts.box_width_px[i], abs=2)

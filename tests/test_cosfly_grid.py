@@ -145,16 +145,6 @@ def test_a_tilted_box_fills_what_its_slice_at_walking_height_covers(subtests):
                 assert grid.occupied[row, column] == is_met, (row, column)
 
 
-def test_one_more_box_never_frees_a_cell():
-    rng = np.random.default_rng(5)
-    rotations = np.column_stack([np.zeros(30), rng.uniform(0, 360, 30), np.zeros(30)])
-    centers = np.column_stack([rng.uniform(0, 40, (30, 2)), np.ones(30)])
-    box_map = make_box_map(centers, rng.uniform(0.1, 3, (30, 3)), rotations, [BUILDINGS] * 30)
-    frame = empty_grid(box_map)
-    before = occupancy(box_map.select(np.arange(29)), like=frame).occupied
-    assert (occupancy(box_map, like=frame).occupied | ~before).all()
-
-
 def test_surfaces_near_the_ground_count_and_a_flyover_does_not():
     box_map = make_box_map(
         [[1, 1, -0.1], [3, 1, 6.0], [5, 1, 1.0]], [[1, 1, 0.1]] * 3, np.zeros((3, 3)), [ROADS, ROADS, BUILDINGS]
@@ -174,19 +164,6 @@ def test_compare_by_hand():
 
 
 # --- growing, cutting out, connecting ---------------------------------------------------------------------------------
-
-
-def test_inflation_by_hand():
-    occupied = grid_of("..... ..... ..#.. ..... .....").occupied
-    for radius_m, expected in (
-        (0.4, "..... ..... ..#.. ..... ....."),
-        (0.5, "..... ..#.. .###. ..#.. ....."),
-        (0.7, "..... ..#.. .###. ..#.. ....."),
-        (0.75, "..... .###. .###. .###. ....."),
-        (1.0, "..#.. .###. ##### .###. ..#.."),
-    ):
-        grown = inflate(OccupancyGrid(0.0, 0.0, 0.5, occupied), radius_m)
-        np.testing.assert_array_equal(grown.occupied, grid_of(expected).occupied)
 
 
 @settings(max_examples=25)
@@ -214,11 +191,6 @@ def test_roi_with_holes_and_several_rings_equals_shapely():
     expected = shapely.contains_xy(region, centers[..., 0], centers[..., 1])
     np.testing.assert_array_equal(roi_mask(grid, roi), expected)
     assert 0 < expected.sum() < expected.size
-
-
-def test_roi_in_the_papers_form_takes_cells_by_their_center():
-    roi = Roi(points_world=[(0.4, 0.4), (2.6, 0.4), (2.6, 1.4), (0.4, 1.4)])
-    np.testing.assert_array_equal(roi_mask(free_grid(4, 3), roi), grid_of(".... .... ###.").occupied)
 
 
 def test_a_corner_joins_eight_neighbours_but_not_four():

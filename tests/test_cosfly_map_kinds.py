@@ -102,6 +102,16 @@ def with_an_outline(model: Model) -> Model:
     return model
 
 
+def in_a_composite(model: Model) -> Model:
+    """The second house one solid of several, below an outline of level 0."""
+    model = copy.deepcopy(model) | {"version": "1.1"}
+    (solid,) = model["CityObjects"]["other"]["geometry"]
+    outline = {"type": "MultiSurface", "lod": "0", "boundaries": [solid["boundaries"][0][0]]}
+    several = solid | {"type": "CompositeSolid", "boundaries": [solid["boundaries"]]}
+    model["CityObjects"]["other"]["geometry"] = [outline, several]
+    return model
+
+
 def with_a_template(model: Model, version: str) -> Model:
     """The second house is an instance of a template of half its size, from its own low corner."""
     model = copy.deepcopy(model) if version >= "1.1" else in_metres(model, version)
@@ -147,6 +157,7 @@ FORMS: dict[str, Callable[[Model], bytes]] = {
     "2.0 with an outline": lambda m: document(with_an_outline(m)),
     "2.0 with a template": lambda m: document(with_a_template(m, "2.0")),
     "1.1 with a group": lambda m: document(v11_with_a_group(m)),
+    "1.1 gzipped, a composite": lambda m: gzip.compress(document(in_a_composite(m)), mtime=0),
     "1.0 with a group": lambda m: document(v10_with_a_group(m)),
     "1.0 with a template": lambda m: document(with_a_template(m, "1.0")),
     "1.0.3 compressed": lambda m: document(copy.deepcopy(m) | {"version": "1.0.3"}),

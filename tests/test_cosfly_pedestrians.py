@@ -391,12 +391,6 @@ def test_the_stage_writes_paths_report_and_picture(map_file, tmp_path):
     assert len(np.unique(picture[::7, ::7].reshape(-1, 3), axis=0)) > 5
 
 
-def test_fewer_paths_are_the_first_of_more(map_file, tmp_path):
-    few = read_paths(run(PedestriansConfig(num_paths=2), map_file, tmp_path / "few"))
-    more = read_paths(run(PedestriansConfig(num_paths=4), map_file, tmp_path / "more"))
-    assert [p.as_json() for p in few] == [p.as_json() for p in more[:2]]
-
-
 def test_a_path_that_fails_is_counted_and_the_others_go_on(tmp_path):
     # A yard of 40 m beside a field: starts in the yard have no goal 60 m off.
     box_map = plain(

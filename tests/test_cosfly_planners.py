@@ -48,13 +48,6 @@ def test_parabola_has_constant_acceleration_and_cubic_constant_jerk():
     assert metrics.jerk_rms(cubic) == pytest.approx(2.0)
 
 
-def test_circle_has_centripetal_acceleration():
-    time_s = np.arange(400) * 0.01
-    circle = 10 * np.stack([np.cos(0.3 * time_s), np.sin(0.3 * time_s), 0 * time_s], axis=1)
-    assert metrics.accel_rms(circle, 0.01) == pytest.approx(10 * 0.3**2, rel=1e-4)
-    assert metrics.jerk_rms(circle, 0.01) == pytest.approx(10 * 0.3**3, rel=1e-3)
-
-
 def test_smoothness_score_by_hand():
     assert metrics.smoothness_score(5, 10) == pytest.approx(np.exp(-1))
     assert metrics.smoothness_score(5, 0) == pytest.approx(np.exp(-0.5))
@@ -173,19 +166,6 @@ def test_gradient_is_the_derivative_of_the_loss():
             moved[i, axis] += sign * 1e-5
             ends.append(loss.evaluate(moved, problem, obstacles, unmasked, scratch))
         assert gradient[i, axis] == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4, abs=1e-3)
-
-
-def test_difference_gradient_tends_to_the_analytic_one():
-    points, problem, obstacles = shaken("canyon")
-    narrow = problem._replace(difference_m=1e-5, altitudes=np.tile([0.0, 20.0, 100.0], (len(points), 1)))
-    state, unmasked = loss.make_state(len(points), len(obstacles.rows)), np.zeros(len(points), dtype=bool)
-    loss.evaluate(points, narrow, obstacles, unmasked, state)
-    differences, before = np.empty_like(points), points.copy()
-    loss.difference_gradient(
-        points, narrow, obstacles, unmasked, loss.make_state(len(points), len(obstacles.rows)), differences
-    )
-    np.testing.assert_array_equal(points, before)
-    np.testing.assert_allclose(differences, state.gradient, rtol=1e-3, atol=1e-3)
 
 
 def test_curvature_is_positive_and_exact_for_the_quadratic_terms():

@@ -30,7 +30,6 @@ from cosfly.reading.files import sha256_file
 from cosfly.render.camera import box_depths, rendered_visibility, view_target
 from cosfly.render.contract import (
     FAR_M,
-    GROUND_PLANE_HALF_M,
     MAX_BOX_ID,
     NEAR_M,
     PERSON_ID,
@@ -199,13 +198,6 @@ def test_boxes_leave_the_ids_of_others_free():
     assert np.isin(ids, [*others, PERSON_ID, 0]).sum() == 0
     assert ids.max() == SHARED_ID
     assert (ids == SHARED_ID).sum() == 25
-
-
-def test_ground_plane_is_below_every_slab():
-    scene = build_scene(street())
-    top = scene.parts.records["center"][-1, 2] + scene.parts.records["half"][-1, 2] + scene.origin_m[2]
-    assert scene.parts.records["half"][-1, 0] == GROUND_PLANE_HALF_M
-    assert top < -0.1
 
 
 # --- the person -------------------------------------------------------------------------------------------------------
