@@ -276,8 +276,10 @@ def test_each_track_is_measured_against_the_map_by_its_own_poses(workplace):
     assert "collision" not in found["ORI"]
     by_variant = {f.variant: f for f in read_inspection(workplace / "out/inspect.json").flights[:2]}
     post = obstacle_index(read_boxes(workplace / "map.json"))
-    for flight in (clean, shaken):
-        least = signed_distances(post, flight.positions_m)[0].min()
+    along = np.linspace(0, 1, 501)[:, None, None]
+    way_m = (clean.positions_m[:-1] * (1 - along) + clean.positions_m[1:] * along).reshape(-1, 3)
+    for flight, places_m in ((clean, way_m), (shaken, shaken.positions_m)):
+        least = signed_distances(post, places_m)[0].min()
         assert by_variant[flight.variant].metrics["clearance_min_m"] == pytest.approx(least, abs=1e-4)
     assert f">{by_variant['aug_001'].metrics['clearance_min_m']:.2f}<" in (workplace / "out/report.html").read_text()
 
@@ -292,6 +294,13 @@ def test_clearance_has_a_floor(workplace, beside_m, codes):
     found = findings(workplace)["ORI"].keys() & {"clearance", "collision"}
     assert found <= codes
     assert bool(found) == bool(codes)
+
+
+def test_a_post_between_two_poses_is_a_collision(workplace):
+    positions_m = read_flight(first_flight(workplace)).positions_m
+    i = int(np.argmax(np.linalg.norm(np.diff(positions_m, axis=0), axis=1)))
+    write_map(workplace, (0.5 * (positions_m[i] + positions_m[i + 1]), [0.01, 0.01, 0.01]))
+    assert findings(workplace, InspectConfig(clearance_min_m=0.0))["ORI"]["collision"] == "error"
 
 
 def test_what_hides_or_holds_the_person_is_found(workplace):

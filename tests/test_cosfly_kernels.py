@@ -56,13 +56,6 @@ def random_boxes(rng, num_boxes, spread_m=60.0, tilt=True):
     return kernels.index_boxes(centers, rng.uniform(0, 8, (num_boxes, 3)), rotation_matrices(angles))
 
 
-def normals_at(index, points, boxes):
-    """(n, 3) outward normals of the given boxes."""
-    return np.array(
-        [kernels.normal_of_box(index.rows, box, *map(float, p)) for p, box in zip(points, boxes, strict=True)]
-    )
-
-
 def one_box(center=(0, 0, 0), half=(1, 2, 3), yaw_deg=0.0):
     return kernels.index_boxes([center], [half], rotation_matrix(0, np.radians(yaw_deg), 0)[None])
 
@@ -80,7 +73,7 @@ def test_distance_and_normal_by_hand():
         points, distances, normals = map(list, zip(*rows, strict=True))
         found, boxes = kernels.signed_distances(index, points)
         np.testing.assert_allclose(found, distances)
-        np.testing.assert_allclose(normals_at(index, points, boxes), normals, atol=1e-12)
+        np.testing.assert_allclose(kernels.normals(index, points, boxes), normals, atol=1e-12)
 
 
 def test_nearest_agrees_with_all_pairs(subtests):
@@ -107,7 +100,7 @@ def test_moving_along_the_normal_changes_the_distance_by_as_much(subtests):
             index = random_boxes(rng, 1)
             points = rng.uniform(-90, 90, (100, 3))
             distances, boxes = kernels.signed_distances(index, points)
-            normals = normals_at(index, points, boxes)
+            normals = kernels.normals(index, points, boxes)
             np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
             moved, _ = kernels.signed_distances(index, points + 0.25 * normals)
             outside = distances > 0
@@ -126,6 +119,35 @@ def test_segments_agree_with_plane_clipping(subtests):
             expected = [slow_hits(index, a, b, inflate_m).any() for a, b in zip(starts, ends, strict=True)]
             assert 0 < sum(expected) < 300
             np.testing.assert_array_equal(kernels.segments_hit(index, starts, ends, inflate_m), expected)
+
+
+def test_the_way_between_points_agrees_with_many_points_on_it(subtests):
+    for seed in range(20):
+        with subtests.test(seed=seed):
+            rng = np.random.default_rng(seed)
+            index = random_boxes(rng, 12, spread_m=20.0)
+            points = np.cumsum(rng.normal(0, 3, (30, 3)), axis=0)
+            gaps, shares, boxes = kernels.swept_distances(index, points, 100.0)
+            ends = points[:-1], points[1:]
+            between = np.linspace(0, 1, 1001)[:, None, None]
+            fine = (ends[0] * (1 - between) + ends[1] * between).reshape(-1, 3)
+            dense = slow_distances(index, fine).min(axis=1).reshape(1001, -1)
+            outside = np.maximum(dense.min(axis=0), 0.0)
+            np.testing.assert_allclose(np.maximum(gaps[:-1], 0.0), outside, atol=1e-3)
+            assert (np.maximum(gaps[:-1], 0.0) <= outside + 1e-9).all()
+            at = ends[0] + shares[:-1, None] * (ends[1] - ends[0])
+            found = slow_distances(index, at)[np.arange(len(at)), boxes[:-1]]
+            np.testing.assert_allclose(np.maximum(found, 0.0), np.maximum(gaps[:-1], 0.0), atol=1e-9)
+            assert gaps[-1] == pytest.approx(slow_distances(index, points[-1:]).min())
+
+
+def test_the_way_past_a_corner_by_hand():
+    index = kernels.index_boxes(np.zeros((1, 3)), np.ones((1, 3)), NO_TURN)
+    points = np.array([[4.0, 1, 0], [1, 4, 0], [1, -4, 0], [-9, -4, 0], [-9, -4, 0]])
+    gaps, shares, boxes = kernels.swept_distances(index, points, 6.0)
+    np.testing.assert_allclose(gaps, [np.sqrt(4.5), 0.0, 3.0, 6.0, 6.0])
+    assert shares[0] == pytest.approx(0.5)
+    assert boxes.tolist() == [0, 0, 0, -1, -1]
 
 
 def test_segments_by_hand():

@@ -113,6 +113,30 @@ def test_every_planner_flies_every_style_safely(planner, style):
         assert trace.as_json().keys().isdisjoint({"segments", "mission", "instead_of"})
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_the_limits_hold_all_the_way_on_ten_seeds(planner):
+    """By what is stored alone: speed, acceleration, and every ten centimetres of the way between points."""
+    shares = {name: 1.0 for name in NAMES if name not in (REACQUIRE, FOLLOW)}
+    cfg = PlanConfig(
+        planner=planner, styles=shares, segment_s=15, relaxed_safety_m=3.0, track_astar={"beam": 256},
+        styles_fallback="follow",
+    )  # fmt: skip
+    for seed, world in enumerate(("canyon", "corner", "tower_midway") * 3 + ("canyon",)):
+        box_map, corners = WORLDS[world]
+        obstacles, walk = kernels.obstacle_index(box_map), walk_along(world, corners, speed_mps=2.0)
+        trace = DroneTrace.from_json(plan_flight(walk, obstacles, cfg, seed).as_json(), world)
+        along = np.linspace(0, 1, 51)[:, None, None]
+        between = trace.positions_m[:-1] * (1 - along) + trace.positions_m[1:] * along
+        least_m = kernels.signed_distances(obstacles, between.reshape(-1, 3), 50.0)[0].min()
+        assert least_m >= cfg.relaxed_safety_m - 1e-3
+        assert trace.metrics["clearance_min_m"] == trace.clearances_m.min() <= least_m + 1e-4
+        speeds = np.linalg.norm(np.diff(trace.positions_m, axis=0), axis=1) / 0.5
+        changes = np.linalg.norm(np.diff(trace.positions_m, n=2, axis=0), axis=1) / 0.25
+        assert speeds.max() <= cfg.speed_max_mps + 1e-6
+        assert changes.max() <= cfg.accel_max_mps2 + 1e-6
+
+
 def test_the_default_is_the_papers_flight_and_draws_nothing():
     scenario = make_scenario(STRAIGHT, OPEN, PlanConfig())
     intent = draw_intent(scenario, OPEN, OPEN, PlanConfig(), style_rng(STRAIGHT, 0))

@@ -154,14 +154,15 @@ def check_surroundings(
     flight: Flight, obstacles: BoxIndex, cfg: InspectConfig, report: Report, metrics: dict[str, float | int | None]
 ) -> np.ndarray:
     """Measure the poses of a flight against the map: clearance of the drone, five-ray visibility, a person in an
-    obstacle; gives the first, (n,) m.
+    obstacle; gives the first, (n,) m: of the way to the next pose, of the poses alone where shifts moved them.
     """
-    from cosfly.space.kernels import signed_distances, visibility
+    from cosfly.space.kernels import signed_distances, swept_distances, visibility
 
-    gaps_m, _ = signed_distances(obstacles, flight.positions_m, CLEARANCE_CAP_M)
+    clearances = swept_distances if flight.is_original else signed_distances
+    gaps_m = clearances(obstacles, flight.positions_m, CLEARANCE_CAP_M)[0]
     metrics.update(clearance_min_m=float(gaps_m.min()))
-    for i in np.flatnonzero(gaps_m < cfg.clearance_min_m - CLEARANCE_TOLERANCE_M):
-        code, where = "collision" if gaps_m[i] < 0 else "clearance", f"trajectory.json: points[{i}].drone_pose"
+    for i in np.flatnonzero((gaps_m < cfg.clearance_min_m - CLEARANCE_TOLERANCE_M) | (gaps_m <= 0)):
+        code, where = "collision" if gaps_m[i] <= 0 else "clearance", f"trajectory.json: points[{i}].drone_pose"
         report.error(code, where, f"{gaps_m[i]:.2f} m", f"at least {cfg.clearance_min_m:g} m to every obstacle")
     known = np.flatnonzero(~np.isnan(flight.targets_m).any(axis=1))
     if not len(known):

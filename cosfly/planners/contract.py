@@ -151,6 +151,9 @@ class PlanConfig(Config):
         20.0, gt=0, description="horizontal distance to the target, m: for foresight all along, for others at the start"
     )
     speed_max_mps: float = Field(10.0, gt=0, description="greatest speed between two waypoints, m/s")
+    accel_max_mps2: float = Field(
+        5.0, gt=0, description="greatest change of speed from a step to the next, m/s^2; muco.step: paper knows none"
+    )
     heading_smoothing_s: float = Field(
         4.0, ge=0, description="standard deviation of the smoothing of the walking direction, s; 0: none"
     )

@@ -3,6 +3,9 @@
 The smoothed flight p of a raw flight r minimises the sum over waypoints of pull (p - r)^2 + velocity^2 + acceleration^2
 + jerk^2, each with its weight: one band system, the same for x, y and z. Waypoints that see less than their raw ones
 are pulled harder, up to a limit, and those that come too near a box or fly too fast without one, until none is left.
+
+`within_limits` mends a flight of any planner by the same system: what breaks a limit is let go, what is too near a box
+is drawn away from it, and the rest stays where it is.
 """
 
 from __future__ import annotations
@@ -12,7 +15,8 @@ from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
 
 from cosfly.planners.contract import PlanConfig, Scenario
-from cosfly.space.kernels import BoxIndex, segments_hit, signed_distances, visibility
+from cosfly.space.flight_metrics import CLEARANCE_TOLERANCE_M
+from cosfly.space.kernels import BoxIndex, normals, swept_distances, visibility
 
 # Weights of the squared distance to the raw flight: where any bearing will do; where the wished one counts, and there
 # at wished places, whose halts are part of what is wished; at most for the sake of sight.
@@ -25,6 +29,8 @@ SPREAD_S = 1.0  # neighbours are pulled along
 ROUNDS, ROUNDS_MAX = 12, 24  # for the sake of sight; for the sake of safety
 SIGHT_LOSS = 0.01  # of a waypoint that is no loss: the five rays count in fifths
 ASTRAY_SHARE = 0.3  # of the wished distance: farther from the raw flight is not the flight that was searched
+PULL_STAYS = 1e6  # of a flight that is right: within a centimetre
+AWAY_M = 0.05  # beyond what is asked for, so that rounds end
 ROUNDING_M = 1e-9
 
 
@@ -56,7 +62,47 @@ def smooth_flight(
             break
         pulls = pulls * PULL_RISE ** _spread(np.maximum(lost, blocked), SPREAD_S / dt_s)
     facts = {"raw_visibility": round(float(seen_raw.mean()), 4), "rounds": tried, "smooth": is_smooth}
-    return (points if is_smooth else raw), facts
+    return within_limits(points if is_smooth else raw, scenario, obstacles, cfg), facts
+
+
+def within_limits(points: np.ndarray, scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> np.ndarray:
+    """Give a flight (n, 3) that keeps the limits of speed, acceleration and clearance as it will be written; itself
+    where it keeps them.
+
+    Raises:
+        NoPathError: none was found near it.
+    """
+    low, high = (scenario.ground_m + bound for bound in (scenario.wish.altitude_min_m, scenario.wish.altitude_max_m))
+    goal, pulls, band = points.copy(), np.full(len(points), PULL_STAYS), smoothness_band(len(points), scenario.dt_s)
+    least_m = cfg.relaxed_safety_m - CLEARANCE_TOLERANCE_M
+    for _ in range(ROUNDS_MAX):
+        written = np.round(points, 4)
+        hurried = hurries(written, cfg, scenario.dt_s)
+        gaps_m, shares, boxes = swept_distances(obstacles, written, cfg.relaxed_safety_m + AWAY_M)
+        if not (hurried.any() or (gaps_m < least_m).any()):
+            return points
+        near = np.flatnonzero((gaps_m < cfg.relaxed_safety_m + AWAY_M) & (boxes >= 0))
+        after = np.minimum(near + 1, len(points) - 1)
+        places = written[near] + shares[near, None] * (written[after] - written[near])
+        away = normals(obstacles, places, boxes[near]) * (cfg.relaxed_safety_m + AWAY_M - gaps_m[near])[:, None]
+        for ends in (near, after):
+            np.add.at(goal, ends, away)
+        pulls = pulls / PULL_RISE ** _spread(hurried, SPREAD_S / scenario.dt_s)
+        system = band.copy()
+        system[0] += pulls
+        points = solveh_banded(system, pulls[:, None] * goal, lower=True)
+        points[:, 2] = np.clip(points[:, 2], low, high)
+    raise scenario.no_way("no flight within the limits of speed and acceleration", cfg.relaxed_safety_m)
+
+
+def hurries(points: np.ndarray, cfg: PlanConfig, dt_s: float) -> np.ndarray:
+    """Tell which waypoints (n, 3) are at an end of a step too fast or of a change of speed too great, (n,) bool."""
+    found = np.zeros(len(points), dtype=bool)
+    for order, most in ((1, cfg.speed_max_mps), (2, cfg.accel_max_mps2)):
+        over = np.linalg.norm(np.diff(points, n=order, axis=0), axis=1) > most * dt_s**order + 1e-9
+        for k in range(order + 1):
+            found[k : k + len(over)] |= over
+    return found
 
 
 def first_pulls(raw: np.ndarray, scenario: Scenario) -> np.ndarray:
@@ -79,10 +125,9 @@ def smoothness_band(num_points: int, dt_s: float) -> np.ndarray:
 
 
 def unsafe(points: np.ndarray, obstacles: BoxIndex, clearance_m: float, step_max_m: float) -> np.ndarray:
-    """Tell which waypoints are too near a box, or at an end of a step too long or through one, (n,) bool."""
-    found = signed_distances(obstacles, points, clearance_m)[0] < clearance_m - ROUNDING_M
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1) > step_max_m * (1.0 + ROUNDING_M)
-    steps |= segments_hit(obstacles, points[:-1], points[1:])
+    """Tell which waypoints are at an end of a step too long or too near a box, (n,) bool."""
+    found = swept_distances(obstacles, points, clearance_m)[0] < clearance_m - ROUNDING_M
+    steps = found[:-1] | (np.linalg.norm(np.diff(points, axis=0), axis=1) > step_max_m * (1.0 + ROUNDING_M))
     found[:-1] |= steps
     found[1:] |= steps
     return found

@@ -26,11 +26,11 @@ class DroneTrace:
 
     time_s: (n,). positions_m: (n, 3) drone. rotations_deg: (n, 3) pitch, yaw, roll of the camera, which looks at the
     target. targets_m: (n, 3) the pedestrian's tracked point (hip height). visibility: (n,) five-ray fraction in [0, 1].
-    clearances_m: (n,) signed distance to the nearest obstacle. metrics and solver: JSON-able facts. segments: the
-    styles of its parts, none where it follows from end to end. mission: the order that ended the pursuit. instead_of:
-    the style that it should have had and the map did not hold, and why. On the way home and in a search the camera
-    looks elsewhere. drop_reason: why the planner-stage prefilter (sec:step6) rejects the flight, None if it passes;
-    only those are rendered. pace: of the walk.
+    clearances_m: (n,) signed distance to the nearest obstacle, the least on the straight way to the next point. metrics
+    and solver: JSON-able facts. segments: the styles of its parts, none where it follows from end to end. mission: the
+    order that ended the pursuit. instead_of: the style that it should have had and the map did not hold, and why. On
+    the way home and in a search the camera looks elsewhere. drop_reason: why the planner-stage prefilter (sec:step6)
+    rejects the flight, None if it passes; only those are rendered. pace: of the walk.
     """
 
     path_id: str

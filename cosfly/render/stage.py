@@ -108,6 +108,7 @@ def script_flight(
             "scenario_id": trace.path_id,
             "scenario_name": town,
             "algorithm": trace.planner,
+            "clearance_min_m": trace.metrics.get("clearance_min_m"),
             **pace_field(trace.pace),
         },
     )

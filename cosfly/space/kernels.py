@@ -220,6 +220,44 @@ def segment_hits_box(rows, box, ax, ay, az, bx, by, bz, inflate_m):
     return touches(rows, box, a, b, c, u, v, w, inflate_m)
 
 
+@njit(cache=True)
+def segment_to_box(rows, box, ax, ay, az, bx, by, bz):
+    """Give the least distance of a segment to a box, m, 0 where it touches, and the share of its way where that is.
+
+    Along a line the squared distance is convex, and a parabola between the places where it crosses the planes of the
+    six faces: its slope is straight there, and zero where the distance is least.
+    """
+    u, v, w = in_box_frame(rows, box, ax, ay, az)
+    p, q, r = turned(rows, box, bx - ax, by - ay, bz - az)
+    starts, ways = (u, v, w), (p, q, r)
+    low, low_slope, high, high_slope = 0.0, -np.inf, 1.0, np.inf
+    for place in range(8):
+        share = float(place - 6)  # both ends too
+        if place < 6:
+            axis = place // 2
+            if abs(ways[axis]) < 1e-12:
+                continue
+            share = ((1 - 2 * (place % 2)) * rows[box, HALF_X + axis] - starts[axis]) / ways[axis]
+            if not 0.0 < share < 1.0:
+                continue
+        slope = 0.0
+        for axis in range(3):
+            x, half = starts[axis] + share * ways[axis], rows[box, HALF_X + axis]
+            slope += (x - min(max(x, -half), half)) * ways[axis]
+        if slope <= 0.0 and share >= low:
+            low, low_slope = share, slope
+        if slope >= 0.0 and share <= high:
+            high, high_slope = share, slope
+    if high <= low or low_slope == -np.inf or high_slope == np.inf:
+        share = low if low_slope > -np.inf else high
+    else:
+        share = low - low_slope * (high - low) / max(high_slope - low_slope, 1e-300)
+    squared = 0.0
+    for axis in range(3):
+        squared += max(abs(starts[axis] + share * ways[axis]) - rows[box, HALF_X + axis], 0.0) ** 2
+    return np.sqrt(squared), share
+
+
 # --- many boxes, one query --------------------------------------------------------------------------------------------
 
 
@@ -337,6 +375,12 @@ def _signed_distances(index, points, reach_m):
     return distances, boxes
 
 
+def normals(index: BoxIndex, points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Give the unit vectors away from boxes (k,) at points (k, 3), (k, 3), as `normal_of_box` does."""
+    found = [normal_of_box(index.rows, box, *map(float, p)) for box, p in zip(boxes, points, strict=True)]
+    return np.array(found).reshape(-1, 3)
+
+
 def segments_hit(index: BoxIndex, starts: np.ndarray, ends: np.ndarray, inflate_m: float = 0.0) -> np.ndarray:
     """Tell which segments touch any box grown by `inflate_m` on every side.
 
@@ -356,6 +400,38 @@ def _segments_hit(index, starts, ends, inflate_m):
         a, b = starts[i], ends[i]
         hits[i] = collect_hits(index, a[0], a[1], a[2], b[0], b[1], b[2], inflate_m, one) > 0
     return hits
+
+
+def swept_distances(index: BoxIndex, points: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Least distance to the boxes on the straight way from each point to the next, the last point's its own.
+
+    Args:
+        points: (n, 3) m. reach_m: boxes farther away are not looked for.
+    Returns:
+        (n,) m, at most reach_m, negative only where an end of the way is inside a box, 0 where the way goes through
+        one; (n,) the share of the way where that is; (n,) the box, -1 where none is in reach.
+    """
+    return _swept_distances(index, _points(points, "points"), float(reach_m))
+
+
+@njit(cache=True)
+def _swept_distances(index, points, reach_m):
+    num = len(points)
+    distances, boxes = _signed_distances(index, points, reach_m)
+    own, shares, near = distances.copy(), np.zeros(num), np.empty(len(index.rows), dtype=np.int64)
+    for i in range(num - 1):
+        a, b = points[i], points[i + 1]
+        if distances[i + 1] < distances[i]:
+            distances[i], shares[i], boxes[i] = distances[i + 1], 1.0, boxes[i + 1]
+        length = np.sqrt((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2 + (b[2] - a[2]) ** 2)
+        # Distance changes by at most a metre per metre.
+        if distances[i] <= 0.0 or own[i] + own[i + 1] - length >= 2.0 * distances[i]:
+            continue
+        for k in range(collect_hits(index, a[0], a[1], a[2], b[0], b[1], b[2], distances[i], near)):
+            distance, share = segment_to_box(index.rows, near[k], a[0], a[1], a[2], b[0], b[1], b[2])
+            if distance < distances[i]:
+                distances[i], shares[i], boxes[i] = distance, share, near[k]
+    return distances, shares, boxes
 
 
 def visibility(index: BoxIndex, drones: np.ndarray, targets: np.ndarray) -> np.ndarray:

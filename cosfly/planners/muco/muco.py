@@ -15,6 +15,7 @@ from cosfly.planners.contract import MucoConfig, Plan, PlanConfig, Scenario
 from cosfly.planners.muco.loss import TERM_NAMES, Problem, make_state
 from cosfly.planners.muco.nearby import nothing_nearby
 from cosfly.planners.muco.step import STOP_REASONS, Rules, descend, descend_as_the_paper, is_feasible, project
+from cosfly.planners.smoothing import within_limits
 from cosfly.space.kernels import RAY_SPREAD_M, BoxIndex, collect_hits, free_rays, nearest_box, visibility
 from cosfly.work.compiled import njit
 
@@ -159,6 +160,8 @@ def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.rando
     start, kind = start_trajectory(scenario, problem, obstacles, cfg)
     points, solver = optimize(start, problem, obstacles, cfg.muco)
     del solver["loss_history"]  # for tests and plots; a product does not need it
+    limits = cfg.model_copy(update={"accel_max_mps2": np.inf}) if cfg.muco.step == "paper" else cfg
+    points = within_limits(points, scenario, obstacles, limits)
     return Plan(points, {"start": kind, **solver}, is_converged=solver["stopped"] in AT_REST)
 
 
