@@ -1,8 +1,8 @@
 """The columns of the released parquet files: one table that says all there is to say of a column.
 
 A new column is one row of FRAME or CAPTION: its type, the values that it may hold, the field that it is taken from, and
-where people see it. Schema, rows, card, Croissant, viewer and `release verify` follow. No list stands in a row except
-the caption's window, picture size and states of sentences, so that every reader of parquet shows plain columns.
+where people see it. Schema, rows, card, Croissant, viewer and `release verify` follow. Lists are flat, so that every
+reader of parquet shows plain columns.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from cosfly.escaping import published_name
 from cosfly.geometry import BODY_FROM_CAMERA
 from cosfly.products.captions import FIELDS, Caption, LabelFrom, Language, SentenceState, TeacherKind, Verdict, Writing
 from cosfly.products.frames import INVALID_DEPTH_M, LEAST_FOV_DEG, MOST_FOV_DEG, SKY_DEPTH_M, FrameFile, Look
+from cosfly.products.motion import ACTION
 from cosfly.products.places import sample_id
 from cosfly.products.playback import EVENTS, Flight
 from cosfly.products.weather import WeatherMode, WeatherParams
@@ -63,6 +64,14 @@ CONTRACT: dict[str, Any] = {
     "camera was aimed anew, and the rotation offset is its turn away from that aim",
     "perturbation": "what became of the frame's two events, position (shift of drone and person) and rotation (turn of "
     "the view): none, applied, or `fallback: ` and why the frame is as planned; null where the tree does not say",
+    "action": "of a policy: mean velocities in m/s until the next frame along the level axes of the camera's yaw "
+    "(forward, left, up), turn of the yaw in degrees/s, pitch of the camera at the next frame. It is of the planned "
+    "motion, as the label is; null at a flight's end and where the plan is not known",
+    "actions": "fives: the action in the equal parts of the step that the flight was planned in; poses_between, sixes: "
+    "the planned poses where those parts meet, empty where it was planned at the rate of its frames",
+    "waypoints": "fours: the planned places of the next 10 frames, fewer at a flight's end, x, y, z in m and yaw in "
+    "degrees; body_waypoints: forward, left, up in m and yaw, from the frame's camera along its level axes, so that "
+    "those of a perturbed frame lead back to the plan",
     "time": "seconds; the frames of a flight are one time step apart, 0.5 s in the paper",
 }
 
@@ -89,6 +98,10 @@ TYPES: dict[str, tuple[pa.DataType, dict[str, Any]]] = {
     "texts": (
         pa.list_(pa.field("element", pa.string())),
         {"feature": {"dtype": "string", "_type": "Value"}, "_type": "Sequence"},
+    ),
+    "numbers": (
+        pa.list_(pa.field("element", pa.float64())),
+        {"feature": {"dtype": "float64", "_type": "Value"}, "_type": "Sequence"},
     ),
 }
 
@@ -147,6 +160,8 @@ class Column:
             numbers = [] if value is None else value.tolist()
             is_null = not numbers or any(map(math.isnan, numbers))
             return None if is_null else {name: x + 0.0 for name, x in zip(self.type, numbers, strict=True)}  # no -0.0
+        if self.type == "numbers":
+            return None if np.isnan(value).any() else (value.ravel() + 0.0).tolist()
         if self.type == "float64":
             return None if value is None or math.isnan(value) else float(value)
         return bool(value) if self.type == "bool" else value
@@ -290,6 +305,11 @@ FRAME = (  # everything of a frame but pictures and depth
         title="offsets of the perturbation", annotation=True,
     ),
     Column("target_offset", POINT, lambda f, i: f.target_offsets_m[i]),
+    Column("action", ACTION, lambda f, i: f.motion.action[i], title="action of a policy", annotation=True),
+    Column("actions", "numbers", lambda f, i: f.motion.actions[i]),
+    Column("waypoints", "numbers", lambda f, i: f.motion.waypoints(i), title="waypoints ahead", annotation=True),
+    Column("body_waypoints", "numbers", lambda f, i: f.motion.body_waypoints(i)),
+    Column("poses_between", "numbers", lambda f, i: f.motion.between[i]),
     Column("has_caption", "bool", of_caption=lambda c: True, required=True),
 )  # fmt: skip
 CAPTION = (  # what a row holds of an accepted caption, and nulls where there is none
@@ -362,6 +382,16 @@ REQUIRED = frozenset(column.name for column in FRAME if column.required)
 def caption_values(caption: Caption) -> ReleasedCaption:
     """Give what a row holds of a caption."""
     return {column.name: column.of_caption(caption) for column in SCALARS if column.of_caption is not None}
+
+
+def between_of(rows: Collection[Mapping[str, Any]]) -> np.ndarray | None:
+    """Give `Flight.between` of the rows of a flight; None where it was planned at the rate of its frames."""
+    found = [row.get("poses_between") for row in rows]
+    most = max((len(one) // len(POSE) for one in found if one), default=0)
+    nothing = np.full(most * len(POSE), np.nan)
+    is_whole = [one is not None and len(one) == len(nothing) for one in found]
+    flat = [one if whole else nothing for one, whole in zip(found, is_whole, strict=True)]
+    return np.array(flat, dtype=np.float64).reshape(len(found), most, len(POSE)) if most else None
 
 
 def matrices_of(intrinsics: np.ndarray) -> np.ndarray:

@@ -432,6 +432,10 @@ LIES_OF_ROWS: dict[str, Lie] = {
     "pose_jumps": turned(at(clean, 6), add("pose", 20.0, "x_m")),
     "lower_than_it_was": change(clean, add("pose", -3.0, "z_m")),
     "heading_backwards": change(clean, heading_backwards),
+    "action_called_faster": alter(at(clean, 3), action=lambda a: a | {"forward_mps": a["forward_mps"] + 1.0}),
+    "action_lost": put(at(clean, 4), actions=None),
+    "waypoints_of_another_height": alter(at(perturbed, 5), waypoints=lambda w: [*w[:2], w[2] + 2.0, *w[3:]]),
+    "waypoints_cut_short": alter(at(clean, 6), body_waypoints=lambda w: w[:8]),
     "headings_lost": put(clean, target_heading_deg=None),
     "offsets_with_the_other_sign": change(
         perturbed, lambda r: r.update(drone_offset={name: -value + 0.0 for name, value in r["drone_offset"].items()})

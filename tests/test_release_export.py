@@ -44,8 +44,9 @@ from cosfly.reading.arrays import parse_picture
 from cosfly.reading.files import sha256_file
 from cosfly.work.config import build as build_config
 from cosfly.work.store import CHECKSUMS, read_checksums
+from release.columns import POSE
 from release.export.contract import FORMATS, ExportConfig, ExportUnit, Files, FormatFacts
-from release.export.lerobot import merged, moves, runs_of, summarize, tiff_of_depth
+from release.export.lerobot import merged, runs_of, states, summarize, tiff_of_depth
 from release.export.source import ReleasedRows, Span, depth_npy, open_release, rows_of_flight, scan
 from release.export.stage import read_export
 from release.export.stage import run as export
@@ -280,11 +281,13 @@ def test_an_episode_has_no_gap(frames, runs):
     assert runs_of(flight_of(frames)) == runs
 
 
-def test_a_move_is_in_the_drones_own_axes():
-    poses = np.array([[0, 0, 10, 0, 90, 0], [0, 2, 11, 0, -175, 0], [0, 2, 11, 0, -175, 0]], dtype=np.float64)
-    assert np.allclose(moves(poses), [[2, 0, 1, 95], [0, 0, 0, 0], [0, 0, 0, 0]])  # it looked north and flew north
-    poses = np.array([[0, 0, 0, 0, 180, 0], [0, 3, 0, 0, 180, 0]], dtype=np.float64)
-    assert np.allclose(moves(poses)[0], [0, -3, 0, 0])  # looking west, north is on the right
+def test_a_state_is_the_motion_that_led_to_a_frame():
+    rows = [
+        {"time_s": 0.5 * i, "pose": dict(zip(POSE, pose, strict=True))}
+        for i, pose in enumerate([(0, 0, 10, -9, 90, 0), (0, 2, 11, -8, 180, 0), (0, 2, 11, -7, -170, 0)])
+    ]
+    expected = [[0, 0, 0, 0, -9], [0, -4, 2, 180, -8], [0, 0, 0, 20, -7]]  # it flew north, and looks west
+    assert np.allclose(states(rows), expected)
 
 
 @given(st.lists(st.floats(0, 1000, width=32), min_size=1, max_size=40))

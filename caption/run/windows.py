@@ -23,7 +23,6 @@ from caption.schema import (
     observed_frames,
 )
 from caption.truth.actions import label_of, measure
-from cosfly.geometry import look_at
 from cosfly.products.captions import KeyframeRecord, LabelFrom
 from cosfly.products.frames import files_in
 from cosfly.products.places import sample_id
@@ -165,9 +164,8 @@ def cut_future(flight: Flight, motion: LabelMotion, current: int, future_frames:
 # --- the motion that labels come from ---------------------------------------------------------------------------------
 
 # Offsets that are drawn anew for every frame are no manoeuvre, so a label made of them is noise. The clean motion of a
-# perturbed flight is that of its twin (`ORI`); without one, what was recorded is taken off: the shifts of drone and
-# person, the turn of the view, and the aim that followed the shifts (cosfly/render/perturbation.py). Visibility is no
-# part of it: what was seen was seen from where the camera was.
+# perturbed flight is that of its twin (`ORI`); without one, what was recorded is taken off (`Flight.planned`).
+# Visibility is no part of it: what was seen was seen from where the camera was.
 
 
 @dataclass(frozen=True)
@@ -202,11 +200,5 @@ def label_motion(flight: Flight, twin: Flight | None = None) -> LabelMotion:
         return as_flown(flight, "flight")
     if twin is not None:
         return as_flown(twin, "twin")
-    positions_m = flight.positions_m - flight.drone_offsets_m
-    targets_m = flight.targets_m - flight.target_offsets_m
-    # A frame without a shift was not aimed anew, whether or not its target is known. An unknown shift (NaN) counts as
-    # one.
-    is_shifted = (flight.drone_offsets_m != 0).any(axis=1) | (flight.target_offsets_m != 0).any(axis=1)
-    aimed_deg = np.degrees(look_at(flight.positions_m, flight.targets_m)[1] - look_at(positions_m, targets_m)[1])
-    yaw_deg = flight.rotations_deg[:, 1] - flight.rotation_offsets_deg[:, 1] - np.where(is_shifted, aimed_deg, 0.0)
-    return LabelMotion("offsets", positions_m, yaw_deg, targets_m)
+    poses, targets_m = flight.planned
+    return LabelMotion("offsets", poses[:, :3], poses[:, 4], targets_m)

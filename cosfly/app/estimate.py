@@ -15,7 +15,6 @@ from caption.run.progress import duration
 from cosfly.app.runs import STAGES, StageLook, find, look
 from cosfly.app.settings import RunConfig, manner_of_work
 from cosfly.errors import CosflyError
-from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.products.captions import read_captions
 from cosfly.products.traces import read_traces
 from cosfly.products.walks import read_paths
@@ -121,7 +120,7 @@ def _learn(rates: Rates, run: Path) -> None:
         rates.stages[stage.name] = Rate(seconds / units, stage.size_bytes / units, f"{run}, {workers} workers")
         if stage.name == "caption" and seen.cfg.caption.teacher_kind != "rules":
             rates.tokens[seen.cfg.caption.teacher_kind] = _tokens_of(run / "caption/captions.jsonl")
-    rates.frames_a_metre = sum(frames) / (len(seen.cfg.render.tracks) * num_walks * _steps(seen.cfg.pedestrians))
+    rates.frames_a_metre = sum(frames) / (len(seen.cfg.render.tracks) * num_walks * _straight_frames(seen.cfg))
 
 
 def _seconds_of_items(folder: Path, stage: StageLook, workers: int) -> float:
@@ -143,9 +142,11 @@ def _mpx(cfg: RunConfig) -> float:
     return cfg.render.width_px * cfg.render.height_px / 1e6
 
 
-def _steps(cfg: PedestriansConfig) -> float:
-    """Steps of time over the mean straight way between a walk's ends."""
-    return (cfg.min_distance_m + cfg.max_distance_m) / 2 / cfg.cruise_speed_mps / cfg.dt_s
+def _straight_frames(cfg: RunConfig) -> float:
+    """Frames over the mean straight way between a walk's ends."""
+    walk = cfg.pedestrians
+    steps = (walk.min_distance_m + walk.max_distance_m) / 2 / walk.cruise_speed_mps / walk.dt_s
+    return steps / cfg.render.frame_stride
 
 
 def _is_complete(folder: Path) -> bool:
@@ -161,7 +162,9 @@ def _frames_of(cfg: RunConfig, run: Path) -> list[int]:
     if not _is_complete(run / "plan"):
         return []
     traces = read_traces(run / "plan/drone_trace.json")
-    return [len(trace.time_s) for trace in traces if trace.drop_reason is None] * len(cfg.render.tracks)
+    return [-(-len(trace.time_s) // cfg.render.frame_stride) for trace in traces if trace.drop_reason is None] * len(
+        cfg.render.tracks
+    )
 
 
 def num_windows(cfg: RunConfig, frames: list[int]) -> int:
@@ -174,7 +177,7 @@ def num_windows(cfg: RunConfig, frames: list[int]) -> int:
 def _amounts(cfg: RunConfig, out: Path, rates: Rates, more: int) -> tuple[dict[str, int], dict[str, int]]:
     """Count what a run is of in all, and what `more` walks are of alone."""
     walks, tracks = cfg.pedestrians.num_paths, len(cfg.render.tracks)
-    each = round(rates.frames_a_metre * _steps(cfg.pedestrians))
+    each = round(rates.frames_a_metre * _straight_frames(cfg))
     made = _walks_of(out)
     known = _frames_of(cfg, out) if made in (walks, walks - more) else []
     frames = known + [each] * ((walks - made if known else walks) * tracks)

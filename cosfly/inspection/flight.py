@@ -215,8 +215,9 @@ def check_poses(flight: Flight, trace: DroneTrace, cfg: InspectConfig, report: R
     Where a perturbation shifted drone or person, the camera was aimed anew, so only the positions can be compared
     there.
     """
-    if len(flight) < len(trace.time_s):
-        got, expected = f"{len(flight)} frames", f"{len(trace.time_s)} planned points"
+    num_planned = -(-len(trace.time_s) // flight.motion.poses_a_frame)
+    if len(flight) < num_planned:
+        got, expected = f"{len(flight)} frames", f"{num_planned} planned ones"
         report.warn("shorter_than_planned", "trajectory.json: points", got, expected)
     row = np.searchsorted(trace.time_s, flight.time_s - TIME_TOLERANCE_S).clip(max=len(trace.time_s) - 1)
     off_time = np.abs(trace.time_s[row] - flight.time_s) > TIME_TOLERANCE_S

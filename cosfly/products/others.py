@@ -74,6 +74,10 @@ class Other:
         """The same at one time alone."""
         return Other(self.kind, self.positions_m[i : i + 1], self.headings_rad[i : i + 1])
 
+    def every(self, stride: int) -> Other:
+        """The same at every so many times."""
+        return Other(self.kind, self.positions_m[::stride], self.headings_rad[::stride])
+
     def as_json(self) -> dict:
         columns = {axis: rounded(self.positions_m[:, k], 4) for k, axis in enumerate("xyz")}
         return {"kind": self.kind, **columns, "yaw": rounded(np.degrees(self.headings_rad), 3)}

@@ -23,6 +23,7 @@ from pydantic import ValidationError
 from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations
 from cosfly.products.frames import ANGLES, COORDINATES, FRAME_FILES, FRAMES_DIR, XYZ, Camera, frame_name, frame_path
+from cosfly.products.motion import PlannedMotion, without_perturbation
 from cosfly.products.places import place_of, tree_of_flight
 from cosfly.products.segments import FOLLOW, Mission, Segment, flown_as_json, mirrored
 from cosfly.products.trajectory import (
@@ -43,6 +44,7 @@ from cosfly.reading.documents import read_json
 from cosfly.work.store import write_json
 
 ORIGINAL = "ORI"  # the folder of a clean flight
+TREE_ACTION = ("forward_mps", "right_mps", "up_mps", "yaw_rate_degps", "gimbal_pitch_deg")  # motion.ACTION, mirrored
 EVENTS = ("position", "rotation")  # of a frame of a perturbed flight; what became of them: docs/files.md
 # A frame of a perturbed flight by what was applied to it, and the shares of the paper, where each event has a chance of
 # 0.6 (tab:augmentation_states).
@@ -70,7 +72,8 @@ class Flight:
     each point, zero where none, NaN where the file has none for a perturbed point (public files say only that there was
     one). segments, mission: the styles of its parts and the order that ended it, as its plan has them. intrinsics: (n,
     3, 3) of a camera that zooms, frame by frame, `camera` is that of the first; None where it is that of all. Who
-    projects asks `camera_at`.
+    projects asks `camera_at`. between: (n, k - 1, 6) planned poses after each frame and before the next, of a flight
+    that was planned at k times the rate of its frames; NaN after the last.
     """
 
     town: str
@@ -101,6 +104,7 @@ class Flight:
     segments: tuple[Segment, ...] = ()
     mission: Mission | None = None
     intrinsics: np.ndarray | None = None
+    between: np.ndarray | None = None
     given_id: str | None = None  # where flights of several towns or runs share the plain one (places.py)
 
     def __len__(self) -> int:
@@ -143,6 +147,21 @@ class Flight:
     def walked_m(self) -> np.ndarray:
         """Where the person walked, (n, 3), without what a perturbation added; NaN where nobody knows."""
         return self.targets_m - self.target_offsets_m
+
+    @cached_property
+    def planned(self) -> tuple[np.ndarray, np.ndarray]:
+        """Poses (n, 6) and targets (n, 3) without what a perturbation added; NaN where nobody knows."""
+        poses = np.hstack([self.positions_m, self.rotations_deg])
+        if self.is_original:
+            return poses, self.targets_m
+        offsets = np.hstack([self.drone_offsets_m, self.rotation_offsets_deg])
+        return without_perturbation(poses, self.targets_m, offsets, self.target_offsets_m)
+
+    @cached_property
+    def motion(self) -> PlannedMotion:
+        """What it teaches a policy."""
+        between = np.empty((len(self), 0, 6)) if self.between is None else self.between
+        return PlannedMotion(self.time_s, self.planned[0], between, self.rotations_deg[:, 1], self.positions_m)
 
     @property
     def pace(self) -> str:
@@ -253,6 +272,7 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
         variant=variant,
         camera=camera,
         intrinsics=reader.intrinsics(points, camera),
+        between=_mirrored_poses(reader.between(points)),
         time_s=time_s,
         positions_m=mirror_positions(poses[:, :3]),
         rotations_deg=mirror_rotations(poses[:, 3:]),
@@ -302,6 +322,7 @@ def write_flight(folder: Path, flight: Flight) -> None:
     }
     positions = mirror_positions(flight.positions_m) + 0.0
     poses = np.hstack([positions, mirror_rotations(flight.rotations_deg) + 0.0]).tolist()
+    between = _mirrored_poses(flight.between)
     vectors: list[tuple[str, str, tuple[str, ...], np.ndarray]] = [
         ("target", "world_location", XYZ, mirror_positions(flight.targets_m)),
         ("target", "image_uv", (), flight.target_uv),
@@ -321,6 +342,9 @@ def write_flight(folder: Path, flight: Flight) -> None:
         following = dict(zip(XYZ, poses[i + 1], strict=False)) if i + 1 < len(points) else None
         point["nav_waypoint"] = {**object_of(point, "nav_waypoint"), "t1_world": following}
         point["perturbation"] = object_of(point, "perturbation")
+        point["action"] = _tree_action(flight.motion.action[i])
+        if between is not None:
+            point["between"] = None if i + 1 == len(points) else (between[i] + 0.0).tolist()
         if flight.intrinsics is not None:
             point["camera"] = {**object_of(point, "camera"), **_focal(flight.camera_at(i))}
         is_nobody = "target" in point and point["target"] is None and np.isnan(flight.targets_m[i]).all()
@@ -331,6 +355,20 @@ def write_flight(folder: Path, flight: Flight) -> None:
                 _put_vector(point[group], key, names, values[i])
     raw["points"] = points
     write_json(folder / "trajectory.json", raw)
+
+
+def _mirrored_poses(poses: np.ndarray | None) -> np.ndarray | None:
+    """Change (..., 6) poses between right-handed and CARLA axes."""
+    if poses is None:
+        return None
+    return np.concatenate([mirror_positions(poses[..., :3]), mirror_rotations(poses[..., 3:])], axis=-1)
+
+
+def _tree_action(action: np.ndarray) -> dict[str, float] | None:
+    """Give an action in the tree's axes: to the right, and clockwise."""
+    if np.isnan(action).any():
+        return None
+    return dict(zip(TREE_ACTION, (action * [1.0, -1.0, 1.0, -1.0, 1.0] + 0.0).tolist(), strict=True))
 
 
 def _focal(camera: Camera) -> dict:

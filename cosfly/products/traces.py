@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from cosfly.reading.documents import check_schema, read_json
 from cosfly.work.store import write_json
 
 TRACE_SCHEMA, TRACE_VERSION = "cosfly.drone_trace", "1.0"
+ARRAYS = ("time_s", "positions_m", "rotations_deg", "targets_m", "visibility")
 MORE = ("metrics", "solver", "drop_reason", "instead_of")  # fields of a flight that are taken as they are
 
 
@@ -48,6 +49,31 @@ class DroneTrace:
     mission: Mission | None = None
     instead_of: str | None = None
     pace: str = PLAIN_PACE
+
+    def every(self, stride: int) -> DroneTrace:
+        """Give the flight at every so many of its points; clearances are the least until the next of them."""
+        if stride == 1:
+            return self
+        points, order = np.arange(0, len(self.time_s), stride), self.mission
+        parts = [replace(part, begin=-(-part.begin // stride), end=-(-part.end // stride)) for part in self.segments]
+        if order is not None:
+            order = replace(order, at_frame=-(-order.at_frame // stride), home_frame=-(-order.home_frame // stride))
+        return replace(
+            self,
+            **{name: getattr(self, name)[points] for name in ARRAYS},
+            clearances_m=np.minimum.reduceat(self.clearances_m, points),
+            segments=tuple(part for part in parts if part.begin < part.end),
+            mission=order,
+        )
+
+    def between(self, stride: int) -> np.ndarray | None:
+        """Give the poses that `every` leaves out, (n, stride - 1, 6) after each that it takes, NaN after the last; None
+        where it takes all."""
+        if stride == 1:
+            return None
+        points = np.arange(0, len(self.time_s), stride)
+        poses = np.hstack([self.positions_m, self.rotations_deg])[points[:-1, None] + np.arange(1, stride)]
+        return np.concatenate([poses, np.full((1, stride - 1, 6), np.nan)])
 
     def as_json(self) -> dict:
         names = ("x", "y", "z")

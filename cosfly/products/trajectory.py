@@ -105,6 +105,19 @@ class FieldReader:
                 self.issue(where, repr(found)[:60], f"the next point's position {positions[i + 1].tolist()}")
                 return  # one note is enough
 
+    def between(self, points: list[dict]) -> np.ndarray | None:
+        """Planned poses after each point and before the next, (n, k - 1, 6), NaN after the last; None without any."""
+        if len(points) < 2 or not any(point.get("between") for point in points):
+            return None
+        try:
+            found = np.array([point.get("between") for point in points[:-1]], dtype=np.float64)
+        except (TypeError, ValueError):
+            found = np.empty(0)
+        if found.ndim != 3 or found.shape[2] != len(XYZ + ANGLES) or not is_in_range(found):
+            self.issue("points[].between", "something else", "as many poses of 6 finite numbers after each point")
+            return None
+        return np.concatenate([found, np.full((1, *found.shape[1:]), np.nan)])
+
     def flown(self, raw: dict, num_points: int) -> tuple[tuple[Segment, ...], Mission | None]:
         """Styles of the parts, and mission; somebody else's fields of these names are noted and left."""
         try:

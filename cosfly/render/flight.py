@@ -87,6 +87,7 @@ class FlightScript:
     segments: tuple[Segment, ...] = ()
     mission: Mission | None = None
     weather: WeatherRecord | None = None  # in the place of `look`
+    between: np.ndarray | None = None  # planned poses that are not drawn (Flight.between)
 
 
 @dataclass(frozen=True)
@@ -286,6 +287,7 @@ def _flight(script: FlightScript, targets: list[TargetMeta], visibility: np.ndar
         source=script.source,
         segments=script.segments,
         mission=script.mission,
+        between=script.between,
         is_original=script.is_original,
         raw={
             **({} if script.weather is None else {"weather": script.weather.model_dump()}),

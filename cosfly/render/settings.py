@@ -56,6 +56,13 @@ class RenderConfig(WeatherConfig):
         description="png: float32 without loss in depth_float32.png, an eighth of the size; npy: depth.npy, as in the "
         "public layout",
     )
+    frame_stride: int = Field(
+        1,
+        ge=1,
+        le=100,
+        description="draw every so many poses of a flight; those between stand in trajectory.json. With "
+        "pedestrians.dt_s 0.1: 1 gives frames and actions at 10 Hz, 5 frames at 2 Hz with actions at 10 Hz",
+    )
     debug: bool = Field(
         False, description="also write debug.png: boxes, ids and distances projected over the colour picture"
     )

@@ -64,7 +64,7 @@ def open_renderer(
 
 
 def script_flight(
-    trace: DroneTrace,
+    planned: DroneTrace,
     number: int,
     track: str,
     town: str,
@@ -74,20 +74,25 @@ def script_flight(
     others: Cast = NOBODY,
     weather: WeatherRecord | None = None,
 ) -> FlightScript:
-    """Decide everything about one flight. Both tracks of a trace share field of view, clothes and weather."""
+    """Decide everything about one flight. Both tracks of a trace share field of view, clothes and weather.
+
+    Args:
+        planned: the flight; every `frame_stride`-th of its poses is drawn. others: at the times of those.
+    """
     assert cfg.first_timestamp is not None, "`run` settles it"
+    trace = planned.every(cfg.frame_stride)
     shared = rng_for(seed, "render", trace.path_id)
     fov_deg = float(cfg.fovs_deg[int(shared.integers(len(cfg.fovs_deg)))])
     clothes = choose_clothes(shared)
     lens_rng = rng_for(seed, "render", f"{trace.path_id}/zoom")
     size_px = cfg.width_px, cfg.height_px
     cameras = cameras_of(size_px, fov_deg, cfg.fovs_deg, cfg.zoom, trace.time_s, trace.segments, lens_rng)
-    planned = Poses(trace.positions_m, trace.rotations_deg, trace.targets_m, trace.clearances_m)
+    poses = Poses(trace.positions_m, trace.rotations_deg, trace.targets_m, trace.clearances_m)
     if track == "perturbed":
         rng = rng_of_shifts(seed, trace.path_id)
-        perturbed = perturb(planned, cameras, surroundings, cfg.perturbation, rng, others)
+        perturbed = perturb(poses, cameras, surroundings, cfg.perturbation, rng, others)
     else:
-        perturbed = PerturbedTrack.nothing(planned)
+        perturbed = PerturbedTrack.nothing(poses)
     return FlightScript(
         town=town,
         trajectory=f"{TRAJECTORY}{cfg.first_timestamp + number}",
@@ -103,6 +108,7 @@ def script_flight(
         is_original=track == "clean",
         segments=trace.segments,
         mission=trace.mission,
+        between=planned.between(cfg.frame_stride),
         source={
             "path_index": number,
             "scenario_id": trace.path_id,
@@ -157,7 +163,7 @@ def run(
         log.warning("render: %d boxes share the instance id %d: ids have 16 bits", num_shared, SHARED_ID)
     town, first_timestamp = _names(stage, cfg, box_map.name, traces, others, seed)
     cfg = cfg.model_copy(update={"first_timestamp": first_timestamp, "weather_seed": _weather_seed(stage, cfg)})
-    items = [_item(number, trace, track) for number, trace in passed for track in cfg.tracks]
+    items = [_item(number, trace.every(cfg.frame_stride), track) for number, trace in passed for track in cfg.tracks]
     arguments = (cfg, boxes, simplified, traces, others, out, town, seed, min(workers, len(items)))
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="render: frames")
     ids_file = out / town / IDS_FILE
@@ -332,7 +338,10 @@ def make_worker(
         check_flight(trace, surroundings)
         company = companies.get(trace.path_id)
         rng = rng_for(seed, "render", f"{trace.path_id}/others")
-        cast = NOBODY if company is None else cast_of(company.others, trace.time_s, rng)
+        cast = NOBODY
+        if company is not None:
+            drawn_others = [other.every(cfg.frame_stride) for other in company.others]
+            cast = cast_of(drawn_others, trace.time_s[:: cfg.frame_stride], rng)
         script = script_flight(
             trace, number, track, town, surroundings, cfg, seed, cast, weather_of(cfg, pools, number)
         )

@@ -24,8 +24,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cosfly.errors import InputError
-from cosfly.geometry import step_s, wrap_deg
+from cosfly.geometry import step_s
 from cosfly.products.frames import FrameFile
+from cosfly.products.motion import ACTION, PlannedMotion
 from cosfly.reading.arrays import parse_array, parse_picture
 from cosfly.work.runner import advance
 from cosfly.work.store import atomic_file, dump_json
@@ -100,14 +101,15 @@ def _nested(value: np.ndarray, is_picture: bool) -> list:
     return value.reshape(-1, 1, 1).tolist() if is_picture else value.tolist()
 
 
-STATE, ACTION = "observation.state", "action"
-MOVE = ("forward_m", "left_m", "up_m", "yaw_deg")
+STATE, ACTED = "observation.state", "action"
 CAMERAS: dict[FrameFile, str] = {
     "rgb": "observation.images.rgb", "depth": "observation.depth", "instance": "observation.images.instance",
 }  # fmt: skip
 TEXTS = ("sample_id", "decision", "label", "verdict", *CAPTION_FIELDS)
 FLAGS = ("target_in_view", "target_visible", "is_perturbed", "has_caption")
 VECTORS = {  # feature -> the release's column and its members
+    ACTED: ("action", ACTION),
+    "pose": ("pose", POSE),
     "target": ("target", POINT),
     "target_uv": ("target_uv", ("u_px", "v_px")),
     "target_bbox": ("target_bbox", BOX),
@@ -121,7 +123,7 @@ DEFAULTS = {
     "task_index": "int64",
 }
 # Columns of the release that the values are made of; pictures apart.
-COLUMNS = ["pose", "visibility", "target_depth_m", *FLAGS, *TEXTS, *(column for column, _ in VECTORS.values())]
+COLUMNS = ["time_s", "visibility", "target_depth_m", *FLAGS, *TEXTS, *(column for column, _ in VECTORS.values())]
 
 
 @dataclass(frozen=True)
@@ -167,8 +169,7 @@ def features_of(modalities: Collection[FrameFile], size_px: tuple[int, int]) -> 
             found[CAMERAS[file]] = LeRobotFeature("image", (height, width, 1), ("height", "width", "channels"), info)
         else:
             found[CAMERAS[file]] = LeRobotFeature("image", (height, width, 3), ("height", "width", "channels"))
-    found[STATE] = LeRobotFeature("float32", (len(POSE),), POSE)
-    found[ACTION] = LeRobotFeature("float32", (len(MOVE),), MOVE)
+    found[STATE] = LeRobotFeature("float32", (len(ACTION),), ACTION)
     found |= {name: LeRobotFeature("float32", (len(members),), members) for name, (_, members) in VECTORS.items()}
     found |= {name: LeRobotFeature("float32", (1,)) for name in ("visibility", "target_depth_m")}
     found |= {name: LeRobotFeature("bool", (1,)) for name in (*FLAGS, "next.done")}
@@ -190,9 +191,11 @@ def values_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
     What a frame does not have is NaN, or the empty text.
     """
-    pose = vectors(rows, "pose", POSE)
-    found: dict[str, Any] = {STATE: pose.astype(np.float32), ACTION: moves(pose).astype(np.float32)}
-    found |= {name: vectors(rows, column, members).astype(np.float32) for name, (column, members) in VECTORS.items()}
+    found: dict[str, Any] = {
+        name: vectors(rows, column, members).astype(np.float32) for name, (column, members) in VECTORS.items()
+    }
+    found[STATE] = states(rows).astype(np.float32)
+    found[ACTED] = np.nan_to_num(found[ACTED])  # trainers take no NaN: after an episode's last frame nothing is flown
     for name in ("visibility", "target_depth_m"):
         found[name] = np.array([np.nan if row[name] is None else row[name] for row in rows], dtype=np.float32)
     found |= {name: np.array([bool(row[name]) for row in rows]) for name in FLAGS}
@@ -200,20 +203,17 @@ def values_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return found | {name: [row[name] or "" for row in rows] for name in TEXTS}
 
 
-def moves(poses: np.ndarray) -> np.ndarray:
-    """Give what takes each pose to the next, (n, 4): the way in the drone's own level axes, m, and the turn, degrees;
-    zero at the last.
-
-    Args:
-        poses: (n, 6) x, y, z in m, pitch, yaw, roll in degrees, right-handed.
-    """
-    found = np.zeros((len(poses), 4))
-    steps = np.diff(poses[:, :3], axis=0)
-    yaw_rad = np.radians(poses[:-1, 4])
-    found[:-1, 0] = steps[:, 0] * np.cos(yaw_rad) + steps[:, 1] * np.sin(yaw_rad)
-    found[:-1, 1] = steps[:, 1] * np.cos(yaw_rad) - steps[:, 0] * np.sin(yaw_rad)
-    found[:-1, 2] = steps[:, 2]
-    found[:-1, 3] = wrap_deg(np.diff(poses[:, 4]))
+def states(rows: list[dict[str, Any]]) -> np.ndarray:
+    """Give what a drone knows of its own motion at each frame, (n, 5) as ACTION: the mean velocities of the step that
+    led there, and the camera's pitch. At the first frame it has not moved."""
+    pose = vectors(rows, "pose", POSE)
+    time_s, nothing = np.array([row["time_s"] for row in rows]), np.empty((len(rows), 0, 6))
+    motion = PlannedMotion(
+        time_s, pose, nothing, np.roll(pose[:, 4], -1), pose[:, :3]
+    )  # in the axes of each step's end
+    found = np.zeros((len(rows), len(ACTION)))
+    found[1:, :4] = motion.action[:-1, :4]
+    found[:, 4] = pose[:, 3]
     return found
 
 
@@ -525,9 +525,9 @@ def finish(
         notes=[
             f"{info['total_episodes']} episodes of {num_flights} flights at {layout.fps} frames a second; a flight of "
             "which frames were left out is cut there. meta/episodes says of each its flight, split and first frame.",
-            "action is what takes a frame's pose to the next one's: forward, left, up in m in the drone's level axes, "
-            "yaw in degrees (counter-clockwise); that of an episode's last frame is zero, for what follows is not in "
-            "the release (next.done).",
+            "action and observation.state are mean velocities: forward, left, up in m/s in the drone's level axes, "
+            "turn in degrees/s (counter-clockwise), the camera's pitch: of the step to the next frame, and of the one "
+            "that led here. Zero where there is none, after an episode's last frame (next.done) and before its first.",
             "task is the caption's decision in words; frames without a caption have the plain order. What a frame has "
             "not is NaN, or an empty text.",
         ],

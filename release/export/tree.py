@@ -30,7 +30,7 @@ from cosfly.products.walks import pace_field
 from cosfly.reading.files import sha256_file
 from cosfly.work.runner import advance
 from cosfly.work.store import CHECKSUMS, checksum_lines, write_model
-from release.columns import BOX, INTRINSICS, PICTURES, POINT, POSE, SCALAR_NAMES, matrices_of
+from release.columns import BOX, INTRINSICS, PICTURES, POINT, POSE, SCALAR_NAMES, between_of, matrices_of
 from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
 from release.export.source import Release, ReleasedRows, depth_in_words, depth_npy, picture, read_span, vectors
 
@@ -181,6 +181,7 @@ def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight
         rotation_offsets_deg=offsets[:, 3:],
         target_offsets_m=vectors(rows, "target_offset", POINT),
         is_original=is_original,
+        between=between_of(rows),
         segments=_segments([row["style"] for row in rows]),
         source={
             "path_index": number,

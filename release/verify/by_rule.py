@@ -183,12 +183,13 @@ def check_settings(flight: FlightRows, settings: dict[str, dict[str, Any]], find
         styles = {None, FOLLOW, *(name for name, share in shares.items() if share)}
         for i in (i for i, style in enumerate(flight.column("style")) if style not in styles):
             tell("style", flight.rows[i]["style"], f"one of {', '.join(sorted(styles - {None}))}, as plan was told", i)
-    step_s = settings.get("pedestrians", {}).get("dt_s")
-    if isinstance(step_s, int | float) and step_s > 0:
+    walk_s, stride = settings.get("pedestrians", {}).get("dt_s"), settings.get("render", {}).get("frame_stride", 1)
+    if isinstance(walk_s, int | float) and walk_s > 0 and isinstance(stride, int):
+        step_s = walk_s * stride
         findings.judge(flight, [(
             "time", "time_s", np.abs(flight.time_s - flight.index * step_s) > TIME_S,
             lambda i: f"{flight.time_s[i]:g} s",
-            lambda i: f"{flight.index[i] * step_s:g} s, {flight.index[i]} steps of the walk's {step_s:g} s",
+            lambda i: f"{flight.index[i] * step_s:g} s, {flight.index[i]} frames of {stride} steps of {walk_s:g} s",
         )])  # fmt: skip
     inspected = settings.get("inspect", {})
     # Of a whole clean flight; of others the plan is not released.

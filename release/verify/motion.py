@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from cosfly.geometry import look_at, wrap_deg
+from cosfly.products.motion import ACTION, BODY_WAYPOINT, NUM_WAYPOINTS, WAYPOINT
 from cosfly.products.playback import EVENTS, HEADING_FRAMES, STANDS_M
 from release.verify.findings import Findings
 from release.verify.rows import FlightRows
@@ -41,6 +42,7 @@ def check_motion(flight: FlightRows, twin: FlightRows | None, settings: dict[str
     _check_steps(flight, findings)
     _check_heading(flight, findings)
     _check_perturbation(flight, settings, findings)
+    _check_actions(flight, findings)
     if twin is not None:
         _check_twin(flight, twin, findings)
     elif not flight.is_clean:
@@ -97,6 +99,31 @@ def _check_heading(flight: FlightRows, findings: Findings) -> None:
         "heading", "target_heading_deg", wrong, lambda i: f"{heading[i]:.2f}",
         lambda i: f"{expected[i]:.2f}, whither the target goes",
     )])  # fmt: skip
+
+
+def _check_actions(flight: FlightRows, findings: Findings) -> None:
+    """Actions and waypoints are those of the poses, wherever the frames that they lead to are in the rows."""
+    motion, index = flight.flight.motion, flight.index
+    for column, width, of_row in (
+        ("action", len(ACTION), lambda i, m: motion.action[i]),
+        ("actions", len(ACTION), lambda i, m: motion.actions[i]),
+        ("waypoints", len(WAYPOINT), lambda i, m: motion.waypoints(i)[:m]),
+        ("body_waypoints", len(BODY_WAYPOINT), lambda i, m: motion.body_waypoints(i)[:m]),
+    ):
+        values = [list(one.values()) if isinstance(one, dict) else one for one in flight.column(column)]
+        is_ahead, last = column.endswith("waypoints"), (flight.num_frames or len(flight)) - 1
+        for i, told in enumerate(values):
+            reach = len(told or ()) // width if is_ahead else 1
+            if not any(values) or i + reach >= len(flight) or index[i + reach] - index[i] != reach:
+                continue  # the format has no such column, or frames were left out
+            expected = np.ravel(of_row(i, reach))
+            if is_ahead and flight.num_frames and told is not None and reach != min(NUM_WAYPOINTS, last - index[i]):
+                findings.error("action", flight.where(i, column), f"{reach} of them", f"the next {NUM_WAYPOINTS}")
+            elif told is None and np.isnan(expected).any():
+                continue
+            elif told is None or len(told) != len(expected) or not (np.abs(told - expected) <= EXACT_M).all():
+                got = "null" if told is None else np.round(told, 3).tolist()
+                findings.error("action", flight.where(i, column), got, f"{expected.round(3).tolist()}, by the poses")
 
 
 # --- perturbation -----------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from cosfly.products.frames import Camera
 from cosfly.products.playback import EVENTS, Flight
 from cosfly.products.shown_captions import ShownCaption, ShownFlight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
-from release.columns import BOX, INTRINSICS, PICTURE_PX, POINT, POSE, WINDOW, matrices_of
+from release.columns import BOX, INTRINSICS, PICTURE_PX, POINT, POSE, WINDOW, between_of, matrices_of
 
 Row = dict[str, Any]
 LANGUAGES: tuple[Language, ...] = get_args(Language)
@@ -147,7 +147,7 @@ class FlightRows:
             is_perturbed=self.flags("is_perturbed"), drone_offsets_m=self.drone_offset[:, :3],
             rotation_offsets_deg=self.drone_offset[:, 3:], target_offsets_m=self.target_offset,
             target_mask_bbox=self.mask_box if has_mask else None, is_original=self.is_clean,
-            intrinsics=matrices if self.zooms else None,
+            intrinsics=matrices if self.zooms else None, between=between_of(self.rows),
         )  # fmt: skip
 
     def shown(

@@ -1,0 +1,127 @@
+"""What a flight teaches a policy: actions that fly the plan, waypoints that lead to it, at the plan's rate and the
+frames'."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from cosfly.geometry import rotation_matrices
+from cosfly.products.boxes import make_box_map
+from cosfly.products.flights import find_flights
+from cosfly.products.motion import PlannedMotion
+from cosfly.products.playback import read_flight, write_flight
+from cosfly.products.segments import Mission, Segment
+from cosfly.products.traces import DroneTrace
+from cosfly.render.perturbation import Surroundings
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import script_flight
+from specimens import make_playback_tree
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return make_playback_tree(tmp_path_factory.mktemp("tree"), num_flights=1, num_points=14)
+
+
+def curve(num: int, dt_s: float = 0.1) -> DroneTrace:
+    """A flight on a curve, whose heading passes the south."""
+    time_s = np.arange(num) * dt_s
+    positions = np.stack([40 * np.cos(time_s / 4), 40 * np.sin(time_s / 4), 12 + time_s], axis=1)
+    yaw_deg = (time_s * 35.0 + 120.0 + 180.0) % 360.0 - 180.0
+    rotations = np.stack([-30 - time_s, yaw_deg, np.zeros(num)], axis=1)
+    targets = np.stack([np.zeros(num), time_s, np.full(num, 0.9)], axis=1)
+    ones = np.ones(num)
+    segments = (Segment("follow", 0, 12), Segment("orbit", 12, 13), Segment("hold", 13, num))
+    return DroneTrace(
+        "p", "none", time_s, positions, rotations, targets, ones, 5 + np.cos(time_s * 7), segments=segments,
+        mission=Mission("battery", 16, 21, (1.0, 2.0, 3.0)),
+    )  # fmt: skip
+
+
+def motion_of(time_s, poses, between=None) -> PlannedMotion:
+    poses = np.asarray(poses, dtype=np.float64)
+    return PlannedMotion(
+        np.asarray(time_s), poses, np.empty((len(poses), 0, 6)) if between is None else between, poses[:, 4],
+        poses[:, :3],
+    )  # fmt: skip
+
+
+def test_an_action_is_in_the_drones_own_level_axes():
+    north = motion_of([0, 0.5, 1], [[0, 0, 10, -20, 90, 0], [0, 2, 11, -25, -175, 0], [0, 2, 11, -25, -175, 0]])
+    assert_allclose(north.action[:2], [[4, 0, 2, 190, -25], [0, 0, 0, 0, -25]], atol=1e-9)
+    assert np.isnan(north.action[2]).all()
+    west = motion_of([0, 0.5], [[0, 0, 0, 0, 180, 0], [0, 3, 0, 0, 180, 0]])
+    assert_allclose(west.action[0], [0, -6, 0, 0, 0], atol=1e-9)  # looking west, north is on the right
+    assert_allclose(west.body_waypoints(0), [[0, -3, 0, 0]], atol=1e-9)
+    assert west.body_waypoints(1).shape == (0, 4)
+
+
+def test_the_known_answer_of_the_public_release_as_an_action():
+    """Points 0 to 1 of trajectory_1777083733: (-3.123, -2.072, -1.6) m/s and -3.13 degrees in 0.5 s, CARLA's axes."""
+    x, y, z = np.array([-3.123, 2.072, -1.6]) * 0.5
+    public = motion_of([0.0, 0.5], [[0, 0, 30, -40, 10, 0], [x, y, 30 + z, -40, 13.13, 0]])
+    forward, left, up, turn, _ = public.action[0]
+    assert_allclose([np.hypot(forward, left), up, turn], [np.hypot(3.123, 2.072), -1.6, 6.26])
+
+
+def test_flying_the_actions_gives_the_plan():
+    """The oracle: velocities turned back into the world by the frame's yaw, step by step."""
+    trace = curve(31)
+    shown, between = trace.every(5), trace.between(5)
+    motion = motion_of(shown.time_s, np.hstack([shown.positions_m, shown.rotations_deg]), between)
+    yaw = np.radians(np.stack([np.zeros(7), motion.yaw_deg, np.zeros(7)], axis=1))
+    for part in range(1, 6):
+        flown = (motion.actions[:-1, :part, :3] * 0.1).sum(axis=1)
+        reached = motion.poses[:-1, :3] + np.einsum("nij,nj->ni", rotation_matrices(yaw)[:-1], flown)
+        assert_allclose(reached, trace.positions_m[part::5][:6], atol=1e-9)
+        turned = shown.rotations_deg[:-1, 1] + (motion.actions[:-1, :part, 3] * 0.1).sum(axis=1)
+        assert_allclose(np.cos(np.radians(turned - trace.rotations_deg[part::5][:6, 1])), 1.0)
+        assert_allclose(motion.actions[:-1, part - 1, 4], trace.rotations_deg[part::5][:6, 0])
+    assert_allclose(motion.action[:-1, :4], motion.actions[:-1, :, :4].mean(axis=1))
+
+
+def test_a_perturbed_frames_waypoints_lead_back_to_the_plan(tree):
+    clean, moved = (read_flight(folder).motion for folder in find_flights(tree))
+    assert np.abs(clean.positions_m - moved.positions_m).max() > 0.1, "it is perturbed"
+    assert_allclose(moved.poses, clean.poses, atol=1e-6)
+    for i in range(len(clean.time_s)):
+        ahead = moved.body_waypoints(i)
+        assert len(ahead) == min(10, len(clean.time_s) - 1 - i)
+        yaw = np.radians([[0.0, moved.yaw_deg[i], 0.0]])
+        assert_allclose(moved.positions_m[i] + ahead[:, :3] @ rotation_matrices(yaw)[0].T, clean.waypoints(i)[:, :3])
+
+
+def test_an_offset_that_nobody_knows_gives_no_action(tree):
+    flight = read_flight(find_flights(tree)[1])
+    offsets = flight.drone_offsets_m.copy()
+    offsets[5] = np.nan
+    action = replace(flight, drone_offsets_m=offsets).motion.action
+    assert np.flatnonzero(np.isnan(action).any(axis=1)).tolist() == [4, 5, len(flight) - 1]
+
+
+def test_frames_at_a_fifth_of_the_plans_rate(tree, tmp_path):
+    """What is not drawn stands in the tree; parts, orders and clearances keep their times."""
+    trace = curve(33)
+    around = Surroundings(make_box_map([[200.0, 0, 5]], [[1.0, 1, 5]], [[0.0, 0, 0]], [3]))
+    cfg = RenderConfig(frame_stride=5, width_px=64, height_px=36, first_timestamp=1)
+    script = script_flight(trace, 0, "clean", "T", around, cfg, 0)
+    assert_allclose(script.time_s, np.arange(7) * 0.5)
+    assert_allclose(script.perturbed.poses.positions_m, trace.positions_m[::5])
+    least = [trace.clearances_m[begin : begin + 5].min() for begin in range(0, 33, 5)]
+    assert_allclose(script.perturbed.poses.clearances_m, least)
+    assert [(part.style, part.begin, part.end) for part in script.segments] == [("follow", 0, 3), ("hold", 3, 7)]
+    assert (script.mission.at_frame, script.mission.home_frame) == (4, 5)
+    assert script_flight(trace, 0, "clean", "T", around, cfg.model_copy(update={"frame_stride": 1}), 0).between is None
+
+    flight = read_flight(find_flights(tree)[0])
+    between = np.random.default_rng(0).uniform(-20, 20, (len(flight), 4, 6))
+    between[-1] = np.nan
+    folder = tmp_path / "Town01" / flight.trajectory / "ORI"
+    folder.mkdir(parents=True)
+    write_flight(folder, replace(flight, between=between))
+    back = read_flight(folder)
+    assert_allclose(back.between, between)
+    write_flight(folder, replace(back, raw={**back.raw, "points": [{"between": "no"} | p for p in back.raw["points"]]}))
+    assert_allclose(read_flight(folder).between, between)
