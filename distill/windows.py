@@ -317,7 +317,9 @@ class Windows(Sequence[WindowData]):
         if max_side_px is not None and max_side_px < 1:
             raise ConfigError("not a size of a picture", where="max_side_px", got=max_side_px, expected="1 or more")
         self.max_side_px = max_side_px
-        self._source = open_source(Path(source), None if captions is None else Path(captions), language, split)
+        source = Path(source) if isinstance(source, str) else source
+        captions = Path(captions) if isinstance(captions, str) else captions
+        self._source = open_source(source, captions, language, split)
         self.left_out = Counter[str]()  # captions that give no window, by reason
         self._places = list(self._source.places(self.left_out))
         if not self._places:

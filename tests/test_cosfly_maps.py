@@ -427,6 +427,13 @@ def test_a_city_model_becomes_boxes_round_the_origin(tmp_path: Path):
     assert boxes.header.num_objects == 4
 
 
+def test_a_surface_of_too_many_vertices_is_refused_by_name(tmp_path: Path):
+    (tmp_path / "city.json").write_text(json.dumps(city_model()))
+    cfg = MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=tmp_path / "city.json", polygon_vertices=3))
+    with pytest.raises(InputError, match=r"CityObjects\.house: .*; got a surface of 4 vertices; .*polygon_vertices"):
+        load_map(cfg)
+
+
 def test_courtyards_stay_open(tmp_path: Path):
     model = city_model()
     outer = [[0, 0], [40, 0], [40, 40], [0, 40]]

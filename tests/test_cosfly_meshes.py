@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import struct
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +27,6 @@ from cosfly.products.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.products.frames import Look
 from cosfly.products.kinds import KINDS
 from cosfly.products.meshes import MESHES_FILE, Meshes, MeshRef, write_meshes
-from cosfly.reading.limits import Limits, use_limits
 from cosfly.reading.meshes import Mesh, read_meshes
 from cosfly.render.contract import (
     GROUND_PLANE_DROP_M,
@@ -195,15 +195,26 @@ def test_missing_linked_and_large_files_are_clear_errors(tmp_path: Path) -> None
         with pytest.raises(InputError, match=words):
             read_meshes(tmp_path / "maps" / name, tree=tmp_path / "maps")
     trimesh.creation.icosphere(subdivisions=3).export(tmp_path / "maps/fine.glb")
+    for words in (
+        r"at most 500; .* raise mesh_triangles",
+        r"got 1\.1 MB; expected at most 0\.128 MB .* raise mesh_triangles",
+    ):
+        with pytest.raises(InputError, match=words):
+            read_meshes(tmp_path / "maps/fine.glb", tree=tmp_path / "maps", most_triangles=500)
+        (tmp_path / "maps/fine.glb").write_bytes(b"\0" * 1_100_000)
+
+
+def test_a_file_that_many_buffers_name_is_read_once(tmp_path: Path) -> None:
+    (tmp_path / "big.bin").write_bytes(b"\0" * 4_000_000)
+    value = {"asset": {"version": "2.0"}, "buffers": [{"uri": "big.bin", "byteLength": 4_000_000}] * 50}
+    (tmp_path / "m.gltf").write_text(json.dumps(value | {"scenes": [{"nodes": []}], "scene": 0}))
+    tracemalloc.start()
     try:
-        for limits, words in ((Limits(mesh_triangles=500), "mesh_triangles"), (Limits(mesh_mb=1), None)):
-            use_limits(limits)
-            if words is None:
-                (tmp_path / "maps/fine.glb").write_bytes(b"\0" * 1_100_000)
-            with pytest.raises(InputError, match=words or "mesh_mb"):
-                read_meshes(tmp_path / "maps/fine.glb", tree=tmp_path / "maps")
+        with pytest.raises(InputError, match="no triangles"):
+            read_meshes(tmp_path / "m.gltf", tree=tmp_path)
+        assert tracemalloc.get_traced_memory()[1] < 40e6
     finally:
-        use_limits(Limits())
+        tracemalloc.stop()
 
 
 def test_a_box_names_no_file_outside_of_its_folder(tmp_path: Path) -> None:
@@ -436,6 +447,16 @@ def test_boxes_of_ones_own_bring_their_meshes_along(tmp_path: Path) -> None:
     assert np.array_equal(ours.rows, theirs.rows)
     assert [path.name for path in read_boxes(product).meshes.files().values()] == [MESHES_FILE]
     assert MESHES_FILE in (tmp_path / "maps/manifest.json").read_text()
+    cone = (tmp_path / "mine/models/cone.glb").rename(tmp_path / "cone.glb")
+    (tmp_path / "mine/models/cone.glb").symlink_to(cone)
+    with pytest.raises(InputError, match="leads out of its folder"):
+        make_map(cfg, tmp_path / "linked")
+    again = make_map(cfg, tmp_path / "linked", follow_links=True)
+    assert (again.parent / MESHES_FILE).read_bytes() == (product.parent / MESHES_FILE).read_bytes()
+    few = cfg.model_copy(update={"mesh_triangles": 200})
+    with pytest.raises(InputError, match=r"over the limit; .*at most 200; .* raise mesh_triangles"):
+        make_map(few, tmp_path / "few", follow_links=True)
+    assert make_map(cfg, tmp_path / "few", follow_links=True).exists()  # it is no other map
     (tmp_path / "mine/models/cone.glb").unlink()
     with pytest.raises(InputError, match=r"cone\.glb: cannot read the mesh"):
         solids_of(read_boxes(tmp_path / "mine/boxes_3d.json"))

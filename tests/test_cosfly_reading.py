@@ -4,6 +4,7 @@ import gzip
 import io
 import json
 import os
+import pickle
 import socket
 import struct
 import tracemalloc
@@ -17,7 +18,9 @@ import pyarrow.parquet as pq
 import pytest
 from shapely.geometry import Polygon
 from tables import each
+from typer.testing import CliRunner
 
+from cosfly.cli import app
 from cosfly.errors import ConfigError, CosflyError, InputError
 from cosfly.maps import cityjson
 from cosfly.maps.footprints import check_outline, num_crossings
@@ -26,20 +29,13 @@ from cosfly.products.frames import depth_bytes, read_depth, rgb_bytes
 from cosfly.products.inspection import Inspection, read_inspection, write_inspection
 from cosfly.products.roi import read_roi
 from cosfly.reading import arrays, documents, files, tables
-from cosfly.reading.files import read_text
-from cosfly.reading.limits import Limits, use_limits
+from cosfly.reading.files import LinkedPath, read_text
 from cosfly.work.config import Config, apply_overrides, build, read_yaml
 from cosfly.work.journal import Journal
 from cosfly.work.stage_folder import Kept, StageFolder, read_failures, result_of
 from cosfly.work.store import inside
 from release.record import RELEASE_VERSION, read_record
-
-
-@pytest.fixture
-def limited():
-    """Set the limits of this process; afterwards they are as before."""
-    yield lambda **changes: use_limits(Limits(**changes))
-    use_limits(Limits())
+from specimens import make_playback_tree
 
 
 class _Dated(Config):
@@ -201,16 +197,12 @@ def test_text_of_another_coding_is_placed(tmp_path):
         read_text(path)
 
 
-def test_a_limit_is_named_and_can_be_raised(tmp_path, limited):
+def test_a_limit_is_named_with_what_to_do(tmp_path):
     path = tmp_path / "x.json"
     path.write_text(json.dumps("x" * 1_100_000))
-    limited(file_mb=1)
-    with pytest.raises(
-        InputError, match=r"limit reading\.file_mb; got 1 MB; expected at most 1 MB; .*--set reading\.file_mb"
-    ):
-        documents.read_json(path)
-    limited(file_mb=2)
-    assert len(documents.read_json(path)) == 1_100_000
+    with pytest.raises(InputError, match=r"over the limit; got 1.1 MB; expected at most 1 MB in one piece; split it"):
+        documents.read_json(path, most_mb=1)
+    assert len(documents.read_json(path, most_mb=2)) == 1_100_000
 
 
 def test_a_sparse_file_is_refused_before_it_is_read(tmp_path):
@@ -222,53 +214,52 @@ def test_a_sparse_file_is_refused_before_it_is_read(tmp_path):
             read(tmp_path / "x.json")
 
 
-def test_a_long_line_is_refused(tmp_path, limited):
-    limited(line_mb=1)
+def test_a_long_line_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "LINE_MB", 1)
     (tmp_path / "x.jsonl").write_bytes(b"{}\n" + b" " * 1_200_000)
-    with pytest.raises(InputError, match=r"x\.jsonl:2: over the limit reading\.line_mb"):
+    with pytest.raises(InputError, match=r"x\.jsonl:2: over the limit; .* at most 1 MB"):
         list(files.read_lines(tmp_path / "x.jsonl"))
 
 
-def test_a_gzip_bomb_is_refused_while_it_unpacks(tmp_path, limited):
+def test_a_gzip_bomb_is_refused_while_it_unpacks(tmp_path, monkeypatch):
     path = tmp_path / "city.json.gz"
     path.write_bytes(gzip.compress(b" " * 70_000_000, 1))
     tracemalloc.start()
     try:
-        with pytest.raises(InputError, match=r"reading\.unpack_factor"):
+        with pytest.raises(InputError, match=r"at most 100 times the file"):
             files.read_unpacked(path)
         assert tracemalloc.get_traced_memory()[1] < 100e6
     finally:
         tracemalloc.stop()
-    limited(unpack_factor=1_000)
+    monkeypatch.setattr(files, "UNPACK_FACTOR", 1_000)
     assert len(files.read_unpacked(path)) == 70_000_000
-    limited(unpack_factor=1_000, file_mb=60)
-    with pytest.raises(InputError, match=r"reading\.file_mb"):
-        files.read_unpacked(path)
+    with pytest.raises(InputError, match=r"got more, unpacked; expected at most 60 MB"):
+        files.read_unpacked(path, most_mb=60)
 
 
-def test_very_many_equal_rows_are_refused_before_they_are_read(tmp_path, limited):
+def test_very_many_equal_rows_are_refused_before_they_are_read(tmp_path, monkeypatch):
     path = tmp_path / "shard.parquet"
     pq.write_table(pa.table({"name": ["x"] * 10_000}), path)
     assert path.stat().st_size < 10_000
-    limited(file_mb=9)
-    with pytest.raises(InputError, match=r"row group 0: .*reading\.file_mb; got 10 MB"):
+    monkeypatch.setattr(tables, "FILE_MB", 9)
+    with pytest.raises(InputError, match=r"row group 0: over the limit; got 10 MB; .* smaller row groups"):
         next(tables.rows_of(path))
-    limited(file_mb=10)
+    monkeypatch.setattr(tables, "FILE_MB", 10)
     assert len(list(tables.rows_of(path))) == 10_000
 
 
 @pytest.mark.parametrize("within", [lambda texts: texts, lambda texts: pa.StructArray.from_arrays([texts], ["x"]),
 lambda texts: pa.ListArray.from_arrays(range(3_001), texts)])  # fmt: skip
 @pytest.mark.parametrize("kind", [pa.string(), pa.binary()])
-def test_texts_that_a_dictionary_repeats_are_counted_before_they_are_unpacked(tmp_path, limited, within, kind):
+def test_texts_that_a_dictionary_repeats_are_counted_before_they_are_unpacked(tmp_path, monkeypatch, within, kind):
     """300 kB of such a shard took 3.7 GB."""
     path = tmp_path / "shard.parquet"
     texts = pa.DictionaryArray.from_arrays(pa.array([0] * 3_000, pa.int32()), pa.array(["x" * 30_000], kind))
     pq.write_table(pa.table({"text": within(texts)}), path, store_schema=False)
     assert path.stat().st_size < 50_000
-    with pytest.raises(InputError, match=r"reading\.unpack_factor; got .* texts of 90,000,000"):
+    with pytest.raises(InputError, match=r"got .* texts of 90,000,000; expected at most 100 times the row group"):
         next(tables.rows_of(path))
-    limited(unpack_factor=10_000_000)
+    monkeypatch.setattr(tables, "UNPACK_FACTOR", 10_000_000)
     row = next(tables.rows_of(path))
     assert row == pq.read_table(path).slice(0, 1).to_pylist()[0]
 
@@ -329,19 +320,14 @@ def _png(width: int, height: int) -> bytes:
     return arrays.PNG_SIGNATURE + b"".join(chunks)
 
 
-def test_a_picture_is_measured_before_it_is_decoded(limited, monkeypatch):
+def test_a_picture_is_measured_before_it_is_decoded(monkeypatch):
     picture = rgb_bytes(np.zeros((40, 60, 3), np.uint8))
     assert arrays.png_size(picture) == (60, 40)
     assert arrays.parse_picture(picture, "x").shape == (40, 60, 3)
     monkeypatch.setattr(cv2, "imdecode", None)
-    for width, height in ((32_000, 32_000), (2**32 - 1, 2**32 - 1), (50_000_001, 1)):
-        with pytest.raises(
-            InputError, match=r"reading\.picture_mpx; got \d+ x \d+ px; expected at most 50 million pixels"
-        ):
+    for width, height in ((32_000, 32_000), (2**32 - 1, 2**32 - 1), (8192**2 + 1, 1)):
+        with pytest.raises(InputError, match=r"got \d+ x \d+ px; expected at most 8192 x 8192 px"):
             arrays.parse_picture(_png(width, height), "x")
-    limited(picture_mpx=1)
-    with pytest.raises(InputError, match=r"reading\.picture_mpx"):
-        arrays.parse_picture(_png(1200, 1000), "x")
 
 
 def test_a_chunk_that_goes_on_beyond_the_file_gets_no_memory(monkeypatch):
@@ -373,17 +359,32 @@ def _frame(tree: Path) -> Path:
     return frame
 
 
-def test_a_link_out_of_the_tree_is_refused(tmp_path, limited):
+def test_a_link_out_of_the_tree_is_refused_unless_the_tree_is_trusted(tmp_path):
     private = tmp_path / "private.npy"
     private.write_bytes(depth_bytes(np.zeros((4, 4), np.float32)))
     frame = _frame(tmp_path / "tree")
     (frame / "depth.npy").symlink_to(private)
     with pytest.raises(
-        InputError, match=r"a link leads out of its folder; got .*private\.npy; .*--set reading\.follow_links=true"
+        InputError, match=r"a link leads out of its folder; got .*private\.npy; .*--set follow_links=true"
     ):
         read_depth(frame)
-    limited(follow_links=True)
-    assert read_depth(frame).shape == (4, 4)
+    assert read_depth(LinkedPath(frame)).shape == (4, 4)
+
+
+def test_one_command_follows_links_and_the_next_in_this_process_does_not(tmp_path):
+    tree = make_playback_tree(tmp_path / "data/tree", 1, 4, with_augmented=False)
+    (picture,) = tree.rglob("frame_00001/rgb.png")
+    picture.symlink_to(picture.rename(tmp_path / "rgb.png"))
+    words = ["gallery", "--data", str(tree), "--out", str(tmp_path / "out")]
+    assert CliRunner().invoke(app, [*words, "--set", "follow_links=true"]).exit_code == 0
+    assert "leads out" in str(CliRunner().invoke(app, words).exception)
+
+
+def test_what_is_made_of_a_trusted_path_is_trusted_in_a_worker_too(tmp_path):
+    (tmp_path / "x").mkdir()
+    tree = LinkedPath(tmp_path)
+    made = (tree / "x", *tree.glob("*"), *tree.iterdir(), tree.parent, (tree / "x").parents[0], tree.absolute())
+    assert all(isinstance(path, LinkedPath) for path in (*made, pickle.loads(pickle.dumps(tree)), tree.with_name("y")))
 
 
 def test_links_within_a_tree_and_to_a_tree_are_followed(tmp_path):
@@ -404,13 +405,12 @@ def _linked_flight(tree: Path, elsewhere: Path) -> Path:
     return flight / "frames_playback/frame_00000"
 
 
-def test_a_flight_behind_a_link_is_read_inside_the_folder_of_its_tree_and_refused_outside(tmp_path, limited):
+def test_a_flight_behind_a_link_is_read_inside_the_folder_of_its_tree_and_refused_outside(tmp_path):
     assert read_depth(_linked_flight(tmp_path / "data/tree", tmp_path / "data/elsewhere")).shape == (4, 4)
     outside = _linked_flight(tmp_path / "other/tree", tmp_path / "elsewhere")
     with pytest.raises(InputError, match="leads out"):
         read_depth(outside)
-    limited(follow_links=True)
-    assert read_depth(outside).shape == (4, 4)
+    assert read_depth(LinkedPath(outside)).shape == (4, 4)
 
 
 def test_nothing_in_a_linked_flight_leads_out_of_it(tmp_path):
@@ -423,7 +423,7 @@ def test_nothing_in_a_linked_flight_leads_out_of_it(tmp_path):
         read_depth(frame)
 
 
-def test_files_are_found_through_links_that_stay_beside_their_tree(tmp_path, limited, caplog):
+def test_files_are_found_through_links_that_stay_beside_their_tree(tmp_path, caplog):
     tree = tmp_path / "data/tree"
     for place in ("tree/Town01/a/ORI", "beside/Town02/b/ORI", "tree/Town01/.hidden/ORI"):
         (tmp_path / "data" / place).mkdir(parents=True)
@@ -436,14 +436,13 @@ def test_files_are_found_through_links_that_stay_beside_their_tree(tmp_path, lim
     (tree / "Town01/gone").symlink_to(tmp_path / "nowhere")
     (tree / "Town01/itself").symlink_to(tree / "Town01/itself")
 
-    def found() -> list[str]:
+    def found(tree: Path) -> list[str]:
         return [path.parent.relative_to(tree).as_posix() for path in files.files_named(tree, "trajectory.json")]
 
-    assert found() == ["Town01/a/ORI", "Town02/b/ORI"]
+    assert found(tree) == ["Town01/a/ORI", "Town02/b/ORI"]
     assert "far: leads to" in caplog.text
-    assert "--set reading.follow_links=true" in caplog.text
-    limited(follow_links=True)
-    assert found() == ["Town01/a/ORI", "Town01/far/ORI", "Town02/b/ORI"]
+    assert "--set follow_links=true" in caplog.text
+    assert found(LinkedPath(tree)) == ["Town01/a/ORI", "Town01/far/ORI", "Town02/b/ORI"]
 
 
 def test_the_cache_of_the_hub_is_one_tree(tmp_path):
@@ -533,16 +532,16 @@ def test_crossings_are_counted():
 @pytest.mark.parametrize("num_vertices", [300, 3_000])
 def test_a_tangled_outline_is_refused_at_once(num_vertices):
     points = np.random.default_rng(0).random((num_vertices, 2)) * 1000
-    with pytest.raises(InputError, match=r"lawn: over the limit reading\.polygon_crossings"):
-        check_outline(Polygon(points), "lawn")
+    with pytest.raises(InputError, match=r"lawn: over the limit; .* raise maps\.cityjson\.polygon_crossings"):
+        check_outline(Polygon(points), "lawn", 500)
 
 
 def test_an_outline_that_crosses_itself_now_and_then_is_mended():
-    check_outline(Polygon([(0, 0), (4, 4), (4, 0), (0, 4)]), "lawn")
+    check_outline(Polygon([(0, 0), (4, 4), (4, 0), (0, 4)]), "lawn", 500)
 
 
-def test_a_polygon_of_too_many_vertices(tmp_path, limited):
-    limited(polygon_vertices=3)
+def test_a_region_of_too_many_vertices(tmp_path):
     (tmp_path / "roi.json").write_text(json.dumps({"points_world": [[0, 0], [9, 0], [9, 9], [0, 9]]}))
-    with pytest.raises(InputError, match=r"reading\.polygon_vertices; got 4 vertices"):
-        read_roi(tmp_path / "roi.json")
+    with pytest.raises(InputError, match=r"got 4 vertices; expected at most 3; .*pedestrians\.roi_vertices"):
+        read_roi(tmp_path / "roi.json", 3)
+    assert len(read_roi(tmp_path / "roi.json", 4).rings()) == 1

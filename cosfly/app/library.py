@@ -58,8 +58,9 @@ def load_map(path: str | Path | None = None, *, source: str | None = None, seed:
     """
     if not isinstance(seed, int):
         raise ConfigError("not a seed", where="load_map", got=repr(seed)[:40], expected="a whole number")
-    if source is None and path is not None and Path(path).suffix == ".json" and not settings:
-        return read_boxes(Path(path))
+    path = Path(path) if isinstance(path, str) else path
+    if source is None and path is not None and path.suffix == ".json" and not settings:
+        return read_boxes(path)
     source = source or ("synthetic" if path is None else "boxes")
     if source not in SOURCES:
         raise ConfigError("there is no such source of maps", got=source, expected=", ".join(SOURCES))
@@ -73,7 +74,7 @@ def load_map(path: str | Path | None = None, *, source: str | None = None, seed:
     given = settings
     if path is not None:
         _check_taken(settings, settings.keys() - {FILE_SETTING[source]}, "load_map")
-        given = {FILE_SETTING[source]: Path(path), **settings}
+        given = {FILE_SETTING[source]: path, **settings}
     return load_source(build(MapsConfig, {"source": source, source: given}, "load_map"), seed=seed)
 
 
@@ -164,7 +165,7 @@ def render_frames(
     intrinsic = intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg)
     gait = None if targets is None else gait_of(targets, STEP_S * np.arange(len(targets)))
     clothes = choose_clothes(rng_for(seed, "render", "library"))
-    renderer = open_renderer(cfg.backend, box_map, cfg.width_px, cfg.height_px, cfg.look)
+    renderer = open_renderer(cfg.backend, box_map, cfg.width_px, cfg.height_px, cfg.look, 0, cfg.mesh_triangles)
     try:
         knobs = None if weather is None else weather.params
         renderer.prepare(positions.min(axis=0), positions.max(axis=0), knobs)

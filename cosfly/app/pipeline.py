@@ -30,7 +30,6 @@ from cosfly.errors import ConfigError, CosflyError, InputError, ResumeError
 from cosfly.look.gallery import contact_sheet, preview_gif
 from cosfly.products.others import OTHERS_FILE
 from cosfly.reading.documents import read_object
-from cosfly.reading.limits import use_limits
 from cosfly.work.folder_lock import give_up, hold_folder
 from cosfly.work.stage_folder import Manifest, Resume, read_manifest
 from cosfly.work.store import refuse_link, write_bytes, write_json
@@ -75,7 +74,7 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path 
         )
 
     return [
-        stage("maps", boxes, cosfly.maps.stage.run, seed=seed),
+        stage("maps", boxes, cosfly.maps.stage.run, seed=seed, follow_links=cfg.follow_links),
         stage("simplify", simplified, cosfly.simplify.stage.run, boxes),
         stage("pedestrians", walks, cosfly.pedestrians.stage.run, simplified, roi=cfg.roi, seed=seed, **working),
         stage("plan", traces, cosfly.planners.stage.run, simplified, walks, seed=seed, **working),
@@ -100,7 +99,7 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageR
     Every stage is complete or resumable at any moment; running again continues. Ends with `contact_sheet.png`,
     `preview.gif` and `summary.json` in the run folder, in that of each town where there are several.
     """
-    use_limits(cfg.reading)
+    out = cfg.opened(out)
     check_out(out)
     towns = check(cfg)
     left = _TimeLeft(cfg, out)

@@ -15,7 +15,7 @@ from cosfly.inspection.settings import InspectConfig
 from cosfly.maps.stage import MapsConfig
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners.contract import PlanConfig
-from cosfly.reading.limits import Limits
+from cosfly.reading.files import LinkedPath
 from cosfly.render.settings import RenderConfig
 from cosfly.simplify.passes import SimplifyConfig
 from cosfly.work.chance import rng_for
@@ -66,8 +66,9 @@ class RunConfig(Config):
     roi: Path | None = Field(
         None, description="region of interest for the pedestrians (a roi_polygon.json of yours); none: the whole map"
     )
-    reading: Limits = Field(
-        default_factory=Limits, description="what a file may ask of this machine; makes no difference to products"
+    follow_links: bool = Field(
+        False,
+        description="follow symbolic links that lead out of the run, tree, release or folder of meshes they stand in",
     )
     towns: dict[str, dict[str, Any]] = Field(
         {},
@@ -84,6 +85,10 @@ class RunConfig(Config):
     caption: CaptionConfig = Field(default_factory=CaptionConfig, description="step 7")
     release: ReleaseConfig = Field(default_factory=ReleaseConfig, description="the published data set")
     distill: DistillConfig = Field(default_factory=DistillConfig, description="students; not part of `cosfly run`")
+
+    def opened(self, path: Path) -> Path:
+        """Give a path that a command was given as one whose links are followed, if they are."""
+        return LinkedPath(path) if self.follow_links else path
 
     @model_validator(mode="after")
     def _towns_can_be(self) -> RunConfig:

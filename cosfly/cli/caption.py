@@ -73,7 +73,7 @@ def caption(
     """Step 7: ask a teacher for the reason of every manoeuvre, prove it against the geometry, repair, translate."""
     from caption.run import stage
 
-    cfg, tree = job.cfg.caption, options.data_folder(data)
+    cfg, tree = job.cfg.caption, job.tree(data)
     target = out or tree.resolve().parent / "caption"
     job.begin(target, tree)
     is_student = cfg.student.folder is not None  # it knows one question, and no other is tried
@@ -227,6 +227,6 @@ def caption_compare_strategies(
     from cosfly.work.console import console
 
     job.begin(out)
-    tree = options.data_folder(data)
+    tree = job.tree(data)
     comparisons = compare.run(job.cfg.caption, tree, out, seed=job.cfg.seed, conflicts=conflicts)
     console.print(compare.comparison_table(comparisons))

@@ -52,7 +52,7 @@ def distill_prepare(
 
     sources = [RunSource.of_run(folder) for folder in runs or []]
     if captions or data or not sources:
-        trees = options.data_folders(data)
+        trees = job.trees(data)
         if len(trees) != len(captions or []):
             raise typer.BadParameter("give --data and --captions, one of each for a tree, or run folders")
         sources += [RunSource.of_files(*files) for files in zip(trees, captions or [], strict=True)]
@@ -68,7 +68,7 @@ def distill_dual_track(job: Job, out: options.Out, runs: Runs = None, data: opti
 
     trees = [folder / "render" for folder in runs or []]
     if data or not trees:
-        trees += options.data_folders(data)
+        trees += job.trees(data)
     job.begin(out, *trees)
     job.finish(dual_track.run(job.cfg.distill.dual_track, trees, out, seed=job.cfg.seed, resume=job.resume), out)
 
@@ -86,7 +86,7 @@ def distill_train(
     from distill.training import stage as train
     from distill.training.ranks import is_first_process
 
-    cfg, trees = job.cfg, options.data_folders(data)
+    cfg, trees = job.cfg, job.trees(data)
     job.begin(out, dataset, *trees)
     product = train.run(cfg.distill.train, dataset, trees, student, out, seed=cfg.seed, resume=job.resume)
     if is_first_process():
@@ -109,7 +109,7 @@ def distill_infer(
     """Let the student answer a split; continues where it stopped."""
     from distill.inference import stage as infer
 
-    trees = options.data_folders(data)
+    trees = job.trees(data)
     job.begin(out, dataset, *trees, adapter)
     product = infer.run(job.cfg.distill.infer, dataset, trees, model, out, adapter=adapter, resume=job.resume)
     job.finish(product, out)

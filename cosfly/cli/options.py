@@ -84,6 +84,25 @@ class Job:
 
         return manner_of_work(self.cfg) | {"resume": self.resume}
 
+    def tree(self, data: list[Path] | None) -> Path:
+        """The playback tree: given, or that of the run folder one stands in; InputError where there is not one."""
+        trees = self.trees(data)
+        if len(trees) > 1:
+            what, got = "this command takes one playback tree", f"{len(trees)}: {', '.join(map(str, trees))}"
+            fix = "run it once for each tree; distill and release take the results of several together"
+            raise InputError(what, where="--data", got=got, fix=fix)
+        return trees[0]
+
+    def trees(self, data: list[Path] | None) -> list[Path]:
+        """The playback trees: given, or that of the run folder one stands in."""
+        if data:
+            return data
+        for candidate in (Path("render"), Path()):
+            if (candidate / "manifest.json").exists() and candidate.resolve().name == "render":
+                return [self.cfg.opened(candidate)]
+        got = "no --data, and this is not a run folder"
+        raise InputError("no playback tree", where=Path.cwd(), got=got, fix="give --data DIR")
+
     def begin(self, out: Path, *inputs: Path | None) -> None:
         """Do what --repair and --verify ask for, before the folder is opened; both where nobody does are nothing."""
         from cosfly.app.repair import repair
@@ -144,7 +163,7 @@ def takes(*names: str, flights: str | None = None) -> Callable[[Callable[..., No
             extra = {one.path: one.value_of(given[name]) for name, one in chosen.items()}
             manner = {name: given[name] for name in ("resume", "verify", "repair") if name in given}
             job = Job(resolve(given["config"], given.get("overrides"), extra), **manner)
-            function(job, **{name: given[name] for name in taken})
+            function(job, **{name: _opened(job.cfg, given[name]) for name in taken})
 
         parameters = [
             Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option])
@@ -156,6 +175,13 @@ def takes(*names: str, flights: str | None = None) -> Callable[[Callable[..., No
         return command
 
     return decorate
+
+
+def _opened(cfg: RunConfig, given: Any) -> Any:
+    """Give a path, or a list of them, as the settings have links followed; anything else as it is."""
+    if isinstance(given, list):
+        return [_opened(cfg, one) for one in given]
+    return cfg.opened(given) if isinstance(given, Path) else given
 
 
 class StageGroup(typer.core.TyperGroup):
@@ -179,15 +205,12 @@ def stage_group(text: str) -> typer.Typer:
 def resolve(config: Path | None, overrides: list[str] | None, given: Mapping[str, Any] = {}) -> RunConfig:
     """Resolve the settings: defaults, file, --set, then `given`: what options say of single settings."""
     from cosfly.app.settings import RunConfig
-    from cosfly.reading.limits import use_limits
     from cosfly.work.config import load
     from cosfly.work.store import dump_json
 
     # As YAML, which JSON is: a colon in a text is only a colon.
     extra = [f"{name}={dump_json(str(value) if isinstance(value, Path) else value)}" for name, value in given.items()]
-    cfg = load(RunConfig, _config_path(config), [*(overrides or []), *extra])
-    use_limits(cfg.reading)
-    return cfg
+    return load(RunConfig, _config_path(config), [*(overrides or []), *extra])
 
 
 def _config_path(config: Path | None) -> Path | None:
@@ -211,27 +234,6 @@ def _config_path(config: Path | None) -> Path | None:
     if is_bare:
         raise ConfigError(f"no such configuration{nearest(str(config), names)}", where=config, expected=expected)
     return config
-
-
-def data_folder(data: list[Path] | None) -> Path:
-    """The playback tree: given, or that of the run folder one stands in; InputError where there is not one."""
-    trees = data_folders(data)
-    if len(trees) > 1:
-        what, got = "this command takes one playback tree", f"{len(trees)}: {', '.join(map(str, trees))}"
-        fix = "run it once for each tree; distill and release take the results of several together"
-        raise InputError(what, where="--data", got=got, fix=fix)
-    return trees[0]
-
-
-def data_folders(data: list[Path] | None) -> list[Path]:
-    """The playback trees: given, or that of the run folder one stands in."""
-    if data:
-        return data
-    for candidate in (Path("render"), Path()):
-        if (candidate / "manifest.json").exists() and candidate.resolve().name == "render":
-            return [candidate]
-    got = "no --data, and this is not a run folder"
-    raise InputError("no playback tree", where=Path.cwd(), got=got, fix="give --data DIR")
 
 
 # --- on the terminal --------------------------------------------------------------------------------------------------

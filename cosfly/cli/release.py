@@ -51,7 +51,7 @@ def release_build(
 
     sources = [Source.of_run(folder) for folder in runs or []]
     if captions or inspected or data or not sources:
-        trees = data or [options.data_folder(None)]
+        trees = data or [job.tree(None)]
         inspections: list[Path | None] = list(inspected) if inspected else [None for _ in trees]
         if not len(trees) == len(captions or []) == len(inspections):
             raise typer.BadParameter(

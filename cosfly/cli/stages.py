@@ -27,7 +27,8 @@ def maps(
     """Step 1: make boxes_3d.json from a map source."""
     from cosfly.maps import stage
 
-    job.finish(stage.run(job.cfg.maps, out, seed=job.cfg.seed, resume=job.resume), out)
+    cfg = job.cfg
+    job.finish(stage.run(cfg.maps, out, seed=cfg.seed, resume=job.resume, follow_links=cfg.follow_links), out)
 
 
 @app.command()
@@ -156,7 +157,7 @@ def render_sample(
     from cosfly.products.boxes import read_boxes
 
     box_map = None if map_ is None else read_boxes(map_)
-    typer.echo(four_panels(options.data_folder(data), out, frame=frame, box_map=box_map))
+    typer.echo(four_panels(job.tree(data), out, frame=frame, box_map=box_map))
     typer.echo(out)
 
 
@@ -170,7 +171,7 @@ def gallery(
     """A contact sheet and a preview GIF of a playback tree."""
     from cosfly.look.gallery import contact_sheet, preview_gif
 
-    tree, choice = options.data_folder(data), job.cfg.inspect.flights
+    tree, choice = job.tree(data), job.cfg.inspect.flights
     contact_sheet(tree, out / "contact_sheet.png", choice)
     preview_gif(tree, out / "preview.gif", choice)
     typer.echo(out)
@@ -192,7 +193,7 @@ def inspect(
     """Step 6: accept, route to review or reject every flight; inspect.json and an HTML report."""
     from cosfly.inspection import stage
 
-    tree = options.data_folder(data)
+    tree = job.tree(data)
     job.begin(out, map_, traces, tree)
     job.finish(stage.run(job.cfg.inspect, map_, traces, tree, out, **job.manner), out)
 

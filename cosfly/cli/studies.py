@@ -17,7 +17,9 @@ app = typer.Typer(no_args_is_help=True, help=ABOUT)
 
 
 @app.command("depth")
+@takes()
 def study_depth(
+    job: Job,
     out: Annotated[Path, Option(help="Folder for depth_study.json, depth_study.md and depth_study.png.")],
     data: options.Trees = None,
     frame: Annotated[
@@ -33,9 +35,9 @@ def study_depth(
     from cosfly.studies import depth
 
     if frame is None:
-        frame = best_frame(options.data_folder(data), "depth.npy")
+        frame = best_frame(job.tree(data), "depth.npy")
     elif data and not frame.exists():
-        frame = frame_in(options.data_folder(data), frame)
+        frame = frame_in(job.tree(data), frame)
     depth.run(frame, out)
     typer.echo(out / "depth_study.md")
 

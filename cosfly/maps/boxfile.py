@@ -25,7 +25,7 @@ from shapely.geometry import Polygon
 
 from cosfly.errors import ConfigError, InputError, nearest
 from cosfly.maps.boxlist import BoxList
-from cosfly.maps.footprints import CUT_SHARES, check_outline, cover
+from cosfly.maps.footprints import CUT_SHARES, cover
 from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource, read_boxes
 from cosfly.products.columns import LARGEST
 from cosfly.products.kinds import GROUND_KINDS, KINDS, SURFACE_KINDS
@@ -371,7 +371,6 @@ def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> None:
         boxes.add(kind, (metres["x"], turn * metres["y"]), size, low_m, high_m, turn * yaw_deg)
         return
     outline = shapely.transform(row.outline, lambda places: places * [cfg.metres_per_unit, turn * cfg.metres_per_unit])
-    check_outline(outline, row.where)
     if not outline.is_valid:
         raise WrongRow(f"the outline crosses itself: {shapely.is_valid_reason(outline)}")
     for rectangle in cover(outline, min_fill=cfg.outline_fill, min_size_m=cfg.outline_piece_m, shares=CUT_SHARES):

@@ -30,7 +30,7 @@ from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader,
 from cosfly.products.ground import Ground, GroundGrid
 from cosfly.products.meshes import MESHES_FILE, Meshes, MeshRef
 from cosfly.reading.meshes import Mesh
-from cosfly.work.config import Config
+from cosfly.work.config import Config, MayDiffer
 
 log = logging.getLogger(__name__)
 
@@ -84,6 +84,13 @@ class CityJsonConfig(Config):
     flat_within_m: float = Field(3.0, ge=0.0, description="ground that rises less over the whole map is made flat, m")
     crown_min_m: float = Field(3.6, gt=0.0, description="least width of a crown, m: a street tree's plot is smaller")
 
+    polygon_vertices: MayDiffer[int] = Field(
+        100_000, ge=3, description="most vertices of a surface, its holes included; more are refused"
+    )
+    polygon_crossings: MayDiffer[int] = Field(
+        500, ge=0, description="most crossings of an outline with itself; mending 1,000 takes a second"
+    )
+
     def inputs(self) -> dict[str, Path]:
         if self.path is None:
             fix = "--set maps.cityjson.path=FILE"
@@ -106,11 +113,11 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
     """
     cfg.inputs()
     assert cfg.path is not None
-    model = read_model(cfg.path)
+    model = read_model(cfg.path, cfg.polygon_vertices)
     objects, offset = _centred(model.objects, cfg.path)
     ground = ground_of(objects, cell_m=cfg.ground_cell_m, flat_within_m=cfg.flat_within_m)
     objects = objects if ground.is_flat else [_over_ground(item, ground) for item in objects]
-    facets = {item.object_id: _facets(item) for item in objects}
+    facets = {item.object_id: _facets(item, cfg.polygon_crossings) for item in objects}
     footprints = {key: united([facet.polygon for facet in value]) for key, value in facets.items()}
     boxes, standing = BoxList(), set[int]()  # rows of solids, whose heights are the source's
     refs, made = dict[int, MeshRef](), dict[str, Mesh]()
@@ -191,7 +198,7 @@ def _moved(surfaces: list[list[np.ndarray]], offset: np.ndarray) -> list[list[np
     return [[ring - offset for ring in rings] for rings in surfaces]
 
 
-def _facets(item: CityObject) -> list[Facet]:
+def _facets(item: CityObject, most_crossings: int) -> list[Facet]:
     """Project the surfaces of an object that are not upright."""
     facets = []
     for surface in item.surfaces:
@@ -206,7 +213,7 @@ def _facets(item: CityObject) -> list[Facet]:
         middle = ring.mean(axis=0)
         plane = np.array([a, b, middle[2] - a * middle[0] - b * middle[1]])
         polygon = Polygon(ring[:, :2], [hole[:, :2] for hole in surface[1:]])
-        check_outline(polygon, item.object_id)
+        check_outline(polygon, item.object_id, most_crossings)
         facets.append(Facet(polygon, plane))
     return facets
 

@@ -19,11 +19,11 @@ import numpy as np
 from cosfly.errors import InputError
 from cosfly.products.columns import is_in_range
 from cosfly.reading.documents import MISSING, parse_document, parse_json
-from cosfly.reading.files import read_unpacked
-from cosfly.reading.limits import limits, over_limit
+from cosfly.reading.files import over_limit, read_unpacked
 
 log = logging.getLogger(__name__)
 
+CITY_MB = 16_384  # as it stands there and unpacked; as values of Python it takes ten times that
 VERSIONS = ("0.8", "0.9", "1.0", "1.1", "2.0")
 PLAIN_VERTICES = VERSIONS[:3]  # may go without `transform`
 RECORD_SEPARATOR = b"\x1e"  # stands before each text of a sequence as RFC 7464 has it
@@ -108,8 +108,9 @@ class _Templates(NamedTuple):
     vertices: np.ndarray
 
 
-def read_model(path: Path) -> CityModel:
-    """Read a CityJSON file or text sequence, plain or gzipped; coordinates stay the source's.
+def read_model(path: Path, most_vertices: int) -> CityModel:
+    """Read a CityJSON file or text sequence, plain or gzipped; coordinates stay the source's. A surface has at most so
+    many vertices, its holes included.
 
     Raises:
         InputError: names the object and the field.
@@ -128,12 +129,21 @@ def read_model(path: Path) -> CityModel:
             if reason:
                 dropped[reason] += 1
             elif isinstance(found, CityObject):
+                _check_vertices(found, most_vertices, part.where)
                 objects[object_id] = found
     if not objects:
         raise InputError("no object can be used", where=f"{path}: CityObjects", got=str(dropped))
     dropped = {reason: count for reason, count in dropped.items() if count}
     num_objects = sum(len(part.objects) for part in parts)
     return CityModel(list(objects.values()), dropped, num_objects, head["version"])
+
+
+def _check_vertices(item: CityObject, most: int, where: str) -> None:
+    largest = max(sum(map(len, surface)) for surface in (*item.surfaces, *item.detailed))
+    if largest > most:
+        fix = "simplify it, or raise maps.cityjson.polygon_vertices if you trust the file"
+        where, got = f"{where}: CityObjects.{item.object_id}", f"a surface of {largest:,} vertices"
+        raise over_limit(where, got, f"{most:,}", fix)
 
 
 def _city_object(object_id: str, value: Any, part: _Part, templates: _Templates) -> CityObject | str:
@@ -178,7 +188,7 @@ def rule_of(object_type: str, attributes: dict) -> ObjectRule | None:
 
 def _read_json(path: Path) -> tuple[dict, list[tuple[str, dict]]]:
     """Give the document, and the features of a sequence with their places in the file."""
-    data = read_unpacked(path, what="city model", limit="city_mb")
+    data = read_unpacked(path, what="city model", most_mb=CITY_MB)
     lines = data.replace(RECORD_SEPARATOR, b"").splitlines()
     is_sequence = len(lines) > 1 and b'"CityJSONFeature"' in data and _is_whole(lines[0])
     texts = [(f"{path}: line {k + 1}", line) for k, line in enumerate(lines) if line.strip()] if is_sequence else []
@@ -351,9 +361,6 @@ def _level(geometry: dict) -> float:
 def _rings(surface: Any, vertices: np.ndarray, where: str) -> list[np.ndarray]:
     if not isinstance(surface, list) or not surface:
         raise InputError("not a surface", where=where, got=repr(surface)[:60], expected="a list of rings")
-    num_vertices = sum(len(ring) for ring in surface if isinstance(ring, list))
-    if num_vertices > limits().polygon_vertices:
-        raise over_limit("polygon_vertices", where, f"{num_vertices:,} vertices")
     rings = []
     for ring in surface:
         if not isinstance(ring, list) or len(ring) < 3 or not all(type(index) is int for index in ring):

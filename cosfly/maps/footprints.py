@@ -10,7 +10,7 @@ import shapely
 from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from cosfly.reading.limits import limits, over_limit
+from cosfly.reading.files import over_limit
 
 MIN_AREA_M2 = 0.02  # smaller pieces are what rounding leaves of a cut
 PAIRS_AT_ONCE = 1_000_000  # of edges that are compared before the count is looked at
@@ -118,15 +118,15 @@ def _cut(piece: Polygon, rectangle: Rectangle, shares: Sequence[float]) -> list[
     return best[1]
 
 
-def check_outline(polygon: Polygon, where: str) -> None:
+def check_outline(polygon: Polygon, where: str, most: int) -> None:
     """Refuse an outline that crosses itself so often that mending it would take minutes and gigabytes.
 
     Raises:
-        InputError: names the limit.
+        InputError: names the setting.
     """
-    most = limits().polygon_crossings
     if not polygon.is_valid and num_crossings(polygon, most) > most:
-        raise over_limit("polygon_crossings", where, "more crossings of its own outline")
+        fix = "mend it, or raise maps.cityjson.polygon_crossings if you trust the file"
+        raise over_limit(where, "an outline that crosses itself", f"{most:,} crossings", fix)
 
 
 def num_crossings(polygon: Polygon, most: int) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +19,9 @@ from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.products.boxes import BoxMap, check_ground, write_boxes
 from cosfly.products.meshes import MESHES_FILE
-from cosfly.work.config import Config
+from cosfly.reading.files import LinkedPath
+from cosfly.reading.meshes import MOST_TRIANGLES
+from cosfly.work.config import Config, MayDiffer
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import write_bytes
 
@@ -39,6 +42,9 @@ class MapsConfig(Config):
     cityjson: CityJsonConfig = Field(default_factory=CityJsonConfig, description="a CityJSON city model")
     boxes: BoxesConfig = Field(default_factory=BoxesConfig, description="boxes of your own: JSON, CSV or GeoJSON")
     picture_px: int = Field(1200, ge=200, le=8000, description="longer side of the overview picture, px")
+    mesh_triangles: MayDiffer[int] = Field(
+        MOST_TRIANGLES, ge=1, description="most triangles of a file of meshes, and of all that the map draws of them"
+    )
 
     @property
     def licence(self) -> str:
@@ -51,14 +57,20 @@ class MapsConfig(Config):
         return {name: value for name, value in super().recorded().items() if name not in others}
 
 
-def load_map(cfg: MapsConfig, *, seed: int = 0) -> BoxMap:
-    """Read or build the map that the settings name."""
-    return SOURCES[cfg.source](getattr(cfg, cfg.source), seed)
+def load_map(cfg: MapsConfig, *, seed: int = 0, follow_links: bool = False) -> BoxMap:
+    """Read or build the map that the settings name; its meshes are read when they are drawn."""
+    box_map = SOURCES[cfg.source](getattr(cfg, cfg.source), seed)
+    meshes = replace(box_map.meshes, most_triangles=cfg.mesh_triangles)
+    if follow_links and meshes.folder is not None:
+        meshes = replace(meshes, folder=LinkedPath(meshes.folder))
+    return replace(box_map, meshes=meshes)
 
 
-def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
+def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same", follow_links: bool = False) -> Path:
     """Reads the source's files, if it has any; writes `boxes_3d.json` and the overview `map.png`.
 
+    Args:
+        follow_links: meshes are read through links that lead out of the map's folder.
     Raises:
         InputError: a file is malformed, or nothing in it says where the ground is: no later stage could tell.
     """
@@ -67,7 +79,7 @@ def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same"
     product = out / "boxes_3d.json"
     if stage.is_complete:
         return product
-    box_map = load_map(cfg, seed=seed)
+    box_map = load_map(cfg, seed=seed, follow_links=follow_links)
     check_ground(box_map, next(iter(inputs.values()), product))
     write_boxes(product, box_map)
     view = TopView.around(np.stack(box_map.bounds()), cfg.picture_px)

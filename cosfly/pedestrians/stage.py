@@ -315,7 +315,7 @@ def run(
     clock = Clock()
     with clock("read"):
         box_map = read_boxes(simplified_map)
-        region = read_roi(roi) if roi else None
+        region = read_roi(roi, cfg.roi_vertices) if roi else None
     ground = walkable_ground(box_map, cfg, region, where=simplified_map, roi_where=roi or "", clock=clock)
     items = [Item(walk_id(k)) for k in range(cfg.num_paths)]
     # Workers need the labels only; the rest would cost time to send.

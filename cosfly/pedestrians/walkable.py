@@ -25,7 +25,7 @@ from cosfly.pedestrians.walking import PACES, SLOWEST_SPEED_MPS
 from cosfly.products.boxes import BoxMap
 from cosfly.products.ground import Ground
 from cosfly.products.kinds import GROUND_KINDS, KINDS
-from cosfly.products.roi import Roi
+from cosfly.products.roi import MOST_VERTICES, Roi
 from cosfly.products.walks import PLAIN_PACE
 from cosfly.space.grid import (
     SURFACE_REACH_M,
@@ -39,7 +39,7 @@ from cosfly.space.grid import (
     roi_mask,
     surface,
 )
-from cosfly.work.config import Config
+from cosfly.work.config import Config, MayDiffer
 
 log = logging.getLogger(__name__)
 
@@ -85,6 +85,9 @@ class PedestriansConfig(Config):
     others: int = Field(0, ge=0, le=500, description="other people who walk about during each walk; 0: nobody")
     traffic: int = Field(
         0, ge=0, le=500, description="cars that drive about during each walk, where the map has straight roads; 0: none"
+    )
+    roi_vertices: MayDiffer[int] = Field(
+        MOST_VERTICES, ge=3, description="most vertices of a region of interest; more are refused"
     )
     others_reach_m: float = Field(40.0, gt=0, le=500, description="how near to a walk its others begin, m")
     dt_s: float = Field(

@@ -22,6 +22,7 @@ from cosfly.reading.documents import MISSING, check_schema, read_json, validated
 from cosfly.work.store import dump_json, write_bytes
 
 BOXES_SCHEMA, BOXES_VERSION = "cosfly.boxes_3d", "1.0"
+MAP_MB = 4_096  # 15 million boxes; ten million took 2.7 GB as they are written
 AXES = "right-handed, metres, x east, y north, z up; degrees"
 # How far a told corner may be from the one that follows: exporters round, and turn boxes in single precision.
 CORNER_M = 0.05
@@ -281,7 +282,7 @@ def read_boxes(path: Path) -> BoxMap:
     if path.suffix.lower() in (".csv", ".geojson"):
         fix = f"cosfly maps --source boxes --set maps.boxes.path={path} --out DIR makes boxes_3d.json of it"
         raise InputError("boxes of one's own, not a map yet", where=path, fix=fix)
-    value = read_json(path, what="map")
+    value = read_json(path, what="map", most_mb=MAP_MB)
     header = MapHeader(name=path.stem)
     records: Any = value
     if not isinstance(value, list):

@@ -77,7 +77,7 @@ def read_twin(flight: Flight) -> Flight | None:
     """
     if flight.is_original or flight.folder is None:
         return None
-    own = Path(os.path.abspath(flight.folder))
+    own = type(flight.folder)(os.path.abspath(flight.folder))
     named = own.parent / ORIGINAL
     has_named = named != own and (named / "trajectory.json").exists()
     for folder in [named] if has_named else sorted(p.parent for p in own.parent.glob("[!.]*/trajectory.json")):

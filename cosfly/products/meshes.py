@@ -12,17 +12,18 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from cosfly.errors import InputError
-from cosfly.reading.limits import limits, over_limit
 from cosfly.reading.meshes import (
     BINARY_CHUNK,
     GLB_MAGIC,
     JSON_CHUNK,
+    MOST_TRIANGLES,
     SUFFIXES,
     TRIANGLES,
     Z_UP,
     Mesh,
     joined,
     read_meshes,
+    too_many,
 )
 from cosfly.work.store import write_bytes
 
@@ -59,12 +60,13 @@ class MeshRef(BaseModel):
 @dataclass(frozen=True)
 class Meshes:
     """The meshes of a map. refs: box id -> what it is drawn as; folder: that their files are below; made: node -> mesh
-    of a MESHES_FILE that is not written yet.
+    of a MESHES_FILE that is not written yet; most_triangles: of each file, and of all that is drawn.
     """
 
     refs: dict[int, MeshRef] = field(default_factory=dict)
     folder: Path | None = None
     made: dict[str, Mesh] = field(default_factory=dict)
+    most_triangles: int = MOST_TRIANGLES
 
     def files(self) -> dict[str, Path]:
         """The files that boxes name, by name."""
@@ -77,8 +79,10 @@ class Meshes:
         Raises:
             InputError: a file is missing, outside of the folder, too large or malformed, or has no such node.
         """
+        most = self.most_triangles
         read = {
-            name: read_meshes(path, tree=path.parents[len(Path(name).parts) - 1]) for name, path in self.files().items()
+            name: read_meshes(path, tree=path.parents[len(Path(name).parts) - 1], most_triangles=most)
+            for name, path in self.files().items()
         }
         found: dict[MeshRef, Mesh] = {}
         for box_id, ref in self.refs.items():
@@ -90,8 +94,8 @@ class Meshes:
                 found[ref] = joined(list(nodes.values())) if ref.node is None else nodes[ref.node]
         num_drawn = sum(len(found[ref]) for ref in self.refs.values() if ref.fit == "box")
         num_drawn += sum(len(mesh) for ref, mesh in found.items() if ref.fit == "world")
-        if num_drawn > limits().mesh_triangles:
-            raise over_limit("mesh_triangles", self.folder or "map", f"{num_drawn:,} triangles drawn")
+        if num_drawn > most:
+            raise too_many(self.folder or "map", f"{num_drawn:,} triangles drawn", most)
         return found
 
     def beside(self, folder: Path) -> Meshes:

@@ -14,9 +14,10 @@ from shapely.geometry.base import BaseGeometry
 from cosfly.errors import InputError
 from cosfly.products.columns import is_in_range
 from cosfly.reading.documents import read_json, validated
+from cosfly.reading.files import over_limit
 from cosfly.reading.geojson import Feature, features_of, is_geojson
-from cosfly.reading.limits import limits, over_limit
 
+MOST_VERTICES = 100_000  # of a region; to see that a spiky ring does not cross itself takes 8 s then
 SMALLEST_M = 1.0  # nobody walks in less; a region drawn in degrees is smaller
 
 
@@ -46,8 +47,8 @@ class Roi(RoiPolygon):
         return shapely.union_all(areas)
 
 
-def read_roi(path: Path) -> Roi:
-    """Read a region of interest.
+def read_roi(path: Path, most_vertices: int = MOST_VERTICES) -> Roi:
+    """Read a region of interest of at most so many vertices in all its rings.
 
     Raises:
         InputError: malformed, not closed, crossing itself, or a ring of fewer than three finite points.
@@ -62,8 +63,9 @@ def read_roi(path: Path) -> Roi:
     if not roi.rings():
         raise InputError("no polygon", where=f"{path}: points_world", expected="at least three points")
     num_vertices = sum(len(ring) for polygon in roi.rings() for ring in (polygon.points_world, *polygon.holes))
-    if num_vertices > limits().polygon_vertices:
-        raise over_limit("polygon_vertices", path, f"{num_vertices:,} vertices")
+    if num_vertices > most_vertices:
+        fix = "simplify it, or raise pedestrians.roi_vertices if you trust it"
+        raise over_limit(path, f"{num_vertices:,} vertices", f"{most_vertices:,}", fix)
     for number, polygon in enumerate(roi.rings()):
         for ring in (polygon.points_world, *polygon.holes):
             if len(ring) < 3 or not is_in_range(np.array(ring, dtype=np.float64)):

@@ -22,13 +22,13 @@ import cv2
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.reading.files import disk_errors, open_file, read_bytes
-from cosfly.reading.limits import limits, over_limit
+from cosfly.reading.files import disk_errors, open_file, over_limit, read_bytes
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_HEADER_BYTES = 24  # signature, length and name of the first chunk, width, height
 NPY_MAGIC = b"\x93NUMPY"
 MOST_HEADER_BYTES = 10_000  # NumPy's own limit
+LONGEST_SIDE_PX = 8192  # of a picture that `render` draws; a square of it is the largest that is read, 8K has half
 _DESCR = re.compile(rb"'descr' *: *'([<>|=][a-z][0-9]{1,2})'")
 _ORDER = re.compile(rb"'fortran_order' *: *(True|False)")
 _SHAPE = re.compile(rb"'shape' *: *\(([0-9, ]{0,200})\)")
@@ -137,8 +137,10 @@ def _no_array(where: str | Path, what: str, got: str) -> InputError:
 
 def check_pixels(num_pixels: float, where: str | Path, got: str) -> None:
     """Refuse what has more pixels than a picture may have."""
-    if num_pixels > limits().picture_mpx * 1_000_000:
-        raise over_limit("picture_mpx", where, got, " million pixels")
+    if num_pixels > LONGEST_SIDE_PX**2:
+        raise over_limit(
+            where, got, f"{LONGEST_SIDE_PX} x {LONGEST_SIDE_PX} px", "scale the pictures down, or cut them"
+        )
 
 
 def png_size(data: bytes) -> tuple[int, int] | None:

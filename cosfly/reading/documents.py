@@ -23,7 +23,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import SchemaValidator
 
 from cosfly.errors import InputError, plain
-from cosfly.reading.files import CHECK_PATH, decoded, not_utf8, read_bytes, read_lines
+from cosfly.reading.files import CHECK_PATH, FILE_MB, decoded, not_utf8, read_bytes, read_lines
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -164,14 +164,16 @@ def _place_in(value: Any) -> str | None:
 
 
 def read_json(
-    path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None, each_key_once: bool = False
+    path: Path,
+    *,
+    what: str = "file",
+    fix: str = CHECK_PATH,
+    tree: Path | None = None,
+    each_key_once: bool = False,
+    most_mb: float = FILE_MB,
 ) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        InputError: it is missing, unreadable or not JSON.
-    """
-    data = read_bytes(path, what=what, fix=fix, tree=tree)
+    """Read a JSON file; raises InputError as `read_bytes`, and where it is not JSON."""
+    data = read_bytes(path, what=what, fix=fix, tree=tree, most_mb=most_mb)
     return parse_document(data, path, what=what, each_key_once=each_key_once)
 
 

@@ -11,19 +11,24 @@ import errno
 import gzip
 import hashlib
 import io
+import itertools
 import logging
 import os
 import stat
 import zlib
 from collections.abc import Callable, Iterator
-from pathlib import Path
+from pathlib import Path, PosixPath
 
 from cosfly.errors import InputError
-from cosfly.reading.limits import MB, limits, over_limit
 
 log = logging.getLogger(__name__)
 
+MB = 1_000_000
+FILE_MB = 2_048  # read as a whole: the flights of a town are some 100 MB a million frames
+LINE_MB = 64  # of a JSON-lines file: a caption with its evidence has some 8 kB
+UNPACK_FACTOR = 100  # times its own size may a packed file unpack to: JSON packs to a third, an indented one to a 15th
 CHECK_PATH = "check the path"
+SPLIT = "split it, or cut out the part that is needed"
 GZIP_MAGIC = b"\x1f\x8b"
 SMALL_UNPACKED_MB = 64  # what any packed file may unpack to, however small it is
 CHUNK = 16 * MB
@@ -31,6 +36,18 @@ CHUNK = 16 * MB
 _KINDS = (
     (stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a named pipe"), (stat.S_ISCHR, "a device"), (stat.S_ISBLK, "a device"),
 )  # fmt: skip
+
+
+class LinkedPath(PosixPath):
+    """A folder or file that the user trusts: links below it are followed wherever they lead.
+
+    Every path that is made from it is one too, also in another process, so nothing else tells readers.
+    """
+
+
+def over_limit(where: object, got: str, expected: str, fix: str) -> InputError:
+    """Give the error of what is larger than its reader takes."""
+    return InputError("over the limit", where=str(where), got=got, expected=f"at most {expected}", fix=fix)
 
 
 def open_file(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None) -> io.BufferedReader:
@@ -71,20 +88,23 @@ def disk_errors(path: Path, what: str, fix: str = CHECK_PATH) -> Iterator[None]:
 
 
 def read_bytes(
-    path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None, limit: str = "file_mb"
+    path: Path,
+    *,
+    what: str = "file",
+    fix: str = CHECK_PATH,
+    tree: Path | None = None,
+    most_mb: float = FILE_MB,
+    split: str = SPLIT,
 ) -> bytes:
     """Read a whole file.
 
     Args:
-        what, fix, tree: as for `open_file`. limit: the field of Limits that bounds its size.
+        what, fix, tree: as for `open_file`. most_mb: its largest size. split: what to do about a larger one.
     Raises:
         InputError: as `open_file`; or it is over the limit.
     """
     with open_file(path, what=what, fix=fix, tree=tree) as file, disk_errors(path, what, fix):
-        size = os.fstat(file.fileno()).st_size
-        if size > getattr(limits(), limit) * MB:
-            raise over_limit(limit, path, f"{size / MB:,.0f} MB", " MB")
-        return file.read(size)
+        return file.read(_size_within(file, path, most_mb, split))
 
 
 def read_into(
@@ -103,9 +123,7 @@ def read_into(
         InputError: as `read_bytes`, and where the file becomes shorter meanwhile.
     """
     with open_file(path, what=what, fix=fix, tree=tree) as file, disk_errors(path, what, fix):
-        size = os.fstat(file.fileno()).st_size
-        if size > limits().file_mb * MB:
-            raise over_limit("file_mb", path, f"{size / MB:,.0f} MB", " MB")
+        size = _size_within(file, path)
         found = file.readinto(target(size))
     if found != size:
         raise InputError(f"the {what} became shorter while it was read", where=path, got=f"{found} bytes", fix=fix)
@@ -116,8 +134,8 @@ def read_span(path: Path, first: int, size: int, *, what: str = "file", fix: str
     """Read `size` bytes from byte `first` on of a file that the user named; raises as `read_bytes`, and where it ends
     before.
     """
-    if size > limits().file_mb * MB:
-        raise over_limit("file_mb", path, f"{size / MB:,.0f} MB", " MB")
+    if size > FILE_MB * MB:
+        raise over_limit(path, f"{size / MB:,.0f} MB", f"{FILE_MB:,} MB in one piece", SPLIT)
     with open_file(path, what=what, fix=fix) as file, disk_errors(path, what, fix):
         file.seek(first)
         data = file.read(size)
@@ -126,6 +144,14 @@ def read_span(path: Path, first: int, size: int, *, what: str = "file", fix: str
             f"the {what} became shorter while it was read", where=path, got=f"{first + len(data)} bytes", fix=fix
         )
     return data
+
+
+def _size_within(file: io.BufferedReader, path: Path, most_mb: float = FILE_MB, split: str = SPLIT) -> int:
+    """Give the size of an open file; InputError where it is larger."""
+    size = os.fstat(file.fileno()).st_size
+    if size > most_mb * MB:
+        raise over_limit(path, f"{size / MB:,.3g} MB", f"{most_mb:,g} MB in one piece", split)
+    return size
 
 
 def read_text(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None) -> str:
@@ -155,36 +181,33 @@ def not_utf8(error: UnicodeDecodeError, where: object) -> InputError:
 def read_lines(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None) -> Iterator[bytes]:
     """Yield the lines of a file, each with its end; raises as `open_file`, and for a line over the limit."""
     with open_file(path, what=what, fix=fix, tree=tree) as file:
-        most, number = limits().line_mb * MB, 0
-        while True:
-            number += 1
+        for number in itertools.count(1):
             with disk_errors(path, what, fix):
-                line = file.readline(most + 1)
-            if len(line) > most:
-                raise over_limit("line_mb", f"{path}:{number}", "a longer line", " MB")
+                line = file.readline(LINE_MB * MB + 1)
+            if len(line) > LINE_MB * MB:
+                fix = "check that it is JSON lines, one record a line"
+                raise over_limit(f"{path}:{number}", "a longer line", f"{LINE_MB} MB", fix)
             if not line:
                 return
             yield line
 
 
-def read_unpacked(path: Path, *, what: str = "file", limit: str = "file_mb") -> bytes:
+def read_unpacked(path: Path, *, what: str = "file", most_mb: float = FILE_MB) -> bytes:
     """Read a whole file, and unpack it where it is gzipped; raises as `read_bytes`, and for damaged gzip data."""
-    data = read_bytes(path, what=what, limit=limit)
+    data = read_bytes(path, what=what, most_mb=most_mb)
     if not data.startswith(GZIP_MAGIC):
         return data
-    by_factor = max(SMALL_UNPACKED_MB * MB, limits().unpack_factor * len(data))
-    most = getattr(limits(), limit) * MB
+    by_factor = max(SMALL_UNPACKED_MB * MB, UNPACK_FACTOR * len(data))
     chunks, size = [], 0
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as packed:
             while chunk := packed.read(CHUNK):
                 size += len(chunk)
-                if size > most:
-                    raise over_limit(limit, path, "more, unpacked", " MB")
+                if size > most_mb * MB:
+                    raise over_limit(path, "more, unpacked", f"{most_mb:,g} MB in one piece", SPLIT)
                 if size > by_factor:
-                    raise over_limit(
-                        "unpack_factor", path, f"{len(data):,} bytes that unpack to more", " times the file"
-                    )
+                    got = f"{len(data):,} bytes that unpack to more"
+                    raise over_limit(path, got, f"{UNPACK_FACTOR} times the file", "if you trust it, gunzip it before")
                 chunks.append(chunk)
     except (OSError, EOFError, zlib.error) as error:
         raise InputError("the gzip data is damaged", where=path, got=str(error)) from None
@@ -202,7 +225,7 @@ def files_named(tree: Path, name: str) -> list[Path]:
     below a folder that has one.
 
     A folder that is a link is gone into where it leads to a place inside the tree's parent folder, or anywhere with
-    `reading.follow_links`; of others the log tells.
+    `follow_links`; of others the log tells.
     """
     found: list[Path] = []
     waiting: list[tuple[Path, tuple[str, ...]]] = [(tree, (os.path.realpath(tree),))]
@@ -219,10 +242,8 @@ def files_named(tree: Path, name: str) -> list[Path]:
                 waiting.append((folder / entry.name, above))
             elif entry.is_symlink() and os.path.isdir(entry.path):  # a link to itself is none, and no error
                 real = os.path.realpath(entry.path)
-                if not (limits().follow_links or is_below(real, parent)):
-                    log.warning(
-                        "%s: leads to %s, which is not looked at; --set reading.follow_links=true", entry.path, real
-                    )
+                if not (isinstance(tree, LinkedPath) or is_below(real, parent)):
+                    log.warning("%s: leads to %s, which is not looked at; --set follow_links=true", entry.path, real)
                 elif real not in above and real != parent:  # a link to a folder above would go round for ever
                     waiting.append((folder / entry.name, (*above, real)))
     return sorted(found)
@@ -241,7 +262,7 @@ def check_stays_below(path: Path, tree: Path, *, beside: bool = False) -> None:
     Raises:
         InputError: it leads out; names the setting that allows it.
     """
-    if limits().follow_links:
+    if isinstance(tree, LinkedPath):
         return
     try:
         real, root = real_path(path), real_path(tree)
@@ -250,7 +271,7 @@ def check_stays_below(path: Path, tree: Path, *, beside: bool = False) -> None:
     if not any(is_below(real, allowed) for allowed in (os.path.dirname(root) if beside else root, *_blobs(Path(root)))):
         raise InputError(
             "a link leads out of its folder", where=path, got=real, expected=f"a file below {tree}",
-            fix="if you trust it, --set reading.follow_links=true",
+            fix="if you trust it, --set follow_links=true",
         )  # fmt: skip
 
 

@@ -10,6 +10,7 @@ the OBJ appendix of Wavefront's manual.
 from __future__ import annotations
 
 import base64
+import functools
 import io
 import json
 import struct
@@ -17,16 +18,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import unquote
 
 import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.reading.documents import parse_document
-from cosfly.reading.files import decoded, read_bytes
-from cosfly.reading.limits import limits, over_limit
+from cosfly.reading.files import MB, decoded, over_limit, read_bytes
 
+MOST_TRIANGLES = 2_000_000  # of a file, and of all that a map draws; a gigabyte as they are read
+TRIANGLE_BYTES = 256  # of a file, at most, for each triangle that is allowed: an OBJ takes some 100
+SIMPLIFY = "simplify the meshes, or raise mesh_triangles of maps and render if you trust them"
 WHAT = "mesh"
 SUFFIXES = (".glb", ".gltf", ".obj")
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # from glTF's axes
@@ -59,7 +62,40 @@ def joined(meshes: list[Mesh]) -> Mesh:
     return Mesh(np.concatenate([m.corners_m for m in meshes]), np.concatenate([m.colors for m in meshes]))
 
 
-def read_meshes(path: Path, *, tree: Path) -> dict[str, Mesh]:
+class _Source(NamedTuple):
+    """A file that is read; what it names lies in `tree`."""
+
+    path: Path
+    tree: Path
+    most_triangles: int
+
+    def check_count(self, num_triangles: int) -> None:
+        if num_triangles > self.most_triangles:
+            raise too_many(self.path, f"{num_triangles:,} triangles or more", self.most_triangles)
+
+    def read(self, path: Path, what: str) -> bytes:
+        most_mb = self.most_triangles * TRIANGLE_BYTES / MB
+        return read_bytes(path, what=what, tree=self.tree, most_mb=most_mb, split=SIMPLIFY)
+
+    def beside(self, name: str) -> bytes:
+        """Read what the file names beside it."""
+        inner = PurePosixPath(unquote(name))
+        if inner.is_absolute() or ".." in inner.parts or "\\" in name or ":" in name or "\0" in name or not inner.parts:
+            what = "the mesh names a file outside of its folder"
+            raise InputError(what, where=self.path, got=name[:80], expected="a name below it")
+        return self.read(self.path.parent / inner, f"file that {self.path.name} names")
+
+    def malformed(self, field: str, what: str, got: str | None = None, expected: str | None = None) -> InputError:
+        where = f"{self.path}: {field}"
+        return InputError(f"the mesh cannot be read: {what}", where=where, got=got, expected=expected)
+
+
+def too_many(where: object, got: str, most: int) -> InputError:
+    """Give the error of what draws too much."""
+    return over_limit(where, got, f"{most:,}", SIMPLIFY)
+
+
+def read_meshes(path: Path, *, tree: Path, most_triangles: int = MOST_TRIANGLES) -> dict[str, Mesh]:
     """Read a file of meshes, node by node; what it names beside it is read too.
 
     Args:
@@ -67,15 +103,16 @@ def read_meshes(path: Path, *, tree: Path) -> dict[str, Mesh]:
     Raises:
         InputError: missing, outside, too large, of another format, or malformed; names the field.
     """
-    data = read_bytes(path, what=WHAT, tree=tree, limit="mesh_mb")
+    source = _Source(path, tree, most_triangles)
+    data = source.read(path, WHAT)
     readers = {".glb": _read_glb, ".gltf": _read_gltf, ".obj": _read_obj}
     if path.suffix.lower() not in readers:
         raise InputError("not a mesh that is known", where=path, got=path.suffix, expected=", ".join(SUFFIXES))
     found: dict[str, Mesh] = {}
     num_triangles = 0
-    for name, mesh in readers[path.suffix.lower()](data, path, tree):
+    for name, mesh in readers[path.suffix.lower()](data, source):
         num_triangles += len(mesh)
-        _check_count(num_triangles, path)
+        source.check_count(num_triangles)
         if not (np.abs(mesh.corners_m) <= LARGEST_M).all():  # NaN is not
             raise InputError(
                 "a vertex is not finite or too far off", where=f"{path}: {name}", expected=f"within {LARGEST_M:g} m"
@@ -86,57 +123,42 @@ def read_meshes(path: Path, *, tree: Path) -> dict[str, Mesh]:
     return found
 
 
-def _check_count(num_triangles: int, where: object) -> None:
-    if num_triangles > limits().mesh_triangles:
-        raise over_limit("mesh_triangles", where, f"{num_triangles:,} triangles or more")
-
-
-def _beside(name: str, path: Path, tree: Path) -> bytes:
-    """Read what a file names beside it."""
-    inner = PurePosixPath(unquote(name))
-    if inner.is_absolute() or ".." in inner.parts or "\\" in name or ":" in name or "\0" in name or not inner.parts:
-        raise InputError(
-            "the mesh names a file outside of its folder", where=path, got=name[:80], expected="a name below it"
-        )
-    return read_bytes(path.parent / inner, what=f"file that {path.name} names", tree=tree, limit="mesh_mb")
-
-
 # --- glTF -------------------------------------------------------------------------------------------------------------
 
 
-def _read_glb(data: bytes, path: Path, tree: Path) -> Iterator[tuple[str, Mesh]]:
+def _read_glb(data: bytes, source: _Source) -> Iterator[tuple[str, Mesh]]:
     if len(data) < 20 or struct.unpack_from("<II", data) != (GLB_MAGIC, 2):
-        raise InputError("not a binary glTF 2.0", where=path, got=f"{len(data)} bytes", expected="a .glb of version 2")
+        raise InputError(
+            "not a binary glTF 2.0", where=source.path, got=f"{len(data)} bytes", expected="a .glb of version 2"
+        )
     chunks: dict[int, bytes] = {}
     at = 12
     while at + 8 <= len(data):
         size, kind = struct.unpack_from("<II", data, at)
         if at + 8 + size > len(data):
-            raise InputError("the mesh is cut short", where=path, got=f"{len(data)} bytes", expected=f"{at + 8 + size}")
+            raise InputError(
+                "the mesh is cut short", where=source.path, got=f"{len(data)} bytes", expected=f"{at + 8 + size}"
+            )
         chunks.setdefault(kind, data[at + 8 : at + 8 + size])
         at += 8 + size
-    return _read_gltf(chunks.get(JSON_CHUNK, b""), path, tree, chunks.get(BINARY_CHUNK))
+    return _read_gltf(chunks.get(JSON_CHUNK, b""), source, chunks.get(BINARY_CHUNK))
 
 
-def _read_gltf(data: bytes, path: Path, tree: Path, binary: bytes | None = None) -> Iterator[tuple[str, Mesh]]:
+def _read_gltf(data: bytes, source: _Source, binary: bytes | None = None) -> Iterator[tuple[str, Mesh]]:
     """Yield the mesh of every node."""
-    document = parse_document(data, path, what=WHAT)
+    document = parse_document(data, source.path, what=WHAT)
     try:
-        yield from _nodes(document, binary, path, tree)
+        yield from _nodes(document, binary, source)
     except NOT_READ as error:
-        raise _malformed(path, "glTF", "malformed", f"{type(error).__name__}: {error}"[:120], "glTF 2.0") from None
+        raise source.malformed("glTF", "malformed", f"{type(error).__name__}: {error}"[:120], "glTF 2.0") from None
 
 
-def _malformed(path: Path, field: str, what: str, got: str | None = None, expected: str | None = None) -> InputError:
-    return InputError(f"the mesh cannot be read: {what}", where=f"{path}: {field}", got=got, expected=expected)
-
-
-def _nodes(document: dict, binary: bytes | None, path: Path, tree: Path) -> Iterator[tuple[str, Mesh]]:
+def _nodes(document: dict, binary: bytes | None, source: _Source) -> Iterator[tuple[str, Mesh]]:
     """Let trimesh read a document of which only what is drawn is left, and in which each drawn node has one triangle
     mesh and both have numbers for names."""
     if unknown := set(document.get("extensionsRequired", ())) - {DRACO}:
         got = ", ".join(sorted(unknown))[:80]
-        raise _malformed(path, "extensionsRequired", "needs what is not read here", got, "plain glTF 2.0, or Draco")
+        raise source.malformed("extensionsRequired", "needs what is not read here", got, "plain glTF 2.0, or Draco")
     nodes, scenes = document.get("nodes", []), document.get("scenes")
     children = [child for node in nodes for child in node.get("children", ())]
     roots = (
@@ -145,7 +167,7 @@ def _nodes(document: dict, binary: bytes | None, path: Path, tree: Path) -> Iter
         else scenes[document.get("scene", 0)].get("nodes", [])
     )
     if len({*children, *roots}) < len(children) + len(roots):
-        raise _malformed(path, "nodes", "a node with two parents")
+        raise source.malformed("nodes", "a node with two parents")
     pieces = [
         [p for p in mesh["primitives"] if p.get("mode", TRIANGLES) in (TRIANGLES, STRIP, FAN)]
         for mesh in document.get("meshes", ())  # points and lines have no surface
@@ -157,19 +179,20 @@ def _nodes(document: dict, binary: bytes | None, path: Path, tree: Path) -> Iter
             num_numbers += 1 + sum(
                 _size(accessors[n], "count") for n in _used(piece)
             )  # trimesh makes a copy for each node
-            _check_count(num_numbers // MOST_NUMBERS, path)
+            source.check_count(num_numbers // MOST_NUMBERS)
             below = flat_nodes[k]["children"] = list(flat_nodes[k].get("children", ()))
             below.append(len(flat_nodes))
             flat_nodes.append({"name": f"piece {len(owners)}", "mesh": len(owners)})
             owners.append((k, piece))
-    buffers = {str(k): _buffer(b, binary, path, tree) for k, b in enumerate(document.get("buffers", ()))}
+    read = functools.cache(lambda uri: _buffer(uri, binary, source))  # each once, however many name it
+    buffers = {str(k): read(b.get("uri")) for k, b in enumerate(document.get("buffers", ()))}
     views = document.get("bufferViews", [])
     if sum(_size(view, "byteLength") for view in views) > 2 * sum(map(len, buffers.values())):
-        raise _malformed(path, "bufferViews", "more numbers than bytes")
+        raise source.malformed("bufferViews", "more numbers than bytes")
     flat = {
         "asset": {"version": "2.0"}, "scenes": [{"nodes": roots}], "nodes": flat_nodes, "bufferViews": views,
-        "meshes": [{"name": str(k), "primitives": [_drawn(piece, path)]} for k, (_, piece) in enumerate(owners)],
-        "accessors": _accessors(accessors, [piece for _, piece in owners], path),
+        "meshes": [{"name": str(k), "primitives": [_drawn(piece, source)]} for k, (_, piece) in enumerate(owners)],
+        "accessors": _accessors(accessors, [piece for _, piece in owners], source),
         "buffers": [{"uri": name} for name in buffers],
     }  # fmt: skip
     import trimesh
@@ -182,18 +205,17 @@ def _nodes(document: dict, binary: bytes | None, path: Path, tree: Path) -> Iter
         k, piece = owners[number]
         shape = scene.geometry[str(number)]
         num_triangles += len(shape.faces)
-        _check_count(num_triangles, path)
+        source.check_count(num_triangles)
         if DRACO in piece.get("extensions", ()) and not shape.vertices.any():  # trimesh leaves zeros, and warns
-            raise _malformed(
-                path, "meshes", "the packed vertices do not unpack", expected="Draco, and DracoPy installed"
-            )
+            expected = "Draco, and DracoPy installed"
+            raise source.malformed("meshes", "the packed vertices do not unpack", expected=expected)
         yield str(nodes[k].get("name", f"node_{k}")), _placed(shape, world, _color(piece, document))
 
 
-def _drawn(piece: dict, path: Path) -> dict:
+def _drawn(piece: dict, source: _Source) -> dict:
     """What is needed of a primitive."""
     if piece.get("mode") == FAN:
-        raise _malformed(path, "meshes", "a fan of triangles", expected="triangles, or strips of them")
+        raise source.malformed("meshes", "a fan of triangles", expected="triangles, or strips of them")
     attributes = {name: piece["attributes"][name] for name in ("POSITION", "COLOR_0") if name in piece["attributes"]}
     extensions = {name: value for name, value in piece.get("extensions", {}).items() if name == DRACO}
     return {key: piece[key] for key in ("mode", "indices") if key in piece} | {
@@ -213,24 +235,23 @@ def _used(piece: dict) -> list[int]:
     return [n for n in (attributes["POSITION"], attributes.get("COLOR_0"), piece.get("indices")) if n is not None]
 
 
-def _accessors(accessors: list[dict], pieces: list[dict], path: Path) -> list[dict]:
+def _accessors(accessors: list[dict], pieces: list[dict], source: _Source) -> list[dict]:
     """The accessors that the pieces need; in the place of others stands an empty one."""
     packed = {n for piece in pieces if DRACO in piece.get("extensions", ()) for n in _used(piece)}
     used = {n for piece in pieces for n in _used(piece)}
     for k in used:  # of sparse numbers trimesh gives the others alone
         if "sparse" in accessors[k] or (k not in packed and "bufferView" not in accessors[k]):
-            raise _malformed(path, f"accessors[{k}]", "sparse numbers are not read here", expected="a bufferView")
+            raise source.malformed(f"accessors[{k}]", "sparse numbers are not read here", expected="a bufferView")
     nothing = {"componentType": 5121, "type": "SCALAR", "count": 0}
     return [accessor if k in used else nothing for k, accessor in enumerate(accessors)]
 
 
-def _buffer(buffer: dict, binary: bytes | None, path: Path, tree: Path) -> bytes:
-    if "uri" not in buffer:
+def _buffer(uri: str | None, binary: bytes | None, source: _Source) -> bytes:
+    if uri is None:
         if binary is None:
-            raise _malformed(path, "buffers", "no bytes", expected="a uri, or the binary part of a .glb")
+            raise source.malformed("buffers", "no bytes", expected="a uri, or the binary part of a .glb")
         return binary
-    uri = buffer["uri"]
-    return base64.b64decode(uri.partition(",")[2]) if uri.startswith("data:") else _beside(uri, path, tree)
+    return base64.b64decode(uri.partition(",")[2]) if uri.startswith("data:") else source.beside(uri)
 
 
 def _color(piece: dict, document: dict) -> np.ndarray:
@@ -255,8 +276,9 @@ def _placed(shape: Any, world: np.ndarray, color: np.ndarray) -> Mesh:
 # --- OBJ --------------------------------------------------------------------------------------------------------------
 
 
-def _read_obj(data: bytes, path: Path, tree: Path) -> Iterator[tuple[str, Mesh]]:
+def _read_obj(data: bytes, source: _Source) -> Iterator[tuple[str, Mesh]]:
     """Yield the objects (`o`) and groups (`g`) of an OBJ."""
+    path = source.path
     vertices: list[list[float]] = []
     colors: dict[str, list[float]] = {}
     faces: dict[str, list[tuple[list[int], list[float]]]] = {}
@@ -270,12 +292,12 @@ def _read_obj(data: bytes, path: Path, tree: Path) -> Iterator[tuple[str, Mesh]]
             if len(corners) < 3:
                 raise InputError("a face of less than three corners", where=f"{path}:{number}", got=rest[:60])
             num_triangles += len(corners) - 2
-            _check_count(num_triangles, path)
+            source.check_count(num_triangles)
             faces.setdefault(name, []).append((corners, paint))
         elif word in ("o", "g"):
             name = rest.strip() or name
         elif word == "mtllib":
-            colors |= _materials(decoded(_beside(rest.strip(), path, tree), path), path)
+            colors |= _materials(decoded(source.beside(rest.strip()), path), path)
         elif word == "usemtl":
             paint = colors.get(rest.strip(), nothing)
     places = np.array(vertices).reshape(-1, 3)

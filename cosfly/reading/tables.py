@@ -18,14 +18,14 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from cosfly.errors import InputError
-from cosfly.reading.files import SMALL_UNPACKED_MB, open_file
-from cosfly.reading.limits import MB, limits, over_limit
+from cosfly.reading.files import FILE_MB, MB, SMALL_UNPACKED_MB, UNPACK_FACTOR, open_file, over_limit
 
 MOST_FOOTER_BYTES = 100 * MB  # what the footer's strings and lists may take; ours have some 10 kB
 
 WORTH_THREADS_BYTES = 8 * MB  # of a row group: one thread takes less time for fewer, and each keeps memory of its own
 
 LEAST_ROW_BYTES = 1_000  # of a row in memory, as values of Python: packed, a million equal ones are a few kB
+SMALLER_GROUPS = "write it again with smaller row groups, as pyarrow's row_group_size does"
 
 
 @contextlib.contextmanager
@@ -112,9 +112,9 @@ def read_row_group(path: Path | str, table: _Table, k: int, columns: list[str] |
         group = table.packed.read_row_group(k, columns=columns, use_threads=about.total_byte_size > WORTH_THREADS_BYTES)
         size = sum(_text_bytes(chunk) for column in group.columns for chunk in column.chunks)
     stored = sum(about.column(j).total_compressed_size for j in range(about.num_columns))
-    if size > max(SMALL_UNPACKED_MB * MB, limits().unpack_factor * stored):
+    if size > max(SMALL_UNPACKED_MB * MB, UNPACK_FACTOR * stored):
         got = f"{stored:,} bytes with texts of {size:,}"
-        raise over_limit("unpack_factor", f"{path}: row group {k}", got, " times the row group")
+        raise over_limit(f"{path}: row group {k}", got, f"{UNPACK_FACTOR} times the row group", SMALLER_GROUPS)
     with arrow_errors(path):
         plain = [member.with_type(_plain(member.type)) for member in group.schema]
         return group.cast(pa.schema(plain, group.schema.metadata))
@@ -156,8 +156,8 @@ def row_batches(path: Path | str, table: _Table, k: int, columns: list[str], num
 def _check_size(path: Path | str, table: _Table, k: int) -> None:
     about = table.metadata.row_group(k)
     size = max(about.total_byte_size, about.num_rows * LEAST_ROW_BYTES)
-    if size > limits().file_mb * MB:
-        raise over_limit("file_mb", f"{path}: row group {k}", f"{size / MB:,.0f} MB", " MB")
+    if size > FILE_MB * MB:
+        raise over_limit(f"{path}: row group {k}", f"{size / MB:,.0f} MB", f"{FILE_MB:,} MB", SMALLER_GROUPS)
 
 
 def rows_of(path: Path, columns: list[str] | None = None, *, tree: Path | None = None) -> Iterator[dict[str, Any]]:

@@ -8,6 +8,8 @@ from pydantic import Field, field_validator, model_validator
 
 from cosfly.products.frames import LEAST_FOV_DEG, MOST_FOV_DEG, DepthFormat, FrameFile, Look
 from cosfly.products.places import folder_name
+from cosfly.reading.arrays import LONGEST_SIDE_PX
+from cosfly.reading.meshes import MOST_TRIANGLES
 from cosfly.render.lens import ZoomConfig
 from cosfly.render.perturbation import PerturbationConfig
 from cosfly.render.weather import WeatherConfig
@@ -22,8 +24,8 @@ class RenderConfig(WeatherConfig):
         description="renderer; gl is OpenGL without a window, on a GPU or the CPU; pyrender is a plain and slow "
         "cross-check",
     )
-    width_px: int = Field(1280, ge=16, le=8192, description="image width, px")
-    height_px: int = Field(720, ge=16, le=8192, description="image height, px")
+    width_px: int = Field(1280, ge=16, le=LONGEST_SIDE_PX, description="image width, px")
+    height_px: int = Field(720, ge=16, le=LONGEST_SIDE_PX, description="image height, px")
     fovs_deg: tuple[float, ...] = Field(
         (110.0, 90.0, 60.0, 30.0),
         min_length=1,
@@ -74,6 +76,9 @@ class RenderConfig(WeatherConfig):
     )
     encoder_threads: MayDiffer[int] = Field(
         2, ge=1, le=64, description="threads that encode and write beside the drawing"
+    )
+    mesh_triangles: MayDiffer[int] = Field(
+        MOST_TRIANGLES, ge=1, description="most triangles of a file of meshes, and of all that the map draws of them"
     )
 
     @field_validator("fovs_deg")

@@ -9,6 +9,7 @@ import importlib
 import logging
 import os
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 from pydantic import BaseModel
@@ -24,6 +25,7 @@ from cosfly.products.town import IDS_FILE, IDS_SCHEMA, IDS_VERSION, write_town_m
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.walks import pace_field
 from cosfly.products.weather import WeatherRecord
+from cosfly.reading.meshes import MOST_TRIANGLES
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids, other_id
 from cosfly.render.flight import FlightScript, Writing, check_flight, render_flight
 from cosfly.render.lens import cameras_of
@@ -47,9 +49,15 @@ FROM_ONE_RUN = "give the others.json that was written beside the walks' path.jso
 
 
 def open_renderer(
-    name: str, box_map: BoxMap, width_px: int, height_px: int, look: Look | None = None, num_others: int = 0
+    name: str,
+    box_map: BoxMap,
+    width_px: int,
+    height_px: int,
+    look: Look | None = None,
+    num_others: int = 0,
+    mesh_triangles: int = MOST_TRIANGLES,
 ) -> Renderer:
-    """Open a renderer of the table for one map and at most so many others.
+    """Open a renderer of the table for one map, of at most so many triangles of meshes, and at most so many others.
 
     Raises:
         ConfigError: unknown name. EnvironmentMissing: what it needs is not there.
@@ -57,6 +65,7 @@ def open_renderer(
     if name not in RENDERERS:
         raise ConfigError("unknown renderer", where="render.backend", got=name, expected=", ".join(RENDERERS))
     module, _, attribute = RENDERERS[name].partition(":")
+    box_map = replace(box_map, meshes=replace(box_map.meshes, most_triangles=mesh_triangles))
     return getattr(importlib.import_module(module), attribute)(box_map, width_px, height_px, look or Look(), num_others)
 
 
@@ -327,7 +336,8 @@ def make_worker(
     companies = _companies(others, all_traces)
     num_others = num_others_of(companies)
     drawn = read_boxes(boxes)
-    renderer = open_renderer(cfg.backend, drawn, cfg.width_px, cfg.height_px, cfg.look, num_others)
+    size_px, most = (cfg.width_px, cfg.height_px), cfg.mesh_triangles
+    renderer = open_renderer(cfg.backend, drawn, *size_px, cfg.look, num_others, most)
     pools = read_pools(cfg)
     overlay = Overlay(drawn, instance_ids(drawn, num_others)) if cfg.debug else None
     writing = Writing(tuple(cfg.modalities), cfg.visible_threshold, cfg.depth_format, overlay)

@@ -71,7 +71,7 @@ def run(
         )
     box_map = read_boxes(boxes)
     check_ground(box_map, boxes)
-    renderer = open_renderer(cfg.backend, box_map, cfg.width_px, cfg.height_px, cfg.look)
+    renderer = open_renderer(cfg.backend, box_map, cfg.width_px, cfg.height_px, cfg.look, 0, cfg.mesh_triangles)
     try:
         pictures = _drawn(
             renderer, pools, trace, index, intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg), seed, advance

@@ -171,7 +171,9 @@ def _edges(grey: np.ndarray) -> float:
 def make_worker(cfg: ZoomStudyConfig, boxes: Path, simplified: Path, traces: Path, seed: int) -> Work:
     """Worker factory: give the function that studies one flight."""
     surroundings, all_traces = Surroundings(read_boxes(simplified)), read_traces(traces)
-    renderer = open_renderer(cfg.backend, read_boxes(boxes), cfg.width_px, cfg.height_px, cfg.look)
+    renderer = open_renderer(
+        cfg.backend, read_boxes(boxes), cfg.width_px, cfg.height_px, cfg.look, 0, cfg.mesh_triangles
+    )
 
     def work(item: Item) -> Outcome:
         trace = all_traces[item.payload]
@@ -289,7 +291,7 @@ def run(
     summary = summarize(studied, cfg, rng_for(seed, STAGE, "intervals"))
     write_json(product, {"schema": SCHEMA, "schema_version": VERSION, "map": box_map.name, "seed": seed, **summary})
     surroundings = Surroundings(read_boxes(simplified))
-    renderer = open_renderer(cfg.backend, box_map, cfg.width_px, cfg.height_px, cfg.look)
+    renderer = open_renderer(cfg.backend, box_map, cfg.width_px, cfg.height_px, cfg.look, 0, cfg.mesh_triangles)
     shown = [
         (script_flight(trace, k, "clean", "study", surroundings, cfg, seed), studied[trace.path_id].best_frame)
         for k, trace in passed

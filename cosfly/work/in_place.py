@@ -1,6 +1,6 @@
 """Data files of somebody's own in the place of those that ship, for as long as a stage works with them.
 
-Like the limits of reading they belong to the process; workers get those of the process that started them
+They belong to the process; workers get those of the process that started them
 (worker_pool.py). What is worked out of such a file is kept by `kept`, and forgotten as soon as another takes its place.
 """
 

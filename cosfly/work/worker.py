@@ -22,7 +22,6 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from cosfly.errors import CosflyError
-from cosfly.reading.limits import Limits, use_limits
 from cosfly.work.console import set_levels
 from cosfly.work.in_place import put_all
 from cosfly.work.items import Item, Work, attempt, counted_steps
@@ -60,7 +59,6 @@ class Manner:
     parent_pid: int
     heartbeat_s: float
     log_level: int
-    reading: Limits
 
 
 @dataclass(frozen=True)
@@ -105,7 +103,6 @@ def work_through(connection: Connection, manner: Manner) -> None:
     voice = _Voice(connection)
     logging.getLogger().handlers = [voice]
     set_levels(manner.log_level)
-    use_limits(manner.reading)
     keep_freed_memory()
     threading.Thread(target=voice.tell_life, args=(manner.heartbeat_s,), daemon=True).start()
     try:

@@ -21,7 +21,6 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from cosfly.errors import EnvironmentMissing
-from cosfly.reading.limits import limits
 from cosfly.work.in_place import everything
 from cosfly.work.items import Item, Work
 from cosfly.work.stage_events import LOSSES, EventLog, Loss, cpu_seconds
@@ -171,7 +170,7 @@ class WorkerPool:
     def _start(self, place: int) -> _Worker:
         context = multiprocessing.get_context("spawn")  # fork would copy GL and thread-pool state
         here, there = context.Pipe()
-        manner = Manner(os.getpid(), self.watch.heartbeat_s, logging.getLogger().level, limits())
+        manner = Manner(os.getpid(), self.watch.heartbeat_s, logging.getLogger().level)
         process = context.Process(target=work_through, args=(there, manner), daemon=True)
         with signals_held_back():
             process.start()

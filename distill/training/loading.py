@@ -19,7 +19,6 @@ from cosfly.errors import CosflyError, EnvironmentMissing, InputError
 from cosfly.look.frame_views import VIEW_FILES
 from cosfly.products.frames import frame_path
 from cosfly.products.places import flight_of
-from cosfly.reading.limits import Limits, limits, use_limits
 from cosfly.work.console import progress_bar
 from cosfly.work.store import inside
 from cosfly.work.worker import end_with_parent
@@ -49,10 +48,8 @@ class _Work(Generic[OrderT, ResultT]):
     loader would raise another in its place."""
 
     function: Callable[[OrderT], ResultT]
-    limits: Limits
 
     def __getitem__(self, order: OrderT) -> ResultT | CosflyError:
-        use_limits(self.limits)
         try:
             return self.function(order)
         except CosflyError as error:
@@ -85,7 +82,7 @@ def in_order(function: Callable[[OrderT], ResultT], orders: Iterable[OrderT], wo
 
     os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")  # threads of its own would not survive the fork
     loader: Any = torch.utils.data.DataLoader(
-        _Work(function, limits()),  # type: ignore[arg-type]  # all that the loader asks of a data set
+        _Work(function),  # type: ignore[arg-type]  # all that the loader asks of a data set
         batch_size=None,
         sampler=orders,
         num_workers=workers,
