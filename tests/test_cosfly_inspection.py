@@ -20,7 +20,7 @@ from cosfly.geometry import box_iou, mask_box
 from cosfly.inspection import frames
 from cosfly.inspection.files import check_recorded
 from cosfly.inspection.flight import check_motion, check_plan, check_poses, is_shifted
-from cosfly.inspection.frames import Jumps, check_others, choose_frames, others_told, pedestrian_region
+from cosfly.inspection.frames import Jumps, check_others, choose_frames, others_told, pedestrian_region, pixels_iou
 from cosfly.inspection.pixels import unpack
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
@@ -528,6 +528,21 @@ def test_far_is_far(workplace, form):
     assert read_depth(folder / FRAME).max() == 1000.0
     list_files(workplace / "tree")
     assert not [one for one in verify(workplace / "tree").issues if one.code in ("depth_range", "sky")]
+
+
+@pytest.mark.parametrize("width_px", [160, 256, 640, 1280])
+def test_track_quality_is_that_of_any_size(width_px):
+    """A person who fills 0.7 of the width of its box, seen at the middles of pixels, in a picture 40 m wide."""
+    rng, px_per_m, ious = np.random.default_rng(0), width_px / 40.0, []
+    for x, y in rng.uniform(10.0, 11.0, (400, 2)):
+        box = np.array([x, y, x + 0.6 * px_per_m, y + 1.8 * px_per_m])
+        middle, half = (box[0] + box[2]) / 2.0, 0.21 * px_per_m
+        pixels = np.mgrid[0:100, 0:100] + 0.5
+        is_person = (np.abs(pixels[1] - middle) < half) & (pixels[0] > box[1]) & (pixels[0] < box[3])
+        ious.append(pixels_iou(box, mask_box(is_person)) if is_person.any() else 0.0)
+    assert np.mean(ious) > 0.65
+    beside = box + np.array([0.0, 0.8, 0.0, 0.8]) * (box[3] - box[1])
+    assert pixels_iou(box, beside) < 0.25
 
 
 def test_colours_hold_no_flight_back(workplace):

@@ -18,9 +18,10 @@ from cosfly.errors import InputError
 from cosfly.inspection import review
 from cosfly.inspection.report import cards, report_html
 from cosfly.inspection.stage import run
-from cosfly.inspection.view import PLOTS, draw_plan
+from cosfly.inspection.view import PLOTS, draw_plan, in_question
 from cosfly.products.flights import find_flights
 from cosfly.products.inspection import read_inspection
+from cosfly.products.issues import Issue
 from cosfly.products.playback import read_flight
 from cosfly.products.review import REVIEW, Choice, add_decisions, read_decisions, read_settled, undecided
 from cosfly.products.traces import write_traces
@@ -272,6 +273,19 @@ def test_a_page_of_hundreds_of_flights_is_bounded(product):
     assert 5 <= kept < 300
     assert f"{300 - kept} are without pictures" in page
     assert cards(many, shown, 1000.0)["left_out"] == 0
+
+
+def test_frames_in_question_are_shown():
+    places = (
+        ("warning", "temporal_jump", "frames_playback/frame_00031/depth.npy"),
+        ("warning", "never_visible", "trajectory.json: points[].target.visible"),
+        ("note", "not_in_this_tree", "frames_playback/frame_00002"),
+        ("error", "projection_differs", "trajectory.json: points[7].target.depth"),
+        ("warning", "stray_frame", "frames_playback/frame_00099"),
+    )
+    issues = [Issue(severity=how, code=code, where=where, got="", expected="") for how, code, where in places]
+    assert in_question(issues, 40) == [7, 30, 31]  # type: ignore[arg-type]
+    assert in_question([], 40) == []
 
 
 def test_the_map_shows_both_ways(inspected):

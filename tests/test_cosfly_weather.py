@@ -11,7 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_cosfly_render import needs_gl
 from test_renderers_contract import HIP, circling, opened, pose_towards, street, write_inputs
+from typer.testing import CliRunner
 
+from cosfly.cli import app
 from cosfly.errors import ConfigError, InputError, RenderError
 from cosfly.geometry import intrinsic_matrix, rotation_matrices
 from cosfly.look.coverage_page import coverage_html
@@ -21,6 +23,7 @@ from cosfly.products.flights import find_flights
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import read_flight, write_flight
+from cosfly.products.walks import walk_id
 from cosfly.products.weather import TIMES, WEATHER_GROUPS, WEATHERS, WeatherParams, resolved
 from cosfly.reading.documents import read_json
 from cosfly.render.contract import PosedPerson
@@ -452,3 +455,18 @@ def test_the_gallery_has_nine_pictures_and_a_sheet_of_all(trees, tmp_path):
         draw_gallery(cfg, inputs[0], inputs[2], tmp_path / "out", trajectory=3)
     with pytest.raises(InputError, match="no such frame"):
         draw_gallery(cfg, inputs[0], inputs[2], tmp_path / "out", frame=3)
+
+
+@pytest.mark.parametrize(("kind", "is_dark"), [("Buildings", True), ("Sidewalks", False), ("Poles", False)])
+def test_flights_that_nobody_can_see_are_told_before_they_are_drawn(tmp_path, kind, is_dark):
+    (tmp_path / "own.csv").write_text(f"type,x,y,length,width,height\nBuildings,0,0,9,9,8\n{kind},20,0,9,9,3\n")
+    settings = "{maps: {source: boxes, boxes: {path: own.csv, licence: cc-by-4.0}}, pedestrians: {num_paths: 8},"
+    settings += " render: {weather_mode: random_per_path}}"
+    (tmp_path / "own.yaml").write_text(settings.replace("own.csv", str(tmp_path / "own.csv")))
+    cfg = build(RenderConfig, RANDOM, "test")
+    by_night = [k for k in range(8) if weather_of(cfg, read_pools(cfg), k).tod_name == "night"]
+    words = f"{len(by_night)} of 8 flights are dark ({', '.join(walk_id(k) for k in by_night[:4])}"
+    for command in (["config", "check"], ["run", "--dry-run", "--out", str(tmp_path / "out")]):
+        told = CliRunner().invoke(app, [*command, str(tmp_path / "own.yaml")])
+        assert told.exit_code == 0, told.output
+        assert (words in told.output) == is_dark, told.output

@@ -9,15 +9,18 @@ import math
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from caption.run.progress import duration
 from cosfly.app.runs import STAGES, StageLook, find, look
 from cosfly.app.settings import RunConfig, manner_of_work
 from cosfly.errors import CosflyError
+from cosfly.maps.stage import load_map
 from cosfly.products.captions import read_captions
 from cosfly.products.traces import read_traces
-from cosfly.products.walks import read_paths
+from cosfly.products.walks import read_paths, walk_id
+from cosfly.render.weather import dark_flights
 from cosfly.work.config import load
 from cosfly.work.stage_folder import Failed, StageFolder, flattened
 
@@ -272,6 +275,7 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
         lines.append(f"figures of {', '.join(names)}: {basis}")
     needed, free = sum(row.bytes for row in rows), free_bytes(out)
     lines.append(f"in all about {time_left(rows)}; {in_words(needed)} of disk, {in_words(free)} are free")
+    lines += darkness(cfg)
     if any(row.tokens is None for row in rows):
         lines.append(f"tokens are {UNKNOWN_TOKENS}")
     if more := more_walks(cfg, out):
@@ -285,6 +289,21 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
         )
     if needed > free:
         lines.append("there is not enough space for it: choose another --out, or fewer walks or pixels")
+    return lines
+
+
+def darkness(cfg: RunConfig) -> list[str]:
+    """Say which flights nobody will see anything on; maps are read where a flight is by night."""
+    lines = []
+    for name, town in ({name: cfg.of_town(name) for name in cfg.towns} or {cfg.name: cfg}).items():
+        num = town.pedestrians.num_paths
+        if dark := dark_flights(town.render, num, partial(load_map, town.maps, seed=town.seed)):
+            listed = ", ".join(map(walk_id, dark[:4])) + ", ..." * (len(dark) > 4)
+            lines.append(
+                f"{name}: {len(dark)} of {num} flights are dark ({listed}): by night, on a map without street lamps, "
+                "roads and pavements; nobody will see the person there. Take another time of day (render.tod_name, "
+                "render.tod_pool), another render.weather_seed, or a map with streets"
+            )
     return lines
 
 

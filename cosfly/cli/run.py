@@ -199,9 +199,11 @@ app.add_typer(config_app, name="config")
 @takes()
 def config_check(job: Job, config: Annotated[Path, Argument(help="YAML file, or the name of one that ships.")]) -> None:
     """Check a configuration without running it: all problems at once, also missing files and licences."""
-    from cosfly.app import pipeline
+    from cosfly.app import estimate, pipeline
 
     pipeline.check_with_files(job.cfg)
+    for line in estimate.darkness(job.cfg):
+        typer.echo(line)
     typer.echo(f"{config}: ok")
 
 

@@ -105,7 +105,7 @@ def inspect_flight(
         issues=issues,
         metrics={name: None if value is None else round(value, 4) for name, value in metrics.items()},
     )
-    view = draw_flight(flight, _heights_m(flight), clearance_m, box_map, cfg.thumbnail_px)
+    view = draw_flight(flight, _heights_m(flight), clearance_m, box_map, cfg.thumbnail_px, report.issues)
     return InspectedFlight(record=record, view=view, coverage=coverage_of(flight))
 
 

@@ -312,7 +312,7 @@ def _check_mask(
         numbers.track_ious.append(0.0)
         return
     found = mask_box(region) + corner
-    numbers.track_ious.append(box_iou(box, found))
+    numbers.track_ious.append(pixels_iou(box, found))
     if flight.target_mask_bbox is not None:
         recorded = flight.target_mask_bbox[i]
         # Between this part of the person and all pedestrian pixels: a pole in front cuts a person into parts. NaN is
@@ -325,6 +325,15 @@ def _check_mask(
     if np.isfinite(expected_m) and abs(found_m - expected_m) > SURFACE_TOLERANCE_M:
         expected = f"{expected_m:.2f} m (target.depth) within {SURFACE_TOLERANCE_M:.1f} m"
         report.error("depth_disagrees", _depth_place(flight, i), f"{found_m:.2f} m at the person", expected)
+
+
+def pixels_iou(box: np.ndarray, found: np.ndarray) -> float:
+    """Give the IoU of a box and that of the pixels in it, (4,) px each.
+
+    A pixel is seen at its middle, so that each edge of the pixels may be half a pixel off: of a person of three pixels
+    that is a third. So much is forgiven at any size.
+    """
+    return box_iou(np.clip(found, box - 0.5, box + 0.5), found)
 
 
 def _kinds_without(instance: np.ndarray, left_out: np.ndarray) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
@@ -10,6 +12,7 @@ from pydantic import BaseModel, Field, FiniteFloat, model_validator
 from cosfly.look.frame_views import small_jpeg, thumbnail
 from cosfly.look.topview import INK, PAPER, TopView, draw_dot, draw_line, draw_map, draw_text
 from cosfly.products.boxes import BoxMap
+from cosfly.products.issues import Issue, sort_key
 from cosfly.products.playback import Flight
 from cosfly.space.flight_metrics import CLEARANCE_CAP_M
 
@@ -22,19 +25,23 @@ PLOTS: dict[str, tuple[str, str, tuple[float | None, float | None]]] = {
     "clearance_m": (f"clearance, up to {CLEARANCE_CAP_M:g} m", "m", (0.0, None)),
     "speed_mps": ("speed", "m/s", (0.0, None)),
 }
+OF_FRAME = re.compile(r"(?:frame_|points\[|frame )(\d+)")  # in the place of a finding
+BETWEEN_FRAMES = ("temporal_jump", "frozen_frame", "teleport")
 PLAN_PX, MARGIN_M = 300, 12.0
 DRONE, PERSON = (35, 100, 220), (235, 120, 20)  # RGB
 JPEG = Annotated[str, Field(pattern=r"^[A-Za-z0-9+/=]*$")]
 
 
 class FlightView(BaseModel):
-    """Curves with gaps by their names in PLOTS, the first, middle and last frame, and the map, as JPEGs in base64; None
-    of what there is not."""
+    """Curves with gaps by their names in PLOTS, three frames (those in question before the first, the middle and the
+    last), and the map, as JPEGs in base64; None of what there is not. frames: which those are; absent in inspections of
+    before."""
 
     time_s: list[FiniteFloat] = []
     curves: dict[str, list[FiniteFloat | None]] = {}
     pictures: list[JPEG | None] = Field([None, None, None], min_length=3, max_length=3)
     plan: JPEG | None = None
+    frames: list[int] = []
 
     @model_validator(mode="after")
     def _curves_have_their_times(self) -> FlightView:
@@ -44,13 +51,18 @@ class FlightView(BaseModel):
 
 
 def draw_flight(
-    flight: Flight, heights_m: np.ndarray, clearance_m: np.ndarray | None, box_map: BoxMap | None, width_px: int
+    flight: Flight,
+    heights_m: np.ndarray,
+    clearance_m: np.ndarray | None,
+    box_map: BoxMap | None,
+    width_px: int,
+    issues: Sequence[Issue] = (),
 ) -> FlightView:
     """Give what a page shows of a flight.
 
     Args:
         heights_m: (n,) of the drone over the person. clearance_m: (n,) to obstacles; None where there is no map.
-            width_px: of the pictures.
+            width_px: of the pictures. issues: what was found, which the pictures show.
     """
     rows = np.unique(np.linspace(0, len(flight) - 1, CURVE_POINTS).round().astype(int))
     speeds_mps = np.full(len(flight), np.nan)
@@ -62,13 +74,25 @@ def draw_flight(
         "clearance_m": clearance_m,
         "speed_mps": speeds_mps,
     }
-    middle, last = len(flight) // 2, len(flight) - 1
+    usual = [0, len(flight) // 2, len(flight) - 1]
+    chosen = sorted((in_question(issues, len(flight)) + usual)[: len(usual)])
     return FlightView(
         time_s=[round(float(at_s), 2) for at_s in flight.time_s[rows]],
         curves={name: _numbers(values[rows]) for name, values in curves.items() if values is not None},
-        pictures=[thumbnail(flight.frame_folder(i), width_px) for i in (0, middle, last)],
+        pictures=[thumbnail(flight.frame_folder(i), width_px) for i in chosen],
         plan=draw_plan(flight, box_map),
+        frames=chosen,
     )
+
+
+def in_question(issues: Sequence[Issue], num_frames: int) -> list[int]:
+    """Give the frames that findings are about, of the worst first; of a jump the one before too."""
+    found: dict[int, None] = {}
+    for issue in sorted(issues, key=sort_key):
+        named = OF_FRAME.search(issue.where) if issue.severity != "note" else None
+        if named is not None and (i := int(named[1])) < num_frames:
+            found.update(dict.fromkeys([max(i - 1, 0), i] if issue.code in BETWEEN_FRAMES else [i]))
+    return list(found)
 
 
 def _numbers(values: np.ndarray) -> list[float | None]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import secrets
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -13,9 +13,13 @@ from typing import Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from cosfly.errors import ConfigError, nearest
+from cosfly.products.boxes import BoxMap
+from cosfly.products.kinds import KINDS
 from cosfly.products.weather import TIMES, WEATHERS, TimePreset, WeatherPreset, WeatherRecord, preset_token, resolved
 from cosfly.work.config import Config, MayDiffer, build, read_yaml
 
+SUN_IS_DOWN_DEG = -3.0  # of its altitude; a sun on the horizon still lights walls
+LIT_KINDS = tuple(KINDS[name] for name in ("Poles", "Roads", "Sidewalks"))  # lamps hang there, or stand along them
 DEFAULT_SEED = 20260423  # of the paper's production runs (app:weather:coverage)
 MOST_SEED = 2**31  # of a seed that is drawn
 
@@ -165,6 +169,20 @@ def weather_of(cfg: WeatherConfig, pools: Pools, path_index: int) -> WeatherReco
         names = _drawn(pools.weathers, rng), _drawn(pools.times, rng)
     params = resolved(pools.weathers[names[0]], pools.times[names[1]])
     return WeatherRecord(mode=cfg.weather_mode, weather_name=names[0], tod_name=names[1], params=params)
+
+
+def dark_flights(cfg: WeatherConfig, num_flights: int, read_map: Callable[[], BoxMap]) -> list[int]:
+    """Give the numbers of the flights on whose pictures nobody sees anything: by night, on a map without lamps.
+
+    Args:
+        read_map: asked only where a flight is by night. A drawn `weather_seed` is not known before: then there is none.
+    """
+    if cfg.weather_mode == "off" or cfg.weather_seed < 0:
+        return []
+    pools = read_pools(cfg)
+    skies = [weather_of(cfg, pools, number) for number in range(num_flights)]
+    by_night = [k for k, sky in enumerate(skies) if sky and sky.params.sun_altitude_angle <= SUN_IS_DOWN_DEG]
+    return by_night if by_night and not read_map().is_any_of(set(LIT_KINDS)).any() else []
 
 
 def _drawn(presets: Mapping[str, Any], rng: random.Random) -> str:

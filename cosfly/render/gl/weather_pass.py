@@ -18,6 +18,7 @@ from cosfly.render.contract import MAX_BOX_ID, PosedPerson
 from cosfly.render.gl import lamps as street_lamps
 from cosfly.render.gl.parts import Parts
 from cosfly.render.gl.programs import set_uniform
+from cosfly.render.weather import SUN_IS_DOWN_DEG
 
 # --- atmosphere -------------------------------------------------------------------------------------------------------
 # The six knobs of weather as the uniforms of weather.glsl: colours of sun, sky, clouds and fog, and how much of each.
@@ -32,7 +33,7 @@ CLEAR_HAZE_M = 620.0  # air without fog, as in Look.haze_m
 FOG_AT_FULL, FOG_POWER = 0.10, 2.4
 RAIN_EXTINCTION = 0.0045  # per m of the heaviest rain: a visibility of some 700 m
 MOON = np.array([-0.35, -0.62, 0.70])  # towards the moon, which is the light where the sun is down
-LOWEST_SUN_DEG, SUN_IS_DOWN_DEG = 2.5, -3.0  # a sun on the horizon still lights walls
+LOWEST_SUN_DEG = 2.5
 MOON_DISC, SUN_DISC = 0.99993, 0.99955
 
 ALTITUDES_DEG = (-18.0, -6.0, 0.0, 6.0, 15.0, 42.0, 75.0)
