@@ -20,17 +20,8 @@ STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")
 ROOMS = ("root", "reading", "work", "products", "space", "look", "chat", "stages", "siblings", "app", "cli")
 ASSEMBLY = ("app", "studies")  # what may know all stages and siblings
 HEAVY = {
-    "torch",
-    "transformers",
-    "peft",
-    "accelerate",
-    "bert_score",
-    "datasets",
-    "vllm",
-    "pyrender",
-    "trimesh",
-    "carla",
-    "ray",
+    *("torch", "transformers", "peft", "accelerate", "bert_score", "datasets"),
+    *("vllm", "pyrender", "trimesh", "carla", "ray"),
 }
 
 SOURCES = {

@@ -44,21 +44,6 @@ def test_a_journal_of_answers_says_which_line_cannot_be_used_and_repair_sets_it_
         assert repair(folder.parent) == 0
 
 
-def test_a_repair_that_is_killed_leaves_no_stage_complete_that_lacks_a_line(tmp_path, monkeypatch):
-    stage = StageFolder(tmp_path, "demo", False)
-    with stage.journal as journal:
-        journal.append({"id": "a", "status": "broken"})
-    (tmp_path / "manifest.json").write_text("{}")
-
-    def end(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("cosfly.work.journal.write_bytes", end)
-    with pytest.raises(KeyboardInterrupt):
-        repair(tmp_path)
-    assert not (tmp_path / "manifest.json").exists()
-
-
 def test_totals_that_have_counted_a_broken_answer_are_counted_anew(tmp_path):
     with Journal(tmp_path / "answers/a_ORI.jsonl") as journal:
         journal.append(ANSWER)

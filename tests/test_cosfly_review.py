@@ -118,20 +118,6 @@ def test_a_changed_decision_is_refused(product, change):
         read_decisions(product)
 
 
-def test_a_decision_that_a_kill_cut_short_does_not_count_and_can_be_made_again(product, caplog):
-    first, second, *_ = folders_of(product)
-    decide(product, "accepted", first)
-    decide(product, "accepted", second)
-    path = product.with_name(REVIEW)
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-20])
-    assert list(read_decisions(product)) == [first]
-    assert "cut short by a kill" in caplog.text
-    decide(product, "accepted", second)
-    assert list(read_decisions(product)) == [first, second]
-    assert path.read_bytes().count(b"\n") == 2
-
-
 def test_what_cannot_be_decided(product):
     with pytest.raises(InputError, match="no such flight"):
         decide(product, "accepted", folders_of(product)[0], "Town01/nobody/ORI")

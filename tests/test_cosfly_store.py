@@ -16,7 +16,6 @@ from cosfly.work import store
 from cosfly.work.config import Config, MayDiffer
 from cosfly.work.folder_lock import LOCK, give_up, hold_folder, is_held
 from cosfly.work.journal import Journal
-from cosfly.work.provenance import fingerprint, has_grown_from, read_stage_record
 from cosfly.work.stage_folder import Failed, StageFolder, Tally, read_manifest, write_failures
 from cosfly.work.store import inside, write_bytes, write_json
 
@@ -99,10 +98,6 @@ def test_a_tally_that_does_not_add_up_is_a_bug():
 class Demo(Config):
     a: dict[str, int] = Field({"b": 1})
     threads: MayDiffer[int] = 1
-
-
-class Growing(Config):
-    count: int
 
 
 def _open(out, **changes):
@@ -231,41 +226,6 @@ def test_a_finished_folder_needs_no_lock_and_holds_none(tmp_path, held_by_anothe
     (out / ".lock").write_text("{}")  # a kill left it
     assert _open(out).is_complete
     assert not (out / ".lock").exists()
-
-
-@pytest.mark.parametrize("is_killed", [False, True])
-def test_what_a_stage_has_grown_from_outlives_a_kill_before_its_new_record(tmp_path, monkeypatch, is_killed):
-    """Else the stages behind it would take the larger product for another one, and not go on."""
-    out = tmp_path / "out"
-    _finished(out, config=Growing(count=1))
-    before = fingerprint(out)
-    if is_killed:
-        unlink = Path.unlink
-
-        def unlink_and_end(path, **more):
-            unlink(path, **more)
-            if path.name == "manifest.json":
-                raise KeyboardInterrupt
-
-        with monkeypatch.context() as patch:
-            patch.setattr(Path, "unlink", unlink_and_end)
-            with pytest.raises(KeyboardInterrupt):
-                _open(out, config=Growing(count=2), grows=("count",))
-        assert not (out / "manifest.json").exists()
-    _open(out, config=Growing(count=2), grows=("count",))
-    assert has_grown_from(out, before)
-    assert len(read_stage_record(out).grown_from) == 2
-
-
-def test_what_a_stage_has_grown_from_outlives_a_kill_while_it_begins_anew(tmp_path):
-    out = tmp_path / "out"
-    _finished(out, config=Growing(count=1))
-    before = fingerprint(out)
-    _open(out, config=Growing(count=2), grows=("count",), begins_anew=True)
-    (out / "product.json").unlink()
-    give_up(tmp_path)
-    _open(out, config=Growing(count=2), grows=("count",), begins_anew=True)
-    assert has_grown_from(out, before)
 
 
 def test_what_a_kill_left_of_a_file_or_folder_goes_when_it_is_written_again(tmp_path):

@@ -16,7 +16,10 @@ from cosfly.work.store import atomic_folder, write_bytes, write_json
 
 SWEEP = Path(__file__).with_name("crash_sweep.py")
 # Of the commands that need a finished run, those that are swept here.
-OF_A_RUN = ("pedestrians, more", "caption, limited", "release build", "release get")
+OF_A_RUN = (
+    *("pedestrians, more", "pedestrians, repaired", "inspect review", "caption, limited"),
+    *("release build", "release get"),
+)
 
 
 # --- the harness finds what is wrong ----------------------------------------------------------------------------------
