@@ -89,6 +89,12 @@ def _base(place: Place) -> Path:
     return place.do("run", place.root / "base")
 
 
+def _walk(place: Place) -> Path:
+    """The trajectory of the finished run, as its tree calls it."""
+    tree = Path(place.given("base")) / "render"
+    return next(tree.glob("Town*/trajectory_*")).relative_to(tree)
+
+
 def _students(place: Place) -> Path:
     import torch
     from specimens_students import make_place
@@ -151,7 +157,7 @@ def _served(place: Place) -> str:
 
 INPUTS: dict[str, Callable[[Place], object]] = {
     "base": _base, "students": _students, "trained": _trained, "inferred": _inferred, "evaluated": _evaluated,
-    "teacher": _teacher, "judge": _judge, "served": _served, "key": _key,
+    "walk": _walk, "teacher": _teacher, "judge": _judge, "served": _served, "key": _key,
 }  # fmt: skip
 
 TRAINING = (
@@ -173,7 +179,6 @@ SHORT = {  # what commands have in common
     "set": "--dataset {students}/set --data {students}/tree",
     "small": "--set distill.infer.max_new_tokens=4 --set distill.infer.device=cpu --set distill.infer.max_pixels=4096",
 }
-FLIGHTS = "Town_SynthTown/trajectory_1593759126"  # of the walk that the seed gives
 
 
 def copy_stage(place: Place, out: Path, stage: str, *, damaged: str | None = None) -> None:
@@ -210,7 +215,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "inspect": ["inspect --map {simple} --traces {traces} --data {tree} --out {out} {tiny}"],
     "inspect review": [
         lambda place, out: copy_stage(place, out, "inspect"),
-        f"inspect review --inspect {{out}} --reject {FLIGHTS} --by somebody --reason 'too near'",
+        "inspect review --inspect {out} --reject {walk} --by somebody --reason 'too near'",
     ],
     "inspect review, page": [lambda place, out: copy_stage(place, out, "inspect"), "inspect review --inspect {out}"],
     "pedestrians, repaired": [

@@ -13,11 +13,11 @@ from cosfly.geometry import DT_S, intrinsic_matrix, world_from_camera
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, walkable_ground
 from cosfly.planners.contract import PLANNERS, PlanConfig
 from cosfly.planners.stage import plan_flight
-from cosfly.products.boxes import BoxMap, make_box_map, read_boxes, write_boxes
+from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.products.ground import Ground
 from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.products.walks import TARGET_HEIGHT_M, Walk
-from cosfly.render.contract import instance_ids
+from cosfly.render.contract import GROUND_PLANE_DROP_M, instance_ids
 from cosfly.render.draping import BARE_GROUND, drape, is_draped
 from cosfly.render.perturbation import Surroundings
 from cosfly.render.stage import RENDERERS, open_renderer
@@ -106,14 +106,15 @@ def test_a_malformed_ground_is_named(tmp_path: Path):
 
 
 def test_simplify_counts_heights_from_the_ground_under_each_box():
-    cfg = SimplifyConfig(merge=False, prune_nested=False)  # in a flat world parts of a crown may share a top
+    alone = {"merge": False, "prune_nested": False}  # in a flat world parts of a crown may share a top
     flat, tilted = flat_town(), sloped_town("plane")
-    low, high = simplify(flat, cfg), simplify(tilted, cfg)
-    assert high.passes == low.passes
-    lifted = on_ground(low.box_map, tilted.ground)
-    assert_allclose(high.box_map.centers, lifted.centers, atol=1e-6)
-    assert_allclose(high.box_map.half_extents, low.box_map.half_extents, atol=1e-6)
-    assert high.box_map.header.ground == tilted.header.ground
+    for cfg in (SimplifyConfig(**alone), SimplifyConfig(**alone, crop_strategy="adaptive", below_ground="clip")):
+        low, high = simplify(flat, cfg), simplify(tilted, cfg)
+        assert high.passes == low.passes
+        lifted = on_ground(low.box_map, tilted.ground)
+        assert_allclose(high.box_map.centers, lifted.centers, atol=1e-6)
+        assert_allclose(high.box_map.half_extents, low.box_map.half_extents, atol=1e-6)
+        assert high.box_map.header.ground == tilted.header.ground
 
 
 def test_what_stands_on_a_slope_is_in_the_way_and_what_hangs_over_it_is_not(town: BoxMap):
@@ -271,6 +272,17 @@ def test_the_depth_of_a_hill_is_on_its_ground(renderer_name: str):
     assert on_grid.mean() > 0.4
     assert np.abs(hit[:, 2] - box_map.ground.height_at(hit))[on_grid].max() < 0.01
     assert np.abs(hit[:, 2] - SHAPES["hill"](hit))[on_grid].max() < 0.03  # of the triangles, 4 m wide
+
+
+def test_a_map_without_ground_boxes_has_its_plane_at_the_headers_height():
+    header = MapHeader(name="bare", ground_z_m=2.0)
+    bare = make_box_map([[0, 0, 5]], np.ones((1, 3)), np.zeros((1, 3)), [KINDS["Buildings"]], header=header)
+    assert (bare.ground.height_at(np.zeros((3, 2))) == 2.0).all()
+    renderer = open_renderer("gl", bare, 32, 32)
+    down = world_from_camera(np.array([500.0, 500.0, 12.0]), np.array([-90.0, 0.0, 0.0]))
+    depth = renderer.render(down, intrinsic_matrix(32, 32, 20.0), None).depth
+    renderer.close()
+    assert_allclose(depth, 12.0 - 2.0 + GROUND_PLANE_DROP_M, atol=1e-3)
 
 
 def test_surfaces_are_seen_on_a_slope_as_on_a_plain(renderer_name: str):
