@@ -47,16 +47,12 @@ def _tree(path: Path) -> ast.Module:
 
 @cache
 def _imports(name: str, path: Path, top_level_only: bool) -> set[str]:
-    tree = _tree(path)
-    skipped = set()
-    for node in ast.walk(tree):
+    found, nodes = set(), [*_tree(path).body]
+    for node in nodes:  # which grows
         lazy = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
         if (lazy and top_level_only) or (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)):
-            skipped |= {id(inner) for inner in ast.walk(node)}
-    found = set()
-    for node in ast.walk(tree):
-        if id(node) in skipped:
             continue
+        nodes += ast.iter_child_nodes(node)
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):

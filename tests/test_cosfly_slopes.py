@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from specimens_slopes import CELL_M, SHAPES, TILT, flat_town, on_ground, plane_m, sampled, sloped_town
+from test_renderers_contract import NAMES
 
 from cosfly.errors import InputError
 from cosfly.geometry import DT_S, intrinsic_matrix, world_from_camera
@@ -20,7 +21,7 @@ from cosfly.products.walks import TARGET_HEIGHT_M, Walk
 from cosfly.render.contract import GROUND_PLANE_DROP_M, instance_ids
 from cosfly.render.draping import BARE_GROUND, drape, is_draped
 from cosfly.render.perturbation import Surroundings
-from cosfly.render.stage import RENDERERS, open_renderer
+from cosfly.render.stage import open_renderer
 from cosfly.simplify.passes import SimplifyConfig, simplify
 from cosfly.space.grid import blocks_walking
 from cosfly.space.kernels import index_boxes, obstacle_index, segments_hit, signed_distances, visibility
@@ -233,7 +234,7 @@ def rays(camera_pose: np.ndarray, intrinsic: np.ndarray, size: tuple[int, int]) 
     return camera_pose[:3, 3], np.stack([across, down, np.ones_like(x)], axis=-1) @ camera_pose[:3, :3].T
 
 
-@pytest.fixture(params=RENDERERS)
+@pytest.fixture(params=NAMES)
 def renderer_name(request) -> str:
     if request.param == "pyrender":
         pytest.importorskip("pyrender")

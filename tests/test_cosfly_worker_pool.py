@@ -136,9 +136,10 @@ def test_workers_end_when_their_parent_is_killed(tmp_path):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc")
 @pytest.mark.parametrize(
-    "until", [("s/stage.json",), ("0.pid", "1.pid")], ids=["while workers start", "while they work"]
+    ("number", "word", "until"),
+    [(signal.SIGINT, "interrupted", ("s/stage.json",)), (signal.SIGTERM, "terminated", ("0.pid", "1.pid"))],
+    ids=["while workers start", "while they work"],
 )
-@pytest.mark.parametrize(("number", "word"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")])
 def test_a_signal_ends_a_command_and_its_workers_in_one_line(tmp_path, until, number, word):
     options: dict = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "start_new_session": True}
     process = start_program(tmp_path, until, **options)

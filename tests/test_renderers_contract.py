@@ -151,7 +151,11 @@ def away_from_silhouettes(depth: np.ndarray, ids: np.ndarray) -> np.ndarray:
     return ~cv2.dilate((bent | differs).astype(np.uint8), np.ones((3, 3))).astype(bool)
 
 
-@pytest.fixture(scope="module", params=sorted(RENDERERS))
+# The second renderer is an extra, and draws slowly.
+NAMES = [pytest.param(name, marks=pytest.mark.slow if name == "pyrender" else ()) for name in sorted(RENDERERS)]
+
+
+@pytest.fixture(scope="module", params=NAMES)
 def renderer_name(request):
     return request.param
 
