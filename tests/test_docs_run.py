@@ -72,6 +72,11 @@ SMALL = {
     "maps": _set("maps.synthetic.size_m=150", "maps.synthetic.num_blocks=1"),
     "pedestrians": _set("pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25"),
     "render": _set("render.width_px=160", "render.height_px=90"),
+    "study weather": _set("render.width_px=160", "render.height_px=90"),
+    "study zoom": _set("render.width_px=160", "render.height_px=90"),
+    "run quickstart --out runs/five": _set("pedestrians.num_paths=2"),
+    "run runs/five --set": _set("pedestrians.num_paths=3"),
+    "bench": ["--workers", "2"],
     "caption reader-check": ["--limit", "12"],
     "distill train": _set(
         *("distill.train.max_steps=2", "distill.train.max_pixels=4096", "distill.train.samples_per_step=2"),
