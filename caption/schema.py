@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -20,7 +20,7 @@ from cosfly.chat.protocol import check_url
 from cosfly.chat.student_chat import MAX_ANSWER_TOKENS
 from cosfly.chat.vllm_engine import VllmConfig
 from cosfly.look.frame_views import DEPTH_RANGE_M, Layout, View
-from cosfly.products.captions import KeyframeRecord, LabelFrom, TeacherKind, Verdict, Writing
+from cosfly.products.captions import KeyframeRecord, LabelFrom, SentenceState, TeacherKind, Verdict, Writing
 from cosfly.products.places import FlightChoice
 from cosfly.products.predictions import PREDICTIONS
 from cosfly.work.config import Config, MayDiffer
@@ -109,6 +109,22 @@ class Window:
     future: FutureMotion
     problem: str | None = None  # why no teacher may be asked, for instance a missing image
     keyframe: KeyframeRecord | None = None  # why it was taken, and how many windows after it were not
+
+
+# --- texts ------------------------------------------------------------------------------------------------------------
+
+
+class Judged(NamedTuple):
+    """A sentence and what was found out about it. problems: "kind: what", empty unless it is contradicted.
+
+    proved: something in it was compared with the facts, all of that holds, and no numeral or opposite was left out.
+    unread: the rest.
+    """
+
+    name: str  # C1 is the first sentence of critical_components, R1 of reasoning_trace
+    text: str
+    state: SentenceState
+    problems: tuple[str, ...] = ()
 
 
 # --- settings ---------------------------------------------------------------------------------------------------------

@@ -13,8 +13,7 @@ from caption.run.windows import cut_windows
 from caption.schema import WindowConfig
 from caption.truth.claims import judge_claim
 from caption.truth.facts import measure_facts
-from caption.truth.holding import word_holds
-from caption.truth.references import Fact, look_up, parse_reference
+from caption.truth.references import Fact, look_up, parse_reference, word_holds
 from cosfly.products.captions import Claim, Coc
 from cosfly.products.sentences import sentences_of
 from specimens import make_flight

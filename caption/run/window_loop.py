@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from caption.schema import CaptionConfig, Strategy, Window
+from caption.schema import CaptionConfig, Judged, Strategy, Window
 from caption.teachers.foreign import Terms
 from caption.teachers.judge import Case, Judge
 from caption.teachers.prompts import Correction, Question, make_question, prompt_hash
@@ -21,7 +21,6 @@ from caption.truth.actions import Motion, contradicted_by, label_of, measure, ve
 from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
 from caption.truth.mirror import check_translation
-from caption.truth.sentences import Judged
 from caption.writing.claims import MAX_COMPLAINTS, measured_series
 from caption.writing.contract import Draft, Refused, refuse_decision, way_of
 from cosfly.chat.contract import NoAnswer, Reply

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 from rich.table import Table
 
-from caption.schema import EvidenceConfig, ReaderConfig
+from caption.schema import EvidenceConfig, Judged, ReaderConfig
 from caption.teachers.asked import AskedModel, figures_table, open_models, share_text
 from caption.teachers.prompt_files import read_prompt
 from caption.truth.claims import claim_name, goes_against, judge_claim, references_of
@@ -24,7 +24,6 @@ from caption.truth.facts import Facts
 from caption.truth.gold import GoldCaption
 from caption.truth.references import QUANTITIES
 from caption.truth.said import SCENE
-from caption.truth.sentences import Judged
 from caption.truth.sizes import numeral_of
 from caption.truth.stated import read_stated
 from caption.writing.claims import QUOTED_SCHEMA, read_quoted

@@ -10,9 +10,8 @@ from collections.abc import Iterable, Iterator
 from itertools import combinations, pairwise
 
 from caption.truth.facts import Facts, wrapped
-from caption.truth.holding import word_holds
 from caption.truth.numerals import Numeral
-from caption.truth.references import QUANTITIES, Fact, Quantity, Reference, look_up
+from caption.truth.references import QUANTITIES, Fact, Quantity, Reference, look_up, word_holds
 from caption.truth.sizes import about_share, both_ways
 from caption.truth.stated import Pole
 

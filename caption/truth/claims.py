@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from caption.schema import EvidenceConfig
+from caption.schema import EvidenceConfig, Judged
 from caption.truth.coverage import cover
 from caption.truth.facts import Facts
-from caption.truth.holding import number_holds, word_holds
 from caption.truth.numerals import Numeral
 from caption.truth.references import (
     MOTIONS,
@@ -23,10 +22,11 @@ from caption.truth.references import (
     Reference,
     facts_meant,
     look_up,
+    number_holds,
     parse_reference,
+    word_holds,
 )
 from caption.truth.said import SCENE
-from caption.truth.sentences import Judged
 from caption.truth.sizes import BOUND_SHARE, RATIO_SLACK, about_share, numeral_of, written_digits
 from caption.truth.stated import read_stated
 from cosfly.products.actions import kin_of

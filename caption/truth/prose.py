@@ -11,10 +11,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
+from caption.schema import Judged
 from caption.truth.borne_out import bears_out_number
 from caption.truth.facts import Facts
 from caption.truth.numerals import Numeral
-from caption.truth.sentences import Judged
 from caption.truth.stated import Pole, Stated, read_stated, subject_before
 from cosfly.products.captions import Coc, Language
 from cosfly.products.sentences import sentences_of

@@ -14,13 +14,12 @@ from typing import Any, get_args
 
 from pydantic import ValidationError
 
-from caption.schema import EvidenceConfig
+from caption.schema import EvidenceConfig, Judged
 from caption.truth.claims import judge_claims
 from caption.truth.facts import Facts
 from caption.truth.glossary import written_units
 from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.references import QUANTITIES
-from caption.truth.sentences import Judged
 from caption.truth.sizes import same_size
 from caption.truth.stated import read_stated
 from caption.writing.contract import Draft, Refused

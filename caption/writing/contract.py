@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Protocol
 
-from caption.schema import EvidenceConfig
+from caption.schema import EvidenceConfig, Judged
 from caption.truth.facts import Facts
-from caption.truth.sentences import Judged
 from cosfly.products.actions import action_tokens
 from cosfly.products.answer_text import Parsed
 from cosfly.products.captions import Claim, Coc, Language, Template, Writing

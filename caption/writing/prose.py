@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from caption.schema import EvidenceConfig
+from caption.schema import EvidenceConfig, Judged
 from caption.truth.facts import Facts
 from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.prose import judge_prose
-from caption.truth.sentences import Judged
 from caption.writing.contract import Draft, Refused
 from cosfly.products.answer_text import Parsed
 from cosfly.products.captions import Language

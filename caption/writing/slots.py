@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
-from caption.schema import EvidenceConfig
+from caption.schema import EvidenceConfig, Judged
 from caption.truth.claims import judge_sentence
 from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
 from caption.truth.mirror import TEXTS, lacking
 from caption.truth.references import QUANTITIES
-from caption.truth.sentences import Judged
 from caption.truth.stated import Pole, read_stated
 from caption.writing.claims import QUOTED_SCHEMA, read_quoted
 from caption.writing.contract import Draft, Refused
