@@ -426,12 +426,6 @@ def scalar_row(flight: Flight, i: int, caption: ReleasedCaption | None, placemen
     return {column.name: column.cell(flight, i, caption, placement) for column in SCALARS}
 
 
-def picture_bytes(row: Mapping[str, Any], file: FrameFile) -> bytes:
-    """Give the bytes of a picture in a row."""
-    value = row[PICTURES[file].name]
-    return value if file == "depth" else value["bytes"]
-
-
 # --- flights ----------------------------------------------------------------------------------------------------------
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +17,7 @@ from cosfly.products.inspection import TrajectoryFunnel
 from cosfly.products.town import TownMap
 from cosfly.reading.documents import read_model
 from cosfly.work.store import sha256_bytes, write_model
-from release.columns import COUNTED, SplitName
+from release.columns import COUNTED, SPLIT_NAMES, SplitName
 
 RELEASE_SCHEMA, RELEASE_VERSION = "cosfly.release", "3.0"
 RECORD = "release.json"
@@ -56,6 +57,15 @@ class ReleasedFlight(Strict):
     walk: str
     pair: str | None
     five_ray_mean: float | None = None
+
+    @property
+    def town(self) -> str:
+        return f"{self.flight}//".split("/")[1]
+
+    @property
+    def trajectory(self) -> str:
+        """What it shares with its twin: run/town/trajectory."""
+        return self.flight.rpartition("/")[0]
 
 
 class ReleasedMap(TownMap):
@@ -135,6 +145,10 @@ class SourceRecord(Strict):
     inspect_sha256: str | None
     review_sha256: str | None = None
     stages: list[MadeBy]
+
+    def has(self, run: str) -> bool:
+        """Tell whether flights of a run are of it: folders above a town count as part of a run's name."""
+        return run == self.run or run.startswith(f"{self.run}_")
 
 
 class ReleasedTeacher(Strict):
@@ -309,6 +323,22 @@ class ReleaseRecord(Strict):
         return (self.actions or shipped_actions()).tokens
 
 
+def numbers_of_splits(flights: Sequence[ReleasedFlight], captions: Mapping[str, int]) -> dict[SplitName, SplitNumbers]:
+    """Give the numbers of each split that has flights. captions: of each split."""
+    found = {}
+    for split in SPLIT_NAMES:
+        if own := [flight for flight in flights if flight.split == split]:
+            found[split] = SplitNumbers(
+                frames=sum(flight.frames for flight in own),
+                captions=captions.get(split, 0),
+                flights=len(own),
+                trajectories=len({flight.trajectory for flight in own}),
+                walks=sorted({flight.walk for flight in own}),
+                towns=sorted({flight.town for flight in own}),
+            )
+    return found
+
+
 DIGEST_CHARACTERS = 12  # of the content's digest, in the names of shards
 
 
@@ -318,9 +348,13 @@ def content_digest(shards: Iterable[tuple[SplitName, str]]) -> str:
     return sha256_bytes("".join(f"{split} {sha256}\n" for split, sha256 in shards).encode())
 
 
-def shard_path(split: SplitName, digest: str, number: int, count: int) -> str:
-    """Give the name of a shard in its release: one of `count` of its split."""
-    return f"data/{split}-{digest[:DIGEST_CHARACTERS]}-{number:05d}-of-{count:05d}.parquet"
+def shard_paths(splits: Sequence[SplitName], digest: str) -> list[str]:
+    """Give the names of shards in their release, of which the splits are told: each has its number in its split."""
+    counts, numbers, paths = Counter(splits), Counter[str](), list[str]()
+    for split in splits:
+        paths.append(f"data/{split}-{digest[:DIGEST_CHARACTERS]}-{numbers[split]:05d}-of-{counts[split]:05d}.parquet")
+        numbers[split] += 1
+    return paths
 
 
 def shard_pattern(split: SplitName, digest: str) -> str:

@@ -20,7 +20,15 @@ from release import columns
 from release.card.numbers import compute_numbers
 from release.package.records import write_records
 from release.package.rows import open_writer
-from release.record import ReleasedFlight, ReleaseRecord, Shard, SplitNumbers, content_digest, read_record, shard_path
+from release.record import (
+    ReleasedFlight,
+    ReleaseRecord,
+    Shard,
+    content_digest,
+    numbers_of_splits,
+    read_record,
+    shard_paths,
+)
 from release.verify.verify import verify
 
 Row = dict[str, Any]
@@ -54,18 +62,15 @@ def forge(
         written.append((path, old, len(rows)))
     hashed = [(path, old.split, rows, sha256_file(path)) for path, old, rows in written]
     digest = content_digest((split, sha256) for _, split, _, sha256 in hashed)
-    counts, numbers, entries = Counter(split for _, split, _, _ in hashed), Counter[str](), []
-    for path, split, rows, sha256 in hashed:
-        name = shard_path(split, digest, numbers[split], counts[split])
-        numbers[split] += 1
+    names, entries = shard_paths([split for _, split, _, _ in hashed], digest), []
+    for name, (path, split, rows, sha256) in zip(names, hashed, strict=True):
         path.rename(out / name)
         entries.append(Shard(path=name, split=split, rows=rows, bytes=(out / name).stat().st_size, sha256=sha256))
     flights = _flights(record, [row for rows in shards for row in rows])
     update: dict[str, Any] = {"shards": entries, "content_digest": digest, "flights": flights}
-    update["splits"] = record.splits.model_copy(
-        update={"splits": _splits(flights, [r for rows in shards for r in rows])}
-    )
-    captions = sum(bool(row["has_caption"]) for rows in shards for row in rows)
+    with_caption = Counter(str(row["split"]) for rows in shards for row in rows if row["has_caption"])
+    update["splits"] = record.splits.model_copy(update={"splits": numbers_of_splits(flights, with_caption)})
+    captions = with_caption.total()
     history = record.history.model_copy(deep=True)
     history.captions.accepted += captions - history.captions.released
     history.captions.read += captions - history.captions.released
@@ -102,21 +107,6 @@ def _flights(record: ReleaseRecord, rows: list[Row]) -> list[ReleasedFlight]:
         )
         for name, own in frames.items()
     ]  # fmt: skip
-
-
-def _splits(flights: list[ReleasedFlight], rows: list[Row]) -> dict[str, SplitNumbers]:
-    found = {}
-    for split in dict.fromkeys(flight.split for flight in flights):
-        own = [flight for flight in flights if flight.split == split]
-        found[split] = SplitNumbers(
-            frames=sum(flight.frames for flight in own),
-            captions=sum(bool(row["has_caption"]) for row in rows if row["split"] == split),
-            flights=len(own),
-            trajectories=len({flight.flight.rpartition("/")[0] for flight in own}),
-            walks=sorted({flight.walk for flight in own}),
-            towns=sorted({flight.flight.split("/")[1] for flight in own}),
-        )
-    return found
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------

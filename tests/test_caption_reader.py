@@ -34,7 +34,7 @@ from cosfly.products.captions import Claim, Coc, Usage, read_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight
 from release.columns import caption_values
-from release.verify.rows import shown_caption
+from release.flight_rows import shown_caption
 
 
 @cache

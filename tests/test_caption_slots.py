@@ -37,7 +37,7 @@ from cosfly.products.captions import Coc, Language, read_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight
 from release.columns import caption_values
-from release.verify.rows import shown_caption
+from release.flight_rows import shown_caption
 from specimens import make_flight
 
 FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, -6.0, -10.0), offset_x_px=(0, 10, 40, None, -64))

@@ -32,6 +32,7 @@ from cosfly.reading.documents import read_json
 from cosfly.work.config import load
 from cosfly.work.store import write_bytes
 from release.columns import INTRINSICS, POSE
+from release.flight_rows import FlightRows
 from release.package import stage as package
 from release.package.config import ReleaseConfig
 from release.package.sources import Source
@@ -40,7 +41,6 @@ from release.rules import split_groups
 from release.verify.by_rule import check_settings
 from release.verify.findings import EXAMPLES, Findings
 from release.verify.records import check_shards
-from release.verify.rows import FlightRows
 from release.verify.verify import verify
 
 TINY = [

@@ -10,10 +10,10 @@ import pytest
 from cosfly.products.kinds import KINDS
 from cosfly.space.reprojection import Agreement
 from release.columns import POSE
+from release.flight_rows import FlightRows
 from release.verify import scene
 from release.verify.findings import Findings
 from release.verify.pictures import ground_beside
-from release.verify.rows import FlightRows
 
 WHOLE = Agreement(
     seen=2000, agree=2000, hidden=0, through=0, same=2000, planes=1700, shifted=0, renamed=0, error=0.0,

@@ -12,6 +12,8 @@ from cosfly.cli import options
 from cosfly.cli.options import Job, Sets, takes
 
 app = typer.Typer(no_args_is_help=True, help="Package captions and frames as a data set that opens with one line.")
+ReleaseFolder = Annotated[Path, Argument(help="Release folder, or a run with one.")]
+LevelBefore = Annotated[Literal["structure", "rows", "pixels"], Option(help="How far the release is verified before.")]
 
 
 @app.command("build")
@@ -112,11 +114,9 @@ def release_verify(
 @takes("workers")
 def release_sign(
     job: Job,
-    folder: Annotated[Path, Argument(help="Release folder, or a run with one.")],
+    folder: ReleaseFolder,
     key: Annotated[Path, Option(help="Private ed25519 key, PEM of openssl or ssh-keygen.")],
-    level: Annotated[
-        Literal["structure", "rows", "pixels"], Option(help="How far the release is verified before.")
-    ] = "pixels",
+    level: LevelBefore = "pixels",
 ) -> None:
     """Verify a release, then sign its checksums with your key, for `release verify --public-key`."""
     from caption.run.released import read_released
@@ -139,7 +139,7 @@ def release_sign(
 @takes()
 def release_stats(
     job: Job,
-    folder: Annotated[Path, Argument(help="Release folder, or a run with one.")],
+    folder: ReleaseFolder,
     out: Annotated[Path, Option(help="Folder for stats.html, stats.md and stats.json.")],
     pixels: Annotated[
         int,
@@ -156,7 +156,7 @@ def release_stats(
 @takes()
 def release_card(
     job: Job,
-    folder: Annotated[Path, Argument(help="Release folder, or a run with one.")],
+    folder: ReleaseFolder,
     out: Annotated[Path | None, Option(help="File to write; by default it is printed.")] = None,
 ) -> None:
     """Render the data-set card of a release from its release.json, as `verify` expects it in README.md."""
@@ -200,7 +200,7 @@ def release_viewer(
 @takes("workers", "verify", "resume", "repair")
 def release_export(
     job: Job,
-    folder: Annotated[Path, Argument(help="Release folder, or a run with one.")],
+    folder: ReleaseFolder,
     out: Annotated[Path, Option(help="Folder for the export and its records.")],
     format: Annotated[
         Literal["tree", "webdataset", "lerobot"],
@@ -258,13 +258,11 @@ def release_get(
 @takes("workers")
 def release_push(
     job: Job,
-    folder: Annotated[Path, Argument(help="Release folder, or a run with one.")],
+    folder: ReleaseFolder,
     repo: Annotated[str, Option(help="Repository of data on the hub: OWNER/NAME; made if there is none.")],
     yes: Annotated[bool, Option("--yes", help="Send it. Without: only say what would go.")] = False,
     public: Annotated[bool, Option("--public", help="A repository that is made is public; else private.")] = False,
-    level: Annotated[
-        Literal["structure", "rows", "pixels"], Option(help="How far the release is verified before.")
-    ] = "pixels",
+    level: LevelBefore = "pixels",
 ) -> None:
     """Send a release to a hub that speaks the Hugging Face protocol; verified first, and a dry run without --yes."""
     from caption.run.released import read_released

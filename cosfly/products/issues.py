@@ -73,7 +73,7 @@ class Report:
 
     def __str__(self) -> str:
         counts = ", ".join(
-            f"{self.num(severity)} {severity}{'' if self.num(severity) == 1 else 's'}" for severity in SEVERITIES
+            f"{self.num(severity):,} {severity}{'' if self.num(severity) == 1 else 's'}" for severity in SEVERITIES
         )
         verdict = "OK" if self.is_ok else "NOT OK"
         return "\n".join(

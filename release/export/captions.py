@@ -10,18 +10,20 @@ import csv
 import io
 import json
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import IO, Any, Literal, NamedTuple
 
 from cosfly.errors import InputError, NothingKept, StorageError
 from cosfly.look.frame_views import Pictures, frame_label
-from cosfly.products.captions import FIELDS, Caption, Language, Prompt, read_captions
+from cosfly.products.captions import FIELDS, Language, Prompt, read_captions
 from cosfly.products.frames import FILE_NAMES, frame_name
+from cosfly.products.places import Place
 from cosfly.reading.files import check_stays_below
 from cosfly.work.store import atomic_file, dump_json, inside
-from release.columns import LANGUAGES, SplitName
+from release.columns import LANGUAGES, SplitName, caption_values
 from release.export.source import open_release, rows_of_flight, scan
 from release.export.tree import tree_folder
 
@@ -110,21 +112,12 @@ def _of_captions(path: Path, tree: Path | None, left_out: Counter[str]) -> Itera
         if tree is not None and not all((tree / image).is_file() for image in images):
             left_out["missing_picture"] += 1
             continue
-        yield _of_caption(caption, images, "" if tree is None else tree.absolute().parent.name)
-
-
-def _of_caption(caption: Caption, images: list[str], run: str) -> CaptionLine:
-    answers = {"en": caption.en, "zh": caption.zh}
-    texts = {language: coc.model_dump() for language in LANGUAGES if (coc := answers[language]) is not None}
-    first = next(iter(texts.values()), {})
-    return CaptionLine(
-        sample_id=caption.sample_id, run=run, town=caption.town, trajectory=caption.trajectory, variant=caption.variant,
-        split="", frame_index=caption.frame_index, window=caption.window, images=images, picture_px=caption.picture_px,
-        decision=first.get("flight_decision", ""), label=caption.label, verdict=caption.verdict,
-        repair_strategy=None if caption.repair is None else caption.repair.strategy,
-        teacher=f"{caption.teacher.kind}: {caption.teacher.model}", texts=texts,
-        prompts={language: caption.prompt[language] for language in texts if language in caption.prompt},
-    )  # fmt: skip
+        row = caption_values(caption) | {
+            "sample_id": caption.sample_id, "frame_index": caption.frame_index, "split": "",
+            "teacher_model": caption.teacher.model,
+        }  # fmt: skip
+        run = "" if tree is None else tree.absolute().parent.name
+        yield _of_row(row, Place(run, caption.town, caption.trajectory, caption.variant), images)
 
 
 _COLUMNS = [
@@ -154,10 +147,10 @@ def _of_release(folder: Path) -> Iterator[CaptionLine]:
                 )  # fmt: skip
             place = tree_folder(flight, has_runs)
             images = [(place / frame_name(numbers[index]) / FILE_NAMES["rgb"]).as_posix() for index in window]
-            yield _of_row(row, flight, images)
+            yield _of_row(row, Place(flight.run, flight.town, flight.trajectory, flight.variant), images)
 
 
-def _of_row(row: dict[str, Any], flight: Any, images: list[str]) -> CaptionLine:
+def _of_row(row: Mapping[str, Any], flight: Place, images: list[str]) -> CaptionLine:
     texts = {
         language: {name: row[f"caption_{language}_{name}"] for name in FIELDS}
         for language in LANGUAGES
@@ -180,6 +173,13 @@ def _of_row(row: dict[str, Any], flight: Any, images: list[str]) -> CaptionLine:
 
 
 # --- formats ----------------------------------------------------------------------------------------------------------
+
+
+class Wanted(NamedTuple):
+    """What of each caption is written; shown: pictures of a conversation."""
+
+    languages: list[Language]
+    shown: ImageChoice
 
 
 @dataclass
@@ -220,9 +220,9 @@ def export(
         raise StorageError("there is a file already" if out.is_file() else "this is a folder", where=out, fix=fix)
     told = CaptionTally()
     lines = _of_split(read_lines(source, told.left_out), split, format, told.left_out)
-    wanted = [language for language in LANGUAGES if language in languages]
+    wanted = Wanted([language for language in LANGUAGES if language in languages], shown)
     with atomic_file(out) as file:
-        WRITERS[format](file, lines, wanted, shown, told)
+        WRITERS[format](file, lines, wanted, told)
         if told.written == 0:
             raise NothingKept("no caption to export", where=source, got=str(told), expected="accepted captions")
     return told
@@ -262,14 +262,12 @@ def _row(line: CaptionLine, languages: list[Language]) -> dict[str, Any]:
     return row
 
 
-def _csv(
-    file: IO[bytes], lines: Iterable[CaptionLine], languages: list[Language], shown: ImageChoice, told: CaptionTally
-) -> None:
+def _csv(file: IO[bytes], lines: Iterable[CaptionLine], wanted: Wanted, told: CaptionTally) -> None:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\r\n", quoting=csv.QUOTE_MINIMAL)
     file.write(BOM.encode())
     for line in lines:
-        row = _row(line, languages)
+        row = _row(line, wanted.languages)
         if told.written == 0:
             writer.writerow(row)
         writer.writerow([cell(value) for value in row.values()])
@@ -287,78 +285,60 @@ def cell(value: Any) -> str:
     return f"'{text}" if isinstance(value, str) and text.lstrip(" ").startswith(FORMULA) else text
 
 
-def _jsonl(
-    file: IO[bytes], lines: Iterable[CaptionLine], languages: list[Language], shown: ImageChoice, told: CaptionTally
-) -> None:
+def _jsonl(file: IO[bytes], lines: Iterable[CaptionLine], wanted: Wanted, told: CaptionTally) -> None:
     for line in lines:
-        file.write((dump_json(_row(line, languages)) + "\n").encode())
+        file.write((dump_json(_row(line, wanted.languages)) + "\n").encode())
         told.written += 1
 
 
-def _sharegpt(
-    file: IO[bytes], lines: Iterable[CaptionLine], languages: list[Language], shown: ImageChoice, told: CaptionTally
-) -> None:
+def _sharegpt(name: str, prompt: Prompt, images: list[str], asked: str, answer: str, wanted: Wanted) -> dict[str, Any]:
     """As LLaMA-Factory reads it: roles in turns, human first; as many marks as `images`, which are joined to its
     media_dir.
     """
-
-    def sample(name: str, prompt: Prompt, images: list[str], asked: str, answer: str) -> dict[str, Any]:
-        turns = [{"from": "human", "value": asked}, {"from": "gpt", "value": answer}]
-        return {"id": name, "conversations": turns, "system": prompt.system, "images": images}
-
-    _write_array(file, _samples(lines, languages, shown, told, sample))
+    turns = [{"from": "human", "value": asked}, {"from": "gpt", "value": answer}]
+    return {"id": name, "conversations": turns, "system": prompt.system, "images": images}
 
 
-def _llava(
-    file: IO[bytes], lines: Iterable[CaptionLine], languages: list[Language], shown: ImageChoice, told: CaptionTally
-) -> None:
+def _llava(name: str, prompt: Prompt, images: list[str], asked: str, answer: str, wanted: Wanted) -> dict[str, Any]:
     """As LLaVA's trainers read it: `image` below its image folder, one name, or a list, which the first LLaVA does not
     take.
 
     It has no place for a system prompt, so that stands in front of the question.
     """
-
-    def sample(name: str, prompt: Prompt, images: list[str], asked: str, answer: str) -> dict[str, Any]:
-        marks, question = asked.split("\n\n", 1)
-        turns = [
-            {"from": "human", "value": f"{marks}\n{prompt.system}\n\n{question}"},
-            {"from": "gpt", "value": answer},
-        ]
-        return {"id": name, "image": images[0] if shown == "last" else images, "conversations": turns}
-
-    _write_array(file, _samples(lines, languages, shown, told, sample))
+    marks, question = asked.split("\n\n", 1)
+    turns = [{"from": "human", "value": f"{marks}\n{prompt.system}\n\n{question}"}, {"from": "gpt", "value": answer}]
+    return {"id": name, "image": images[0] if wanted.shown == "last" else images, "conversations": turns}
 
 
-Sample = Callable[[str, Prompt, list[str], str, str], dict[str, Any]]
-
-
-def _samples(
-    lines: Iterable[CaptionLine], languages: list[Language], shown: ImageChoice, told: CaptionTally, sample: Sample
-) -> Iterator[dict[str, Any]]:
-    for line in lines:
-        for language in languages:
-            if language not in line.texts or language not in line.prompts:
-                told.left_out[f"no_{language}"] += 1
-                continue
-            prompt, answer = line.question(language, shown), dump_json(line.texts[language])
-            if any(mark in text for mark in MARKS for text in (prompt.system, prompt.user, answer)):
-                told.left_out["text_with_a_mark_for_pictures"] += 1  # a loader would look for one more
-                continue
-            images = line.images[-1:] if shown == "last" else line.images
-            labels = ["" if shown == "last" else f"{frame_label(number)} " for number in range(len(images))]
-            asked = "\n".join(f"{label}{IMAGE}" for label in labels) + f"\n\n{prompt.user}"
-            told.written += 1
-            yield sample(f"{line.sample_id}_{language}", prompt, images, asked, answer)
-
-
-def _write_array(file: IO[bytes], samples: Iterable[dict[str, Any]]) -> None:
+def _conversations(
+    sample: Callable[..., dict[str, Any]],
+    file: IO[bytes],
+    lines: Iterable[CaptionLine],
+    wanted: Wanted,
+    told: CaptionTally,
+) -> None:
     """Write a JSON array, a sample a line: LLaVA reads no other form, and memory stays flat."""
-    begin = "[\n"
-    for sample in samples:
-        file.write(f"{begin}{json.dumps(sample, ensure_ascii=False)}".encode())
+    begin, is_last = "[\n", wanted.shown == "last"
+    for line, language in ((line, language) for line in lines for language in wanted.languages):
+        if language not in line.texts or language not in line.prompts:
+            told.left_out[f"no_{language}"] += 1
+            continue
+        prompt, answer = line.question(language, wanted.shown), dump_json(line.texts[language])
+        if any(mark in text for mark in MARKS for text in (prompt.system, prompt.user, answer)):
+            told.left_out["text_with_a_mark_for_pictures"] += 1  # a loader would look for one more
+            continue
+        images = line.images[-1:] if is_last else line.images
+        labels = ["" if is_last else f"{frame_label(number)} " for number in range(len(images))]
+        asked = "\n".join(f"{label}{IMAGE}" for label in labels) + f"\n\n{prompt.user}"
+        told.written += 1
+        written = sample(f"{line.sample_id}_{language}", prompt, images, asked, answer, wanted)
+        file.write(f"{begin}{json.dumps(written, ensure_ascii=False)}".encode())
         begin = ",\n"
     file.write(b"\n]\n")
 
 
-LineWriter = Callable[[IO[bytes], Iterable[CaptionLine], list[Language], ImageChoice, CaptionTally], None]
-WRITERS: dict[FormatName, LineWriter] = {"csv": _csv, "jsonl": _jsonl, "sharegpt": _sharegpt, "llava": _llava}
+LineWriter = Callable[[IO[bytes], Iterable[CaptionLine], Wanted, CaptionTally], None]
+WRITERS: dict[FormatName, LineWriter] = {
+    "csv": _csv, "jsonl": _jsonl, "sharegpt": partial(_conversations, _sharegpt),
+    "llava": partial(_conversations, _llava),
+}  # fmt: skip

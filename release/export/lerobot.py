@@ -40,8 +40,8 @@ from release.export.source import (
     picture,
     read_span,
     rows_of_flight,
-    vectors,
 )
+from release.flight_rows import vectors
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 SAMPLED_FRAMES, PIXEL_STEP = 5, 4

@@ -5,7 +5,7 @@ at a time.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -257,9 +257,3 @@ def depth_in_words(coding: DepthCoding | None, stored: str) -> str:
         f"{coding.sky:g} sky, {coding.invalid:g} invalid), whose greatest error, "
         f"measured over all pixels, is {coding.max_error_m:g} m"
     )
-
-
-def vectors(rows: Sequence[Mapping[str, Any]], name: str, members: tuple[str, ...]) -> np.ndarray:
-    """Give a column of structures as numbers, (n, members) float64; NaN where a row has none."""
-    nothing = dict.fromkeys(members, np.nan)
-    return np.array([[(row[name] or nothing)[member] for member in members] for row in rows], dtype=np.float64)

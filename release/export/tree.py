@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.products.boxes import UNKNOWN_LICENCE
-from cosfly.products.frames import COORDINATES, FILE_NAMES, Camera, frame_name
+from cosfly.products.frames import COORDINATES, FILE_NAMES, frame_name
 from cosfly.products.places import TOWN
 from cosfly.products.playback import Flight, write_flight
 from cosfly.products.segments import FOLLOW, Segment
@@ -30,9 +31,10 @@ from cosfly.products.walks import pace_field
 from cosfly.reading.files import sha256_file
 from cosfly.work.runner import advance
 from cosfly.work.store import CHECKSUMS, checksum_lines, write_model
-from release.columns import BOX, INTRINSICS, PICTURES, POINT, POSE, SCALAR_NAMES, between_of, matrices_of
+from release.columns import PICTURES, SCALAR_NAMES, matrices_of
 from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
-from release.export.source import Release, ReleasedRows, depth_in_words, depth_npy, picture, read_span, vectors
+from release.export.source import Release, ReleasedRows, depth_in_words, depth_npy, picture, read_span
+from release.flight_rows import FlightRows
 
 VERSION = "drone_nav_traj_v7 7.0.0"
 Row = dict[str, Any]
@@ -154,34 +156,10 @@ def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight
     sizes = {(r["width_px"], r["height_px"]) for r in rows}
     if len(sizes) != 1:
         raise InputError("a flight has pictures of one size", where=placed.name, got=f"{len(sizes)} sizes")
-    intrinsics = matrices_of(vectors(rows, "intrinsics", INTRINSICS))
-    poses = vectors(rows, "pose", POSE)
-    offsets = vectors(rows, "drone_offset", POSE)
-    has_mask_box = any(row["target_mask_bbox"] is not None for row in rows)
-    is_original = rows[0]["track"] == "clean"
-    return Flight(
-        town=placed.town,
-        trajectory=placed.trajectory,
-        variant=placed.variant,
-        camera=Camera(rows[0]["width_px"], rows[0]["height_px"], intrinsics[0]),
-        intrinsics=None if (intrinsics == intrinsics[0]).all() else intrinsics,
-        time_s=placed.time_s,
-        positions_m=poses[:, :3],
-        rotations_deg=poses[:, 3:],
-        targets_m=vectors(rows, "target", POINT),
-        target_in_view=_flags(rows, "target_in_view"),
-        target_visible=_flags(rows, "target_visible"),
-        target_depth_m=_numbers(rows, "target_depth_m"),
-        target_uv=vectors(rows, "target_uv", ("u_px", "v_px")),
-        target_bbox=vectors(rows, "target_bbox", BOX),
-        target_mask_bbox=vectors(rows, "target_mask_bbox", BOX) if has_mask_box else None,
-        visibility=_numbers(rows, "visibility"),
-        is_perturbed=_flags(rows, "is_perturbed"),
-        drone_offsets_m=offsets[:, :3],
-        rotation_offsets_deg=offsets[:, 3:],
-        target_offsets_m=vectors(rows, "target_offset", POINT),
-        is_original=is_original,
-        between=between_of(rows),
+    found = FlightRows(placed.name, rows)
+    return replace(
+        found.flight,
+        intrinsics=None if (found.intrinsics == found.intrinsics[0]).all() else matrices_of(found.intrinsics),
         segments=_segments([row["style"] for row in rows]),
         source={
             "path_index": number,
@@ -222,11 +200,3 @@ def _segments(styles: list[str]) -> tuple[Segment, ...]:
         parts.append(Segment(style, begin, end))
         begin = end
     return tuple(parts)
-
-
-def _numbers(rows: list[Row], name: str) -> np.ndarray:
-    return np.array([np.nan if row[name] is None else row[name] for row in rows], dtype=np.float64)
-
-
-def _flags(rows: list[Row], name: str) -> np.ndarray:
-    return np.array([bool(row[name]) for row in rows])

@@ -23,7 +23,6 @@ from cosfly.work.store import write_bytes, write_checksums
 from release import columns
 from release.card.croissant import CROISSANT, render_croissant
 from release.card.render import render_card
-from release.columns import SPLIT_NAMES, SplitName
 from release.depth import depth_record
 from release.package.captions import CaptionAccount, teacher_settings
 from release.package.config import ReleaseConfig
@@ -44,10 +43,10 @@ from release.record import (
     Settings,
     Shard,
     SourceRecord,
-    SplitNumbers,
     Splits,
     content_digest,
-    shard_path,
+    numbers_of_splits,
+    shard_paths,
     write_record,
 )
 from release.rules import RULE, SPLIT_RULE
@@ -135,21 +134,14 @@ def account_for(plan: ReleasePlan, written: list[ShardResult]) -> History:
     return History(trajectories=plan.material.trajectories, flights=found, captions=captions)
 
 
-def splits_of(cfg: ReleaseConfig, plan: ReleasePlan, written: list[ShardResult]) -> Splits:
+def splits_of(
+    cfg: ReleaseConfig, plan: ReleasePlan, written: list[ShardResult], flights: list[ReleasedFlight]
+) -> Splits:
     """Give what the record says of its splits."""
-    surveyed = {flight.name: flight for flight, *_ in plan.flights}
-    numbers: dict[SplitName, SplitNumbers] = {}
-    for split in SPLIT_NAMES:
-        own = [f for result in written for f in result.flights if plan.placements[f.name].split == split]
-        if own:
-            numbers[split] = SplitNumbers(
-                frames=sum(flight.frames for flight in own),
-                captions=sum(flight.captions for flight in own),
-                flights=len(own),
-                trajectories=len({surveyed[flight.name].candidate.trajectory for flight in own}),
-                walks=sorted({plan.placements[flight.name].walk for flight in own}),
-                towns=sorted({surveyed[flight.name].candidate.place.town for flight in own}),
-            )
+    captions = Counter[str]()
+    for flight in (flight for result in written for flight in result.flights):
+        captions[plan.placements[flight.name].split] += flight.captions
+    numbers = numbers_of_splits(flights, captions)
     return Splits(by=cfg.split_by, rule=SPLIT_RULE, seed=cfg.split_seed, fractions=cfg.fractions, splits=numbers)
 
 
@@ -164,6 +156,19 @@ def make_record(
 ) -> ReleaseRecord:
     """Give what release.json says of its shards. prompts: as the record has them."""
     five_ray = {flight.name: flight.candidate.five_ray_mean for flight, *_ in plan.flights}
+    flights = [
+        ReleasedFlight(
+            flight=flight.name,
+            frames=flight.frames,
+            frames_available=flight.frames_available,
+            split=plan.placements[flight.name].split,
+            walk=plan.placements[flight.name].walk,
+            pair=plan.placements[flight.name].pair,
+            five_ray_mean=five_ray[flight.name],
+        )
+        for result in written
+        for flight in result.flights
+    ]
     return ReleaseRecord(
         name=cfg.name,
         licence=plan.licence,
@@ -183,23 +188,11 @@ def make_record(
         coordinates=columns.CONTRACT,
         actions=in_place.given("actions"),
         prompts=prompts,
-        splits=splits_of(cfg, plan, written),
+        splits=splits_of(cfg, plan, written, flights),
         numbers=numbers,
         history=account_for(plan, written),
         provenance=provenance,
-        flights=[
-            ReleasedFlight(
-                flight=flight.name,
-                frames=flight.frames,
-                frames_available=flight.frames_available,
-                split=plan.placements[flight.name].split,
-                walk=plan.placements[flight.name].walk,
-                pair=plan.placements[flight.name].pair,
-                five_ray_mean=five_ray[flight.name],
-            )
-            for result in written
-            for flight in result.flights
-        ],
+        flights=flights,
         content_digest=content_digest((shard.split, shard.sha256) for shard in shards),
         shards=shards,
     )
@@ -230,12 +223,9 @@ def name_shards(parts: Sequence[tuple[Path, Shard]], folder: Path) -> list[Shard
         parts: where they stand until the release has its name, and what they are; their `path` is not read.
     """
     digest = content_digest((shard.split, shard.sha256) for _, shard in parts)
-    counts, numbers = Counter(shard.split for _, shard in parts), Counter[str]()
     (folder / "data").mkdir()
     shards = []
-    for part, shard in parts:
-        path = shard_path(shard.split, digest, numbers[shard.split], counts[shard.split])
-        numbers[shard.split] += 1
+    for (part, shard), path in zip(parts, shard_paths([shard.split for _, shard in parts], digest), strict=True):
         try:
             os.link(part, folder / path)
         except OSError:  # the file system has no links

@@ -43,7 +43,7 @@ from cosfly.work.store import (
     write_json,
 )
 from release.card.numbers import compute_numbers
-from release.columns import PLACE, SPLIT_NAMES, SplitName, flight_name, flight_spans, schema
+from release.columns import PLACE, SplitName, flight_name, flight_spans, schema
 from release.package.records import DATASET, OF_SHARD, PARTS, check_parts, name_shards, write_records
 from release.package.rows import open_writer
 from release.record import (
@@ -54,9 +54,9 @@ from release.record import (
     ReleasedFlight,
     ReleaseRecord,
     Shard,
-    SplitNumbers,
     content_digest,
-    shard_path,
+    numbers_of_splits,
+    shard_paths,
 )
 from release.sign import MOST_SIGNATURE_BYTES, SIGNATURE
 from release.transfer.remote import CHUNK, Remote, RemoteFile, open_remote, published_address
@@ -122,12 +122,9 @@ def _small_file(remote: Remote, name: str) -> bytes:
 def _check_shards(record: ReleaseRecord, where: str) -> None:
     """See that the names of shards are those that their digests give: no other name is ever asked for or written."""
     digest = content_digest((shard.split, shard.sha256) for shard in record.shards)
-    counts = Counter(shard.split for shard in record.shards)
-    numbers: Counter[str] = Counter()
     wrong = [] if digest == record.content_digest else [f"content_digest {record.content_digest} and not {digest}"]
-    for shard in record.shards:
-        named = shard_path(shard.split, record.content_digest, numbers[shard.split], counts[shard.split])
-        numbers[shard.split] += 1
+    names = shard_paths([shard.split for shard in record.shards], record.content_digest)
+    for shard, named in zip(record.shards, names, strict=True):
         if shard.path != named:
             wrong.append(f"{shard.path} and not {named}")
         if shard.bytes < 0 or shard.rows < 0 or len(shard.sha256) != 64:
@@ -143,9 +140,9 @@ def chosen_flights(record: ReleaseRecord, choice: Selection) -> list[ReleasedFli
         InputError: a name that the release does not have, or nothing is left; says what there is.
     """
     known: dict[str, set[str]] = {
-        "towns": {flight.flight.split("/")[1] for flight in record.flights if flight.flight.count("/") == 3},
+        "towns": {flight.town for flight in record.flights if flight.town},
         "splits": set(map(str, record.splits.splits)),
-        "flights": {flight.flight for flight in record.flights} | {f.flight.rpartition("/")[0] for f in record.flights},
+        "flights": {flight.flight for flight in record.flights} | {f.trajectory for f in record.flights},
         "modalities": set(map(str, record.settings.modalities)),
     }
     for what, names in known.items():
@@ -158,9 +155,9 @@ def chosen_flights(record: ReleaseRecord, choice: Selection) -> list[ReleasedFli
     found = {
         flight.flight
         for flight in record.flights
-        if (not choice.towns or flight.flight.split("/")[1] in choice.towns)
+        if (not choice.towns or flight.town in choice.towns)
         and (not choice.splits or flight.split in choice.splits)
-        and (not choice.flights or {flight.flight, flight.flight.rpartition("/")[0]} & set(choice.flights))
+        and (not choice.flights or {flight.flight, flight.trajectory} & set(choice.flights))
     }
     found |= {flight.pair for flight in record.flights if flight.flight in found and flight.pair is not None}
     if not found:
@@ -492,23 +489,14 @@ def part_record(
         history.flights.left_out[NOT_ASKED_FOR] = history.flights.left_out.get(NOT_ASKED_FOR, 0) + gone
     history.captions.flight_left_out += history.captions.released - numbers.captions.frames_with
     history.captions.released = numbers.captions.frames_with
-    splits: dict[SplitName, SplitNumbers] = {}
-    for split in SPLIT_NAMES:
-        own = [flight for flight in flights if flight.split == split]
-        if own:
-            splits[split] = SplitNumbers(
-                frames=sum(flight.frames for flight in own),
-                captions=sum(got.captions for shard, got in taken if shard.split == split),
-                flights=len(own),
-                trajectories=len({flight.flight.rpartition("/")[0] for flight in own}),
-                walks=sorted({flight.walk for flight in own}),
-                towns=sorted({flight.flight.split("/")[1] for flight in own}),
-            )
+    captions = Counter[str]()
+    for shard, got in taken:
+        captions[shard.split] += got.captions
     return record.model_copy(
         update={
             "settings": record.settings.model_copy(update={"modalities": modalities}),
             "depth": record.depth if "depth" in modalities else None,
-            "splits": record.splits.model_copy(update={"splits": splits}),
+            "splits": record.splits.model_copy(update={"splits": numbers_of_splits(flights, captions)}),
             "numbers": numbers,
             "history": history,
             "flights": flights,

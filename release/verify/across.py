@@ -21,9 +21,9 @@ from cosfly.products.issues import Severity
 from cosfly.products.splits import town_family
 from cosfly.reading.files import read_bytes
 from cosfly.work.store import write_bytes
+from release.flight_rows import FlightRows
 from release.verify.findings import Findings
 from release.verify.motion import clean_positions
-from release.verify.rows import FlightRows
 from release.verify.scene import PictureKeys
 
 CELL_M = 0.35  # people in one cell are nearer than the 0.5 m within which flights are built into one walk

@@ -13,10 +13,10 @@ from cosfly.products.places import folder_name, town_folder
 from cosfly.products.segments import FOLLOW
 from cosfly.products.splits import town_family
 from cosfly.space.flight_metrics import accel_rms, jerk_rms
-from release.record import ReleasedFlight, ReleaseRecord
+from release.flight_rows import FlightRows
+from release.record import ReleaseRecord
 from release.rules import NAME_OF, SPLIT_RULE, split_groups
 from release.verify.findings import Findings
-from release.verify.rows import FlightRows
 
 WITHOUT_TWIN = "its twin is not released"  # of flights that were left out after walks had their names
 TIME_S = 1e-3  # times are written with three digits at least
@@ -53,17 +53,13 @@ def _check_split_rule(record: ReleaseRecord, findings: Findings) -> None:
     if shares.keys() != set(NAME_OF.values()) or not is_whole:
         findings.error("rule", "release.json: splits.fractions", shares, "three shares, together 1")
     elif record.part_of is None and record.flights:
-        group_of = {f.flight: f.walk if told.by == "walk" else town_family(_town(f)) for f in record.flights}
+        group_of = {f.flight: f.walk if told.by == "walk" else town_family(f.town) for f in record.flights}
         splits = split_groups(group_of.values(), shares, told.seed, f"{told.by}s")
         for flight in record.flights:
             group = group_of[flight.flight]
             if flight.split != splits[group]:
                 expected = f"{splits[group]}, by the rank of {group} under seed {told.seed}"
                 findings.error("split", f"{flight.flight}: split", flight.split, expected)
-
-
-def _town(flight: ReleasedFlight) -> str:
-    return f"{flight.flight}//".split("/")[1]
 
 
 def _check_names(record: ReleaseRecord, findings: Findings) -> None:
@@ -73,9 +69,9 @@ def _check_names(record: ReleaseRecord, findings: Findings) -> None:
     trajectories: dict[str, set[str]] = defaultdict(set)
     chosen: dict[str, set[str]] = {}
     for flight in record.flights:
-        trajectories[flight.walk].add(flight.flight.rpartition("/")[0])
+        trajectories[flight.walk].add(flight.trajectory)
         for config in _configs(record, flight.flight, "render"):
-            chosen.setdefault(_town(flight), set()).add(str(config.get("town") or ""))
+            chosen.setdefault(flight.town, set()).add(str(config.get("town") or ""))
     may_be_gone = record.part_of is not None or record.history.flights.left_out.get(WITHOUT_TWIN, 0) > 0
     for walk, own in trajectories.items():
         if walk > min(own) or (walk != min(own) and not may_be_gone):
@@ -92,8 +88,7 @@ def _check_names(record: ReleaseRecord, findings: Findings) -> None:
 def _configs(record: ReleaseRecord, flight: str, stage: str) -> list[dict[str, Any]]:
     """Give the settings of a stage, of the sources that a flight may be of; folders above a town are part of its run's
     name."""
-    run = flight.split("/")[0]
-    own = (source for source in record.provenance.sources if run == source.run or run.startswith(f"{source.run}_"))
+    own = (source for source in record.provenance.sources if source.has(flight.split("/")[0]))
     return [made.config for source in own for made in source.stages if made.stage == stage]
 
 

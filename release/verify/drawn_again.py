@@ -19,9 +19,9 @@ from cosfly.geometry import look_at, wrap_deg
 from cosfly.products.shift_draws import PERTURBED, ShiftDraw, rng_of_shifts, shift_draws
 from cosfly.products.walks import walk_id
 from cosfly.work.chance import draw_by_share, rng_for
+from release.flight_rows import FlightRows
 from release.record import MadeBy
 from release.verify.findings import Findings
-from release.verify.rows import FlightRows
 
 EXACT_M, EXACT_DEG = 1e-4, 1e-3  # files keep all digits; those of older ones four
 # Of each walk, and walks of a run: to draw them takes a second or so, once a process. Nothing is said of a flight whose

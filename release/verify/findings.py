@@ -8,54 +8,40 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import ConfigDict
 
 from cosfly.escaping import cut, for_terminal
-from cosfly.products.issues import SEVERITIES, Issue, Report, Severity, sort_key
-from release.verify.rows import FlightRows
+from cosfly.products.issues import Issue, Report, Severity, sort_key
+from release.flight_rows import FlightRows
 
 EXAMPLES = 3  # places of a kind that are named
 Words = str | Callable[[int], Any]  # of all rows alike, or of each
 
 
-class Kind(BaseModel):
-    """All findings of one code. got, expected: of the first one."""
+class Kind(Issue):
+    """All findings of one code; where, got, expected: of the first one."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", frozen=False)
 
-    severity: Severity
-    code: str
-    count: int = 0
-    got: str = ""
-    expected: str = ""
-    examples: list[str] = []
+    examples: list[str]
 
     def __str__(self) -> str:
         times = "once" if self.count == 1 else f"{self.count:,} times"
         more = f"; also {', '.join(self.examples[1:])}" if len(self.examples) > 1 else ""
-        got, expected = self.got, self.expected
-        text = f"{self.severity}: {self.code}: {times}: {self.examples[0]}: got {got}; expected {expected}{more}"
+        text = f"{self.severity}: {self.code}: {times}: {self.where}: got {self.got}; expected {self.expected}{more}"
         return " ".join(for_terminal(text).split())
 
 
 @dataclass
-class Findings:
-    """Findings by kind. `facts` are lines that tell what was checked."""
+class Findings(Report):
+    """Findings by kind."""
 
     kinds: dict[tuple[str, str], Kind] = field(default_factory=dict)
-    facts: list[str] = field(default_factory=list)
 
     def add(self, severity: Severity, code: str, where: object, got: object, expected: str) -> None:
-        found = Kind(
-            severity=severity, code=code, count=1, got=cut(str(got)), expected=expected, examples=[cut(str(where))]
-        )
-        self._merge(found)
-
-    def error(self, code: str, where: object, got: object, expected: str) -> None:
-        self.add("error", code, where, got, expected)
-
-    def warn(self, code: str, where: object, got: object, expected: str) -> None:
-        self.add("warning", code, where, got, expected)
+        place = cut(str(where))
+        kind = Kind(severity=severity, code=code, where=place, got=cut(str(got)), expected=expected, examples=[place])
+        self._merge(kind)
 
     def note(self, code: str, where: object, got: object, expected: str) -> None:
         self.add("note", code, where, got, expected)
@@ -84,25 +70,24 @@ class Findings:
 
     def report(self, level: str = "") -> Verified:
         """Give the report of all that was found."""
-        kinds = sorted(self.kinds.values(), key=lambda kind: (SEVERITIES.index(kind.severity), kind.code))
-        values = ({**kind.model_dump(exclude={"examples"}), "where": kind.examples[0]} for kind in kinds)
-        issues = sorted((Issue(**value) for value in values), key=sort_key)
-        return Verified(issues=issues, facts=self.facts, kinds=kinds, level=level)
+        return Verified(facts=self.facts, kinds=sorted(self.kinds.values(), key=sort_key), level=level)
 
 
 @dataclass
 class Verified(Report):
-    """The report of a verification. `issues` has one entry a kind, the first occurrence's with the count; kinds the
-    first places too."""
+    """The report of a verification; of each kind of finding the first places."""
 
     kinds: list[Kind] = field(default_factory=list)
     level: str = ""
+
+    def __post_init__(self) -> None:
+        self.issues = [*self.kinds]
 
     def as_json(self) -> dict[str, Any]:
         """Give what `--json` writes."""
         return {
             "schema": "cosfly.verification", "schema_version": "1.0", "level": self.level, "ok": self.is_ok,
-            "facts": self.facts, "findings": [kind.model_dump() for kind in self.kinds],
+            "facts": self.facts, "findings": [kind.model_dump(exclude={"where"}) for kind in self.kinds],
         }  # fmt: skip
 
     def repair_plan(self) -> list[str]:
@@ -114,12 +99,6 @@ class Verified(Report):
             f"{code} ({count:,}): {'could be mended' if can_be else 'not to be mended here'}: {how}"
             for code, (count, can_be, how) in told.items()
         ]
-
-    def __str__(self) -> str:
-        counts = ((severity, self.num(severity)) for severity in SEVERITIES)
-        told = ", ".join(f"{count:,} {severity}{'' if count == 1 else 's'}" for severity, count in counts)
-        verdict = "OK" if self.is_ok else "NOT OK"
-        return "\n".join([*map(for_terminal, self.facts), *map(str, self.kinds), f"{verdict}: {told}"])
 
 
 AGAIN, REBUILD = "fetch the file again from where the release is published", "build the release again from its runs"

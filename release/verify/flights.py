@@ -9,9 +9,10 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
 from cosfly.products.shown_captions import CaptionReader
 from cosfly.work.items import Item, Outcome
+from release.depth import depth_record
+from release.flight_rows import FlightRows
 from release.record import DepthCoding, DepthCodingName, MadeBy, ReleaseRecord
 from release.verify.across import RowFiles, summary_of
 from release.verify.by_rule import check_settings
@@ -20,7 +21,6 @@ from release.verify.findings import Findings
 from release.verify.geometry import check_geometry
 from release.verify.identity import check_identity
 from release.verify.motion import check_motion
-from release.verify.rows import FlightRows
 from release.verify.said import check_captions
 from release.verify.scene import PictureKeys, check_pictures
 from release.verify.sources import Entry, FlightSource, flight_rows
@@ -30,10 +30,7 @@ Value = TypeVar("Value")
 # What a value of no sense does to a check that takes it for one: each value is judged by itself, so that the cause is
 # named too.
 SENSELESS = (ValueError, KeyError, TypeError, IndexError, ArithmeticError, AttributeError)
-# As in a playback tree.
-LOSSLESS = DepthCoding(
-    coding="float32", unit="metre", sky=SKY_DEPTH_M, invalid=INVALID_DEPTH_M, min_m=None, max_m=None, max_error_m=0.0
-)
+LOSSLESS = depth_record("float32", ())  # as in a playback tree
 
 
 @dataclass(frozen=True)

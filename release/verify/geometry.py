@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from cosfly.geometry import BODY_FROM_CAMERA
+from release.flight_rows import FlightRows
 from release.verify.findings import Findings
-from release.verify.rows import FlightRows
 
 PIXEL_PX = 0.5  # a target's pixel: half a pixel is the most that another convention of pixel centres shifts it
 DEPTH_M = 0.02  # z-depth of the target: rounded to centimetres at worst

@@ -12,8 +12,8 @@ import numpy as np
 from cosfly.products.actions import action_tokens
 from cosfly.products.playback import EVENTS, ORIGINAL
 from release.columns import REQUIRED, SCALARS
+from release.flight_rows import FlightRows
 from release.verify.findings import Findings
-from release.verify.rows import FlightRows
 
 CONSTANT = [column.name for column in SCALARS if column.constant]
 ZOOMED = ("fov_deg", "intrinsics")  # but of a camera that zooms; geometry.py looks at each row's

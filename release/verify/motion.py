@@ -10,8 +10,8 @@ import numpy as np
 from cosfly.geometry import look_at, wrap_deg
 from cosfly.products.motion import ACTION, BODY_WAYPOINT, NUM_WAYPOINTS, WAYPOINT
 from cosfly.products.playback import EVENTS, HEADING_FRAMES, STANDS_M
+from release.flight_rows import FlightRows
 from release.verify.findings import Findings
-from release.verify.rows import FlightRows
 
 STEP_S = 1e-3  # frames are one time step apart; times are written with three digits at least
 # The inspection's limits for teleports: nothing in the data flies 25 m/s or walks 10 m/s.
@@ -20,17 +20,8 @@ UNTOLD_M = 6.0  # a shift that a public file does not tell: the paper's 3 m of t
 EXACT_M, EXACT_DEG, EXACT_PX = 1e-4, 1e-3, 1e-3  # sums and differences of what stands in two rows
 # Greatest shifts of tab:augmentation_params, in a cube (sampling: cubic) and with a step of the ground.
 DRONE_SHIFT_M, TURN_DEG = 3.0 * np.sqrt(3.0), 45.0
-SHARED = [
-    "pace",
-    "walk",
-    "split",
-    "width_px",
-    "height_px",
-    "weather",
-    "time_of_day",
-    "weather_params",
-    "look",
-]  # by twins
+# By twins.
+SHARED = ("pace", "walk", "split", "width_px", "height_px", "weather", "time_of_day", "weather_params", "look")
 
 
 def check_motion(flight: FlightRows, twin: FlightRows | None, settings: dict[str, Any], findings: Findings) -> None:

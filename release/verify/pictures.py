@@ -15,10 +15,10 @@ from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.space.reprojection import FLAT, View, median_of
 from release.columns import PICTURES
 from release.depth import depth_of
+from release.flight_rows import FlightRows
 from release.record import DepthCoding
 from release.verify.findings import Findings
 from release.verify.pixels import Survey, depths_of_person, rays_to_person, survey
-from release.verify.rows import FlightRows
 from release.verify.sources import Pictures
 
 SURFACE_M = PERSON_HALF_EXTENTS_M[2] + 0.3  # between the hip and the visible surface of a person along the optical axis

@@ -11,8 +11,7 @@ from cosfly.products.kinds import KINDS
 from cosfly.space.reprojection import COLUMNS, GRID_ROWS
 from cosfly.work.compiled import njit
 
-PERSON_ID = 65535  # the person in `instance.png`: docs/files.md
-SHARED_ID, NOBODY = 65534, 0  # ids that stand for several things, or for none
+SHARED_ID, NOBODY = 65534, 0  # ids of `instance.png` that stand for several things, or for none
 NUM_IDS = 65536
 PERSON, SKY = KINDS["Pedestrians"], KINDS["Sky"]
 NEAR_M = 0.3  # where rays begin: the renderers' near plane

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from cosfly.errors import InputError
 from cosfly.products.boxes import UNKNOWN_LICENCE
-from cosfly.products.frames import FILE_NAMES, INVALID_DEPTH_M, SKY_DEPTH_M
+from cosfly.products.frames import FILE_NAMES
 from cosfly.reading.files import read_bytes
 from cosfly.reading.tables import arrow_errors, open_table, read_row_group
 from cosfly.work.stage_folder import flattened
@@ -24,8 +24,8 @@ from release.card.croissant import CROISSANT, render_croissant
 from release.card.numbers import compute_numbers
 from release.card.render import render_card
 from release.columns import PICTURES, SCALAR_NAMES
-from release.depth import SKY_MM
-from release.record import DepthCoding, ReleaseRecord, content_digest, shard_path
+from release.depth import depth_record
+from release.record import DepthCoding, ReleaseRecord, content_digest, numbers_of_splits, shard_paths
 from release.rules import RULE, select_frames
 from release.verify.across import Summary, frames_digest
 from release.verify.findings import Findings
@@ -58,10 +58,9 @@ def _contract(record: ReleaseRecord) -> Iterator[Comparison]:
     yield "rule", "frame_selection", record.frame_selection, RULE
     yield "depth_coding", "depth", record.depth is not None, "depth" in record.settings.modalities
     if record.depth is not None:
-        is_png = record.depth.coding == "millimetre_png"
-        yield "depth_coding", "depth.unit", record.depth.unit, "millimetre" if is_png else "metre"
-        yield "depth_coding", "depth.sky", record.depth.sky, SKY_MM if is_png else SKY_DEPTH_M
-        yield "depth_coding", "depth.invalid", record.depth.invalid, INVALID_DEPTH_M
+        coded = depth_record(record.depth.coding, ())
+        for name in ("unit", "sky", "invalid"):
+            yield "depth_coding", f"depth.{name}", getattr(record.depth, name), getattr(coded, name)
 
 
 def _check_coding_error(depth: DepthCoding, findings: Findings) -> None:
@@ -105,11 +104,9 @@ def _shards(record: ReleaseRecord) -> Iterator[Comparison]:
     """Shards are named by the digest of their content and their number in their split."""
     digest = content_digest((shard.split, shard.sha256) for shard in record.shards)
     yield "digest", "content_digest", record.content_digest, digest
-    counts, numbers = Counter(shard.split for shard in record.shards), Counter[str]()
-    for shard in record.shards:
-        name = shard_path(shard.split, record.content_digest, numbers[shard.split], counts[shard.split])
+    names = shard_paths([shard.split for shard in record.shards], record.content_digest)
+    for shard, name in zip(record.shards, names, strict=True):
         yield "shard_name", shard.path, shard.path, name
-        numbers[shard.split] += 1
     yield "sum", "numbers.frames", record.numbers.frames, sum(shard.rows for shard in record.shards)
     yield "sum", "numbers.frames", record.numbers.frames, sum(flight.frames for flight in record.flights)
     yield "sum", "numbers.flights", record.numbers.flights, len(record.flights)
@@ -117,21 +114,15 @@ def _shards(record: ReleaseRecord) -> Iterator[Comparison]:
 
 def _splits(record: ReleaseRecord) -> Iterator[Comparison]:
     """Each split's numbers are those of the flights and shards that the record lists."""
-    for name in sorted({*record.splits.splits, *(flight.split for flight in record.flights)}):
-        told, flights = record.splits.splits.get(name), [flight for flight in record.flights if flight.split == name]
-        if told is None:
-            yield "split", f"splits.{name}", "nothing", f"numbers of {len(flights)} flights"
-            continue
-        towns = {flight.flight.split("/")[1] for flight in flights if flight.flight.count("/") == 3}
-        counted = {
-            "frames": sum(flight.frames for flight in flights), "flights": len(flights),
-            "trajectories": len({flight.flight.rpartition("/")[0] for flight in flights}),
-            "walks": sorted({flight.walk for flight in flights}), "towns": sorted(towns),
-        }  # fmt: skip
-        for key, value in counted.items():
-            own = getattr(told, key)
-            yield "split", f"splits.{name}.{key}", sorted(own) if isinstance(own, list) else own, value
-        yield "split", f"splits.{name}.frames", told.frames, sum(s.rows for s in record.shards if s.split == name)
+    told = record.splits.splits
+    counted = numbers_of_splits(record.flights, {name: own.captions for name, own in told.items()})
+    for name in sorted(told.keys() | counted.keys()):
+        one, other = (vars(numbers[name]) if name in numbers else {} for numbers in (told, counted))
+        for key in sorted(one.keys() | other.keys()):
+            got = one.get(key)
+            yield "split", f"splits.{name}.{key}", sorted(got) if isinstance(got, list) else got, other.get(key)
+        rows = sum(shard.rows for shard in record.shards if shard.split == name)
+        yield "split", f"splits.{name}.frames", one.get("frames", 0), rows
     total = sum(split.captions for split in record.splits.splits.values())
     yield "split", "splits: captions", total, record.numbers.captions.frames_with
 
@@ -164,11 +155,10 @@ def _check_teachers(record: ReleaseRecord, findings: Findings) -> None:
                 expected = f"no more than the provenance's teachers read: {dict(sorted(asked.items()))}"
                 where = f"release.json: numbers.captions.frames_by.{column}"
                 findings.error("provenance", where, f"{name}: {count}", expected)
-    runs = {source.run for source in told.sources}
     for flight in record.flights:
         run = flight.flight.split("/")[0]
-        if not any(run == own or run.startswith(f"{own}_") for own in runs):
-            expected = f"a run of the sources: {', '.join(sorted(runs))}"
+        if not any(source.has(run) for source in told.sources):
+            expected = f"a run of the sources: {', '.join(sorted(source.run for source in told.sources))}"
             findings.error("provenance", f"release.json: flights: {flight.flight}", run, expected)
             break
 

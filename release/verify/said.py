@@ -14,8 +14,8 @@ from cosfly.products.answer_text import MAX_CHARACTERS, MIN_CHARACTERS, MIN_CHAR
 from cosfly.products.captions import FIELDS, PICTURES_MARK, Coc
 from cosfly.products.sentences import sentences_of
 from release.columns import CAPTION, CAPTION_NAMES, LANGUAGES, PICTURE_PX, STATES, WINDOW
+from release.flight_rows import FlightRows, Row
 from release.verify.findings import Findings
-from release.verify.rows import FlightRows, Row
 
 NEVER_NULL = [column.name for column in CAPTION if column.required]
 SHARE = 1e-6  # of proved sentences: a quotient of counts

@@ -17,11 +17,11 @@ import numpy as np
 
 from cosfly.space.reprojection import Agreement, View, compare_views
 from cosfly.work.items import advance
+from release.flight_rows import FlightRows
 from release.record import DepthCoding, DepthCodingName
 from release.verify.findings import Findings
 from release.verify.pictures import check_picture, decode, ground_beside, least_step, view_of
 from release.verify.pixels import NUM_IDS, new_kinds
-from release.verify.rows import FlightRows
 from release.verify.sources import Pictures
 
 KEPT_GROUNDS = 200  # frames of a flight

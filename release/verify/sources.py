@@ -25,7 +25,7 @@ from cosfly.products.playback import Flight, read_flight
 from cosfly.reading.files import read_bytes
 from cosfly.reading.tables import open_table, read_row_group, row_batches
 from release.columns import PICTURES, PLACE, SCALAR_NAMES, SCALARS, Placement, flight_name, flight_spans
-from release.verify.rows import FlightRows, Row
+from release.flight_rows import FlightRows, Row
 
 BATCH_ROWS = 2  # whose pictures are in memory at once
 Pictures = dict[FrameFile, bytes | memoryview | None]

@@ -1,4 +1,4 @@
-"""The rows of one flight as arrays: what every check of rows stands on, whichever format they came from."""
+"""The rows of one flight as arrays, whichever format they came from: what checks of rows and exports stand on."""
 
 from __future__ import annotations
 
@@ -23,15 +23,14 @@ NEAR_M = 0.3  # the renderers' near plane
 LEAST_ZOOMED = 3  # rows whose camera is not that of most rows
 
 
+def vectors(rows: Sequence[Row], name: str, members: tuple[str, ...]) -> np.ndarray:
+    """Give a column of groups, (n, members) float64, NaN where null or incomplete."""
+    groups = (row.get(name) or {} for row in rows)
+    return np.array([[group.get(m) for m in members] for group in groups], dtype=np.float64).reshape(-1, len(members))
+
+
 def _vectors(name: str, members: tuple[str, ...]) -> cached_property[np.ndarray]:
-    """A column of groups, (n, members) float64, NaN where null or incomplete."""
-
-    def found(flight: FlightRows) -> np.ndarray:
-        groups = (group or {} for group in flight.column(name))
-        values = [[np.nan if group.get(m) is None else group[m] for m in members] for group in groups]
-        return np.array(values, dtype=np.float64).reshape(-1, len(members))
-
-    return cached_property(found)
+    return cached_property(lambda flight: vectors(flight.rows, name, members))
 
 
 @dataclass(frozen=True)
@@ -123,13 +122,6 @@ class FlightRows:
     @property
     def is_clean(self) -> bool:
         return self.rows[0].get("track") == "clean"
-
-    def steps(self) -> np.ndarray:
-        """Positions k of rows whose successor in the rows is the next frame of the flight."""
-        return np.flatnonzero(np.diff(self.index) == 1)
-
-    # --- for who reads captions
-    # -------------------------------------------------------------------------------------------
 
     @cached_property
     def flight(self) -> Flight:
