@@ -5,11 +5,11 @@ Wide on purpose: nobody said of which quantity or frame it is meant, so any of i
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator
 from itertools import combinations, pairwise
 
 from caption.truth.facts import Facts, wrapped
+from caption.truth.glossary import mentions
 from caption.truth.numerals import Numeral
 from caption.truth.references import QUANTITIES, Fact, Quantity, Reference, look_up, word_holds
 from caption.truth.sizes import about_share, both_ways
@@ -132,14 +132,13 @@ def bears_out_pole(pole: Pole, facts: Facts) -> bool:
     return True  # bends and centres: words that nothing here measures closely
 
 
-_OF_HEIGHT = re.compile(
-    r"altitude|height|climb|ascen|descen|sink|sank|sunk|爬升|攀升|上升|升高|拉高|下降|下沉|降落|掉高", re.IGNORECASE
-)
-
-
 def bears_out_own(pole: Pole, facts: Facts) -> bool:
     """Tell whether a word that names its quantity ("lost altitude") is true of just that."""
-    return pole.value in _TRENDS and bool(_OF_HEIGHT.search(pole.word)) and _has_trend(pole.value, ["altitude"], facts)
+    return (
+        pole.value in _TRENDS
+        and bool(mentions("of_height").search(pole.word))
+        and _has_trend(pole.value, ["altitude"], facts)
+    )
 
 
 def _holds_any(word: str, names: Iterable[str], facts: Facts, aspect: str = "") -> bool:

@@ -13,6 +13,7 @@ from itertools import pairwise
 
 from caption.truth.borne_out import bears_out_number, bears_out_own, bears_out_pole
 from caption.truth.facts import Facts
+from caption.truth.glossary import mentions
 from caption.truth.numerals import Numeral
 from caption.truth.poles import ACTION_WORDS, poles_of
 from caption.truth.references import QUANTITIES
@@ -22,12 +23,6 @@ from caption.truth.stated import Pole, Stated, lexicon_of, read_stated
 from cosfly.products.actions import kin_of
 from cosfly.products.captions import Claim, Language
 
-# Said of two quantities as well as of one that changes.
-COMPARATIVES = frozenset(
-    ("shorter", "longer", "larger", "bigger", "smaller", "higher", "lower", "wider", "taller",
-     "更高", "更大", "更长", "更宽", "更低", "更小", "更短")
-)  # fmt: skip
-
 # Words, negated or not, that say that the person is seen, and that not all is.
 _SEEN = {
     ("glimpsed", False), ("visible", False), ("full", False), ("partly", False), ("hidden", True), ("gone", True),
@@ -35,12 +30,6 @@ _SEEN = {
 }  # fmt: skip
 _UNSEEN = {("hidden", False), ("gone", False), ("visible", True), ("glimpsed", True)}
 _PARTLY = {("partly", False), ("hidden", False), ("visible", False), ("full", True)}
-
-
-# Words of one speed that changes, not of two.
-_OF_CHANGE = re.compile(
-    r"accelerat|slow(?:s|ed|ing)|brak|sp(?:eed|ed)|quicken|eas|加速|减速|提速|加快|放慢|放缓|减慢|变|越来越", re.I
-)
 
 
 _PAIRS = (
@@ -147,7 +136,7 @@ def _uncovered_poles(stated: Stated, said: Said, facts: Facts, language: Languag
             is_covered = bears_out_pole(pole, facts)
         elif pole.dimension == "pace" and pole.value != "matching":
             is_covered = _covers_pace(pole, said)
-        elif pole.dimension == "trend" and (pole.is_than or pole.word.lower() in COMPARATIVES):
+        elif pole.dimension == "trend" and (pole.is_than or mentions("comparatives").fullmatch(pole.word)):
             is_covered = pole.value in covers or (said.compares and not covers & {"increasing", "decreasing"})
         else:
             # Mostly what a side is told from.
@@ -187,7 +176,7 @@ def _is_led(pole: Pole, said: Said, facts: Facts) -> bool | None:
     changes = [c for c in claims if c.quantity.partition(":")[0] in ("change", "rate", "growth") and c.value]
     if changes and pole.value != "steady":
         return any(("trend", pole.value) in poles_of(claim) for claim in changes)
-    if pole.is_than or pole.word.startswith("比") or pole.word.lower() in COMPARATIVES:
+    if pole.is_than or pole.word.startswith("比") or mentions("comparatives").fullmatch(pole.word):
         return None
     verdicts = [_has_come(pole.value, claim, facts) for claim in claims]
     if True in verdicts:
@@ -224,7 +213,7 @@ def _covers_pace(pole: Pole, said: Said) -> bool:
     """Tell whether claims cover "faster" or "slower": said of the target, a comparison of drone and target is the other
     way round."""
     other = {"faster": "slower", "slower": "faster"}
-    if _OF_CHANGE.search(pole.word):
+    if mentions("of_change").search(pole.word):
         return ("paced", pole.value) in said.poles
     if pole.is_compared:
         return ("compared", pole.value if pole.about == "drone" else other[pole.value]) in said.poles

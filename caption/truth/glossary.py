@@ -155,6 +155,19 @@ def glossary_file() -> GlossaryFile:
     return build(GlossaryFile, read_yaml(GLOSSARY_FILE), GLOSSARY_FILE)
 
 
+def listed(name: str, language: Language) -> str:
+    """Give the words of a list as one pattern, whole words in English."""
+    options = "|".join(glossary_file().lists[name][language])
+    return rf"\b(?:{options})\b" if language == "en" else f"(?:{options})"
+
+
+@cache
+def mentions(name: str, language: Language | None = None) -> re.Pattern[str]:
+    """Give what finds a word of a list; without a language one of either, also within other words."""
+    both = (words for one in LANGUAGES for words in glossary_file().lists[name][one])
+    return re.compile("|".join(both) if language is None else listed(name, language), re.I)
+
+
 @cache
 def written_units(language: Language) -> dict[str, Unit]:
     """Give every spelling of a unit in running text, foreign ones too."""

@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from functools import cache
 
 from caption.schema import Judged
 from caption.truth.borne_out import bears_out_number
 from caption.truth.facts import Facts
+from caption.truth.glossary import listed, mentions
 from caption.truth.numerals import Numeral
 from caption.truth.stated import Pole, Stated, read_stated, subject_before
 from cosfly.products.captions import Coc, Language
@@ -22,36 +24,18 @@ from cosfly.products.sentences import sentences_of
 LONGEST = 500  # characters of a sentence that is read; a model that repeats itself ends none
 SHOWN = 120  # characters of a sentence in a problem
 MEASURED = ("m", "mps", "deg", "dps", "px")
-# What a rule, a plan or another text says need not be of this window.
-_OTHER = {
-    "en": re.compile(
-        r"\b(?:article|section|paragraph|clause|rule|manual|regulation|handbook|guideline|limit|minimum|maximum"
-        r"|threshold|margin|if|would|could|"
-        r"should|will|must|may|might|within|than the \w+ limit|allow\w*|target of|goal|safe\w*|future|next)\b",
-        re.I,
-    ),
-    "zh": re.compile(
-        r"《|§|第\s?\d*条|规定|手册|限制|阈值|如果|若|假如|将|应|会|可以|宜|需|最好|下一|安全|目标值|预计"
-    ),
-}
 _RISES = {"increasing": 1, "decreasing": -1}
 _ENDS = {"en": re.compile(r"\bfrom\b[^,;.]{0,24}$", re.I), "zh": re.compile(r"[从由自][^，；。]{0,12}$")}
 _TO = {
     "en": re.compile(r"[^,;]{0,12}\b(?:to|down to|up to)\b[^,;\d]{0,16}", re.I),
     "zh": re.compile(r"[^，；\d]{0,10}[到至为][^，；\d]{0,6}"),
 }
-_TURN = {
-    "en": r"\b(?:yaw\w*|turn\w*|rotat\w+|swing\w*|pan\w*|circl\w+|orbit\w*|straf\w+|sidestep\w*)",
-    "zh": "(?:偏航|转|环绕|绕|盘旋|平移|横移|侧移)",
-}
-_ASKED = {
-    "en": re.compile(
-        rf"\b(?:should|must|needs? to|ought to|has to|best (?:move|choice|action|response|option)|therefore"
-        rf"|hence)\b[^.;]{{0,40}}?{_TURN['en']}",
-        re.I,
-    ),
-    "zh": re.compile(rf"(?:应|宜|需要|必须|因此|所以|最好)[^。；]{{0,16}}?{_TURN['zh']}"),
-}
+_ASKED_WITHIN: dict[Language, str] = {"en": r"[^.;]{0,40}?", "zh": r"[^。；]{0,16}?"}
+
+
+@cache
+def _asks(language: Language) -> re.Pattern[str]:
+    return re.compile(f"{listed('asked', language)}{_ASKED_WITHIN[language]}{listed('sideways', language)}", re.I)
 
 
 def judge_prose(coc: Coc, facts: Facts, language: Language) -> list[Judged]:
@@ -73,7 +57,7 @@ def check_prose(coc: Coc, facts: Facts, language: Language) -> list[str]:
 
 
 def _problems(stated: Stated, facts: Facts, language: Language, decision: str) -> Iterator[str]:
-    if not _OTHER[language].search(stated.text):
+    if not mentions("elsewhere", language).search(stated.text):
         if any(_is_of_nothing(numeral, facts) for numeral in stated.numerals):
             yield "number"
         if any(_runs_against(pole, stated, language) for pole in stated.poles):
@@ -127,5 +111,5 @@ def _plans_other_side(stated: Stated, language: Language, decision: str) -> bool
         and is_plain
         and len(sides) == 1
         and side not in sides
-        and bool(_ASKED[language].search(stated.text))
+        and bool(_asks(language).search(stated.text))
     )
