@@ -488,6 +488,24 @@ def test_a_run_of_towns_goes_on_from_its_own_run_yaml(towns):
     assert {path: path.stat().st_mtime_ns for path in towns.rglob("manifest.json")} == before
 
 
+@pytest.mark.slow
+def test_the_stages_one_by_one_make_a_town_as_the_run_does(towns, tmp_path):
+    made = [tmp_path / "maps/boxes_3d.json", tmp_path / "simplify/step2_simplified.json"]
+    made += [tmp_path / "pedestrians/path.json", tmp_path / "plan/drone_trace.json"]
+    inputs = ([], ["--map", made[0]], ["--map", made[1]], ["--map", made[1], "--paths", made[2]])
+    for product, needed in zip(made, inputs, strict=True):
+        command = [product.parent.name, *needed, "--config", towns / "run.yaml", "--town", "one"]
+        done = CliRunner().invoke(app, [*map(str, command), "--out", str(product.parent)])
+        assert done.exit_code == 0
+        assert "--town" not in done.output
+        assert product.read_bytes() == (towns / "one" / product.relative_to(tmp_path)).read_bytes()
+    nobody = ["maps", "--config", str(towns / "run.yaml"), "--out", str(tmp_path / "none")]
+    told = " ".join(CliRunner().invoke(app, nobody).output.split())
+    assert "the settings and the seed of none. As `cosfly run` makes one: --town, of one, two" in told
+    with pytest.raises(ConfigError, match=r"no such town .did you mean 'one'.*--town; got oen; expected one, two"):
+        CliRunner().invoke(app, [*nobody, "--town", "oen"], catch_exceptions=False)
+
+
 def test_a_town_that_cannot_be_is_refused():
     for given, words in (
         ("towns={release: {}}", "cannot be called 'release'"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from inspect import Parameter, Signature, signature
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
     from cosfly.app.settings import RunConfig
     from cosfly.work.stage_folder import Resume, Tally
+
+log = logging.getLogger(__name__)
 
 Out = Annotated[Path, Option(help="Output folder.")]
 Map = Annotated[Path, Option("--map", help="Boxes: boxes_3d.json or step2_simplified.json.")]
@@ -58,6 +61,11 @@ SHARED: dict[str, tuple[Any, Any, Any]] = {  # name -> type, option and default,
         Option("--set", "-s", metavar="A.B=C", help="Override a setting; repeat it."),
         None,
     ),
+    "town": (
+        str | None,
+        Option(help="A town of the configuration: its settings and seed."),
+        None,
+    ),
     "seed": (int | None, Option(help="Seed; every random choice derives from it."), None),
     "workers": (int | None, Option(help="Worker processes; 0 takes one per core."), None),
     "verify": (bool, Option("--verify", help=VERIFY_HELP), False),
@@ -65,7 +73,7 @@ SHARED: dict[str, tuple[Any, Any, Any]] = {  # name -> type, option and default,
     "repair": (bool, Option("--repair", help=REPAIR_HELP), False),
 }
 SET_BY = {"flights": Sets("match"), "tracks": Sets("tracks", TRACKS), "seed": Sets("seed"), "workers": Sets("workers")}
-STAGE = ("seed", "workers", "verify", "resume", "repair")  # of a stage that does items by workers
+STAGE = ("town", "seed", "workers", "verify", "resume", "repair")  # of a stage that does items by workers
 
 
 @dataclass(frozen=True)
@@ -162,7 +170,8 @@ def takes(*names: str, flights: str | None = None) -> Callable[[Callable[..., No
             chosen = {name: one for name, one in sets.items() if given[name] not in (None, [])}
             extra = {one.path: one.value_of(given[name]) for name, one in chosen.items()}
             manner = {name: given[name] for name in ("resume", "verify", "repair") if name in given}
-            job = Job(resolve(given["config"], given.get("overrides"), extra), **manner)
+            cfg = resolve(given["config"], given.get("overrides"), extra)
+            job = Job(_town_of(cfg, given["town"]) if "town" in given else cfg, **manner)
             function(job, **{name: _opened(job.cfg, given[name]) for name in taken})
 
         parameters = [
@@ -211,6 +220,20 @@ def resolve(config: Path | None, overrides: list[str] | None, given: Mapping[str
     # As YAML, which JSON is: a colon in a text is only a colon.
     extra = [f"{name}={dump_json(str(value) if isinstance(value, Path) else value)}" for name, value in given.items()]
     return load(RunConfig, _config_path(config), [*(overrides or []), *extra])
+
+
+def _town_of(cfg: RunConfig, name: str | None) -> RunConfig:
+    """Give the settings of a town; where none is named, what towns have in common, which is none of them."""
+    names = ", ".join(cfg.towns)
+    if name is None:
+        if cfg.towns:
+            what = "%s has towns; these are the settings and the seed of none. As `cosfly run` makes one: --town, of %s"
+            log.warning(what, cfg.name, names)
+        return cfg
+    if name not in cfg.towns:
+        what, expected = f"there is no such town{nearest(name, cfg.towns)}", names or "a configuration with towns"
+        raise ConfigError(what, where="--town", got=name, expected=expected)
+    return cfg.of_town(name)
 
 
 def _config_path(config: Path | None) -> Path | None:

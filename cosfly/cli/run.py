@@ -10,7 +10,7 @@ import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import STAGE, Job, takes
+from cosfly.cli.options import Job, takes
 
 if TYPE_CHECKING:
     from cosfly.app.pipeline import StageResult
@@ -23,7 +23,7 @@ PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)}
 
 
 @app.command()
-@takes(*STAGE)
+@takes("seed", "workers", "verify", "resume", "repair")
 def run(
     job: Job,
     config: Annotated[Path, Argument(help=CONFIG)],

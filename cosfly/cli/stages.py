@@ -18,7 +18,7 @@ Traces = Annotated[Path, Option(help="Flights: drone_trace.json.")]
 
 
 @app.command()
-@takes("seed", "resume")
+@takes("town", "seed", "resume")
 def maps(
     job: Job,
     out: options.Out,
@@ -32,7 +32,7 @@ def maps(
 
 
 @app.command()
-@takes("verify", "resume")
+@takes("town", "verify", "resume")
 def simplify(job: Job, map_: options.Map, out: options.Out) -> None:
     """Step 2: merge, crop and prune boxes_3d.json into step2_simplified.json."""
     from cosfly.simplify import stage
@@ -182,7 +182,7 @@ app.add_typer(inspect_app, name="inspect")
 
 
 @inspect_app.callback()
-@takes("workers", "verify", "resume", "repair", flights="inspect.flights")
+@takes("town", "workers", "verify", "resume", "repair", flights="inspect.flights")
 def inspect(
     job: Job,
     out: options.Out,
