@@ -2,13 +2,15 @@
 
 import os
 import signal
+from collections import Counter
+from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cosfly.errors import EnvironmentMissing, InputError, StorageError
-from cosfly.work.chance import draw_by_share, draws_for, rng_for
+from cosfly.work.chance import BLOCK, draw_by_share, draw_to_quota, draws_for, rng_for
 from cosfly.work.config import Config
 from cosfly.work.runner import Item, Outcome, run_items
 from cosfly.work.stage_folder import StageFolder
@@ -134,6 +136,20 @@ def test_names_are_drawn_by_their_shares():
         draw_by_share(shares, np.random.default_rng(k)) for k in range(20)
     ]
     assert draw_by_share({"a": 0.0, "b": 1.0, "c": 0.0}, rng) == "b"
+
+
+def test_what_is_drawn_to_a_quota_has_its_share_of_any_number():
+    shares = {"a": 5.0, "b": 3.0, "c": 1.0, "d": 1.0, "e": 0.0}
+    for seed in range(30):
+        drawn = list(islice(draw_to_quota(shares, np.random.default_rng(seed)), 200))
+        for num in range(1, 201):
+            counts = Counter(drawn[:num])
+            off = max(abs(counts[name] - num * share / 10) for name, share in shares.items())
+            assert off < (3.5 if num % BLOCK else 2.5)
+        assert drawn[:50] == list(islice(draw_to_quota(shares, np.random.default_rng(seed)), 50))
+    assert len(set(pairwise(drawn))) > 10  # in random order
+    with pytest.raises(ValueError, match="something positive"):
+        next(draw_to_quota({"a": 0.0}, np.random.default_rng(0)))
 
 
 @pytest.mark.parametrize("shares", [{}, {"a": 0.0}, {"a": 2.0, "b": -1.0}], ids=["none", "zero", "negative"])

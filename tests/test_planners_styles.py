@@ -1,5 +1,6 @@
 """Styles: what the table says is what is drawn, flown by every planner, and seen in the labels."""
 
+import re
 from collections import Counter
 from dataclasses import replace
 
@@ -9,20 +10,28 @@ from specimens_planning import CANYON, WORLDS, assert_safe, town_of, walk_along
 
 from caption.schema import FutureMotion, LabelConfig
 from caption.truth.actions import label_of, measure
+from cosfly.app.settings import RunConfig
 from cosfly.errors import InputError, NoPathError
 from cosfly.geometry import look_at, wrap_deg
+from cosfly.maps.stage import load_map
+from cosfly.pedestrians.stage import make_walk
+from cosfly.pedestrians.walkable import walkable_ground
 from cosfly.planners.contract import PLANNERS, PlanConfig
 from cosfly.planners.courses import wish_of
-from cosfly.planners.intent import draw_intent
+from cosfly.planners.intent import draw_intent, draw_styles
 from cosfly.planners.reacquire import finds_again, screens_of
-from cosfly.planners.stage import make_scenario, plan_flight, run, style_rng
-from cosfly.planners.styles import ALTITUDE_LEAST_M, FOLLOW, HIDING, NAMES, REACQUIRE, RETURN_HOME, TABLE
+from cosfly.planners.stage import draw_styles_of, make_scenario, plan_flight, run, style_rng
+from cosfly.planners.styles import ALTITUDE_LEAST_M, FOLLOW, HIDING, NAMES, OTHER_SIDE, REACQUIRE, RETURN_HOME, TABLE
+from cosfly.products.actions import actions_in_use
 from cosfly.products.boxes import MapHeader, make_box_map, write_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.products.segments import Mission, read_mission, read_segments
 from cosfly.products.traces import DroneTrace, read_traces
-from cosfly.products.walks import write_paths
+from cosfly.products.walks import walk_id, write_paths
+from cosfly.simplify.passes import simplify
 from cosfly.space import kernels
+from cosfly.work.chance import rng_for
+from cosfly.work.config import load, shipped
 from cosfly.work.stage_folder import read_manifest
 
 OPEN = kernels.obstacle_index(town_of())
@@ -46,6 +55,7 @@ def labels_of(trace):
         future = FutureMotion(
             tuple(range(now + 1, now + 6)), trace.time_s[span], trace.positions_m[span], trace.rotations_deg[span, 1],
             trace.targets_m[span], visible[span], float(np.linalg.norm(before)) / 0.5,
+            order=None if trace.mission is None else trace.mission.order_at(now),
         )  # fmt: skip
         found.append(label_of(measure(future), LabelConfig()))
     return Counter(found)
@@ -140,7 +150,7 @@ def test_the_limits_hold_all_the_way_on_ten_seeds(planner):
 
 def test_the_default_is_the_papers_flight_and_draws_nothing():
     scenario = make_scenario(STRAIGHT, OPEN, PlanConfig())
-    intent = draw_intent(scenario, OPEN, OPEN, PlanConfig(), style_rng(STRAIGHT, 0))
+    intent = draw_intent([FOLLOW], scenario, OPEN, OPEN, PlanConfig(), style_rng(STRAIGHT, 0))
     assert intent.wish is scenario.wish
     assert (intent.segments, intent.mission, intent.impossible) == ((), None, None)
 
@@ -167,14 +177,27 @@ def test_parts_draw_their_styles_and_cover_the_flight():
 def test_the_order_of_the_shares_draws_nothing_else():
     """Settings that say the same are equal, so a run begun with one order may go on with another."""
     shares = {"top": 1.0, "side": 2.0, "follow": 1.0, "rise": 1.0}
-    turned = dict(reversed(shares.items()))
-    scenario = make_scenario(STRAIGHT, OPEN, PlanConfig())
     for seed in range(6):
         one, other = (
-            draw_intent(scenario, OPEN, OPEN, PlanConfig(styles=styles, segment_s=10), np.random.default_rng(seed))
-            for styles in (shares, turned)
+            draw_styles([180], 0.5, PlanConfig(styles=styles, segment_s=10), np.random.default_rng(seed))
+            for styles in (shares, dict(reversed(shares.items())))
         )
-        assert one.styles == other.styles
+        assert one == other
+
+
+def test_styles_are_drawn_to_their_shares_whatever_the_seed():
+    """Also both sides of a style of either; a flight's do not depend on those after it."""
+    shares = {"top": 1.0, "side": 2.0, "rise": 1.0, "reacquire": 1.0, "return_home": 1.0}
+    cfg, lengths = PlanConfig(styles=shares, segment_s=40), [240, 80, 90, 160] * 15
+    for seed in range(10):
+        drawn = draw_styles(lengths, 0.5, cfg, np.random.default_rng(seed))
+        assert drawn[:20] == draw_styles(lengths[:20], 0.5, cfg, np.random.default_rng(seed))
+        whole = Counter(names[-1] for names in drawn)
+        assert abs(whole[REACQUIRE] - 10) <= 2
+        assert abs(whole[RETURN_HOME] - 10) <= 2
+        parts = Counter(name for names in drawn for name in names if name not in (REACQUIRE, RETURN_HOME))
+        for name in ("top", "side", OTHER_SIDE + "side", "rise"):
+            assert abs(parts[name] - parts.total() / 4) <= 2.5
 
 
 def test_walks_of_two_maps_with_one_id_draw_apart():
@@ -205,6 +228,101 @@ def test_the_manifest_counts_styles_and_what_was_not_held(tmp_path):
     product = run(cfg, tmp_path / "map.json", tmp_path / "path.json", tmp_path / "plan")
     assert read_manifest(tmp_path / "plan").model_dump()["styles"] == {"top": 2}
     assert [part.style for trace in read_traces(product) for part in trace.segments] == ["top", "top"]
+
+
+def test_what_was_asked_what_was_flown_and_what_was_in_the_way_is_said(tmp_path, caplog):
+    towers = [((x, side * 13, 40), (12, 8, 40)) for x in range(-40, 140, 25) for side in (-1, 1)]
+    write_boxes(tmp_path / "map.json", town_of(*towers))
+    write_paths(tmp_path / "path.json", [STRAIGHT], {})
+    cfg = styled("orbit_left", planner="muco", styles_fallback="follow", five_ray_mean_min=0)
+    product = run(cfg, tmp_path / "map.json", tmp_path / "path.json", tmp_path / "plan")
+    (trace,) = read_traces(product)
+    assert trace.instead_of == "orbit_left: style_not_held"
+    asked = r"orbit_left, \d+% of frames 0 to \d+: asked \d+ m up, \d+ m away, at -?\d+ deg; "
+    words = asked + r"flown \d+ m up, .* because .*\d+% nearer"
+    assert re.match(words, trace.not_held)
+    assert read_manifest(tmp_path / "plan").model_dump()["styles_not_held"] == {"straight": trace.not_held}
+    assert trace.not_held in caplog.text
+
+
+# --- ranges -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [name for name in TABLE if name not in ("rise", "sink", "approach", "retreat")])
+def test_a_style_is_flown_at_the_height_and_distance_that_are_asked(name):
+    asked = {name: {"altitude_m": (12.0, 12.5), "ground_distance_m": (18.0, 18.5)}}
+    for planner in ("foresight", "muco"):
+        trace = plan_flight(STRAIGHT, OPEN, styled(name, planner=planner, style_ranges=asked), 0)
+        assert trace.drop_reason is None
+        away = trace.positions_m - trace.targets_m
+        assert 11.0 < np.median(away[:, 2]) + 0.9 < 13.5
+        apart_m = np.hypot(away[:, 0], away[:, 1])
+        assert 15.0 < (np.median(apart_m) if TABLE[name].hop_s is None else apart_m.min()) < 21.0  # of a halt the least
+
+
+def test_azimuths_ends_and_places_below_the_usual_bound_are_flown():
+    asked = {"side": {"altitude_m": (5.0, 5.0), "bearing_deg": (40.0, 40.0)}, "rise": {"altitude_end_m": (20.0, 20.0)}}
+    side, rise = (plan_flight(STRAIGHT, OPEN, styled(name, style_ranges=asked), 0) for name in asked)
+    away = (side.positions_m - side.targets_m)[20:-20]
+    assert abs(np.median(np.abs(np.degrees(np.arctan2(away[:, 1], away[:, 0])))) - 40) < 8
+    assert abs(np.median(away[:, 2]) + 0.9 - 5) < 1
+    assert abs(rise.positions_m[-1, 2] - 20) < 1.5
+
+
+def test_what_cannot_be_honoured_together_is_said():
+    for given, words in (
+        ({"styles": {"rise": 1}, "altitude_max_m": 40}, "style_ranges.rise goes up to 55 m, above altitude_max_m"),
+        ({"styles": {"orbit_left": 1}, "speed_max_mps": 5}, "style_ranges.orbit_left.round_mps is up to 6"),
+        ({"style_ranges": {"side": {"altitude_m": (18, 12)}}}, "18 before 12"),
+        ({"style_ranges": {"side": {"altitude_m": (0, 12)}}}, "greater than 0"),
+        ({"style_ranges": {"side": {"hop_s": (3, 4)}}}, "hop_s"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            PlanConfig(**given)
+    assert PlanConfig(altitude_max_m=40).remarks() == []
+    (remark,) = PlanConfig(styles={"side": 1, "follow": 1}, behind_distance_m=18).remarks()
+    assert remark.startswith("plan.behind_distance_m = 18 holds for the style follow alone")
+    assert PlanConfig(behind_distance_m=18).remarks() == []
+
+
+def test_ranges_bind_a_run_where_its_styles_have_them():
+    assert "style_ranges" not in PlanConfig().recorded()
+    assert list(styled("side").recorded()["style_ranges"]) == ["side"]
+
+
+# --- the shipped towns ------------------------------------------------------------------------------------------------
+
+ORDERS, DECISIONS_LEAST, STYLE_MOST = {"break_off", "return_to_home"}, 0.02, 0.45
+
+
+def flights_of(cfg):
+    """The kept flights of all towns of a configuration, planned from their maps and walks."""
+    for name in cfg.towns:
+        town = cfg.of_town(name)
+        box_map = simplify(load_map(town.maps, seed=town.seed), town.simplify).box_map
+        ground, ids = walkable_ground(box_map, town.pedestrians), map(walk_id, range(town.pedestrians.num_paths))
+        walks = [make_walk(id_, ground, town.pedestrians, rng_for(town.seed, "pedestrians", id_)).walk for id_ in ids]
+        obstacles, screens = kernels.obstacle_index(box_map), screens_of(box_map)
+        for walk, styles in zip(walks, draw_styles_of(walks, town.plan, town.seed), strict=True):
+            yield plan_flight(walk, obstacles, town.plan, town.seed, screens, styles)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(10))
+def test_diverse_shows_each_decision_and_all_heights_and_distances_whatever_the_seed(seed):
+    flights = flights_of(load(RunConfig, shipped("diverse.yaml"), [f"seed={seed}"]))
+    kept = [trace for trace in flights if trace.drop_reason is None]
+    assert len(kept) >= 78
+    labels = sum(map(labels_of, kept), Counter())
+    for name in actions_in_use().actions.keys() - ORDERS:
+        assert labels[name] >= DECISIONS_LEAST * labels.total(), (name, labels)
+    for over, low_m, high_m in ((2, 10, 50), (3, 12, 50)):
+        away = np.concatenate([trace.positions_m - trace.targets_m for trace in kept])
+        found_m = away[:, 2] + 0.9 if over == 2 else np.linalg.norm(away, axis=1)
+        assert np.percentile(found_m, 5) <= low_m
+        assert np.percentile(found_m, 95) >= high_m
+    styles = Counter(part.style for trace in kept for part in trace.segments for _ in range(part.begin, part.end))
+    assert max(styles.values()) <= STYLE_MOST * sum(len(trace.time_s) for trace in kept)
 
 
 # --- searching --------------------------------------------------------------------------------------------------------

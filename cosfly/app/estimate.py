@@ -275,7 +275,7 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
         lines.append(f"figures of {', '.join(names)}: {basis}")
     needed, free = sum(row.bytes for row in rows), free_bytes(out)
     lines.append(f"in all about {time_left(rows)}; {in_words(needed)} of disk, {in_words(free)} are free")
-    lines += darkness(cfg)
+    lines += caveats(cfg)
     if any(row.tokens is None for row in rows):
         lines.append(f"tokens are {UNKNOWN_TOKENS}")
     if more := more_walks(cfg, out):
@@ -292,9 +292,11 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
     return lines
 
 
-def darkness(cfg: RunConfig) -> list[str]:
-    """Say which flights nobody will see anything on; maps are read where a flight is by night."""
-    lines = []
+def caveats(cfg: RunConfig) -> list[str]:
+    """Say which settings hold for some flights alone, and which flights nobody will see anything on; maps are read
+    where a flight is by night.
+    """
+    lines = cfg.plan.remarks()
     for name, town in ({name: cfg.of_town(name) for name in cfg.towns} or {cfg.name: cfg}).items():
         num = town.pedestrians.num_paths
         if dark := dark_flights(town.render, num, partial(load_map, town.maps, seed=town.seed)):

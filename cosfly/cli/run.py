@@ -202,7 +202,7 @@ def config_check(job: Job, config: Annotated[Path, Argument(help="YAML file, or 
     from cosfly.app import estimate, pipeline
 
     pipeline.check_with_files(job.cfg)
-    for line in estimate.darkness(job.cfg):
+    for line in estimate.caveats(job.cfg):
         typer.echo(line)
     typer.echo(f"{config}: ok")
 

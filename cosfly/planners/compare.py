@@ -22,7 +22,7 @@ from cosfly.errors import InputError, NoPathError
 from cosfly.look.topview import INK, PAPER, add_caption, draw_area, draw_dot, draw_line, draw_text, png_bytes
 from cosfly.planners.contract import PLANNERS, PlanConfig, known_planner, title_of
 from cosfly.planners.overview import draw_walks
-from cosfly.planners.stage import check_ids, plan_flight, warm_up
+from cosfly.planners.stage import check_ids, draw_styles_of, plan_flight, warm_up
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import Walk, read_paths
@@ -198,13 +198,13 @@ def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int) -> Work:
         warm_up(planner)
 
     def work(item: Item) -> Outcome:
-        flights: dict[str, dict] = {}
+        (walk, styles), flights = item.payload, dict[str, dict]()
         errors: dict[str, NoPathError] = {}
         times_ms: dict[str, float] = {}
         for name, planner in settings.items():
             begin_s = time.perf_counter()
             try:
-                flights[name] = plan_flight(item.payload, obstacles, planner, seed, screens).as_json()
+                flights[name] = plan_flight(walk, obstacles, planner, seed, screens, styles).as_json()
             except NoPathError as error:
                 errors[name] = error
             times_ms[name] = round(1000.0 * (time.perf_counter() - begin_s), 2)
@@ -245,7 +245,7 @@ def run(
         return product
     box_map, walks = read_boxes(simplified_map), read_paths(paths)
     check_ids(walks, paths)
-    items = [Item(walk.path_id, walk) for walk in walks]
+    items = [Item(w.path_id, (w, styles)) for w, styles in zip(walks, draw_styles_of(walks, cfg, seed), strict=True)]
     finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers, watch=watch)
     shared = finished.kept
     if not shared:

@@ -13,15 +13,15 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from cosfly.errors import NoPathError, nearest
 from cosfly.geometry import DT_S
-from cosfly.planners.styles import NAMES
+from cosfly.planners.styles import ALTITUDE_LEAST_M, NAMES, OTHER_SIDE, ROWS, Style, StyleRanges
 from cosfly.products.segments import FOLLOW
 from cosfly.space.flight_metrics import (
     ACCEL_RMS_MAX_MPS2,
@@ -144,11 +144,14 @@ class PlanConfig(Config):
     planner: str = Field("foresight", description="which planner flies: foresight, muco or track_astar")
     safety_distance_m: float = Field(SAFETY_DISTANCE_M, gt=0, description="nominal distance to obstacles, m")
     relaxed_safety_m: float = Field(RELAXED_SAFETY_M, gt=0, description="distance kept where the nominal one cannot, m")
-    altitude_min_m: float = Field(20.0, gt=0, description="least altitude, m")
-    altitude_preferred_m: float = Field(20.0, gt=0, description="preferred altitude, m")
+    altitude_min_m: float = Field(20.0, gt=0, description="least altitude of the style follow, m")
+    altitude_preferred_m: float = Field(20.0, gt=0, description="preferred altitude of the style follow, m")
     altitude_max_m: float = Field(100.0, gt=0, description="greatest altitude, m")
     behind_distance_m: float = Field(
-        20.0, gt=0, description="horizontal distance to the target, m: for foresight all along, for others at the start"
+        20.0,
+        gt=0,
+        description="horizontal distance to the target of the style follow, m: for foresight all along, for others at "
+        "the start",
     )
     speed_max_mps: float = Field(10.0, gt=0, description="greatest speed between two waypoints, m/s")
     accel_max_mps2: float = Field(
@@ -168,6 +171,10 @@ class PlanConfig(Config):
         {FOLLOW: 1.0},
         description="shares of the styles that flights are drawn from, by name; they need not add up to one",
         examples=[*NAMES],
+    )
+    style_ranges: StyleRanges = Field(
+        default_factory=StyleRanges,
+        description="where each style but follow stands to the walker: drawn evenly from a range for each part",
     )
     segment_s: float = Field(
         0.0, ge=0, description="length of the parts of a flight that draw a style each, about, s; 0: one style a flight"
@@ -199,9 +206,47 @@ class PlanConfig(Config):
             wrong.append("relaxed_safety_m may not exceed safety_distance_m")
         if not self.altitude_min_m <= self.altitude_preferred_m <= self.altitude_max_m:
             wrong.append("altitude_min_m, altitude_preferred_m and altitude_max_m must be in ascending order")
+        for name, row in self._rows().items():
+            highest_m = max(row.altitude_m[1], (row.altitude_end_m or row.altitude_m)[1])
+            if highest_m > self.altitude_max_m:
+                wrong.append(f"style_ranges.{name} goes up to {highest_m:g} m, above altitude_max_m")
+            if (fastest_mps := max(map(abs, row.round_mps))) >= self.speed_max_mps:
+                wrong.append(f"style_ranges.{name}.round_mps is up to {fastest_mps:g}, no less than speed_max_mps")
         if wrong:
             raise ValueError("; ".join(wrong))
         return self
+
+    def style(self, name: str) -> Style:
+        """Give a row of the table of styles with the ranges of the settings."""
+        plain = name.removeprefix(OTHER_SIDE)
+        row = replace(ROWS[plain], **getattr(self.style_ranges, plain).model_dump())
+        if name.startswith(OTHER_SIDE) and row.bearing_deg is not None:
+            row = replace(row, bearing_deg=(-row.bearing_deg[1], -row.bearing_deg[0]))
+        return row
+
+    def _rows(self) -> dict[str, Style]:
+        return {name: self.style(name) for name, share in self.styles.items() if share > 0 and name in ROWS}
+
+    @property
+    def styles_floor_m(self) -> float:
+        """Least altitude of a flight of other styles than follow."""
+        lows = [min(row.altitude_m[0], (row.altitude_end_m or row.altitude_m)[0]) for row in self._rows().values()]
+        return min(ALTITUDE_LEAST_M, self.altitude_min_m, *lows)
+
+    def remarks(self) -> list[str]:
+        """Say which settings of heights and distances hold for a part of the flights alone."""
+        fields = ("altitude_min_m", "altitude_preferred_m", "behind_distance_m") if self._rows() else ()
+        return [
+            f"plan.{field} = {getattr(self, field):g} holds for the style follow alone; for others plan.style_ranges"
+            for field in fields
+            if getattr(self, field) != type(self).model_fields[field].default
+        ]
+
+    def recorded(self) -> dict[str, Any]:
+        """Ranges of styles that nobody flies make no difference."""
+        settings = super().recorded()
+        ranges = {name: ends for name, ends in settings.pop("style_ranges").items() if name in self._rows()}
+        return settings | ({"style_ranges": ranges} if ranges else {})
 
 
 # --- a planner --------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from cosfly.geometry import DT_S
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
-from cosfly.planners.styles import ALTITUDE_LEAST_M, TABLE, Range, Style
+from cosfly.planners.styles import Range, Style
 from cosfly.products.segments import FOLLOW
 
 if TYPE_CHECKING:
@@ -46,8 +46,8 @@ def wish_of(
             course[part] = np.column_stack([azimuth, paper.ground_distance_m[part], paper.altitude_m[part]])
             continue
         before = float(course[begin - 1, 0]) if begin else None
-        course[part] = _best_course(TABLE[name], part, before, scenario, obstacles, cfg, rng)
-        paces_mps[part] = rng.uniform(*TABLE[name].pace_mps)
+        course[part] = _best_course(cfg.style(name), part, before, scenario, obstacles, cfg, rng)
+        paces_mps[part] = rng.uniform(*cfg.style(name).pace_mps)
     return without_jumps(course, scenario, cfg, paces_mps)
 
 
@@ -71,7 +71,7 @@ def without_jumps(
         ground_distance_m=apart_m,
         pitch_rad=np.arctan2(over_hips_m, apart_m),
         altitude_m=altitude_m,
-        altitude_min_m=np.full(num, min(ALTITUDE_LEAST_M, cfg.altitude_min_m)),
+        altitude_min_m=np.full(num, cfg.styles_floor_m),
         any_bearing=False,
     )
 
@@ -116,7 +116,7 @@ def _course(
     if style.bearing_deg is None:
         bearing = rng.uniform(-np.pi, np.pi) if before is None else before - heading_rad[0]
     else:
-        bearing = np.radians(rng.uniform(*style.bearing_deg)) * (-1 if style.either_side and rng.random() < 0.5 else 1)
+        bearing = np.radians(rng.uniform(*style.bearing_deg))
     if style.hop_s is None:
         azimuth = _steady(heading_rad) + bearing + rng.uniform(*style.round_mps) * seconds / apart_m
         return np.column_stack([azimuth, apart_m, altitude_m])

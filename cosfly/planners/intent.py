@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,9 +14,9 @@ from cosfly.geometry import look_at
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
 from cosfly.planners.courses import ROUNDING_S, wish_of
 from cosfly.planners.reacquire import finds_again, wish_of_reacquire
-from cosfly.planners.styles import ALTITUDE_LEAST_M, REACQUIRE, RETURN_HOME, WHOLE
+from cosfly.planners.styles import OTHER_SIDE, REACQUIRE, RETURN_HOME, ROWS, WHOLE
 from cosfly.products.segments import FOLLOW, MISSION_KINDS, Mission, Segment
-from cosfly.work.chance import draw_by_share
+from cosfly.work.chance import draw_to_quota
 
 if TYPE_CHECKING:
     from cosfly.space.kernels import BoxIndex
@@ -50,36 +52,64 @@ class Intent:
         return any(part.style == REACQUIRE for part in self.segments)
 
 
+def draw_styles(lengths: Sequence[int], dt_s: float, cfg: PlanConfig, rng: np.random.Generator) -> list[list[str]]:
+    """Draw the styles of the parts of each flight of a run to the quota of the settings' shares.
+
+    Flights draw among themselves which takes a style that is of a whole flight, parts which styles they have.
+
+    Args:
+        lengths: points of each flight. Those of a flight do not depend on the flights after it.
+    """
+    others = {style: share for style, share in cfg.styles.items() if style not in WHOLE}
+    parts_share = sum(others.values())
+    if parts_share == 0:
+        others = {FOLLOW: 1.0}  # what comes before a flight home
+    for style, other in zip([*others], mirrored([*others]), strict=True):
+        if style != other:
+            others[style] = others[other] = others[style] / 2.0
+    whole = {style: share for style, share in cfg.styles.items() if style in WHOLE}
+    flights_rng, parts_rng = rng.spawn(2)
+    flights = draw_to_quota(whole | {"": parts_share}, flights_rng)
+    parts = draw_to_quota(others, parts_rng)
+    drawn = []
+    for num_points, last in zip(lengths, flights, strict=False):
+        num = round(num_points * dt_s / cfg.segment_s) if cfg.segment_s else 1
+        num = 0 if last == REACQUIRE else max(1, min(num, num_points // POINTS_LEAST))
+        drawn.append([*islice(parts, num), *([last] if last else [])])
+    return drawn
+
+
+def mirrored(names: Sequence[str]) -> list[str]:
+    """Turn styles of either side to the other one."""
+    either = {name for name, row in ROWS.items() if row.either_side}
+    others = {OTHER_SIDE + name: name for name in either} | {name: OTHER_SIDE + name for name in either}
+    return [others.get(name, name) for name in names]
+
+
 def draw_intent(
-    scenario: Scenario, obstacles: BoxIndex, screens: BoxIndex, cfg: PlanConfig, rng: np.random.Generator
-) -> Intent:
-    """Draw the style or styles of a flight. screens: the obstacles that hide a person for certain."""
-    name, num = draw_by_share(cfg.styles, rng), len(scenario.targets_m)
-    if name == REACQUIRE:
+    names: Sequence[str], scenario: Scenario, obstacles: BoxIndex, screens: BoxIndex, cfg: PlanConfig,
+    rng: np.random.Generator,
+) -> Intent:  # fmt: skip
+    """Draw how a flight of these styles is flown. screens: the obstacles that hide a person for certain."""
+    num = len(scenario.targets_m)
+    if names[-1] == REACQUIRE:
         wish = wish_of_reacquire(scenario, obstacles, screens, cfg, rng)
-        segment = Segment(name, 0, num, keeps_sight=False)
+        segment = Segment(REACQUIRE, 0, num, keeps_sight=False)
         if wish is None:
             return Intent(scenario.wish, (segment,), impossible=NO_HIDING_PLACE)
         return Intent(wish, (segment,))
-    names = _parts(name, num, scenario.dt_s, cfg, rng)
+    names, goes_home = [name for name in names if name != RETURN_HOME], names[-1] == RETURN_HOME
     cuts = np.linspace(0, num, len(names) + 1).round().astype(int).tolist()
-    segments = tuple(Segment(*part) for part in zip(names, cuts[:-1], cuts[1:], strict=True))
+    plain = [name.removeprefix(OTHER_SIDE) for name in names]
+    segments = tuple(Segment(*part) for part in zip(plain, cuts[:-1], cuts[1:], strict=True))
     is_paper = set(names) == {FOLLOW}
     wish = scenario.wish if is_paper else wish_of(names, scenario, obstacles, cfg, rng)
-    if name != RETURN_HOME:
+    if not goes_home:
         return Intent(wish, () if is_paper else segments)
     wish, mission = wish_of_mission(wish, scenario, cfg, rng)
     at = mission.at_frame
     before = tuple(Segment(p.style, p.begin, min(p.end, at)) for p in segments if p.begin < at)
     return Intent(wish, (*before, Segment(RETURN_HOME, at, num, keeps_sight=False)), mission)
-
-
-def _parts(name: str, num_points: int, dt_s: float, cfg: PlanConfig, rng: np.random.Generator) -> list[str]:
-    """Give the styles of a flight's parts, of which the first is `name` if it takes parts at all."""
-    shares = {style: share for style, share in cfg.styles.items() if style not in WHOLE and share > 0} or {FOLLOW: 1.0}
-    num = round(num_points * dt_s / cfg.segment_s) if cfg.segment_s else 1
-    num = max(1, min(num, num_points // POINTS_LEAST))
-    return [name if k == 0 and name not in WHOLE else draw_by_share(shares, rng) for k in range(num)]
 
 
 def why_not_held(intent: Intent, scenario: Scenario, positions_m: np.ndarray, seen: np.ndarray) -> str | None:
@@ -92,13 +122,47 @@ def why_not_held(intent: Intent, scenario: Scenario, positions_m: np.ndarray, se
         return intent.impossible
     if intent.searches:
         return None if finds_again(seen, scenario.dt_s) else NOT_FOUND_AGAIN
-    wished = intent.wish.places_m(scenario.targets_m, scenario.ground_m) - scenario.targets_m
+    return None if _is_held(intent.wish, scenario, positions_m).mean() >= HELD_SHARE else NOT_HELD
+
+
+def _is_held(wish: Wish, scenario: Scenario, positions_m: np.ndarray) -> np.ndarray:
+    """Tell at which frames a flight is about where it is wished, (n,) bool."""
+    wished = wish.places_m(scenario.targets_m, scenario.ground_m) - scenario.targets_m
     flown = positions_m - scenario.targets_m
     wished_m, flown_m = np.linalg.norm(wished, axis=1), np.linalg.norm(flown, axis=1)
     cosine = (wished * flown).sum(axis=1) / np.maximum(wished_m * flown_m, 1e-9)
     ratio = np.maximum(flown_m, 1e-9) / np.maximum(wished_m, 1e-9)
-    held = (cosine >= np.cos(np.radians(HELD_DEG))) & (ratio <= HELD_RATIO) & (ratio >= 1.0 / HELD_RATIO)
-    return None if held.mean() >= HELD_SHARE else NOT_HELD
+    return (cosine >= np.cos(np.radians(HELD_DEG))) & (ratio <= HELD_RATIO) & (ratio >= 1.0 / HELD_RATIO)
+
+
+def tell_not_held(
+    intent: Intent, scenario: Scenario, positions_m: np.ndarray, obstacles: BoxIndex, cfg: PlanConfig
+) -> str:
+    """Say of the part that is held least what was asked, what was flown, and what was in the way."""
+    from cosfly.space.kernels import signed_distances, visibility
+
+    is_held, targets, wish = _is_held(intent.wish, scenario, positions_m), scenario.targets_m, intent.wish
+    part = min(intent.segments, key=lambda part: is_held[part.begin : part.end].mean())
+    span, places = slice(part.begin, part.end), wish.places_m(targets, scenario.ground_m)
+    lost = ~is_held[span]
+
+    def told(flown: np.ndarray) -> str:
+        away = flown[span] - targets[span]
+        bearing = np.degrees(_wrapped(np.arctan2(away[:, 1], away[:, 0]) - wish.heading_rad[span]))
+        up_m = np.median((flown[:, 2] - scenario.ground_m)[span][lost])
+        apart_m = np.median(np.hypot(away[:, 0], away[:, 1])[lost])
+        return f"{up_m:.0f} m up, {apart_m:.0f} m away, at {np.median(bearing[lost]):.0f} deg"
+
+    near = signed_distances(obstacles, places, cfg.safety_distance_m)[0] < cfg.safety_distance_m
+    unseen, fast = visibility(obstacles, places, targets) == 0, np.zeros(len(places), dtype=bool)
+    fast[1:] = np.linalg.norm(np.diff(places, axis=0), axis=1) > cfg.speed_max_mps * scenario.dt_s
+    causes = {f"nearer than {cfg.safety_distance_m:g} m to a box": near, "without sight": unseen, "too fast": fast}
+    why = [f"{found[span][lost].mean():.0%} {cause}" for cause, found in causes.items() if found[span][lost].any()]
+    return (
+        f"{part.style}, {lost.mean():.0%} of frames {part.begin} to {part.end - 1}: asked {told(places)}; "
+        f"flown {told(positions_m)} (medians); because the places asked are "
+        f"{', '.join(why) or 'free, in sight and within reach, but not all the way there'}"
+    )
 
 
 # --- mission ----------------------------------------------------------------------------------------------------------
@@ -154,7 +218,7 @@ def _seen_from_the_walker(wish: Wish, scenario: Scenario, places: np.ndarray, at
         ground_distance_m=apart_m,
         pitch_rad=np.arctan2(away[:, 2], apart_m),
         altitude_m=places[:, 2] - scenario.ground_m,
-        altitude_min_m=np.full(num, min(ALTITUDE_LEAST_M, cfg.altitude_min_m)),
+        altitude_min_m=np.full(num, cfg.styles_floor_m),
         keeps_sight=np.arange(num) < at,
         any_bearing=False,
     )

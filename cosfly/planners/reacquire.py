@@ -14,7 +14,7 @@ import numpy as np
 
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
 from cosfly.planners.courses import places_of, without_jumps
-from cosfly.planners.styles import HIDING
+from cosfly.planners.styles import REACQUIRE, Style
 from cosfly.products.kinds import KINDS
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ BEFORE_S, AFTER_S = 2.0, 3.0  # seen at least so long before it is lost, and at 
 SEEN = 0.5  # mean visibility that counts as seen
 WAITS_S = 4.0  # before it searches
 DEEP_LOSS_S = 5.0  # of a place that is looked for: the planner may move a little, and the walker stays hidden
-CLIMBS_M, SEARCHES_FROM_M = (12.0, 26.0), (8.0, 16.0)  # while it searches: height gained, distance in the plane
 CROWN_SHARE = 1 / np.sqrt(3.0)  # of the half extents: the box within the ellipsoid within the box
 LATE_SHARE = 0.5  # of the tries that fly along the walker's own way
 FREE_SHARE = 1.0  # of the wished places that keep the safety distance
@@ -48,9 +47,11 @@ def wish_of_reacquire(
     """Look for a flight that loses the walker and finds again; None where the map hides nobody on this walk."""
     from cosfly.space.kernels import signed_distances, visibility
 
-    targets, ground, dt_s = scenario.targets_m, scenario.ground_m, scenario.dt_s
+    targets, ground, dt_s, style = scenario.targets_m, scenario.ground_m, scenario.dt_s, cfg.style(REACQUIRE)
     for _ in range(TRIES):
-        course, climb_m, near_m = _watching(scenario, rng), rng.uniform(*CLIMBS_M), rng.uniform(*SEARCHES_FROM_M)
+        course = _watching(style, scenario, rng)
+        searches_m = style.ground_distance_end_m or style.ground_distance_m
+        climb_m, near_m = rng.uniform(*style.climb_m), rng.uniform(*searches_m)
         seen = visibility(screens, places_of(course, targets, ground), targets)
         lost = first_loss(seen, dt_s, DEEP_LOSS_S)
         if lost is None:
@@ -67,10 +68,10 @@ def wish_of_reacquire(
     return None
 
 
-def _watching(scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
+def _watching(style: Style, scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
     """Draw a course, (n, 3), before the loss: at a bearing of the walker, or late along the walker's own way."""
     targets, heading_rad = scenario.targets_m, scenario.wish.heading_rad
-    apart_m, altitude_m = rng.uniform(*HIDING.ground_distance_m), rng.uniform(*HIDING.altitude_m)
+    apart_m, altitude_m = rng.uniform(*style.ground_distance_m), rng.uniform(*style.altitude_m)
     bearing, is_late = rng.uniform(-np.pi, np.pi), rng.random() < LATE_SHARE
     azimuth, aparts_m = heading_rad + bearing, np.full(len(targets), apart_m)
     if is_late:

@@ -6,7 +6,9 @@ Compiled code is imported by the functions that need it: `cosfly --help` goes wi
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,6 +32,9 @@ if TYPE_CHECKING:
     from cosfly.planners.intent import Intent
     from cosfly.space.kernels import BoxIndex
 
+log = logging.getLogger(__name__)
+
+TRIES = 3  # of a flight that does not hold its styles: places in their ranges are drawn anew
 COORDINATE_MAX_M = 1e6  # beyond, float32 depth and four decimals of a metre in the files lose their meaning
 
 
@@ -71,46 +76,63 @@ def make_scenario(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig) -> Scenario:
     return Scenario(walk.path_id, targets, np.array(walk.positions_m[:, 2]), follow(targets, cfg, dt_s), dt_s)
 
 
+def draw_styles_of(walks: Sequence[Walk], cfg: PlanConfig, seed: int) -> list[list[str]]:
+    """Draw the styles of the flights of a run, for each walk in order; by the first one's begin too: walks of other
+    maps have the same ids.
+    """
+    from cosfly.planners.intent import draw_styles
+
+    return draw_styles([len(walk.time_s) for walk in walks], step_s(walks[0].time_s), cfg, style_rng(walks[0], seed))
+
+
 def plan_flight(
-    walk: Walk, obstacles: BoxIndex, cfg: PlanConfig, seed: int, screens: BoxIndex | None = None
-) -> DroneTrace:
-    """Plan, measure and check one flight in a style drawn for it; in that of the paper instead where it fails and the
+    walk: Walk, obstacles: BoxIndex, cfg: PlanConfig, seed: int, screens: BoxIndex | None = None,
+    styles: Sequence[str] = (),
+) -> DroneTrace:  # fmt: skip
+    """Plan, measure and check one flight in styles drawn for it; in that of the paper instead where it fails and the
     settings say so.
 
     Args:
-        screens: the obstacles that hide a person for certain, for a search; None: all do.
+        screens: the obstacles that hide a person for certain, for a search; None: all do. styles: of its parts; none:
+            drawn as those of a first flight.
     Raises:
         NoPathError: the walk cannot be followed, or the planner's flight is not free of collisions.
     """
-    from cosfly.planners.intent import Intent, draw_intent
+    from cosfly.planners.intent import Intent, draw_intent, mirrored
 
     scenario = make_scenario(walk, obstacles, cfg)
     screens = obstacles if screens is None else screens
-    intent = draw_intent(scenario, obstacles, screens, cfg, style_rng(walk, seed))
-    has_other = bool(intent.segments) and cfg.styles_fallback == "follow"
-    try:
-        trace = _fly(walk, scenario, intent, obstacles, screens, cfg, seed)
-        reason = trace.drop_reason
-    except NoPathError:
-        if not has_other:
-            raise
-        reason = "no_path"
-    if reason is None or not has_other:
-        return trace
+    styles = styles or draw_styles_of([walk], cfg, seed)[0]
+    for attempt in range(TRIES):
+        intent = draw_intent(styles, scenario, obstacles, screens, cfg, style_rng(walk, seed, attempt))
+        flown: DroneTrace | NoPathError
+        try:
+            flown = _fly(walk, scenario, intent, obstacles, screens, cfg, seed)
+        except NoPathError as error:
+            flown = error
+        if not intent.segments or (isinstance(flown, DroneTrace) and flown.drop_reason is None):
+            break
+        styles = mirrored(styles)  # a wall may stand on the one side alone
+    is_last = not intent.segments or cfg.styles_fallback == "drop"
+    if isinstance(flown, DroneTrace) and (is_last or flown.drop_reason is None):
+        return flown
+    if isinstance(flown, NoPathError) and is_last:
+        raise flown
+    reason, not_held = ("no_path", None) if isinstance(flown, NoPathError) else (flown.drop_reason, flown.not_held)
     follows = _fly(walk, scenario, Intent(scenario.wish), obstacles, screens, cfg, seed)
-    return replace(follows, instead_of=f"{intent.styles}: {reason}")
+    return replace(follows, instead_of=f"{intent.styles}: {reason}", not_held=not_held)
 
 
-def style_rng(walk: Walk, seed: int) -> np.random.Generator:
-    """Give the generator of a flight's style, by the walk's begin too: walks of other maps have the same ids."""
+def style_rng(walk: Walk, seed: int, attempt: int = 0) -> np.random.Generator:
+    """Give the generator of how a flight's styles are flown, by the walk's begin too."""
     x_m, y_m = np.round(walk.positions_m[0, :2], 2) + 0.0
-    return rng_for(seed, "style", f"{walk.path_id}/{x_m:.2f}/{y_m:.2f}")
+    return rng_for(seed, "style", f"{walk.path_id}/{x_m:.2f}/{y_m:.2f}" + (f"/{attempt}" if attempt else ""))
 
 
 def _fly(
     walk: Walk, scenario: Scenario, intent: Intent, obstacles: BoxIndex, screens: BoxIndex, cfg: PlanConfig, seed: int
 ) -> DroneTrace:
-    from cosfly.planners.intent import view_of, why_not_held
+    from cosfly.planners.intent import NOT_HELD, tell_not_held, view_of, why_not_held
     from cosfly.space.kernels import swept_distances, visibility
 
     scenario = replace(scenario, wish=intent.wish)
@@ -131,6 +153,7 @@ def _fly(
     counted = seen[judged] if judged.any() else seen
     metrics = flight_metrics(positions, targets, counted, clearances, scenario.ground_m, scenario.dt_s)
     reason = drop_reason(metrics, cfg, made.is_converged, is_judged_by_sight=bool(judged.any()))
+    reason = reason or why_not_held(intent, scenario, positions, seen_past_screens)
     return DroneTrace(
         path_id=walk.path_id,
         planner=cfg.planner,
@@ -142,7 +165,8 @@ def _fly(
         clearances_m=clearances,
         metrics=metrics,
         solver=made.solver,
-        drop_reason=reason or why_not_held(intent, scenario, positions, seen_past_screens),
+        drop_reason=reason,
+        not_held=tell_not_held(intent, scenario, positions, obstacles, cfg) if reason == NOT_HELD else None,
         segments=intent.segments,
         mission=intent.mission,
         pace=walk.pace,
@@ -177,7 +201,8 @@ def make_worker(cfg: PlanConfig, simplified_map: Path, seed: int) -> Work:
     warm_up(cfg)
 
     def work(item: Item) -> Outcome:
-        trace = plan_flight(item.payload, obstacles, cfg, seed, screens)
+        walk, styles = item.payload
+        trace = plan_flight(walk, obstacles, cfg, seed, screens, styles)
         return Outcome(trace.as_json(), trace.drop_reason)
 
     return work
@@ -223,13 +248,18 @@ def run(
         return product
     box_map, walks = read_boxes(simplified_map), read_paths(paths)
     check_ids(walks, paths)
-    items = [Item(walk.path_id, walk) for walk in walks]
+    for remark in cfg.remarks():
+        log.warning("%s", remark)
+    items = [Item(w.path_id, (w, styles)) for w, styles in zip(walks, draw_styles_of(walks, cfg, seed), strict=True)]
     finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers, watch=watch)
     planned = [record for record in finished.records if not isinstance(record, Failed)]
     if not planned:
         raise stage.nothing_kept(finished.tally)
     traces = [DroneTrace.from_json(record.result, f"{stage.path}/items.jsonl: {record.id}") for record in planned]
-    header = {"map": box_map.name, "planner": cfg.planner, "seed": seed, "settings": cfg.model_dump(mode="json")}
+    header = {"map": box_map.name, "planner": cfg.planner, "seed": seed, "settings": cfg.recorded()}
+    for trace in traces:
+        if trace.not_held:
+            log.warning("%s: style_not_held: %s", trace.path_id, trace.not_held)
     write_traces(product, traces, header)
     write_bytes(picture, draw_flights(box_map, walks, traces))
     stage.finish([product, picture], finished.tally, **_facts(box_map, traces, planned))
@@ -260,6 +290,7 @@ def _styles_flown(traces: list[DroneTrace]) -> dict:
         "styles": dict(sorted(Counter(parts).items())),
         "styles_flown_as_follow": dict(sorted(Counter(not_held).items())),
         "styles_dropped": dict(sorted(Counter(dropped).items())),
+        "styles_not_held": {trace.path_id: trace.not_held for trace in styled if trace.not_held},
     }
 
 

@@ -1,19 +1,24 @@
 """The table of styles: how the drone stands to the walker while a part of a flight lasts, and which decisions that
 shows.
 
-A row is data; `courses.py` makes a wish of it, and a new row needs no code. Labels come from the motion that was flown,
-not from the style. Two styles are more than a row: `reacquire` looks for a place where the walker disappears,
-`return_home` ends with a mission.
+A row is data; `courses.py` makes a wish of it, its ranges are settings (`plan.style_ranges`), and a new row needs no
+code. Labels come from the motion that was flown, not from the style. Two styles are more than a row: `reacquire` looks
+for a place where the walker disappears, `return_home` ends with a mission.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import AfterValidator, Field, PositiveFloat, create_model
 
 from cosfly.products.segments import FOLLOW
+from cosfly.work.config import Config
 
 REACQUIRE, RETURN_HOME = "reacquire", "return_home"
-ALTITUDE_LEAST_M = 8.0  # bound of every style but `follow`, which keeps that of the settings
+ALTITUDE_LEAST_M = 8.0  # bound of every style but `follow`, unless their ranges begin lower
+OTHER_SIDE = "~"  # before the name of a style: the mirror image
 
 Range = tuple[float, float]  # a value is drawn evenly from it for each part of a flight
 
@@ -23,8 +28,8 @@ class Style:
     """One row. Distances are in the plane, altitudes above the ground under the walker.
 
     bearing_deg: of the drone as seen from the walker, counter-clockwise from the walking direction: 0 in front, 180
-    behind; None: where the part before ended, anywhere at the beginning; either_side: half of them are mirrored. The
-    values with `end` are reached at the end of the part, None: as at its beginning.
+    behind; None: where the part before ended, anywhere at the beginning; either_side: half of the parts are mirrored.
+    The values with `end` are reached at the end of the part, None: as at its beginning. climb_m: while it searches.
     round_mps: speed round the walker, positive counter-clockwise. hop_s: the drone stands still, and so often takes a
     new place, of which the bearing is that of the halt's beginning. pace_mps: how fast the distance changes on the way
     there.
@@ -38,6 +43,7 @@ class Style:
     either_side: bool = False
     ground_distance_end_m: Range | None = None
     altitude_end_m: Range | None = None
+    climb_m: Range = (0.0, 0.0)
     round_mps: Range = (0.0, 0.0)
     hop_s: Range | None = None
     pace_mps: Range = (4.0, 4.0)
@@ -48,7 +54,7 @@ class Style:
 TABLE: dict[str, Style] = {
     "orbit_left": Style(("circle_left",), (8.0, 20.0), (8.0, 24.0), round_mps=(-6.0, -4.0)),
     "orbit_right": Style(("circle_right",), (8.0, 20.0), (8.0, 24.0), round_mps=(4.0, 6.0)),
-    "side": Style(("strafe_left", "strafe_right"), (8.0, 10.5), (8.0, 9.5), (75.0, 105.0), either_side=True),
+    "side": Style(("strafe_left", "strafe_right"), (8.0, 10.5), (8.0, 10.0), (75.0, 105.0), either_side=True),
     "lead": Style(("move_backward",), (30.0, 48.0), (10.0, 32.0), (-25.0, 25.0)),
     "approach": Style(
         ("move_forward",), (40.0, 52.0), (15.0, 28.0), (150.0, 210.0),
@@ -62,14 +68,67 @@ TABLE: dict[str, Style] = {
     "sink": Style(("descend",), (10.0, 22.0), (50.0, 55.0), (135.0, 225.0), altitude_end_m=(8.0, 14.0)),
     "hold": Style(("hover",), (10.0, 18.0), (8.0, 25.0), (-18.0, 18.0), hop_s=(9.0, 15.0), pace_mps=(1.5, 3.0)),
     "stop_and_go": Style(
-        ("speed_up", "slow_down", "hover"), (12.0, 24.0), (8.0, 13.0), (178.0, 182.0),
-        hop_s=(5.0, 6.5), pace_mps=(2.5, 3.5),
+        ("speed_up", "slow_down", "hover"), (16.0, 34.0), (8.0, 13.0), (178.0, 182.0),
+        hop_s=(6.0, 7.5), pace_mps=(4.0, 6.0),
     ),
     "top": Style(("track_straight",), (4.0, 8.0), (44.0, 59.0), (150.0, 210.0)),
 }  # fmt: skip
 
-# Places from which a walker is lost behind a house or a tree; what the drone does then stands in reacquire.py.
-HIDING = Style(("search_to_reacquire_target",), (18.0, 42.0), (8.0, 16.0))
+# Where a walker is lost behind a house or a tree, and from where the drone searches; how stands in reacquire.py.
+HIDING = Style(
+    ("search_to_reacquire_target",), (18.0, 42.0), (8.0, 16.0), ground_distance_end_m=(8.0, 16.0), climb_m=(12.0, 26.0)
+)
 
 NAMES = (FOLLOW, *TABLE, REACQUIRE, RETURN_HOME)
 WHOLE = (REACQUIRE, RETURN_HOME)  # take a whole flight; the others may take parts
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+def _ordered(ends: Range) -> Range:
+    if ends[0] > ends[1]:
+        raise ValueError(f"a range is its least and its greatest value, got {ends[0]:g} before {ends[1]:g}")
+    return ends
+
+
+AnyRange = Annotated[tuple[float, float], AfterValidator(_ordered)]
+PositiveRange = Annotated[tuple[PositiveFloat, PositiveFloat], AfterValidator(_ordered)]
+MEANINGS = {
+    "altitude_m": "height above the ground under the walker, m",
+    "altitude_end_m": "height at the end of a part, m",
+    "climb_m": "how much higher it searches, m",
+    "ground_distance_m": "distance to the walker in the plane, m",
+    "ground_distance_end_m": "distance in the plane at the end of a part, of reacquire while it searches, m",
+    "bearing_deg": "azimuth of the drone from the walker, degrees: 0 in front, 90 left, 180 behind",
+    "round_mps": "speed round the walker, m/s: positive counter-clockwise from above",
+    "hop_s": "stands still for so long before it takes a new place, s",
+    "pace_mps": "speed at which its distance changes on the way there, m/s",
+}
+
+
+def _settings_of(name: str, style: Style) -> type[Config]:
+    """Make the settings of a style: the ranges that its row has."""
+    plain, made = {field.name: field.default for field in fields(Style)}, dict[str, Any]()
+    for field, meaning in MEANINGS.items():
+        if (value := getattr(style, field)) != plain[field]:
+            kind = AnyRange if field in ("bearing_deg", "round_mps") else PositiveRange
+            made[field] = kind, Field(value, description=meaning)
+    return create_model(f"Style_{name}", __base__=Config, __doc__=f"Ranges of the style {name}.", **made)
+
+
+ROWS: dict[str, Style] = TABLE | {REACQUIRE: HIDING}
+_MODELS = {name: _settings_of(name, row) for name, row in ROWS.items()}
+globals().update({model.__name__: model for model in _MODELS.values()})  # pickle looks for a class by its name
+if TYPE_CHECKING:
+    StyleRanges = Config
+else:
+    StyleRanges = create_model(
+        "StyleRanges",
+        __base__=Config,
+        __doc__="Ranges of each style.",
+        **{
+            name: (model, Field(default_factory=model, description=f"for {', '.join(ROWS[name].purpose)}"))
+            for name, model in _MODELS.items()
+        },
+    )

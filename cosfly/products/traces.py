@@ -18,7 +18,7 @@ from cosfly.work.store import write_json
 
 TRACE_SCHEMA, TRACE_VERSION = "cosfly.drone_trace", "1.0"
 ARRAYS = ("time_s", "positions_m", "rotations_deg", "targets_m", "visibility")
-MORE = ("metrics", "solver", "drop_reason", "instead_of")  # fields of a flight that are taken as they are
+MORE = ("metrics", "solver", "drop_reason", "instead_of", "not_held")  # fields of a flight that are taken as they are
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,10 @@ class DroneTrace:
     target. targets_m: (n, 3) the pedestrian's tracked point (hip height). visibility: (n,) five-ray fraction in [0, 1].
     clearances_m: (n,) signed distance to the nearest obstacle, the least on the straight way to the next point. metrics
     and solver: JSON-able facts. segments: the styles of its parts, none where it follows from end to end. mission: the
-    order that ended the pursuit. instead_of: the style that it should have had and the map did not hold, and why. On
-    the way home and in a search the camera looks elsewhere. drop_reason: why the planner-stage prefilter (sec:step6)
-    rejects the flight, None if it passes; only those are rendered. pace: of the walk.
+    order that ended the pursuit. instead_of: the style that it should have had and the map did not hold, and why;
+    not_held: what was asked and what was flown. On the way home and in a search the camera looks elsewhere.
+    drop_reason: why the planner-stage prefilter (sec:step6) rejects the flight, None if it passes; only those are
+    rendered. pace: of the walk.
     """
 
     path_id: str
@@ -48,6 +49,7 @@ class DroneTrace:
     segments: tuple[Segment, ...] = ()
     mission: Mission | None = None
     instead_of: str | None = None
+    not_held: str | None = None
     pace: str = PLAIN_PACE
 
     def every(self, stride: int) -> DroneTrace:
@@ -83,7 +85,7 @@ class DroneTrace:
             **pace_field(self.pace),
             "drop_reason": self.drop_reason,
             **flown_as_json(self.segments, self.mission),
-            **({"instead_of": self.instead_of} if self.instead_of else {}),
+            **{name: said for name in ("instead_of", "not_held") if (said := getattr(self, name))},
             "metrics": self.metrics,
             "solver": self.solver,
             "t": rounded(self.time_s, 4),

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from itertools import count
 
 import numpy as np
 
@@ -18,15 +19,37 @@ def draws_for(seed: int, stage: str, item_id: str) -> bytes:
     return hashlib.sha256(f"{seed}/{stage}/{item_id}".encode()).digest()
 
 
+BLOCK = 8  # draws to a quota that are as far apart as they can be; more hold shares no better where few are drawn
+GOLDEN = 0.5 * (5**0.5 - 1)  # by so much turned, blocks lie between each other for ever
+
+
+def draw_to_quota(shares: Mapping[str, float], rng: np.random.Generator) -> Iterator[str]:
+    """Yield names for ever, in random order, so that of any number of them each has its share but for three at most.
+
+    What is drawn first does not depend on how many are. Raises as `draw_by_share`.
+    """
+    names, ends = _ends(shares)
+    start = rng.random()
+    for block in count():
+        places = (rng.permutation(BLOCK) + (start + block * GOLDEN) % 1.0) / BLOCK
+        for place in np.searchsorted(ends, places * ends[-1], side="right").tolist():
+            yield names[place]
+
+
 def draw_by_share(shares: Mapping[str, float], rng: np.random.Generator) -> str:
     """Draw one of the names, each as likely as its share of the sum. The names' order does not matter; takes one draw.
 
     Raises:
         ValueError: a share is negative, or none is positive.
     """
+    names, ends = _ends(shares)
+    return names[int(np.searchsorted(ends, rng.random() * ends[-1], side="right"))]
+
+
+def _ends(shares: Mapping[str, float]) -> tuple[list[str], np.ndarray]:
+    """Give the names in order, and where the share of each ends when they stand one after the other."""
     names = sorted(shares)
     weights = np.array([shares[name] for name in names], dtype=np.float64)
     if not ((weights >= 0).all() and weights.sum() > 0):
         raise ValueError(f"shares must not be negative and must add up to something positive: {dict(shares)}")
-    ends = np.cumsum(weights)
-    return names[int(np.searchsorted(ends, rng.random() * ends[-1], side="right"))]
+    return names, np.cumsum(weights)
