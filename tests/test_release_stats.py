@@ -28,9 +28,8 @@ from cosfly.space.flight_metrics import accel_rms, jerk_rms, length_m
 from release.columns import BOX, POINT, POSE
 from release.record import read_record
 from release.stats.counting import Counts, overlap
-from release.stats.page import markdown, page_html
 from release.stats.pixels import BIN_M, Pixels
-from release.stats.stats import run
+from release.stats.stats import markdown, page_html, run
 from release.stats.tables import Absent, Stats, Table, weather
 from specimens import make_flight
 

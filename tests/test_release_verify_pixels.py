@@ -1,11 +1,11 @@
-"""release/verify/pixels.py: what is measured in pictures, beside slow and obvious versions of the same."""
+"""release/verify/pictures.py: what is measured in pictures, beside slow and obvious versions of the same."""
 
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 from tables import each
 
-from release.verify.pixels import NUM_IDS, PERSON, SKY, new_kinds, rays_to_person, survey
+from release.verify.pictures import NUM_IDS, PERSON, SKY, new_kinds, rays_to_person, survey
 
 FAR_M = np.float32(1000.0)
 

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+from cosfly.escaping import for_markdown
+from cosfly.look.coverage_page import coverage_html
+from cosfly.look.page import page
+from cosfly.products.coverage import Coverage
 from cosfly.work.console import progress_bar
 from cosfly.work.store import write_bytes, write_json
 from release.card.numbers import RowCounts, check_rows, row_lists
 from release.columns import SHORT_NAMES
-from release.record import read_record, release_folder
+from release.record import ReleaseRecord, read_record, release_folder
 from release.stats.counting import Counts
-from release.stats.page import markdown, page_html, tiles_of
 from release.stats.pixels import look_at, middle_picture
-from release.stats.tables import make_stats
+from release.stats.tables import Cell, Stats, Table, make_stats
 
 
 def run(dataset: Path, out: Path, *, pixels: int = 200) -> Path:
@@ -39,6 +44,99 @@ def run(dataset: Path, out: Path, *, pixels: int = 200) -> Path:
     stats = make_stats(record, counts, looked)
     write_json(out / "stats.json", {**stats.model_dump(mode="json"), "coverage": card.coverage.model_dump(mode="json")})
     write_bytes(out / "stats.md", markdown(stats).encode())
-    page = page_html(stats, card.coverage, tiles_of(record, stats), middle_picture(dataset, record))
-    write_bytes(out / "stats.html", page.encode())
+    text = page_html(stats, card.coverage, tiles_of(record, stats), middle_picture(dataset, record))
+    write_bytes(out / "stats.html", text.encode())
     return out / "stats.html"
+
+
+# --- for people: one page without script or network, and Markdown -----------------------------------------------------
+
+STYLE = """
+.tables { columns: 560px 2; column-gap: 12px; } .tables .panel { break-inside: avoid; }
+.tables .wide { column-span: all; margin-top: 12px; } figure.first img { max-width: 100%; border-radius: 8px; }
+td.bar { width: 26%; min-width: 80px; } td.bar .stack { height: 11px; margin: 6px 0 0; }
+td.bar > i { display: block; height: 11px; margin-top: 6px; border-radius: 2px; min-width: 1px; }
+.k0 { --own: var(--good); } .k1 { --own: var(--bad); } .k2 { --own: var(--unread); }
+"""
+
+
+def page_html(
+    stats: Stats, coverage: Coverage, tiles: Sequence[tuple[str, str]] = (), picture: str | None = None
+) -> str:
+    """Give the page's text.
+
+    Args:
+        tiles: what a person asks first, how much and how good. picture: of one frame, JPEG in base64.
+    """
+    return page(
+        "release/stats/page.html", title=", ".join(stats.runs) or stats.name, style=STYLE, stats=stats, tiles=tiles,
+        picture=picture, coverage=coverage_html(coverage), shown=shown, numeric_columns=_numeric_columns,
+        greatest=_greatest,
+    )  # fmt: skip
+
+
+def tiles_of(record: ReleaseRecord, stats: Stats) -> list[tuple[str, str]]:
+    """Give what a person asks first: how much there is, and how good it is."""
+    numbers, captions, found = record.numbers, record.numbers.captions, record.history.flights
+    quality = {row[0]: row[1] for table in stats.tables if table.key == "quality_stats" for row in table.rows}
+    seen, proved = numbers.visibility.mean, captions.mean_proved["proved_en"]
+    values: list[tuple[str, Any, Any]] = [  # name, value or count, of how many
+        ("frames", numbers.frames, None),
+        ("flights", numbers.flights, None),
+        ("trajectories", numbers.trajectories, None),
+        ("towns", len(numbers.frames_by.town), None),
+        ("captions", captions.frames_with, None),
+        ("GB", round(numbers.files.bytes / 1e9, 2), None),
+        ("of the flights that were found are released", found.released, found.found),
+        ("of the frames show the person", numbers.frames_target_visible, numbers.frames),
+        ("of the person is seen, on average", seen, None if seen is None else 1),
+        ("mean smoothness score", quality["mean smoothness score S"], None),
+        ("of the decisions are those of the geometry", captions.decision_equals_label, captions.with_label),
+        ("of a caption's sentences are proved", proved, None if proved is None else 1),
+    ]
+    return [
+        (name, shown(value) if whole is None else f"{100 * value / whole:.1f} %")
+        for name, value, whole in values
+        if value is not None and whole != 0
+    ]
+
+
+def _numeric_columns(table: Table) -> list[bool]:
+    return [all(isinstance(row[k], int | float | None) for row in table.rows) for k in range(len(table.head))]
+
+
+def _greatest(table: Table) -> float:
+    """Give what fills a bar, or a cell of a map: the greatest number there is; 1 where there is none."""
+    cells = [cell for row in table.rows for cell in (row[1:] if table.plot == "heat" else row[1:2])]
+    return max((float(cell) for cell in cells if isinstance(cell, int | float)), default=0.0) or 1.0
+
+
+def shown(cell: Cell) -> str:
+    """Give a number for people: no digits that say nothing."""
+    if cell is None:
+        return "-"
+    if isinstance(cell, str):
+        return cell
+    return f"{cell:,}" if isinstance(cell, int) else f"{cell:,.4f}".rstrip("0").rstrip(".")
+
+
+def markdown(stats: Stats) -> str:
+    """Give the tables as Markdown."""
+    parts = [f"# {for_markdown(stats.name)}: statistics", f"Content {for_markdown(stats.content_digest[:12])}."]
+    for table in stats.tables:
+        parts.append(f"## {for_markdown(table.title)}" + (f" ({for_markdown(table.paper)})" if table.paper else ""))
+        parts += [for_markdown(table.note)] if table.note else []
+        parts.append(_markdown_table(table.head, table.rows))
+    absent: list[list[Cell]] = [[one.what, one.paper, one.why] for one in stats.absent]
+    parts += ["## What this release cannot tell", _markdown_table(["what", "of the paper", "why"], absent)]
+    parts += ["## Rules", *(for_markdown(f"{name}: {rule}.") for name, rule in stats.rules.items())]
+    return "\n\n".join(parts) + "\n"
+
+
+def _markdown_table(head: list[str], rows: list[list[Cell]]) -> str:
+    texts = [
+        [for_markdown(cell) if isinstance(cell, str) else shown(cell) for cell in row]
+        for row in [list[Cell](head), *rows]
+    ]
+    lines = [f"| {' | '.join(cells)} |" for cells in texts]
+    return "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])

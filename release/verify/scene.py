@@ -20,8 +20,7 @@ from cosfly.work.items import advance
 from release.flight_rows import FlightRows
 from release.record import DepthCoding, DepthCodingName
 from release.verify.findings import Findings
-from release.verify.pictures import check_picture, decode, ground_beside, least_step, view_of
-from release.verify.pixels import NUM_IDS, new_kinds
+from release.verify.pictures import NUM_IDS, check_picture, decode, ground_beside, least_step, new_kinds, view_of
 from release.verify.sources import Pictures
 
 KEPT_GROUNDS = 200  # frames of a flight
