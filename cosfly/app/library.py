@@ -35,12 +35,12 @@ from cosfly.work.config import build
 __all__ = ["BoxMap", "DroneTrace", "Frame", "load_map", "plan", "read_captions", "render_frames"]
 
 # Settings that a function makes something of; it refuses the others of the section.
-OF_WALK = PedestriansConfig.model_fields.keys() - {"num_paths", "others", "traffic", "others_reach_m"}
+OF_WALK = PedestriansConfig.model_fields.keys() - {"num_paths", "others", "traffic", "others_reach_m", "roi_vertices"}
 OF_PACE = {
     "cruise_speed_mps", "curvature_gain_m", "speed_jitter", "min_speed_mps", "max_speed_mps", "pace", "hurry_speed_mps",
     "dt_s",
 }  # fmt: skip
-OF_PICTURE = {"backend", "look", *WeatherConfig.model_fields}
+OF_PICTURE = {"backend", "look", "mesh_triangles", *WeatherConfig.model_fields}
 STEP_S = 0.5  # between the places of `render_frames`, for the person's stride
 FILE_SETTING = {"simworld": "world", "cityjson": "path", "boxes": "path"}  # of a source: which setting names its file
 
