@@ -25,13 +25,13 @@ from cosfly.products.actions import ActionSet
 from cosfly.products.captions import Language, Prompt
 from cosfly.products.frames import frame_name
 from cosfly.products.splits import SPLITS, Split
-from cosfly.reading.documents import read_model, validated
+from cosfly.reading.documents import FileFormat, read_model, validated
 from cosfly.reading.tables import TableRows
 from cosfly.work import in_place
 from cosfly.work.provenance import fingerprint
 from cosfly.work.store import atomic_file, write_bytes, write_model
 
-RECORD, RECORD_SCHEMA, VERSION = "training_set.json", "cosfly.training_set", "3.0"
+RECORD, RECORD_FORMAT = "training_set.json", FileFormat("cosfly.training_set", "3.0", "training set")
 PAGE = "README.md"
 # Rows of a row group. One look at a sample, in an order drawn by lot, decodes them; the footer, of which a reader and
 # the writer hold all, grows by the groups.
@@ -129,7 +129,7 @@ def read_training_set(dataset: Path) -> TrainingSet:
     path = dataset / RECORD
     if not path.exists():
         raise InputError("no training set", where=dataset, got=f"no {RECORD}", fix="run cosfly distill prepare")
-    return read_model(path, TrainingSet, schema=RECORD_SCHEMA, version=VERSION, what="training set", tree=dataset)
+    return read_model(path, TrainingSet, RECORD_FORMAT, tree=dataset)
 
 
 Arguments = ParamSpec("Arguments")
@@ -310,7 +310,7 @@ class TrainingSetWriter(SplitFiles):
             systems=list(self._systems),
             actions=in_place.given("actions"),
         )
-        write_model(self.out / RECORD, record, schema=RECORD_SCHEMA, version=VERSION)
+        write_model(self.out / RECORD, record, RECORD_FORMAT)
         write_bytes(self.out / PAGE, _page(record))
         self.files = [*self.paths, self.out / RECORD, self.out / PAGE]
         return record

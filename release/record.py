@@ -15,11 +15,11 @@ from cosfly.products.coverage import Coverage
 from cosfly.products.frames import FrameFile
 from cosfly.products.inspection import TrajectoryFunnel
 from cosfly.products.town import TownMap
-from cosfly.reading.documents import read_model
+from cosfly.reading.documents import FileFormat, read_model
 from cosfly.work.store import sha256_bytes, write_model
 from release.columns import COUNTED, SPLIT_NAMES, SplitName
 
-RELEASE_SCHEMA, RELEASE_VERSION = "cosfly.release", "3.0"
+RELEASE_FORMAT = FileFormat("cosfly.release", "3.0", "release record")
 RECORD = "release.json"
 
 Counts = dict[str, int]
@@ -374,7 +374,7 @@ def release_folder(folder: Path) -> Path:
 
 
 def write_record(path: Path, record: ReleaseRecord) -> None:
-    write_model(path, record, schema=RELEASE_SCHEMA, version=RELEASE_VERSION)
+    write_model(path, record, RELEASE_FORMAT)
 
 
 def read_record(path: Path) -> ReleaseRecord:
@@ -388,6 +388,4 @@ def read_record(path: Path) -> ReleaseRecord:
             "there is no release", where=path, expected="the folder of a release, or of a run that has one",
             fix="check the path, or make one: cosfly release build",
         )  # fmt: skip
-    return read_model(
-        path, ReleaseRecord, schema=RELEASE_SCHEMA, version=RELEASE_VERSION, what="release record", tree=path.parent
-    )
+    return read_model(path, ReleaseRecord, RELEASE_FORMAT, tree=path.parent)

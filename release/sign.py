@@ -18,13 +18,13 @@ from typing import Any, Literal
 from pydantic import Field
 
 from cosfly.errors import EnvironmentMissing, InputError, VerifyError
-from cosfly.reading.documents import read_model
+from cosfly.reading.documents import FileFormat, read_model
 from cosfly.reading.files import read_bytes, sha256_file
 from cosfly.work.store import CHECKSUMS, read_checksums, remove_left, storage_errors, write_model
 from release.record import RECORD, Strict
 
 SIGNATURE = "signature.json"
-SCHEMA, VERSION = "cosfly.signature", "1.0"
+FORMAT = FileFormat("cosfly.signature", "1.0", "signature")
 PASSPHRASE = "COSFLY_SIGNING_PASSPHRASE"
 MOST_SIGNATURE_BYTES = 4_096
 MAKE_KEY = "make a pair: openssl genpkey -algorithm ed25519 -out key.pem, openssl pkey -in key.pem -pubout -out pub.pem"
@@ -126,7 +126,7 @@ def sign(folder: Path, key: Any) -> Path:
     parts = (key.public_key().public_bytes_raw(), key.sign(read_bytes(folder / CHECKSUMS, tree=folder)))
     public, made = (base64.b64encode(part).decode() for part in parts)
     value = Signature(algorithm="ed25519", signed_file="checksums.sha256", public_key=public, signature=made)
-    write_model(folder / SIGNATURE, value, schema=SCHEMA, version=VERSION)
+    write_model(folder / SIGNATURE, value, FORMAT)
     return folder / SIGNATURE
 
 
@@ -149,7 +149,7 @@ def signature_fault(folder: Path, public_key: bytes) -> tuple[str, str] | None:
     if not is_signed(folder):
         return "no signature", f"one of the key that was given, {wanted}"
     try:
-        found = read_model(folder / SIGNATURE, Signature, schema=SCHEMA, version=VERSION, what="signature", tree=folder)
+        found = read_model(folder / SIGNATURE, Signature, FORMAT, tree=folder)
         if found.public_key != wanted:
             return f"signed with another key, {found.public_key}", f"the key that was given, {wanted}"
         data, signature = read_bytes(folder / CHECKSUMS, tree=folder), base64.b64decode(found.signature)

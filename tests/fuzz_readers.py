@@ -66,7 +66,7 @@ from cosfly.products.playback import read_flight
 from cosfly.products.png import parse_png
 from cosfly.products.predictions import read_predictions
 from cosfly.products.roi import read_roi
-from cosfly.products.town import IDS_FILE, IDS_SCHEMA, IDS_VERSION, read_instance_ids, read_town_map, write_town_map
+from cosfly.products.town import IDS_FILE, IDS_FORMAT, read_instance_ids, read_town_map, write_town_map
 from cosfly.products.traces import DroneTrace, read_traces, write_traces
 from cosfly.products.walks import read_paths, write_paths
 from cosfly.reading.documents import read_json, read_model
@@ -172,7 +172,7 @@ TEXTS = {
     "header.txt": "120",
     "reply.json": json.dumps(REPLY),
     "signature.json": json.dumps({
-        "schema": sign.SCHEMA, "schema_version": sign.VERSION, "algorithm": "ed25519",
+        **sign.FORMAT.header, "algorithm": "ed25519",
         "signed_file": "checksums.sha256",
         "public_key": f"{'A' * 43}=", "signature": f"{'A' * 86}==",
     }),
@@ -195,7 +195,7 @@ def make_specimens(root: Path) -> Path:
         "are_box_ids": True,
         "boxes": [[1, 1], [7, 7]],
     }
-    write_json(tree / "Town01" / IDS_FILE, {"schema": IDS_SCHEMA, "schema_version": IDS_VERSION, **ids})
+    write_json(tree / "Town01" / IDS_FILE, {**IDS_FORMAT.header, **ids})
     pack_depth(root / TREE / "aug_001")
     for folder in find_flights(tree):
         write_checksums(
@@ -817,7 +817,7 @@ READERS: dict[str, Reader] = {
     "release record": _one("release/dataset/release.json", read_record),
     "signature": _one(
         "signature.json",
-        lambda path: read_model(path, sign.Signature, schema=sign.SCHEMA, version=sign.VERSION, what="signature"),
+        lambda path: read_model(path, sign.Signature, sign.FORMAT),
     ),
     "release, verify": Reader(
         (

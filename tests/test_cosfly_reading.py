@@ -34,7 +34,7 @@ from cosfly.work.config import Config, apply_overrides, build, read_yaml
 from cosfly.work.journal import Journal
 from cosfly.work.stage_folder import Kept, StageFolder, read_failures, result_of
 from cosfly.work.store import inside
-from release.record import RELEASE_VERSION, read_record
+from release.record import RELEASE_FORMAT, read_record
 from specimens import make_playback_tree
 
 
@@ -106,7 +106,7 @@ def test_a_key_given_twice_among_very_many_is_found_soon():
 
 @pytest.mark.parametrize("field", ["shards", "flights", "maps"])
 def test_a_list_of_empty_objects_is_refused_at_the_first(tmp_path, field):
-    head = {"schema": "cosfly.release", "schema_version": RELEASE_VERSION, field: [{}] * 30_000}
+    head = {**RELEASE_FORMAT.header, field: [{}] * 30_000}
     (tmp_path / "release.json").write_text(json.dumps(head))
     tracemalloc.start()
     try:

@@ -141,7 +141,7 @@ def test_the_command_decides_and_says_what_is_open(product):
     assert page.exit_code == 0
     assert product.with_name("review.html").is_file()
     filled = product.with_name("filled.json")
-    about = {"schema": review.SCHEMA, "schema_version": review.VERSION, "inspection": sha256_file(product), "by": "Cy"}
+    about = {**review.FORMAT.header, "inspection": sha256_file(product), "by": "Cy"}
     filled.write_text(json.dumps(about | {"choices": [{"folder": third, "verdict": "accepted", "reason": "again"}]}))
     assert "3 accepted" in ask("--decisions", str(filled)).output
     filled.write_text(json.dumps(about | {"inspection": "0" * 64, "choices": []}))

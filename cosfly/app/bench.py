@@ -16,13 +16,14 @@ from caption.teachers.teacher import EMBEDDED
 from cosfly.app.pipeline import stages
 from cosfly.app.settings import RunConfig
 from cosfly.errors import ConfigError, ResumeError
+from cosfly.reading.documents import FileFormat
 from cosfly.work.stage_events import EVENTS, LOSSES, Event, read_events
 from cosfly.work.stage_folder import Manifest, read_manifest
 from cosfly.work.store import write_bytes, write_model
 
 log = logging.getLogger(__name__)
 
-SCHEMA, VERSION = "cosfly.bench", "1.1"
+FORMAT = FileFormat("cosfly.bench", "1.1")
 STAGES = ("pedestrians", "plan", "render", "inspect", "caption", "release")  # those that do items
 
 
@@ -91,7 +92,7 @@ def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterab
         stages=stage_rows(run_folder, STAGES),
     )
     write_bytes(out / "bench.md", markdown(bench).encode())
-    write_model(out / "bench.json", bench, schema=SCHEMA, version=VERSION)
+    write_model(out / "bench.json", bench, FORMAT)
     return bench
 
 

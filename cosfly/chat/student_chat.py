@@ -22,7 +22,7 @@ from cosfly.chat.contract import Request
 from cosfly.errors import InputError
 from cosfly.look.frame_views import View, encode_picture, frame_label
 from cosfly.products.captions import Language, Prompt
-from cosfly.reading.documents import read_model
+from cosfly.reading.documents import FileFormat, read_model
 from cosfly.work.store import sha256_bytes, write_model
 
 IMAGE_ENCODING: Literal["png"] = "png"
@@ -98,7 +98,7 @@ def _bounded(picture: np.ndarray, max_pixels: int) -> np.ndarray:
 
 # --- what a student was taught ----------------------------------------------------------------------------------------
 
-TAUGHT, TAUGHT_SCHEMA, TAUGHT_VERSION = "cosfly_student.json", "cosfly.student", "1.0"
+TAUGHT, TAUGHT_FORMAT = "cosfly_student.json", FileFormat("cosfly.student", "1.0", "student")
 
 
 class FrameLook(BaseModel):
@@ -129,7 +129,7 @@ class Taught(BaseModel):
 
 
 def write_taught(folder: Path, taught: Taught) -> None:
-    write_model(folder / TAUGHT, taught, schema=TAUGHT_SCHEMA, version=TAUGHT_VERSION)
+    write_model(folder / TAUGHT, taught, TAUGHT_FORMAT)
 
 
 def read_taught(folder: Path) -> Taught:
@@ -139,7 +139,7 @@ def read_taught(folder: Path) -> Taught:
         InputError: there is none, or it is malformed.
     """
     place = _place_of(folder)
-    return read_model(place / TAUGHT, Taught, schema=TAUGHT_SCHEMA, version=TAUGHT_VERSION, what="student", tree=place)
+    return read_model(place / TAUGHT, Taught, TAUGHT_FORMAT, tree=place)
 
 
 def student_files(folder: Path) -> dict[str, Path]:

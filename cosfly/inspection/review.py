@@ -14,13 +14,13 @@ from cosfly.inspection.view import FlightView
 from cosfly.look.page import page, run_name
 from cosfly.products.inspection import read_inspection
 from cosfly.products.review import Choice, Decision, Verdict, add_decisions, read_decisions, undecided
-from cosfly.reading.documents import read_model
+from cosfly.reading.documents import FileFormat, read_model
 from cosfly.reading.files import read_text, sha256_file
 from cosfly.work.journal import Journal
 from cosfly.work.stage_folder import Failed, read_item, result_of
 from cosfly.work.store import write_bytes
 
-SCHEMA, VERSION = "cosfly.review", "1.0"
+FORMAT = FileFormat("cosfly.review", "1.0", "file of decisions")
 FILLED = "decisions.json"  # as the page saves it
 SCRIPT = read_text(Path(__file__).with_name("review.js"))
 
@@ -41,7 +41,7 @@ def read_filled(path: Path) -> ReviewForm:
     Raises:
         InputError: names the file and the field.
     """
-    return read_model(path, ReviewForm, schema=SCHEMA, version=VERSION, what="file of decisions")
+    return read_model(path, ReviewForm, FORMAT)
 
 
 def take(inspected: Path, filled: Path) -> list[Decision]:
@@ -95,7 +95,7 @@ def page_html(inspected: Path) -> str:
     queue = [flight for flight in inspection.flights if flight.result == "review"]
     page_mb = float(inspection.settings.get("page_mb", InspectConfig().page_mb))
     rows = cards(queue, _views(inspected), page_mb, read_decisions(inspected))
-    data = {"schema": SCHEMA, "schema_version": VERSION, "inspection": sha256_file(inspected), "file": FILLED}
+    data = {**FORMAT.header, "inspection": sha256_file(inspected), "file": FILLED}
     return page("cosfly/inspection/review.html", title=run_name(inspected.parent), script=SCRIPT, data=data, **rows)
 
 

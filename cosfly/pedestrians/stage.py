@@ -45,6 +45,7 @@ from cosfly.products.ground import Ground
 from cosfly.products.others import OTHERS_FILE, Company, write_others
 from cosfly.products.roi import read_roi
 from cosfly.products.walks import Walk, pace_field, walk_id, write_paths
+from cosfly.reading.documents import FileFormat
 from cosfly.work.chance import draw_by_share, rng_for
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.work.stage_folder import Resume, StageFolder, result_of
@@ -130,7 +131,7 @@ def _legend(width_px: int, pixels_per_m: float, has_roi: bool, num_paths: int) -
 log = logging.getLogger(__name__)
 
 STAGE = "pedestrians"
-REPORT_SCHEMA, REPORT_VERSION = "cosfly.pedestrians_report", "1.0"
+REPORT_FORMAT = FileFormat("cosfly.pedestrians_report", "1.0")
 RETRY_REASONS = ("no_goal", "detour")
 
 
@@ -255,8 +256,7 @@ def report(ground: WalkableGround, paths: list[Walk], retries: list[dict[str, in
     total_m = sum(line["length_m"] for line in lines)
     total_s = sum(line["duration_s"] for line in lines)
     return {
-        "schema": REPORT_SCHEMA,
-        "schema_version": REPORT_VERSION,
+        **REPORT_FORMAT.header,
         "ground": ground.counts,
         "paths": lines,
         "failed": failed,

@@ -26,13 +26,13 @@ from cosfly.planners.stage import check_ids, draw_styles_of, plan_flight, warm_u
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import Walk, read_paths
-from cosfly.reading.documents import read_object, validated
+from cosfly.reading.documents import FileFormat, read_object, validated
 from cosfly.work.chance import rng_for
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Kept, Resume, StageFolder, read_manifest, result_of
 from cosfly.work.store import write_bytes, write_json
 
-SCHEMA, VERSION = "cosfly.plan_compare", "2.1"
+FORMAT = FileFormat("cosfly.plan_compare", "2.1")
 CLEARANCE_SCALE_M = 5.0  # a clearance of this or more is full safety
 
 # Figures of one flight, in the order of the tables: name, title, digits.
@@ -258,7 +258,7 @@ def run(
         **summarize(flights, rng_for(seed, "plan_compare", "intervals")),
         "left_out": _left_out(finished.records),
     }
-    write_json(product, {"schema": SCHEMA, "schema_version": VERSION, **header, **summary})
+    write_json(product, {**FORMAT.header, **header, **summary})
     outputs = [product]
     for name, traces in flights.items():
         outputs.append(out / f"drone_trace_{name}.json")

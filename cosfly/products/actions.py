@@ -17,14 +17,14 @@ from typing import Self, TypeVar
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from cosfly.errors import ConfigError, InputError, nearest
-from cosfly.reading.documents import read_model
+from cosfly.reading.documents import FileFormat, read_model
 from cosfly.reading.files import read_bytes
 from cosfly.work import in_place
 from cosfly.work.config import LEFT_OUT, Config, build, read_yaml
 from cosfly.work.store import write_bytes, write_model
 
 ACTIONS_FILE = Path(__file__).with_name("actions.yaml")
-ACTIONS_SCHEMA, ACTIONS_VERSION = "cosfly.actions", "1.0"
+ACTIONS_FORMAT = FileFormat("cosfly.actions", "1.0", "actions")
 OWN_ACTIONS = "actions.json"  # beside `captions.jsonl`, where the set is not the one that ships
 
 MOST_ACTIONS, MOST_TOKEN_CHARACTERS = 100, 40
@@ -237,8 +237,8 @@ class ActionSet(Config):
 class _ActionsFile(ActionSet):
     """With what says which file it is."""
 
-    schema_: str = Field(alias="schema", pattern=f"^{ACTIONS_SCHEMA}$", description=ACTIONS_SCHEMA)
-    schema_version: str = Field(pattern=f"^{re.escape(ACTIONS_VERSION)}$", description="version of this form")
+    schema_: str = Field(alias="schema", pattern=f"^{ACTIONS_FORMAT.schema}$", description=ACTIONS_FORMAT.schema)
+    schema_version: str = Field(pattern=f"^{re.escape(ACTIONS_FORMAT.version)}$", description="version of this form")
 
 
 def read_actions(path: Path) -> ActionSet:
@@ -293,7 +293,7 @@ def write_own_actions(folder: Path) -> list[Path]:
     actions = in_place.given("actions")
     if actions is None:
         return []
-    write_model(folder / OWN_ACTIONS, actions, schema=ACTIONS_SCHEMA, version=ACTIONS_VERSION)
+    write_model(folder / OWN_ACTIONS, actions, ACTIONS_FORMAT)
     return [folder / OWN_ACTIONS]
 
 
@@ -306,7 +306,7 @@ def actions_beside(captions: Path) -> ActionSet | None:
     path = captions.parent / OWN_ACTIONS
     if not path.is_file():
         return None
-    return read_model(path, ActionSet, schema=ACTIONS_SCHEMA, version=ACTIONS_VERSION, what="actions", tree=path.parent)
+    return read_model(path, ActionSet, ACTIONS_FORMAT, tree=path.parent)
 
 
 def not_in_set(token: object, where: object) -> InputError:

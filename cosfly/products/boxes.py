@@ -18,10 +18,10 @@ from cosfly.products.columns import LARGEST, rounded
 from cosfly.products.ground import Ground, GroundGrid
 from cosfly.products.kinds import GROUND_KINDS, KIND_COLORS, KIND_NAMES, KINDS
 from cosfly.products.meshes import Meshes, MeshRef
-from cosfly.reading.documents import MISSING, check_schema, read_json, validated
+from cosfly.reading.documents import MISSING, FileFormat, check_schema, read_json, validated
 from cosfly.work.store import dump_json, write_bytes
 
-BOXES_SCHEMA, BOXES_VERSION = "cosfly.boxes_3d", "1.0"
+BOXES_FORMAT = FileFormat("cosfly.boxes_3d", "1.0", "map")
 MAP_MB = 4_096  # 15 million boxes; ten million took 2.7 GB as they are written
 AXES = "right-handed, metres, x east, y north, z up; degrees"
 # How far a told corner may be from the one that follows: exporters round, and turn boxes in single precision.
@@ -242,8 +242,7 @@ def write_boxes(path: Path, box_map: BoxMap) -> None:
     passes: dict[str, Any] = {name: told.pop(name) for name in ("passes", "simplify") if name in told}
     heights = told.pop("ground", None)
     header: dict[str, Any] = {
-        "schema": BOXES_SCHEMA,
-        "schema_version": BOXES_VERSION,
+        **BOXES_FORMAT.header,
         **told,
         "axes": AXES,
         "bounds": {"min": rounded(low), "max": rounded(high)},
@@ -282,11 +281,11 @@ def read_boxes(path: Path) -> BoxMap:
     if path.suffix.lower() in (".csv", ".geojson"):
         fix = f"cosfly maps --source boxes --set maps.boxes.path={path} --out DIR makes boxes_3d.json of it"
         raise InputError("boxes of one's own, not a map yet", where=path, fix=fix)
-    value = read_json(path, what="map", most_mb=MAP_MB)
+    value = read_json(path, what=BOXES_FORMAT.what, most_mb=MAP_MB)
     header = MapHeader(name=path.stem)
     records: Any = value
     if not isinstance(value, list):
-        records = check_schema(value, BOXES_SCHEMA, BOXES_VERSION, path).pop("boxes", None)
+        records = check_schema(value, BOXES_FORMAT, path).pop("boxes", None)
         header = validated(MapHeader, {key: told for key, told in value.items() if key not in COMPUTED}, path)
         if records is None:
             raise InputError(MISSING, where=f"{path}: boxes", expected="a list")

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.reading.documents import MISSING
+from cosfly.geometry import step_s
+from cosfly.reading.documents import MISSING, FileFormat, check_schema, read_json
+from cosfly.work.store import write_json
+
+Item = TypeVar("Item")
 
 LARGEST = 1e18  # no length or time is larger in any unit, and no square or sum of such numbers overflows
 
@@ -34,6 +39,26 @@ def records(value: dict, name: str, path: Path | str) -> list[dict]:
     if not isinstance(records, list) or not all(isinstance(r, dict) for r in records):
         raise InputError("not a list of objects", where=f"{path}: {name}")
     return records
+
+
+def read_items(path: Path, form: FileFormat, name: str, parse: Callable[[dict, str], Item]) -> list[Item]:
+    """Read the items of a product, as `parse` makes them of a record and its place.
+
+    Raises:
+        InputError: names the file, the item and the field.
+    """
+    value = check_schema(read_json(path, what=form.what), form, path)
+    return [parse(record, f"{path}: {name}[{i}]") for i, record in enumerate(records(value, name, path))]
+
+
+def write_items(path: Path, form: FileFormat, name: str, items: list[Any], header: dict[str, Any]) -> None:
+    """Write what `read_items` reads; `header` holds the map's name, the seed and what else a stage wants on record."""
+    write_json(path, {**form.header, **header, name: [item.as_json() for item in items]}, indent=None)
+
+
+def step_field(items: list[Any]) -> dict[str, float | None]:
+    """Give what a product says of the step of its items' times."""
+    return {"dt_s": round(step_s(items[0].time_s), 6) if items else None}
 
 
 def text_id(record: dict, where: str) -> str:

@@ -25,7 +25,7 @@ from cosfly.products.places import tree_of_flight
 from cosfly.products.png import areas_png, colours_png, floats_of, floats_png
 from cosfly.products.weather import WeatherRecord
 from cosfly.reading.arrays import PNG_SIGNATURE, parse_array_header, read_array, read_picture
-from cosfly.reading.documents import read_model
+from cosfly.reading.documents import FileFormat, read_model
 from cosfly.reading.files import read_bytes
 from cosfly.work.config import Config
 from cosfly.work.store import dump_json
@@ -43,7 +43,7 @@ FILM_WIDTH_MM = 36.0  # of a 35 mm film's picture
 LEAST_FOV_DEG, MOST_FOV_DEG = 0.1, 179.0
 LEVEL_NAMES: dict[float, str] = {110: "wide-angle", 90: "standard", 60: "narrow", 30: "telephoto"}  # tab:zoom_config
 SKY_DEPTH_M, INVALID_DEPTH_M = 1000.0, 0.0
-META_SCHEMA, META_VERSION = "cosfly.frame", "1.0"
+META_FORMAT = FileFormat("cosfly.frame", "1.0", "frame annotation")
 XYZ, ANGLES = ("x", "y", "z"), ("pitch", "yaw", "roll")
 
 COORDINATES = {
@@ -264,7 +264,7 @@ class FrameMeta(_Group):
 
     def to_bytes(self) -> bytes:
         """The content of the file."""
-        record = {"schema": META_SCHEMA, "schema_version": META_VERSION, **self.model_dump()}
+        record = {**META_FORMAT.header, **self.model_dump()}
         return (dump_json(record, indent=1) + "\n").encode()
 
 
@@ -274,10 +274,7 @@ def read_meta(frame: Path) -> FrameMeta:
     Raises:
         InputError: missing, or not such a file; names the field.
     """
-    path = frame / "meta.json"
-    return read_model(
-        path, FrameMeta, schema=META_SCHEMA, version=META_VERSION, what="frame annotation", tree=tree_of(frame)
-    )
+    return read_model(frame / "meta.json", FrameMeta, META_FORMAT, tree=tree_of(frame))
 
 
 # --- the files --------------------------------------------------------------------------------------------------------

@@ -12,10 +12,10 @@ from cosfly.errors import InputError
 from cosfly.products.coverage import Coverage
 from cosfly.products.issues import Issue
 from cosfly.products.playback import ORIGINAL
-from cosfly.reading.documents import read_model
+from cosfly.reading.documents import FileFormat, read_model
 from cosfly.work.store import write_model
 
-INSPECT_SCHEMA, INSPECT_VERSION = "cosfly.inspect", "1.0"
+INSPECT_FORMAT = FileFormat("cosfly.inspect", "1.0", "inspection")
 
 Result = Literal["accepted", "review", "rejected"]
 RESULTS: tuple[Result, ...] = ("accepted", "review", "rejected")
@@ -120,7 +120,7 @@ def count_trajectories(flights: list[FlightInspection], *, planned: bool) -> dic
 
 def write_inspection(path: Path, inspection: Inspection) -> None:
     """Write `inspect.json`."""
-    write_model(path, inspection, schema=INSPECT_SCHEMA, version=INSPECT_VERSION)
+    write_model(path, inspection, INSPECT_FORMAT)
 
 
 def read_inspection(path: Path) -> Inspection:
@@ -129,7 +129,7 @@ def read_inspection(path: Path) -> Inspection:
     Raises:
         InputError: names the file and the field.
     """
-    inspection = read_model(path, Inspection, schema=INSPECT_SCHEMA, version=INSPECT_VERSION, what="inspection")
+    inspection = read_model(path, Inspection, INSPECT_FORMAT)
     counts = Counter(flight.folder for flight in inspection.flights)
     if twice := [folder for folder, count in counts.items() if count > 1]:
         raise InputError(

@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.products.columns import column, records, rounded, text_id
+from cosfly.products.columns import column, read_items, records, rounded, text_id, write_items
 from cosfly.products.kinds import KINDS
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
-from cosfly.reading.documents import check_schema, read_json
-from cosfly.work.store import write_json
+from cosfly.reading.documents import FileFormat
 
 OTHERS_FILE = "others.json"
-OTHERS_SCHEMA, OTHERS_VERSION = "cosfly.others", "1.0"
+OTHERS_FORMAT = FileFormat("cosfly.others", "1.0", "others")
 
 
 @dataclass(frozen=True)
@@ -134,15 +133,9 @@ def distances_to_boxes_m(points_m: np.ndarray, other: Other) -> np.ndarray:
 
 def write_others(path: Path, companies: list[Company], header: dict) -> None:
     """Write `others.json`; `header` holds the map's name, the seed and the time step."""
-    value = {"schema": OTHERS_SCHEMA, "schema_version": OTHERS_VERSION, **header}
-    write_json(path, {**value, "paths": [company.as_json() for company in companies]}, indent=None)
+    write_items(path, OTHERS_FORMAT, "paths", companies, header)
 
 
 def read_others(path: Path) -> list[Company]:
-    """Read `others.json`.
-
-    Raises:
-        InputError: names the file, the walk, the other and the field.
-    """
-    value = check_schema(read_json(path, what="others"), OTHERS_SCHEMA, OTHERS_VERSION, path)
-    return [Company.from_json(r, f"{path}: paths[{i}]") for i, r in enumerate(records(value, "paths", path))]
+    """Read `others.json`; raises as `read_items`."""
+    return read_items(path, OTHERS_FORMAT, "paths", Company.from_json)

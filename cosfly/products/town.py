@@ -11,11 +11,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader
-from cosfly.reading.documents import read_model
+from cosfly.reading.documents import FileFormat, read_model
 from cosfly.work.store import write_model
 
-IDS_SCHEMA, IDS_VERSION, IDS_FILE = "cosfly.instance_ids", "1.0", "instance_ids.json"
-TOWN_SCHEMA, TOWN_VERSION, TOWN_FILE = "cosfly.town_map", "1.0", "map.json"
+IDS_FILE, IDS_FORMAT = "instance_ids.json", FileFormat("cosfly.instance_ids", "1.0", "record of ids")
+TOWN_FILE, TOWN_FORMAT = "map.json", FileFormat("cosfly.town_map", "1.0", "town's map")
 
 
 class TownMap(BaseModel):
@@ -31,7 +31,7 @@ class TownMap(BaseModel):
 def write_town_map(town: Path, header: MapHeader) -> Path:
     """Write what `read_town_map` reads; give the file."""
     shown = TownMap(name=header.name, licence=header.licence, credits=header.credits)
-    write_model(town / TOWN_FILE, shown, schema=TOWN_SCHEMA, version=TOWN_VERSION)
+    write_model(town / TOWN_FILE, shown, TOWN_FORMAT)
     return town / TOWN_FILE
 
 
@@ -39,9 +39,7 @@ def read_town_map(town: Path) -> TownMap:
     """Read what a town's folder says of its map; a foreign tree has no such file, and its licence is unknown."""
     if not (town / TOWN_FILE).exists():
         return TownMap(name=town.name, licence=UNKNOWN_LICENCE, credits="")
-    return read_model(
-        town / TOWN_FILE, TownMap, schema=TOWN_SCHEMA, version=TOWN_VERSION, what="town's map", tree=town.parent
-    )
+    return read_model(town / TOWN_FILE, TownMap, TOWN_FORMAT, tree=town.parent)
 
 
 class InstanceIds(BaseModel):
@@ -63,11 +61,5 @@ class InstanceIds(BaseModel):
 
 
 def read_instance_ids(town: Path) -> InstanceIds:
-    """Read the ids of a town's folder.
-
-    Raises:
-        InputError: missing, or not such a file; names the field.
-    """
-    return read_model(
-        town / IDS_FILE, InstanceIds, schema=IDS_SCHEMA, version=IDS_VERSION, what="record of ids", tree=town.parent
-    )
+    """Read the ids of a town's folder; raises as `read_model`."""
+    return read_model(town / IDS_FILE, InstanceIds, IDS_FORMAT, tree=town.parent)

@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.geometry import step_s
-from cosfly.products.columns import column, records, rounded, text_id
+from cosfly.products.columns import column, read_items, rounded, step_field, text_id, write_items
 from cosfly.products.segments import Mission, Segment, flown_as_json, read_mission, read_segments
 from cosfly.products.walks import PLAIN_PACE, pace_field, pace_of
-from cosfly.reading.documents import check_schema, read_json
-from cosfly.work.store import write_json
+from cosfly.reading.documents import FileFormat
 
-TRACE_SCHEMA, TRACE_VERSION = "cosfly.drone_trace", "1.0"
+TRACE_FORMAT = FileFormat("cosfly.drone_trace", "1.0", "drone traces")
 ARRAYS = ("time_s", "positions_m", "rotations_deg", "targets_m", "visibility")
 MORE = ("metrics", "solver", "drop_reason", "instead_of", "not_held")  # fields of a flight that are taken as they are
 
@@ -118,20 +116,9 @@ class DroneTrace:
 
 def write_traces(path: Path, traces: list[DroneTrace], header: dict) -> None:
     """Write `drone_trace.json`; `header` holds the map's name, planner settings and seed."""
-    value = {
-        "schema": TRACE_SCHEMA,
-        "schema_version": TRACE_VERSION,
-        **header,
-        "dt_s": round(step_s(traces[0].time_s), 6) if traces else None,
-    }
-    write_json(path, {**value, "traces": [t.as_json() for t in traces]}, indent=None)
+    write_items(path, TRACE_FORMAT, "traces", traces, header | step_field(traces))
 
 
 def read_traces(path: Path) -> list[DroneTrace]:
-    """Read `drone_trace.json`.
-
-    Raises:
-        InputError: names the file, the trace and the field.
-    """
-    value = check_schema(read_json(path, what="drone traces"), TRACE_SCHEMA, TRACE_VERSION, path)
-    return [DroneTrace.from_json(r, f"{path}: traces[{i}]") for i, r in enumerate(records(value, "traces", path))]
+    """Read `drone_trace.json`; raises as `read_items`."""
+    return read_items(path, TRACE_FORMAT, "traces", DroneTrace.from_json)

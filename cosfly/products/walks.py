@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.geometry import step_s
-from cosfly.products.columns import column, matrix, records, rounded, text_id
-from cosfly.reading.documents import check_schema, read_json
-from cosfly.work.store import write_json
+from cosfly.products.columns import column, matrix, read_items, rounded, step_field, text_id, write_items
+from cosfly.reading.documents import FileFormat
 
 # The tracked person: an axis-aligned box round the hip point, which is the target's position everywhere.
 PERSON_HALF_EXTENTS_M = (0.3, 0.3, 0.9)
@@ -19,7 +17,7 @@ TARGET_HEIGHT_M = 0.9  # hip height over the ground: the box stands on it
 
 PLAIN_PACE = "walk"  # files do not name it
 
-PATHS_SCHEMA, PATHS_VERSION = "cosfly.path", "1.0"
+PATHS_FORMAT = FileFormat("cosfly.path", "1.0", "pedestrian paths")
 
 
 @dataclass(frozen=True)
@@ -86,20 +84,9 @@ def pace_of(record: dict, where: str) -> str:
 
 def write_paths(path: Path, paths: list[Walk], header: dict) -> None:
     """Write `path.json`; `header` holds the map's name, seed and whatever the stage wants on record."""
-    value = {
-        "schema": PATHS_SCHEMA,
-        "schema_version": PATHS_VERSION,
-        **header,
-        "dt_s": round(step_s(paths[0].time_s), 6) if paths else None,
-    }
-    write_json(path, {**value, "paths": [p.as_json() for p in paths]}, indent=None)
+    write_items(path, PATHS_FORMAT, "paths", paths, header | step_field(paths))
 
 
 def read_paths(path: Path) -> list[Walk]:
-    """Read `path.json`.
-
-    Raises:
-        InputError: names the file, the path and the field.
-    """
-    value = check_schema(read_json(path, what="pedestrian paths"), PATHS_SCHEMA, PATHS_VERSION, path)
-    return [Walk.from_json(r, f"{path}: paths[{i}]") for i, r in enumerate(records(value, "paths", path))]
+    """Read `path.json`; raises as `read_items`."""
+    return read_items(path, PATHS_FORMAT, "paths", Walk.from_json)

@@ -17,7 +17,7 @@ import re
 import reprlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import SchemaValidator
@@ -254,12 +254,26 @@ def model_lines(path: Path, model: type[Model], *, what: str, fix: str) -> Itera
 MISSING = "the field is missing or null"
 
 
-def check_schema(value: Any, schema: str, version: str, path: Path | str) -> dict:
+class FileFormat(NamedTuple):
+    """What a kind of JSON file says of itself, and how messages call it."""
+
+    schema: str
+    version: str
+    what: str = "file"
+
+    @property
+    def header(self) -> dict[str, str]:
+        """What such a file begins with."""
+        return {"schema": self.schema, "schema_version": self.version}
+
+
+def check_schema(value: Any, form: FileFormat, path: Path | str) -> dict:
     """Give a JSON value that is an object of the wanted schema and major version.
 
     Raises:
         InputError: it is not; names the file and the field.
     """
+    schema, version, _ = form
     if not isinstance(value, dict):
         raise InputError(
             "not a cosfly file", where=path, got=type(value).__name__, expected=f"an object, schema {schema}"
@@ -280,13 +294,16 @@ def check_schema(value: Any, schema: str, version: str, path: Path | str) -> dic
     return value
 
 
-def read_model(
-    path: Path, model: type[Model], *, schema: str, version: str, what: str = "file", tree: Path | None = None
-) -> Model:
-    """Read a JSON file of the wanted schema and major version.
+def model_of(value: Any, model: type[Model], form: FileFormat, where: Path | str) -> Model:
+    """Give what a JSON value of the wanted schema and major version says as a model.
 
     Raises:
         InputError: names the file and the field.
     """
-    value = check_schema(read_json(path, what=what, tree=tree, each_key_once=True), schema, version, path)
-    return validated(model, {key: v for key, v in value.items() if key not in ("schema", "schema_version")}, path)
+    value = check_schema(value, form, where)
+    return validated(model, {key: v for key, v in value.items() if key not in form.header}, where)
+
+
+def read_model(path: Path, model: type[Model], form: FileFormat, *, tree: Path | None = None) -> Model:
+    """Read a JSON file of the wanted schema and major version; raises as `read_json` and `model_of`."""
+    return model_of(read_json(path, what=form.what, tree=tree, each_key_once=True), model, form, path)

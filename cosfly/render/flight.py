@@ -22,6 +22,7 @@ from cosfly.products.segments import Mission, Segment
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.products.weather import WeatherRecord
+from cosfly.reading.documents import FileFormat
 from cosfly.reading.files import sha256_file
 from cosfly.render.camera import TargetView, hidden_shares, rendered_visibility, view_target
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
@@ -63,7 +64,7 @@ def check_flight(trace: DroneTrace, surroundings: Surroundings) -> None:
         )  # fmt: skip
 
 
-REPORT_SCHEMA, REPORT_VERSION = "cosfly.perturbation_report", "1.0"
+REPORT_FORMAT = FileFormat("cosfly.perturbation_report", "1.0")
 MARGIN_M = 60.0  # shadows and sky openness are computed this far around the flight
 FRAMES_IN_FLIGHT = 6  # drawn but not written yet: bounds the memory (about 10 MB each)
 
@@ -251,8 +252,7 @@ def _report(perturbed: PerturbedTrack) -> dict:
     """`perturbation_report.json`: how often each event happened, and how near the drone came to an obstacle."""
     outcomes = {event: Counter(state[event] for state in perturbed.states) for event in ("position", "rotation")}
     return {
-        "schema": REPORT_SCHEMA,
-        "schema_version": REPORT_VERSION,
+        **REPORT_FORMAT.header,
         "num_frames": len(perturbed.states),
         "num_perturbed": int(perturbed.is_perturbed.sum()),
         "clearance_min_m": round(float(perturbed.poses.clearances_m.min()), 4),

@@ -21,7 +21,7 @@ from cosfly.products.frames import Look
 from cosfly.products.others import Company, read_others
 from cosfly.products.places import place_of, town_folder
 from cosfly.products.shift_draws import PERTURBED, rng_of_shifts
-from cosfly.products.town import IDS_FILE, IDS_SCHEMA, IDS_VERSION, write_town_map
+from cosfly.products.town import IDS_FILE, IDS_FORMAT, write_town_map
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.walks import pace_field
 from cosfly.products.weather import WeatherRecord
@@ -306,8 +306,7 @@ def _ids_record(box_map: BoxMap, num_others: int) -> dict:
     """Which box an id of `instance.png` stands for, rows of (instance id, box id), and the ids of others."""
     ids = instance_ids(box_map, num_others)
     return {
-        "schema": IDS_SCHEMA,
-        "schema_version": IDS_VERSION,
+        **IDS_FORMAT.header,
         "person": PERSON_ID,
         "shared": SHARED_ID,
         **({"others": [other_id(number) for number in range(num_others)]} if num_others else {}),

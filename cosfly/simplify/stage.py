@@ -11,13 +11,14 @@ from cosfly.errors import InputError
 from cosfly.look.topview import TopView, add_caption, draw_map, png_bytes
 from cosfly.products.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.products.kinds import SURFACE_KINDS
+from cosfly.reading.documents import FileFormat
 from cosfly.simplify.passes import Simplification, SimplifyConfig, simplify
 from cosfly.space.grid import blocks_walking, compare, connected_parts, empty_grid, inflate, occupancy
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import write_bytes, write_json
 
 SAFETY_RADIUS_M = 0.5  # tab:ped_params; for the walkable area in the report
-REPORT_SCHEMA, REPORT_VERSION = "cosfly.simplify_report", "1.0"
+REPORT_FORMAT = FileFormat("cosfly.simplify_report", "1.0")
 
 log = logging.getLogger(__name__)
 
@@ -43,8 +44,7 @@ def cross_validate(raw: BoxMap, simplified: BoxMap) -> dict:
 def report(raw: BoxMap, result: Simplification, cfg: SimplifyConfig) -> dict:
     """Give the content of `simplify_report.json`."""
     return {
-        "schema": REPORT_SCHEMA,
-        "schema_version": REPORT_VERSION,
+        **REPORT_FORMAT.header,
         "name": raw.name,
         "num_boxes": {"raw": len(raw), "simplified": len(result.box_map)},
         "obstacles_at_walking_height": {

@@ -29,12 +29,13 @@ from cosfly.products.frames import (
     read_rgb,
 )
 from cosfly.reading.arrays import parse_array, parse_array_header
+from cosfly.reading.documents import FileFormat
 from cosfly.reading.files import read_bytes
 from cosfly.work.store import write_bytes, write_model
 from release.depth import MOST_PNG_M, depth_of, depth_record, encoded
 from release.record import DepthCodingName
 
-SCHEMA, VERSION = "cosfly.depth_study", "1.0"
+FORMAT = FileFormat("cosfly.depth_study", "1.0")
 MOST_HALF_M = float(np.finfo(np.float16).max)  # more is no number in 16 bits
 BITS = (8, 10, 12, 16)
 ENTROPY_BINS = 8192  # of the frame's range, the same for all codings: exact values of a float are nearly all unlike
@@ -112,7 +113,7 @@ def run(frame: Path, out: Path) -> Study:
         max_m=float(known.max()), share_measured=float(measured.mean()), rows=rows, left_out=left_out,
     )  # fmt: skip
     rgb = read_rgb(frame) if frame.is_dir() and (frame / "rgb.png").exists() else None
-    write_model(out / "depth_study.json", study, schema=SCHEMA, version=VERSION)
+    write_model(out / "depth_study.json", study, FORMAT)
     write_bytes(out / "depth_study.md", markdown(study).encode())
     write_bytes(
         out / "depth_study.png",

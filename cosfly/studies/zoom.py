@@ -22,6 +22,7 @@ from cosfly.look.topview import add_caption
 from cosfly.products.boxes import check_ground, read_boxes
 from cosfly.products.frames import Camera, level_name, rgb_bytes
 from cosfly.products.traces import read_traces
+from cosfly.reading.documents import FileFormat
 from cosfly.render.contract import Renderer
 from cosfly.render.flight import MARGIN_M, FlightScript, check_flight, draw_frame
 from cosfly.render.perturbation import Surroundings
@@ -32,7 +33,7 @@ from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.work.stage_folder import Resume, StageFolder, result_of
 from cosfly.work.store import write_bytes, write_json
 
-SCHEMA, VERSION = "cosfly.zoom_study", "1.0"
+FORMAT = FileFormat("cosfly.zoom_study", "1.0")
 STAGE = "zoom_study"
 NUM_RESAMPLES, INTERVAL_PERCENT = 1000, (2.5, 97.5)  # of flights
 HEAD = ("level", "deg", "35 mm", "target px", "visibility %", "IoU")  # of `text_rows`
@@ -289,7 +290,7 @@ def run(
         raise stage.nothing_kept(finished.tally, expected="a flight that can be drawn")
     studied = {record.id: result_of(record, Studied) for record in finished.kept}
     summary = summarize(studied, cfg, rng_for(seed, STAGE, "intervals"))
-    write_json(product, {"schema": SCHEMA, "schema_version": VERSION, "map": box_map.name, "seed": seed, **summary})
+    write_json(product, {**FORMAT.header, "map": box_map.name, "seed": seed, **summary})
     surroundings = Surroundings(read_boxes(simplified))
     renderer = open_renderer(cfg.backend, box_map, cfg.width_px, cfg.height_px, cfg.look, 0, cfg.mesh_triangles)
     shown = [

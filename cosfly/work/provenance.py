@@ -19,7 +19,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.errors import InputError, VerifyError
-from cosfly.reading.documents import read_json, read_model, read_object
+from cosfly.reading.documents import FileFormat, read_json, read_model, read_object
 from cosfly.reading.files import files_named, sha256_file
 from cosfly.work.console import progress_bar
 from cosfly.work.journal import Journal
@@ -27,8 +27,9 @@ from cosfly.work.store import CHECKSUMS, checksum_lines, dump_json, inside, read
 
 log = logging.getLogger(__name__)
 
-STAGE_SCHEMA, MANIFEST_SCHEMA, VERSION = "cosfly.stage", "cosfly.manifest", "1.0"
-RECORDS = (("manifest.json", MANIFEST_SCHEMA), ("stage.json", STAGE_SCHEMA))
+STAGE_FORMAT = FileFormat("cosfly.stage", "1.0", "stage record")
+MANIFEST_FORMAT = FileFormat("cosfly.manifest", "1.0", "manifest")
+RECORDS = (("manifest.json", MANIFEST_FORMAT.schema), ("stage.json", STAGE_FORMAT.schema))
 FLIGHT = "trajectory.json"
 ROLES = {"maps": "boxes", "map": "simplified"}  # a product that stages call by two names
 NUM_NAMED = 5  # files that an error names
@@ -81,9 +82,7 @@ def read_stage_record(folder: Path) -> StageRecord:
     Raises:
         InputError: it is missing or malformed.
     """
-    return read_model(
-        folder / "stage.json", StageRecord, schema=STAGE_SCHEMA, version=VERSION, what="stage record", tree=folder
-    )
+    return read_model(folder / "stage.json", StageRecord, STAGE_FORMAT, tree=folder)
 
 
 def fingerprint(path: Path) -> str:
@@ -95,7 +94,7 @@ def fingerprint(path: Path) -> str:
         )
     if not path.is_dir():
         return sha256_file(path)  # which says so where it is a pipe or a device
-    if _has_record(path, "manifest.json", MANIFEST_SCHEMA):
+    if _has_record(path, "manifest.json", MANIFEST_FORMAT.schema):
         outputs = read_object(path / "manifest.json", what="manifest").get("outputs", [])
         return sha256_bytes(dump_json(outputs).encode())
     digest = hashlib.sha256()
@@ -126,11 +125,9 @@ def folder_digests(folder: Path) -> dict[str, str]:
 
 def recorded_digests(folder: Path) -> dict[str, str]:
     """Give the sha256 of a finished stage's products by their paths; empty where there is no manifest of ours."""
-    if not _has_record(folder, "manifest.json", MANIFEST_SCHEMA):
+    if not _has_record(folder, "manifest.json", MANIFEST_FORMAT.schema):
         return {}
-    made = read_model(
-        folder / "manifest.json", _Made, schema=MANIFEST_SCHEMA, version=VERSION, what="manifest", tree=folder
-    )
+    made = read_model(folder / "manifest.json", _Made, MANIFEST_FORMAT, tree=folder)
     return {output.path: output.sha256 for output in made.outputs}
 
 

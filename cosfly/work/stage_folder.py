@@ -25,9 +25,8 @@ from cosfly.work.config import Config
 from cosfly.work.folder_lock import LOCK, FolderLock, hold_folder, remove_left_lock
 from cosfly.work.journal import Journal
 from cosfly.work.provenance import (
-    MANIFEST_SCHEMA,
-    STAGE_SCHEMA,
-    VERSION,
+    MANIFEST_FORMAT,
+    STAGE_FORMAT,
     Output,
     StageRecord,
     checked_inputs,
@@ -167,9 +166,7 @@ class Manifest(BaseModel):
 
 def read_manifest(folder: Path) -> Manifest:
     """Read the manifest of a complete stage."""
-    return read_model(
-        folder / "manifest.json", Manifest, schema=MANIFEST_SCHEMA, version=VERSION, what="manifest", tree=folder
-    )
+    return read_model(folder / "manifest.json", Manifest, MANIFEST_FORMAT, tree=folder)
 
 
 class StageFolder:
@@ -239,7 +236,7 @@ class StageFolder:
             record = _taken_up(out, record, resume, grows, begins_anew, (*BEGUN, *begun))
             # Failed items are tried again; the others stand in the journal.
             (out / "manifest.json").unlink(missing_ok=True)
-            write_model(out / "stage.json", record, schema=STAGE_SCHEMA, version=VERSION)
+            write_model(out / "stage.json", record, STAGE_FORMAT)
             remove_partials(out)
         except BaseException:
             lock.release()
@@ -300,7 +297,7 @@ class StageFolder:
             seconds=round(time.monotonic() - self.started_s, 3),
             **facts,
         )
-        write_model(self.path / "manifest.json", manifest, schema=MANIFEST_SCHEMA, version=VERSION)
+        write_model(self.path / "manifest.json", manifest, MANIFEST_FORMAT)
         if self._lock is not None:
             self._lock.release()
         log.info("%s: %s, %.1f s", self.stage, tally, manifest.seconds)
@@ -354,7 +351,7 @@ def _taken_up(
             before += [d for d in (fingerprint(out), *recorded_digests(out).values()) if d not in before]
             # While the manifest stands: once it is gone, nobody could say any more what the products of before were.
             noted = found.model_copy(update={"grown_from": before})
-            write_model(out / "stage.json", noted, schema=STAGE_SCHEMA, version=VERSION)
+            write_model(out / "stage.json", noted, STAGE_FORMAT)
         if begins_anew:
             (out / "items.jsonl").unlink(missing_ok=True)
     return record.model_copy(update={"grown_from": before})

@@ -16,6 +16,7 @@ from typing import IO, Any
 from pydantic import BaseModel
 
 from cosfly.errors import InputError, StorageError
+from cosfly.reading.documents import FileFormat
 from cosfly.reading.files import check_stays_below, read_text
 
 DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
@@ -127,9 +128,9 @@ def write_json(path: Path, value: Any, *, indent: int | None = 1) -> None:
     write_bytes(path, (dump_json(value, indent=indent) + "\n").encode())
 
 
-def write_model(path: Path, content: BaseModel, *, schema: str, version: str) -> None:
+def write_model(path: Path, content: BaseModel, form: FileFormat) -> None:
     """Write what `read_model` reads."""
-    write_json(path, {"schema": schema, "schema_version": version, **content.model_dump(mode="json")})
+    write_json(path, {**form.header, **content.model_dump(mode="json")})
 
 
 def sha256_bytes(data: bytes) -> str:

@@ -16,6 +16,7 @@ from cosfly.errors import InputError
 from cosfly.escaping import for_markdown
 from cosfly.look.page import page
 from cosfly.products.actions import one_set
+from cosfly.reading.documents import FileFormat
 from cosfly.work import in_place
 from cosfly.work.chance import rng_for
 from cosfly.work.config import Config
@@ -113,7 +114,7 @@ def _compare(cfg: ReportConfig, reports: Names, folders: Mapping[str, Path], sta
         raise InputError("evaluations of one split are needed", got=", ".join(sorted(splits)))
     comparison = compare(cfg, reports, folders, seed)
     record, path, page = out / "comparison.json", out / "comparison.md", out / "comparison.html"
-    write_model(record, comparison, schema="cosfly.distill_comparison", version="1.0")
+    write_model(record, comparison, FileFormat("cosfly.distill_comparison", "1.0"))
     write_bytes(path, markdown_of(comparison, reports).encode())
     write_bytes(page, page_of(comparison, reports).encode())
     stage.finish([record, path, page], Tally(input=len(reports), kept=len(reports)))

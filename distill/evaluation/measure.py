@@ -16,10 +16,10 @@ from cosfly.products.actions import ActionSet, action_tokens
 from cosfly.products.captions import FIELDS, Coc, Language, SentenceState, read_captions
 from cosfly.products.predictions import FAILED, Prediction
 from cosfly.products.splits import Split
-from cosfly.reading.documents import read_model, read_object, validated
+from cosfly.reading.documents import FileFormat, read_model, read_object, validated
 from cosfly.work.chance import rng_for
 from cosfly.work.journal import Journal
-from cosfly.work.provenance import MANIFEST_SCHEMA
+from cosfly.work.provenance import MANIFEST_FORMAT
 from cosfly.work.stage_folder import read_manifest
 from distill.evaluation.bertscore import Metric, score_beside_floors
 from distill.evaluation.floors import WRITTEN, Floors, coc_of
@@ -79,13 +79,13 @@ def _latency(times_s: np.ndarray) -> dict[str, float]:
 def _last_start(folder: Path) -> tuple[float | None, int]:
     """Give the seconds of the last start of `distill infer`, and how many answers it made."""
     path = folder / "manifest.json"
-    if not path.is_file() or read_object(path, what="manifest").get("schema") != MANIFEST_SCHEMA:
+    if not path.is_file() or read_object(path, what="manifest").get("schema") != MANIFEST_FORMAT.schema:
         return None, 0
     found = validated(_LastStart, read_manifest(folder).facts.get("speed", {}), path)
     return found.seconds, found.answers
 
 
-REPORT, REPORT_SCHEMA, REPORT_VERSION = "report.json", "cosfly.distill_report", "2.0"
+REPORT, REPORT_FORMAT = "report.json", FileFormat("cosfly.distill_report", "2.0", "report")
 STAGE = "distill.evaluate"
 STUDENT = "student"
 UNPARSED_NAME = "(unparsed)"  # column of the confusion table beside the decisions
@@ -155,7 +155,7 @@ NOTES = [
 def read_report(folder: Path) -> Evaluation:
     """Read an evaluation's report; raises as `read_model`."""
     path = folder / REPORT
-    return read_model(path, Evaluation, schema=REPORT_SCHEMA, version=REPORT_VERSION, what="report", tree=folder)
+    return read_model(path, Evaluation, REPORT_FORMAT, tree=folder)
 
 
 def pair_up(samples: Sequence[Sample], predictions: Sequence[Prediction]) -> list[tuple[Sample, Prediction]]:

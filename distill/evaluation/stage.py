@@ -26,8 +26,7 @@ from distill.evaluation.floors import Floors, coc_of
 from distill.evaluation.measure import (
     NOTES,
     REPORT,
-    REPORT_SCHEMA,
-    REPORT_VERSION,
+    REPORT_FORMAT,
     STAGE,
     STUDENT,
     Evaluation,
@@ -106,7 +105,7 @@ def run(
     report, scores = _evaluate(cfg, pairs, dataset, models, sentences, seed)
     num_left = len(samples) - len(pairs)
     report = report.model_copy(update={"not_asked": num_left, "speed": speed_of(predictions, found)})
-    write_model(path, report, schema=REPORT_SCHEMA, version=REPORT_VERSION)
+    write_model(path, report, REPORT_FORMAT)
     write_scores(out / SCORES, scores)
     write_bytes(out / "evaluation.md", markdown_of(report).encode())
     shown = {sample.key: sample for sample, _ in pairs}

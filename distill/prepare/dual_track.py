@@ -21,7 +21,7 @@ from cosfly.products.flights import find_flights, read_twin
 from cosfly.products.places import Place, flight_ids, place_of, sample_id
 from cosfly.products.playback import ORIGINAL, Flight, read_flight
 from cosfly.products.splits import SPLITS, Course, Split, walks_of
-from cosfly.reading.documents import read_model, validated
+from cosfly.reading.documents import FileFormat, read_model, validated
 from cosfly.reading.tables import rows_of
 from cosfly.work.console import progress_bar
 from cosfly.work.provenance import fingerprint
@@ -32,7 +32,7 @@ from distill.prepare.splitting import SplitConfig, check_no_leak
 from distill.schema import PAGE, SourceTree, SplitFiles, SplitMember, columns_of, page_of, split_path, tree_inputs
 
 STAGE = "distill.dual_track"
-RECORD, RECORD_SCHEMA, VERSION = "tracks.json", "cosfly.track_windows", "1.0"
+RECORD, RECORD_FORMAT = "tracks.json", FileFormat("cosfly.track_windows", "1.0", "set of windows")
 AXES = "right-handed: metres, x east, y north, z up; degrees, yaw counter-clockwise from east, pitch nose-up"
 NO_TWIN, OTHER_FRAMES, SHORT = "no_clean_flight", "clean_flight_of_other_frames", "shorter_than_a_window"
 UNEVEN = "uneven_steps"
@@ -97,8 +97,7 @@ def read_track_set(dataset: Path) -> TrackSet:
     Raises:
         InputError: it is missing, of another version, or malformed.
     """
-    path, what = dataset / RECORD, "set of windows"
-    return read_model(path, TrackSet, schema=RECORD_SCHEMA, version=VERSION, what=what, tree=dataset)
+    return read_model(dataset / RECORD, TrackSet, RECORD_FORMAT, tree=dataset)
 
 
 def read_track_samples(dataset: Path, split: Split) -> Iterator[TrackSample]:
@@ -166,7 +165,7 @@ def run(cfg: DualTrackConfig, trees: Sequence[Path], out: Path, *, seed: int = 0
         trees=[SourceTree(run=name, sha256=fingerprint(tree)) for name, tree in runs.items()],
         samples=files.counts,
     )
-    write_model(out / RECORD, record, schema=RECORD_SCHEMA, version=VERSION)
+    write_model(out / RECORD, record, RECORD_FORMAT)
     write_bytes(out / PAGE, _page_of(record))
     check_no_leak({split: read_track_samples(out, split) for split in SPLITS}, cfg.split_by)
     stage.finish([*files.paths, out / RECORD, out / PAGE], tally, split_by=cfg.split_by, **facts)

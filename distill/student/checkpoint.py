@@ -18,7 +18,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from cosfly.errors import InputError
-from cosfly.reading.documents import parse_json, read_json, read_model, read_object, validated
+from cosfly.reading.documents import FileFormat, parse_json, read_json, read_model, read_object, validated
 from cosfly.reading.files import read_lines, sha256_file
 from cosfly.work.store import atomic_folder, read_checksums, write_bytes, write_checksums, write_json, write_model
 from distill.student.model import Student, weight_files
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 ADAPTER_FACTS = "cosfly_adapter.json"
 WEIGHTS, MOMENTS, STATE = "weights.safetensors", "optimizer.safetensors", "state.json"
-CHECKPOINT_SCHEMA, VERSION = "cosfly.checkpoint", "2.0"
+CHECKPOINT_FORMAT = FileFormat("cosfly.checkpoint", "2.0", "checkpoint")
 
 
 class Progress(BaseModel):
@@ -65,7 +65,7 @@ def save_checkpoint(folder: Path, student: Student, optimizer: Any, progress: Pr
     with atomic_folder(folder) as partial:
         save_tensors(partial / WEIGHTS, weights)
         save_tensors(partial / MOMENTS, moments)
-        write_model(partial / STATE, progress, schema=CHECKPOINT_SCHEMA, version=VERSION)
+        write_model(partial / STATE, progress, CHECKPOINT_FORMAT)
         files = [path for path in sorted(partial.rglob("*")) if path.is_file()]
         write_checksums(partial, {str(path.relative_to(partial)): sha256_file(path) for path in files})
 
@@ -123,9 +123,7 @@ def _damage_of(checkpoint: Path) -> str | None:
 
 def read_progress(folder: Path) -> Progress:
     """Read how far a checkpoint is."""
-    return read_model(
-        folder / STATE, Progress, schema=CHECKPOINT_SCHEMA, version=VERSION, what="checkpoint", tree=folder
-    )
+    return read_model(folder / STATE, Progress, CHECKPOINT_FORMAT, tree=folder)
 
 
 def load_checkpoint(folder: Path, student: Student, optimizer: Any = None) -> Progress:

@@ -17,7 +17,7 @@ import cosfly
 from cosfly.errors import InputError, VerifyError
 from cosfly.escaping import for_markdown
 from cosfly.products.actions import ActionSet
-from cosfly.reading.documents import read_model
+from cosfly.reading.documents import FileFormat, read_model
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.work.stage_folder import Resume, StageFolder, result_of
 from cosfly.work.store import CHECKSUMS, dump_json, inside, sha256_bytes, storage_errors, write_bytes, write_checksums
@@ -25,7 +25,7 @@ from release.export.contract import ExportConfig, ExportUnit, FormatFacts, UnitF
 from release.export.source import Release, open_release, scan
 from release.record import DepthCoding, ReleasedMap, Strict
 
-EXPORT_SCHEMA, EXPORT_VERSION = "cosfly.export", "1.1"
+EXPORT_FORMAT = FileFormat("cosfly.export", "1.1", "record of an export")
 
 
 class SourceRelease(Strict):
@@ -88,7 +88,7 @@ def describe(release: Release, facts: FormatFacts, cfg: ExportConfig, *, frames:
 
 def write_export(path: Path, record: ExportRecord) -> str:
     """Write `export.json`; give its sha256."""
-    value = {"schema": EXPORT_SCHEMA, "schema_version": EXPORT_VERSION, **record.model_dump(mode="json")}
+    value = {**EXPORT_FORMAT.header, **record.model_dump(mode="json")}
     data = (dump_json(value, indent=1) + "\n").encode()
     write_bytes(path, data)
     return sha256_bytes(data)
@@ -100,9 +100,7 @@ def read_export(path: Path) -> ExportRecord:
     Raises:
         InputError: names the file and the field.
     """
-    return read_model(
-        path, ExportRecord, schema=EXPORT_SCHEMA, version=EXPORT_VERSION, what="record of an export", tree=path.parent
-    )
+    return read_model(path, ExportRecord, EXPORT_FORMAT, tree=path.parent)
 
 
 def render_readme(record: ExportRecord) -> str:

@@ -26,7 +26,7 @@ from cosfly.products.frames import COORDINATES, FILE_NAMES, frame_name
 from cosfly.products.places import TOWN
 from cosfly.products.playback import Flight, write_flight
 from cosfly.products.segments import FOLLOW, Segment
-from cosfly.products.town import TOWN_FILE, TOWN_SCHEMA, TOWN_VERSION, TownMap
+from cosfly.products.town import TOWN_FILE, TOWN_FORMAT, TownMap
 from cosfly.products.walks import pace_field
 from cosfly.reading.files import sha256_file
 from cosfly.work.runner import advance
@@ -107,7 +107,7 @@ def finish(
         shown = maps.get(town)
         about = TownMap(name=shown.name, licence=shown.licence, credits=shown.credits) if shown else None
         about = about or TownMap(name=town, licence=UNKNOWN_LICENCE, credits="")
-        write_model(folder / place / TOWN_FILE, about, schema=TOWN_SCHEMA, version=TOWN_VERSION)
+        write_model(folder / place / TOWN_FILE, about, TOWN_FORMAT)
         files[f"{place}/{TOWN_FILE}"] = sha256_file(folder / place / TOWN_FILE)
     return FormatFacts(
         version=VERSION,

@@ -26,7 +26,7 @@ from pydantic import BaseModel, Field
 
 from cosfly.errors import InputError, VerifyError, nearest
 from cosfly.products.frames import FrameFile
-from cosfly.reading.documents import check_schema, parse_document, validated
+from cosfly.reading.documents import model_of, parse_document
 from cosfly.reading.files import open_file, sha256_file
 from cosfly.reading.tables import arrow_errors, open_stream, read_row_group, row_groups
 from cosfly.work.config import Config
@@ -48,8 +48,7 @@ from release.package.records import DATASET, OF_SHARD, PARTS, check_parts, name_
 from release.package.rows import open_writer
 from release.record import (
     RECORD,
-    RELEASE_SCHEMA,
-    RELEASE_VERSION,
+    RELEASE_FORMAT,
     PartOf,
     ReleasedFlight,
     ReleaseRecord,
@@ -103,8 +102,7 @@ def fetch_record(remote: Remote, expected: str | None) -> tuple[ReleaseRecord, b
             got=sha256_bytes(data),
             expected=str(listed)[:80],
         )
-    value = check_schema(parse_document(data, where, each_key_once=True), RELEASE_SCHEMA, RELEASE_VERSION, where)
-    record = validated(ReleaseRecord, {k: v for k, v in value.items() if k not in ("schema", "schema_version")}, where)
+    record = model_of(parse_document(data, where, each_key_once=True), ReleaseRecord, RELEASE_FORMAT, where)
     _check_shards(record, where)
     if expected is not None and not record.content_digest.startswith(expected):
         raise InputError("not the release that is expected", where=where, got=record.content_digest, expected=expected)
