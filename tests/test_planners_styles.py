@@ -399,6 +399,27 @@ def test_a_mission_ends_the_pursuit_at_home_and_looks_ahead():
     ]
 
 
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_the_way_home_arrives_and_holds_past_what_stands_between(planner):
+    """A tower stands between the end of the pursuit and home; the pursuit went round it."""
+    tower = kernels.obstacle_index(town_of(((20, 20, 60), (8, 8, 60))))
+    walk = walk_along("round", [(0, 0), (50, 0), (50, 50)])
+    trace = plan_flight(walk, tower, styled(RETURN_HOME, planner=planner, track_astar={"beam": 256}), 0)
+    assert trace.drop_reason is None
+    assert trace.mission.at_frame >= len(trace.time_s) / 3
+    speeds = np.linalg.norm(np.diff(trace.positions_m, axis=0), axis=1) / 0.5
+    assert np.linalg.norm(trace.positions_m[-5:] - trace.mission.home_m, axis=1).max() < 0.5
+    assert speeds[-4:].max() < 0.3
+    assert speeds[trace.mission.home_frame :].max() <= 6.5
+    assert np.linalg.norm(np.diff(trace.positions_m, n=2, axis=0), axis=1).max() / 0.25 <= 5.0 + 1e-6
+    assert trace.metrics["clearance_min_m"] >= 2.5 - 1e-3
+
+
+def test_a_walk_too_short_for_a_way_home_says_so():
+    trace = plan_flight(walk_along("few", [(0, 0), (6, 0)]), OPEN, styled(RETURN_HOME), 0)
+    assert trace.drop_reason == "no_time_for_home"
+
+
 @pytest.mark.parametrize(
     ("change", "where"),
     [

@@ -29,18 +29,21 @@ HELD_DEG, HELD_RATIO, HELD_SHARE = 25.0, 1.4, 0.7
 POINTS_LEAST = 4  # of a part
 
 NO_HIDING_PLACE, NOT_FOUND_AGAIN, NOT_HELD = "no_hiding_place", "not_lost_and_found", "style_not_held"
+NO_TIME = "no_time_for_home"
 
 
 @dataclass(frozen=True)
 class Intent:
     """What a flight is meant to be. segments: empty for the paper's flight from end to end.
 
-    impossible: why the map cannot hold the style; the wish is the paper's then.
+    order: kind of the mission that is to end the pursuit. impossible: why the map cannot hold the style; the wish is
+    the paper's then.
     """
 
     wish: Wish
     segments: tuple[Segment, ...] = ()
     mission: Mission | None = None
+    order: str | None = None
     impossible: str | None = None
 
     @property
@@ -102,14 +105,12 @@ def draw_intent(
     cuts = np.linspace(0, num, len(names) + 1).round().astype(int).tolist()
     plain = [name.removeprefix(OTHER_SIDE) for name in names]
     segments = tuple(Segment(*part) for part in zip(plain, cuts[:-1], cuts[1:], strict=True))
-    is_paper = set(names) == {FOLLOW}
+    is_paper = not goes_home and set(names) == {FOLLOW}
     wish = scenario.wish if is_paper else wish_of(names, scenario, obstacles, cfg, rng)
     if not goes_home:
         return Intent(wish, () if is_paper else segments)
-    wish, mission = wish_of_mission(wish, scenario, cfg, rng)
-    at = mission.at_frame
-    before = tuple(Segment(p.style, p.begin, min(p.end, at)) for p in segments if p.begin < at)
-    return Intent(wish, (*before, Segment(RETURN_HOME, at, num, keeps_sight=False)), mission)
+    order = MISSION_KINDS[int(rng.integers(len(MISSION_KINDS)))]
+    return Intent(wish, (*segments, Segment(RETURN_HOME, num, num, keeps_sight=False)), order=order)
 
 
 def why_not_held(intent: Intent, scenario: Scenario, positions_m: np.ndarray, seen: np.ndarray) -> str | None:
@@ -122,7 +123,8 @@ def why_not_held(intent: Intent, scenario: Scenario, positions_m: np.ndarray, se
         return intent.impossible
     if intent.searches:
         return None if finds_again(seen, scenario.dt_s) else NOT_FOUND_AGAIN
-    return None if _is_held(intent.wish, scenario, positions_m).mean() >= HELD_SHARE else NOT_HELD
+    pursued = None if intent.mission is None else intent.mission.at_frame
+    return None if _is_held(intent.wish, scenario, positions_m)[:pursued].mean() >= HELD_SHARE else NOT_HELD
 
 
 def _is_held(wish: Wish, scenario: Scenario, positions_m: np.ndarray) -> np.ndarray:
@@ -142,7 +144,9 @@ def tell_not_held(
     from cosfly.space.kernels import signed_distances, visibility
 
     is_held, targets, wish = _is_held(intent.wish, scenario, positions_m), scenario.targets_m, intent.wish
-    part = min(intent.segments, key=lambda part: is_held[part.begin : part.end].mean())
+    part = min(
+        (part for part in intent.segments if part.keeps_sight), key=lambda part: is_held[part.begin : part.end].mean()
+    )
     span, places = slice(part.begin, part.end), wish.places_m(targets, scenario.ground_m)
     lost = ~is_held[span]
 
@@ -170,58 +174,82 @@ def tell_not_held(
 # started.
 
 
-BREAKS_OFF_S = 4.0
-LEAVES_MPS, HOME_MPS = 2.5, 6.0
-LEAVES_M, CLIMBS_M = 6.0, 8.0  # away from the walker and up, before it turns for home
+LEAVES_MPS, HOME_MPS, HOME_MPS2 = 3.0, 6.0, 1.5  # greatest speeds, and how fast they are reached and lost
+LEAVES_M, CLIMBS_M = 6.0, 8.0  # away from the walker and up, before it turns for home, as far as there is room
+HOLDS_S = 3.0  # over home, at the end
 PURSUIT_LEAST = 1 / 3  # of the flight
 
 
-def wish_of_mission(wish: Wish, scenario: Scenario, cfg: PlanConfig, rng: np.random.Generator) -> tuple[Wish, Mission]:
-    """End a flight's wish with the way home; the order comes so late that the rest of the walk is just enough."""
-    places, dt_s = wish.places_m(scenario.targets_m, scenario.ground_m), scenario.dt_s
-    home_m, breaks_off = places[0], round(BREAKS_OFF_S / dt_s)
-    first = int(len(places) * PURSUIT_LEAST)
-    ways = np.linalg.norm(places[:, :2] - home_m[:2], axis=1) / (HOME_MPS * dt_s) + breaks_off + LEAVES_M / HOME_MPS
-    in_time = np.flatnonzero(np.arange(len(places)) + ways <= len(places) - 1)
-    at = max(first, int(in_time[-1]) if len(in_time) else first)
-    flown = _way_home(places, scenario.targets_m, at, breaks_off, home_m, dt_s)
-    kind = MISSION_KINDS[int(rng.integers(len(MISSION_KINDS)))]
-    mission = Mission(kind, at, min(at + breaks_off, len(places) - 1), tuple(np.round(home_m, 4).tolist()))
-    return _seen_from_the_walker(wish, scenario, flown, at, cfg), mission
+def ended_by_order(
+    intent: Intent, positions_m: np.ndarray, scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig
+) -> tuple[Intent, np.ndarray]:
+    """End a pursuit as it was flown, (n, 3), with the way home, where the rest of the walk is just enough for it.
 
+    Raises:
+        NoPathError: the way home cannot be flown within the limits.
+    """
+    from cosfly.planners.smoothing import within_limits
 
-def _way_home(
-    places: np.ndarray, targets_m: np.ndarray, at: int, breaks_off: int, home_m: np.ndarray, dt_s: float
-) -> np.ndarray:
-    """Give the wished places with the way home from frame `at` on, (n, 3)."""
-    flown, here = places.copy(), places[at].copy()
-    away = here - targets_m[at]
-    away[2] = 0.0
-    aside = here + away / max(float(np.linalg.norm(away)), 1e-6) * LEAVES_M + [0.0, 0.0, CLIMBS_M]
-    over_home = np.array([home_m[0], home_m[1], max(home_m[2], here[2]) + CLIMBS_M])
-    for i in range(at + 1, len(places)):
-        goal, speed_mps = (aside, LEAVES_MPS) if i <= at + breaks_off else (over_home, HOME_MPS)
-        way = goal - here
-        here = here + way * min(1.0, speed_mps * dt_s / max(float(np.linalg.norm(way)), 1e-9))
-        flown[i] = here
-    return gaussian_filter1d(flown, ROUNDING_S / dt_s, axis=0, mode="nearest")
-
-
-def _seen_from_the_walker(wish: Wish, scenario: Scenario, places: np.ndarray, at: int, cfg: PlanConfig) -> Wish:
-    """Give the wish whose places these are."""
-    away, num = places - scenario.targets_m, len(places)
-    apart_m = np.hypot(away[:, 0], away[:, 1])
-    return replace(
-        wish,
-        bearing_rad=np.unwrap(np.arctan2(away[:, 1], away[:, 0])) - wish.heading_rad,
-        distance_m=np.linalg.norm(away, axis=1),
-        ground_distance_m=apart_m,
-        pitch_rad=np.arctan2(away[:, 2], apart_m),
-        altitude_m=places[:, 2] - scenario.ground_m,
-        altitude_min_m=np.full(num, cfg.styles_floor_m),
-        keeps_sight=np.arange(num) < at,
-        any_bearing=False,
+    assert intent.order is not None
+    num, dt_s = len(positions_m), scenario.dt_s
+    at, first, in_time = num - 1, max(1, int(num * PURSUIT_LEAST)), num - round(HOLDS_S / dt_s)
+    legs = _legs_home(positions_m, scenario.targets_m[-1], obstacles, cfg, dt_s)
+    while at > first and at + sum(map(len, legs)) > in_time:
+        at = max(first, min(at - 1, in_time - sum(map(len, legs))))
+        legs = _legs_home(positions_m[: at + 1], scenario.targets_m[at], obstacles, cfg, dt_s)
+    if at + sum(map(len, legs)) > in_time:
+        whole = Segment(RETURN_HOME, 0, num, keeps_sight=False)
+        return replace(intent, impossible=NO_TIME, segments=(whole,)), positions_m
+    way = np.vstack([positions_m[: at + 1], *legs])
+    flown = np.vstack([way, np.tile(way[-1], (num - len(way), 1))])
+    share = np.clip((np.arange(num) - at) * dt_s / (2.0 * ROUNDING_S), 0.0, 1.0)[:, None]  # the pursuit stays
+    flown += share * (gaussian_filter1d(flown, ROUNDING_S / dt_s, axis=0, mode="nearest") - flown)
+    home_m = np.round(positions_m[0], 4)
+    mission = Mission(intent.order, at, at + len(legs[0]), (float(home_m[0]), float(home_m[1]), float(home_m[2])))
+    before = tuple(Segment(p.style, p.begin, min(p.end, at)) for p in intent.segments if p.begin < at)
+    segments = (*before, Segment(RETURN_HOME, at, num, keeps_sight=False))
+    wish = replace(intent.wish, keeps_sight=intent.wish.keeps_sight & (np.arange(num) < at))
+    return replace(intent, wish=wish, segments=segments, mission=mission), within_limits(
+        flown, scenario, obstacles, cfg
     )
+
+
+def _legs_home(
+    trail_m: np.ndarray, target_m: np.ndarray, obstacles: BoxIndex, cfg: PlanConfig, dt_s: float
+) -> list[np.ndarray]:
+    """Give the way from the end of a trail (k, 3) away from the target, and then home: along the trail, but straight
+    where that is free."""
+    from cosfly.space.kernels import segments_hit
+
+    def are_free(start: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        return ~segments_hit(obstacles, np.broadcast_to(start, ends.shape), ends, cfg.safety_distance_m)
+
+    here, away = trail_m[-1], (trail_m[-1] - target_m) * [1.0, 1.0, 0.0]
+    outwards, up = LEAVES_M * away / max(float(np.linalg.norm(away)), 1e-6), np.array([0.0, 0.0, CLIMBS_M])
+    asides = here + np.stack([outwards + up, outwards, up, 0.0 * up])
+    aside = asides[int(np.argmax([*are_free(here, asides[:3]), True]))]
+    corners, left = [aside], len(trail_m)
+    while left:
+        free = are_free(corners[-1], trail_m[:left])
+        left = int(np.argmax(free)) if free.any() else left - 1
+        corners.append(trail_m[left])
+    return [
+        _flown_along(np.stack([here, aside]), LEAVES_MPS, dt_s),
+        _flown_along(np.stack(corners), HOME_MPS, dt_s),
+    ]
+
+
+def _flown_along(corners_m: np.ndarray, most_mps: float, dt_s: float) -> np.ndarray:
+    """Give the places (k, 3), dt_s apart, of a drone that starts and stops at the ends of a polyline, without its
+    first."""
+    along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners_m, axis=0), axis=1))])
+    speed_mps = min(most_mps, np.sqrt(HOME_MPS2 * along_m[-1]))
+    seconds = along_m[-1] / max(speed_mps, 1e-9) + speed_mps / HOME_MPS2
+    times = dt_s * np.arange(1, max(1, int(np.ceil(seconds / dt_s))) + 1)
+    ramp = np.minimum(times, speed_mps / HOME_MPS2), np.clip(seconds - times, 0.0, speed_mps / HOME_MPS2)
+    gone_m = speed_mps * np.minimum(times, seconds) - 0.5 * speed_mps**2 / HOME_MPS2
+    gone_m += 0.5 * HOME_MPS2 * ((speed_mps / HOME_MPS2 - ramp[0]) ** 2 - (speed_mps / HOME_MPS2 - ramp[1]) ** 2)
+    return np.stack([np.interp(gone_m, along_m, corners_m[:, axis]) for axis in range(3)], axis=1)
 
 
 # --- camera -----------------------------------------------------------------------------------------------------------

@@ -132,12 +132,15 @@ def style_rng(walk: Walk, seed: int, attempt: int = 0) -> np.random.Generator:
 def _fly(
     walk: Walk, scenario: Scenario, intent: Intent, obstacles: BoxIndex, screens: BoxIndex, cfg: PlanConfig, seed: int
 ) -> DroneTrace:
-    from cosfly.planners.intent import NOT_HELD, tell_not_held, view_of, why_not_held
+    from cosfly.planners.intent import NOT_HELD, ended_by_order, tell_not_held, view_of, why_not_held
     from cosfly.space.kernels import swept_distances, visibility
 
     scenario = replace(scenario, wish=intent.wish)
     made = load_planner(cfg.planner)(scenario, obstacles, cfg, rng_for(seed, "plan", walk.path_id))
-    positions = np.round(made.positions_m, 4)  # measured as it is written
+    positions = made.positions_m
+    if intent.order is not None:
+        intent, positions = ended_by_order(intent, positions, scenario, obstacles, cfg)
+    positions = np.round(positions, 4)  # measured as it is written
     targets = np.round(scenario.targets_m, 4)
     clearances, _, _ = swept_distances(obstacles, positions, CLEARANCE_CAP_M)
     if clearances.min() < cfg.relaxed_safety_m - CLEARANCE_TOLERANCE_M:
