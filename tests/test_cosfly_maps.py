@@ -406,7 +406,7 @@ def test_a_city_model_becomes_boxes_round_the_origin(tmp_path: Path):
 def test_a_surface_of_too_many_vertices_is_refused_by_name(tmp_path: Path):
     (tmp_path / "city.json").write_text(json.dumps(city_model()))
     cfg = MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=tmp_path / "city.json", polygon_vertices=3))
-    with pytest.raises(InputError, match=r"CityObjects\.house: .*; got a surface of 4 vertices; .*polygon_vertices"):
+    with pytest.raises(InputError, match=r"CityObjects\.part: .*; got a surface of 4 vertices; .*polygon_vertices"):
         load_map(cfg)
 
 

@@ -146,13 +146,6 @@ def test_stops_change_when_a_place_is_reached_and_not_which(seed, count):
 ROUTE = np.column_stack([0.5 * np.arange(201), np.zeros(201)])  # 100 m
 
 
-def test_plain_paces_go_a_route_as_it_is():
-    for name in ("walk", "hurry"):
-        way = take_pace(ROUTE, PACES[name], np.random.default_rng(0))
-        assert way.polyline_m is ROUTE
-        assert not way.stops_s.any()
-
-
 def test_stops_lie_as_far_apart_and_last_as_long_as_the_row_says():
     row = PACES["stop_and_look"]
     for seed in range(30):
