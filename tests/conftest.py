@@ -70,7 +70,7 @@ def held_by_another() -> Callable[[Path], contextlib.AbstractContextManager[subp
 
 
 @pytest.fixture(scope="session")
-def students(tmp_path_factory) -> Path:
+def place(tmp_path_factory) -> Path:
     """A playback tree, a training set and a tiny student, read by many tests; what a test writes has a folder of its
     own."""
     from specimens_students import make_place
@@ -87,11 +87,17 @@ def tree(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def dataset(tmp_path_factory) -> Path:
+def two_splits(tmp_path_factory) -> Path:
     """A release of six flights in two towns, a split each, several shards; read by many tests."""
     from specimens_release import TWO_SPLITS, make_release
 
     return make_release(tmp_path_factory.mktemp("two_splits"), **TWO_SPLITS)
+
+
+@pytest.fixture(scope="session")
+def dataset(two_splits) -> Path:
+    """The release of a test that does not mind which."""
+    return two_splits
 
 
 @pytest.fixture(scope="session")

@@ -7,14 +7,17 @@ import json
 import shutil
 from collections import Counter, defaultdict
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from caption.run.released import read_released
+from cosfly.products.frames import depth_bytes
 from cosfly.reading.files import sha256_file
 from release import columns
 from release.card.numbers import compute_numbers
@@ -34,6 +37,10 @@ from release.verify.verify import verify
 Row = dict[str, Any]
 
 
+def _nothing(rows: list[Row]) -> None:
+    pass
+
+
 def read_all(dataset: Path) -> tuple[ReleaseRecord, list[list[Row]]]:
     """Give the record, and of each shard all rows with their pictures."""
     record = read_record(dataset / "release.json")
@@ -43,11 +50,15 @@ def read_all(dataset: Path) -> tuple[ReleaseRecord, list[list[Row]]]:
 def forge(
     dataset: Path,
     out: Path,
-    change: Callable[[list[Row]], None] = lambda rows: None,
+    change: Callable[[list[Row]], None] = _nothing,
     change_record: Callable[[dict[str, Any]], None] = lambda record: None,
 ) -> Path:
     """Copy a release, change all of its rows together, then its record, and make everything that counts or hashes them
     right again."""
+    if change is _nothing:
+        values = read_record(dataset / "release.json").model_dump(mode="json")
+        shutil.copytree(dataset, out, dirs_exist_ok=True)
+        return _finished(out, values, change_record)
     record, shards = read_all(dataset)
     change([row for rows in shards for row in rows])
     shutil.rmtree(out, ignore_errors=True)
@@ -78,9 +89,13 @@ def forge(
     update["history"] = history
     record = record.model_copy(update=update)
     computed = compute_numbers([out / shard.path for shard in entries], record.settings.num_frames)
-    values = record.model_copy(update={"numbers": computed}).model_dump(mode="json")
+    return _finished(out, record.model_copy(update={"numbers": computed}).model_dump(mode="json"), change_record)
+
+
+def _finished(out: Path, values: dict[str, Any], change_record: Callable[[dict[str, Any]], None]) -> Path:
+    """Write the records as a build does."""
     change_record(values)
-    finish(out, ReleaseRecord.model_validate_json(json.dumps(values)))
+    write_records(out, ReleaseRecord.model_validate_json(json.dumps(values)))
     return out
 
 
@@ -88,11 +103,6 @@ def errors_in(folder: Path, level: str = "pixels", **how: Any) -> dict[str, int]
     """Verify a folder as the command does; gives the errors by code."""
     report = verify(folder, level=level, reader=read_released, **how)
     return {kind.code: kind.count for kind in report.kinds if kind.severity == "error"}
-
-
-def finish(out: Path, record: ReleaseRecord) -> None:
-    """Write the records as a build does."""
-    write_records(out, record)
 
 
 def _flights(record: ReleaseRecord, rows: list[Row]) -> list[ReleasedFlight]:
@@ -113,25 +123,17 @@ def _flights(record: ReleaseRecord, rows: list[Row]) -> list[ReleasedFlight]:
 
 
 def depth_of(row: Row) -> np.ndarray:
-    from io import BytesIO
-
     return np.load(BytesIO(row["depth"]))
 
 
 def set_depth(row: Row, depth: np.ndarray) -> None:
-    from cosfly.products.frames import depth_bytes
-
     row["depth"] = depth_bytes(depth)
 
 
 def png(pixels: np.ndarray) -> bytes:
     """PNG bytes of (h, w, 3) RGB."""
-    import cv2
-
     return cv2.imencode(".png", pixels[..., ::-1])[1].tobytes()
 
 
 def pixels_of(row: Row, column: str) -> np.ndarray:
-    import cv2
-
     return cv2.imdecode(np.frombuffer(row[column]["bytes"], np.uint8), cv2.IMREAD_COLOR)[..., ::-1].copy()

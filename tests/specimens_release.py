@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 from collections import Counter, defaultdict
 from pathlib import Path
+from unittest import mock
 
 from specimens_distill import make_caption as caption_of_frame
 
+from cosfly.app import pipeline
+from cosfly.app.settings import RunConfig
 from cosfly.products.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.inspection import (
@@ -21,6 +24,7 @@ from cosfly.products.inspection import (
 )  # fmt: skip
 from cosfly.products.issues import Issue
 from cosfly.products.playback import read_flight
+from cosfly.work.config import load
 from release.export.source import open_release, read_span, scan
 from release.package.config import ReleaseConfig
 from release.package.sources import Source
@@ -133,3 +137,10 @@ def rows_by_id(dataset: Path) -> dict[str, dict]:
 
 def all_bytes(folder: Path) -> dict[str, bytes]:
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def run_here(told: list[str], out: Path) -> Path:
+    """Go the whole way from a map to a release in this process: workers take longer to start than a few flights."""
+    with mock.patch.object(pipeline, "manner_of_work", return_value={"workers": 0}):
+        pipeline.run(load(RunConfig, None, told), out)
+    return out

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pytest
 from specimens_distill import make_captions, prepared
 
 from distill.schema import Sample, open_split, resolve_trees
@@ -70,3 +71,32 @@ def log_of(out: Path, kind: str = "loss") -> list[dict]:
 
 def losses_of(out: Path) -> list[float]:
     return [record["loss"] for record in log_of(out)]
+
+
+def run(
+    place: Path, out: Path, student: str | Path | None = None, dataset: Path | None = None, **settings: Any
+) -> Path:
+    """Train in twelve steps, or as the settings say."""
+    from distill.training import stage as train
+    from distill.training.settings import TrainConfig
+
+    cfg = TrainConfig.model_validate({**TWELVE, **settings})
+    return train.run(cfg, dataset or place / "set", [place / "tree"], student or place / "student", out)
+
+
+def begun(place: Path, out: Path, num_steps: int = 7, **settings: Any) -> None:
+    """Leave a training that was stopped after so many steps."""
+    from distill.training import fit
+
+    steps, real = [], fit.train_step
+
+    def stop(*args: Any) -> Any:
+        if len(steps) == num_steps:
+            raise KeyboardInterrupt
+        steps.append(1)
+        return real(*args)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit, "train_step", stop)
+        with pytest.raises(KeyboardInterrupt):
+            run(place, out, **settings)

@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import invoke
+from specimens_release import run_here
 from teacher_server import TeacherServer
 from test_caption_actions import future
 from test_pipeline_tiny import TINY
-from typer.testing import CliRunner
 
 from caption.run.own_files import own_files
 from caption.run.released import read_released
@@ -23,9 +24,6 @@ from caption.run.stage import run as caption_run
 from caption.schema import CaptionConfig, LabelConfig
 from caption.truth.actions import is_contradicted, label_of, measure, table_of
 from caption.truth.reach import never_labels
-from cosfly.app import pipeline
-from cosfly.app.settings import RunConfig
-from cosfly.cli import app
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.actions import (
     ACTIONS_FILE,
@@ -41,7 +39,6 @@ from cosfly.products.captions import read_captions
 from cosfly.products.splits import SPLITS
 from cosfly.reading.documents import read_json
 from cosfly.work import in_place
-from cosfly.work.config import load
 from distill.evaluation import compare
 from distill.evaluation import stage as evaluate
 from distill.evaluation.floors import write_floors
@@ -89,10 +86,8 @@ def mine(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory, mine) -> Path:
     """The whole way with it: a map to a release."""
-    out = tmp_path_factory.mktemp("own") / "run"
     more = [f"caption.actions={mine}", "caption.repair.soft_conflict=repair", "release.num_frames=20"]
-    pipeline.run(load(RunConfig, None, [*TINY, *more]), out)
-    return out
+    return run_here([*TINY, *more], tmp_path_factory.mktemp("own") / "run")
 
 
 # --- the file ---------------------------------------------------------------------------------------------------------
@@ -101,10 +96,10 @@ def whole(tmp_path_factory, mine) -> Path:
 def test_the_file_that_ships_can_be_written_and_checked(tmp_path):
     path = tmp_path / "actions.yaml"
     for words in (["--export", str(path)], ["--check", str(path)]):
-        result = CliRunner().invoke(app, ["caption", "actions", *words])
+        result = invoke("caption actions", words)
         assert result.exit_code == 0, result.output
     assert path.read_bytes() == ACTIONS_FILE.read_bytes()
-    assert isinstance(CliRunner().invoke(app, ["caption", "actions", "--export", str(path)]).exception, ConfigError)
+    assert isinstance(invoke("caption actions --export", path).exception, ConfigError)
 
 
 WRONG = [
@@ -220,10 +215,7 @@ def test_the_example_of_the_page_is_a_label_and_behind_what_it_shares_its_motion
     text = text.replace("\n# The first line in which", f"\n{entry}\n# The first line in which")
     for name, order in (("pasted.yaml", (own, straight)), ("last.yaml", (straight, own))):
         (tmp_path / name).write_text(text.replace(straight, "\n".join(order)), encoding="utf-8")
-    told = {
-        name: CliRunner().invoke(app, ["caption", "actions", "--check", str(tmp_path / name)])
-        for name in ("pasted.yaml", "last.yaml")
-    }
+    told = {name: invoke("caption actions --check", tmp_path / name) for name in ("pasted.yaml", "last.yaml")}
     assert [result.exit_code for result in told.values()] == [0, 0]
     assert told["pasted.yaml"].output.endswith("18 actions, nothing wrong\n")
     assert "warning" not in told["pasted.yaml"].output

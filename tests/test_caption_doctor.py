@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import invoke
 from specimens_captions import deciding, report_of, settings
 from teacher_server import ENGLISH, TeacherServer, is_mirror, written_answer
-from typer.testing import CliRunner
 
 from caption.run.forecast import estimate, make_forecast
 from caption.run.stage import run
@@ -20,7 +20,6 @@ from caption.teachers.images import pictures_of
 from caption.teachers.trials import SCENES, TrialFrames, trial_window
 from caption.truth.facts import measure_facts
 from caption.writing.contract import WAYS
-from cosfly.cli import app
 from cosfly.errors import NothingKept
 
 TOKENS_PER_IMAGE, CONTEXT = 220, 8192
@@ -244,9 +243,9 @@ def test_trial_windows_are_consistent_flights(scene):
 
 def test_the_command_exits_with_1_when_unusable():
     with TeacherServer(respond=patient()) as server:
-        assert CliRunner().invoke(app, ["caption", "doctor", server.url]).exit_code == 0
+        assert invoke("caption doctor", server.url).exit_code == 0
     with TeacherServer(respond=patient(max_images=0)) as server:
-        assert CliRunner().invoke(app, ["caption", "doctor", server.url]).exit_code == 1
+        assert invoke("caption doctor", server.url).exit_code == 1
 
 
 # --- the plan ---------------------------------------------------------------------------------------------------------

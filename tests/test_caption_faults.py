@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from commands import invoke
 from specimens_captions import QUICK, deciding, report_of, settings
 from teacher_server import MODEL, TeacherServer, is_mirror, refusal
-from typer.testing import CliRunner
 
 from caption.run.flights import allot, named_flights
 from caption.run.stage import run
@@ -29,7 +29,6 @@ from cosfly.chat import client
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import NoAnswer, Reply, started
-from cosfly.cli import app
 from cosfly.errors import ResumeError, TeacherError
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
@@ -406,8 +405,7 @@ def test_retry_failed_leaves_a_folder_complete_in_which_a_flight_cannot_be_read(
 
 def test_retry_failed_on_the_command_line_says_what_was_refused(tree, tmp_path, whole):
     with hovering(Picky(400, "[bold]no[/bold] [/] " + FILTERED, whole.seeds[:1])) as server:
-        words = ["caption", "--teacher", server.url, "--data", str(tree), "--out", str(tmp_path / "out"), "--no-check"]
-        words += ["--set", "caption.image.max_side_px=32", "--set", "caption.repair.hard_conflict=keep"]
-        for more in ([], ["--retry-failed"]):
-            result = CliRunner().invoke(app, [*words, *more])
+        words = ["--data", tree, "--out", tmp_path / "out", "--set", "caption.repair.hard_conflict=keep"]
+        for more in ("", "--retry-failed"):
+            result = invoke("caption --no-check --set caption.image.max_side_px=32 --teacher", server.url, words, more)
             assert result.exit_code == 0, result.output

@@ -7,14 +7,13 @@ import json
 from pathlib import Path
 
 import pytest
+from commands import invoke
 from specimens_distill import prepared
 from teacher_server import MODEL, TeacherServer
-from typer.testing import CliRunner
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.foreign import read_foreign, read_student
-from cosfly.cli import app
 from cosfly.errors import InputError, NothingKept
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.settings import InspectConfig
@@ -87,10 +86,8 @@ def test_a_file_is_judged_as_answers_are(tree, rules, tmp_path):
     assert record["inputs"].keys() == {"data", "captions"}
     report = json.loads((tmp_path / "a/out/caption_report.json").read_text())
     assert report["windows"]["dropped"] == {"not_in_file": 1}
-    assert (report["refusals"], found[-1].checks.refusal) == (
-        {},
-        None,
-    )  # no server, and nothing that --retry-failed could mend
+    # No server, and nothing that --retry-failed could mend.
+    assert (report["refusals"], found[-1].checks.refusal) == ({}, None)
 
 
 def test_a_contradiction_is_on_record_and_drops_its_window_unless_the_settings_say_otherwise(tree, rules, tmp_path):
@@ -175,8 +172,7 @@ def test_no_file_is_an_error_of_one_line(tree, tmp_path, content):
     path = tmp_path / "theirs.jsonl"
     if content is not None:
         path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    words = ["caption", "--teacher", f"file:{path}", "--data", str(tree), "--out", str(tmp_path / "out")]
-    result = CliRunner().invoke(app, words)
+    result = invoke("caption --teacher", f"file:{path}", "--data", tree, "--out", tmp_path / "out")
     assert isinstance(result.exception, InputError)
     assert "theirs.jsonl" in str(result.exception)
     assert not (tmp_path / "out").exists()
@@ -286,10 +282,7 @@ def test_from_a_students_answers_to_a_release(tree, rules, tmp_path):
         server.text = lambda body: answers[body["messages"][1]["content"][-1]["text"]]
         cfg = infer.InferConfig(split="train", engine="endpoint")
         infer.run(cfg, taught, [tree], server.url, tmp_path / "infer")
-    words = [
-        "caption", "--teacher", f"student:{tmp_path / 'infer'}", "--data", str(tree), "--out", str(tmp_path / "out"),
-    ]  # fmt: skip
-    result = CliRunner().invoke(app, words)
+    result = invoke("caption --teacher", f"student:{tmp_path / 'infer'}", "--data", tree, "--out", tmp_path / "out")
     assert result.exit_code == 0, result.output
     inspected = inspection.run(InspectConfig(), None, None, tree, tmp_path / "inspect")
     source = Source("students", tree, tmp_path / "out/captions.jsonl", inspected)

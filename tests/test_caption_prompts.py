@@ -8,15 +8,14 @@ import re
 from pathlib import Path
 
 import pytest
+from commands import invoke
 from specimens_distill import prepared
 from teacher_server import TeacherServer
-from typer.testing import CliRunner
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.prompt_files import PROMPTS, export_prompts, own_prompts
 from cosfly.chat.student_chat import write_taught
-from cosfly.cli import app
 from cosfly.errors import ConfigError, ResumeError
 from cosfly.products.captions import OWN_PROMPTS, read_captions
 from cosfly.work import in_place
@@ -56,16 +55,16 @@ def mine(tmp_path) -> Path:
 
 def test_what_is_exported_is_what_ships(tmp_path):
     folder = tmp_path / "mine"
-    result = CliRunner().invoke(app, ["caption", "prompts", "--export", str(folder)])
+    result = invoke("caption prompts --export", folder)
     assert result.exit_code == 0, result.output
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == {p.name: p.read_bytes() for p in PROMPTS.glob("*.txt")}
-    assert CliRunner().invoke(app, ["caption", "prompts", "--check", str(folder)]).exit_code == 0
+    assert invoke("caption prompts --check", folder).exit_code == 0
     (folder / "user_zh.txt").unlink()  # as after a kill
-    assert CliRunner().invoke(app, ["caption", "prompts", "--export", str(folder)]).exit_code == 0
+    assert invoke("caption prompts --export", folder).exit_code == 0
     for name in ("user_en", "system_zh"):
         edit(folder / f"{name}.txt", "the" if name == "user_en" else "1", "2")
     (folder / "user_zh.txt").unlink()
-    again = CliRunner().invoke(app, ["caption", "prompts", "--export", str(folder)])
+    again = invoke("caption prompts --export", folder)
     assert not (folder / "user_zh.txt").exists()
     assert isinstance(again.exception, ConfigError)
     assert "got system_zh.txt, user_en.txt" in str(again.exception)

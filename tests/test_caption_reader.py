@@ -10,10 +10,10 @@ from contextlib import nullcontext
 from functools import cache, partial
 
 import pytest
+from commands import invoke
 from measure_prose import answers_of, loses, misquotes, misreads, perfect_readings, turns
 from specimens_captions import saying
 from teacher_server import is_mirror
-from typer.testing import CliRunner
 
 from caption.run.forecast import make_forecast
 from caption.run.released import state_lies
@@ -28,7 +28,6 @@ from caption.truth.gold import GoldCaption, read_gold
 from caption.truth.mirror import TEXTS
 from cosfly.chat.answers import KeptAnswers
 from cosfly.chat.contract import Reply
-from cosfly.cli import app
 from cosfly.errors import NothingKept
 from cosfly.products.captions import Claim, Coc, Usage, read_captions
 from cosfly.products.flights import find_flights
@@ -189,7 +188,7 @@ def test_a_contradicted_caption_is_asked_again_with_the_fact_and_then_dropped(tr
 
 def test_the_command_measures_an_endpoint():
     with saying(lambda body: "I cannot.") as server:
-        result = CliRunner().invoke(app, ["caption", "reader-check", server.url, "--limit", "2"])
+        result = invoke("caption reader-check", server.url, "--limit 2")
     assert result.exit_code == 0, result.output
     assert "flagged" in result.output
     assert "unreadable" in result.output

@@ -10,15 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import invoke
 from specimens_distill import prepared
 from teacher_server import TeacherServer
-from typer.testing import CliRunner
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.students import as_taught
 from cosfly.chat.student_chat import TAUGHT, read_taught, write_taught
-from cosfly.cli import app
 from cosfly.errors import ConfigError, InputError, NothingKept, ResumeError, TeacherError
 from cosfly.products.captions import Caption, read_captions
 from distill.inference import stage as infer
@@ -122,7 +121,7 @@ def test_a_real_model_is_asked_the_same(place, tmp_path):
 def test_unlabelled_flights_are_captioned_and_marked(place, tmp_path):
     with TeacherServer(decision=label_of(place)) as server:
         words = ["caption", "--teacher", server.url, "--as-student", place / "trained", "--data", place / "tree"]
-        result = CliRunner().invoke(app, [str(word) for word in [*words, "--out", tmp_path / "out"]])
+        result = invoke([*words, "--out", tmp_path / "out"])
         assert result.exit_code == 0, result.output
         assert {json.loads(body)["temperature"] for body in server.bodies} == {0.0}
     captions = list(read_captions(tmp_path / "out" / "captions.jsonl"))

@@ -11,11 +11,11 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+from commands import invoke
 from specimens_captions import deciding, report_of
 from specimens_captions import settings as quick
 from tables import each
 from teacher_server import TeacherServer, kept_answers
-from typer.testing import CliRunner
 
 from caption.run.reasons import REASONS, meaning_of
 from caption.run.stage import run
@@ -23,7 +23,6 @@ from caption.schema import CaptionConfig
 from cosfly.chat.client import KEY_VARIABLE
 from cosfly.chat.protocol import base_url, check_url
 from cosfly.chat.throttle import Throttle
-from cosfly.cli import app
 from cosfly.errors import CosflyError, NothingKept, TeacherError
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
@@ -283,16 +282,15 @@ def test_what_is_wrong_with_a_url_is_one_line_without_a_secret(url, words):
     "url", ["http://[::1", "http://user:hunter2@h/v1", "http://h/v1?api_key=hunter2", "http://u:hunter 2: 3@h"]
 )
 def test_no_command_takes_a_url_that_cannot_be_asked_or_holds_a_secret(tmp_path, url):
-    at, data = ["--out", tmp_path / "out"], ["--data", tmp_path]
+    at, data, asked = ["--out", tmp_path / "out"], ["--data", tmp_path], [url]
     commands = [
-        ["caption", "--teacher", url, *data], ["caption", "--judge", url, *data], ["caption", "--plan", "--teacher",
-        url, *data],
-        ["caption", "doctor", url], ["caption", "judge-check", url], ["caption", "reader-check", url], ["caption",
-        "compare-strategies", "--teacher", url, *at, *data],
-        ["run", "quickstart", "--set", f"caption.teacher={json.dumps(url)}", "--set", "caption.writing=prose", *at],
+        ("caption --teacher", asked, data), ("caption --judge", asked, data), ("caption --plan --teacher", asked, data),
+        ("caption doctor", asked), ("caption judge-check", asked), ("caption reader-check", asked),
+        ("caption compare-strategies --teacher", asked, at, data),
+        ("run quickstart --set", [f"caption.teacher={json.dumps(url)}"], "--set caption.writing=prose", at),
     ]  # fmt: skip
     for command in commands:
-        result = CliRunner().invoke(app, [str(word) for word in command])
+        result = invoke(*command)
         assert result.exit_code == 1, command
         assert isinstance(result.exception, CosflyError), (command, result.exception)
         assert "URL" in str(result.exception)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -160,6 +161,7 @@ def test_true_prose_of_others_is_seldom_flagged():
 # --- captions of the rule teacher ------------------------------------------------------------------------
 
 
+@cache
 def clean_captions(num_flights: int) -> list[tuple[Facts, Coc, Coc]]:
     captions = []
     for seed in range(num_flights):

@@ -1,4 +1,4 @@
-"""Windows, facts, prompts and pictures; above all: nothing of the future reaches a request."""
+"""Windows, facts, prompts and pictures; above all: nothing of the future reaches a request. Missions, and keyframes."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from collections import Counter
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from teacher_server import TeacherServer
 
 from caption.run.stage import run
-from caption.run.windows import as_flown, current_frames, cut_future, cut_windows
+from caption.run.windows import as_flown, choose_keyframes, current_frames, cut_future, cut_windows, missed_changes
 from caption.schema import (
     CaptionConfig,
     FutureMotion,
@@ -34,6 +36,7 @@ from cosfly.products.boxes import MapHeader, make_box_map
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights, read_twin
 from cosfly.products.playback import Flight, read_flight, write_flight
+from cosfly.products.segments import Mission
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, perturb
 from specimens import make_flight, make_playback_tree
 
@@ -417,3 +420,124 @@ def test_a_label_that_cannot_be_cleaned_says_so(two_tracks, tmp_path):
     sources = [w.future.label_from for w in cut_windows(still, NO_IMAGES)]
     assert sources[:11] == ["offsets"] * 11
     assert set(sources[11:]) == {"perturbed"}
+
+
+# --- orders of a mission in captions ----------------------------------------------------------------------------------
+
+
+MISSION = Mission("battery", 8, 12, (1.0, 2.0, 30.0))
+
+
+@pytest.fixture(scope="module")
+def ordered(tree, tmp_path_factory):
+    """The same flight with a mission that ends its pursuit at frame 8."""
+    root = tmp_path_factory.mktemp("ordered") / "tree"
+    shutil.copytree(tree, root)
+    write_flight(find_flights(root)[0], dataclasses.replace(flight_in(root), mission=MISSION))
+    return root
+
+
+def test_a_mission_gives_labels_and_is_known_from_its_first_frame_on(tree, ordered):
+    windows = list(cut_windows(flight_in(ordered), NO_IMAGES))
+    currents = [w.observed.indices[-1] for w in windows]
+    assert currents == list(range(4, 11))
+    plain = {
+        w.observed.indices[-1]: label_of(measure(w.future), LabelConfig())
+        for w in cut_windows(flight_in(tree), NO_IMAGES)
+    }
+    for now, window in zip(currents, windows, strict=True):
+        label, known = label_of(measure(window.future), LabelConfig()), window.observed.mission
+        assert (label, known) == ((plain[now], None) if now < 8 else ("break_off", "battery"))
+
+
+def test_no_label_comes_from_an_order_that_nobody_knows_yet(ordered):
+    """The turn for home, seen from before the order, would be a turn after the walker."""
+    windows = list(cut_windows(flight_in(ordered), WindowConfig(require_images=False, future_frames=3)))
+    problems = {w.observed.indices[-1]: w.problem for w in windows}
+    assert problems == {now: "order_to_come" if now in (5, 6, 7) else None for now in range(4, 13)}
+
+
+def test_a_mission_reaches_no_request_before_its_order_stands(tree, ordered):
+    def users(root):
+        asked = [
+            make_question(w.observed, ImageConfig(), "slots").asked for w in cut_windows(flight_in(root), NO_IMAGES)
+        ]
+        return [(prompts["en"].user, prompts["zh"].user) for prompts in asked]
+
+    plain, told = users(tree), users(ordered)
+    assert plain[:4] == told[:4]
+    for before, after in zip(plain[4:], told[4:], strict=True):
+        assert after[0] == before[0] + "\nMission: the battery is down to the reserve for the way home."
+        assert after[1] == before[1] + "\n任务状态：电池电量已降至返航储备。"
+
+
+def test_the_rule_teacher_obeys_an_order(ordered, tmp_path):
+    product = run(CaptionConfig(window=NO_IMAGES), ordered, tmp_path / "out")
+    late = [c for c in read_captions(product) if c.sample_id[-2:] in ("08", "09", "10")]
+    assert len(late) == 3
+    for caption in late:
+        assert caption.label == caption.en.flight_decision == "break_off"
+        assert "reserve for the way home" in caption.en.reasoning_trace
+
+
+# --- keyframes --------------------------------------------------------------------------------------------------------
+
+
+LABELS = st.lists(st.sampled_from(["track_straight", "hover", None]), max_size=60)
+
+
+def test_a_hand_made_flight():
+    labels = ["a", "a", "a", "b", "b", "b", "b", "b", "a", None, None]
+    found = choose_keyframes(labels, 3)
+    assert {i: keyframe.model_dump() for i, keyframe in found.items()} == {
+        0: {"reason": "start", "skipped": 2, "missed": 0},
+        3: {"reason": "change", "skipped": 2, "missed": 0},
+        6: {"reason": "stride", "skipped": 1, "missed": 0},
+        8: {"reason": "change", "skipped": 0, "missed": 0},
+        9: {"reason": "change", "skipped": 1, "missed": 0},
+    }
+    assert choose_keyframes([], 3) == {}
+
+
+@given(LABELS, st.integers(1, 12))
+def test_no_change_is_missed_and_every_window_is_taken_or_counted(labels, stride):
+    chosen = choose_keyframes(labels, stride)
+    assert missed_changes(labels, set(chosen)) == []
+    assert len(chosen) + sum(keyframe.skipped for keyframe in chosen.values()) == len(labels)
+    assert all(keyframe.skipped < stride for keyframe in chosen.values())
+    # Whoever gives each window the label of the keyframe before it gets the flight's labels back.
+    spread = [labels[max(k for k in chosen if k <= i)] for i in range(len(labels))]
+    assert spread == labels
+
+
+def test_the_count_of_missed_changes_can_fail():
+    assert missed_changes(["a", "b", "b", "a"], {0, 3}) == [1]
+    assert choose_keyframes(["a"] * 8, 20)[0].skipped == 7
+
+
+def test_a_run_reports_what_it_saved(tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 2, 40, with_images=False)
+    window = {"require_images": False, "keyframe_stride": 5}
+    plain = run(CaptionConfig.model_validate({"window": window}), tree, tmp_path / "plain")
+    few = run(CaptionConfig.model_validate({"window": window | {"keyframes": True}}), tree, tmp_path / "few")
+    every = {caption.sample_id: caption for caption in read_captions(plain)}
+    taken = list(read_captions(few))
+    report = json.loads((tmp_path / "few" / "caption_report.json").read_text())["keyframes"]
+    assert report["windows"] == len(every) == 4 * 31
+    assert report["taken"] == len(taken) < len(every)
+    assert report["changes_missed"] == 0
+    assert report["calls_saved"] > 0
+    # Read anew from the flights: every window whose label differs from the one before was captioned.
+    ids = {caption.sample_id for caption in taken}
+    cfg = CaptionConfig.model_validate({"window": window})
+    for folder in find_flights(tree):
+        samples = list(cut_windows(read_flight(folder), cfg.window))
+        labels = [label_of(measure(sample.future), cfg.label) for sample in samples]
+        for before, after, sample in zip(labels, labels[1:], samples[1:], strict=False):
+            assert before == after or sample.observed.sample_id in ids
+    # The window itself is the same one: only the mark is added.
+    for caption in taken:
+        assert caption.checks.keyframe.missed == 0
+        caption.checks.keyframe = None
+        assert caption == every[caption.sample_id]
+    assert json.loads((tmp_path / "plain" / "caption_report.json").read_text())["keyframes"] is None

@@ -10,13 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import invoke
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from specimens_distill import make_caption, write_set
-from typer.testing import CliRunner
 
 from cosfly.chat.answers import AnswerBook
-from cosfly.cli import app
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import write_captions
@@ -432,7 +431,7 @@ def test_students_side_by_side(place):
     folders = [place / "students" / name for name in ("right", "predictions")]
     words = ["distill", "report", *map(str, folders), "--out", str(place / "table")]
     words += ["--set", "distill.report.resamples=100"]
-    result = CliRunner().invoke(app, words)
+    result = invoke(words)
     assert result.exit_code == 0, result.output
     page = (place / "table" / "comparison.md").read_text()
     assert "| right | 100.00% " in page

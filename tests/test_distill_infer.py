@@ -10,12 +10,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from commands import invoke
 from PIL import Image
 from specimens_distill import make_captions, prepared
 from teacher_server import TeacherServer, kept_answers
-from typer.testing import CliRunner
 
-from cosfly.cli import app
 from cosfly.errors import ConfigError, ResumeError, TeacherError
 from cosfly.products.predictions import read_predictions
 from distill.inference import outcome
@@ -93,8 +92,8 @@ def test_one_sample_without_an_answer_costs_no_other(place, tmp_path):
     words += ["--out", tmp_path / "out", "--set", "distill.infer.split=train"]
     words += ["--set", "distill.infer.endpoint.max_tries=1"]
     with TeacherServer(lambda number, body: "500" if number == 2 else None) as server:
-        words = [str(word) for word in [*words, "--model", server.url]]
-        result = CliRunner().invoke(app, words)
+        words += ["--model", server.url]
+        result = invoke(words)
         assert result.exit_code == 1
         assert "http_500" in str(result.exception)
         predictions, num_asked = read_predictions(tmp_path / "out" / "predictions.jsonl"), len(server.bodies)
@@ -102,7 +101,7 @@ def test_one_sample_without_an_answer_costs_no_other(place, tmp_path):
         manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
         assert manifest["counts"]["failed"] == {"http_500": 1}
         assert manifest["counts"]["kept"] == manifest["parsed"] == len(predictions) - 1
-        result = CliRunner().invoke(app, words)
+        result = invoke(words)
         assert result.exit_code == 0, result.output
         assert len(server.bodies) == num_asked + 1
     assert all(p.coc is not None for p in read_predictions(tmp_path / "out" / "predictions.jsonl"))

@@ -8,16 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import invoke
 from specimens_distill import ADAPTER_PIXELS, make_adapter, make_captions, prepared
 from specimens_students import features_of, inputs_of
 from teacher_server import kept_answers
-from typer.testing import CliRunner
 
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
 from cosfly.chat.student_chat import TAUGHT  # noqa: E402
-from cosfly.cli import app  # noqa: E402
 from cosfly.errors import ConfigError  # noqa: E402
 from cosfly.products.predictions import Prediction, read_predictions  # noqa: E402
 from distill.inference import merge  # noqa: E402
@@ -162,7 +161,7 @@ def test_one_bad_picture_costs_its_samples_only(place, clean, tmp_path):
     words += ["--adapter", place / "trained" / "adapter", "--out", tmp_path / "out"]
     for name, value in settings().model_dump(include={"split", "batch_size", "max_new_tokens", "device"}).items():
         words += ["--set", f"distill.infer.{name}={value}"]
-    result = CliRunner().invoke(app, [str(word) for word in words])
+    result = invoke(words)
     assert result.exit_code == 1
     assert "some items failed" in str(result.exception)
     found, expected = read_predictions(tmp_path / "out" / "predictions.jsonl"), told(read_predictions(clean))
@@ -173,7 +172,7 @@ def test_one_bad_picture_costs_its_samples_only(place, clean, tmp_path):
     assert counts_of(tmp_path / "out")["failed"] == {"input": len(hit)}
     assert (tmp_path / "out" / "failures.jsonl").read_text().count("not an image") == len(hit)
     (tree / bad).write_bytes(whole)  # mended: those alone are answered
-    result = CliRunner().invoke(app, [str(word) for word in words])
+    result = invoke(words)
     assert result.exit_code == 0, result.output
     assert told(read_predictions(tmp_path / "out" / "predictions.jsonl")) == expected
     assert json.loads((tmp_path / "out" / "manifest.json").read_text())["speed"]["answers"] == len(hit)

@@ -16,19 +16,17 @@ pytest.importorskip("peft", reason="needs the extra distill")
 
 from safetensors import safe_open  # noqa: E402
 from safetensors.torch import load_file, save_file  # noqa: E402
-from specimens_distill import TEACHING, make_adapter, make_captions, prepared  # noqa: E402
-from specimens_students import inputs_of  # noqa: E402
+from specimens_distill import TEACHING, make_adapter  # noqa: E402
+from specimens_students import inputs_of, samples_of, trees_of  # noqa: E402
 
 from cosfly.chat.student_chat import TAUGHT, read_taught  # noqa: E402
 from cosfly.errors import InputError  # noqa: E402
 from cosfly.work.store import write_json  # noqa: E402
 from distill.inference import merge  # noqa: E402
 from distill.inference.merge import MergeConfig  # noqa: E402
-from distill.schema import open_split, resolve_trees  # noqa: E402
 from distill.student.checkpoint import ADAPTER_FACTS, base_digests  # noqa: E402
 from distill.student.model import Student, load_student  # noqa: E402
 from distill.student.random_student import make_tiny_student  # noqa: E402
-from specimens import make_playback_tree  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -58,14 +56,9 @@ def adapter(base, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def inputs(base, tmp_path_factory) -> dict:
-    root = tmp_path_factory.mktemp("data")
-    tree = make_playback_tree(root / "tree", num_flights=3, num_points=7)
-    make_captions(root / "captions.jsonl", tree)
-    dataset = prepared(tree, root / "captions.jsonl", root / "set")
+def inputs(place, base) -> dict:
     student = load_student(base, device="cpu", max_pixels=PIXELS)
-    trees = resolve_trees(dataset, [tree])
-    return inputs_of(student, open_split(dataset, "train")[:3], trees)
+    return inputs_of(student, samples_of(place)[:3], trees_of(place))
 
 
 def logits(student: Student, inputs: dict) -> torch.Tensor:

@@ -8,8 +8,6 @@ is off.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra distill")
@@ -99,11 +97,6 @@ TEMPLATES = {
     "3.6": WORDS + turns("(preserve_thinking is defined and preserve_thinking)", reads_thoughts=True) + END,
     "3.8": WORDS + EFFORT + turns("(preserve_thinking | default(true))", reads_thoughts=False) + END,
 }
-
-
-@pytest.fixture(scope="module")
-def place(students) -> Path:
-    return students
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from specimens_distill import write_set
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
-from specimens_students import FAST, MAX_PIXELS, TWELVE, inputs_of, load, log_of, samples_of, trees_of  # noqa: E402
+from specimens_students import FAST, MAX_PIXELS, begun, inputs_of, load, log_of, run, samples_of, trees_of  # noqa: E402
 
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError  # noqa: E402
 from cosfly.products.predictions import read_predictions  # noqa: E402
@@ -23,28 +23,17 @@ from distill.student import model as student  # noqa: E402
 from distill.student.checkpoint import load_checkpoint  # noqa: E402
 from distill.student.encoding import IGNORED, encode_text, load_pictures, padded, prompt_batch  # noqa: E402
 from distill.student.random_student import make_tiny_student  # noqa: E402
-from distill.training import fit  # noqa: E402
 from distill.training import stage as train  # noqa: E402
-from distill.training.settings import (  # noqa: E402
-    Steps,
-    TrainConfig,
-    learning_rate_at,
-    share_of,
-)
+from distill.training.settings import Steps, TrainConfig, learning_rate_at, share_of  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@pytest.fixture(scope="module")
-def place(students) -> Path:
-    return students
 
 
 @pytest.fixture(scope="module")
 def trained(place, tmp_path_factory) -> Path:
     """The output folder of a training of 12 steps without a break."""
     out = tmp_path_factory.mktemp("trained")
-    train.run(TrainConfig(**TWELVE), place / "set", [place / "tree"], place / "student", out)
+    run(place, out)
     return out
 
 
@@ -145,8 +134,7 @@ def test_positions_are_the_librarys(place):
 
 
 def test_pictures_keep_all_pixels_unless_told(place, tmp_path):
-    cfg = TrainConfig(**FAST | {"max_pixels": 0}, max_steps=1)
-    train.run(cfg, place / "set", [place / "tree"], place / "student", tmp_path / "out")
+    run(place, tmp_path / "out", max_pixels=0, max_steps=1)
     facts = json.loads((tmp_path / "out" / "adapter" / "cosfly_adapter.json").read_text())
     assert facts["max_pixels"] == 64 * 36
 
@@ -231,20 +219,8 @@ def test_adapter_reloads_equal(place, trained):
 def test_stopped_and_continued_is_the_same(place, tmp_path):
     """Stop after 7 of 8 steps, cut a line of the log short, damage a newer checkpoint, then go on: the same log and the
     same adapter."""
-    cfg = TrainConfig(**{**TWELVE, "lora_dropout": 0.3, "max_steps": 8})
-    arguments = (cfg, place / "set", [place / "tree"], place / "student")
-    out, steps, real = tmp_path / "out", [], fit.train_step
-
-    def stop_after_seven(*args):
-        if len(steps) == 7:
-            raise KeyboardInterrupt
-        steps.append(1)
-        return real(*args)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit, "train_step", stop_after_seven)
-        with pytest.raises(KeyboardInterrupt):
-            train.run(*arguments, out)
+    out, whole, settings = tmp_path / "out", tmp_path / "whole", {"lora_dropout": 0.3, "max_steps": 8}
+    begun(place, out, **settings)
     assert sorted(path.name for path in (out / "checkpoints").iterdir()) == ["step_00000005", "step_00000006"]
     assert not (out / "manifest.json").exists()
     with open(out / "log.jsonl", "a") as file:
@@ -252,22 +228,17 @@ def test_stopped_and_continued_is_the_same(place, tmp_path):
     damaged = shutil.copytree(out / "checkpoints/step_00000006", out / "checkpoints/step_00000007")
     moments = damaged / "optimizer.safetensors"
     moments.write_bytes(moments.read_bytes()[:-7])
-    train.run(*arguments, out)
-    train.run(*arguments, tmp_path / "whole")
-    assert_same_training(out, tmp_path / "whole")
-
-
-def assert_same_training(out: Path, other: Path) -> None:
-    assert log_of(out) == log_of(other)
-    assert log_of(out, "validation") == log_of(other, "validation")
+    run(place, out, **settings)
+    run(place, whole, **settings)
+    assert log_of(out) == log_of(whole)
+    assert log_of(out, "validation") == log_of(whole, "validation")
     name = "adapter/adapter_model.safetensors"
-    assert (out / name).read_bytes() == (other / name).read_bytes()
+    assert (out / name).read_bytes() == (whole / name).read_bytes()
 
 
 def test_a_learning_rate_that_explodes_stops_with_a_clear_error(place, tmp_path):
-    cfg = TrainConfig(**{**FAST, "learning_rate": 1e30}, max_steps=5, samples_per_step=1)
     with pytest.raises(ConfigError, match=r"not finite.*lower learning_rate"):
-        train.run(cfg, place / "set", [place / "tree"], place / "student", tmp_path / "out")
+        run(place, tmp_path / "out", learning_rate=1e30, max_steps=5, samples_per_step=1)
 
 
 @pytest.mark.slow

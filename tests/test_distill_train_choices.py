@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,17 +15,7 @@ torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
 from safetensors.torch import load_file  # noqa: E402
-from specimens_students import (  # noqa: E402
-    FAST,
-    MAX_PIXELS,
-    TWELVE,
-    inputs_of,
-    load,
-    log_of,
-    losses_of,
-    samples_of,
-    trees_of,
-)
+from specimens_students import FAST, MAX_PIXELS, inputs_of, load, log_of, losses_of, run, samples_of, trees_of  # noqa: E402
 
 from cosfly.errors import InputError, ResumeError  # noqa: E402
 from distill.schema import Sample  # noqa: E402
@@ -41,18 +30,6 @@ from distill.training.preflight import estimate, saved_bytes_per_token, used_gb 
 from distill.training.settings import TrainConfig  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@pytest.fixture(scope="module")
-def place(students) -> Path:
-    return students
-
-
-def run(
-    place: Path, out: Path, student: str | Path | None = None, dataset: Path | None = None, **settings: object
-) -> Path:
-    cfg = TrainConfig.model_validate({**TWELVE, **settings})
-    return train.run(cfg, dataset or place / "set", [place / "tree"], student or place / "student", out)
 
 
 def test_a_model_trained_in_full_is_a_whole_folder(place, tmp_path):

@@ -18,7 +18,7 @@ from specimens_distill import write_set
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
-from specimens_students import FAST, MAX_PIXELS, TWELVE, load, log_of, samples_of  # noqa: E402
+from specimens_students import FAST, MAX_PIXELS, TWELVE, begun, load, log_of, run, samples_of  # noqa: E402
 
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, NothingKept  # noqa: E402
 from distill.student.checkpoint import load_checkpoint, newest_checkpoint  # noqa: E402
@@ -28,34 +28,6 @@ from distill.training import stage as train  # noqa: E402
 from distill.training.settings import TrainConfig  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@pytest.fixture(scope="module")
-def place(students) -> Path:
-    return students
-
-
-def run(
-    place: Path, out: Path, student: str | Path | None = None, dataset: Path | None = None, **settings: object
-) -> Path:
-    cfg = TrainConfig.model_validate({**TWELVE, **settings})
-    return train.run(cfg, dataset or place / "set", [place / "tree"], student or place / "student", out)
-
-
-def begun(place: Path, out: Path, num_steps: int = 7, **settings: object) -> None:
-    """Leave a training that was stopped after so many steps."""
-    steps, real = [], fit.train_step
-
-    def stop(*args):
-        if len(steps) == num_steps:
-            raise KeyboardInterrupt
-        steps.append(1)
-        return real(*args)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit, "train_step", stop)
-        with pytest.raises(KeyboardInterrupt):
-            run(place, out, **settings)
 
 
 def test_samples_are_left_out_with_a_reason_and_counted(place, tmp_path):
@@ -215,6 +187,7 @@ for pid, _ in in_order(lambda order: (os.getpid(), bytes(10_000_000)), range(100
 """
 
 
+@pytest.mark.slow
 def test_workers_end_with_a_training_that_was_killed(tmp_path):
     """Those that had something to hand over stayed for ever, and held the lock of the folder."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}

@@ -14,17 +14,11 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
-from specimens_students import FAST, TWELVE, features_of, inputs_of, load, losses_of, samples_of, trees_of  # noqa: E402
+from specimens_students import FAST, features_of, inputs_of, load, losses_of, run, samples_of, trees_of  # noqa: E402
 
 from cosfly.errors import ConfigError  # noqa: E402
 from distill.student.encoding import EncodedSample, encode_text, padded  # noqa: E402
-from distill.student.features import (  # noqa: E402
-    FramePicture,
-    PictureData,
-    PictureReader,
-    VisionFeatures,
-    pictures_of,
-)
+from distill.student.features import FramePicture, PictureData, PictureReader, VisionFeatures, pictures_of  # noqa: E402
 from distill.student.model import Student  # noqa: E402
 from distill.training import stage as train  # noqa: E402
 from distill.training.loading import Maker, Order  # noqa: E402
@@ -35,12 +29,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 # Adam divides by what gradients were before, so rounding grows from step to step, with a rate that makes a student
 # learn in 12 steps sooner than with usual ones.
-FOUR = {**TWELVE, "max_steps": 4, "validation_samples": 0, "learning_rate": 1e-3}
-
-
-@pytest.fixture(scope="module")
-def place(students) -> Path:
-    return students
+FOUR = {"max_steps": 4, "validation_samples": 0, "learning_rate": 1e-3}
 
 
 def seen(place: Path, own: Student, count: int) -> tuple[list[EncodedSample], torch.Tensor]:
@@ -203,13 +192,12 @@ def test_pictures_go_from_process_to_process_as_one_tensor():
     ids=lambda changes: "_".join(changes),
 )
 def test_what_changes_how_and_not_what_gives_the_same_losses(place, plain, tmp_path, changes):
-    settings = {**FOUR, **changes}
-    train.run(TrainConfig(**settings), place / "set", [place / "tree"], place / "student", tmp_path / "out")
+    run(place, tmp_path / "out", **{**FOUR, **changes})
     assert losses_of(tmp_path / "out") == pytest.approx(plain, rel=1e-5)
 
 
 @pytest.fixture(scope="module")
 def plain(place, tmp_path_factory) -> list[float]:
     out = tmp_path_factory.mktemp("plain") / "out"
-    train.run(TrainConfig(**FOUR), place / "set", [place / "tree"], place / "student", out)
+    run(place, out, **FOUR)
     return losses_of(out)

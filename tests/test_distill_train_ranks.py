@@ -30,11 +30,6 @@ SETTINGS = {**TWELVE, "learning_rate": 1e-3, "validation_answers": True, "max_ne
 
 
 @pytest.fixture(scope="module")
-def place(students) -> Path:
-    return students
-
-
-@pytest.fixture(scope="module")
 def alone(place, tmp_path_factory) -> Path:
     """What one process gives."""
     out = tmp_path_factory.mktemp("alone") / "out"

@@ -25,10 +25,9 @@ def place(tmp_path_factory) -> Path:
     """tree/, captions.jsonl and release/dataset/ of three walks; the last caption of each flight was dropped."""
     root = tmp_path_factory.mktemp("windows")
     make_playback_tree(root / "tree", 3, NUM_POINTS, width_px=96, height_px=54)
+    dropped = {"status": "dropped", "drop_reason": "hard_conflict"}
     captions = [
-        make_caption(
-            flight, i, **({"status": "dropped", "drop_reason": "hard_conflict"} if i == NUM_POINTS - 2 else {})
-        )
+        make_caption(flight, i, **(dropped if i == NUM_POINTS - 2 else {}))
         for flight in map(read_flight, find_flights(root / "tree"))
         for i in range(4, NUM_POINTS - 1)
     ]

@@ -57,7 +57,7 @@ NOT_HERE = {
     "chromium --headless": "a browser; tests/browser.py drives one for the pages that run a script",
     "hf://datasets/": "a hub is asked; tests/test_release_get.py reads the same through fsspec from elsewhere",
     "--repo OWNER/NAME --yes": "a hub is written to; tests/test_release_push.py sends to one of its own",
-    "--teacher vllm:": "vLLM needs an accelerator; tests/test_caption_vllm.py holds its engine to the documents",
+    "--teacher vllm:": "vLLM needs an accelerator; tests/test_engines_contract.py holds its engine to the documents",
     "--engine vllm": "the same",
     "--out work/students-captions": "of a random student nothing is kept; docs/distillation.md has one that answers",
 }

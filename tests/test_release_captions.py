@@ -6,12 +6,11 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from commands import invoke
 from hypothesis import given
 from hypothesis import strategies as st
-from specimens_release import CFG, TWO_SPLITS, build, make_caption, make_inspection, make_release
-from typer.testing import CliRunner
+from specimens_release import CFG, build, make_caption, make_inspection
 
-from cosfly.cli import app
 from cosfly.errors import InputError, NothingKept, StorageError
 from cosfly.products.captions import Coc, Prompt, read_captions, write_captions
 from cosfly.products.flights import find_flights
@@ -125,16 +124,15 @@ def test_pictures_of_a_release_are_those_of_the_tree_that_it_is_exported_to(run,
     assert {s["id"]: s["conversations"] for s in samples} == {k: s["conversations"] for k, s in theirs.items()}
 
 
-def test_conversations_of_a_release_are_of_one_split(tmp_path):
-    release = make_release(tmp_path, **TWO_SPLITS)
+def test_conversations_of_a_release_are_of_one_split(dataset, tmp_path):
     with pytest.raises(InputError, match=r"captions of several splits; got train, validation; .*--split"):
-        export(release, tmp_path / "c.json", "llava")
+        export(dataset, tmp_path / "c.json", "llava")
     assert not (tmp_path / "c.json").exists()
-    export(release, tmp_path / "all.jsonl", "jsonl")
+    export(dataset, tmp_path / "all.jsonl", "jsonl")
     lines = [json.loads(line) for line in (tmp_path / "all.jsonl").read_text(encoding="utf-8").splitlines()]
     for split in ("train", "validation"):
-        words = ["export", "captions", str(release), "--format", "sharegpt", "--split", split, "--language", "en"]
-        done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / f"{split}.json")])
+        to = ["--split", split, "--out", tmp_path / f"{split}.json"]
+        done = invoke("export captions", dataset, "--format sharegpt --language en", to)
         assert done.exit_code == 0, done.output
         found = [sample["id"] for sample in json.loads((tmp_path / f"{split}.json").read_text(encoding="utf-8"))]
         assert found == [f"{line['sample_id']}_en" for line in lines if line["split"] == split] != []
@@ -162,9 +160,7 @@ def test_what_cannot_be_exported_says_why_and_leaves_nothing(run, tmp_path):
 
 
 def test_the_command_tells_what_it_wrote(run, tmp_path):
-    done = CliRunner().invoke(
-        app, ["export", "captions", str(run), "--format", "csv", "--out", str(tmp_path / "c.csv")]
-    )
+    done = invoke("export captions", run, "--format csv --out", tmp_path / "c.csv")
     assert done.exit_code == 0, done.output
     assert f"{len(accepted(run))} written; left out: dropped_hard_conflict 4" in done.output
 
@@ -182,6 +178,6 @@ def test_a_file_that_is_there_stays_unless_it_may_go(run, tmp_path):
     with pytest.raises(StorageError, match=r"c\.csv: there is a file already; --overwrite"):
         export(run, tmp_path / "c.csv", "csv")
     assert (tmp_path / "c.csv").read_text() == "mine"
-    words = ["export", "captions", str(run), "--format", "csv", "--out", str(tmp_path / "c.csv"), "--overwrite"]
-    assert CliRunner().invoke(app, words).exit_code == 0
+    told = invoke("export captions", run, "--format csv --overwrite --out", tmp_path / "c.csv")
+    assert told.exit_code == 0
     assert (tmp_path / "c.csv").read_text(encoding="utf-8-sig").startswith("sample_id,")

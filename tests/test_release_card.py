@@ -1,10 +1,15 @@
-"""The card's numbers: counted row by row, merged, flat in memory; what the card says of them."""
+"""The card's numbers: counted row by row, merged, flat in memory; what the card says of them; and `croissant.json`."""
 
 from __future__ import annotations
 
+import io
 import itertools
+import json
 import math
 import re
+import shutil
+import subprocess
+import sys
 import tracemalloc
 from pathlib import Path
 
@@ -13,18 +18,21 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
+from commands import invoke
 from hypothesis import given
 from hypothesis import strategies as st
+from specimens_release import rows_by_id
 from specimens_rows import make_row
-from typer.testing import CliRunner
 
-from cosfly.cli import app
 from cosfly.errors import InputError
 from cosfly.products.actions import action_tokens
+from cosfly.reading.arrays import parse_picture
+from release.card.croissant import CROISSANT, render_croissant
 from release.card.numbers import COLUMNS, RowCounts, Sum, compute_numbers, spread_of
 from release.card.render import first_split, render_card
 from release.columns import POINT, schema
 from release.record import MadeBy, read_record
+from release.verify.verify import verify
 
 ROOT = Path(__file__).resolve().parents[1]
 ROWS = [make_row(i, variant, f"trajectory_{k}") for k in (1, 2) for variant in ("ORI", "aug_001") for i in range(12)]
@@ -218,9 +226,61 @@ def test_every_snippet_of_the_card_runs(record, built, tmp_path, monkeypatch):
 
 
 def test_the_command_renders_what_verify_expects(built, tmp_path):
-    shown = CliRunner().invoke(app, ["release", "card", str(built)])
+    shown = invoke("release card", built)
     assert shown.exit_code == 0, shown.output
     assert shown.output == (built / "README.md").read_text(encoding="utf-8")
-    written = CliRunner().invoke(app, ["release", "card", str(built.parent), "--out", str(tmp_path / "card.md")])
+    written = invoke("release card", built.parent, "--out", tmp_path / "card.md")
     assert written.exit_code == 0, written.output
     assert (tmp_path / "card.md").read_bytes() == (built / "README.md").read_bytes()
+
+
+# --- `croissant.json` -------------------------------------------------------------------------------------------------
+
+
+def test_it_is_what_the_record_gives(dataset, tmp_path):
+    record = read_record(dataset / "release.json")
+    assert (dataset / CROISSANT).read_text() == render_croissant(record)
+    said = json.loads((dataset / CROISSANT).read_text())
+    (records,) = said["recordSet"]
+    columns = {field["source"]["extract"]["column"] for field in records["field"]}
+    assert columns == set(schema(record.settings.modalities).names)
+    shards = {entry["@id"]: entry for entry in said["distribution"] if entry["@type"] == "cr:FileObject"}
+    assert {name: entry["sha256"] for name, entry in shards.items()} == {s.path: s.sha256 for s in record.shards}
+
+
+def test_a_changed_word_of_it_is_found(dataset, tmp_path):
+    broken = shutil.copytree(dataset, tmp_path / "broken")
+    text = (broken / CROISSANT).read_text()
+    (broken / CROISSANT).write_text(text.replace("cc-by-4.0", "cc0-1.0"))
+    assert not verify(broken).is_ok
+
+
+@pytest.mark.slow
+def test_mlcroissant_accepts_it(dataset):
+    pytest.importorskip("mlcroissant", reason="extra dev")
+    code = "from mlcroissant.scripts.cli import main; sys.argv[1:] = ['validate', '--jsonld', sys.argv[1]]; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys; {code}", str(dataset / CROISSANT)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "Done" in done.stderr
+
+
+def test_mlcroissant_loads_every_row(dataset):
+    mlcroissant = pytest.importorskip("mlcroissant", reason="extra dev")
+    rows = rows_by_id(dataset)
+    found = list(mlcroissant.Dataset(jsonld=str(dataset / CROISSANT)).records("frames"))
+    assert {row["frames/sample_id"].decode() for row in found} == rows.keys()
+    assert {row["frames/split"].decode() for row in found} == {"train", "validation"}
+    for one in found[::9]:
+        row = rows[one["frames/sample_id"].decode()]
+        assert (np.asarray(one["frames/image"]) == parse_picture(row["image"]["bytes"], "x")[..., ::-1]).all()
+        assert np.load(io.BytesIO(one["frames/depth"])).tobytes() == np.load(io.BytesIO(row["depth"])).tobytes()
+        assert one["frames/pose/x_m"] == row["pose"]["x_m"]
+        assert one["frames/time_s"] == row["time_s"]
+        text = one["frames/caption_zh_reasoning_trace"]
+        assert (text and text.decode()) == row["caption_zh_reasoning_trace"]
+        assert (one["frames/caption_window"] or None) == row["caption_window"]

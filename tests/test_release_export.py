@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from commands import invoke
 from hypothesis import given
 from hypothesis import strategies as st
 from public_reader import read_public
@@ -21,7 +22,6 @@ from specimens_release import (
     CFG,
     NUM_POINTS,
     TOWNS,
-    TWO_SPLITS,
     all_bytes,
     build,
     make_inspection,
@@ -29,9 +29,7 @@ from specimens_release import (
     release_of,
     rows_by_id,
 )
-from typer.testing import CliRunner
 
-from cosfly.cli import app
 from cosfly.errors import InputError, ResumeError
 from cosfly.products.captions import write_captions
 from cosfly.products.flights import find_flights
@@ -73,6 +71,12 @@ def dataset(whole) -> Path:
     return whole / "release" / "dataset"
 
 
+@pytest.fixture(scope="module")
+def spread(tmp_path_factory) -> Path:
+    """Eight frames of each flight, which are spread evenly, as there are no windows to keep."""
+    return make_release(tmp_path_factory.mktemp("spread"), num_frames=8, window=1)
+
+
 # --- the playback tree ------------------------------------------------------------------------------------------------
 
 
@@ -110,12 +114,11 @@ def test_tree_to_release_to_tree_loses_nothing(whole, dataset, tmp_path):
     assert read_town_map(product / "Town01").licence == about.maps[0].licence
 
 
-def test_a_tree_of_chosen_frames_says_which_they_were(tmp_path):
+def test_a_tree_of_chosen_frames_says_which_they_were(whole, spread, tmp_path):
     """Every second frame or so: counted anew from 0, uneven steps told."""
-    dataset = make_release(tmp_path, num_frames=8, window=1)  # without windows to keep, frames are spread evenly
-    product = export(config("tree"), dataset, tmp_path / "out")
-    frames = [flight.frame_index.tolist() for flight in scan(open_release(dataset))]
-    for a, b, kept in zip(find_flights(tmp_path / "tree"), find_flights(product), frames, strict=True):
+    product = export(config("tree"), spread, tmp_path / "out")
+    frames = [flight.frame_index.tolist() for flight in scan(open_release(spread))]
+    for a, b, kept in zip(find_flights(whole / "tree"), find_flights(product), frames, strict=True):
         assert len(kept) == 8
         assert_same_flight(b, a, kept)
     read_public(product)
@@ -316,28 +319,26 @@ def test_statistics_leave_out_what_is_unknown():
     assert summarize(np.array([[np.nan]]), 1)["count"] == [0]
 
 
-def test_a_flight_with_gaps_is_several_episodes(tmp_path):
-    dataset = make_release(tmp_path, num_frames=8, window=1)  # without windows to keep, frames are spread evenly
-    product = export(config("lerobot"), dataset, tmp_path / "out")
+def test_a_flight_with_gaps_is_several_episodes(spread, tmp_path):
+    product = export(config("lerobot"), spread, tmp_path / "out")
     info = json.loads((product / "meta/info.json").read_text())
     episodes = pq.read_table(product / "meta/episodes").to_pylist()
-    frames = [flight.frame_index for flight in scan(open_release(dataset))]
+    frames = [flight.frame_index for flight in scan(open_release(spread))]
     runs = [stop - start for index in frames for start, stop in runs_of(flight_of(index.tolist()))]
     assert [row["length"] for row in sorted(episodes, key=lambda row: row["episode_index"])] == runs
     assert info["total_episodes"] == len(runs) > 6
     assert info["total_frames"] == 48
 
 
-def test_splits_reach_every_format(tmp_path):
-    dataset = make_release(tmp_path, **TWO_SPLITS)
-    numbers = open_release(dataset).record.splits.splits
+def test_splits_reach_every_format(two_splits, tmp_path):
+    numbers = open_release(two_splits).record.splits.splits
     assert set(numbers) == {"train", "validation"}
-    shards = export(config("webdataset"), dataset, tmp_path / "wds")
+    shards = export(config("webdataset"), two_splits, tmp_path / "wds")
     for split, told in numbers.items():
         names = [name for shard in shards.glob(f"{split}-*.tar") for name in names_in(shard)]
         assert sum(name.endswith(".json") for name in names) == told.frames
     episodes = numbers["train"].flights
-    info = json.loads((export(config("lerobot"), dataset, tmp_path / "lerobot") / "meta/info.json").read_text())
+    info = json.loads((export(config("lerobot"), two_splits, tmp_path / "lerobot") / "meta/info.json").read_text())
     assert info["splits"] == {"train": f"0:{episodes}", "validation": f"{episodes}:6"}
 
 
@@ -537,15 +538,10 @@ def test_lerobot_has_one_size_of_picture(broken, tmp_path):
 
 
 def test_the_command(dataset, tmp_path):
-    done = CliRunner().invoke(
-        app,
-        ["release", "export", str(dataset), "--format", "webdataset", "--out", str(tmp_path / "out"), "--workers", "1"],
-    )
+    done = invoke("release export", dataset, "--format webdataset --out", tmp_path / "out", "--workers 0")
     assert done.exit_code == 0, done.output
     assert str(tmp_path / "out/webdataset") in done.output
-    done = CliRunner().invoke(
-        app, ["release", "export", str(tmp_path), "--format", "tree", "--out", str(tmp_path / "x")]
-    )
+    done = invoke("release export", tmp_path, "--format tree --out", tmp_path / "x")
     assert done.exit_code == 1
     assert "Traceback" not in done.output
 
@@ -564,14 +560,14 @@ def test_a_release_is_found_from_its_stage_and_from_its_run(below, dataset, tmp_
     (tmp_path / "run/render").mkdir()  # a run has its tree beside the release, and it is the release that is asked for
     assert open_release(tmp_path / "run").folder == tmp_path / "run" / below
     assert "by their record" in str(verify(tmp_path / "run", level="structure"))
-    card = CliRunner().invoke(app, ["release", "card", str(tmp_path / "run")])
+    card = invoke("release card", tmp_path / "run")
     assert card.output == (dataset / "README.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("words", [["card"], ["stats", "--out", "x"], ["export", "--format", "tree", "--out", "x"]])
+@pytest.mark.parametrize("words", ["card", "stats --out x", "export --format tree --out x"])
 def test_where_there_is_no_release_that_is_said(words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(app, ["release", *words, "."])
+    done = invoke("release", words, ".")
     assert "there is no release" in str(done.exception)
     assert "a run that has one" in str(done.exception)
 

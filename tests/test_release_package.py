@@ -12,15 +12,13 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from commands import invoke
 from hypothesis import given
 from hypothesis import strategies as st
-from specimens_release import CFG, FREE, NUM_POINTS, all_bytes, build, make_inspection, source_of
-from typer.testing import CliRunner
+from specimens_release import CFG, FREE, NUM_POINTS, all_bytes, build, make_inspection, rewrite_captions, source_of
 
-from cosfly.cli import app
 from cosfly.errors import ConfigError, InputError, NothingKept
 from cosfly.products.boxes import MapHeader
-from cosfly.products.captions import read_captions, write_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import read_depth, read_instance, read_rgb
 from cosfly.products.inspection import (
@@ -38,11 +36,12 @@ from release.package.config import ReleaseConfig
 from release.package.plan import plan_shards
 from release.package.sources import Source
 from release.package.stage import run
-from release.record import read_record
+from release.record import ReleaseRecord, read_record
 from release.verify.verify import verify
 from specimens import make_flight
 
 PLACED = Placement("a walk", "train")
+UNLICENSED = CFG.model_copy(update={"licence": None})
 
 
 @pytest.fixture
@@ -211,25 +210,20 @@ def with_maps(release_inputs: Path, copy: Path, **licences: str) -> Path:
     return copy
 
 
-def test_a_release_takes_the_licence_of_its_maps(release_inputs, tmp_path):
+def test_a_release_takes_the_licence_of_its_maps_unless_told_and_names_them(release_inputs, tmp_path):
     source = with_maps(release_inputs, tmp_path / "in", Town01="mit", Town02="mit")
-    folder = build(source, tmp_path / "r", CFG.model_copy(update={"licence": None}))
+    folder = build(source, tmp_path / "r", UNLICENSED)
     record = read_json(folder / "release.json")
     card = (folder / "README.md").read_text(encoding="utf-8")
     assert record["licence"] == "mit"
     assert record["maps"][0] == {"name": "A Town01", "licence": "mit", "credits": "Made by M.", "town": "Town01"}
-    assert "license: mit\n" in card
-    assert "Map of Town02: A Town02, licence mit. Made by M." in card
-    assert "Map: a specimen." in card
+    for words in ("license: mit\n", "Map of Town02: A Town02, licence mit. Made by M.", "Map: a specimen."):
+        assert words in card
     assert verify(folder).is_ok
-
-
-def test_another_licence_for_the_data_set_still_names_the_maps(release_inputs, tmp_path):
-    source = with_maps(release_inputs, tmp_path / "in", Town01="mit")
-    card = (build(source, tmp_path / "r") / "README.md").read_text(encoding="utf-8")
-    assert "license: cc-by-4.0\n" in card
-    assert "licence mit. Made by M." in card
-    assert "Map of Town02: Town02, licence unknown." in card
+    source = with_maps(release_inputs, tmp_path / "one", Town01="mit")
+    card = (build(source, tmp_path / "own") / "README.md").read_text(encoding="utf-8")
+    for words in ("license: cc-by-4.0\n", "licence mit. Made by M.", "Map of Town02: Town02, licence unknown."):
+        assert words in card
 
 
 @pytest.mark.parametrize(
@@ -240,7 +234,7 @@ def test_another_licence_for_the_data_set_still_names_the_maps(release_inputs, t
 def test_a_release_without_a_licence_is_refused(release_inputs, tmp_path, licences, got):
     source = with_maps(release_inputs, tmp_path / "in", **licences)
     with pytest.raises(ConfigError, match=r"release\.licence") as caught:
-        build(source, tmp_path / "r", CFG.model_copy(update={"licence": None}))
+        build(source, tmp_path / "r", UNLICENSED)
     assert got in str(caught.value)
     assert not (tmp_path / "r" / "dataset").exists()
 
@@ -254,10 +248,10 @@ def test_a_tree_may_stand_deeper_and_a_town_twice_in_it(release_inputs, tmp_path
     (tmp_path / "in/captions.jsonl").write_text("")
     write_inspection(tmp_path / "in" / "inspect.json", make_inspection(tmp_path / "in" / "tree", {}))
     with pytest.raises(ConfigError, match=r"Town01: cc0-1\.0, Town01: mit, Town02: cc0-1\.0, Town02: mit"):
-        build(tmp_path / "in", tmp_path / "r", CFG.model_copy(update={"licence": None}))
+        build(tmp_path / "in", tmp_path / "r", UNLICENSED)
     shutil.rmtree(tmp_path / "in" / "tree" / "b")
     write_inspection(tmp_path / "in" / "inspect.json", make_inspection(tmp_path / "in" / "tree", {}))
-    folder = build(tmp_path / "in", tmp_path / "r2", CFG.model_copy(update={"licence": None}))
+    folder = build(tmp_path / "in", tmp_path / "r2", UNLICENSED)
     assert read_json(folder / "release.json")["flights"][0]["flight"].startswith("one_a/Town01/")
     assert verify(folder).is_ok
 
@@ -265,15 +259,15 @@ def test_a_tree_may_stand_deeper_and_a_town_twice_in_it(release_inputs, tmp_path
 # --- several runs -----------------------------------------------------------------------------------------------------
 
 
-def other_run(release_inputs: Path, target: Path, rename: dict[str, str]) -> Path:
+OTHER_TOWNS = {"Town01": "Town03", "Town02": "Town04"}
+
+
+def other_run(release_inputs: Path, target: Path, rename: dict[str, str] = OTHER_TOWNS) -> Path:
     """Give a run like another, its town folders renamed, and captions and inspection with them."""
     shutil.copytree(release_inputs, target)
     for old, new in rename.items():
         (target / "tree" / old).rename(target / "tree" / new)
-    captions = [
-        c.model_copy(update={"town": rename.get(c.town, c.town)}) for c in read_captions(target / "captions.jsonl")
-    ]
-    write_captions(target / "captions.jsonl", captions)
+    rewrite_captions(target, lambda lines: [one.update(town=rename.get(one["town"], one["town"])) for one in lines])
     write_inspection(target / "inspect.json", make_inspection(target / "tree", {}))
     return target
 
@@ -282,55 +276,40 @@ def ids_of(folder: Path) -> list[str]:
     return pq.read_table(folder / "data", columns=["sample_id"]).column(0).to_pylist()
 
 
-def test_runs_of_other_towns_go_into_one_release_under_ids_of_their_own(release_inputs, built, tmp_path):
-    other = other_run(release_inputs, tmp_path / "in", {"Town01": "Town03", "Town02": "Town04"})
-    folder = run(CFG, [source_of(release_inputs), source_of(other, "two")], tmp_path / "r")
+def joined(out: Path, *sources: Source) -> tuple[Path, ReleaseRecord]:
+    folder = run(CFG, sources, out)
     assert verify(folder).is_ok
+    assert len(ids_of(folder)) == len(set(ids_of(folder))) == 8 * (4 + 6)
+    return folder, read_record(folder / "release.json")
+
+
+def test_runs_of_other_towns_go_into_one_release_under_ids_of_their_own(release_inputs, built, tmp_path):
+    other = other_run(release_inputs, tmp_path / "in")
+    folder, record = joined(tmp_path / "r", source_of(release_inputs), source_of(other, "two"))
     ids, alone = ids_of(folder), ids_of(built)
-    assert len(ids) == len(set(ids)) == 8 * (4 + 6)
     assert f"Town01_{alone[0]}" in ids, "both runs have this trajectory, so the town tells them apart"
     assert set(alone) == {i.partition("_")[2] for i in ids if i.startswith(("Town01", "Town02"))}
-    record, before = read_record(folder / "release.json"), read_record(built / "release.json")
+    before = read_record(built / "release.json")
     assert record.history.captions.read == 2 * before.history.captions.read
     assert record.history.trajectories.planned == 2 * before.history.trajectories.planned
     rows = pq.read_table(folder / "data", columns=["run", "town", "has_caption"]).to_pylist()
-    assert {(row["run"], row["town"]) for row in rows} == {
-        ("one", "Town01"),
-        ("one", "Town02"),
-        ("two", "Town03"),
-        ("two", "Town04"),
-    }
-    assert (
-        sum(row["has_caption"] for row in rows) == record.history.captions.released > before.history.captions.released
-    )
-
-
-def test_runs_of_the_same_town_are_told_apart_by_their_names(release_inputs, built, tmp_path):
-    other = other_run(release_inputs, tmp_path / "in", {})
-    folder = run(CFG, [source_of(release_inputs), source_of(other, "two")], tmp_path / "r")
-    assert verify(folder).is_ok
-    ids = ids_of(folder)
-    assert len(ids) == len(set(ids)) == 8 * (4 + 6)
-    assert {i.partition("_Town")[0] for i in ids} == {"one", "two"}
-    assert read_record(folder / "release.json").numbers.flights == 4 + 6
-
-
-def test_two_runs_of_one_name_are_refused(release_inputs, tmp_path):
-    other = other_run(release_inputs, tmp_path / "in", {"Town01": "Town03", "Town02": "Town04"})
+    towns = {"one": set(OTHER_TOWNS), "two": set(OTHER_TOWNS.values())}
+    assert {(row["run"], row["town"]) for row in rows} == {(name, town) for name in towns for town in towns[name]}
+    num_captions = sum(row["has_caption"] for row in rows)
+    assert num_captions == record.history.captions.released > before.history.captions.released
     with pytest.raises(InputError, match=r"two runs have one name.*different names"):
         run(CFG, [source_of(release_inputs), source_of(other)], tmp_path / "r2")
-
-
-def test_two_trees_in_one_folder_go_by_their_own_names(release_inputs, tmp_path):
-    other = other_run(release_inputs, tmp_path / "in", {"Town01": "Town03", "Town02": "Town04"})
+    # Of two trees in one folder each goes by its own name.
     (other / "tree").rename(other / "second")
-    trees = [source_of(release_inputs), replace(source_of(other), data=other / "second")]
-    folder = run(CFG, trees, tmp_path / "r")
-    assert verify(folder).is_ok
-    assert {one.flight.partition("/")[0] for one in read_record(folder / "release.json").flights} == {
-        "one_tree",
-        "one_second",
-    }
+    _, record = joined(tmp_path / "trees", source_of(release_inputs), replace(source_of(other), data=other / "second"))
+    assert {one.flight.partition("/")[0] for one in record.flights} == {"one_tree", "one_second"}
+
+
+def test_runs_of_the_same_town_are_told_apart_by_their_names(release_inputs, tmp_path):
+    other = other_run(release_inputs, tmp_path / "in", {})
+    folder, record = joined(tmp_path / "r", source_of(release_inputs), source_of(other, "two"))
+    assert {i.partition("_Town")[0] for i in ids_of(folder)} == {"one", "two"}
+    assert record.numbers.flights == 4 + 6
 
 
 def test_one_run_keeps_the_ids_of_its_tree(release_inputs, built):
@@ -348,19 +327,15 @@ def test_runs_are_given_as_folders_or_file_by_file(release_inputs, tmp_path):
         shutil.copy(release_inputs / "inspect.json", place / "inspect")
     a, b = (tmp_path / "runs" / name for name in ("a", "b"))
     assert [Source.of_run(place).run for place in (a, b)] == ["a", "b"]
-    more = [
-        "--out", str(tmp_path / "out"), "--set", "release.licence=mit", "--frames", "2", "--set",
-        "release.unbound=accept",
-    ]  # fmt: skip
+    more = ["--out", tmp_path / "out", "--frames", 2]
+    more += ["--set", "release.licence=mit", "--set", "release.unbound=accept"]
     files = ["--data", str(b / "render"), "--captions", str(b / "caption/captions.jsonl")]
-    result = CliRunner().invoke(
-        app, ["release", "build", str(a), *files, "--workers", "1", "--inspect", str(b / "inspect/inspect.json"), *more]
-    )
+    result = invoke("release build", a, files, "--workers 0 --inspect", b / "inspect/inspect.json", more)
     assert result.exit_code == 0, result.output
     assert {i.partition("_")[0] for i in ids_of(tmp_path / "out/dataset")} == {"a", "b"}
-    assert CliRunner().invoke(app, ["release", "build", *files[:2], *more]).exit_code == 2
-    assert CliRunner().invoke(app, ["release", "build", *files, *more, "--frames", "some"]).exit_code == 1
-    refused = CliRunner().invoke(app, ["release", "build", str(release_inputs), *more])
+    assert invoke("release build", files[:2], more).exit_code == 2
+    assert invoke("release build", files, more, "--frames some").exit_code == 1
+    refused = invoke("release build", release_inputs, more)
     assert isinstance(refused.exception, InputError)
     assert "not a run folder" in str(refused.exception)
 
@@ -476,25 +451,18 @@ def test_no_folder_is_a_finding_not_a_traceback(tmp_path):
     assert codes(tmp_path) == {"missing"}
 
 
-def test_every_flight_can_be_its_own_shard(release_inputs, tmp_path, monkeypatch):
-    """Parts that fill a shard are linked; the rows and their order are those of the copied shards."""
-    from release.package import config
-
-    monkeypatch.setattr(config, "MB", 1000)  # so that the specimen's small flights pass shard_mb
-    folder = build(release_inputs, tmp_path / "r")
-    record = read_json(folder / "release.json")
-    assert len(record["shards"]) == 4
-    assert [flight["frames"] for flight in record["flights"]] == [entry["rows"] for entry in record["shards"]]
-    assert verify(folder).is_ok
-
-
-def test_a_disk_without_links_gets_copies(release_inputs, built, tmp_path, monkeypatch):
+def test_every_flight_can_be_its_own_shard_linked_or_copied(release_inputs, tmp_path, monkeypatch):
+    """Parts that fill a shard are linked; the rows and their order are those of the copied shards of another disk."""
     from release.package import config
 
     def refuse(*args):
         raise OSError("no links here")
 
-    monkeypatch.setattr(config, "MB", 1000)
-    linked = build(release_inputs, tmp_path / "linked")
+    monkeypatch.setattr(config, "MB", 1000)  # so that the specimen's small flights pass shard_mb
+    folder = build(release_inputs, tmp_path / "linked")
+    record = read_record(folder / "release.json")
+    assert len(record.shards) == 4
+    assert [flight.frames for flight in record.flights] == [entry.rows for entry in record.shards]
+    assert verify(folder).is_ok
     monkeypatch.setattr(os, "link", refuse)
-    assert all_bytes(build(release_inputs, tmp_path / "copied")) == all_bytes(linked)
+    assert all_bytes(build(release_inputs, tmp_path / "copied")) == all_bytes(folder)

@@ -1,18 +1,16 @@
 """A release on its way to a hub: the library's real client against a server of ours."""
 
 import base64
-import contextlib
 import hashlib
-import http.server
 import json
 import os
 import shutil
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import pytest
+from serving import Handler, serving
 from tables import each
 
 from cosfly.errors import ConfigError
@@ -30,21 +28,8 @@ def is_public(made: dict) -> bool:
     return made.get("private") is not True and made.get("visibility") != "private"
 
 
-class Hub(http.server.BaseHTTPRequestHandler):
+class Hub(Handler):
     """One repository of data: login, making it, its list of files, uploads by LFS, commits."""
-
-    protocol_version = "HTTP/1.1"
-
-    def log_message(self, *args) -> None:
-        pass
-
-    def answer(self, status: int, value: object = None) -> None:
-        data = b"" if value is None else json.dumps(value).encode()
-        self.send_response(status)
-        self.send_header("content-type", "application/json")
-        self.send_header("content-length", str(len(data)))
-        self.end_headers()
-        self.wfile.write(data)
 
     def body(self) -> bytes:
         if "chunked" in self.headers.get("transfer-encoding", ""):
@@ -115,20 +100,9 @@ class Hub(http.server.BaseHTTPRequestHandler):
         self.answer(200)
 
 
-@contextlib.contextmanager
 def hub():
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Hub)
-    server.daemon_threads = True
-    server.address = f"http://127.0.0.1:{server.server_address[1]}"
-    server.files, server.uploads, server.asked, server.sent = {"README.md": b"old"}, {}, [], 0
-    server.made, server.commits_left = {}, 99
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    try:
-        yield server
-    finally:
-        server.shutdown()
-        server.server_close()
+    state = {"files": {"README.md": b"old"}, "uploads": {}, "asked": [], "sent": 0, "made": {}, "commits_left": 99}
+    return serving(Hub, **state)
 
 
 def command(folder: Path, home: Path, *more: str, address: str = "http://127.0.0.1:9", key: str | None = KEY):
@@ -206,7 +180,9 @@ def test_a_push_that_was_refused_half_way_goes_on(dataset, tmp_path):
         assert server.files == contents(dataset)
 
 
-@pytest.mark.parametrize(("key", "words"), [(None, "hf auth login"), ("another", "HTTP 401")])
+@pytest.mark.parametrize(
+    ("key", "words"), [(None, "hf auth login"), pytest.param("another", "HTTP 401", marks=pytest.mark.slow)]
+)
 def test_who_is_not_logged_in_is_told(dataset, tmp_path, key, words):
     with hub() as server:
         done = command(dataset, tmp_path, "--yes", address=server.address, key=key)
@@ -216,6 +192,7 @@ def test_who_is_not_logged_in_is_told(dataset, tmp_path, key, words):
     assert server.files == {"README.md": b"old"}
 
 
+@pytest.mark.slow
 def test_a_changed_release_does_not_go_out(dataset, tmp_path):
     card = dataset / "README.md"
     before = card.read_bytes()

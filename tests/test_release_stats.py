@@ -11,13 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import invoke
 from hypothesis import given
 from hypothesis import strategies as st
 from specimens_release import build, make_inputs
 from specimens_rows import make_row
-from typer.testing import CliRunner
 
-from cosfly.cli import app
 from cosfly.errors import InputError
 from cosfly.products.coverage import Coverage, default_coverage
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
@@ -218,7 +217,7 @@ def test_nothing_is_kept_a_frame():
 
 
 def test_a_release_is_counted_again(built, tmp_path):
-    result = CliRunner().invoke(app, ["release", "stats", str(built.parent), "--out", str(tmp_path), "--pixels", "5"])
+    result = invoke("release stats", built.parent, "--out", tmp_path, "--pixels 5")
     assert result.exit_code == 0, result.output
     written = Stats.model_validate({k: v for k, v in read_json(tmp_path / "stats.json").items() if k != "coverage"})
     tables = {table.key: {row[0]: row[1:] for row in table.rows} for table in written.tables}

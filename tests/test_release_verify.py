@@ -16,22 +16,22 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from commands import invoke
 from release_lies import LIES, at, captioned, change, everything, put
-from release_tampering import errors_in, forge, read_all, set_depth
+from release_tampering import errors_in, forge, pixels_of, png, read_all, set_depth
 from specimens_foreign import hub_snapshot, write_foreign_tree
-from typer.testing import CliRunner
+from specimens_release import run_here
 
 from caption.run.released import read_released
-from cosfly.app import pipeline
-from cosfly.app.settings import RunConfig
-from cosfly.cli import app
 from cosfly.errors import InputError
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import instance_bytes
 from cosfly.reading.documents import read_json
-from cosfly.work.config import load
-from cosfly.work.store import write_bytes
+from cosfly.reading.files import sha256_file
+from cosfly.work.store import read_checksums, write_bytes, write_checksums
 from release.columns import INTRINSICS, POSE
+from release.export.contract import FORMATS, ExportConfig
+from release.export.stage import run as export
 from release.flight_rows import FlightRows
 from release.package import stage as package
 from release.package.config import ReleaseConfig
@@ -51,16 +51,17 @@ TINY = [
 
 @pytest.fixture(scope="module")
 def honest_run(tmp_path_factory) -> Path:
-    out = tmp_path_factory.mktemp("verify") / "run"
-    pipeline.run(load(RunConfig, None, TINY), out)
-    return out
+    return run_here(TINY, tmp_path_factory.mktemp("verify") / "run")
 
 
 @pytest.fixture(scope="module")
 def honest(honest_run, tmp_path_factory) -> Path:
     """A small release of what the whole way makes: two walks, both tracks, twenty frames each."""
-    cfg = ReleaseConfig(num_frames=20, licence="cc-by-4.0")
-    return package.run(cfg, [Source.of_run(honest_run)], tmp_path_factory.mktemp("verify") / "release")
+    return released(honest_run, tmp_path_factory.mktemp("verify") / "release")
+
+
+def released(run: Path, out: Path, **settings) -> Path:
+    return package.run(ReleaseConfig(num_frames=20, licence="cc-by-4.0", **settings), [Source.of_run(run)], out)
 
 
 @pytest.fixture
@@ -80,9 +81,10 @@ def test_an_honest_release_passes(honest, level):
 
 def test_a_release_that_the_kit_wrote_again_passes(honest, tmp_path):
     """Else every lie below would be found for the kit's own faults."""
-    assert errors_in(forge(honest, tmp_path / "again")) == {}
+    assert errors_in(forge(honest, tmp_path / "again", lambda rows: None)) == {}
 
 
+@pytest.mark.slow
 def test_processes_find_what_one_finds(honest, tmp_path):
     forged = forge(honest, tmp_path / "forged", LIES["depth_doubled"][0])
     one, two = (verify(forged, workers=workers, reader=read_released) for workers in (0, 2))
@@ -457,9 +459,7 @@ def test_one_line_a_kind_with_count_and_first_places():
 def test_the_command_tells_people_and_machines(honest, tmp_path):
     forged = forge(honest, tmp_path / "forged", LIES["visibility_above_one"][0])
     before = {path: path.read_bytes() for path in forged.rglob("*") if path.is_file()}
-    more = ["--json", str(tmp_path / "found.json"), "--repair-plan", "--workers", "1"]
-    arguments = ["release", "verify", str(forged), "--level", "rows", *more]
-    result = CliRunner().invoke(app, arguments)
+    result = invoke("release verify", forged, "--level rows --repair-plan --workers 0 --json", tmp_path / "found.json")
     assert result.exit_code == 1
     assert "range: once" in result.output
     assert "repair plan: range" in result.output
@@ -467,11 +467,85 @@ def test_the_command_tells_people_and_machines(honest, tmp_path):
     assert told["ok"] is False
     assert {kind["code"] for kind in told["findings"]} == {"range"}
     assert {path: path.read_bytes() for path in forged.rglob("*") if path.is_file()} == before
-    assert CliRunner().invoke(app, ["release", "verify", str(honest), "--level", "structure"]).exit_code == 0
-    assert CliRunner().invoke(app, ["release", "verify", str(honest), "--level", "all"]).exit_code == 2
+    assert invoke("release verify", honest, "--level structure").exit_code == 0
+    assert invoke("release verify", honest, "--level all").exit_code == 2
 
 
 def test_a_frame_that_is_missing_in_a_tree_is_found(honest_run, tmp_path):
     tree = shutil.copytree(honest_run / "render", tmp_path / "tree")
     (find_flights(tree)[0] / "frames_playback/frame_00003/rgb.png").unlink()
     assert {"missing", "picture"} <= set(errors_in(tree))
+
+
+# --- exports: made again from their release, so that lies are found whatever checksums say ----------------------------
+
+
+@pytest.fixture(scope="module")
+def honest_exports(honest, tmp_path_factory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("formats")
+    return {name: exported_as(name, honest, folder / name) for name in FORMATS}
+
+
+def exported_as(name: str, release: Path, out: Path) -> Path:
+    return export(ExportConfig(format=name), release, out, workers=0)
+
+
+def make_right(folder: Path, path: Path) -> None:
+    """Make the checksums right again."""
+    name = path.relative_to(folder).as_posix()
+    write_checksums(folder, read_checksums(folder) | {name: sha256_file(path)})
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_an_honest_export_passes(honest_exports, name):
+    for level in ("structure", "pixels"):
+        report = verify(honest_exports[name], level=level, reader=read_released)
+        assert report.is_ok, str(report)
+        assert [kind.code for kind in report.kinds] == ["not_checked"] * (name != "tree"), "the release tells more"
+
+
+@pytest.mark.parametrize("coding", ["float16", "millimetre_png"])
+def test_an_honest_tree_of_coded_depth_passes(honest_run, tmp_path, coding):
+    release = released(honest_run, tmp_path / "release", depth=coding)
+    report = verify(exported_as("tree", release, tmp_path / "tree"), level="pixels", reader=read_released)
+    assert report.issues == [], str(report)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_an_export_is_what_its_release_gives(honest, honest_exports, tmp_path, name):
+    report = verify(honest_exports[name], level="structure", source=honest)
+    assert report.issues == [], str(report)
+    assert any("made again" in fact for fact in report.facts)
+    other = forge(honest, tmp_path / "other", lambda rows: rows[3]["pose"].update(roll_deg=0.01))
+    assert "source" in errors_in(honest_exports[name], "structure", source=other)
+    # A patch of one picture, which nothing else in the export tells.
+    patched = exported_as(name, forge(honest, tmp_path / "patched", _patch), tmp_path / name)
+    about = read_json(patched / "export.json")
+    about["release"] = read_json(honest_exports[name] / "export.json")["release"]
+    (patched / "export.json").write_text(json.dumps(about))
+    make_right(patched, patched / "export.json")
+    assert "source" in errors_in(patched, "structure", source=honest)
+
+
+def _patch(rows):
+    pixels = pixels_of(rows[3], "image")
+    pixels[1:3, 1:3] = 255 - pixels[1:3, 1:3]
+    rows[3]["image"]["bytes"] = png(pixels)
+
+
+@pytest.mark.parametrize("name", ["depth_doubled", "empty_instances", "pose_jumps"])
+def test_a_lie_is_found_in_a_tree(honest, tmp_path, name):
+    forged = forge(honest, tmp_path / "forged", LIES[name][0])
+    assert errors_in(exported_as("tree", forged, tmp_path / "export"))
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_changed_files_of_an_export_are_found(honest_exports, tmp_path, name):
+    folder = shutil.copytree(honest_exports[name], tmp_path / name)
+    largest = max((path for path in folder.rglob("*") if path.is_file()), key=lambda path: path.stat().st_size)
+    data = bytearray(largest.read_bytes())
+    data[len(data) // 2] ^= 1
+    largest.write_bytes(data)
+    (folder / "README.md").write_text("words")
+    (folder / "more.txt").write_text("words")
+    assert {"card", "checksum", "unexpected"} <= set(errors_in(folder))

@@ -12,14 +12,13 @@ import cv2
 import numpy as np
 import pytest
 from browser import browser
+from commands import invoke
 from hypothesis import given
 from hypothesis import strategies as st
 from release_tampering import forge
 from specimens_distill import WINDOW, make_caption
 from specimens_foreign import hub_snapshot
-from typer.testing import CliRunner
 
-from cosfly.cli import app
 from cosfly.errors import InputError
 from cosfly.look.frame_views import read_view
 from cosfly.products.boxes import make_box_map, write_boxes
@@ -52,39 +51,30 @@ EVIL = (
 )
 
 
+REPAIRED = {
+    "strategy": "cascade", "rung": "anchored", "outcome": "repaired", "asks": 2, "first_decision": "hover",
+    "first_verdict": "HARD_CONFLICT",
+}  # fmt: skip
+ODD = {
+    7: {"verdict": "HARD_CONFLICT"},
+    8: {"repair": REPAIRED},
+    9: {"status": "dropped", "drop_reason": "hard_conflict"},
+    10: {"verdict": "SOFT_CONFLICT"},
+}
+
+
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory) -> Path:
     """A run of four flights in two towns with a map and captions: a conflict, a repaired, a dropped, a hostile one."""
     folder = tmp_path_factory.mktemp("runs") / "one"
     tree = make_playback_tree(folder / "render", 2, NUM_POINTS, width_px=96, height_px=54, towns=("Town01", "Town02"))
-    captions = []
-    for place in find_flights(tree):
-        flight = read_flight(place)
+    captions, read = [], {"sentences": {"en": ["proved", "unread"], "zh": ["proved", "contradicted"]}}
+    for flight in map(read_flight, find_flights(tree)):
         for i in range(WINDOW - 1, NUM_POINTS - 1):
-            more: dict = (
-                {"checks": {"sentences": {"en": ["proved", "unread"], "zh": ["proved", "contradicted"]}}}
-                if i % 2
-                else {}
-            )
-            if i == 7:
-                more["verdict"] = "HARD_CONFLICT"
-            if i == 8:
-                more["repair"] = {
-                    "strategy": "cascade", "rung": "anchored", "outcome": "repaired", "asks": 2,
-                    "first_decision": "hover", "first_verdict": "HARD_CONFLICT",
-                }  # fmt: skip
-            if i == 9:
-                more |= {"status": "dropped", "drop_reason": "hard_conflict"}
+            more = {"checks": read if i % 2 else {}} | ODD.get(i, {})
             caption = make_caption(flight.town, flight.trajectory, flight.variant, i, **more)
-            if i == 10:
-                caption = caption.model_copy(
-                    update={
-                        "en": caption.en.model_copy(update={"reasoning_trace": EVIL}),
-                        "label": EVIL,
-                        "verdict": "SOFT_CONFLICT",
-                    }
-                )
-            captions.append(caption)
+            evil = {"en": caption.en.model_copy(update={"reasoning_trace": EVIL}), "label": EVIL}
+            captions.append(caption.model_copy(update=evil if i == 10 else {}))
     (folder / "caption").mkdir()
     write_captions(folder / "caption/captions.jsonl", captions)
     (folder / "simplify").mkdir()
@@ -307,18 +297,13 @@ def test_bad_folders_are_refused(tmp_path):
     with pytest.raises(InputError):
         run(tmp_path, tmp_path / "page.html", ViewerConfig())
     assert not (tmp_path / "page.html").exists()
-    result = CliRunner().invoke(
-        app, ["release", "viewer", str(tmp_path), "--out", str(tmp_path / "p.html"), "--frames", "0"]
-    )
+    result = invoke("release viewer", tmp_path, "--out", tmp_path / "p.html", "--frames 0")
     assert result.exit_code == 1
     assert "frames" in str(result.exception or result.output)
 
 
 def test_the_command_tells_the_size(run_folder, tmp_path):
-    result = CliRunner().invoke(
-        app,
-        ["release", "viewer", str(run_folder), "--out", str(tmp_path / "p.html"), "--frames", "2", "--flights", "2"],
-    )
+    result = invoke("release viewer", run_folder, "--out", tmp_path / "p.html", "--frames 2 --flights 2")
     assert result.exit_code == 0, result.output
     assert re.search(r"p\.html: 0\.\d MB", result.output)
     assert len(data_of((tmp_path / "p.html").read_text(encoding="utf-8"))["flights"]) == 2
