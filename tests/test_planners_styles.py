@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -283,6 +284,13 @@ def test_what_cannot_be_honoured_together_is_said():
     (remark,) = PlanConfig(styles={"side": 1, "follow": 1}, behind_distance_m=18).remarks()
     assert remark.startswith("plan.behind_distance_m = 18 holds for the style follow alone")
     assert PlanConfig(behind_distance_m=18).remarks() == []
+
+
+def test_every_style_stands_in_the_documents_with_a_picture():
+    docs = Path(__file__).parents[1] / "docs"
+    pictures = [f"images/style-{name}.png" for name in NAMES]
+    assert all(f"]({picture}) |" in (docs / "styles.md").read_text() for picture in pictures)
+    assert sum((docs / picture).stat().st_size for picture in pictures) < 400_000
 
 
 def test_ranges_bind_a_run_where_its_styles_have_them():

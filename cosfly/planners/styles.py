@@ -52,8 +52,8 @@ class Style:
 # Distances and heights keep the slant distance from 10 to 60 m. Nearer than some 8 m in the plane, a low drone would
 # have to fly faster round a bend than it can.
 TABLE: dict[str, Style] = {
-    "orbit_left": Style(("circle_left",), (8.0, 20.0), (8.0, 24.0), round_mps=(-6.0, -4.0)),
-    "orbit_right": Style(("circle_right",), (8.0, 20.0), (8.0, 24.0), round_mps=(4.0, 6.0)),
+    "orbit_left": Style(("circle_left",), (8.0, 17.0), (8.0, 22.0), round_mps=(-6.0, -4.0)),
+    "orbit_right": Style(("circle_right",), (8.0, 17.0), (8.0, 22.0), round_mps=(4.0, 6.0)),
     "side": Style(("strafe_left", "strafe_right"), (8.0, 10.5), (8.0, 10.0), (75.0, 105.0), either_side=True),
     "lead": Style(("move_backward",), (30.0, 48.0), (10.0, 32.0), (-25.0, 25.0)),
     "approach": Style(
@@ -71,7 +71,7 @@ TABLE: dict[str, Style] = {
         ("speed_up", "slow_down", "hover"), (16.0, 34.0), (8.0, 13.0), (178.0, 182.0),
         hop_s=(6.0, 7.5), pace_mps=(4.0, 6.0),
     ),
-    "top": Style(("track_straight",), (4.0, 8.0), (44.0, 59.0), (150.0, 210.0)),
+    "top": Style(("track_straight",), (4.0, 8.0), (48.0, 59.0), (150.0, 210.0)),
 }  # fmt: skip
 
 # Where a walker is lost behind a house or a tree, and from where the drone searches; how stands in reacquire.py.
