@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple, TypeGuard
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.products.columns import is_in_range
+from cosfly.products.columns import numbers
 from cosfly.reading.documents import MISSING, parse_document, parse_json
 from cosfly.reading.files import over_limit, read_unpacked
 
@@ -254,11 +254,8 @@ def _transform(model: dict, path: Path) -> np.ndarray:
     for name in ("scale", "translate"):
         if not isinstance(transform, dict) or transform.get(name) is None:
             raise InputError(MISSING, where=f"{path}: transform.{name}", expected="three finite numbers")
-        try:
-            part = np.array(transform[name], dtype=np.float64)
-        except (TypeError, ValueError):
-            part = np.empty(0)
-        if part.shape != (3,) or not is_in_range(part):
+        part = numbers(transform[name], 3)
+        if part is None:
             raise InputError("not a vector", where=f"{path}: transform.{name}", expected="three finite numbers")
         parts.append(part)
     return np.array(parts)
@@ -266,11 +263,8 @@ def _transform(model: dict, path: Path) -> np.ndarray:
 
 def _vectors(values: Any, where: str) -> np.ndarray:
     """Lists of three numbers as (n, 3)."""
-    try:
-        vectors = np.empty((0, 3)) if values == [] else np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        vectors = np.empty(0)
-    if vectors.ndim != 2 or vectors.shape[1] != 3 or not is_in_range(vectors):
+    vectors = np.empty((0, 3)) if values == [] else numbers(values, None, 3)
+    if vectors is None:
         raise InputError("not a list of vertices", where=where, expected="lists of three finite numbers")
     return vectors
 

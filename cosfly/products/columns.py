@@ -18,11 +18,6 @@ Item = TypeVar("Item")
 LARGEST = 1e18  # no length or time is larger in any unit, and no square or sum of such numbers overflows
 
 
-def is_in_range(numbers: np.ndarray) -> bool:
-    """Tell whether all numbers are finite and no larger than a length or a time can be."""
-    return bool((np.abs(numbers) <= LARGEST).all())  # NaN is not
-
-
 def is_number(value: Any) -> bool:
     """Tell whether a JSON value is a number no larger than a length or a time can be; true and false are none."""
     return type(value) in (int, float) and abs(value) <= LARGEST
@@ -70,29 +65,34 @@ def text_id(record: dict, where: str) -> str:
     return record["id"]
 
 
+def numbers(value: Any, *shape: int | None) -> np.ndarray | None:
+    """Give lists of numbers, one in another, as float64 of a shape, in which None is any length; None where they are
+    something else, or a number is not finite or too large."""
+    try:
+        found = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    fits = found.ndim == len(shape) and all(wanted in (None, n) for wanted, n in zip(shape, found.shape, strict=True))
+    return found if fits and (np.abs(found) <= LARGEST).all() else None  # NaN is not
+
+
 def column(record: dict, name: str, where: str, length: int | None = None) -> np.ndarray:
     """Read a list of finite numbers, (n,) float64, n = `length` where it is given; else InputError."""
-    try:
-        column = np.array(record[name], dtype=np.float64)
-    except KeyError:
-        raise InputError(MISSING, where=f"{where}.{name}", expected="a list of numbers") from None
-    except (TypeError, ValueError):
-        column = np.empty((0, 0))
-    if column.ndim != 1 or len(column) == 0 or not is_in_range(column) or length not in (None, len(column)):
-        wanted = "a list of finite numbers" if length is None else f"{length} finite numbers"
+    wanted = "a list of finite numbers" if length is None else f"{length} finite numbers"
+    if name not in record:
+        raise InputError(MISSING, where=f"{where}.{name}", expected=wanted)
+    column = numbers(record[name], length)
+    if column is None or len(column) == 0:
         raise InputError("not a column", where=f"{where}.{name}", got=repr(record[name])[:60], expected=wanted)
     return column
 
 
 def matrix(record: dict, name: str, width: int, where: str) -> np.ndarray:
     """Read a list of vectors of finite numbers, (n, width) float64; raises InputError for anything else."""
+    wanted = f"a list of {width} finite numbers each"
     if record.get(name) is None:
-        raise InputError(MISSING, where=f"{where}.{name}", expected=f"a list of {width} finite numbers each")
-    try:
-        matrix = np.array(record[name], dtype=np.float64)
-    except (TypeError, ValueError):
-        matrix = np.empty((0, 0))
-    if matrix.ndim != 2 or matrix.shape[1] != width or not is_in_range(matrix):
-        got, expected = repr(record[name])[:60], f"{width} finite numbers each"
-        raise InputError("not a list of vectors", where=f"{where}.{name}", got=got, expected=expected)
+        raise InputError(MISSING, where=f"{where}.{name}", expected=wanted)
+    matrix = numbers(record[name], None, width)
+    if matrix is None:
+        raise InputError("not a list of vectors", where=f"{where}.{name}", got=repr(record[name])[:60], expected=wanted)
     return matrix

@@ -269,11 +269,7 @@ class FrameMeta(_Group):
 
 
 def read_meta(frame: Path) -> FrameMeta:
-    """Read `meta.json` of a frame folder.
-
-    Raises:
-        InputError: missing, or not such a file; names the field.
-    """
+    """Read `meta.json` of a frame folder; raises as `read_model`."""
     return read_model(frame / "meta.json", FrameMeta, META_FORMAT, tree=tree_of(frame))
 
 

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from shapely.geometry.base import BaseGeometry
 
 from cosfly.errors import InputError
-from cosfly.products.columns import is_in_range
+from cosfly.products.columns import numbers
 from cosfly.reading.documents import read_json, validated
 from cosfly.reading.files import over_limit
 from cosfly.reading.geojson import Feature, features_of, is_geojson
@@ -68,7 +68,7 @@ def read_roi(path: Path, most_vertices: int = MOST_VERTICES) -> Roi:
         raise over_limit(path, f"{num_vertices:,} vertices", f"{most_vertices:,}", fix)
     for number, polygon in enumerate(roi.rings()):
         for ring in (polygon.points_world, *polygon.holes):
-            if len(ring) < 3 or not is_in_range(np.array(ring, dtype=np.float64)):
+            if len(ring) < 3 or numbers(ring, None, 2) is None:
                 where, got = f"{path}: polygon {number}", f"{len(ring)} points"
                 raise InputError("not a ring", where=where, got=got, expected="at least three finite points")
             reason = shapely.is_valid_reason(shapely.Polygon(ring))

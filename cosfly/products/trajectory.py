@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,7 @@ import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.geometry import step_s
-from cosfly.products.columns import is_in_range, is_number
+from cosfly.products.columns import is_number, numbers
 from cosfly.products.frames import ANGLES, XYZ, Camera
 from cosfly.products.segments import Mission, Segment, read_mission, read_segments
 from cosfly.products.weather import WeatherRecord
@@ -35,10 +37,18 @@ class FieldReader:
         return InputError(message, where=f"{self.path}: {where}", got=str(got), expected=expected)
 
     def issue(self, where: str, got: object, expected: str) -> None:
-        error = self.error("breaks the layout", where, got, expected)
-        if self.strict:
-            raise error
-        self.issues.append(str(error))
+        with self.noted():
+            raise self.error("breaks the layout", where, got, expected)
+
+    @contextmanager
+    def noted(self) -> Iterator[None]:
+        """Note an InputError that is raised within, unless the reader is strict."""
+        try:
+            yield
+        except InputError as error:
+            if self.strict:
+                raise
+            self.issues.append(str(error))
 
     def equal(self, where: str, got: object, expected: object) -> None:
         if got != expected:
@@ -109,47 +119,32 @@ class FieldReader:
         """Planned poses after each point and before the next, (n, k - 1, 6), NaN after the last; None without any."""
         if len(points) < 2 or not any(point.get("between") for point in points):
             return None
-        try:
-            found = np.array([point.get("between") for point in points[:-1]], dtype=np.float64)
-        except (TypeError, ValueError):
-            found = np.empty(0)
-        if found.ndim != 3 or found.shape[2] != len(XYZ + ANGLES) or not is_in_range(found):
+        found = numbers([point.get("between") for point in points[:-1]], None, None, len(XYZ + ANGLES))
+        if found is None:
             self.issue("points[].between", "something else", "as many poses of 6 finite numbers after each point")
             return None
         return np.concatenate([found, np.full((1, *found.shape[1:]), np.nan)])
 
     def flown(self, raw: dict, num_points: int) -> tuple[tuple[Segment, ...], Mission | None]:
         """Styles of the parts, and mission; somebody else's fields of these names are noted and left."""
-        try:
+        with self.noted():
             segments = read_segments(raw.get("segments"), num_points, f"{self.path}: segments")
             return segments, read_mission(raw.get("mission"), num_points, f"{self.path}: mission")
-        except InputError as error:
-            if self.strict:
-                raise
-            self.issues.append(str(error))
-            return (), None
+        return (), None
 
     def weather(self, raw: dict) -> None:
         """Check the record of weather, where it is one as the paper has it; public files may call something else so."""
         told = raw.get("weather")
-        if not (isinstance(told, dict) and ("params" in told or "mode" in told)):
-            return
-        try:
-            validated(WeatherRecord, told, f"{self.path}: weather")
-        except InputError as error:
-            if self.strict:
-                raise
-            self.issues.append(str(error))
+        if isinstance(told, dict) and ("params" in told or "mode" in told):
+            with self.noted():
+                validated(WeatherRecord, told, f"{self.path}: weather")
 
     def camera(self, group: Any) -> Camera:
         if not isinstance(group, dict):
             raise InputError("missing", where=f"{self.path}: camera", expected="width, height, intrinsic")
         width, height = self.number("camera", group, "width"), self.number("camera", group, "height")
-        try:
-            matrix = np.array(group.get("intrinsic"), dtype=np.float64)
-        except (TypeError, ValueError):
-            matrix = np.empty(0)
-        if matrix.shape != (3, 3) or not is_in_range(matrix) or matrix[0, 0] <= 0 or width < 1 or height < 1:
+        matrix = numbers(group.get("intrinsic"), 3, 3)
+        if matrix is None or matrix[0, 0] <= 0 or width < 1 or height < 1:
             got, expected = repr(group.get("intrinsic"))[:60], "a 3x3 matrix with a positive focal length"
             raise self.error("not a camera", "camera.intrinsic", got, expected)
         check_pixels(width * height, f"{self.path}: camera", f"{width:g} x {height:g} px")
