@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cosfly.chat.contract import Reply, Request
@@ -204,6 +204,7 @@ JSON = st.recursive(
 )
 
 
+@settings(max_examples=40)
 @given(JSON)
 def test_whatever_json_a_server_sends_can_be_written(value):
     read = read_body(json.dumps(value).encode())
