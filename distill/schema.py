@@ -8,26 +8,23 @@ README.md                                  for `datasets.load_dataset`
 from __future__ import annotations
 
 import contextlib
-import functools
-import inspect
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, ParamSpec, Self, TypeVar, get_args, get_origin, overload
+from typing import Any, Literal, Self, get_args, get_origin, overload
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.errors import InputError
 from cosfly.look.frame_views import VIEW_FILES, Pictures, View
-from cosfly.products.actions import ActionSet
+from cosfly.products.actions import ActionSet, RecordedActions, shipped_actions
 from cosfly.products.captions import Language, Prompt
 from cosfly.products.frames import frame_name
 from cosfly.products.splits import SPLITS, Split
 from cosfly.reading.documents import FileFormat, read_model, validated
 from cosfly.reading.tables import TableRows
-from cosfly.work import in_place
 from cosfly.work.provenance import fingerprint
 from cosfly.work.store import atomic_file, write_bytes, write_model
 
@@ -110,14 +107,14 @@ class SourceTree(_Strict):
 class TrainingSet(_Strict):
     """`training_set.json`. samples: of each split. systems: the system prompts, which samples name by their place.
 
-    actions: the closed set of the answers' decisions, null for the one that ships.
+    actions: the closed set of the answers' decisions.
     """
 
     split_by: Literal["walk", "town"]
     trees: list[SourceTree]
     samples: dict[Split, int]
     systems: list[str]
-    actions: ActionSet | None = None
+    actions: RecordedActions = Field(default_factory=shipped_actions)
 
 
 def read_training_set(dataset: Path) -> TrainingSet:
@@ -130,23 +127,6 @@ def read_training_set(dataset: Path) -> TrainingSet:
     if not path.exists():
         raise InputError("no training set", where=dataset, got=f"no {RECORD}", fix="run cosfly distill prepare")
     return read_model(path, TrainingSet, RECORD_FORMAT, tree=dataset)
-
-
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
-
-
-def in_its_actions(step: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Have a step, which takes a training set as `dataset`, work with the set of actions that this was made with."""
-    arguments = inspect.signature(step)
-
-    @functools.wraps(step)
-    def in_actions(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        record = read_training_set(arguments.bind(*args, **kwargs).arguments["dataset"])
-        with in_place.put(actions=record.actions):
-            return step(*args, **kwargs)
-
-    return in_actions
 
 
 def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
@@ -209,7 +189,7 @@ class Samples(Sequence[Sample]):
 
     def __init__(self, dataset: Path, split: Split) -> None:
         record = read_training_set(dataset)
-        self.path, self._systems = split_path(dataset, split), record.systems
+        self.path, self._systems, self.actions = split_path(dataset, split), record.systems, record.actions
         self._rows = TableRows(self.path, COLUMNS.names) if record.samples.get(split) else None
 
     def __len__(self) -> int:
@@ -301,14 +281,14 @@ class TrainingSetWriter(SplitFiles):
         row["prompt"] = sample.prompt.user
         self.add(split, row)
 
-    def finish(self, split_by: Literal["walk", "town"], trees: Iterable[SourceTree]) -> TrainingSet:
+    def finish(self, split_by: Literal["walk", "town"], trees: Iterable[SourceTree], actions: ActionSet) -> TrainingSet:
         """Write the record and the page, after the block ended and the splits stand."""
         record = TrainingSet(
             split_by=split_by,
             trees=list(trees),
             samples=self.counts,
             systems=list(self._systems),
-            actions=in_place.given("actions"),
+            actions=actions,
         )
         write_model(self.out / RECORD, record, RECORD_FORMAT)
         write_bytes(self.out / PAGE, _page(record))

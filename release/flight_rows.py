@@ -10,6 +10,7 @@ from typing import Any, get_args
 import numpy as np
 
 from cosfly.geometry import BODY_FROM_CAMERA, CORNER_SIGNS, rotation_matrices
+from cosfly.products.actions import ActionSet
 from cosfly.products.captions import FIELDS, Coc, Language
 from cosfly.products.frames import Camera
 from cosfly.products.playback import EVENTS, Flight
@@ -143,13 +144,13 @@ class FlightRows:
         )  # fmt: skip
 
     def shown(
-        self, twin: FlightRows | None, settings: dict[str, Any] | None, prompts: dict[str, str] | None = None
+        self, twin: FlightRows | None, actions: ActionSet, settings: dict[str, Any], prompts: dict[str, str]
     ) -> ShownFlight:
-        """Give what a reader of captions gets. settings, prompts: of the captions, as the record has them."""
+        """Give what a reader of captions gets. actions, settings, prompts: of the captions, as the record has them."""
         captions = [shown_caption(row) for row in self.rows if row.get("has_caption")]
         same = twin is not None and np.array_equal(twin.index, self.index)
         other = twin.flight if twin is not None and same else None
-        return ShownFlight(self.flight, self.index, self.column("style"), captions, other, settings, prompts)
+        return ShownFlight(self.flight, self.index, self.column("style"), captions, actions, other, settings, prompts)
 
 
 def shown_caption(row: Row) -> ShownCaption:

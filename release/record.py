@@ -10,7 +10,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from cosfly.errors import InputError
-from cosfly.products.actions import ActionSet, shipped_actions
+from cosfly.products.actions import RecordedActions, shipped_actions
 from cosfly.products.coverage import Coverage
 from cosfly.products.frames import FrameFile
 from cosfly.products.inspection import TrajectoryFunnel
@@ -306,7 +306,7 @@ class ReleaseRecord(Strict):
     frame_selection: str
     depth: DepthCoding | None  # null: without depth
     coordinates: dict[str, Any]
-    actions: ActionSet | None = None
+    actions: RecordedActions = Field(default_factory=shipped_actions)
     prompts: dict[str, dict[str, str]] = Field(default_factory=dict)
     splits: Splits
     numbers: Numbers
@@ -316,11 +316,6 @@ class ReleaseRecord(Strict):
     content_digest: str
     shards: list[Shard]
     part_of: PartOf | None = None
-
-    @property
-    def closed_set(self) -> tuple[str, ...]:
-        """The decisions that its captions may have."""
-        return (self.actions or shipped_actions()).tokens
 
 
 def numbers_of_splits(flights: Sequence[ReleasedFlight], captions: Mapping[str, int]) -> dict[SplitName, SplitNumbers]:

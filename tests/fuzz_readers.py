@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from fuzz import Reader
 from safetensors.numpy import save_file
+from specimens_captions import VOCABULARY, WAY
 from specimens_distill import make_captions
 from specimens_planning import walk_along
 
@@ -27,7 +28,6 @@ from caption.truth.facts import Facts
 from caption.truth.gold import GOLD, read_gold
 from caption.truth.prose import judge_prose
 from caption.truth.references import parse_reference
-from caption.writing.slots import Slots
 from cosfly.app.settings import RunConfig
 from cosfly.chat.answers import TOTALS, AnswerBook, journal_name
 from cosfly.chat.contract import Request
@@ -52,7 +52,14 @@ from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners import compare
 from cosfly.planners.compare import text_tables
 from cosfly.products import review
-from cosfly.products.actions import ACTIONS_FILE, actions_beside, read_actions, shipped_actions, write_own_actions
+from cosfly.products.actions import (
+    ACTIONS_FILE,
+    ACTIONS_FORMAT,
+    OWN_ACTIONS,
+    actions_beside,
+    read_actions,
+    shipped_actions,
+)
 from cosfly.products.answer_text import Parsed, parse_answer
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.products.captions import Coc, read_captions
@@ -77,13 +84,13 @@ from cosfly.render.weather import read_pools
 from cosfly.simplify import stage as simplify
 from cosfly.simplify.passes import SimplifyConfig
 from cosfly.studies.depth import run as study_depth
-from cosfly.work import in_place, provenance
+from cosfly.work import provenance
 from cosfly.work.config import apply_overrides, build
 from cosfly.work.items import Item
 from cosfly.work.journal import Journal
 from cosfly.work.stage_events import EventLog, read_events
 from cosfly.work.stage_folder import StageFolder, read_failures, read_manifest
-from cosfly.work.store import CHECKSUMS, read_checksums, write_checksums, write_json
+from cosfly.work.store import CHECKSUMS, read_checksums, write_checksums, write_json, write_model
 from distill.evaluation import stage as evaluate
 from distill.evaluation.measure import read_report
 from distill.evaluation.scores import read_scores
@@ -348,7 +355,10 @@ def _students(root: Path, captions: Path, tree: Path) -> None:
     _prepare(captions, tree, root / "train")
     _windows(tree, root / "tracks")
     samples = list(open_split(root / "train", "val"))
-    lines = [make_prediction(sample, "val", sample.answer, 20, True).model_dump_json() for sample in samples]
+    lines = [
+        make_prediction(sample, "val", sample.answer, 20, True, shipped_actions()).model_dump_json()
+        for sample in samples
+    ]
     (root / "predictions.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
     evaluate.run(
         evaluate.EvaluateConfig(resamples=100, examples=2),
@@ -407,9 +417,8 @@ def _merged(root: Path, scratch: Path) -> None:
 
 def _records(root: Path) -> None:
     shutil.copy(ACTIONS_FILE, root / "actions.yaml")
-    with in_place.put(actions=shipped_actions()):
-        write_own_actions(root)
-    export_prompts(root / "prompts")
+    write_model(root / OWN_ACTIONS, shipped_actions(), ACTIONS_FORMAT)
+    export_prompts(root / "prompts", VOCABULARY.prompts)
     (root / "sky.yaml").write_text(
         "presets:\n  sleet: {cloudiness: 90, precipitation: 40.5, fog_density: 20, fog_distance: 25}\n"
         "  haze: {cloudiness: 9, precipitation: 0, fog_density: 70, fog_distance: 12.5}\n"
@@ -480,7 +489,7 @@ def _facts() -> Facts:
 def _answer(root: Path, name: str, language: Any = "en") -> None:
     text = _bytes(root / name).decode("utf-8", "replace")
     more, finish_reason = ("claims",) if len(text) % 2 else (), "length" if len(text) % 3 == 0 else None
-    parsed = parse_answer(text, language, more, finish_reason)
+    parsed = parse_answer(text, shipped_actions(), language, more, finish_reason)
     assert (parsed.coc is None) == (parsed.reason is not None)
 
 
@@ -495,7 +504,7 @@ def _slots(root: Path) -> None:
     text = _bytes(root / "slots.txt").decode("utf-8", "replace")
     components, _, trace = text.partition("\n")
     coc = Coc.model_construct(critical_components=components, reasoning_trace=trace, flight_decision="track_straight")
-    Slots().read(Parsed(coc, therefore="track_straight"), _facts())
+    WAY.read(Parsed(coc, therefore="track_straight"), _facts())
     for word in components.split():
         parse_reference(word.strip("{}"))
 

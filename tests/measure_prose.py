@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from specimens_captions import VOCABULARY
 from teacher_server import TeacherServer
 
 from caption.schema import EvidenceConfig, ReaderConfig
@@ -33,6 +34,7 @@ from caption.truth.gold import GoldCaption, PlantedError, read_gold
 from caption.truth.prose import check_prose
 from caption.truth.sizes import same_size
 from caption.truth.stated import read_stated
+from cosfly.products.actions import shipped_actions
 from cosfly.products.captions import Claim, Coc, Language
 from cosfly.products.sentences import sentences_of
 from cosfly.work.console import console
@@ -52,7 +54,7 @@ def planted(line: GoldCaption, error: PlantedError, where: str) -> tuple[Coc, tu
 
 
 def claims_problems(coc: Coc, claims: tuple[Claim, ...], facts: Facts, language: Language) -> list[str]:
-    judged = judge_claims(coc, claims, facts, EvidenceConfig(), language)
+    judged = judge_claims(coc, claims, facts, EvidenceConfig(), language, shipped_actions())
     return [f"{one.name} {problem}" for one in judged for problem in one.problems]
 
 
@@ -208,7 +210,7 @@ def measure_readers(gold: Sequence[GoldCaption]) -> None:
         server = TeacherServer()
         server.text = answers_of(readings, fault, alike=alike)
         with server:
-            check = asyncio.run(check_reader(ReaderConfig(urls=(server.url,)), gold))
+            check = asyncio.run(check_reader(ReaderConfig(urls=(server.url,)), VOCABULARY, gold))
         check.models = [name]
         console.print(reader_check_table(check))
 

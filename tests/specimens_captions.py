@@ -1,4 +1,5 @@
-"""What tests of captions share: windows made by hand, the rule teacher's texts, settings and servers of quick runs."""
+"""What tests of captions share: what ships, windows made by hand, the rule teacher's texts, settings and servers of
+quick runs."""
 
 from __future__ import annotations
 
@@ -10,14 +11,18 @@ from pathlib import Path
 import numpy as np
 from teacher_server import TeacherServer
 
-from caption.schema import CaptionConfig
+from caption.run.own_files import vocabulary_of
+from caption.schema import CaptionConfig, LabelConfig
 from caption.teachers.rules import write_templates
+from caption.truth.actions import table_of
 from caption.truth.facts import Facts
-from caption.writing.contract import Draft
-from caption.writing.slots import Slots
+from caption.writing.contract import Draft, way_of
 from cosfly.products.answer_text import Parsed
 from cosfly.products.captions import Coc
 
+VOCABULARY = vocabulary_of(CaptionConfig())  # what ships
+ACTION_TABLE = table_of(VOCABULARY.actions, LabelConfig())
+WAY = way_of("slots", VOCABULARY)
 # A drone that climbs, speeds up and turns right; the walker is hidden once.
 FACTS = Facts(
     speed_mps=(None, 2.0, 2.5, 3.0, 4.0), altitude_m=(20.0, 20.0, 20.5, 21.0, 22.0),
@@ -53,10 +58,10 @@ FOLLOW = Facts(
 
 def write_answers(facts: Facts, rng: np.random.Generator, decision: str | None = None) -> tuple[Coc, Coc]:
     """Give the rule teacher's English and Chinese answer as plain text."""
-    english, chinese = (Coc(**answer) for answer in write_templates(facts, rng.bytes(32), decision))
-    first = Slots().read(Parsed(english, therefore=english.flight_decision), facts)
+    english, chinese = (Coc(**answer) for answer in write_templates(facts, rng.bytes(32), VOCABULARY.actions, decision))
+    first = WAY.read(Parsed(english, therefore=english.flight_decision), facts)
     assert isinstance(first, Draft), first
-    second = Slots().read_mirror(Parsed(chinese), first, facts)
+    second = WAY.read_mirror(Parsed(chinese), first, facts)
     assert isinstance(second, Draft), second
     return first.coc, second.coc
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.chat.student_chat import FrameLook, Taught, write_taught
+from cosfly.products.actions import shipped_actions
 from cosfly.products.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.places import sample_id
@@ -87,7 +88,8 @@ def write_set(out: Path, splits: Mapping[Split, Iterable[Sample]], trees: Iterab
         for split, samples in splits.items():
             for sample in samples:
                 writer.add_sample(split, sample)
-    writer.finish("walk", [SourceTree(run=tree.parent.name, sha256=fingerprint(tree)) for tree in trees])
+    sources = [SourceTree(run=tree.parent.name, sha256=fingerprint(tree)) for tree in trees]
+    writer.finish("walk", sources, shipped_actions())
     return out
 
 

@@ -20,7 +20,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import BinaryIO
 
-from cosfly.products.actions import action_tokens
+from cosfly.products.actions import shipped_actions
 from cosfly.work.journal import Journal
 
 MODEL = "test-teacher"
@@ -156,7 +156,7 @@ def is_mirror(body: dict) -> bool:
 
 
 def _decision_by_seed(body: dict) -> str:
-    return action_tokens()[body.get("seed", 0) % len(action_tokens())]
+    return shipped_actions().tokens[body.get("seed", 0) % len(shipped_actions().tokens)]
 
 
 def obedient_answer(server: TeacherServer, body: dict, fault: str | None = None) -> dict:
@@ -169,7 +169,7 @@ def obedient_answer(server: TeacherServer, body: dict, fault: str | None = None)
             reasons = reasons.replace("。", "，距离为 77.7 米。")
         return {**CHINESE, "reasoning_trace": reasons, "flight_decision": decision}
     schema = body.get("response_format", {}).get("json_schema", {}).get("schema", {})
-    allowed = schema.get("properties", {}).get("flight_decision", {}).get("enum", action_tokens())
+    allowed = schema.get("properties", {}).get("flight_decision", {}).get("enum", shipped_actions().tokens)
     decision = server.decision(body)
     if len(allowed) == 1 and fault != "schema_ignored":
         decision = allowed[0]

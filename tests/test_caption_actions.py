@@ -9,17 +9,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from specimens_captions import ACTION_TABLE
 from tables import each
 
 from caption.schema import FutureMotion, LabelConfig
-from caption.truth.actions import is_contradicted, label_of, measure, table_of, verdict_of
-from cosfly.products.actions import action_tokens
+from caption.truth.actions import measure, table_of
+from cosfly.products.actions import shipped_actions
 
 CFG = LabelConfig()
 
 MIRRORED = {
     token: token.replace("left", "right") if "left" in token else token.replace("right", "left")
-    for token in action_tokens()
+    for token in ACTION_TABLE.shown
 }
 
 
@@ -95,16 +96,16 @@ LABELS = [
 
 @each(("motion", "label"), LABELS)
 def test_label_of_a_known_future(motion, label):
-    assert label_of(measure(future(**motion)), CFG) == label
+    assert ACTION_TABLE.label_of(measure(future(**motion))) == label
 
 
 @pytest.mark.parametrize("order", ["break_off", "return_to_home"])
 @pytest.mark.parametrize("motion", [{"forward": 3.0}, {"forward": -4.0}, {"visible": 0}])
 def test_an_order_is_the_label_whatever_is_flown(order, motion):
     ordered = measure(dataclasses.replace(future(**motion), order=order))
-    assert label_of(ordered, CFG) == order
-    assert not is_contradicted(order, ordered, CFG)
-    assert label_of(measure(future(**motion)), CFG) != order
+    assert ACTION_TABLE.label_of(ordered) == order
+    assert not ACTION_TABLE.is_contradicted(order, ordered)
+    assert ACTION_TABLE.label_of(measure(future(**motion))) != order
 
 
 STEADY = {"forward": 3.0, "target_step": (0.6, 0.0)}  # straight and level behind a walker
@@ -144,17 +145,17 @@ HARD = [  # the opposite, then what is plainly not there
 @each(("decision", "motion"), HARD)
 def test_contradiction_of_each_action(decision, motion):
     measured = measure(future(**motion))
-    assert verdict_of(decision, measured, CFG, label_of(measured, CFG)) == "HARD_CONFLICT"
+    assert ACTION_TABLE.verdict_of(decision, measured, ACTION_TABLE.label_of(measured)) == "HARD_CONFLICT"
 
 
 def test_soft_and_abstain_and_consistent():
     straight = measure(future(forward=3.0, target_step=(0.6, 0.0)))
-    assert verdict_of("track_straight", straight, CFG, "track_straight") == "CONSISTENT"
-    assert verdict_of("yaw_left_to_follow", straight, CFG, "track_straight") == "SOFT_CONFLICT"
+    assert ACTION_TABLE.verdict_of("track_straight", straight, "track_straight") == "CONSISTENT"
+    assert ACTION_TABLE.verdict_of("yaw_left_to_follow", straight, "track_straight") == "SOFT_CONFLICT"
     vague = measure(future(left=0.4, forward=0.3, up=0.6))
-    assert label_of(vague, CFG) is None
-    assert verdict_of("yaw_left_to_follow", vague, CFG, None) == "ABSTAIN"
-    assert verdict_of("descend", vague, CFG, None) == "HARD_CONFLICT"  # a contradiction needs no label
+    assert ACTION_TABLE.label_of(vague) is None
+    assert ACTION_TABLE.verdict_of("yaw_left_to_follow", vague, None) == "ABSTAIN"
+    assert ACTION_TABLE.verdict_of("descend", vague, None) == "HARD_CONFLICT"  # a contradiction needs no label
 
 
 SOFT = [
@@ -173,23 +174,31 @@ SOFT = [
 @each(("decision", "motion"), SOFT)
 def test_another_decision_of_which_there_is_something_is_a_soft_conflict(decision, motion):
     measured = measure(future(**motion))
-    assert verdict_of(decision, measured, CFG, label_of(measured, CFG)) == "SOFT_CONFLICT"
+    assert ACTION_TABLE.verdict_of(decision, measured, ACTION_TABLE.label_of(measured)) == "SOFT_CONFLICT"
 
 
 def test_share_zero_leaves_only_the_opposite_as_a_contradiction():
     lenient = LabelConfig(absent_share=0.0)
     for up, verdict in ((0.1, "SOFT_CONFLICT"), (-0.1, "HARD_CONFLICT")):
         motion = measure(future(**STEADY, up=up))
-        assert verdict_of("ascend", motion, lenient, label_of(motion, lenient)) == verdict
-        assert verdict_of("ascend", motion, CFG, label_of(motion, CFG)) == "HARD_CONFLICT"
-    assert verdict_of("hover", measure(future(**STEADY)), lenient, "track_straight") == "HARD_CONFLICT"
+        assert (
+            table_of(shipped_actions(), lenient).verdict_of(
+                "ascend", motion, table_of(shipped_actions(), lenient).label_of(motion)
+            )
+            == verdict
+        )
+        assert ACTION_TABLE.verdict_of("ascend", motion, ACTION_TABLE.label_of(motion)) == "HARD_CONFLICT"
+    assert (
+        table_of(shipped_actions(), lenient).verdict_of("hover", measure(future(**STEADY)), "track_straight")
+        == "HARD_CONFLICT"
+    )
 
 
 def test_unknown_target_leaves_the_other_labels_alone():
     base = future(forward=3.0, turn_deg=5.0)
     blind = dataclasses.replace(base, targets_m=np.full((6, 3), np.nan))
-    assert label_of(measure(blind), CFG) == "yaw_left_to_follow"
-    assert label_of(measure(dataclasses.replace(blind, yaw_deg=np.zeros(6))), CFG) == "track_straight"
+    assert ACTION_TABLE.label_of(measure(blind)) == "yaw_left_to_follow"
+    assert ACTION_TABLE.label_of(measure(dataclasses.replace(blind, yaw_deg=np.zeros(6)))) == "track_straight"
 
 
 # --- properties -------------------------------------------------------------------------------------------------------
@@ -214,8 +223,8 @@ def futures(draw) -> FutureMotion:
 
 
 def judged(motion) -> tuple[str | None, dict[str, str]]:
-    label = label_of(motion, CFG)
-    return label, {token: verdict_of(token, motion, CFG, label) for token in action_tokens()}
+    label = ACTION_TABLE.label_of(motion)
+    return label, {token: ACTION_TABLE.verdict_of(token, motion, label) for token in ACTION_TABLE.shown}
 
 
 def is_near_a_threshold(motion) -> bool:
@@ -226,8 +235,8 @@ def is_near_a_threshold(motion) -> bool:
     numbers += [abs(motion.left_m) - abs(motion.forward_m)]
     if any(abs(abs(number) - limit) < 1e-6 for number in numbers for limit in limits if limit or number):
         return True
-    for group in table_of(CFG).implied:
-        shown = [table_of(CFG).shown[token][0](motion) for token, _ in group]
+    for group in ACTION_TABLE.implied:
+        shown = [ACTION_TABLE.shown[token][0](motion) for token, _ in group]
         implied = [size(motion) for _, size in group]
         ranks = sorted(size for size in implied if size >= 0.99)
         if any(
@@ -273,15 +282,15 @@ def test_moving_the_world_and_the_clock_changes_nothing(drawn, turn_deg, shift, 
 @given(futures())
 def test_what_is_implied_is_never_contradicted(drawn):
     motion = measure(drawn)
-    label = label_of(motion, CFG)
+    label = ACTION_TABLE.label_of(motion)
     if label is not None:
-        assert not is_contradicted(label, motion, CFG)
-        assert table_of(CFG).shown[label][0](motion) >= 1.0
+        assert not ACTION_TABLE.is_contradicted(label, motion)
+        assert ACTION_TABLE.shown[label][0](motion) >= 1.0
 
 
 @given(futures())
 def test_geometry_never_orders_a_mission(drawn):
-    assert label_of(measure(drawn), CFG) not in ("break_off", "return_to_home")
+    assert ACTION_TABLE.label_of(measure(drawn)) not in ("break_off", "return_to_home")
 
 
 def test_thresholds_that_contradict_each_other_are_refused():

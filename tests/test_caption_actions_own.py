@@ -8,37 +8,30 @@ import re
 import shutil
 import textwrap
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import invoke
+from specimens_captions import ACTION_TABLE
 from specimens_release import run_here
 from teacher_server import TeacherServer
 from test_caption_actions import future
 from test_pipeline_tiny import TINY
 
-from caption.run.own_files import own_files
+from caption.run.own_files import vocabulary_of
 from caption.run.released import read_released
 from caption.run.stage import run as caption_run
 from caption.schema import CaptionConfig, LabelConfig
-from caption.truth.actions import is_contradicted, label_of, measure, table_of
+from caption.truth.actions import measure, table_of
 from caption.truth.reach import never_labels
 from cosfly.errors import ConfigError, InputError
-from cosfly.products.actions import (
-    ACTIONS_FILE,
-    OWN_ACTIONS,
-    action_tokens,
-    actions_beside,
-    kin_of,
-    read_actions,
-    shipped_actions,
-)
+from cosfly.products.actions import ACTIONS_FILE, OWN_ACTIONS, actions_beside, read_actions, shipped_actions
 from cosfly.products.answer_text import answer_schema, normalize_action
 from cosfly.products.captions import read_captions
 from cosfly.products.splits import SPLITS
 from cosfly.reading.documents import read_json
-from cosfly.work import in_place
 from distill.evaluation import compare
 from distill.evaluation import stage as evaluate
 from distill.evaluation.floors import write_floors
@@ -162,32 +155,28 @@ def test_a_set_that_lacks_what_the_rule_teacher_decides_is_refused(tmp_path):
     hover = text[text.index("  hover:\n") : text.index("  break_off:\n")]
     path = tmp_path / "fewer.yaml"
     path.write_text(text.replace(hover, "").replace("  - [hover]\n", ""), encoding="utf-8")
-    with (
-        pytest.raises(ConfigError, match="rule teacher decides what this set of actions does not hold; got hover"),
-        own_files(CaptionConfig(actions=path)),
-    ):
-        pass
-    with own_files(CaptionConfig(actions=path, teacher="http://localhost:1", writing="prose")):
-        assert len(action_tokens()) == 16
-        assert normalize_action("hover") is None
-        assert "hover" not in table_of(LabelConfig()).shown
+    with pytest.raises(ConfigError, match="rule teacher decides what this set of actions does not hold; got hover"):
+        vocabulary_of(CaptionConfig(actions=path))
+    actions = vocabulary_of(CaptionConfig(actions=path, teacher="http://localhost:1", writing="prose")).actions
+    assert len(actions.tokens) == 16
+    assert normalize_action("hover", actions) is None
+    assert "hover" not in table_of(actions, LabelConfig()).shown
 
 
 def test_rules_measure_as_they_say(mine):
     fast, slow = ({"forward": 4.0, "target_step": (0.8, 0.0)}, {"forward": 1.0, "target_step": (0.2, 0.0)})
-    cfg = LabelConfig()
-    assert label_of(measure(future(**fast)), cfg) == "track_straight"
-    with in_place.put(actions=read_actions(mine)):
-        assert label_of(measure(future(**fast)), cfg) == OWN
-        assert label_of(measure(future(**slow)), cfg) == "track_straight"
-        assert label_of(measure(future(**fast, up=2.1)), cfg) == "ascend"  # it climbs too much
-        assert not is_contradicted(OWN, measure(future(**slow)), cfg)
-        assert is_contradicted(OWN, measure(future()), cfg)
-        assert normalize_action("Cruise-Along.") == OWN
-        assert answer_schema()["properties"]["flight_decision"]["enum"][-1] == OWN
-        assert kin_of(OWN) == "track_straight"
-    assert label_of(measure(future(**fast)), cfg) == "track_straight"
-    assert normalize_action(OWN) is None
+    actions, shipped = read_actions(mine), shipped_actions()
+    labels = table_of(actions, LabelConfig())
+    assert ACTION_TABLE.label_of(measure(future(**fast))) == "track_straight"
+    assert labels.label_of(measure(future(**fast))) == OWN
+    assert labels.label_of(measure(future(**slow))) == "track_straight"
+    assert labels.label_of(measure(future(**fast, up=2.1))) == "ascend"  # it climbs too much
+    assert not labels.is_contradicted(OWN, measure(future(**slow)))
+    assert labels.is_contradicted(OWN, measure(future()))
+    assert normalize_action("Cruise-Along.", actions) == OWN
+    assert normalize_action(OWN, shipped) is None
+    assert answer_schema(actions)["properties"]["flight_decision"]["enum"][-1] == OWN
+    assert actions.kin_of(OWN) == "track_straight"
 
 
 def test_a_value_that_nobody_knows_fulfils_no_condition(tmp_path):
@@ -195,10 +184,10 @@ def test_a_value_that_nobody_knows_fulfils_no_condition(tmp_path):
         "implied: {size: [mean_speed_mps / 0.5], where:",
         "implied: {size: [sweep_deg / 1.0, mean_speed_mps / 0.5], unless: [approach_m < 0], where:",
     )
-    with in_place.put(actions=read_actions(with_own(tmp_path / "mine.yaml", entry))):
-        blind = measure(future(forward=4.0, target=(np.nan, np.nan)))
-        assert np.isnan(blind.sweep_deg)
-        assert dict(table_of(LabelConfig()).implied[3])[OWN](blind) == pytest.approx(4.0 / 2.5 / 0.5)
+    labels = table_of(read_actions(with_own(tmp_path / "mine.yaml", entry)), LabelConfig())
+    blind = measure(future(forward=4.0, target=(np.nan, np.nan)))
+    assert np.isnan(blind.sweep_deg)
+    assert dict(labels.implied[3])[OWN](blind) == pytest.approx(4.0 / 2.5 / 0.5)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -240,6 +229,20 @@ def test_a_run_tells_of_an_action_that_was_never_the_label(whole, mine, tmp_path
     assert "an action of yours" not in caplog.text
 
 
+@pytest.mark.slow
+def test_two_campaigns_of_other_sets_run_in_one_process_one_after_the_other_and_at_once(whole, mine, tmp_path):
+    entry = ENTRY.replace(OWN, "glide_along").replace("cruise along", "glide along").replace("巡航伴飞", "滑行伴飞")
+    other = with_own(tmp_path / "other.yaml", entry, "  - [glide_along]\n")
+
+    def captions_of(name: str, path: Path) -> bytes:
+        return caption_run(CaptionConfig(actions=path, limit=8), whole / "render", tmp_path / name).read_bytes()
+
+    alone = [captions_of("first", mine), captions_of("second", other)]
+    with ThreadPoolExecutor() as threads:
+        assert list(threads.map(captions_of, ("third", "fourth"), (mine, other))) == alone
+    assert alone[0] != alone[1]
+
+
 # --- the whole way ----------------------------------------------------------------------------------------------------
 
 
@@ -258,13 +261,12 @@ def test_it_is_labelled_decided_and_written_in_both_languages(whole, mine):
     )
     listed = {entry["path"] for entry in json.loads((whole / "caption/manifest.json").read_text())["outputs"]}
     assert OWN_ACTIONS in listed
-    assert action_tokens() == read_actions(ACTIONS_FILE).tokens  # nothing stays behind
 
 
 def test_the_release_says_so_and_verify_goes_by_that(whole, tmp_path):
     dataset = whole / "release/dataset"
     record = read_record(dataset / "release.json")
-    assert record.closed_set[-1] == OWN
+    assert record.actions.tokens[-1] == OWN
     assert record.numbers.captions.frames_by["decision"][OWN] > 0
     report = verify(dataset, level="pixels", reader=read_released)
     assert report.is_ok, str(report)
@@ -315,7 +317,6 @@ def test_students_are_asked_and_scored_with_it(whole, tmp_path):
     cfg = PrepareConfig(modalities=("rgb",), too_few="fill", val_fraction=0.0, test_fraction=0.5)
     prepare.run(cfg, [Prepared.of_run(whole)], tmp_path / "set")
     record = read_training_set(tmp_path / "set")
-    assert record.actions is not None
     assert record.actions.tokens[-1] == OWN
     found = {split: list(open_split(tmp_path / "set", split)) for split in SPLITS if record.samples[split]}
     split = next(split for split, samples in found.items() if any(sample.decision == OWN for sample in samples))

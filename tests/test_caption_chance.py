@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from specimens_captions import ACTION_TABLE, VOCABULARY
 from teacher_server import TeacherServer
 
 from caption.run.chance import ChanceCounts
@@ -17,12 +18,12 @@ from caption.run.window_loop import Trial, caption_window
 from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig, RepairConfig, WindowConfig
 from caption.teachers.teacher import RuleTeacher
-from caption.truth.actions import measure, verdict_of
+from caption.truth.actions import measure
 from cosfly.errors import TeacherError
-from cosfly.products.actions import action_tokens
 from cosfly.products.captions import Caption, Coc
 from specimens import make_flight, make_playback_tree
 
+TOKENS = VOCABULARY.actions.tokens
 CFG = CaptionConfig(window=WindowConfig(require_images=False))
 
 
@@ -32,15 +33,15 @@ def captions() -> list[tuple[Caption, object]]:
     found = []
     for seed in range(4):
         flight = dataclasses.replace(make_flight(60, seed=seed)[0], folder=Path("nowhere"))
-        for window in cut_windows(flight, CFG.window):
-            caption = asyncio.run(caption_window(window, RuleTeacher(0), CFG))
+        for window in cut_windows(flight, CFG.window, ACTION_TABLE):
+            caption = asyncio.run(caption_window(window, RuleTeacher(0), CFG, VOCABULARY))
             if caption.en is not None:
                 found.append((caption, measure(window.future)))
     return found
 
 
 def counted(captions: list[Caption]) -> ChanceCounts:
-    counts = ChanceCounts()
+    counts = ChanceCounts(TOKENS)
     for caption in captions:
         counts.add(caption)
     return counts
@@ -49,7 +50,7 @@ def counted(captions: list[Caption]) -> ChanceCounts:
 def decided(caption: Caption, motion, decision: str) -> Caption:
     """The caption as a teacher with this decision would have had it, without a repair."""
     assert caption.en is not None
-    verdict = verdict_of(decision, motion, CFG.label, caption.label)
+    verdict = ACTION_TABLE.verdict_of(decision, motion, caption.label)
     answer = caption.en.model_copy(update={"flight_decision": decision})
     return caption.model_copy(update={"en": answer, "verdict": verdict, "repair": None})
 
@@ -58,7 +59,7 @@ def test_expected_shares_are_those_of_many_guesses(captions):
     expected = counted([caption for caption, _ in captions]).report()
     rng = np.random.default_rng(0)
     verdicts = [
-        verdict_of(action_tokens()[rng.integers(len(action_tokens()))], motion, CFG.label, caption.label)
+        ACTION_TABLE.verdict_of(TOKENS[rng.integers(len(TOKENS))], motion, caption.label)
         for caption, motion in captions
         for _ in range(200)
     ]
@@ -66,7 +67,7 @@ def test_expected_shares_are_those_of_many_guesses(captions):
         assert share == pytest.approx(verdicts.count(name.upper()) / len(verdicts), abs=0.01)
     decisions = [c.repair.first_decision if c.repair else c.en.flight_decision for c, _ in captions]
     dealt = [
-        verdict_of(decision, motion, CFG.label, caption.label)
+        ACTION_TABLE.verdict_of(decision, motion, caption.label)
         for _ in range(100)
         for decision, (caption, motion) in zip(rng.permutation(decisions), captions, strict=True)
     ]
@@ -86,9 +87,7 @@ def test_a_teacher_that_looks_gets_no_warning(captions):
 
 def test_a_teacher_that_guesses_is_told_apart(captions):
     rng = np.random.default_rng(1)
-    guessed = [
-        decided(caption, motion, action_tokens()[rng.integers(len(action_tokens()))]) for caption, motion in captions
-    ]
+    guessed = [decided(caption, motion, TOKENS[rng.integers(len(TOKENS))]) for caption, motion in captions]
     assert any("no better than chance" in warning for warning in counted(guessed).report().warnings)
 
 
@@ -129,11 +128,11 @@ def test_too_few_windows_say_nothing(captions):
 @pytest.mark.parametrize("treatment", ["keep", "repair", "drop"])
 def test_what_becomes_of_a_soft_conflict(treatment):
     flight = dataclasses.replace(make_flight(60)[0], folder=Path("nowhere"))
-    windows = list(cut_windows(flight, CFG.window))
+    windows = list(cut_windows(flight, CFG.window, ACTION_TABLE))
 
     def captioned(repair: RepairConfig) -> list[Caption]:
         cfg = CFG.model_copy(update={"repair": repair})
-        return [asyncio.run(caption_window(window, RuleTeacher(0), cfg)) for window in windows]
+        return [asyncio.run(caption_window(window, RuleTeacher(0), cfg, VOCABULARY)) for window in windows]
 
     soft = [i for i, caption in enumerate(captioned(RepairConfig())) if caption.verdict == "SOFT_CONFLICT"]
     assert soft

@@ -16,6 +16,7 @@ from caption.truth.claims import judge_claims
 from caption.truth.gold import GoldCaption, read_gold
 from caption.truth.numerals import chinese_number, english_number, read_numerals
 from caption.truth.stated import read_stated
+from cosfly.products.actions import shipped_actions
 from cosfly.products.captions import Claim, Coc, Language
 
 FILLER = "Nothing else is of any weight for the moment in this place."
@@ -36,7 +37,7 @@ def claims_of(told: str) -> list[Claim]:
 
 def judged(first: str, claims: list[Claim], language: Language = "en", reasons: str = FILLER, decision: str = "hover"):
     coc = Coc(critical_components=first, reasoning_trace=reasons, flight_decision=decision)
-    return judge_claims(coc, claims, FACTS, EvidenceConfig(), language)
+    return judge_claims(coc, claims, FACTS, EvidenceConfig(), language, shipped_actions())
 
 
 DISTANCE = claim("distance@t4=18.0 m")
@@ -129,7 +130,7 @@ def test_what_states_nothing_wrong_is_not_flagged(language, text, claims):
     facts = dataclasses.replace(FACTS, travelled_m=(0.0, 1.5, 3.0, 5.0, 7.2), displacement_m=(0.0, 1.5, 3.0, 4.9, 6.9))
     coc = Coc(critical_components=text, reasoning_trace=FILLER, flight_decision="hover")
     told = claims_of(claims) if isinstance(claims, str) else claims
-    assert judge_claims(coc, told, facts, EvidenceConfig(), language)[0].problems == ()
+    assert judge_claims(coc, told, facts, EvidenceConfig(), language, shipped_actions())[0].problems == ()
 
 
 @each(
@@ -267,7 +268,7 @@ def test_the_speed_of_the_step_and_of_the_window_are_both_true():
     for value, state in ((2.0, "proved"), (1.6, "proved"), (1.2, "contradicted")):
         text = Coc(critical_components=f"The walker does {value} m/s.", reasoning_trace=FILLER, flight_decision="hover")
         told = [claim(f"target_speed@t4={value} mps")]
-        assert judge_claims(text, told, facts, EvidenceConfig(), "en")[0].state == state
+        assert judge_claims(text, told, facts, EvidenceConfig(), "en", shipped_actions())[0].state == state
 
 
 def test_the_chinese_text_is_covered_by_the_claims_of_the_english():

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import invoke
-from specimens_captions import deciding, report_of, settings
+from specimens_captions import VOCABULARY, deciding, report_of, settings
 from teacher_server import ENGLISH, TeacherServer, is_mirror, written_answer
 
 from caption.run.forecast import estimate, make_forecast
@@ -117,7 +117,7 @@ def examine(behaviour: Callable, **changes) -> dict[str, Finding]:
     changes = {"writing": next(iter(WAYS)), **changes}
     with TeacherServer(respond=behaviour, model_facts={"max_model_len": CONTEXT}) as server:
         cfg = CaptionConfig.model_validate({"endpoint": {"backoff_s": 0.01, **changes.pop("endpoint", {})}, **changes})
-        return {finding.name: finding for finding in examine_endpoint(server.url, cfg)}
+        return {finding.name: finding for finding in examine_endpoint(server.url, cfg, VOCABULARY)}
 
 
 def test_a_sound_endpoint_passes_every_check():
@@ -135,7 +135,7 @@ def test_a_sound_endpoint_passes_every_check():
 def test_the_doctor_samples_as_a_run_does():
     endpoint = {"temperature": 0.7, "top_p": 0.9, "max_tokens": 300, "extra_body": {"min_p": 0.1}}
     with TeacherServer(respond=patient(), model_facts={"max_model_len": CONTEXT}) as server:
-        examine_endpoint(server.url, CaptionConfig.model_validate({"endpoint": endpoint}))
+        examine_endpoint(server.url, CaptionConfig.model_validate({"endpoint": endpoint}), VOCABULARY)
     for body in map(json.loads, server.bodies):
         assert {name: body[name] for name in ("temperature", "top_p", "min_p")} == {
             "temperature": 0.7,
@@ -182,7 +182,7 @@ def test_a_defect_is_found(defect, name, state, words):
 
 def test_an_endpoint_that_is_none_and_a_missing_model(tmp_path):
     with TeacherServer() as server:
-        found = examine_endpoint(server.url, CaptionConfig.model_validate({"endpoint": {"model": "other"}}))
+        found = examine_endpoint(server.url, CaptionConfig.model_validate({"endpoint": {"model": "other"}}), VOCABULARY)
     assert [(finding.name, finding.state) for finding in found] == [("model", "unusable")]
     assert "does not have this model" in found[0].detail
 
@@ -300,4 +300,4 @@ def test_the_largest_prompt_bounds_real_ones_with_their_corrections(tree, tmp_pa
         return sum(len(part.get("text", "")) if isinstance(part, dict) else len(part) for c in contents for part in c)
 
     assert len(bodies) >= 2
-    assert max(size(body["messages"]) for body in bodies) <= size(largest_messages(cfg, []))
+    assert max(size(body["messages"]) for body in bodies) <= size(largest_messages(cfg, VOCABULARY, []))

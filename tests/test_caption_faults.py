@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 from commands import invoke
-from specimens_captions import QUICK, deciding, report_of, settings
+from specimens_captions import QUICK, VOCABULARY, deciding, report_of, settings
 from teacher_server import MODEL, TeacherServer, is_mirror, refusal
 
 from caption.run.flights import allot, named_flights
@@ -195,14 +195,18 @@ def test_refusals_between_which_windows_are_answered_cost_one_trial_prompt(tree,
     """Asked one after the other, so that it is plain which answer came before which refusal; every third is refused."""
 
     async def ask_in_turn(cfg: CaptionConfig) -> list[bool]:
-        windows = [window for flight in allot(named_flights(tree), cfg)[0] for window in flight.windows(cfg)]
+        windows = [
+            window
+            for flight in allot(named_flights(tree), cfg, VOCABULARY)[0]
+            for window in flight.windows(cfg, VOCABULARY)
+        ]
         refused = []
         with AnswerBook(tmp_path / "answers") as book:
             async with AskingTeacher(cfg, book, 0, first_budget(cfg, book.totals)) as teacher:
                 for number, window in enumerate(windows):
                     server.respond = Picky(400, TOO_LONG, whole.seeds) if number % 3 == 2 else None
                     try:
-                        await teacher.ask(make_question(window.observed, cfg.image, cfg.writing))
+                        await teacher.ask(make_question(window.observed, cfg.image, cfg.writing, VOCABULARY))
                         refused.append(False)
                     except NoAnswer:
                         refused.append(True)

@@ -7,6 +7,7 @@ import json
 from collections import Counter
 
 import pytest
+from specimens_captions import VOCABULARY
 from tables import each
 from teacher_server import TeacherServer
 
@@ -162,7 +163,7 @@ def few_conflicts():
 
 def gold_answers():
     """A judge that knows the gold set by heart, from the user's message."""
-    return {judge_messages(case)[1]["content"]: right for case, right in gold_conflicts()}
+    return {judge_messages(case, VOCABULARY)[1]["content"]: right for case, right in gold_conflicts()}
 
 
 def options(body):
@@ -177,7 +178,7 @@ def say(verdict):
 
 def checked(answer):
     with judging_server(answer) as server:
-        found = asyncio.run(check_judge(JudgeConfig(url=server.url), few_conflicts()))
+        found = asyncio.run(check_judge(JudgeConfig(url=server.url), VOCABULARY, few_conflicts()))
         assert server.most_at_once > 4  # not one after the other
         return found
 

@@ -8,6 +8,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 import pytest
+from specimens_captions import VOCABULARY
 from teacher_server import kept_answers
 
 from caption.run.stage import run
@@ -15,6 +16,7 @@ from caption.schema import CaptionConfig
 from caption.teachers.doctor import examine_endpoint
 from caption.writing.contract import way_of
 from cosfly.errors import NothingKept
+from cosfly.products.actions import shipped_actions
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import read_captions
 from distill.student.random_student import make_tiny_student
@@ -46,14 +48,14 @@ def test_every_answer_parses_and_every_window_is_accounted_for(server, tmp_path)
     tree = make_playback_tree(tmp_path / "tree", 1, 13, with_augmented=False)
     with pytest.raises(NothingKept):  # a random model seldom decides what it concluded before
         run(settings(server), tree, tmp_path / "out")
-    answers, optional = kept_answers(tmp_path / "out"), way_of("slots").optional
+    answers, optional = kept_answers(tmp_path / "out"), way_of("slots", VOCABULARY).optional
     assert len(answers) == server.num_answers > 0
     assert server.num_images >= 4 * 15
     for answer in answers:
         assert answer["structured"] == "json_schema"
         is_mirror = answer["purpose"].startswith("mirror")
         language, more = ("zh", ()) if is_mirror else ("en", ("therefore",))
-        parsed = parse_answer(answer["text"], language, (*optional, *more), optional=optional)
+        parsed = parse_answer(answer["text"], shipped_actions(), language, (*optional, *more), optional=optional)
         # No schema keeps a random model from other alphabets, or from a claim of 1e999.
         noise = ("wrong_language", "unreadable_character", "not_finite")
         is_noise = parsed.reason is not None and parsed.reason.endswith(noise)
@@ -82,7 +84,7 @@ def test_every_answer_parses_and_every_window_is_accounted_for(server, tmp_path)
 
 @pytest.mark.slow
 def test_the_doctor_sees_that_this_server_applies_the_schema(server):
-    findings = {finding.name: finding for finding in examine_endpoint(server.url, settings(server))}
+    findings = {finding.name: finding for finding in examine_endpoint(server.url, settings(server), VOCABULARY)}
     assert findings["JSON schema"].state == "ok"
     assert findings["images per prompt"].state == "ok"
     assert findings["finish reason"].state == "ok"

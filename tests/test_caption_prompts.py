@@ -14,11 +14,10 @@ from teacher_server import TeacherServer
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig
-from caption.teachers.prompt_files import PROMPTS, export_prompts, own_prompts
+from caption.teachers.prompt_files import PROMPTS, export_prompts, own_prompts, shipped_prompts
 from cosfly.chat.student_chat import write_taught
 from cosfly.errors import ConfigError, ResumeError
 from cosfly.products.captions import OWN_PROMPTS, read_captions
-from cosfly.work import in_place
 from distill.schema import open_split
 from distill.training.stage import taught_by
 from specimens import make_playback_tree
@@ -27,7 +26,7 @@ OWN_LINE = "Costs $$5 & 100 %: you speak as a coast guard."
 
 
 def export(folder: Path) -> Path:
-    export_prompts(folder)
+    export_prompts(folder, shipped_prompts())
     return folder
 
 
@@ -122,7 +121,6 @@ def test_captions_are_asked_with_them_and_keep_them(tree, mine, tmp_path):
     }
     listed = {entry["path"] for entry in json.loads((out / "manifest.json").read_text())["outputs"]}
     assert {f"{OWN_PROMPTS}/{p.name}" for p in mine.iterdir()} <= listed
-    assert in_place.given("prompts") is None  # what ships is in use again
     with pytest.raises(ResumeError, match="the prompts changed"):
         run(CaptionConfig(), tree, out)
     edit(mine / "hint_en.txt", "Hint:", "A hint:")

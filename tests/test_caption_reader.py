@@ -12,7 +12,7 @@ from functools import cache, partial
 import pytest
 from commands import invoke
 from measure_prose import answers_of, loses, misquotes, misreads, perfect_readings, turns
-from specimens_captions import saying
+from specimens_captions import ACTION_TABLE, VOCABULARY, saying
 from teacher_server import is_mirror
 
 from caption.run.forecast import make_forecast
@@ -57,7 +57,7 @@ class FakeEngine:
 @cache
 def measured(fault=None, *, alike: bool = False) -> ReaderCheck:
     engine = FakeEngine(fault, alike=alike)
-    reader = Reader([AskedModel(KeptAnswers(engine, None), ReaderConfig(), 0)])
+    reader = Reader([AskedModel(KeptAnswers(engine, None), ReaderConfig(), 0)], VOCABULARY)
     return asyncio.run(measure_reader(reader, gold()))
 
 
@@ -145,18 +145,27 @@ def test_a_run_reads_prose_of_others_and_keeps_the_claims(tree, tmp_path):
     assert [c.checks.sentences["en"][0] for c in found] == [
         "contradicted" if n % 2 else "proved" for n in range(len(found))
     ]
-    assert all(c.reader.prompt == prompt_digest() and c.reader.claims["en"][0].quote for c in found)
-    windows = list(cut_windows(read_flight(find_flights(tree)[0]), WindowConfig()))
+    assert all(c.reader.prompt == prompt_digest(VOCABULARY) and c.reader.claims["en"][0].quote for c in found)
+    windows = list(cut_windows(read_flight(find_flights(tree)[0]), WindowConfig(), ACTION_TABLE))
     lie_of_state, lie_of_claim = 0, 0
     for caption, window in zip(found, windows, strict=True):
         row = caption_values(caption) | {"sample_id": caption.sample_id, "frame_index": caption.frame_index}
         facts = measure_facts(window.observed, caption.picture_px)
-        assert state_lies(shown_caption(row), facts, EvidenceConfig()) == []  # from the row alone: nobody is asked
+        assert (
+            state_lies(shown_caption(row), facts, EvidenceConfig(), VOCABULARY) == []
+        )  # from the row alone: nobody is asked
         states = ["unread", *row["sentence_states_en"][1:]]
-        lie_of_state += len(state_lies(shown_caption(row | {"sentence_states_en": states}), facts, EvidenceConfig()))
+        lie_of_state += len(
+            state_lies(shown_caption(row | {"sentence_states_en": states}), facts, EvidenceConfig(), VOCABULARY)
+        )
         evidence = row["evidence"].replace('"value":', '"value":9')
-        lie_of_claim += len(state_lies(shown_caption(row | {"evidence": evidence}), facts, EvidenceConfig()))
-        assert state_lies(shown_caption(row | {"evidence": "[]"}), facts, EvidenceConfig())[0].code == "evidence"
+        lie_of_claim += len(
+            state_lies(shown_caption(row | {"evidence": evidence}), facts, EvidenceConfig(), VOCABULARY)
+        )
+        assert (
+            state_lies(shown_caption(row | {"evidence": "[]"}), facts, EvidenceConfig(), VOCABULARY)[0].code
+            == "evidence"
+        )
     assert lie_of_state == len(found)
     assert lie_of_claim >= len(found) // 2  # what was proved no longer is
 
@@ -202,6 +211,6 @@ def test_the_doctor_tells_a_reader_from_a_model_that_reads_nothing():
             return answer(body) if reads and body["messages"][0]["role"] == "system" else "ready"
 
         with saying(text) as server:
-            findings = {f.name: f for f in examine_endpoint(server.url, CaptionConfig(), as_reader=True)}
+            findings = {f.name: f for f in examine_endpoint(server.url, CaptionConfig(), VOCABULARY, as_reader=True)}
         assert findings["reads prose"].state == state, findings
         assert "image input" not in findings

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from specimens_captions import FOLLOW, GAP, report_of, saying, settings
+from specimens_captions import ACTION_TABLE, FOLLOW, GAP, VOCABULARY, WAY, report_of, saying, settings
 from tables import each
 from teacher_server import CHINESE, ENGLISH, TeacherServer, is_mirror
 
@@ -28,10 +28,9 @@ from caption.truth.mirror import check_translation
 from caption.truth.references import Fact, look_up, parse_reference
 from caption.writing.contract import Draft, Refused
 from caption.writing.filling import Filler
-from caption.writing.slots import Slots, fact_table
+from caption.writing.slots import fact_table
 from caption.writing.templates import Sentence, read_sentence
 from cosfly.errors import NothingKept
-from cosfly.products.actions import action_tokens
 from cosfly.products.answer_text import Parsed
 from cosfly.products.captions import Coc, Language, read_captions
 from cosfly.products.flights import find_flights
@@ -46,8 +45,8 @@ FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, -6.0, -10.0), offset_x_
 def filled(
     text: str, language: Language = "en", facts: Facts = FACTS, decision: str = "yaw_right_to_follow"
 ) -> str | Refused:
-    sentence = read_sentence(text, language, len(facts), facts.step_s)
-    return sentence if isinstance(sentence, Refused) else Filler(facts, decision, language).fill(sentence)
+    sentence = read_sentence(text, language, len(facts), facts.step_s, VOCABULARY)
+    return sentence if isinstance(sentence, Refused) else Filler(facts, decision, language, VOCABULARY).fill(sentence)
 
 
 @each(
@@ -148,7 +147,7 @@ def windows_of(num_flights: int) -> list[Facts]:
     found = []
     for seed in range(num_flights):
         flight = dataclasses.replace(make_flight(30, seed=seed, width_px=640, height_px=360)[0], folder=Path("nowhere"))
-        samples = cut_windows(flight, WindowConfig(require_images=False, stride=4))
+        samples = cut_windows(flight, WindowConfig(require_images=False, stride=4), ACTION_TABLE)
         found += [measure_facts(sample.observed, (640, 360)) for sample in samples]
     return found
 
@@ -169,7 +168,9 @@ def earned_texts() -> dict[str, list[str]]:
 def test_natural_templates_are_not_refused(language):
     """What a careful writer puts down who has read the prompt; written before the checks were tried on them."""
     texts = earned_texts()[f"natural {language}"]
-    refused = {text: found for text in texts if isinstance(found := read_sentence(text, language, 5, 0.5), Refused)}
+    refused = {
+        text: found for text in texts if isinstance(found := read_sentence(text, language, 5, 0.5, VOCABULARY), Refused)
+    }
     assert len(texts) >= 30
     assert len(refused) <= 0.05 * len(texts), refused
 
@@ -254,9 +255,9 @@ def test_a_size_and_its_side_are_its_sign(facts, name, frame):
 def drafts(english: str, chinese: str) -> Draft | Refused:
     en = Coc(critical_components="The walker is {visibility}.", reasoning_trace=english, flight_decision="hover")
     zh = Coc(critical_components="行人{visibility}。", reasoning_trace=chinese, flight_decision="hover")
-    first = Slots().read(Parsed(en, therefore="hover"), FACTS)
+    first = WAY.read(Parsed(en, therefore="hover"), FACTS)
     assert isinstance(first, Draft), first
-    return Slots().read_mirror(Parsed(zh), first, FACTS)
+    return WAY.read_mirror(Parsed(zh), first, FACTS)
 
 
 @each(
@@ -285,11 +286,11 @@ def test_a_translation_has_the_same_sentences_and_the_glossarys_words():
         critical_components="The drone climbs. The target walks.", reasoning_trace="So be it.", flight_decision="hover"
     )
     chinese = Coc(critical_components="无人机爬升。目标行走。", reasoning_trace="如此。", flight_decision="hover")
-    assert check_translation(english, chinese) is None
+    assert check_translation(english, chinese, VOCABULARY) is None
     one = chinese.model_copy(update={"critical_components": "无人机爬升，目标行走。"})
-    assert check_translation(english, one)[0] == "sentences"
+    assert check_translation(english, one, VOCABULARY)[0] == "sentences"
     other = chinese.model_copy(update={"critical_components": "飞行器爬升。目标行走。"})
-    assert check_translation(english, other) == ("glossary", 'write "无人机" for "drone"')
+    assert check_translation(english, other, VOCABULARY) == ("glossary", 'write "无人机" for "drone"')
 
 
 @each(
@@ -307,7 +308,7 @@ def test_a_translation_has_the_same_sentences_and_the_glossarys_words():
 )
 def test_a_reasoning_that_argues_against_its_decision_is_refused(reasons, decision, is_taken):
     answer = Coc(critical_components="The gap is {distance}.", reasoning_trace=reasons, flight_decision=decision)
-    found = Slots().read(Parsed(answer, therefore=decision), FACTS)
+    found = WAY.read(Parsed(answer, therefore=decision), FACTS)
     assert isinstance(found, Draft) == is_taken, found
     assert is_taken or found.reason == "decision_against_reasoning"
 
@@ -316,10 +317,10 @@ def test_a_sentence_is_proved_only_where_its_words_are_true_with_its_slots():
     texts = earned_texts()
     for language in ("en", "zh"):
         for text in texts[f"false {language}"]:
-            found = read_sentence(text, language, 5, 0.5)
+            found = read_sentence(text, language, 5, 0.5, VOCABULARY)
             assert isinstance(found, Refused) or found.state == "unread", text
         for text in texts[f"true {language}"]:
-            found = read_sentence(text, language, 5, 0.5)
+            found = read_sentence(text, language, 5, 0.5, VOCABULARY)
             assert isinstance(found, Sentence), (text, found)
             assert found.state == "proved", text
 
@@ -378,13 +379,13 @@ STEADY = partial(claimed, "trend:pitch", "steady", at="t0-t4")
 def test_a_word_beside_slots_needs_a_claim_that_holds(language, reasons, claims, state):
     coc = Coc(critical_components="{visibility}", reasoning_trace=reasons, flight_decision="hover")
     if language == "en":
-        found = Slots().read(Parsed(coc, therefore="hover", more={"claims": claims}), FACTS)
+        found = WAY.read(Parsed(coc, therefore="hover", more={"claims": claims}), FACTS)
     else:
         english = coc.model_copy(update={"reasoning_trace": "With {" + re.search(r"\{(\w+)\}", reasons)[1] + "}."})
-        first = Slots().read(Parsed(english, therefore="hover"), FACTS)
-        found = Slots().read_mirror(Parsed(coc, more={"claims": claims}), first, FACTS)
+        first = WAY.read(Parsed(english, therefore="hover"), FACTS)
+        found = WAY.read_mirror(Parsed(coc, more={"claims": claims}), first, FACTS)
     assert isinstance(found, Draft), found
-    [_, judged] = Slots().judge(found, FACTS, EvidenceConfig(), language)
+    [_, judged] = WAY.judge(found, FACTS, EvidenceConfig(), language)
     assert judged.state == state
     assert (state == "contradicted") == bool(judged.problems)
     asked_again = isinstance(claims, list) and len(found.template.claims or ()) > 0 and state == "unread"
@@ -456,15 +457,15 @@ def test_claims_beside_slots_stand_in_record_report_and_evidence_and_are_judged_
     assert report["proved_by_claims"] == {"en": 2, "zh": 2}
     page = (tmp_path / "out" / "report.html").read_text()
     assert "proved by slots 0 (0.0 %), proved by claims 2 (50.0 %)" in page
-    windows = cut_windows(read_flight(find_flights(tree)[0]), WindowConfig())
+    windows = cut_windows(read_flight(find_flights(tree)[0]), WindowConfig(), ACTION_TABLE)
     for caption, window in zip(captions, windows, strict=False):
         assert caption.checks.sentences["en"] == ["unread", "proved"]
         assert [claim.quote for claim in caption.evidence.slots["zh"].claims] == ["保持稳定"]
         row = caption_values(caption) | {"sample_id": caption.sample_id, "frame_index": caption.frame_index}
         facts = measure_facts(window.observed, caption.picture_px)
-        assert state_lies(shown_caption(row), facts, EvidenceConfig()) == []
+        assert state_lies(shown_caption(row), facts, EvidenceConfig(), VOCABULARY) == []
         lie = row | {"evidence": row["evidence"].replace('"value":"steady"', '"value":"increasing"')}
-        [found, *_] = state_lies(shown_caption(lie), facts, EvidenceConfig())
+        [found, *_] = state_lies(shown_caption(lie), facts, EvidenceConfig(), VOCABULARY)
         assert found.expected.startswith("contradicted, by flight and evidence")
 
 
@@ -501,7 +502,7 @@ def test_an_answer_that_stays_wrong_drops_its_window_for_that_reason(tree, tmp_p
 
 
 def test_the_question_shows_what_is_known_by_its_slot(tree, tmp_path):
-    table = fact_table(FACTS)
+    table = fact_table(FACTS, VOCABULARY)
     assert (
         "{distance@t0} to {distance@t4}: 20.0, 20.5, 21.0, -, 18.0 m; {change:distance} -2.0 m; {trend:distance} "
         "decreases" in table
@@ -518,17 +519,19 @@ def test_the_question_shows_what_is_known_by_its_slot(tree, tmp_path):
 
 def test_every_slot_of_the_table_can_be_written():
     for facts in [FACTS, *WINDOWS[:4]]:
-        for address, text in re.findall(r"\{([a-z_:@0-9]+)\} ([^;\n]+)", fact_table(facts).partition("\n")[2]):
+        for address, text in re.findall(
+            r"\{([a-z_:@0-9]+)\} ([^;\n]+)", fact_table(facts, VOCABULARY).partition("\n")[2]
+        ):
             if text != "to":
                 found = filled(f"it {{{address}}} it", "en", facts)
                 assert found == f"it {text} it" or text.startswith("to {"), address
 
 
 def test_actions_named_in_words_are_those_of_the_answer():
-    for action in action_tokens():
-        sentence = read_sentence("So the drone should {decision} now.", "en", 5, 0.5)
+    for action in VOCABULARY.actions.tokens:
+        sentence = read_sentence("So the drone should {decision} now.", "en", 5, 0.5, VOCABULARY)
         assert isinstance(sentence, Sentence)
-        assert isinstance(Filler(FACTS, action, "en").fill(sentence), str)
+        assert isinstance(Filler(FACTS, action, "en", VOCABULARY).fill(sentence), str)
 
 
 @pytest.mark.parametrize(

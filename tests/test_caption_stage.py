@@ -11,6 +11,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
+from specimens_captions import ACTION_TABLE, VOCABULARY
 
 from caption.run import stage
 from caption.run.flights import allot, named_flights
@@ -22,7 +23,7 @@ from caption.schema import CaptionConfig, ImageConfig
 from caption.teachers.prompts import Correction, make_question
 from caption.teachers.teacher import RuleTeacher
 from caption.teachers.trials import SCENES, trial_window
-from caption.truth.actions import label_of, measure
+from caption.truth.actions import measure
 from cosfly.chat.budget import BudgetConfig
 from cosfly.errors import InputError, NothingKept, ResumeError
 from cosfly.products.captions import read_captions
@@ -44,9 +45,9 @@ def done(tree, tmp_path_factory):
 def test_windows_prepared_a_few_at_a_time_give_the_same_bytes(tree, done, tmp_path, monkeypatch):
     monkeypatch.setattr(stage, "WINDOWS_AT_ONCE", 4)  # of nine
     cfg, found = CaptionConfig(), b""
-    for flight in allot(named_flights(tree), cfg)[0]:
+    for flight in allot(named_flights(tree), cfg, VOCABULARY)[0]:
         part = tmp_path / flight.name
-        asyncio.run(stage.caption_in_order(flight.windows(cfg), RuleTeacher(0), cfg, part))
+        asyncio.run(stage.caption_in_order(flight.windows(cfg, VOCABULARY), RuleTeacher(0), cfg, VOCABULARY, part))
         found += part.read_bytes()
     assert found == (done / "captions.jsonl").read_bytes()
 
@@ -55,8 +56,8 @@ def test_every_window_is_one_line_sorted_and_labelled_from_geometry(tree, done):
     captions = list(read_captions(done / "captions.jsonl"))
     expected = {}
     for folder in find_flights(tree):
-        for sample in cut_windows(read_flight(folder), CaptionConfig().window):
-            expected[sample.observed.sample_id] = label_of(measure(sample.future), CaptionConfig().label)
+        for sample in cut_windows(read_flight(folder), CaptionConfig().window, ACTION_TABLE):
+            expected[sample.observed.sample_id] = ACTION_TABLE.label_of(measure(sample.future))
     assert [caption.sample_id for caption in captions] == sorted(expected)
     assert {caption.sample_id: caption.label for caption in captions} == expected
     assert len(captions) == 6 * 9
@@ -190,7 +191,7 @@ def test_a_perturbed_flight_waits_for_a_clean_one_that_cannot_be_read(tmp_path):
 
 def test_the_rule_teachers_mirror_is_of_its_answer_to_a_correction_too():
     """The mirror is asked with the question alone; other slots in both languages dropped 2 of quickstart's windows."""
-    question = make_question(trial_window(SCENES[0], 5), ImageConfig(), "slots")
+    question = make_question(trial_window(SCENES[0], 5), ImageConfig(), "slots", VOCABULARY)
     corrected = replace(question, correction=Correction("", "", 1))
     texts = [asyncio.run(RuleTeacher(0).ask(one)).text for one in (question, corrected)]
     assert texts[0] == texts[1]
@@ -261,7 +262,7 @@ def test_text_of_a_teacher_cannot_become_markup(done):
     report = report_of(done)
     caption = next(read_captions(done / "captions.jsonl"))
     evil = caption.en.model_copy(update={"reasoning_trace": "<script>alert(1)</script> & so on"})
-    page = page_html(report, [caption.model_copy(update={"en": evil})], {}, BudgetConfig(), "x")
+    page = page_html(report, VOCABULARY.actions, [caption.model_copy(update={"en": evil})], {}, BudgetConfig(), "x")
     assert "<script" not in page
     assert "&lt;script&gt;" in page
     assert page.count(">no picture<") == 5
@@ -270,9 +271,9 @@ def test_text_of_a_teacher_cannot_become_markup(done):
 def test_cost_is_told_when_there_are_prices(done):
     used = {"prompt_tokens": 2_000_000, "completion_tokens": 100_000}
     report = report_of(done).model_copy(update={"tokens": used})
-    page = page_html(report, [], {}, BudgetConfig(price_prompt=0.5, price_completion=3.0), "x")
+    page = page_html(report, VOCABULARY.actions, [], {}, BudgetConfig(price_prompt=0.5, price_completion=3.0), "x")
     assert ">1.30<" in page
-    assert "no prices set" in page_html(report, [], {}, BudgetConfig(), "x")
+    assert "no prices set" in page_html(report, VOCABULARY.actions, [], {}, BudgetConfig(), "x")
 
 
 def test_sentences_are_marked_by_what_was_read_of_them(done):
@@ -282,7 +283,12 @@ def test_sentences_are_marked_by_what_was_read_of_them(done):
     )
     checks = caption.checks.model_copy(update={"sentences": {"en": ["proved", "unread", "contradicted"]}})
     page = page_html(
-        report_of(done), [caption.model_copy(update={"en": answer, "checks": checks})], {}, BudgetConfig(), "x"
+        report_of(done),
+        VOCABULARY.actions,
+        [caption.model_copy(update={"en": answer, "checks": checks})],
+        {},
+        BudgetConfig(),
+        "x",
     )
     for text, state in (("It is near.", "proved"), ("It is &lt;red&gt;!", "unread"), ("So be it.", "contradicted")):
         assert f'class="sentence {state}">{text}</span>' in page

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from commands import invoke
+from specimens_captions import VOCABULARY
 from specimens_distill import prepared
 from teacher_server import TeacherServer
 
@@ -202,13 +203,13 @@ def test_another_version_of_the_prompt_is_refused(place, tmp_path):
     ]):  # fmt: skip
         folder = taught_otherwise(place, tmp_path / f"{number}", prompts=taught["prompts"] | {"en": changed})
         with pytest.raises(ConfigError, match="another version of the prompt"):
-            as_taught(settings("http://127.0.0.1:1/v1", folder))
+            as_taught(settings("http://127.0.0.1:1/v1", folder), VOCABULARY)
     mission = {"system": english["system"], "user": english["user"] + "\nMission: the time of the mission is over."}
     folder = taught_otherwise(place, tmp_path / "mission", prompts={"en": mission})
-    assert as_taught(settings("http://127.0.0.1:1/v1", folder)).endpoint.temperature == 0.0
+    assert as_taught(settings("http://127.0.0.1:1/v1", folder), VOCABULARY).endpoint.temperature == 0.0
     folder = taught_otherwise(place, tmp_path / "zh", prompts={"zh": taught["prompts"]["zh"]})
     with pytest.raises(ConfigError, match="taught no English"):
-        as_taught(settings("http://127.0.0.1:1/v1", folder))
+        as_taught(settings("http://127.0.0.1:1/v1", folder), VOCABULARY)
 
 
 def test_a_student_without_chinese_gives_english_captions(place, tmp_path):
@@ -233,7 +234,7 @@ def test_a_tree_with_other_pictures_is_refused(place, tmp_path):
 
 def test_a_folder_that_says_nothing_is_refused(place, tmp_path):
     with pytest.raises(InputError, match="nothing here says what the student was taught"):
-        as_taught(settings("http://127.0.0.1:1/v1", tmp_path))
+        as_taught(settings("http://127.0.0.1:1/v1", tmp_path), VOCABULARY)
     with pytest.raises(ValueError, match=r"student.folder needs a teacher that is asked"):
         CaptionConfig.model_validate({"student": {"folder": place / "trained"}})
 

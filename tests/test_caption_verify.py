@@ -11,17 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from specimens_captions import write_answers
+from specimens_captions import ACTION_TABLE, VOCABULARY, write_answers
 from tables import each
 
 from caption.run.windows import cut_windows
 from caption.schema import WindowConfig
 from caption.truth.facts import Facts, measure_facts
-from caption.truth.glossary import load_glossary
 from caption.truth.gold import read_gold
 from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.prose import check_prose, judge_prose
-from cosfly.products.actions import action_tokens
 from cosfly.products.captions import Coc
 from specimens import make_flight
 
@@ -168,7 +166,7 @@ def clean_captions(num_flights: int) -> list[tuple[Facts, Coc, Coc]]:
         for variant in ("ORI", "aug_001"):
             flight, _ = make_flight(30, seed=seed, variant=variant, width_px=640, height_px=360)
             flight = dataclasses.replace(flight, folder=Path("nowhere"))
-            for sample in cut_windows(flight, WindowConfig(require_images=False, stride=2)):
+            for sample in cut_windows(flight, WindowConfig(require_images=False, stride=2), ACTION_TABLE):
                 facts = measure_facts(sample.observed)
                 captions.append((facts, *write_answers(facts, np.random.default_rng([seed, len(captions)]))))
     return captions
@@ -190,7 +188,7 @@ def test_rule_captions_are_one_record_in_two_languages():
 # --- the rule teacher -------------------------------------------------------------------------------------------------
 
 
-@each("decision", action_tokens())
+@each("decision", VOCABULARY.actions.tokens)
 def test_the_rule_teacher_justifies_any_given_decision_without_contradiction(decision):
     for facts, _, _ in clean_captions(2)[::7]:
         english, chinese = write_answers(facts, np.random.default_rng(3), decision)
@@ -198,7 +196,7 @@ def test_the_rule_teacher_justifies_any_given_decision_without_contradiction(dec
         assert check_prose(english, facts, "en") == []
         assert check_prose(chinese, facts, "zh") == []
         assert check_mirror(english, chinese, flight_numbers(facts)) is None
-        assert load_glossary().actions[decision]["zh"] in chinese.reasoning_trace
+        assert VOCABULARY.names[decision]["zh"] in chinese.reasoning_trace
 
 
 def test_the_rule_teacher_decides_from_what_it_sees():

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from specimens_captions import ACTION_TABLE, VOCABULARY
 from teacher_server import TeacherServer
 
 from caption.run.stage import run
@@ -21,16 +22,15 @@ from caption.schema import (
     CaptionConfig,
     FutureMotion,
     ImageConfig,
-    LabelConfig,
     ObservedWindow,
     WindowConfig,
     observed_frames,
 )
 from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import make_question, question_messages, system_prompt
-from caption.truth.actions import label_of, measure
+from caption.truth.actions import measure
 from caption.truth.facts import measure_facts
-from cosfly.products.actions import action_tokens
+from cosfly.products.actions import shipped_actions
 from cosfly.products.answer_text import answer_schema
 from cosfly.products.boxes import MapHeader, make_box_map
 from cosfly.products.captions import read_captions
@@ -62,7 +62,7 @@ def test_current_frames_have_a_whole_past_and_future(num_points, stride, expecte
 
 def test_the_observed_type_has_no_future_and_shares_no_memory_with_it(tree):
     flight = flight_in(tree)
-    sample = next(cut_windows(flight, WindowConfig()))
+    sample = next(cut_windows(flight, WindowConfig(), ACTION_TABLE))
     assert not any(field.type == FutureMotion.__name__ for field in dataclasses.fields(ObservedWindow))
     assert [frame.time_s for frame in sample.observed.frames] == flight.time_s[:5].tolist()
     values = [
@@ -129,23 +129,25 @@ def test_changing_all_future_frames_leaves_prompts_and_pictures_identical(tree, 
     cfg = ImageConfig(layout=layout)
     found = []
     for root in (tree, spoiled):
-        sample = next(s for s in cut_windows(flight_in(root), NO_IMAGES) if s.observed.indices[-1] == current)
-        question = make_question(sample.observed, cfg, "prose")
+        sample = next(
+            s for s in cut_windows(flight_in(root), NO_IMAGES, ACTION_TABLE) if s.observed.indices[-1] == current
+        )
+        question = make_question(sample.observed, cfg, "prose", VOCABULARY)
         messages, digests = question_messages(question, FrameEncoder(cfg))
         found.append((question.asked, json.dumps(messages), digests))
     assert found[0] == found[1]
     # The comparison can fail: a frame that is observed does reach the request.
     changed = [
-        make_question(s.observed, cfg, "prose").prompts
+        make_question(s.observed, cfg, "prose", VOCABULARY).prompts
         for root in (tree, spoiled)
-        for s in cut_windows(flight_in(root), NO_IMAGES)
+        for s in cut_windows(flight_in(root), NO_IMAGES, ACTION_TABLE)
         if s.observed.indices[-1] == current + 1
     ]
     assert changed[0] != changed[1]
 
 
 def test_facts_of_a_hand_made_window(tree):
-    window = next(cut_windows(flight_in(tree), WindowConfig())).observed
+    window = next(cut_windows(flight_in(tree), WindowConfig(), ACTION_TABLE)).observed
     x = np.arange(5.0)
     window = dataclasses.replace(
         window,
@@ -173,23 +175,23 @@ def test_facts_of_a_hand_made_window(tree):
     assert (facts.box_width_px[-1], facts.box_height_px[-1]) == (20, 60)
     assert (facts.offset_x_px[-1], facts.offset_y_px[-1]) == (30, 10)
     assert facts.visibility == ("visible", "visible", "partly_occluded", "occluded", "out_of_view")
-    prompt = make_question(window, ImageConfig(), "prose").prompts["en"].user
+    prompt = make_question(window, ImageConfig(), "prose", VOCABULARY).prompts["en"].user
     assert "Velocity: [0.0, 2.24, 2.24, 2.24, 2.24] m/s" in prompt
     assert "Yaw against the first frame: [0.0, 1.0, 2.0, 3.0, 4.0] deg" in prompt
     assert "[visible, visible, partly occluded, occluded, out of view]" in prompt
-    chinese = make_question(window, ImageConfig(), "prose").prompts["zh"].user
+    chinese = make_question(window, ImageConfig(), "prose", VOCABULARY).prompts["zh"].user
     assert "[可见, 可见, 部分遮挡, 被遮挡, 在视野外]" in chinese
     assert "Frames are 0.5 s apart." in prompt
     frames = tuple(dataclasses.replace(frame, time_s=0.5 * frame.time_s) for frame in window.frames)
     halved = dataclasses.replace(window, frames=frames)
-    doubled = make_question(halved, ImageConfig(), "prose").prompts
+    doubled = make_question(halved, ImageConfig(), "prose", VOCABULARY).prompts
     assert "Frames are 0.25 s apart." in doubled["en"].user
     assert "Velocity: [0.0, 4.47, 4.47, 4.47, 4.47] m/s" in doubled["en"].user
 
 
 def test_a_walker_who_turns_left_does_so_in_the_facts(tree):
     """East for two steps, then north: in a mirrored world it would be to the right."""
-    window = next(cut_windows(flight_in(tree), WindowConfig())).observed
+    window = next(cut_windows(flight_in(tree), WindowConfig(), ACTION_TABLE)).observed
     ways = [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 1.0), (2.0, 2.0)]
     frames = zip(window.frames, ways, strict=True)
     window = dataclasses.replace(
@@ -205,23 +207,23 @@ def test_the_box_is_that_of_what_is_seen(tree):
     flight = flight_in(tree)
     seen = np.tile([340.0, 160.0, 360.0, 220.0], (len(flight), 1)) / 10.0
     seen[4] = np.nan
-    told = next(cut_windows(dataclasses.replace(flight, target_mask_bbox=seen), WindowConfig())).observed
+    told = next(cut_windows(dataclasses.replace(flight, target_mask_bbox=seen), WindowConfig(), ACTION_TABLE)).observed
     facts = measure_facts(told)
     assert facts.box_width_px == (2, 2, 2, 2, None)
     assert facts.box_height_px == (6, 6, 6, 6, None)
     assert facts.offset_x_px[:4] == (3, 3, 3, 3)  # 35 of 64 px across
     assert facts.offset_x_px[4] == round(flight.target_uv[4, 0] - 32)
-    untold = next(cut_windows(flight, WindowConfig())).observed
+    untold = next(cut_windows(flight, WindowConfig(), ACTION_TABLE)).observed
     assert np.array_equal([frame.target_bbox for frame in untold.frames], flight.target_bbox[:5])
 
 
 def test_prompts_name_the_closed_set_and_the_shape():
     for language in ("en", "zh"):
-        text = system_prompt(language)
-        assert all(token in text for token in action_tokens())
+        text = system_prompt(language, VOCABULARY)
+        assert all(token in text for token in shipped_actions().tokens)
         assert all(name in text for name in ("critical_components", "reasoning_trace", "flight_decision"))
-    assert answer_schema()["properties"]["flight_decision"]["enum"] == list(action_tokens())
-    assert answer_schema("hover", "zh")["properties"]["flight_decision"]["enum"] == ["hover"]
+    assert answer_schema(shipped_actions())["properties"]["flight_decision"]["enum"] == list(shipped_actions().tokens)
+    assert answer_schema(shipped_actions(), "hover", "zh")["properties"]["flight_decision"]["enum"] == ["hover"]
 
 
 def test_a_foreign_tree_without_boxes_scores_depth_and_meta(tmp_path):
@@ -239,11 +241,11 @@ def test_a_foreign_tree_without_boxes_scores_depth_and_meta(tmp_path):
         (frame / "depth.npy").unlink()
         rgb = cv2.imread(str(frame / "rgb.png"))
         cv2.imwrite(str(frame / "rgb.png"), cv2.cvtColor(rgb, cv2.COLOR_BGR2BGRA))
-    sample = next(cut_windows(flight_in(root), WindowConfig()))
+    sample = next(cut_windows(flight_in(root), WindowConfig(), ACTION_TABLE))
     facts = measure_facts(sample.observed)
     assert facts.box_width_px == (None,) * 5
     assert facts.offset_x_px[-1] is not None  # from image_uv
-    question = make_question(sample.observed, ImageConfig(), "prose")
+    question = make_question(sample.observed, ImageConfig(), "prose", VOCABULARY)
     assert question.pictures.views == ("rgb", "segmentation")
     _, digests = question_messages(question, FrameEncoder(ImageConfig()))
     assert len(digests) == 10
@@ -255,8 +257,8 @@ def test_a_foreign_tree_without_boxes_scores_depth_and_meta(tmp_path):
 def test_pictures_are_bounded_and_encoded_once_per_frame(tree, layout, num_images, width_px):
     cfg = ImageConfig(layout=layout, max_side_px=32, encoding="png")
     encoder = FrameEncoder(cfg)
-    for sample in list(cut_windows(flight_in(tree), WindowConfig()))[:4]:
-        question = make_question(sample.observed, cfg, "prose")
+    for sample in list(cut_windows(flight_in(tree), WindowConfig(), ACTION_TABLE))[:4]:
+        question = make_question(sample.observed, cfg, "prose", VOCABULARY)
         messages, digests = question_messages(question, encoder)
         assert len(digests) == num_images
     assert encoder.num_encoded == 8  # four windows over frames 0..7
@@ -308,15 +310,15 @@ def flights_of(root) -> tuple[Flight, Flight]:
 
 
 def labels_of(windows) -> list[str | None]:
-    return [label_of(measure(window.future), LabelConfig()) for window in windows]
+    return [ACTION_TABLE.label_of(measure(window.future)) for window in windows]
 
 
 @pytest.mark.parametrize("label_from", ["twin", "offsets"])
 def test_both_tracks_have_the_same_labels_where_the_same_was_visible(two_tracks, label_from):
     clean, perturbed = flights_of(two_tracks)
     twin = read_twin(perturbed) if label_from == "twin" else None
-    expected = list(cut_windows(clean, NO_IMAGES))
-    found = list(cut_windows(perturbed, NO_IMAGES, twin=twin))
+    expected = list(cut_windows(clean, NO_IMAGES, ACTION_TABLE))
+    found = list(cut_windows(perturbed, NO_IMAGES, ACTION_TABLE, twin=twin))
     assert {w.future.label_from for w in expected} == {"flight"}
     assert {w.future.label_from for w in found} == {label_from}
     saw_the_same = [bool((a.future.visible == b.future.visible).all()) for a, b in zip(expected, found, strict=True)]
@@ -331,13 +333,13 @@ def test_both_tracks_have_the_same_labels_where_the_same_was_visible(two_tracks,
         assert a.future.speed_before_mps == pytest.approx(b.future.speed_before_mps)
     # What is compared is not the same from the start: as flown, a good part of the labels is another.
     flown = as_flown(perturbed, "perturbed")
-    raw = [label_of(measure(cut_future(perturbed, flown, i, 5)), LabelConfig()) for i in range(4, NUM_POINTS - 5)]
+    raw = [ACTION_TABLE.label_of(measure(cut_future(perturbed, flown, i, 5))) for i in range(4, NUM_POINTS - 5)]
     assert np.mean([a != b for (a, _, _), b in zip(pairs, raw, strict=True)]) > 0.2
 
 
 def test_what_is_observed_stays_perturbed(two_tracks):
     clean, perturbed = flights_of(two_tracks)
-    one, two = (next(cut_windows(flight, NO_IMAGES)) for flight in (clean, perturbed))
+    one, two = (next(cut_windows(flight, NO_IMAGES, ACTION_TABLE)) for flight in (clean, perturbed))
     assert not np.allclose(*[[frame.position_m for frame in own.observed.frames] for own in (one, two)])
 
 
@@ -345,7 +347,7 @@ def test_keyframes_are_chosen_by_the_same_labels(two_tracks):
     clean, perturbed = flights_of(two_tracks)
     visible = dataclasses.replace(perturbed, target_visible=clean.target_visible)
     cfg = WindowConfig(require_images=False, keyframes=True)
-    chosen = [[w.observed.indices for w in cut_windows(flight, cfg)] for flight in (clean, visible)]
+    chosen = [[w.observed.indices for w in cut_windows(flight, cfg, ACTION_TABLE)] for flight in (clean, visible)]
     assert chosen[0] == chosen[1]
     assert len(chosen[0]) < NUM_POINTS - 9
 
@@ -406,7 +408,9 @@ def test_a_label_that_cannot_be_cleaned_says_so(two_tracks, tmp_path):
     shutil.copytree(two_tracks, root)
     without_offsets(root)
     _, perturbed = flights_of(root)
-    assert {w.future.label_from for w in cut_windows(perturbed, NO_IMAGES, twin=read_twin(perturbed))} == {"twin"}
+    assert {
+        w.future.label_from for w in cut_windows(perturbed, NO_IMAGES, ACTION_TABLE, twin=read_twin(perturbed))
+    } == {"twin"}
     shutil.rmtree(find_flights(root)[0])
     path = run(CaptionConfig(window=NO_IMAGES), root, tmp_path / "out")
     assert {c.label_from for c in read_captions(path)} == {"perturbed"}
@@ -417,7 +421,7 @@ def test_a_label_that_cannot_be_cleaned_says_so(two_tracks, tmp_path):
         values = getattr(perturbed, name).copy()
         values[:20] = 0.0
         still = dataclasses.replace(still, **{name: values})
-    sources = [w.future.label_from for w in cut_windows(still, NO_IMAGES)]
+    sources = [w.future.label_from for w in cut_windows(still, NO_IMAGES, ACTION_TABLE)]
     assert sources[:11] == ["offsets"] * 11
     assert set(sources[11:]) == {"perturbed"}
 
@@ -438,21 +442,21 @@ def ordered(tree, tmp_path_factory):
 
 
 def test_a_mission_gives_labels_and_is_known_from_its_first_frame_on(tree, ordered):
-    windows = list(cut_windows(flight_in(ordered), NO_IMAGES))
+    windows = list(cut_windows(flight_in(ordered), NO_IMAGES, ACTION_TABLE))
     currents = [w.observed.indices[-1] for w in windows]
     assert currents == list(range(4, 11))
     plain = {
-        w.observed.indices[-1]: label_of(measure(w.future), LabelConfig())
-        for w in cut_windows(flight_in(tree), NO_IMAGES)
+        w.observed.indices[-1]: ACTION_TABLE.label_of(measure(w.future))
+        for w in cut_windows(flight_in(tree), NO_IMAGES, ACTION_TABLE)
     }
     for now, window in zip(currents, windows, strict=True):
-        label, known = label_of(measure(window.future), LabelConfig()), window.observed.mission
+        label, known = ACTION_TABLE.label_of(measure(window.future)), window.observed.mission
         assert (label, known) == ((plain[now], None) if now < 8 else ("break_off", "battery"))
 
 
 def test_no_label_comes_from_an_order_that_nobody_knows_yet(ordered):
     """The turn for home, seen from before the order, would be a turn after the walker."""
-    windows = list(cut_windows(flight_in(ordered), WindowConfig(require_images=False, future_frames=3)))
+    windows = list(cut_windows(flight_in(ordered), WindowConfig(require_images=False, future_frames=3), ACTION_TABLE))
     problems = {w.observed.indices[-1]: w.problem for w in windows}
     assert problems == {now: "order_to_come" if now in (5, 6, 7) else None for now in range(4, 13)}
 
@@ -460,7 +464,8 @@ def test_no_label_comes_from_an_order_that_nobody_knows_yet(ordered):
 def test_a_mission_reaches_no_request_before_its_order_stands(tree, ordered):
     def users(root):
         asked = [
-            make_question(w.observed, ImageConfig(), "slots").asked for w in cut_windows(flight_in(root), NO_IMAGES)
+            make_question(w.observed, ImageConfig(), "slots", VOCABULARY).asked
+            for w in cut_windows(flight_in(root), NO_IMAGES, ACTION_TABLE)
         ]
         return [(prompts["en"].user, prompts["zh"].user) for prompts in asked]
 
@@ -531,8 +536,8 @@ def test_a_run_reports_what_it_saved(tmp_path):
     ids = {caption.sample_id for caption in taken}
     cfg = CaptionConfig.model_validate({"window": window})
     for folder in find_flights(tree):
-        samples = list(cut_windows(read_flight(folder), cfg.window))
-        labels = [label_of(measure(sample.future), cfg.label) for sample in samples]
+        samples = list(cut_windows(read_flight(folder), cfg.window, ACTION_TABLE))
+        labels = [ACTION_TABLE.label_of(measure(sample.future)) for sample in samples]
         for before, after, sample in zip(labels, labels[1:], samples[1:], strict=False):
             assert before == after or sample.observed.sample_id in ids
     # The window itself is the same one: only the mark is added.

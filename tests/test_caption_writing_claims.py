@@ -9,7 +9,7 @@ import time
 from contextlib import nullcontext
 
 import pytest
-from specimens_captions import FACTS, deciding, settings
+from specimens_captions import FACTS, VOCABULARY, deciding, settings
 from tables import each
 
 from caption.run.stage import run
@@ -18,10 +18,11 @@ from caption.truth.facts import Facts
 from caption.writing.claims import MAX_CLAIMS, read_claims
 from caption.writing.contract import Draft, Refused, more_fields, way_of
 from cosfly.errors import NothingKept
+from cosfly.products.actions import shipped_actions
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import read_captions
 
-WAY = way_of("claims")
+WAY = way_of("claims", VOCABULARY)
 MORE = tuple(more_fields(WAY))
 ANSWER = {
     "critical_components": "The walker is 18.0 m away and left of the middle.",
@@ -39,7 +40,7 @@ ANSWER = {
 
 
 def read(answer: dict, facts: Facts = FACTS) -> Draft | Refused:
-    parsed = parse_answer(json.dumps(answer), "en", MORE)
+    parsed = parse_answer(json.dumps(answer), shipped_actions(), "en", MORE)
     assert parsed.coc is not None, parsed.reason
     return WAY.read(parsed, facts)
 
@@ -121,7 +122,7 @@ def test_the_mirror_is_held_against_the_same_claims():
     }
 
     def mirrored(**texts: str) -> Draft | Refused:
-        return WAY.read_mirror(parse_answer(json.dumps(chinese | texts), "zh"), english, FACTS)
+        return WAY.read_mirror(parse_answer(json.dumps(chinese | texts), shipped_actions(), "zh"), english, FACTS)
 
     good = mirrored()
     assert isinstance(good, Draft), good
@@ -135,7 +136,7 @@ def test_the_mirror_is_held_against_the_same_claims():
 
 
 def test_the_example_of_the_prompt_is_an_answer_that_is_taken():
-    text = way_prompt("claims").partition("Example, of another flight:\n")[2].splitlines()[0]
+    text = way_prompt(WAY).partition("Example, of another flight:\n")[2].splitlines()[0]
     series = {"speed_mps": (None, 1.0, 1.1, 1.1, 1.2), "distance_m": (14.0, 14.5, 15.0, 16.0, 16.5)}
     facts = dataclasses.replace(FACTS, offset_x_px=(0, -10, -20, -30, -40), **series)
     assert isinstance(read(json.loads(text), facts), Draft), read(json.loads(text), facts)
@@ -156,7 +157,7 @@ def test_the_example_of_the_prompt_is_an_answer_that_is_taken():
 )
 def test_a_huge_or_deep_answer_is_refused_quickly(text):
     start_s = time.perf_counter()
-    assert parse_answer(text, "en", MORE).coc is None
+    assert parse_answer(text, shipped_actions(), "en", MORE).coc is None
     assert time.perf_counter() - start_s < 1.0
 
 

@@ -9,6 +9,7 @@ import re
 import numpy as np
 import pytest
 from PIL import Image
+from specimens_captions import ACTION_TABLE, VOCABULARY
 
 from caption.run.window_loop import caption_window
 from caption.run.windows import cut_windows
@@ -18,6 +19,7 @@ from caption.teachers.prompts import make_question, prompt_hash, question_messag
 from caption.teachers.teacher import RuleTeacher
 from cosfly.errors import InputError
 from cosfly.look.frame_views import PEDESTRIAN_RGB, Pictures, depth_colors, segmentation_colors, thumbnail
+from cosfly.products.actions import shipped_actions
 from cosfly.products.captions import PICTURES_MARK, Language
 from cosfly.products.flights import find_flights
 from cosfly.products.kinds import KINDS
@@ -115,12 +117,12 @@ def sent_pictures(messages: list[dict]) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def window(tree) -> Window:
-    return next(cut_windows(read_flight(find_flights(tree)[0]), WindowConfig()))
+    return next(cut_windows(read_flight(find_flights(tree)[0]), WindowConfig(), ACTION_TABLE))
 
 
 def ask(window: Window, cfg: ImageConfig) -> tuple[dict[Language, str], list[np.ndarray]]:
     """What a teacher is told in both languages, and shown."""
-    question = make_question(window.observed, cfg, "prose")
+    question = make_question(window.observed, cfg, "prose", VOCABULARY)
     messages, _ = question_messages(question, FrameEncoder(cfg))
     assert messages[1]["content"][-1]["text"] == question.asked["en"].user
     return {language: prompt.user for language, prompt in question.asked.items()}, sent_pictures(messages)
@@ -145,14 +147,14 @@ def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, 
     """The teacher gets all three; the student any of them, in any order."""
     image = {"layout": layout, "max_side_px": max_side_px, "depth_range_m": 40.0, "encoding": "png"}
     cfg = CaptionConfig.model_validate({"image": image, "window": {"require_images": True}})
-    caption = asyncio.run(caption_window(window, RuleTeacher(0), cfg))
+    caption = asyncio.run(caption_window(window, RuleTeacher(0), cfg, VOCABULARY))
     _, shown = ask(window, cfg.image)
     if layout == "tiled":
         shown = [part for picture in shown for part in np.split(picture, 3, axis=1)]
     teachers = [dict(zip(cfg.image.modalities, shown[3 * i : 3 * i + 3], strict=True)) for i in range(5)]
     assert caption.status == "accepted"
     for language in ("en", "zh"):
-        sample = make_sample(caption, language, PrepareConfig(modalities=views))
+        sample = make_sample(caption, language, PrepareConfig(modalities=views), shipped_actions())
         assert isinstance(sample, Sample)
         text, pictures = sample.prompt.user, load_pictures(sample, {"": tree})
         assert PICTURES_MARK not in text
@@ -163,7 +165,9 @@ def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, 
         expected = [teachers[i][view] for i in range(5) for view in views]
         for picture, wanted in zip(pictures, expected, strict=True):
             assert np.array_equal(picture, wanted)
-        request = make_request(sample, {"": tree}, InferConfig().sampling, 0)  # engines `endpoint` and `vllm`
+        request = make_request(
+            sample, {"": tree}, InferConfig().sampling, 0, shipped_actions()
+        )  # engines `endpoint` and `vllm`
         kinds = [part.get("text", "picture") for part in request.messages[1]["content"]]
         assert kinds == [word for i in range(5) for word in (f"t{i}:", *["picture"] * len(views))] + [text]
         for picture, wanted in zip(sent_pictures(request.messages), expected, strict=True):
@@ -172,7 +176,7 @@ def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, 
 
 def test_without_pictures_pixels_are_the_cameras(window):
     blind = dataclasses.replace(window.observed, width_px=1280, height_px=720, frame_files=(frozenset(),) * 5)
-    question = make_question(blind, ImageConfig(), "prose")
+    question = make_question(blind, ImageConfig(), "prose", VOCABULARY)
     assert "No pictures are given. Pixel values refer to pictures of 1280 x 720 px." in question.asked["en"].user
     assert "未提供图像。像素值以 1280 × 720 像素的图像为准。" in question.asked["zh"].user
     assert (question.facts.width_px, question.facts.height_px) == (1280, 720)
@@ -180,7 +184,8 @@ def test_without_pictures_pixels_are_the_cameras(window):
 
 def test_the_hash_is_of_what_was_asked(window):
     few, many = (
-        make_question(window.observed, ImageConfig(modalities=views), "prose") for views in (("rgb",), ("rgb", "depth"))
+        make_question(window.observed, ImageConfig(modalities=views), "prose", VOCABULARY)
+        for views in (("rgb",), ("rgb", "depth"))
     )
     assert few.prompts == many.prompts
     assert prompt_hash(few) != prompt_hash(many)
@@ -202,14 +207,14 @@ def large(tmp_path_factory):
     """A window of a flight in pictures of 640 x 360."""
     root = tmp_path_factory.mktemp("large")
     make_playback_tree(root, 1, 10, seed=1, width_px=640, height_px=360, with_augmented=False)
-    return next(cut_windows(read_flight(find_flights(root)[0]), WindowConfig())).observed
+    return next(cut_windows(read_flight(find_flights(root)[0]), WindowConfig(), ACTION_TABLE)).observed
 
 
 @pytest.mark.parametrize("max_side_px", [640, 500])
 def test_a_size_read_off_the_picture_is_the_measured_one(large, max_side_px):
     """The red person (some 20 x 60 px) of the segmentation that is sent, against the facts, where it is whole."""
     cfg = ImageConfig(modalities=("segmentation",), max_side_px=max_side_px)
-    facts = make_question(large, cfg, "prose").facts
+    facts = make_question(large, cfg, "prose", VOCABULARY).facts
     assert facts.width_px == max_side_px
     compared = 0
     for i, folder in enumerate(large.frame_folders):

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from specimens_distill import make_caption, make_captions, prepared
 
 from cosfly.errors import InputError, NothingKept, ResumeError, VerifyError
-from cosfly.products.actions import action_tokens
+from cosfly.products.actions import shipped_actions
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import write_captions
 from cosfly.products.splits import SPLITS
@@ -44,7 +44,7 @@ def captions(tree, tmp_path_factory) -> Path:
 
 def sample_of(trajectory="trajectory_1", variant="ORI", frame=4, town="Town01", language="en") -> Sample:
     caption = make_caption(town, trajectory, variant, frame)
-    sample = make_sample(caption, language, PrepareConfig(), run="run", walk=f"{town}/{trajectory}")
+    sample = make_sample(caption, language, PrepareConfig(), shipped_actions(), run="run", walk=f"{town}/{trajectory}")
     assert isinstance(sample, Sample)
     return sample
 
@@ -70,8 +70,8 @@ def test_sample_holds_what_the_student_needs():
     sample = sample_of(frame=6)
     assert sample.key == "trajectory_1_ORI_frame_00006/en"
     assert sample.images == [f"Town01/trajectory_1/ORI/frames_playback/frame_{i:05d}/rgb.png" for i in (2, 3, 4, 5, 6)]
-    assert parse_answer(sample.answer).coc is not None
-    assert parse_answer(sample.answer).recovered == ()
+    assert parse_answer(sample.answer, shipped_actions()).coc is not None
+    assert parse_answer(sample.answer, shipped_actions()).recovered == ()
     assert json.loads(sample.answer)["flight_decision"] == sample.decision
     assert "行人" in sample_of(language="zh").answer  # not escaped: escapes would cost tokens
 
@@ -90,7 +90,7 @@ def test_which_captions_teach_and_how_much():
 
     def made(changes: dict, language: str = "en", variant: str = "ORI", **settings) -> Sample | str:
         caption = make_caption("Town01", "trajectory_1", variant, 4, **changes)
-        return make_sample(caption, language, PrepareConfig(**settings))
+        return make_sample(caption, language, PrepareConfig(**settings), shipped_actions())
 
     for changes, language, settings, reason in (
         ({"status": "dropped", "drop_reason": "hard_conflict"}, "en", {}, "dropped_hard_conflict"),
@@ -127,11 +127,11 @@ def test_which_captions_teach_and_how_much():
 def test_what_is_proved_is_carried_weighed_and_filtered(states, proved, weight):
     checks = {"sentences": {"en": states}} if states else {}
     caption = make_caption("Town01", "trajectory_1", "ORI", 4, checks=checks)
-    sample = make_sample(caption, "en", PrepareConfig(weigh_proved=True))
+    sample = make_sample(caption, "en", PrepareConfig(weigh_proved=True), shipped_actions())
     assert (sample.proved, sample.weight) == (proved, weight)
-    strict = make_sample(caption, "en", PrepareConfig(min_proved=0.5))
+    strict = make_sample(caption, "en", PrepareConfig(min_proved=0.5), shipped_actions())
     assert strict == "too_little_proved" if (proved or 0.0) < 0.5 else strict.weight == 1.0
-    assert make_sample(caption, "zh", PrepareConfig(min_proved=0.5)) == "too_little_proved"
+    assert make_sample(caption, "zh", PrepareConfig(min_proved=0.5), shipped_actions()) == "too_little_proved"
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +151,7 @@ def asked(tmp_path_factory):
 @pytest.mark.parametrize("language", ["en", "zh"])
 def test_a_student_may_get_text_alone_or_pictures_alone(asked, language):
     both, text, pictures = (
-        make_sample(asked, language, PrepareConfig(modalities=views, text_state=state))
+        make_sample(asked, language, PrepareConfig(modalities=views, text_state=state), shipped_actions())
         for views, state in ((("rgb",), True), ((), True), (("rgb",), False))
     )
     told = {"en": "No pictures are given.", "zh": "未提供图像。"}[language]
@@ -390,7 +390,7 @@ def balanced(windows: list[tuple[str, str]], ratio: float, seed: int = 0) -> lis
 
 
 @given(
-    counts=st.dictionaries(st.sampled_from(action_tokens()), st.integers(1, 60), min_size=1),
+    counts=st.dictionaries(st.sampled_from(shipped_actions().tokens), st.integers(1, 60), min_size=1),
     ratio=st.sampled_from([0.01, 0.3, 1.0, 1.7, 20.0]),
     seed=st.integers(0, 3),
 )
@@ -410,10 +410,10 @@ def test_stray_decisions_do_not_take_the_others_with_them():
 
 def test_the_cost_by_hand():
     windows = windows_of({"track_straight": 8, "hover": 2, "slow_down": 2})
-    cost = balance_of(ranked([("group", *window) for window in windows]), ["group"], 0.5).cost(12)
+    cost = balance_of(ranked([("group", *window) for window in windows]), ["group"], 0.5).cost(12, shipped_actions())
     # Effective decisions before: 1.5 ** (2 / 3) * 6 ** (1 / 3), then three of one size.
     assert cost.pop("effective_decisions") == [pytest.approx(2.38, abs=0.01), 3.0]
-    assert set(cost.pop("absent")) == set(action_tokens()) - {"track_straight", "hover", "slow_down"}
+    assert set(cost.pop("absent")) == set(shipped_actions().tokens) - {"track_straight", "hover", "slow_down"}
     assert cost == {
         "ratio": 0.5, "most_windows": 2, "windows": {"hover": 2, "slow_down": 2, "track_straight": 8},
         "windows_left_out": {"track_straight": 6}, "samples_left_out": 12,
@@ -421,7 +421,7 @@ def test_the_cost_by_hand():
 
 
 @given(
-    counts=st.dictionaries(st.sampled_from(action_tokens()), st.integers(1, 60), min_size=1),
+    counts=st.dictionaries(st.sampled_from(shipped_actions().tokens), st.integers(1, 60), min_size=1),
     part=st.floats(0.0, 1.2),
     seed=st.integers(0, 2),
     ratio=st.sampled_from([0.0, 0.5, 1.0]),

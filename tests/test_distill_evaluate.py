@@ -17,6 +17,7 @@ from specimens_distill import make_caption, write_set
 
 from cosfly.chat.answers import AnswerBook
 from cosfly.errors import ConfigError, InputError
+from cosfly.products.actions import shipped_actions
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import write_captions
 from cosfly.products.flights import find_flights
@@ -38,6 +39,7 @@ from distill.evaluation.measure import (
     text_of,
 )
 from distill.evaluation.scores import (
+    COLUMNS,
     STATES,
     VERDICTS,
     ScoredAnswer,
@@ -58,7 +60,9 @@ from specimens import make_playback_tree
 
 
 def sample_of(frame: int, language: str = "en") -> Sample:
-    return make_sample(make_caption("Town01", "trajectory_1", "ORI", frame), language, PrepareConfig())
+    return make_sample(
+        make_caption("Town01", "trajectory_1", "ORI", frame), language, PrepareConfig(), shipped_actions()
+    )
 
 
 # Frames 4..11 have the decisions slow_down, track, yaw_left, track, slow_down, track, yaw_left, track (see
@@ -80,7 +84,10 @@ def predictions_of(samples: list[Sample]) -> list[Prediction]:
     texts[3] = texts[3][:40]
     texts[4] = "I would slow down."
     texts[5] = f"```json\n{texts[5]}\n```"
-    return [make_prediction(sample, "test", text, 9, True) for sample, text in zip(samples, texts, strict=True)]
+    return [
+        make_prediction(sample, "test", text, 9, True, shipped_actions())
+        for sample, text in zip(samples, texts, strict=True)
+    ]
 
 
 @pytest.fixture
@@ -93,7 +100,7 @@ def samples() -> list[Sample]:
 def scores_of(samples, predictions=None, **more) -> Scores:
     pairs = pair_up(samples, predictions or predictions_of(samples))
     answers = [ScoredAnswer.of(prediction) for _, prediction in pairs]
-    return score_answers([sample for sample, _ in pairs], answers, **more)
+    return score_answers([sample for sample, _ in pairs], answers, shipped_actions(), **more)
 
 
 def figures(scores: Scores, resamples: int = 200, confidence: float = 0.95):
@@ -130,7 +137,7 @@ def test_measured_numbers_by_hand(samples):
 
 def test_failures_are_no_wrong_answers(samples):
     predictions = predictions_of(samples)
-    predictions[7] = failed_prediction(samples[7], "test", "damaged_picture")  # was right
+    predictions[7] = failed_prediction(samples[7], "test", "damaged_picture", shipped_actions())  # was right
     found, _ = figures(scores_of(samples, predictions))
     assert (found["answered"].value, found["answered"].count) == (7 / 8, 8)
     assert (found["accuracy"].value, found["accuracy"].count) == (3 / 7, 7)
@@ -182,7 +189,8 @@ def made_up(num_walks: int, rng: np.random.Generator, *, size: int = 6, skill: f
     codes = {name: np.full(count, -1, dtype=np.int8) for name in ("label", "verdict")}
     flags = {name: np.ones(count, dtype=bool) for name in ("answered", "unmended")}
     answer, tokens = np.where(right, reference, 5).astype(np.int8), np.zeros(count, dtype=np.int64)
-    return Scores(reference=reference, answer=answer, num_tokens=tokens, **texts, **unknown, **codes, **flags)
+    known = {"reference": reference, "answer": answer, "num_tokens": tokens}
+    return Scores(shipped_actions(), **known, **texts, **unknown, **codes, **flags)
 
 
 def test_intervals_agree_with_the_bootstrap_of_scipy():
@@ -226,8 +234,8 @@ def test_scores_survive_the_disk(tmp_path, samples):
     texts = np.random.default_rng(0).random((8, 3))
     scores = scores_of(samples, texts=texts, judged={samples[0].key: ["proved"]})
     write_scores(tmp_path / "scores.parquet", scores)
-    again = read_scores(tmp_path / "scores.parquet")
-    for name in Scores.__dataclass_fields__:
+    again = read_scores(tmp_path / "scores.parquet", shipped_actions())
+    for name in COLUMNS:
         found, wanted = getattr(again, name), getattr(scores, name)
         assert np.array_equal(found, wanted, equal_nan=name in STATES), name
         assert found.dtype == wanted.dtype
@@ -245,13 +253,15 @@ def test_shuffling_leaves_nothing_in_its_place(count, seed):
 
 def test_floors_by_hand(samples):
     train = [sample.model_copy(update={"decision": "hover"}) for sample in samples[:3]] + samples[3:5]
-    answers = Floors(train, "en", 0).answers(samples, [coc_of(sample) for sample in samples])
+    answers = Floors(train, "en", 0, shipped_actions()).answers(samples, [coc_of(sample) for sample in samples])
     decisions = {name: [answer.coc.flight_decision for answer in own] for name, own in answers.items()}
     assert set(decisions["majority"]) == {"hover"}
     assert sorted(decisions["shuffled"]) == sorted(DECISIONS)
     assert len({answer.coc.reasoning_trace for answer in answers["constant"]}) == 1
-    assert list(Floors([], "en", 0).answers(samples[:1], [coc_of(samples[0])])) == ["teacher"]
-    assert majority(["slow_down", "track_straight"]) == "track_straight"  # a tie goes to the first of the action table
+    assert list(Floors([], "en", 0, shipped_actions()).answers(samples[:1], [coc_of(samples[0])])) == ["teacher"]
+    assert (
+        majority(["slow_down", "track_straight"], shipped_actions()) == "track_straight"
+    )  # a tie goes to the first of the action table
 
 
 def test_a_rule_on_the_numbers_of_the_prompt_beats_the_majority(samples):
@@ -268,7 +278,7 @@ def test_a_rule_on_the_numbers_of_the_prompt_beats_the_majority(samples):
             found.append(samples[0].model_copy(update={"prompt": prompt, "decision": decision}))
         return found
 
-    floors, asked = Floors(told(400), "en", 0), told(100)
+    floors, asked = Floors(told(400), "en", 0, shipped_actions()), told(100)
     answers = floors.answers(asked, [coc_of(sample) for sample in asked])
     decisions = {name: np.array([answer.coc.flight_decision for answer in own]) for name, own in answers.items()}
     wanted = np.array([sample.decision for sample in asked])
@@ -282,7 +292,10 @@ def test_floors_are_predictions_that_a_verifier_can_judge(place):
     for path in paths:
         found = read_predictions(path)
         assert len(found) == 16
-        assert all(parse_answer(prediction.raw, prediction.language).coc == prediction.coc for prediction in found)
+        assert all(
+            parse_answer(prediction.raw, shipped_actions(), prediction.language).coc == prediction.coc
+            for prediction in found
+        )
         decisions = {
             p.key: p.coc.flight_decision for p in found
         }  # a verifier holds the two languages against each other
@@ -424,7 +437,9 @@ def test_speed_comes_from_what_stands_beside_the_predictions(place):
 def test_students_side_by_side(place):
     predictions = read_predictions(place / "predictions.jsonl")
     samples = {sample.key: sample for sample in open_split(place / "set", "test")}
-    right = [make_prediction(samples[p.key], "test", samples[p.key].answer, 5, True) for p in predictions]
+    right = [
+        make_prediction(samples[p.key], "test", samples[p.key].answer, 5, True, shipped_actions()) for p in predictions
+    ]
     write_predictions(place, right, "right.jsonl")
     for name in ("predictions", "right"):
         run(CFG, place / f"{name}.jsonl", place / "set", place / "students" / name)
@@ -446,7 +461,7 @@ def test_students_side_by_side(place):
 def test_students_of_other_references_are_not_compared(place):
     """Two sets of other captions call their samples alike. What was asked may differ: another prompt is an ablation."""
     samples = list(open_split(place / "set", "test"))
-    predictions = [make_prediction(samples[0], "test", samples[0].answer, 5, True)]
+    predictions = [make_prediction(samples[0], "test", samples[0].answer, 5, True, shipped_actions())]
     coc = coc_of(samples[0])
     other = dump_json(coc.model_copy(update={"reasoning_trace": coc.reasoning_trace + " So it is."}).model_dump())
     blind = {"prompt": samples[0].prompt.model_copy(update={"user": "Nothing is given."})}

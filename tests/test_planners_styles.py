@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from specimens_captions import ACTION_TABLE
 from specimens_planning import CANYON, WORLDS, assert_safe, town_of, walk_along
 
-from caption.schema import FutureMotion, LabelConfig
-from caption.truth.actions import label_of, measure
+from caption.schema import FutureMotion
+from caption.truth.actions import measure
 from cosfly.app.settings import RunConfig
 from cosfly.errors import InputError, NoPathError
 from cosfly.geometry import look_at, wrap_deg
@@ -23,7 +24,7 @@ from cosfly.planners.intent import draw_intent, draw_styles
 from cosfly.planners.reacquire import finds_again, screens_of
 from cosfly.planners.stage import draw_styles_of, make_scenario, plan_flight, run, style_rng
 from cosfly.planners.styles import ALTITUDE_LEAST_M, FOLLOW, HIDING, NAMES, OTHER_SIDE, REACQUIRE, RETURN_HOME, TABLE
-from cosfly.products.actions import actions_in_use
+from cosfly.products.actions import shipped_actions
 from cosfly.products.boxes import MapHeader, make_box_map, write_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.products.segments import Mission, read_mission, read_segments
@@ -58,7 +59,7 @@ def labels_of(trace):
             trace.targets_m[span], visible[span], float(np.linalg.norm(before)) / 0.5,
             order=None if trace.mission is None else trace.mission.order_at(now),
         )  # fmt: skip
-        found.append(label_of(measure(future), LabelConfig()))
+        found.append(ACTION_TABLE.label_of(measure(future)))
     return Counter(found)
 
 
@@ -322,7 +323,7 @@ def test_diverse_shows_each_decision_and_all_heights_and_distances_whatever_the_
     kept = [trace for trace in flights if trace.drop_reason is None]
     assert len(kept) >= 78
     labels = sum(map(labels_of, kept), Counter())
-    for name in actions_in_use().actions.keys() - ORDERS:
+    for name in shipped_actions().actions.keys() - ORDERS:
         assert labels[name] >= DECISIONS_LEAST * labels.total(), (name, labels)
     for over, low_m, high_m in ((2, 10, 50), (3, 12, 50)):
         away = np.concatenate([trace.positions_m - trace.targets_m for trace in kept])

@@ -25,7 +25,7 @@ from specimens_release import rows_by_id
 from specimens_rows import make_row
 
 from cosfly.errors import InputError
-from cosfly.products.actions import action_tokens
+from cosfly.products.actions import shipped_actions
 from cosfly.reading.arrays import parse_picture
 from release.card.croissant import CROISSANT, render_croissant
 from release.card.numbers import COLUMNS, RowCounts, Sum, compute_numbers, spread_of
@@ -195,7 +195,7 @@ def test_the_card_says_whom_it_is_not_for_and_whom_to_cite(record):
 
 def test_limits_are_those_of_the_numbers(record):
     card = render_card(record)
-    missing = [name for name in action_tokens() if name not in record.numbers.captions.frames_by["decision"]]
+    missing = [name for name in shipped_actions().tokens if name not in record.numbers.captions.frames_by["decision"]]
     line = next(line for line in card.splitlines() if line.startswith("- Decisions that no caption has"))
     assert all(f"`{name}`" in line for name in missing)
     assert "rule teacher" in card

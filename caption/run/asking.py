@@ -24,6 +24,7 @@ from caption.schema import CaptionConfig, Window
 from caption.teachers.judge import open_judge
 from caption.teachers.reader import open_reader
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
+from caption.truth.vocabulary import Vocabulary
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.budget import BudgetSpent
 from cosfly.chat.contract import NoAnswer, Troubles
@@ -68,13 +69,20 @@ class Asking:
     """One run of a teacher over the allotted flights."""
 
     def __init__(
-        self, stage: StageFolder, cfg: CaptionConfig, seed: int, *, retry_failed: bool = False, was_whole: bool = False
+        self,
+        stage: StageFolder,
+        cfg: CaptionConfig,
+        vocabulary: Vocabulary,
+        seed: int,
+        *,
+        retry_failed: bool = False,
+        was_whole: bool = False,
     ) -> None:
         """
         Args:
             was_whole: the folder was complete before `retry_failed`: of a flight without a part nothing can be asked.
         """
-        self.stage, self.cfg, self.seed = stage, cfg, seed
+        self.stage, self.cfg, self.vocabulary, self.seed = stage, cfg, vocabulary, seed
         self.asked = Asked(Tally())
         self.failures: list[Failed] = []  # flights that cannot be read
         self.quarantine = read_quarantine(stage.path)
@@ -101,8 +109,8 @@ class Asking:
             with answers, judgements, readings, display as self.display:
                 async with (
                     open_teacher(self.cfg, answers, self.seed, budget, self.only, troubles) as teacher,
-                    open_judge(self.cfg.judge, self.seed, judgements, budget, troubles) as self.judge,
-                    open_reader(self.cfg.reader, self.seed, readings, budget, troubles) as self.reader,
+                    open_judge(self.cfg.judge, self.vocabulary, self.seed, judgements, budget, troubles) as self.judge,
+                    open_reader(self.cfg.reader, self.vocabulary, self.seed, readings, budget, troubles) as self.reader,
                     self._heartbeat(),
                 ):
                     await self._ask_all(allotted, teacher, guesses)
@@ -160,7 +168,7 @@ class Asking:
         flight, tally = _OpenFlight(allotted), self.asked.flights
         num_windows = 0
         try:
-            for window in allotted.windows(self.cfg):
+            for window in allotted.windows(self.cfg, self.vocabulary):
                 num_windows += 1
                 flight.pending += 1
                 running.add(asyncio.create_task(self._one(flight, window, teacher)))
@@ -192,7 +200,7 @@ class Asking:
     async def _caption(self, flight: _OpenFlight, window: Window, teacher: Teacher) -> None:
         sample_id, begun_s = window.observed.sample_id, time.monotonic()
         try:
-            caption = await caption_window(window, teacher, self.cfg, self.judge, self.reader)
+            caption = await caption_window(window, teacher, self.cfg, self.vocabulary, self.judge, self.reader)
         except BudgetSpent as error:
             self.asked.stopped = self.asked.stopped or error.what
             self._leave_out(flight, Failed(id=sample_id, code="not_asked", message=error.what))

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from pydantic import BaseModel, ConfigDict
 
-from cosfly.products.actions import action_tokens
 from cosfly.products.captions import Caption, Language
 from cosfly.work.store import sha256_bytes
 
@@ -54,9 +53,11 @@ class ChanceReport(BaseModel):
 
 
 class ChanceCounts:
-    """Counts windows one by one; memory grows with the number of distinct texts only, by a short hash each."""
+    """Counts windows one by one; memory grows with the number of distinct texts only, by a short hash each. tokens: of
+    all actions."""
 
-    def __init__(self) -> None:
+    def __init__(self, tokens: Sequence[str]) -> None:
+        self.tokens = tokens
         self.num_windows = 0
         self.decisions: Counter[str] = Counter()
         self.verdicts: Counter[str] = Counter()
@@ -76,7 +77,7 @@ class ChanceCounts:
         self.verdicts[str(repair.first_verdict if repair else caption.verdict)] += 1
         self.hard.update(contradicted)
         if caption.label is None:
-            self.open.update(set(action_tokens()) - set(contradicted))
+            self.open.update(set(self.tokens) - set(contradicted))
         else:
             self.labels[caption.label] += 1
         for language, texts in self.texts.items():
@@ -92,13 +93,13 @@ class ChanceCounts:
         if n == 0:
             return None
         first = Shares(**{name.lower(): self.verdicts[name] / n for name in _VERDICTS})
-        best = max(action_tokens(), key=lambda action: self.labels[action])
-        shuffled = self._expected((action, self.decisions[action] / n) for action in action_tokens())
+        best = max(self.tokens, key=lambda action: self.labels[action])
+        shuffled = self._expected((action, self.decisions[action] / n) for action in self.tokens)
         constant = self._expected([(best, 1.0)])
         return ChanceReport(
             windows=n,
             first_answers=first,
-            random_decisions=self._expected((action, 1.0 / len(action_tokens())) for action in action_tokens()),
+            random_decisions=self._expected((action, 1.0 / len(self.tokens)) for action in self.tokens),
             shuffled_decisions=shuffled,
             one_decision=constant,
             decision=best,

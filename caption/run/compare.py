@@ -19,10 +19,11 @@ from rich.table import Table
 
 from caption.run.asking import ANSWERS
 from caption.run.flights import allot, named_flights
-from caption.run.own_files import own_files
+from caption.run.own_files import vocabulary_of
 from caption.run.window_loop import Trial, try_strategy
 from caption.schema import CaptionConfig, Strategy, Window
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
+from caption.truth.vocabulary import Vocabulary
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.contract import NoAnswer
 from cosfly.chat.interrupts import run_until_interrupted
@@ -84,8 +85,7 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
         raise ConfigError("captions of a file cannot be asked for again", where="--teacher", got=cfg.teacher)
     out.mkdir(parents=True, exist_ok=True)
     refuse_links(out)
-    with own_files(cfg):
-        num_windows, trials = run_until_interrupted(_try_all(cfg, data, out, seed, conflicts))
+    num_windows, trials = run_until_interrupted(_try_all(cfg, vocabulary_of(cfg), data, out, seed, conflicts))
     if not trials[STRATEGIES[0]]:
         raise InputError("no conflict to repair", where=data, got=f"{num_windows} windows, all without one")
     comparisons = [compare(strategy, trials[strategy]) for strategy in STRATEGIES]
@@ -101,16 +101,16 @@ def run(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, conflicts: 
 
 
 async def _try_all(
-    cfg: CaptionConfig, data: Path, out: Path, seed: int, most: int
+    cfg: CaptionConfig, vocabulary: Vocabulary, data: Path, out: Path, seed: int, most: int
 ) -> tuple[int, dict[Strategy, list[Trial]]]:
     trials: dict[Strategy, list[Trial]] = {strategy: [] for strategy in STRATEGIES}
     num_windows = 0
     with AnswerBook(out / ANSWERS) as book:  # the first answer is asked once for all strategies
         async with open_teacher(cfg, book, seed, first_budget(cfg, book.totals)) as teacher:
-            windows = iter(_windows(cfg, data))
+            windows = iter(_windows(cfg, vocabulary, data))
             while batch := list(itertools.islice(windows, cfg.most_in_flight)):
                 num_windows += len(batch)
-                for tried in await asyncio.gather(*(_try_each(window, teacher, cfg) for window in batch)):
+                for tried in await asyncio.gather(*(_try_each(window, teacher, cfg, vocabulary) for window in batch)):
                     if tried is not None and len(trials[STRATEGIES[0]]) < most:
                         for strategy in STRATEGIES:
                             trials[strategy].append(tried[strategy])
@@ -119,12 +119,14 @@ async def _try_all(
     return num_windows, trials
 
 
-async def _try_each(window: Window, teacher: Teacher, cfg: CaptionConfig) -> dict[Strategy, Trial] | None:
+async def _try_each(
+    window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary
+) -> dict[Strategy, Trial] | None:
     """Give a trial per strategy; None where the first answer is no conflict or an answer is missing."""
     found: dict[Strategy, Trial] = {}
     for strategy in STRATEGIES:
         try:
-            trial = await try_strategy(window, teacher, cfg, strategy)
+            trial = await try_strategy(window, teacher, cfg, vocabulary, strategy)
         except NoAnswer:
             return None
         if trial is None:
@@ -133,9 +135,9 @@ async def _try_each(window: Window, teacher: Teacher, cfg: CaptionConfig) -> dic
     return found
 
 
-def _windows(cfg: CaptionConfig, data: Path) -> Iterable[Window]:
-    for flight in allot(named_flights(data, cfg.flights), cfg)[0]:
-        yield from (window for window in flight.windows(cfg) if window.problem is None)
+def _windows(cfg: CaptionConfig, vocabulary: Vocabulary, data: Path) -> Iterable[Window]:
+    for flight in allot(named_flights(data, cfg.flights), cfg, vocabulary)[0]:
+        yield from (window for window in flight.windows(cfg, vocabulary) if window.problem is None)
 
 
 def comparison_table(comparisons: list[Comparison]) -> Table:

@@ -16,15 +16,16 @@ import numpy as np
 
 from caption.run.asking import ANSWERS, READINGS
 from caption.run.flights import Allotted, allot, named_flights
-from caption.run.own_files import own_files
+from caption.run.own_files import vocabulary_of
 from caption.run.progress import duration
 from caption.run.stage import open_stage
 from caption.run.window_loop import caption_window
 from caption.schema import CaptionConfig, Window
-from caption.teachers.prompts import make_question
+from caption.teachers.prompts import Question, make_question
 from caption.teachers.reader import Reader, open_reader
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import AskingTeacher, Teacher, first_budget, open_teacher
+from caption.truth.vocabulary import Vocabulary
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.budget import BudgetSpent
 from cosfly.chat.contract import NoAnswer
@@ -96,20 +97,17 @@ def make_forecast(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, r
     if cfg.teacher_kind != "endpoint" and not cfg.reader.urls:
         expected = "--teacher URL or --reader URL"
         raise ConfigError("a plan needs an endpoint", where="--plan", got=cfg.teacher, expected=expected)
-    with own_files(cfg):
-        return _forecast(as_taught(cfg), data, out, seed, resume)
-
-
-def _forecast(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Resume) -> Forecast:
+    vocabulary = vocabulary_of(cfg)
+    cfg = as_taught(cfg, vocabulary)
     stage = open_stage(cfg, data, out, seed, resume)
-    allotted, _ = allot(named_flights(data, cfg.flights), cfg)
+    allotted, _ = allot(named_flights(data, cfg.flights), cfg, vocabulary)
     left = [flight for flight in allotted if not stage.is_complete and not flight.part(out).exists()]
     guesses = {flight.name: flight.guess_num_windows(cfg.window) for flight in allotted}
     num_windows = sum(guesses[flight.name] for flight in left)
-    windows = _trial_windows([flight for flight in left if guesses[flight.name]], guesses, cfg)
+    windows = _trial_windows([flight for flight in left if guesses[flight.name]], guesses, cfg, vocabulary)
     if not windows:
         raise InputError("no window to plan for", where=data, got=f"{len(left)} flights to do")
-    captions, seconds, image_tokens = run_until_interrupted(_rehearse(cfg, out, seed, windows))
+    captions, seconds, image_tokens = run_until_interrupted(_rehearse(cfg, vocabulary, out, seed, windows))
     return _scaled(captions, seconds, image_tokens, num_windows, sum(guesses.values()) - num_windows, cfg)
 
 
@@ -170,7 +168,9 @@ def estimate(values: Sequence[float]) -> Estimate:
     return Estimate(max(0.0, mean - half), mean, mean + half)
 
 
-def _trial_windows(flights: list[Allotted], guesses: dict[str, int], cfg: CaptionConfig) -> list[Window]:
+def _trial_windows(
+    flights: list[Allotted], guesses: dict[str, int], cfg: CaptionConfig, vocabulary: Vocabulary
+) -> list[Window]:
     """Take windows from flights spread over all, each from another part of its flight."""
     count = min(TRIAL_WINDOWS, sum(guesses[flight.name] for flight in flights))
     windows: dict[str, Window] = {}
@@ -178,7 +178,7 @@ def _trial_windows(flights: list[Allotted], guesses: dict[str, int], cfg: Captio
         flight = flights[number * len(flights) // count]
         position = min(guesses[flight.name] - 1, (2 * number + 1) * guesses[flight.name] // (2 * count))
         try:
-            found = next(itertools.islice(flight.windows(cfg), position, None), None)
+            found = next(itertools.islice(flight.windows(cfg, vocabulary), position, None), None)
         except InputError:
             continue  # the run itself records it
         if found is not None:
@@ -187,19 +187,20 @@ def _trial_windows(flights: list[Allotted], guesses: dict[str, int], cfg: Captio
 
 
 async def _rehearse(
-    cfg: CaptionConfig, out: Path, seed: int, windows: list[Window]
+    cfg: CaptionConfig, vocabulary: Vocabulary, out: Path, seed: int, windows: list[Window]
 ) -> tuple[list[Caption], list[float], int | None]:
     """Give the trial captions, the seconds of each, and the tokens of all pictures of one question."""
     with AnswerBook(out / ANSWERS) as answers, AnswerBook(out / READINGS) as readings:
         budget = first_budget(cfg, answers.totals, readings.totals)
         async with (
             open_teacher(cfg, answers, seed, budget) as teacher,
-            open_reader(cfg.reader, seed, readings, budget) as reader,
+            open_reader(cfg.reader, vocabulary, seed, readings, budget) as reader,
         ):
             image_tokens = None
             if isinstance(teacher, AskingTeacher):
-                image_tokens = await _image_tokens(windows[0], teacher, cfg)
-            results = await asyncio.gather(*(_answered(window, teacher, cfg, reader) for window in windows))
+                question = make_question(windows[0].observed, cfg.image, cfg.writing, vocabulary)
+                image_tokens = await _image_tokens(question, teacher)
+            results = await asyncio.gather(*(_answered(window, teacher, cfg, vocabulary, reader) for window in windows))
         captions = [result for result in results if isinstance(result, Caption)]
         ids = [caption.sample_id for caption in captions]
         seconds = [sum(book.latency_s(flight_of(name), name) for book in (answers, readings)) for name in ids]
@@ -208,16 +209,18 @@ async def _rehearse(
     return captions, seconds, image_tokens
 
 
-async def _answered(window: Window, teacher: Teacher, cfg: CaptionConfig, reader: Reader | None) -> Caption | str:
+async def _answered(
+    window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary, reader: Reader | None
+) -> Caption | str:
     try:
-        return await caption_window(window, teacher, cfg, reader=reader)
+        return await caption_window(window, teacher, cfg, vocabulary, reader=reader)
     except (NoAnswer, BudgetSpent) as error:
         return str(error)
 
 
-async def _image_tokens(window: Window, teacher: AskingTeacher, cfg: CaptionConfig) -> int | None:
+async def _image_tokens(question: Question, teacher: AskingTeacher) -> int | None:
     """Ask one prompt with and without its pictures, for one token each: the difference is theirs."""
-    request = await teacher.request(make_question(window.observed, cfg.image, cfg.writing))
+    request = await teacher.request(question)
     counts: list[int] = []
     for messages in (request.messages, [_without_images(message) for message in request.messages]):
         try:

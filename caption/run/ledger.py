@@ -10,7 +10,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from caption.run.chance import ChanceCounts, ChanceReport
-from cosfly.products.actions import action_tokens, actions_in_use, shipped_actions
+from cosfly.products.actions import ActionSet, shipped_actions
 from cosfly.products.captions import Caption, Language, SentenceState, TeacherRecord, Usage
 from cosfly.products.sentences import sentences_of
 from cosfly.work.stage_folder import Tally
@@ -92,15 +92,14 @@ class CaptionReport(_Record):
     refusals: dict[str, str] = {}  # of dropped windows: reason -> what the server said last
     judge_tokens: Usage | None = None
 
-    @property
-    def warnings(self) -> list[str]:
-        """What a person must know before the captions are used."""
+    def warnings(self, actions: ActionSet) -> list[str]:
+        """Give what a person must know before the captions are used. actions: that they were made with."""
         refused = [
             f"{self.windows.dropped[reason]} windows were dropped: {reason} ({words}); --retry-failed asks about them "
             f"again"
             for reason, words in self.refusals.items()
         ]
-        own = set(actions_in_use().tokens) - set(shipped_actions().tokens)
+        own = set(actions.tokens) - set(shipped_actions().tokens)
         never = [
             f"{token}, an action of yours, was the label of no window; `cosfly caption actions --check FILE` may tell "
             f"why"
@@ -145,12 +144,13 @@ class Shelf:
 class Ledger:
     """Counts captions one by one; memory does not grow with them."""
 
-    def __init__(self) -> None:
+    def __init__(self, actions: ActionSet) -> None:
+        self.actions = actions
         self.windows = Tally()
         self.num_asks = self.num_skipped = self.num_missed = 0
         self.teacher: TeacherRecord | None = None
         self.shelf = Shelf()
-        self.chance = ChanceCounts()
+        self.chance = ChanceCounts(actions.tokens)
         self.words = {name: Counter[str]() for name in WORDS}
         self.keyframes: Counter[str] = Counter()
         self.repairs: Counter[str] = Counter()
@@ -226,7 +226,7 @@ class Ledger:
         return tally
 
     def report(self, flights: Tally, windows: Tally, judge_tokens: Usage | None) -> CaptionReport:
-        order = {token: i for i, token in enumerate((*action_tokens(), "none"))}
+        order = {token: i for i, token in enumerate((*self.actions.tokens, "none"))}
         confusion = _nested(self.confusion, lambda pair: (order[pair[0]], order[pair[1]]))
         return CaptionReport(
             teacher=self.teacher,

@@ -1,42 +1,36 @@
-"""What a run puts in the place of files that ship: its prompts and actions. Read before anything is asked, in use while
-a block runs, copied beside the captions, so that whoever reads them later knows."""
+"""What a run speaks with: its prompts and actions, those that ship or somebody's own. Read before anything is asked;
+what does not ship is copied beside the captions, so that whoever reads them later knows."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from caption.schema import CaptionConfig
-from caption.teachers.prompt_files import PROMPTS, SUFFIX, own_prompts
+from caption.teachers.prompt_files import PROMPTS, SUFFIX, own_prompts, shipped_prompts
 from caption.teachers.rules import DECIDES
+from caption.truth.vocabulary import Vocabulary
 from cosfly.errors import ConfigError
-from cosfly.products.actions import ACTIONS_FILE, ActionSet, read_actions, write_own_actions
+from cosfly.products.actions import ACTIONS_FILE, ActionSet, read_actions, shipped_actions, write_own_actions
 from cosfly.products.captions import OWN_PROMPTS
-from cosfly.work import in_place
 from cosfly.work.store import write_bytes
 
 
-@contextmanager
-def own_files(cfg: CaptionConfig) -> Iterator[None]:
-    """Have the files that the settings name in use while a block runs.
+def vocabulary_of(cfg: CaptionConfig) -> Vocabulary:
+    """Read the files that the settings name.
 
     Raises:
         ConfigError: one of them cannot be used.
     """
-    with in_place.put(prompts=own_prompts(cfg.prompts), actions=_own_actions(cfg)):
-        yield
+    prompts = shipped_prompts() if cfg.prompts is None else own_prompts(cfg.prompts)
+    return Vocabulary(shipped_actions() if cfg.actions is None else _own_actions(cfg, cfg.actions), prompts)
 
 
-def _own_actions(cfg: CaptionConfig) -> ActionSet | None:
-    if cfg.actions is None:
-        return None
-    actions = read_actions(cfg.actions)
+def _own_actions(cfg: CaptionConfig, path: Path) -> ActionSet:
+    actions = read_actions(path)
     lacking = [token for token in DECIDES if token not in actions.tokens]
     if cfg.teacher_kind == "rules" and lacking:
         raise ConfigError(
-            "the rule teacher decides what this set of actions does not hold", where=cfg.actions,
-            got=", ".join(lacking),
+            "the rule teacher decides what this set of actions does not hold", where=path, got=", ".join(lacking),
             fix="keep these, or have another teacher asked (--teacher)",
         )  # fmt: skip
     return actions
@@ -47,12 +41,12 @@ def package_files(cfg: CaptionConfig) -> dict[str, Path]:
     return {"prompts": cfg.prompts or PROMPTS, "action table": cfg.actions or ACTIONS_FILE}
 
 
-def keep_own_files(out: Path) -> list[Path]:
+def keep_own_files(out: Path, vocabulary: Vocabulary) -> list[Path]:
     """Copy what is in use and does not ship beside the captions; gives what was written."""
-    texts: dict[str, str] = in_place.given("prompts") or {}
+    texts = {} if vocabulary.prompts == shipped_prompts() else vocabulary.prompts
     paths = [out / OWN_PROMPTS / f"{name}{SUFFIX}" for name in texts]
     if paths:
         (out / OWN_PROMPTS).mkdir(exist_ok=True)
     for path, text in zip(paths, texts.values(), strict=True):
         write_bytes(path, text.encode())
-    return [*paths, *write_own_actions(out)]
+    return [*paths, *write_own_actions(out, vocabulary.actions)]

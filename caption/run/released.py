@@ -8,24 +8,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from functools import lru_cache
 
 import numpy as np
 
 from caption.run.windows import LabelMotion, cut_future, frames_of, label_motion
 from caption.schema import EvidenceConfig, FutureMotion, LabelConfig, ObservedFrame, ObservedWindow
+from caption.teachers.prompt_files import shipped_prompts
 from caption.teachers.prompts import mission_lines, system_prompt, user_prompts
 from caption.teachers.reader import judge_text
-from caption.truth.actions import label_of, measure, verdict_of
+from caption.truth.actions import Motion, measure, table_of
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.mirror import check_mirror, flight_numbers
-from caption.writing.contract import WAYS, Draft, Refused, way_of
-from cosfly.products.actions import actions_in_use
+from caption.truth.vocabulary import Vocabulary
+from caption.writing.contract import WAYS, Draft, Refused, WayOfWriting, way_of
+from cosfly.products.actions import ActionSet
 from cosfly.products.answer_text import Parsed
-from cosfly.products.captions import Coc, Evidence, Language, Writing
+from cosfly.products.captions import Coc, Evidence, Language
 from cosfly.products.shown_captions import Lie, ShownCaption, ShownFlight
 from cosfly.reading.documents import parse_json
-from cosfly.work import in_place
 
 NUDGE = 1e-9  # of a threshold: what taking offsets off again may cost
 MOST_SHOWN = 160  # characters of a text in a finding
@@ -33,14 +34,10 @@ MOST_SHOWN = 160  # characters of a text in a finding
 
 def read_released(shown: ShownFlight) -> list[Lie]:
     """Say what of a flight's captions cannot be."""
-    with in_place.put(prompts=shown.prompts or None):
-        return _read_released(shown)
-
-
-def _read_released(shown: ShownFlight) -> list[Lie]:
+    vocabulary = _vocabulary(shown.actions, tuple(shown.prompts.items()))
     rows = {int(index): row for row, index in enumerate(shown.frame_indices)}
     motion, frames = label_motion(shown.flight, shown.twin), frames_of(shown.flight)
-    evidence_cfg = EvidenceConfig.model_validate((shown.settings or {}).get("evidence", {}))
+    evidence_cfg = EvidenceConfig.model_validate(shown.settings.get("evidence", {}))
     lies: list[Lie] = []
     for caption in shown.captions:
         picked = [rows.get(index) for index in caption.window]
@@ -48,10 +45,16 @@ def _read_released(shown: ShownFlight) -> list[Lie]:
             continue  # found by release verify itself
         mission = _mission_of(caption)
         window = _window(shown, frames, caption, [row for row in picked if row is not None], mission)
-        lies += _prompt_lies(window, caption)
-        lies += _text_lies(window, caption, evidence_cfg)
+        lies += _prompt_lies(window, caption, vocabulary)
+        lies += _text_lies(window, caption, evidence_cfg, vocabulary)
         lies += _label_lies(shown, motion, caption, rows, mission)
     return lies
+
+
+@lru_cache(maxsize=16)
+def _vocabulary(actions: ActionSet, prompts: tuple[tuple[str, str], ...]) -> Vocabulary:
+    """Give the one vocabulary of all flights that are shown with these."""
+    return Vocabulary(actions, shipped_prompts() | dict(prompts))
 
 
 def _mission_of(caption: ShownCaption) -> str | None:
@@ -75,9 +78,9 @@ def _window(
     )  # fmt: skip
 
 
-def _prompt_lies(window: ObservedWindow, caption: ShownCaption) -> list[Lie]:
+def _prompt_lies(window: ObservedWindow, caption: ShownCaption, vocabulary: Vocabulary) -> list[Lie]:
     """The prompt must be the one that the window gives, to the letter: what more it holds nobody could have known."""
-    expected = user_prompts(window, measure_facts(window, caption.picture_px))
+    expected = user_prompts(window, measure_facts(window, caption.picture_px), vocabulary)
     lies = []
     for language, text in caption.prompts.items():
         if text != expected[language]:
@@ -86,7 +89,7 @@ def _prompt_lies(window: ObservedWindow, caption: ShownCaption) -> list[Lie]:
                 Lie("prompt", where, _difference(text, expected[language]), "the flight data of the window's rows")
             )
     for language, text in caption.systems.items():
-        wanted = system_prompt(language)
+        wanted = system_prompt(language, vocabulary)
         if text != wanted:
             where = f"{caption.sample_id}: system_{language}"
             lies.append(
@@ -105,15 +108,14 @@ def _difference(found: str, wanted: str) -> str:
 # --- texts ------------------------------------------------------------------------------------------------------------
 
 
-def _text_lies(window: ObservedWindow, caption: ShownCaption, cfg: EvidenceConfig) -> list[Lie]:
+def _text_lies(window: ObservedWindow, caption: ShownCaption, cfg: EvidenceConfig, vocabulary: Vocabulary) -> list[Lie]:
     """Texts must be what their templates give, each sentence of the state that its evidence gives, and the same in both
     languages."""
     facts = measure_facts(window, caption.picture_px)
     # A decision outside the closed set is found by release verify itself; no template can be filled with it.
-    is_judged = (
-        caption.evidence is not None and caption.writing in WAYS and caption.decision in actions_in_use().actions
-    )
-    lies = state_lies(caption, facts, cfg) if is_judged else []
+    is_closed = caption.decision in vocabulary.actions.actions
+    is_judged = caption.evidence is not None and caption.writing in WAYS and is_closed
+    lies = state_lies(caption, facts, cfg, vocabulary) if is_judged else []
     if len(caption.answers) == 2:
         reason = check_mirror(caption.answers["en"], caption.answers["zh"], flight_numbers(facts))
         if reason is not None:
@@ -121,14 +123,15 @@ def _text_lies(window: ObservedWindow, caption: ShownCaption, cfg: EvidenceConfi
     return lies
 
 
-def state_lies(caption: ShownCaption, facts: Facts, cfg: EvidenceConfig) -> list[Lie]:
+def state_lies(caption: ShownCaption, facts: Facts, cfg: EvidenceConfig, vocabulary: Vocabulary) -> list[Lie]:
     assert caption.evidence is not None
+    way = way_of(caption.writing, vocabulary)
     try:
         evidence = Evidence.model_validate(parse_json(caption.evidence))
     except ValueError as error:
         got = " ".join(str(error).split())[:MOST_SHOWN]
         return [Lie("evidence", f"{caption.sample_id}: evidence", got, "JSON of what its states follow from")]
-    drafts = drafts_of(caption.answers, caption.writing, evidence, facts)
+    drafts = drafts_of(caption.answers, way, evidence, facts)
     if isinstance(drafts, Refused):
         got = f"{drafts.reason}: {drafts.complaint}"[:MOST_SHOWN]
         return [Lie("evidence", f"{caption.sample_id}: evidence", got, "templates that the flight fills")]
@@ -141,7 +144,7 @@ def state_lies(caption: ShownCaption, facts: Facts, cfg: EvidenceConfig) -> list
             lies.append(Lie("caption_text", where, got, "the text that its template gives of the flight"))
             continue
         states = caption.states.get(language)
-        judged = judge_text(draft, caption.writing, evidence.reader, facts, cfg, language)
+        judged = judge_text(draft, way, evidence.reader, facts, cfg, language)
         wrong = [n for n, one in enumerate(judged) if states is not None and states[n : n + 1] != (one.state,)]
         if wrong:
             one, called = judged[wrong[0]], (states or ())[wrong[0] : wrong[0] + 1]
@@ -152,11 +155,11 @@ def state_lies(caption: ShownCaption, facts: Facts, cfg: EvidenceConfig) -> list
 
 
 def drafts_of(
-    answers: Mapping[Language, Coc], writing: Writing, evidence: Evidence, facts: Facts
+    answers: Mapping[Language, Coc], way: WayOfWriting, evidence: Evidence, facts: Facts
 ) -> dict[Language, Draft] | Refused:
     """Make the texts of a caption again, from its templates where it was written with slots."""
-    if writing != "slots":
-        claims = tuple(evidence.claims or ()) if writing == "claims" else ()
+    if way.name != "slots":
+        claims = tuple(evidence.claims or ()) if way.name == "claims" else ()
         return {language: Draft(coc, claims=claims) for language, coc in answers.items()}
     written: dict[Language, Parsed] = {
         language: Parsed(
@@ -168,10 +171,10 @@ def drafts_of(
     }
     if set(written) != set(answers):
         return Refused("slots", f"templates in {', '.join(written) or 'no language'}")
-    english = way_of("slots").read(written["en"], facts)
+    english = way.read(written["en"], facts)
     if isinstance(english, Refused) or "zh" not in written:
         return english if isinstance(english, Refused) else {"en": english}
-    chinese = way_of("slots").read_mirror(written["zh"], english, facts)
+    chinese = way.read_mirror(written["zh"], english, facts)
     return chinese if isinstance(chinese, Refused) else {"en": english, "zh": chinese}
 
 
@@ -183,12 +186,12 @@ def _label_lies(
 ) -> list[Lie]:
     """The label must be what the frames after the window show, where these are released."""
     where = f"{caption.sample_id}: label"
-    action = actions_in_use().actions.get(caption.label or "")
+    action = shown.actions.actions.get(caption.label or "")
     is_order = action is not None and action.is_order
     if caption.prompts and is_order != (mission is not None):
         got = f"{caption.label}, and {'an order' if mission else 'no order'} in the prompt"
         return [Lie("label", where, got, "an order as label exactly where the prompt tells of one")]
-    settings = shown.settings or {}
+    settings = shown.settings
     label_cfg = LabelConfig.model_validate(settings.get("label", {}))
     num_future = int(settings.get("window", {}).get("future_frames", 5))
     future = _future(shown, motion, caption, rows, num_future)
@@ -197,23 +200,24 @@ def _label_lies(
     if mission is not None:
         future = replace(future, order=caption.label)
     measured = measure(future)
-    label = label_of(measured, label_cfg)
-    if label != caption.label and caption.label not in _nearly(measured, label_cfg):
+    table = table_of(shown.actions, label_cfg)
+    label = table.label_of(measured)
+    if label != caption.label and caption.label not in _nearly(measured, shown.actions, label_cfg):
         return [Lie("label", where, str(caption.label), f"{label}, which the frames after the window show")]
     if caption.verdict is None:
         return []
-    verdict = verdict_of(caption.decision, measured, label_cfg, caption.label)
+    verdict = table.verdict_of(caption.decision, measured, caption.label)
     if verdict != caption.verdict:
         got = f"{caption.verdict} for {caption.decision} (label {caption.label})"
         return [Lie("verdict", f"{caption.sample_id}: verdict", got, f"{verdict}, by the frames after the window")]
     return []
 
 
-def _nearly(measured: Any, cfg: LabelConfig) -> set[str | None]:
+def _nearly(measured: Motion, actions: ActionSet, cfg: LabelConfig) -> set[str | None]:
     """Give the labels of thresholds a nudge away: a value may lie on one."""
     numbers = {name: value for name, value in cfg.model_dump().items() if name != "absent_share"}
     scaled = [cfg.model_copy(update={n: v * (1.0 + side * NUDGE) for n, v in numbers.items()}) for side in (-1, 1)]
-    return {label_of(measured, one) for one in scaled}
+    return {table_of(actions, one).label_of(measured) for one in scaled}
 
 
 def _future(

@@ -11,7 +11,7 @@ from caption.run.ledger import CaptionReport, Histogram
 from cosfly.chat.budget import BudgetConfig
 from cosfly.look.frame_views import thumbnail
 from cosfly.look.page import page, run_name
-from cosfly.products.actions import action_tokens
+from cosfly.products.actions import ActionSet
 from cosfly.products.captions import Caption, Language
 from cosfly.products.frames import frame_name
 from cosfly.products.places import flight_of
@@ -32,18 +32,29 @@ STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))
 
 
 def write_page(
-    path: Path, report: CaptionReport, cards: Sequence[Caption], folders: Mapping[str, Path], budget: BudgetConfig
+    path: Path,
+    report: CaptionReport,
+    actions: ActionSet,
+    cards: Sequence[Caption],
+    folders: Mapping[str, Path],
+    budget: BudgetConfig,
 ) -> None:
     """Write the page.
 
     Args:
-        report: `caption_report.json`. cards: captions to show. folders: flight id -> its folder, for the pictures.
+        report: `caption_report.json`. actions: that the captions were made with. cards: captions to show. folders:
+            flight id -> its folder, for the pictures.
     """
-    write_bytes(path, page_html(report, cards, folders, budget, run_name(path.parent)).encode())
+    write_bytes(path, page_html(report, actions, cards, folders, budget, run_name(path.parent)).encode())
 
 
 def page_html(
-    report: CaptionReport, cards: Sequence[Caption], folders: Mapping[str, Path], budget: BudgetConfig, name: str
+    report: CaptionReport,
+    actions: ActionSet,
+    cards: Sequence[Caption],
+    folders: Mapping[str, Path],
+    budget: BudgetConfig,
+    name: str,
 ) -> str:
     """Give the page's text; name: of the run."""
     teacher = report.teacher
@@ -53,7 +64,7 @@ def page_html(
         who=f"teacher: {teacher.kind}, model {teacher.model}" if teacher else "teacher: none, model unknown",
         is_rules=teacher is not None and teacher.kind == "rules", tiles=_tiles(report), verdicts=verdicts, share=_share,
         proved_by=_proved_by(report), language_names=LANGUAGE_NAMES, chance=_chance(report),
-        confusion=_confusion(report.confusion),
+        confusion=_confusion(report.confusion, actions.tokens), warnings=report.warnings(actions),
         repairs=_repairs(report), checks=_checks(report),
         cost=_cost(report, budget),
         lengths=[_histogram(language, *one) for language, fields in report.lengths.items() for one in fields.items()],
@@ -103,10 +114,10 @@ def _chance(report: CaptionReport) -> dict[str, Any]:
     }
 
 
-def _confusion(confusion: Mapping[str, Mapping[str, int]]) -> dict[str, list[str]]:
+def _confusion(confusion: Mapping[str, Mapping[str, int]], tokens: Sequence[str]) -> dict[str, list[str]]:
     return {
-        "labels": [name for name in (*action_tokens(), "none") if name in confusion],
-        "decisions": [name for name in action_tokens() if any(name in row for row in confusion.values())],
+        "labels": [name for name in (*tokens, "none") if name in confusion],
+        "decisions": [name for name in tokens if any(name in row for row in confusion.values())],
     }
 
 

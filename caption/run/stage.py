@@ -16,7 +16,7 @@ from pathlib import Path
 from caption.run.asking import ANSWERS, Asked, Asking, common_causes, read_quarantine
 from caption.run.flights import PARTS, Allotted, allot, named_flights, parts_of, restore_parts
 from caption.run.ledger import Ledger
-from caption.run.own_files import keep_own_files, own_files, package_files
+from caption.run.own_files import keep_own_files, package_files, vocabulary_of
 from caption.run.reasons import explained
 from caption.run.report import write_page
 from caption.run.window_loop import caption_prepared, prepare
@@ -25,6 +25,7 @@ from caption.teachers.foreign import given_samples
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import EMBEDDED, Teacher, embedded_teacher
 from caption.truth.glossary import GLOSSARY_FILE
+from caption.truth.vocabulary import Vocabulary
 from cosfly.chat.interrupts import run_until_interrupted
 from cosfly.chat.student_chat import student_files
 from cosfly.errors import ConfigError, ResumeError, TeacherError
@@ -73,13 +74,8 @@ def run(
         raise ConfigError(
             "this teacher never fails to answer", where="--retry-failed", got=cfg.teacher_kind, fix="leave it out"
         )
-    with own_files(cfg):
-        return _run(as_taught(cfg), data, out, seed, workers, watch, resume, retry_failed)
-
-
-def _run(
-    cfg: CaptionConfig, data: Path, out: Path, seed: int, workers: int, watch: Watch, resume: Resume, retry_failed: bool
-) -> Path:
+    vocabulary = vocabulary_of(cfg)
+    cfg = as_taught(cfg, vocabulary)
     foreign = None if cfg.caption_file is None else given_samples(cfg, cfg.caption_file)
     stage = open_stage(cfg, data, out, seed, resume)
     was_whole = stage.is_complete and not _has_more(stage, cfg)
@@ -87,17 +83,19 @@ def _run(
         if read_manifest(out).facts.get("limit") is None:
             shutil.rmtree(out / PARTS, ignore_errors=True)  # a kill came before they were gone
         return out / PRODUCT
-    allotted, is_cut = allot(named_flights(data, cfg.flights), cfg)
+    allotted, is_cut = allot(named_flights(data, cfg.flights), cfg, vocabulary)
     restore_parts(stage.path, out / PRODUCT, allotted)
     if cfg.teacher_kind in EMBEDDED and cfg.judge.url is None and not cfg.reader.urls:
-        asked = Asked(_run_embedded(stage, allotted, cfg, seed, workers, watch))
+        items = [Item(flight.item_id, flight) for flight in allotted]
+        args = (cfg, vocabulary, stage.path, seed)
+        asked = Asked(run_items(stage, items, make_worker, args, workers=workers, watch=watch, label="caption").tally)
     else:
         if retry_failed:
             _take_back(stage, allotted)
-        asked = run_until_interrupted(
-            Asking(stage, cfg, seed, retry_failed=retry_failed, was_whole=was_whole).run(allotted)
-        )
-    ledger = _merge(stage, allotted, foreign, with_gaps=bool(asked.unanswered))
+        asking = Asking(stage, cfg, vocabulary, seed, retry_failed=retry_failed, was_whole=was_whole)
+        asked = run_until_interrupted(asking.run(allotted))
+    ledger = Ledger(vocabulary.actions)
+    _merge(stage, ledger, allotted, foreign, with_gaps=bool(asked.unanswered))
     tally = ledger.tally(len(asked.unanswered))
     is_whole = not (asked.unanswered or asked.num_flights_left)
     if tally.input == 0 and is_whole:
@@ -105,19 +103,20 @@ def _run(
         raise stage.nothing_kept(asked.flights, expected=f"a flight of at least {num_frames} frames")
     report = ledger.report(asked.flights, tally, asked.judge_usage)
     write_json(stage.path / REPORT, report.as_json())
-    for warning in report.warnings:
+    for warning in report.warnings(vocabulary.actions):
         log.warning("caption: %s", warning)
     if foreign and not is_cut:
         log.warning("caption: %d captions of %s are of no window of this tree", len(foreign), cfg.caption_file)
     folders = {flight.name: flight.folder for flight in allotted}
-    write_page(stage.path / PAGE, report, ledger.shelf.cards(), folders, cfg.budget)
+    write_page(stage.path / PAGE, report, vocabulary.actions, ledger.shelf.cards(), folders, cfg.budget)
     if not is_whole:
         _tell_what_is_left(cfg, asked, tally)
         return out / PRODUCT
     if not tally.kept:
         fix = f"mend what is dropped ({explained(tally.dropped)}), or change the settings and choose another --out"
         raise stage.nothing_kept(tally, where=out / PRODUCT, fix=fix)
-    outputs = [out / PRODUCT, out / REPORT, out / PAGE, *sorted((out / ANSWERS).glob("*.jsonl")), *keep_own_files(out)]
+    outputs = [out / PRODUCT, out / REPORT, out / PAGE, *sorted((out / ANSWERS).glob("*.jsonl"))]
+    outputs += keep_own_files(out, vocabulary)
     stage.finish(outputs, tally, flights=asked.flights.model_dump(), limit=cfg.limit if is_cut else None)
     if not is_cut:
         shutil.rmtree(out / PARTS, ignore_errors=True)  # a cut run keeps them, for the next with a larger limit
@@ -207,21 +206,14 @@ def _tell_what_is_left(cfg: CaptionConfig, asked: Asked, tally: Tally) -> None:
 # --- embedded teachers ------------------------------------------------------------------------------------------------
 
 
-def _run_embedded(
-    stage: StageFolder, allotted: list[Allotted], cfg: CaptionConfig, seed: int, workers: int, watch: Watch
-) -> Tally:
-    items = [Item(flight.item_id, flight) for flight in allotted]
-    args = (cfg, stage.path, seed)
-    return run_items(stage, items, make_worker, args, workers=workers, watch=watch, label="caption").tally
-
-
-def make_worker(cfg: CaptionConfig, stage_path: Path, seed: int) -> Work:
+def make_worker(cfg: CaptionConfig, vocabulary: Vocabulary, stage_path: Path, seed: int) -> Work:
     """Make what a process does with one flight."""
     teacher = embedded_teacher(cfg, seed)
 
     def work(item: Item) -> Outcome:
         flight: Allotted = item.payload
-        num_windows = asyncio.run(caption_in_order(flight.windows(cfg), teacher, cfg, flight.part(stage_path)))
+        windows, part = flight.windows(cfg, vocabulary), flight.part(stage_path)
+        num_windows = asyncio.run(caption_in_order(windows, teacher, cfg, vocabulary, part))
         if num_windows == 0:
             return Outcome({}, drop_reason="too_short")
         return Outcome({"windows": num_windows})
@@ -229,7 +221,9 @@ def make_worker(cfg: CaptionConfig, stage_path: Path, seed: int) -> Work:
     return work
 
 
-async def caption_in_order(windows: Iterable[Window], teacher: Teacher, cfg: CaptionConfig, part: Path) -> int:
+async def caption_in_order(
+    windows: Iterable[Window], teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary, part: Path
+) -> int:
     """Caption the windows of a flight in order, and write their part; gives how many there are.
 
     A caption is kept as its line: a hundred times fewer objects, through which the garbage collector would go again and
@@ -238,7 +232,7 @@ async def caption_in_order(windows: Iterable[Window], teacher: Teacher, cfg: Cap
     lines: list[bytes] = []
     rest = iter(windows)
     while some := list(islice(rest, WINDOWS_AT_ONCE)):
-        for prepared in prepare(some, teacher, cfg):
+        for prepared in prepare(some, teacher, cfg, vocabulary):
             lines.append(line_of(await caption_prepared(prepared, teacher, cfg)))
             advance()
     if lines:
@@ -249,14 +243,15 @@ async def caption_in_order(windows: Iterable[Window], teacher: Teacher, cfg: Cap
 # --- the product ------------------------------------------------------------------------------------------------------
 
 
-def _merge(stage: StageFolder, allotted: list[Allotted], foreign: set[str] | None, *, with_gaps: bool) -> Ledger:
+def _merge(
+    stage: StageFolder, ledger: Ledger, allotted: list[Allotted], foreign: set[str] | None, *, with_gaps: bool
+) -> None:
     """Join the parts to `captions.jsonl`, one at a time, and count on the way.
 
     Args:
         foreign: windows of a file of captions; those that are captioned are taken out.
         with_gaps: windows are still without an answer.
     """
-    ledger = Ledger()
     product = stage.path / PRODUCT
     parts = parts_of(stage.path, allotted, with_gaps)
 
@@ -269,4 +264,3 @@ def _merge(stage: StageFolder, allotted: list[Allotted], foreign: set[str] | Non
                 yield line
 
     write_caption_lines(product, (line.encode() for line in lines()))
-    return ledger

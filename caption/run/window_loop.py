@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 from typing import Any, NamedTuple
 
 from caption.schema import CaptionConfig, Judged, Strategy, Window
@@ -17,12 +18,12 @@ from caption.teachers.judge import Case, Judge
 from caption.teachers.prompts import Correction, Question, make_question, prompt_hash
 from caption.teachers.reader import Reader, judge_text
 from caption.teachers.teacher import Teacher, terms_of
-from caption.truth.actions import Motion, contradicted_by, label_of, measure, verdict_of
+from caption.truth.actions import ActionTable, Motion, measure, table_of
 from caption.truth.facts import Facts
-from caption.truth.glossary import load_glossary
 from caption.truth.mirror import check_translation
+from caption.truth.vocabulary import Vocabulary
 from caption.writing.claims import MAX_COMPLAINTS, measured_series
-from caption.writing.contract import Draft, Refused, refuse_decision, way_of
+from caption.writing.contract import Draft, Refused, refuse_decision
 from cosfly.chat.contract import NoAnswer, Reply
 from cosfly.errors import InputError, RenderError
 from cosfly.products.answer_text import Parsed, parse_answer
@@ -49,24 +50,33 @@ class Prepared(NamedTuple):
     question: Question
     prompt_hash: str
     motion: Motion
+    labels: ActionTable
     label: str | None
     contradicted: list[str]
 
 
-def prepare(windows: Sequence[Window], teacher: Teacher, cfg: CaptionConfig) -> list[Prepared]:
+def prepare(windows: Sequence[Window], teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary) -> list[Prepared]:
     """Measure windows and write their questions: each step for all of them, while the processor's caches hold its
     code."""
-    terms = [terms_of(teacher, window.observed.sample_id, cfg) for window in windows]
-    questions = [make_question(w.observed, cfg.image, t.writing) for w, t in zip(windows, terms, strict=True)]
+    terms = [terms_of(teacher, window.observed.sample_id, cfg, vocabulary) for window in windows]
+    questions = [
+        make_question(w.observed, cfg.image, t.writing, vocabulary) for w, t in zip(windows, terms, strict=True)
+    ]
     hashes = [prompt_hash(question) for question in questions]
     motions = [measure(window.future) for window in windows]
-    labels = [label_of(motion, cfg.label) for motion in motions]
-    contradicted = [contradicted_by(m, cfg.label, label) for m, label in zip(motions, labels, strict=True)]
-    return list(map(Prepared, windows, terms, questions, hashes, motions, labels, contradicted))
+    table = table_of(vocabulary.actions, cfg.label)
+    labels = [table.label_of(motion) for motion in motions]
+    contradicted = [table.contradicted_by(m, label) for m, label in zip(motions, labels, strict=True)]
+    return list(map(Prepared, windows, terms, questions, hashes, motions, repeat(table), labels, contradicted))
 
 
 async def caption_window(
-    window: Window, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None, reader: Reader | None = None
+    window: Window,
+    teacher: Teacher,
+    cfg: CaptionConfig,
+    vocabulary: Vocabulary,
+    judge: Judge | None = None,
+    reader: Reader | None = None,
 ) -> Caption:
     """Caption one window.
 
@@ -77,7 +87,7 @@ async def caption_window(
         NoAnswer: the teacher gave none, and asking again later may help.
         TeacherError: no window will get one.
     """
-    [prepared] = prepare([window], teacher, cfg)
+    [prepared] = prepare([window], teacher, cfg, vocabulary)
     return await caption_prepared(prepared, teacher, cfg, judge, reader)
 
 
@@ -85,8 +95,8 @@ async def caption_prepared(
     prepared: Prepared, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None, reader: Reader | None = None
 ) -> Caption:
     """Caption a window that is prepared; as `caption_window`."""
-    window, terms, question = prepared.window, prepared.terms, prepared.question
-    loop = _Loop(teacher, cfg, terms, prepared.motion, prepared.label, judge)
+    window, question = prepared.window, prepared.question
+    loop = _Loop(teacher, cfg, prepared, judge)
     loop.reader = reader
     loop.checks["keyframe"] = window.keyframe
     loop.checks["contradicted"] = prepared.contradicted
@@ -98,7 +108,7 @@ async def caption_prepared(
             if not error.is_final:
                 raise
             reason = error.cause
-            if not terms.is_given:  # else nobody was asked: the file does not hold it
+            if not prepared.terms.is_given:  # else nobody was asked: the file does not hold it
                 loop.checks["refusal"] = error.detail
         except (InputError, RenderError) as error:  # a picture that cannot be read or encoded
             reason = "unreadable_frame"
@@ -151,16 +161,18 @@ class Trial:
     tokens: int
 
 
-async def try_strategy(window: Window, teacher: Teacher, cfg: CaptionConfig, strategy: Strategy) -> Trial | None:
+async def try_strategy(
+    window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary, strategy: Strategy
+) -> Trial | None:
     """Repair a window's first answer by a strategy; None where that answer is none or is not rejected.
 
     Raises:
         NoAnswer: the teacher gave none.
     """
     repair = cfg.repair.model_copy(update={"strategy": strategy})
-    [prepared] = prepare([window], teacher, cfg)
+    [prepared] = prepare([window], teacher, cfg, vocabulary)
     question = prepared.question
-    loop = _Loop(teacher, cfg.model_copy(update={"repair": repair}), prepared.terms, prepared.motion, prepared.label)
+    loop = _Loop(teacher, cfg.model_copy(update={"repair": repair}), prepared)
     if await loop.ask_freely(question) is not None or repair.treatment_of(loop.verdict) == "keep" or loop.label is None:
         return None
     assert loop.english is not None
@@ -179,19 +191,13 @@ def _rungs(strategy: Strategy, max_asks: int) -> list[str]:
 class _Loop:
     """The asks of one window and what came of them."""
 
-    def __init__(
-        self,
-        teacher: Teacher,
-        cfg: CaptionConfig,
-        terms: Terms,
-        motion: Motion,
-        label: str | None,
-        judge: Judge | None = None,
-    ) -> None:
+    def __init__(self, teacher: Teacher, cfg: CaptionConfig, prepared: Prepared, judge: Judge | None = None) -> None:
+        terms = prepared.terms
         once = {"structure_asks": 1, "correction_asks": 0, "mirror_asks": 1}
         self.cfg = cfg.model_copy(update=once) if terms.is_given else cfg
-        self.teacher, self.terms, self.motion, self.label, self.judge = teacher, terms, motion, label, judge
-        self.way = way_of(terms.writing)
+        self.teacher, self.terms, self.judge = teacher, terms, judge
+        self.motion, self.labels, self.label = prepared.motion, prepared.labels, prepared.label
+        self.way = prepared.question.way
         self.english: Draft | None = None
         self.chinese: Draft | None = None
         self.answered: Question | None = None  # the one that `english` answers
@@ -346,7 +352,7 @@ class _Loop:
     def _states_decision(self, fixed: Draft, before: Coc, facts: Facts) -> bool:
         """Tell whether the text states the decision that it was written for, so that another one would make it a
         lie."""
-        if load_glossary().actions[before.flight_decision]["en"] in before.reasoning_trace.lower():
+        if self.way.vocabulary.names[before.flight_decision]["en"] in before.reasoning_trace.lower():
             return True
         judged = self.way.judge(fixed, facts, self.cfg.evidence, "en")
         return any(problem.startswith("decision:") for sentence in judged for problem in sentence.problems)
@@ -374,7 +380,7 @@ class _Loop:
             if isinstance(answer, Refused) or (asked.decision and answer.coc.flight_decision != asked.decision):
                 continue
             decision = answer.coc.flight_decision
-            verdict = verdict_of(decision, self.motion, self.cfg.label, self.label)
+            verdict = self.labels.verdict_of(decision, self.motion, self.label)
             is_enough = (
                 verdict == "CONSISTENT" or self.cfg.repair.strategy != "cascade"
             )  # which has surer rungs to come
@@ -420,7 +426,7 @@ class _Loop:
         nobody's translation."""
         if self.terms.is_given or not self.terms.is_translated or chinese.template is not None:
             return chinese
-        found = check_translation(english.coc, chinese.coc)
+        found = check_translation(english.coc, chinese.coc, self.way.vocabulary)
         return Refused(*found, chinese) if found else chinese
 
     async def _check_evidence(self, question: Question) -> str | None:
@@ -436,7 +442,7 @@ class _Loop:
             self.reading = await self.reader.record(texts, facts, question.window.sample_id)
             self.reading.usage += before.usage if before else Usage()
         judged: dict[Language, list[Judged]] = {
-            language: judge_text(draft, writing, self.reading, facts, self.cfg.evidence, language)
+            language: judge_text(draft, self.way, self.reading, facts, self.cfg.evidence, language)
             for language, draft in drafts.items()
         }
         self.checks["sentences"] = {
@@ -459,7 +465,8 @@ class _Loop:
             self.usage += reply.usage
         self.structured = reply.structured
         more = self.terms.fields if language == "en" else tuple(self.way.optional)
-        parsed = parse_answer(reply.text, language, more, reply.finish_reason, self.way.optional)
+        actions = self.way.vocabulary.actions
+        parsed = parse_answer(reply.text, actions, language, more, reply.finish_reason, self.way.optional)
         if parsed.reason == CONTEXT_FULL:
             usage = reply.usage or Usage()
             self.checks["refusal"] = (
@@ -470,4 +477,4 @@ class _Loop:
 
     def _accept(self, draft: Draft, question: Question) -> None:
         self.english, self.answered = draft, question
-        self.verdict = verdict_of(draft.coc.flight_decision, self.motion, self.cfg.label, self.label)
+        self.verdict = self.labels.verdict_of(draft.coc.flight_decision, self.motion, self.label)

@@ -31,6 +31,7 @@ from caption.teachers.prompts import (
 from caption.teachers.reader import Reader, measure_reader
 from caption.teachers.trials import NO_ANSWER, best_way, try_ways
 from caption.truth.gold import read_gold
+from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import WAYS, more_fields, way_of
 from cosfly.chat.answers import KeptAnswers
 from cosfly.chat.client import ChatClient
@@ -63,14 +64,14 @@ class Finding:
 
 
 def examine_endpoint(
-    url: str, cfg: CaptionConfig, ways: Sequence[Writing] = tuple(WAYS), *, as_reader: bool = False
+    url: str, cfg: CaptionConfig, vocabulary: Vocabulary, ways: Sequence[Writing] = tuple(WAYS), as_reader: bool = False
 ) -> list[Finding]:
     """Try an endpoint. It is usable if no finding is `unusable`.
 
     Args:
         ways: of writing that are tried. as_reader: none is, it reads prose of others and sees no picture.
     """
-    return asyncio.run(_Examination(url, cfg, ways, as_reader).run())
+    return asyncio.run(_Examination(url, cfg, vocabulary, ways, as_reader).run())
 
 
 # --- what one request gave --------------------------------------------------------------------------------------------
@@ -151,8 +152,10 @@ def read_probe(response: Response, request: Request, client: ChatClient, seconds
 
 
 class _Examination:
-    def __init__(self, url: str, cfg: CaptionConfig, ways: Sequence[Writing], as_reader: bool) -> None:
-        self.cfg, self.ways, self.as_reader = cfg, ways, as_reader
+    def __init__(
+        self, url: str, cfg: CaptionConfig, vocabulary: Vocabulary, ways: Sequence[Writing], as_reader: bool
+    ) -> None:
+        self.cfg, self.vocabulary, self.ways, self.as_reader = cfg, vocabulary, ways, as_reader
         self.takes_schema = cfg.endpoint.json_schema
         self.client = ChatClient(url, cfg.endpoint)
         self.findings: list[Finding] = []
@@ -327,10 +330,10 @@ class _Examination:
     async def _largest_prompt(self) -> bool:
         """Send a prompt as long as ours get, with our answer limit and schema."""
         limit = self.cfg.endpoint.max_tokens
-        messages = largest_messages(self.cfg, self._pictures(self.num_images))
-        way = way_of(self.cfg.writing)
+        messages = largest_messages(self.cfg, self.vocabulary, self._pictures(self.num_images))
+        way = way_of(self.cfg.writing, self.vocabulary)
         more = more_fields(way)
-        schema = answer_schema(more=more) if self.takes_schema else None
+        schema = answer_schema(self.vocabulary.actions, more=more) if self.takes_schema else None
         probe = await self._ask(messages, limit, schema)
         length = self.client.context
         known = f" of {length} that the model holds" if length else ""
@@ -349,7 +352,7 @@ class _Examination:
             self._add("largest prompt", "unusable", f"its answer was cut after {written} of {limit} tokens: {fix}")
             return False
         self._add("largest prompt", "ok", f"{used or 'unknown'} tokens and {limit} for the answer{known}")
-        parsed = parse_answer(probe.text, more=more, optional=way.optional)
+        parsed = parse_answer(probe.text, self.vocabulary.actions, more=more, optional=way.optional)
         state: State = "ok" if parsed.coc is not None else "warning"
         mended = f", after mending {', '.join(parsed.recovered)}" if parsed.recovered else ""
         detail = f"{parsed.reason or 'of the right structure'}{mended}; {probe.seconds:.1f} s, {probe.finish_reason!r}"
@@ -358,7 +361,7 @@ class _Examination:
 
     async def _writing(self) -> None:
         """Find what it can write: slots, claims or prose."""
-        results = await try_ways(self._written, self.cfg, self.ways)
+        results = await try_ways(self._written, self.cfg, self.vocabulary, self.ways)
         for result in results:
             silent = f" ({self.last_detail})" if NO_ANSWER in result.reasons else ""
             self._add(f"writes {result.writing}", "ok" if result.is_enough else "warning", result.detail + silent)
@@ -373,7 +376,8 @@ class _Examination:
     async def _reading(self) -> None:
         """Find whether it reads true captions into claims."""
         gold = [caption.model_copy(update={"errors": ()}) for caption in read_gold() if caption.claims][:READ_CAPTIONS]
-        check = await measure_reader(Reader([AskedModel(KeptAnswers(self.client, None), self.cfg.reader, 0)]), gold)
+        model = AskedModel(KeptAnswers(self.client, None), self.cfg.reader, 0)
+        check = await measure_reader(Reader([model], self.vocabulary), gold)
         is_good = not check.num_unreadable and not check.num_flagged and check.num_claims >= check.num_sentences
         self._add(
             "reads prose",
@@ -403,7 +407,7 @@ class _Examination:
         return [_picture(width, side * 9 // 16, self.num_drawn - left) for left in range(count, 0, -1)]
 
 
-def largest_messages(cfg: CaptionConfig, pictures: list[dict]) -> list[dict]:
+def largest_messages(cfg: CaptionConfig, vocabulary: Vocabulary, pictures: list[dict]) -> list[dict]:
     """Give messages as long as ours get: a made-up window whose numbers have many digits."""
     count = cfg.window.num_frames
     far = np.full((count, 3), -12345.67) + np.arange(count)[:, None]
@@ -429,16 +433,16 @@ def largest_messages(cfg: CaptionConfig, pictures: list[dict]) -> list[dict]:
         frame_folders=tuple(Path(f"frame_{i:05d}") for i in range(count)),
         frame_files=tuple(frozenset(VIEW_FILES.values()) for _ in range(count)),
     )
-    question = make_question(window, cfg.image, cfg.writing)
+    question = make_question(window, cfg.image, cfg.writing, vocabulary)
     content = [*pictures, {"type": "text", "text": text_of(question)}]
     messages: list[dict] = [
-        {"role": "system", "content": way_prompt(cfg.writing)},
+        {"role": "system", "content": way_prompt(question.way)},
         {"role": "user", "content": content},
     ]
     if not cfg.correction_asks:
         return messages
     words = "Nothing has to change. " * (MAX_RETURNED_CHARACTERS // 23)
-    return messages + correction_messages(Correction(words, words[:MAX_COMPLAINT], 1))
+    return messages + correction_messages(Correction(words, words[:MAX_COMPLAINT], 1), vocabulary)
 
 
 def _user(text: str, pictures: list[dict] | None = None) -> dict:

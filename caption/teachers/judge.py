@@ -17,8 +17,8 @@ from rich.table import Table
 
 from caption.schema import JudgeConfig, Judgement
 from caption.teachers.asked import AskedModel, figures_table, open_models
-from caption.teachers.prompt_files import read_prompt
 from caption.truth.gold import GoldCaption, read_gold
+from caption.truth.vocabulary import Vocabulary
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.budget import Budget
 from cosfly.chat.contract import NoAnswer, Troubles
@@ -48,12 +48,13 @@ class Case:
     label: str | None
 
 
-def judge_messages(case: Case, order: Sequence[Judgement] = JUDGEMENTS) -> list[dict]:
+def judge_messages(case: Case, vocabulary: Vocabulary, order: Sequence[Judgement] = JUDGEMENTS) -> list[dict]:
     """Give the chat messages; `order` is the order in which the options are named."""
     options = "\n".join(f"- {name}: {_MEANINGS[name]}." for name in order)
-    system = read_prompt("judge_system").substitute(options=options, names=", ".join(order))
+    system = vocabulary.templates["judge_system"].substitute(options=options, names=", ".join(order))
     record = dump_json(case.answer.model_dump(), indent=1)
-    user = read_prompt("judge_user").substitute(flight=case.flight, record=record, label=case.label or "not known")
+    told = {"flight": case.flight, "record": record, "label": case.label or "not known"}
+    user = vocabulary.templates["judge_user"].substitute(told)
     return [{"role": "system", "content": system}, {"role": "user", "content": user}]
 
 
@@ -83,8 +84,8 @@ def parse_judgement(text: str, finish_reason: str | None = None) -> tuple[str, s
 class Judge:
     """Asks an endpoint about conflicts. Made by `open_judge`."""
 
-    def __init__(self, model: AskedModel) -> None:
-        self.model = model
+    def __init__(self, model: AskedModel, vocabulary: Vocabulary) -> None:
+        self.model, self.vocabulary = model, vocabulary
 
     async def judge(self, case: Case, order: Sequence[Judgement] = JUDGEMENTS) -> JudgeRecord:
         """Judge a case; the verdict is `unjudged` where none could be read or the judge did not answer.
@@ -93,7 +94,8 @@ class Judge:
             BudgetSpent: one more request might pass a limit.
         """
         try:
-            reply = await self.model.ask(judge_messages(case, order), judge_schema(order), case.sample_id, "judge")
+            messages = judge_messages(case, self.vocabulary, order)
+            reply = await self.model.ask(messages, judge_schema(order), case.sample_id, "judge")
         except NoAnswer as error:  # not kept: a later run may ask again
             verdict, reason = UNJUDGED, f"no answer: {error}"
         else:
@@ -104,6 +106,7 @@ class Judge:
 @asynccontextmanager
 async def open_judge(
     cfg: JudgeConfig,
+    vocabulary: Vocabulary,
     seed: int,
     book: AnswerBook | None = None,
     budget: Budget | None = None,
@@ -115,7 +118,7 @@ async def open_judge(
         yield None
         return
     async with open_models(cfg, [(cfg.url, cfg.model)], seed, book, budget, troubles) as [model]:
-        yield Judge(model)
+        yield Judge(model, vocabulary)
 
 
 # --- how good a judge is ----------------------------------------------------------------------------------------------
@@ -186,7 +189,9 @@ class JudgeCheck:
         return self.num_agreed / self.num_asks
 
 
-async def check_judge(cfg: JudgeConfig, gold: list[tuple[Case, Judgement]], seed: int = 0) -> JudgeCheck:
+async def check_judge(
+    cfg: JudgeConfig, vocabulary: Vocabulary, gold: list[tuple[Case, Judgement]], seed: int = 0
+) -> JudgeCheck:
     """Measure a judge.
 
     Raises:
@@ -195,7 +200,7 @@ async def check_judge(cfg: JudgeConfig, gold: list[tuple[Case, Judgement]], seed
     orders = [(*JUDGEMENTS[i:], *JUDGEMENTS[:i]) for i in range(len(JUDGEMENTS))]
     confusion: Counter[tuple[str, str]] = Counter()
     num_agreed = num_moved = num_first = 0
-    async with open_judge(cfg, seed) as judge:
+    async with open_judge(cfg, vocabulary, seed) as judge:
         if judge is None:
             raise InputError("no judge to check", where="--judge", got="nothing", expected="the URL of an endpoint")
         asked = [judge.judge(case, order) for case, _ in gold for order in orders]

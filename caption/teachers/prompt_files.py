@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
+from functools import cache, lru_cache
 from pathlib import Path
 from string import Template
 
+from caption.truth.vocabulary import Vocabulary
 from cosfly.errors import ConfigError, InputError, nearest
 from cosfly.reading.files import read_text
-from cosfly.work import in_place
 from cosfly.work.store import refuse_links, storage_errors, write_bytes
 
 log = logging.getLogger(__name__)
@@ -22,20 +23,18 @@ PROMPTS = Path(__file__).with_name("prompts")
 SUFFIX, VERSION = ".txt", "# version: "
 
 
-@in_place.kept()
+@cache
 def shipped_prompts() -> dict[str, str]:
     """Give the files that ship, name without suffix -> text with its version line."""
     return {path.stem: read_text(path) for path in sorted(PROMPTS.glob(f"*{SUFFIX}"))}
 
 
-def own_prompts(folder: Path | None) -> dict[str, str] | None:
-    """Read a folder of prompts, in the place of those that ship; None for None.
+def own_prompts(folder: Path) -> dict[str, str]:
+    """Read a folder of prompts, in the place of those that ship.
 
     Raises:
         ConfigError: something is wrong with them; each thing is told in a line of the log, with its file and line.
     """
-    if folder is None:
-        return None
     if not folder.is_dir():
         raise ConfigError(
             "no such folder of prompts",
@@ -95,18 +94,10 @@ def slots_of(text: str) -> list[str]:
     return Template(text).get_identifiers()
 
 
-@in_place.kept()
-def read_prompt(name: str) -> Template:
-    """Give a prompt in use, without its version line."""
-    texts: Mapping[str, str] = in_place.given("prompts") or {}
-    text = texts[name] if name in texts else shipped_prompts()[name]
-    return Template(text.partition("\n")[2].rstrip("\n"))
-
-
-@in_place.kept()
-def prompt_format(name: str) -> str:
-    """Give a prompt in use as a format for `%`, which is ten times faster than a template."""
-    template, pieces, end = read_prompt(name).template, list[str](), 0
+@lru_cache
+def prompt_format(name: str, vocabulary: Vocabulary) -> str:
+    """Give a prompt as a format for `%`, which is ten times faster than a template."""
+    template, pieces, end = vocabulary.templates[name].template, list[str](), 0
     for match in Template.pattern.finditer(template):
         pieces.append(template[end : match.start()].replace("%", "%%"))
         slot = match["named"] or match["braced"]
@@ -115,13 +106,12 @@ def prompt_format(name: str) -> str:
     return "".join([*pieces, template[end:].replace("%", "%%")])
 
 
-def export_prompts(folder: Path) -> list[Path]:
-    """Write the prompts in use into a folder, to begin with; files that stand there already stay.
+def export_prompts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
+    """Write prompts into a folder, to begin with; files that stand there already stay.
 
     Raises:
         ConfigError: a file of these names is there, with another text.
     """
-    texts = in_place.given("prompts") or shipped_prompts()
     with storage_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     refuse_links(folder)

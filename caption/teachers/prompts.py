@@ -11,15 +11,14 @@ from functools import lru_cache
 
 from caption.schema import ImageConfig, ObservedFrame, ObservedWindow
 from caption.teachers.images import FrameSource, pictures_of
-from caption.teachers.prompt_files import prompt_format, read_prompt
+from caption.teachers.prompt_files import prompt_format
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.glossary import load_glossary
-from caption.writing.contract import Draft, way_of
+from caption.truth.vocabulary import Vocabulary
+from caption.writing.contract import Draft, WayOfWriting, way_of
 from cosfly.look.frame_views import Pictures, frame_label
-from cosfly.products.actions import action_tokens
 from cosfly.products.captions import PICTURES_MARK, Language, Prompt, Writing
 from cosfly.products.segments import MISSION_KINDS
-from cosfly.work import in_place
 from cosfly.work.store import dump_json, sha256_bytes
 
 MAX_RETURNED_CHARACTERS = 6000  # of a refused answer, when it is shown to who wrote it
@@ -50,7 +49,7 @@ class Question:
     facts: Facts
     prompts: dict[Language, Prompt]
     pictures: Pictures
-    writing: Writing
+    way: WayOfWriting
     decision: str | None = None
     rejected: str | None = None
     ask: int = 0
@@ -67,36 +66,39 @@ class Question:
         return {language: prompt.told(self.pictures.sentence(language)) for language, prompt in self.prompts.items()}
 
 
-@in_place.kept()
-def system_prompt(language: Language) -> str:
-    return read_prompt(f"system_{language}").substitute(actions=", ".join(action_tokens()))
+@lru_cache
+def _with_actions(name: str, vocabulary: Vocabulary) -> str:
+    return vocabulary.templates[name].substitute(actions=", ".join(vocabulary.actions.tokens))
 
 
-@in_place.kept()
-def way_prompt(writing: Writing, decision: str | None = None) -> str:
+def system_prompt(language: Language, vocabulary: Vocabulary) -> str:
+    return _with_actions(f"system_{language}", vocabulary)
+
+
+def way_prompt(way: WayOfWriting, decision: str | None = None) -> str:
     """Give the system prompt of a way of writing; a decision is a hard constraint (the anchored strategy of
     sec:appendix_e)."""
-    prompt = read_prompt(way_of(writing).system).substitute(actions=", ".join(action_tokens()))
-    return prompt if decision is None else f"{prompt}\n{decision_words(decision)}"
+    prompt = _with_actions(way.system, way.vocabulary)
+    return prompt if decision is None else f"{prompt}\n{decision_words(decision, way.vocabulary)}"
 
 
-def decision_words(decision: str) -> str:
+def decision_words(decision: str, vocabulary: Vocabulary) -> str:
     """Give the words that tie an answer to a decision."""
-    words = load_glossary().actions[decision]["en"]
-    return read_prompt("anchored_en").substitute(decision=decision, decision_words=words)
+    words = vocabulary.names[decision]["en"]
+    return vocabulary.templates["anchored_en"].substitute(decision=decision, decision_words=words)
 
 
-def build_prompts(window: ObservedWindow, facts: Facts) -> dict[Language, Prompt]:
+def build_prompts(window: ObservedWindow, facts: Facts, vocabulary: Vocabulary) -> dict[Language, Prompt]:
     """Write the prompts of both languages from one window, with a mark for the sentence about the pictures."""
-    users = user_prompts(window, facts)
-    return {language: Prompt(system=system_prompt(language), user=user) for language, user in users.items()}
+    users = user_prompts(window, facts, vocabulary)
+    return {language: Prompt(system=system_prompt(language, vocabulary), user=user) for language, user in users.items()}
 
 
-def user_prompts(window: ObservedWindow, facts: Facts) -> dict[Language, str]:
+def user_prompts(window: ObservedWindow, facts: Facts, vocabulary: Vocabulary) -> dict[Language, str]:
     """Write the questions alone, without what stands before all of them."""
     numbers = _numbers(window, facts)
     languages: tuple[Language, Language] = ("en", "zh")
-    return {language: _user_prompt(numbers, window, facts, language) for language in languages}
+    return {language: _user_prompt(numbers, window, facts, language, vocabulary) for language in languages}
 
 
 def mission_lines(language: Language) -> dict[str, str]:
@@ -106,7 +108,7 @@ def mission_lines(language: Language) -> dict[str, str]:
 
 def prompt_hash(question: Question) -> str:
     """Give the hash of the plain question and of how its answer is to be written."""
-    standing = _standing_hash(*[prompt.system for prompt in question.prompts.values()], way_prompt(question.writing))
+    standing = _standing_hash(*[prompt.system for prompt in question.prompts.values()], way_prompt(question.way))
     users = [
         prompt.user.replace(PICTURES_MARK, question.pictures.sentence(language))
         for language, prompt in question.prompts.items()
@@ -120,7 +122,9 @@ def _standing_hash(*texts: str) -> str:
     return sha256_bytes("\x00".join(texts).encode())
 
 
-def _user_prompt(numbers: dict[str, str], window: ObservedWindow, facts: Facts, language: Language) -> str:
+def _user_prompt(
+    numbers: dict[str, str], window: ObservedWindow, facts: Facts, language: Language, vocabulary: Vocabulary
+) -> str:
     unknown, unit = _WORDS_OF_NUMBERS[language]
     speed = facts.target_speed_mps
     words = load_glossary().visibility
@@ -130,7 +134,7 @@ def _user_prompt(numbers: dict[str, str], window: ObservedWindow, facts: Facts, 
         "visibility": ", ".join([words[word][language] for word in facts.visibility]),
         "target": "; ".join([_target_text(frame) or unknown for frame in window.frames]),
     }
-    told = prompt_format(f"user_{language}") % (numbers | own)
+    told = prompt_format(f"user_{language}", vocabulary) % (numbers | own)
     return told if window.mission is None else f"{told}\n{_MISSION[language][window.mission]}"
 
 
@@ -199,45 +203,47 @@ def question_messages(question: Question, encoder: FrameSource) -> tuple[list[di
                 content.append({"type": "image_url", "image_url": {"url": image.url}})
                 digests.append(image.digest)
     content.append({"type": "text", "text": text_of(question)})
-    system = way_prompt(question.writing, question.decision)
+    system, templates = way_prompt(question.way, question.decision), question.way.vocabulary.templates
     if question.rejected is not None:
-        system += "\n" + read_prompt("hint_en").substitute(rejected=question.rejected)
+        system += "\n" + templates["hint_en"].substitute(rejected=question.rejected)
     messages: list[dict] = [{"role": "system", "content": system}, {"role": "user", "content": content}]
-    return messages + correction_messages(question.correction), digests
+    return messages + correction_messages(question.correction, question.way.vocabulary), digests
 
 
 def text_of(question: Question) -> str:
     """Give the text of a question: the flight data, and what its way of writing shows beside them."""
-    table = way_of(question.writing).table(question.facts)
+    table = question.way.table(question.facts)
     return question.asked["en"].user + ("\n" + table if table else "")
 
 
-def correction_messages(correction: Correction | None) -> list[dict]:
+def correction_messages(correction: Correction | None, vocabulary: Vocabulary) -> list[dict]:
     """Give the messages that follow a question whose answer was refused: that answer, and what was wrong."""
     if correction is None:
         return []
-    text = read_prompt("correction_en").substitute(complaint=correction.complaint)
+    text = vocabulary.templates["correction_en"].substitute(complaint=correction.complaint)
     return [
         {"role": "assistant", "content": correction.answer[:MAX_RETURNED_CHARACTERS]},
         {"role": "user", "content": [{"type": "text", "text": text}]},
     ]
 
 
-def mirror_messages(english: Draft, writing: Writing, complaint: str | None = None) -> list[dict]:
+def mirror_messages(english: Draft, way: WayOfWriting, complaint: str | None = None) -> list[dict]:
     """Give the chat messages that ask for the Chinese mirror of an English answer.
 
     Args:
         complaint: what was wrong with an earlier one.
     """
-    system = read_prompt(way_of(writing).mirror_system).substitute(glossary=load_glossary().quoted())
+    templates = way.vocabulary.templates
+    system = templates[way.mirror_system].substitute(glossary=way.vocabulary.quoted())
     if complaint:
-        system += "\n" + read_prompt("correction_en").substitute(complaint=complaint)
-    user = read_prompt("mirror_user").substitute(english=dump_json(english.written))
+        system += "\n" + templates["correction_en"].substitute(complaint=complaint)
+    user = templates["mirror_user"].substitute(english=dump_json(english.written))
     return [{"role": "system", "content": system}, {"role": "user", "content": user}]
 
 
-def make_question(window: ObservedWindow, image: ImageConfig, writing: Writing) -> Question:
+def make_question(window: ObservedWindow, image: ImageConfig, writing: Writing, vocabulary: Vocabulary) -> Question:
     """Make the free question of a window; its pixels are those of the pictures that are sent."""
     pictures = pictures_of(window, image)
     facts = measure_facts(window, pictures.size_px)
-    return Question(window, facts, build_prompts(window, facts), pictures, writing)
+    prompts = build_prompts(window, facts, vocabulary)
+    return Question(window, facts, prompts, pictures, way_of(writing, vocabulary))

@@ -18,7 +18,6 @@ from rich.table import Table
 
 from caption.schema import EvidenceConfig, Judged, ReaderConfig
 from caption.teachers.asked import AskedModel, figures_table, open_models, share_text
-from caption.teachers.prompt_files import read_prompt
 from caption.truth.claims import claim_name, goes_against, judge_claim, references_of
 from caption.truth.facts import Facts
 from caption.truth.gold import GoldCaption
@@ -26,14 +25,15 @@ from caption.truth.references import QUANTITIES
 from caption.truth.said import SCENE
 from caption.truth.sizes import numeral_of
 from caption.truth.stated import read_stated
+from caption.truth.vocabulary import Vocabulary
 from caption.writing.claims import QUOTED_SCHEMA, read_quoted
-from caption.writing.contract import Draft, way_of
+from caption.writing.contract import Draft, WayOfWriting
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.budget import Budget, BudgetConfig
 from cosfly.chat.contract import NoAnswer, Troubles
 from cosfly.errors import InputError
-from cosfly.products.actions import action_tokens
-from cosfly.products.captions import Claim, Coc, Language, ReaderRecord, Usage, Writing
+from cosfly.products.actions import ActionSet
+from cosfly.products.captions import Claim, Coc, Language, ReaderRecord, SentenceState, Usage
 from cosfly.products.sentences import sentences_of
 from cosfly.reading.objects import find_object
 from cosfly.work.store import sha256_bytes
@@ -47,23 +47,23 @@ SCHEMA = {
 }
 
 
-def reader_messages(coc: Coc, facts: Facts, order: int) -> list[dict]:
+def reader_messages(coc: Coc, facts: Facts, order: int, vocabulary: Vocabulary) -> list[dict]:
     """Give the chat messages of a reading; of the facts only the number of frames is told. order: 1 names all things
     backwards."""
     quantities, sentences = list(QUANTITIES), [f"{name}: {text}" for name, text in sentences_of(coc)]
     if order:
         quantities, sentences = quantities[::-1], sentences[::-1]
-    system = read_prompt("reader_system").substitute(
+    system = vocabulary.templates["reader_system"].substitute(
         num_frames=len(facts), last=f"t{len(facts) - 1}", step_s=f"{facts.step_s:g}",
-        quantities=", ".join(quantities), actions=", ".join(action_tokens()),
+        quantities=", ".join(quantities), actions=", ".join(vocabulary.actions.tokens),
     )  # fmt: skip
-    user = read_prompt("reader_user").substitute(sentences="\n".join(sentences))
+    user = vocabulary.templates["reader_user"].substitute(sentences="\n".join(sentences))
     return [{"role": "system", "content": system}, {"role": "user", "content": user}]
 
 
-def prompt_digest() -> str:
+def prompt_digest(vocabulary: Vocabulary) -> str:
     """Give the digest of the prompts that a reader is asked with."""
-    texts = [read_prompt(name).template for name in ("reader_system", "reader_user")]
+    texts = [vocabulary.templates[name].template for name in ("reader_system", "reader_user")]
     return sha256_bytes("\x00".join(texts).encode())[:16]
 
 
@@ -96,54 +96,46 @@ def _key(claim: Claim, num_frames: int) -> tuple:
 
 
 def judge_reading(
-    coc: Coc, claims: Sequence[Claim], facts: Facts, cfg: EvidenceConfig, language: Language
+    coc: Coc, claims: Sequence[Claim], facts: Facts, cfg: EvidenceConfig, language: Language, actions: ActionSet
 ) -> list[Judged]:
     """Compare what both readings say with the facts; gives the state of every sentence, in order.
 
     A claim that cannot be compared is the reader's fault and makes its sentence unread, not contradicted.
     """
-    return [
-        _judge_sentence(name, text, [c for c in claims if c.sentence == name], coc.flight_decision, facts, cfg,
-        language)
-        for name, text in sentences_of(coc)
-    ]  # fmt: skip
+    judged = []
+    for name, text in sentences_of(coc):
+        about = cfg if read_stated(text, language).is_approximate else None
+        own, states, problems = [claim for claim in claims if claim.sentence == name], set[str](), list[str]()
+        for claim in own:
+            if claim.quantity == SCENE or claim.modality == "hypothetical":
+                continue
+            if claim.quantity == "decision" or claim.modality == "predicted":
+                if goes_against(claim, coc.flight_decision, actions):
+                    problems.append(f"decision: {claim_name(claim)}, not {coc.flight_decision}")
+                continue
+            numeral = numeral_of(text, claim, language) if isinstance(claim.value, float) else None
+            state = judge_claim(claim, facts, about, numeral)
+            states.add(state)
+            if state == "contradicted":
+                problems.append(f"false: {claim_name(claim)}")
+        is_proved = states == {"proved"} and is_covered(text, own, language)
+        found: SentenceState = "contradicted" if problems else "proved" if is_proved else "unread"
+        judged.append(Judged(name, text, found, tuple(dict.fromkeys(problems))))
+    return judged
 
 
 def judge_text(
-    draft: Draft, writing: Writing, reader: ReaderRecord | None, facts: Facts, cfg: EvidenceConfig, language: Language
+    draft: Draft, way: WayOfWriting, reader: ReaderRecord | None, facts: Facts, cfg: EvidenceConfig, language: Language
 ) -> list[Judged]:
     """Give the state of every sentence of a text from what stands in its record, which asks nobody.
 
     reader: what it proves or contradicts counts; a sentence that it leaves unread keeps what was found without it.
     """
-    judged = way_of(writing).judge(draft, facts, cfg, language)
+    judged = way.judge(draft, facts, cfg, language)
     if reader is None or language not in reader.claims:
         return judged
-    read = judge_reading(draft.coc, reader.claims[language], facts, cfg, language)
+    read = judge_reading(draft.coc, reader.claims[language], facts, cfg, language, way.vocabulary.actions)
     return [one if one.state != "unread" else other for one, other in zip(read, judged, strict=True)]
-
-
-def _judge_sentence(
-    name: str, text: str, claims: Sequence[Claim], decision: str, facts: Facts, cfg: EvidenceConfig, language: Language
-) -> Judged:
-    about = cfg if read_stated(text, language).is_approximate else None
-    states, problems = set[str](), list[str]()
-    for claim in claims:
-        if claim.quantity == SCENE or claim.modality == "hypothetical":
-            continue
-        if claim.quantity == "decision" or claim.modality == "predicted":
-            if goes_against(claim, decision):
-                problems.append(f"decision: {claim_name(claim)}, not {decision}")
-            continue
-        numeral = numeral_of(text, claim, language) if isinstance(claim.value, float) else None
-        state = judge_claim(claim, facts, about, numeral)
-        states.add(state)
-        if state == "contradicted":
-            problems.append(f"false: {claim_name(claim)}")
-    if problems:
-        return Judged(name, text, "contradicted", tuple(dict.fromkeys(problems)))
-    is_proved = states == {"proved"} and is_covered(text, claims, language)
-    return Judged(name, text, "proved" if is_proved else "unread")
 
 
 def is_covered(text: str, claims: Iterable[Claim], language: Language) -> bool:
@@ -174,8 +166,8 @@ class Read:
 class Reader:
     """Asks one or two endpoints what texts state. Made by `open_reader`."""
 
-    def __init__(self, models: Sequence[AskedModel]) -> None:
-        self.models = models
+    def __init__(self, models: Sequence[AskedModel], vocabulary: Vocabulary) -> None:
+        self.models, self.vocabulary = models, vocabulary
 
     @property
     def names(self) -> list[str]:
@@ -199,7 +191,8 @@ class Reader:
     async def _reading(
         self, number: int, coc: Coc, facts: Facts, language: Language, sample_id: str
     ) -> tuple[list[Claim] | None, Usage]:
-        model, messages = self.models[number % len(self.models)], reader_messages(coc, facts, number)
+        model = self.models[number % len(self.models)]
+        messages = reader_messages(coc, facts, number, self.vocabulary)
         try:
             reply = await model.ask(messages, SCHEMA, sample_id, f"read_{language}/{number}")
         except NoAnswer as error:
@@ -214,7 +207,7 @@ class Reader:
         reads = dict(zip(texts, found, strict=True))
         return ReaderRecord(
             models=self.names,
-            prompt=prompt_digest(),
+            prompt=prompt_digest(self.vocabulary),
             claims={language: read.claims for language, read in reads.items()},
             num_claims={language: read.num_claims for language, read in reads.items()},
             usage=sum((read.usage for read in found), Usage()),
@@ -224,6 +217,7 @@ class Reader:
 @asynccontextmanager
 async def open_reader(
     cfg: ReaderConfig,
+    vocabulary: Vocabulary,
     seed: int,
     book: AnswerBook | None = None,
     budget: Budget | None = None,
@@ -236,7 +230,7 @@ async def open_reader(
         return
     where = [(url, cfg.models[i] if i < len(cfg.models) else None) for i, url in enumerate(cfg.urls)]
     async with open_models(cfg, where, seed, book, budget, troubles) as models:
-        yield Reader(models)
+        yield Reader(models, vocabulary)
 
 
 # --- how good a reader is ---------------------------------------------------------------------------------------------
@@ -260,13 +254,15 @@ class ReaderCheck:
     usage: Usage = field(default_factory=Usage)
 
 
-async def check_reader(cfg: ReaderConfig, gold: Sequence[GoldCaption], seed: int = 0) -> ReaderCheck:
+async def check_reader(
+    cfg: ReaderConfig, vocabulary: Vocabulary, gold: Sequence[GoldCaption], seed: int = 0
+) -> ReaderCheck:
     """Measure the reader that the settings name.
 
     Raises:
         TeacherError: an endpoint cannot be used.
     """
-    async with open_reader(cfg, seed) as reader:
+    async with open_reader(cfg, vocabulary, seed) as reader:
         if reader is None:
             raise InputError("no reader to check", where="--reader", got="nothing", expected="the URL of an endpoint")
         return await measure_reader(reader, gold)
@@ -279,7 +275,8 @@ async def measure_reader(reader: Reader, gold: Sequence[GoldCaption]) -> ReaderC
     texts += [(caption, error.in_text(caption.coc), False) for caption in gold for error in caption.errors]
     asked = [reader.read(coc, gold.facts, gold.language, f"gold_{gold.id}_frame_00000") for gold, coc, _ in texts]
     for (caption, coc, is_true), read in zip(texts, await asyncio.gather(*asked), strict=True):
-        judged = judge_reading(coc, read.claims, caption.facts, EvidenceConfig(), caption.language)
+        actions = reader.vocabulary.actions
+        judged = judge_reading(coc, read.claims, caption.facts, EvidenceConfig(), caption.language, actions)
         _count(check, judged, read, is_true)
     return check
 

@@ -12,7 +12,7 @@ from functools import cache, partial
 
 from caption.teachers.statements import BEND_DEG, CENTERED_SHARE, Both, describe, word_of
 from caption.truth.facts import Facts
-from cosfly.products.actions import actions_in_use
+from cosfly.products.actions import ActionSet
 
 MODEL = "rules-7"  # its name in the records; counts changes of decisions and wording
 STEPS_AHEAD = 5.0  # the observed trend is taken to hold for the next 2.5 s
@@ -109,11 +109,13 @@ def _goes_one_way(values: Sequence[float | None]) -> bool:
     return len(known) == len(values) and known in (sorted(known), sorted(known, reverse=True))
 
 
-def write_templates(facts: Facts, draws: bytes, decision: str | None = None) -> tuple[dict[str, str], dict[str, str]]:
+def write_templates(
+    facts: Facts, draws: bytes, actions: ActionSet, decision: str | None = None
+) -> tuple[dict[str, str], dict[str, str]]:
     """Write the English and the Chinese answer, with slots for the facts.
 
     Args:
-        draws: random, one for each sentence (draws_for).
+        draws: random, one for each sentence (draws_for). actions: that have the general reasons.
         decision: the decision to justify (anchored); None decides freely.
     """
     cues = find_cues(facts)
@@ -121,7 +123,7 @@ def write_templates(facts: Facts, draws: bytes, decision: str | None = None) -> 
     *statements, conclusion = [
         options[draw % len(options)] for options, draw in zip([*describe(facts), _CONCLUSIONS], draws, strict=False)
     ]
-    causes = [*_causes(facts, cues, token), conclusion]
+    causes = [*_causes(facts, cues, token, actions), conclusion]
     texts = [(" ".join([en for en, _ in both]), "".join([zh for _, zh in both])) for both in (statements, causes)]
     english, chinese = [
         {"critical_components": critical, "reasoning_trace": reasons, "flight_decision": token}
@@ -140,10 +142,10 @@ _CONCLUSIONS: tuple[Both, ...] = (
 # --- causes -----------------------------------------------------------------------------------------------------------
 
 
-def _causes(f: Facts, cues: Cues, token: str) -> list[Both]:
+def _causes(f: Facts, cues: Cues, token: str, actions: ActionSet) -> list[Both]:
     """Give the reasons for a decision that the facts hold, else its general reason, which claims nothing measurable."""
     found = [wording for wording in (cause(f, cues) for cause in _EVIDENCE.get(token, ())) if wording]
-    general = actions_in_use().actions[token].reason
+    general = actions.actions[token].reason
     return found[:2] or [(general.en, general.zh)]
 
 

@@ -10,14 +10,15 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from string import Template
 
 import numpy as np
 
 from caption.schema import CaptionConfig
 from caption.teachers.foreign import Terms
 from caption.teachers.images import EncodedImage
-from caption.teachers.prompt_files import read_prompt
 from caption.teachers.prompts import Question, decision_words, system_prompt
+from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft
 from cosfly.chat.client import EndpointConfig
 from cosfly.chat.contract import Request
@@ -36,7 +37,7 @@ from cosfly.products.answer_text import answer_schema
 from cosfly.products.captions import Language, Prompt
 
 
-def as_taught(cfg: CaptionConfig) -> CaptionConfig:
+def as_taught(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfig:
     """Give the settings of a run that asks a student, from what its folder says: windows, pictures, way of writing and
     sampling.
 
@@ -50,7 +51,7 @@ def as_taught(cfg: CaptionConfig) -> CaptionConfig:
     if folder is None:
         return cfg
     taught = read_taught(folder)
-    check_prompts(taught, folder)
+    check_prompts(taught, folder, vocabulary)
     views, ranges = {look.views for look in taught.looks}, {look.depth_range_m for look in taught.looks}
     sides = {max(look.size_px) for look in taught.looks}
     if not len(views) == len(ranges) == len(sides) == 1:
@@ -75,7 +76,7 @@ def as_taught(cfg: CaptionConfig) -> CaptionConfig:
     })  # fmt: skip
 
 
-def check_prompts(taught: Taught, folder: Path) -> None:
+def check_prompts(taught: Taught, folder: Path, vocabulary: Vocabulary) -> None:
     """Check that prompts are written today as they were for the student.
 
     Raises:
@@ -84,7 +85,10 @@ def check_prompts(taught: Taught, folder: Path) -> None:
     if "en" not in taught.prompts:
         raise ConfigError("the student was taught no English", where=folder, got=", ".join(taught.prompts))
     for language, prompt in taught.prompts.items():
-        if prompt.system != system_prompt(language) or not _is_of_template(prompt.user, language, taught):
+        template = vocabulary.templates[f"user_{language}"]
+        if prompt.system != system_prompt(language, vocabulary) or not _is_of_template(
+            prompt.user, language, taught, template
+        ):
             raise ConfigError(
                 "the student was taught another version of the prompt", where=f"{folder}: {language}",
                 got=prompt.user[:80],
@@ -93,13 +97,12 @@ def check_prompts(taught: Taught, folder: Path) -> None:
             )  # fmt: skip
 
 
-def _is_of_template(user: str, language: Language, taught: Taught) -> bool:
+def _is_of_template(user: str, language: Language, taught: Taught, template: Template) -> bool:
     told = {"num_frames": re.escape(str(taught.num_frames)), "pictures": "|".join(
         re.escape(Pictures(look.views, look.size_px, "separate",
         look.depth_range_m).sentence(language)) for look in taught.looks
     )}  # fmt: skip
     pattern, end = "", 0
-    template = read_prompt(f"user_{language}")
     for match in template.pattern.finditer(template.template):
         name = match["named"] or match["braced"]
         pattern += re.escape(template.template[end : match.start()])
@@ -147,8 +150,8 @@ class TaughtStudent:
 
     def request(self, question: Question, frames: Sequence[Sequence[EncodedImage]], seed: int) -> Request:
         """Give the English question."""
-        prompt = question.asked["en"]
-        return self._request(self._reworked(prompt, question), frames, answer_schema(question.decision), seed)
+        prompt = self._reworked(question.asked["en"], question)
+        return self._request(prompt, frames, answer_schema(question.way.vocabulary.actions, question.decision), seed)
 
     def mirror_request(
         self, question: Question, english: Draft, frames: Sequence[Sequence[EncodedImage]], seed: int
@@ -158,15 +161,16 @@ class TaughtStudent:
         The Chinese of an answer whose decision was given must hold that decision.
         """
         decision = english.coc.flight_decision if question.decision else None
-        return self._request(question.asked["zh"], frames, answer_schema(decision, "zh"), seed)
+        schema = answer_schema(question.way.vocabulary.actions, decision, "zh")
+        return self._request(question.asked["zh"], frames, schema, seed)
 
     def _reworked(self, prompt: Prompt, question: Question) -> Prompt:
         """Add what a repair says, as for any teacher: the student was not taught it, but may follow."""
         more = []
         if question.decision is not None:
-            more.append(decision_words(question.decision))
+            more.append(decision_words(question.decision, question.way.vocabulary))
         if question.rejected is not None:
-            more.append(read_prompt("hint_en").substitute(rejected=question.rejected))
+            more.append(question.way.vocabulary.templates["hint_en"].substitute(rejected=question.rejected))
         return prompt.model_copy(update={"system": "\n".join([prompt.system, *more])})
 
     def _request(self, prompt: Prompt, frames: Sequence[Sequence[EncodedImage]], schema: dict, seed: int) -> Request:

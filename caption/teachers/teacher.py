@@ -14,7 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractAsyncContextManager, nullcontext
 from dataclasses import replace
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Protocol
 
@@ -28,6 +28,7 @@ from caption.teachers.prompts import Question, mirror_messages, question_message
 from caption.teachers.rules import MODEL, write_templates
 from caption.teachers.students import TaughtStudent
 from caption.teachers.trials import SCENES, TrialFrames, TrialScene, trial_question
+from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft, more_fields, way_of
 from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget
@@ -74,7 +75,10 @@ class RuleTeacher:
         key = f"{question.window.sample_id}/{replace(question, correction=None).purpose}"
         if self._last is None or self._last[0] != key:
             draws = draws_for(self.seed, "caption", key)
-            self._last = (key, write_templates(question.facts, draws, question.decision))
+            self._last = (
+                key,
+                write_templates(question.facts, draws, question.way.vocabulary.actions, question.decision),
+            )
         return self._last[1]
 
     async def ask(self, question: Question) -> Reply:
@@ -197,10 +201,10 @@ class AskingTeacher:
             frames = await self.frames.pictures(question)
             request = self.student.mirror_request(question, english, frames, ask)
         else:
-            optional = way_of(question.writing).optional.items()
+            optional = question.way.optional.items()
             more = {name: schema for name, schema in optional if name in english.written}
-            schema = answer_schema(english.coc.flight_decision, "zh", more)
-            messages = mirror_messages(english, question.writing, complaint)
+            schema = answer_schema(question.way.vocabulary.actions, english.coc.flight_decision, "zh", more)
+            messages = mirror_messages(english, question.way, complaint)
             request = self.cfg.request(messages, [], schema, sampling_seed(self.seed, sample_id, purpose))
         return await self._kept_answer(question, request, purpose)
 
@@ -248,7 +252,7 @@ class AskingTeacher:
         trial = trial_question(question, self.all_cfg, scene)
         sample_id, purpose = question.window.sample_id, f"trial/{time.time_ns()}"  # never one that the book holds
         messages, digests = question_messages(trial, TrialFrames(trial.window, self.all_cfg.image))
-        schema = answer_schema(more=more_fields(way_of(trial.writing)))
+        schema = answer_schema(trial.way.vocabulary.actions, more=more_fields(trial.way))
         request = self.cfg.request(messages, digests, schema, sampling_seed(self.seed, sample_id, purpose))
         await self.kept.ask(request, flight_of(sample_id), sample_id, purpose)
 
@@ -263,7 +267,8 @@ class AskingTeacher:
             return self.student.request(question, await self.frames.pictures(question), question.ask)
         messages, digests = await self.frames.messages(question)
         seed = sampling_seed(self.seed, question.window.sample_id, question.purpose)
-        schema = answer_schema(question.decision, more=more_fields(way_of(question.writing)))
+        actions = question.way.vocabulary.actions
+        schema = answer_schema(actions, question.decision, more=more_fields(question.way))
         return self.cfg.request(messages, digests, schema, seed)
 
 
@@ -310,15 +315,15 @@ def open_teacher(
     return AskingTeacher(cfg, book, seed, budget, only, troubles)
 
 
-def terms_of(teacher: Teacher, sample_id: str, cfg: CaptionConfig) -> Terms:
+def terms_of(teacher: Teacher, sample_id: str, cfg: CaptionConfig, vocabulary: Vocabulary) -> Terms:
     """Give the terms under which a teacher answers for a window."""
     if isinstance(teacher, FileTeacher | StudentTeacher):
         return teacher.terms(sample_id)
     if isinstance(teacher, AskingTeacher) and teacher.student is not None:
         return teacher.student.terms
-    return _asked_terms(cfg.writing)
+    return _asked_terms(cfg.writing, vocabulary)
 
 
-@cache
-def _asked_terms(writing: Writing) -> Terms:
-    return Terms(writing, tuple(more_fields(way_of(writing))))
+@lru_cache
+def _asked_terms(writing: Writing, vocabulary: Vocabulary) -> Terms:
+    return Terms(writing, tuple(more_fields(way_of(writing, vocabulary))))

@@ -19,7 +19,8 @@ import numpy as np
 from caption.schema import CaptionConfig, ImageConfig, ObservedWindow, observed_frames
 from caption.teachers.images import EncodedImage, encode_image
 from caption.teachers.prompts import Correction, Question, make_question, question_messages
-from caption.writing.contract import Refused, more_fields, refuse_decision, way_of
+from caption.truth.vocabulary import Vocabulary
+from caption.writing.contract import Refused, more_fields, refuse_decision
 from cosfly.look.frame_views import VIEW_FILES, Pictures
 from cosfly.products.answer_text import answer_schema, parse_answer
 from cosfly.products.captions import Writing
@@ -78,30 +79,31 @@ class Result:
         )
 
 
-async def try_ways(ask: Ask, cfg: CaptionConfig, ways: Iterable[Writing]) -> list[Result]:
+async def try_ways(ask: Ask, cfg: CaptionConfig, vocabulary: Vocabulary, ways: Iterable[Writing]) -> list[Result]:
     """Let a teacher write about every trial window in each way; results in the order of the ways."""
-    return [await _try_way(ask, cfg, way) for way in ways]
+    return [await _try_way(ask, cfg, vocabulary, way) for way in ways]
 
 
-async def _try_way(ask: Ask, cfg: CaptionConfig, writing: Writing) -> Result:
+async def _try_way(ask: Ask, cfg: CaptionConfig, vocabulary: Vocabulary, writing: Writing) -> Result:
     windows = [trial_window(scene, cfg.window.num_frames) for scene in SCENES]
-    reasons = await asyncio.gather(*(_reason(ask, cfg, window, writing) for window in windows))
+    questions = [make_question(window, cfg.image, writing, vocabulary) for window in windows]
+    reasons = await asyncio.gather(*(_reason(ask, cfg, question) for question in questions))
     refused = Counter(reason for reason in reasons if reason)
     return Result(writing, len(reasons) - refused.total(), len(reasons), refused)
 
 
-async def _reason(ask: Ask, cfg: CaptionConfig, window: ObservedWindow, writing: Writing) -> str:
+async def _reason(ask: Ask, cfg: CaptionConfig, question: Question) -> str:
     """Give why an answer about a window was not taken in the end; "" where it was."""
-    way, question = way_of(writing), make_question(window, cfg.image, writing)
+    way, actions = question.way, question.way.vocabulary.actions
     more = more_fields(way)
     reason = ""
     for number in range(cfg.correction_asks + 1):
-        messages, _ = question_messages(question, TrialFrames(window, cfg.image))
-        answered = await ask(messages, answer_schema(more=more))
+        messages, _ = question_messages(question, TrialFrames(question.window, cfg.image))
+        answered = await ask(messages, answer_schema(actions, more=more))
         if answered is None:
             return NO_ANSWER
         text, is_cut = answered
-        parsed = parse_answer(text, more=tuple(more), optional=way.optional)
+        parsed = parse_answer(text, actions, more=tuple(more), optional=way.optional)
         if parsed.coc is None:
             return CUT_SHORT if is_cut else f"structure_{parsed.reason}"
         answer = refuse_decision(parsed) or way.read(parsed, question.facts)
@@ -131,8 +133,8 @@ def best_way(results: list[Result]) -> Writing | None:
 
 def trial_question(question: Question, cfg: CaptionConfig, scene: TrialScene) -> Question:
     """Give a question about a made-up window, with pictures of the number, views and size of another question's."""
-    made_up = make_question(trial_window(scene, cfg.window.num_frames), cfg.image, question.writing)
-    return replace(made_up, pictures=question.pictures)
+    window, way = trial_window(scene, cfg.window.num_frames), question.way
+    return replace(make_question(window, cfg.image, way.name, way.vocabulary), pictures=question.pictures)
 
 
 def trial_window(scene: TrialScene, count: int) -> ObservedWindow:

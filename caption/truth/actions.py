@@ -14,13 +14,12 @@ import math
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from itertools import pairwise
 
 from caption.schema import FutureMotion, LabelConfig
-from cosfly.products.actions import Condition, Rule, Size, Term, actions_in_use
+from cosfly.products.actions import ActionSet, Condition, Rule, Size, Term
 from cosfly.products.captions import Verdict
-from cosfly.work import in_place
 
 
 @dataclass(frozen=True)
@@ -94,11 +93,36 @@ class ActionTable:
     implied: tuple[tuple[tuple[str, Measure], ...], ...]
     shown: dict[str, tuple[Measure, float]]
 
+    def label_of(self, motion: Motion) -> str | None:
+        """Give the ground-truth decision, None where neither an order nor geometry tells."""
+        for group in self.implied:
+            sizes = [(size(motion), token) for token, size in group]
+            found = [pair for pair in sizes if pair[0] >= 1.0]
+            if found:
+                return max(found, key=lambda pair: pair[0])[1]  # the earlier one of two equal ones
+        return None
 
-@in_place.kept(16)
-def table_of(cfg: LabelConfig) -> ActionTable:
-    """Give the rules of the actions in use."""
-    actions = actions_in_use()
+    def is_contradicted(self, decision: str, motion: Motion) -> bool:
+        """Tell whether a motion shows too little of a decision, or its opposite."""
+        shown, limit = self.shown[decision]
+        return shown(motion) < limit
+
+    def verdict_of(self, decision: str, motion: Motion, label: str | None) -> Verdict:
+        """Judge a decision against the actual future (the three classes of sec:appendix_e, and ABSTAIN)."""
+        if decision == label:
+            return "CONSISTENT"
+        if self.is_contradicted(decision, motion):
+            return "HARD_CONFLICT"
+        return "ABSTAIN" if label is None else "SOFT_CONFLICT"
+
+    def contradicted_by(self, motion: Motion, label: str | None) -> list[str]:
+        """Give the decisions that the actual future contradicts: what a guess would have run into."""
+        return [token for token, (size, limit) in self.shown.items() if token != label and size(motion) < limit]
+
+
+@lru_cache(maxsize=16)
+def table_of(actions: ActionSet, cfg: LabelConfig) -> ActionTable:
+    """Give the rules of a set of actions."""
     groups = [
         [(token, _rule(rule, token, cfg)) for token in line if (rule := actions.actions[token].implied) is not None]
         for line in actions.precedence
@@ -185,34 +209,3 @@ def _read(name: str, token: str) -> Measure:
 
 def _setting(term: Term, cfg: LabelConfig) -> float:
     return 1.0 if term.setting is None else float(getattr(cfg, term.setting))
-
-
-def label_of(motion: Motion, cfg: LabelConfig) -> str | None:
-    """Give the ground-truth decision, None where neither an order nor geometry tells."""
-    for group in table_of(cfg).implied:
-        sizes = [(size(motion), token) for token, size in group]
-        found = [pair for pair in sizes if pair[0] >= 1.0]
-        if found:
-            return max(found, key=lambda pair: pair[0])[1]  # the earlier one of two equal ones
-    return None
-
-
-def is_contradicted(decision: str, motion: Motion, cfg: LabelConfig) -> bool:
-    """Tell whether a motion shows too little of a decision, or its opposite."""
-    shown, limit = table_of(cfg).shown[decision]
-    return shown(motion) < limit
-
-
-def verdict_of(decision: str, motion: Motion, cfg: LabelConfig, label: str | None) -> Verdict:
-    """Judge a decision against the actual future (the three classes of sec:appendix_e, and ABSTAIN)."""
-    if decision == label:
-        return "CONSISTENT"
-    if is_contradicted(decision, motion, cfg):
-        return "HARD_CONFLICT"
-    return "ABSTAIN" if label is None else "SOFT_CONFLICT"
-
-
-def contradicted_by(motion: Motion, cfg: LabelConfig, label: str | None) -> list[str]:
-    """Give the decisions that the actual future contradicts: what a guess would have run into."""
-    shown = table_of(cfg).shown.items()
-    return [token for token, (size, limit) in shown if token != label and size(motion) < limit]

@@ -29,14 +29,14 @@ from caption.truth.references import (
 from caption.truth.said import SCENE
 from caption.truth.sizes import BOUND_SHARE, RATIO_SLACK, about_share, numeral_of, written_digits
 from caption.truth.stated import read_stated
-from cosfly.products.actions import kin_of
+from cosfly.products.actions import ActionSet
 from cosfly.products.answer_text import normalize_action
 from cosfly.products.captions import Claim, Coc, Language, SentenceState
 from cosfly.products.sentences import sentences_of
 
 
 def judge_claims(
-    coc: Coc, claims: Sequence[Claim], facts: Facts, cfg: EvidenceConfig, language: Language
+    coc: Coc, claims: Sequence[Claim], facts: Facts, cfg: EvidenceConfig, language: Language, actions: ActionSet
 ) -> list[Judged]:
     """Compare the claims of a text with the facts and with its own words; gives the state of every sentence, in order.
 
@@ -52,7 +52,7 @@ def judge_claims(
     for name, text in sentences:
         own = [claim for claim in claims if of_names[claim.sentence] == name]
         beside = [claim for claim in claims if claim not in own and _is_beside(of_names[claim.sentence], name)]
-        judged.append(judge_sentence(name, text, own, beside, coc.flight_decision, facts, cfg, language))
+        judged.append(judge_sentence(name, text, own, beside, coc.flight_decision, facts, cfg, language, actions))
     if stray and judged:
         first = judged[0]
         judged[0] = Judged(first.name, first.text, "contradicted", (*first.problems, *dict.fromkeys(stray)))
@@ -84,17 +84,18 @@ def judge_sentence(
     facts: Facts,
     cfg: EvidenceConfig,
     language: Language,
+    actions: ActionSet,
 ) -> Judged:
     """Judge one sentence by its claims; beside: those of the sentences before and after it."""
     about = cfg if read_stated(text, language).is_approximate else None
     problems, states = [], []
     for claim in claims:
         numeral = numeral_of(text, claim, language) if isinstance(claim.value, float) else None
-        state, problem = _compare(claim, decision, facts, about, numeral)
+        state, problem = _compare(claim, decision, facts, about, numeral, actions)
         states.append(state)
         if problem:
             problems.append(problem)
-    coverage = cover(text, claims, facts, language, beside)
+    coverage = cover(text, claims, facts, language, actions, beside)
     problems += coverage.problems
     if problems:
         return Judged(name, text, "contradicted", tuple(dict.fromkeys(problems)))
@@ -103,13 +104,13 @@ def judge_sentence(
 
 
 def _compare(
-    claim: Claim, decision: str, facts: Facts, about: EvidenceConfig | None, numeral: Numeral | None
+    claim: Claim, decision: str, facts: Facts, about: EvidenceConfig | None, numeral: Numeral | None, actions: ActionSet
 ) -> tuple[str, str]:
     """Give what became of a claim, proved | unread | contradicted | not_compared, and the problem, if it is one."""
     if claim.quantity == SCENE or claim.modality == "hypothetical":
         return "not_compared", ""
     if claim.quantity == "decision" or claim.modality == "predicted":
-        is_against = goes_against(claim, decision)
+        is_against = goes_against(claim, decision, actions)
         return (
             ("contradicted", f"decision: {claim_name(claim)}, not {decision}") if is_against else ("not_compared", "")
         )
@@ -226,10 +227,10 @@ _AGAINST: dict[tuple[str, str], tuple[str, ...]] = {
 }
 
 
-def goes_against(claim: Claim, decision: str) -> bool:
+def goes_against(claim: Claim, decision: str, actions: ActionSet) -> bool:
     """Tell whether a predicted claim contradicts the decision."""
     if claim.quantity == "decision":
-        return claim.modality != "hypothetical" and normalize_action(str(claim.value)) != decision
+        return claim.modality != "hypothetical" and normalize_action(str(claim.value), actions) != decision
     aspect, _, name = claim.quantity.rpartition(":")
     word = claim.value
     if isinstance(word, float):
@@ -237,7 +238,7 @@ def goes_against(claim: Claim, decision: str) -> bool:
             return False
         rises = word > 0
         word = ("left" if rises else "right") if name == "yaw" else ("increasing" if rises else "decreasing")
-    return kin_of(decision) in _AGAINST.get((name, word), ())
+    return actions.kin_of(decision) in _AGAINST.get((name, word), ())
 
 
 def claim_name(claim: Claim) -> str:

@@ -15,12 +15,12 @@ from caption.truth.borne_out import bears_out_number, bears_out_own, bears_out_p
 from caption.truth.facts import Facts
 from caption.truth.glossary import mentions
 from caption.truth.numerals import Numeral
-from caption.truth.poles import ACTION_WORDS, poles_of
+from caption.truth.poles import ACTION_WORDS
 from caption.truth.references import QUANTITIES
 from caption.truth.said import Said, frames_of
 from caption.truth.sizes import may_mean, same_size
 from caption.truth.stated import Pole, Stated, lexicon_of, read_stated
-from cosfly.products.actions import kin_of
+from cosfly.products.actions import ActionSet
 from cosfly.products.captions import Claim, Language
 
 # Words, negated or not, that say that the person is seen, and that not all is.
@@ -47,7 +47,7 @@ class ClaimCoverage:
 
 
 def cover(
-    sentence: str, claims: Sequence[Claim], facts: Facts, language: Language, beside: Sequence[Claim] = ()
+    text: str, claims: Sequence[Claim], facts: Facts, language: Language, actions: ActionSet, beside: Sequence[Claim]
 ) -> ClaimCoverage:
     """Say what of a sentence neither a claim covers nor the facts bear out, and which claims it says the opposite of.
 
@@ -56,11 +56,11 @@ def cover(
     sentence: then it stands in the place of what was claimed.
 
     Args:
-        claims: of this sentence, all of them.
+        text: a sentence. claims: all of it.
         beside: claims of the sentences before and after it.
     """
-    stated = read_stated(sentence, language)
-    said, around = Said(claims, facts, language), Said([*claims, *beside], facts, language)
+    stated = read_stated(text, language)
+    said, around = (Said(of, facts, language, actions) for of in (claims, [*claims, *beside]))
     uncovered = [numeral for numeral in stated.numerals if not said.covers_numeral(numeral, stated)]
     problems = [f"uncovered: {text}" for text in _wrong_numerals(stated, said, around, uncovered)]
     poles = list(_uncovered_poles(stated, said, facts, language))
@@ -175,7 +175,7 @@ def _is_led(pole: Pole, said: Said, facts: Facts) -> bool | None:
     claims = [claim for claim in said.numbers if same_size(pole.number, claim)]
     changes = [c for c in claims if c.quantity.partition(":")[0] in ("change", "rate", "growth") and c.value]
     if changes and pole.value != "steady":
-        return any(("trend", pole.value) in poles_of(claim) for claim in changes)
+        return any(("trend", pole.value) in said.poles_of(claim) for claim in changes)
     if pole.is_than or pole.word.startswith("比") or mentions("comparatives").fullmatch(pole.word):
         return None
     verdicts = [_has_come(pole.value, claim, facts) for claim in claims]
@@ -252,7 +252,7 @@ def _denied_words(stated: Stated, said: Said) -> Iterator[str]:
             if "off_centre" in places and not _is_off_somewhere(said):
                 yield _name(claim)
         elif claim.quantity == "decision" and claim.modality == "predicted":
-            word = ACTION_WORDS.get(kin_of(str(claim.value)))
+            word = ACTION_WORDS.get(said.actions.kin_of(str(claim.value)))
             if stated.named and word not in stated.actions:
                 yield _name(claim)
 
@@ -286,8 +286,8 @@ def _denied_numbers(stated: Stated, said: Said) -> Iterator[str]:
         pole = _side_of(numeral, stated)
         if pole is None:
             continue
-        signed = [claim for claim in said.numbers if same_size(numeral, claim) and _has_side(claim, pole)]
-        if signed and not any((pole.dimension, pole.value) in poles_of(claim) for claim in signed):
+        signed = [claim for claim in said.numbers if same_size(numeral, claim) and _has_side(claim, pole, said)]
+        if signed and not any((pole.dimension, pole.value) in said.poles_of(claim) for claim in signed):
             yield f"{numeral.text} {pole.word}"
     for first, second in pairwise(stated.numerals):
         between = stated.text[first.start + len(first.text) : second.start]
@@ -308,8 +308,8 @@ def _side_of(numeral: Numeral, stated: Stated) -> Pole | None:
     return None
 
 
-def _has_side(claim: Claim, pole: Pole) -> bool:
-    return any(dimension == pole.dimension for dimension, _ in poles_of(claim))
+def _has_side(claim: Claim, pole: Pole, said: Said) -> bool:
+    return any(dimension == pole.dimension for dimension, _ in said.poles_of(claim))
 
 
 def _is_turned(first: Numeral, second: Numeral, said: Said) -> bool:

@@ -1,6 +1,7 @@
-"""The words of both languages (`glossary.yaml`, and the names and terms of the actions in use): the one reader of them.
+"""The words of both languages, `glossary.yaml`: the one reader of them.
 
-Everything that writes, reads or compares the two languages takes its words here; what a sentence states: stated.py.
+Everything that writes, reads or compares the two languages takes its words here; what a sentence states: stated.py. What
+a set of actions adds: vocabulary.py.
 """
 
 from __future__ import annotations
@@ -13,9 +14,7 @@ from typing import NamedTuple
 
 from pydantic import Field
 
-from cosfly.products.actions import ActionSet, actions_in_use
 from cosfly.products.captions import Language
-from cosfly.work import in_place
 from cosfly.work.config import Config, build, read_yaml
 
 GLOSSARY_FILE = Path(__file__).with_name("glossary.yaml")
@@ -67,11 +66,7 @@ class Unit(NamedTuple):
 class Glossary:
     """The glossary with its patterns compiled."""
 
-    def __init__(self, file: GlossaryFile, actions: ActionSet) -> None:
-        self.actions = {token: {"en": action.en, "zh": action.zh} for token, action in actions.actions.items()}
-        self.terms = [(pair.en, pair.zh) for pair in actions.terms]
-        self._translations = dict([*((action.en, action.zh) for action in actions.actions.values()), *self.terms])
-        self._translated = _term_pattern(self._translations, "en")
+    def __init__(self, file: GlossaryFile) -> None:
         self.slot_words = {
             value: {language: tuple(words.slot[language]) for language in LANGUAGES}
             for values in file.notions.values()
@@ -86,8 +81,8 @@ class Glossary:
         }
         self._denials, lists = file.lists["denials"], file.lists
         self._poles = {one: _opposites(file, one) for one in LANGUAGES}
-        self._terms = {one: _term_pattern([*self._poles[one], *lists["not_terms"][one]], one) for one in LANGUAGES}
-        self._states = {one: _term_pattern(lists["states"][one], one) for one in LANGUAGES}
+        self._terms = {one: term_pattern([*self._poles[one], *lists["not_terms"][one]], one) for one in LANGUAGES}
+        self._states = {one: term_pattern(lists["states"][one], one) for one in LANGUAGES}
         self._idioms = {one: re.compile("|".join(lists["idioms"][one]), re.IGNORECASE) for one in LANGUAGES}
 
     def spellings(self, language: Language) -> dict[str, str]:
@@ -101,11 +96,6 @@ class Glossary:
     def states(self, text: str, language: Language) -> list[str]:
         """Find words for what a slot can say, opposites aside."""
         return [match.group() for match in self._states[language].finditer(text.lower())]
-
-    def terms_in(self, english: str) -> tuple[tuple[str, str], ...]:
-        """Give the terms of an English text with their translations."""
-        found = dict.fromkeys(match.group() for match in self._translated.finditer(english.lower()))
-        return tuple((term, self._translations[term]) for term in found)
 
     def poles(self, text: str, language: Language) -> list[tuple[str, int, int]]:
         """Find opposites in a text: (pair, +1 or -1, position), negations applied."""
@@ -126,13 +116,12 @@ class Glossary:
         words = re.findall(r"[a-z']+", re.split(r"[.,;:]", text[max(0, start - 24) : start])[-1])
         return bool(set(self._denials.en).intersection(words[-2:]))
 
-    def quoted(self) -> str:
-        """Give the glossary as lines for a translation prompt."""
-        pairs = [(pair["en"], pair["zh"]) for group in (self.actions, self.visibility) for pair in group.values()]
+    def pairs(self) -> list[tuple[str, str]]:
+        """Give its words of visibility and its units, English and Chinese, as they are written."""
+        pairs = [(pair["en"], pair["zh"]) for pair in self.visibility.values()]
         units = {unit: spelling for spelling, unit in reversed(self._units["zh"].items())}
         english = {unit: spelling for spelling, unit in reversed(self._units["en"].items())}
-        pairs += [(english[unit], units[unit]) for unit in english if unit in units]
-        return "\n".join(f"{en} = {zh}" for en, zh in pairs + self.terms)
+        return pairs + [(english[unit], units[unit]) for unit in english if unit in units]
 
 
 def _opposites(file: GlossaryFile, language: Language) -> dict[str, tuple[str, int]]:
@@ -145,7 +134,8 @@ def _opposites(file: GlossaryFile, language: Language) -> dict[str, tuple[str, i
     }
 
 
-def _term_pattern(words: Iterable[str], language: Language) -> re.Pattern[str]:
+def term_pattern(words: Iterable[str], language: Language) -> re.Pattern[str]:
+    """Give the pattern of any of some words, the longest first."""
     options = "|".join(re.escape(word) for word in sorted(words, key=len, reverse=True))
     return re.compile(rf"(?<![a-z_])(?:{options})(?![a-z_])" if language == "en" else options)
 
@@ -192,7 +182,7 @@ def words_beside(language: Language) -> dict[str, tuple[str, frozenset[str]]]:
     return found
 
 
-@in_place.kept()
+@cache
 def load_glossary() -> Glossary:
-    """Read the glossary, and put the actions in use into it."""
-    return Glossary(glossary_file(), actions_in_use())
+    """Read the glossary."""
+    return Glossary(glossary_file())

@@ -7,9 +7,8 @@ from collections import Counter, defaultdict
 import numpy as np
 
 from caption.schema import FutureMotion, LabelConfig
-from caption.truth.actions import Motion, label_of, measure, table_of
+from caption.truth.actions import ActionTable, Motion, measure, table_of
 from cosfly.products.actions import ActionSet
-from cosfly.work import in_place
 
 NUM_MOTIONS = 3000
 STEPS, STEP_S = 5, 0.5
@@ -23,14 +22,13 @@ def never_labels(actions: ActionSet, cfg: LabelConfig, rng: np.random.Generator)
     motions = [measure(_made_up(rng)) for _ in range(NUM_MOTIONS)]
     implied, wins = Counter[str](), Counter[str]()
     taken: dict[str, Counter[str]] = defaultdict(Counter)
-    with in_place.put(actions=actions):
-        for motion in motions:
-            label = label_of(motion, cfg)
-            wins[str(label)] += 1
-            found = _implied(motion, cfg)
-            implied.update(found)
-            if len(found) == 2 and label in found:  # but for this one it would have been the other
-                taken[found[label == found[0]]][str(label)] += 1
+    table = table_of(actions, cfg)
+    for motion in motions:
+        label, found = table.label_of(motion), _implied(motion, table)
+        wins[str(label)] += 1
+        implied.update(found)
+        if len(found) == 2 and label in found:  # but for this one it would have been the other
+            taken[found[label == found[0]]][str(label)] += 1
     return [
         _told(token, implied[token], wins[token], taken[token])
         for token, action in actions.actions.items()
@@ -38,8 +36,8 @@ def never_labels(actions: ActionSet, cfg: LabelConfig, rng: np.random.Generator)
     ]
 
 
-def _implied(motion: Motion, cfg: LabelConfig) -> list[str]:
-    return [token for line in table_of(cfg).implied for token, size in line if size(motion) >= 1.0]
+def _implied(motion: Motion, table: ActionTable) -> list[str]:
+    return [token for line in table.implied for token, size in line if size(motion) >= 1.0]
 
 
 def _told(token: str, num_implied: int, num_wins: int, taken: Counter[str]) -> str:

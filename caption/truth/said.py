@@ -14,6 +14,7 @@ from caption.truth.poles import Pair, poles_between, poles_of, side_word
 from caption.truth.references import QUANTITIES, TURNING, Fact, look_up, parse_reference
 from caption.truth.sizes import both_ways, is_share, same_size, ways
 from caption.truth.stated import Pole, Stated, read_stated
+from cosfly.products.actions import ActionSet
 from cosfly.products.captions import Claim, Language
 
 HOUR_DEG = 30.0
@@ -41,8 +42,8 @@ def _is_expected(claim: Claim, pole: Pair) -> bool:
 class Said:
     """The claims of one sentence: their numbers, and the opposites that they stand for."""
 
-    def __init__(self, claims: Sequence[Claim], facts: Facts, language: Language) -> None:
-        self.facts, self.language = facts, language
+    def __init__(self, claims: Sequence[Claim], facts: Facts, language: Language, actions: ActionSet) -> None:
+        self.facts, self.language, self.actions = facts, language, actions
         self.claims = [claim for claim in claims if claim.quantity != SCENE]
         self.scene = [str(claim.value) for claim in claims if claim.quantity == SCENE]
         self.numbers = [claim for claim in self.claims if isinstance(claim.value, float)]
@@ -52,10 +53,10 @@ class Said:
         self.poles: set[Pair] = set()
         self.observed: set[Pair] = set()
         for claim in self.claims:
-            self.poles.update(poles_of(claim))
+            self.poles.update(self.poles_of(claim))
             if claim.modality == "observed":
-                self.observed.update(poles_of(claim))
-        self.worded = {pole for claim in self.words for pole in poles_of(claim) if _is_expected(claim, pole)}
+                self.observed.update(self.poles_of(claim))
+        self.worded = {pole for claim in self.words for pole in self.poles_of(claim) if _is_expected(claim, pole)}
         between = set(poles_between(self.numbers))
         self.poles |= between
         self.observed |= between
@@ -66,6 +67,9 @@ class Said:
             for either in LANGUAGES:
                 self.poles.update((pole.dimension, pole.value) for pole in read_stated(text, either).poles)
 
+    def poles_of(self, claim: Claim) -> set[Pair]:
+        return poles_of(claim, self.actions)
+
     def names_frames(self, pole: Pole) -> bool:
         """Tell whether a claim of visibility is of a frame that stands beside a word of it."""
         return any(c.quantity == "visibility" and pole.frames.intersection(frames_of(c)) for c in self.words)
@@ -73,7 +77,7 @@ class Said:
     def denies_frames(self, pole: Pole) -> bool:
         """Tell whether claims of the frames that stand beside a word of visibility say another."""
         of_frames = [c for c in self.words if c.quantity == "visibility" and pole.frames.intersection(frames_of(c))]
-        return bool(of_frames) and not any(("visibility", pole.value) in poles_of(claim) for claim in of_frames)
+        return bool(of_frames) and not any(("visibility", pole.value) in self.poles_of(claim) for claim in of_frames)
 
     def covers_numeral(self, numeral: Numeral, stated: Stated) -> bool:
         if numeral.kind == "clock":

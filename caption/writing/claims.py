@@ -22,10 +22,10 @@ from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.references import QUANTITIES
 from caption.truth.sizes import same_size
 from caption.truth.stated import read_stated
-from caption.writing.contract import Draft, Refused
+from caption.writing.contract import Draft, Refused, WayOfWriting
 from cosfly.errors import plain
 from cosfly.products.answer_text import Parsed
-from cosfly.products.captions import Claim, Language, Modality
+from cosfly.products.captions import Claim, Language, Modality, Writing
 from cosfly.products.sentences import sentences_of
 
 MAX_CLAIMS = 60
@@ -76,9 +76,10 @@ _REASONS = {
 }
 
 
-class Claims:
+class Claims(WayOfWriting):
     """The teacher writes prose and its claims."""
 
+    name: Writing = "claims"
     system = "system_claims_en"
     mirror_system = "mirror_system"
     fields: Mapping[str, dict] = {"claims": {"type": "array", "maxItems": MAX_CLAIMS, "items": CLAIM_SCHEMA}}
@@ -109,7 +110,7 @@ class Claims:
         return refused or draft
 
     def judge(self, draft: Draft, facts: Facts, cfg: EvidenceConfig, language: Language) -> list[Judged]:
-        return judge_claims(draft.coc, draft.claims, facts, cfg, language)
+        return judge_claims(draft.coc, draft.claims, facts, cfg, language, self.vocabulary.actions)
 
 
 def measured_series(facts: Facts) -> list[str]:

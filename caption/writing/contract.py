@@ -9,12 +9,12 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from typing import Any, Protocol
 
 from caption.schema import EvidenceConfig, Judged
 from caption.truth.facts import Facts
-from cosfly.products.actions import action_tokens
+from caption.truth.vocabulary import Vocabulary
 from cosfly.products.answer_text import Parsed
 from cosfly.products.captions import Claim, Coc, Language, Template, Writing
 
@@ -61,17 +61,22 @@ class Refused:
 
 
 class WayOfWriting(Protocol):
-    """One way of writing. All are stateless.
+    """One way of writing, in a vocabulary; nothing else stays in it.
 
-    system, mirror_system: prompt files (`system` is asked in English). fields: further fields of an answer, name ->
-    JSON schema, in the order in which they stand between the texts and `therefore`. optional: more of them, which an
-    answer in either language may leave out.
+    name: among WAYS. system, mirror_system: prompt files (`system` is asked in English). fields: further fields of an
+    answer, name -> JSON schema, in the order in which they stand between the texts and `therefore`. optional: more of
+    them, which an answer in either language may leave out.
     """
 
+    name: Writing
     system: str
     mirror_system: str
     fields: Mapping[str, dict]
     optional: Mapping[str, dict]
+    vocabulary: Vocabulary
+
+    def __init__(self, vocabulary: Vocabulary) -> None:
+        self.vocabulary = vocabulary
 
     def table(self, facts: Facts) -> str:
         """Give what the question shows beside the flight data; "" for nothing."""
@@ -86,15 +91,15 @@ class WayOfWriting(Protocol):
         """Give the state of every sentence of both texts, in order."""
 
 
-@cache
-def way_of(name: Writing) -> WayOfWriting:
+@lru_cache
+def way_of(name: Writing, vocabulary: Vocabulary) -> WayOfWriting:
     module, _, attribute = WAYS[name].partition(":")
-    return getattr(importlib.import_module(module), attribute)()
+    return getattr(importlib.import_module(module), attribute)(vocabulary)
 
 
 def more_fields(way: WayOfWriting) -> dict[str, dict]:
     """Give the fields of an answer beyond the paper's three. `therefore` is free even where the decision is given."""
-    return {**way.fields, **way.optional, "therefore": {"type": "string", "enum": list(action_tokens())}}
+    return {**way.fields, **way.optional, "therefore": {"type": "string", "enum": list(way.vocabulary.actions.tokens)}}
 
 
 def refuse_decision(answer: Parsed) -> Refused | None:

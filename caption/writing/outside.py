@@ -7,13 +7,13 @@ hypotheses. Patterns are wide where a slot could have said it and narrow where t
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 
 from caption.truth.glossary import load_glossary
 from caption.truth.numerals import read_numerals
+from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Refused
-from cosfly.products.actions import action_tokens
 from cosfly.products.captions import Language
-from cosfly.work import in_place
 
 SLOT_MARK = "¤"
 
@@ -119,15 +119,15 @@ def decisions_opposed(text: str) -> tuple[str, ...]:
     )
 
 
-def decisions_named(text: str) -> tuple[str, ...]:
+def decisions_named(text: str, vocabulary: Vocabulary) -> tuple[str, ...]:
     """Give the actions, in words or as tokens, that an English text says to take."""
-    return tuple((match["words"] or match["token"]).lower() for match in _named().finditer(text))
+    return tuple((match["words"] or match["token"]).lower() for match in _named(vocabulary).finditer(text))
 
 
-@in_place.kept()
-def _named() -> re.Pattern[str]:
-    words = "|".join(re.escape(pair["en"]) for pair in load_glossary().actions.values())
-    tokens = "|".join(token for token in action_tokens() if "_" in token)
+@lru_cache
+def _named(vocabulary: Vocabulary) -> re.Pattern[str]:
+    words = "|".join(re.escape(name["en"]) for name in vocabulary.names.values())
+    tokens = "|".join(token for token in vocabulary.actions.tokens if "_" in token)
     return re.compile(
         r"\b(?:should|must|shall|needs? to|has to|have to|best to|decision (?:is|that follows is)(?: to)?"
         r"|therefore,?)\s+(?:now\s+)?"

@@ -8,14 +8,15 @@ from caption.schema import EvidenceConfig, Judged
 from caption.truth.facts import Facts
 from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.prose import judge_prose
-from caption.writing.contract import Draft, Refused
+from caption.writing.contract import Draft, Refused, WayOfWriting
 from cosfly.products.answer_text import Parsed
-from cosfly.products.captions import Language
+from cosfly.products.captions import Language, Writing
 
 
-class Prose:
+class Prose(WayOfWriting):
     """The teacher writes as it likes; its sentences are unread, but for what is plainly false."""
 
+    name: Writing = "prose"
     system = "system_prose_en"
     mirror_system = "mirror_system"
     fields: Mapping[str, dict] = {}

@@ -7,6 +7,7 @@ are known and fit them (earned.py), or if claims that quote the others hold; els
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any, get_args
 
 from caption.schema import EvidenceConfig, Judged
@@ -16,16 +17,16 @@ from caption.truth.glossary import load_glossary
 from caption.truth.mirror import TEXTS, lacking
 from caption.truth.references import QUANTITIES
 from caption.truth.stated import Pole, read_stated
+from caption.truth.vocabulary import Vocabulary
 from caption.writing.claims import QUOTED_SCHEMA, read_quoted
-from caption.writing.contract import Draft, Refused
+from caption.writing.contract import Draft, Refused, WayOfWriting
 from caption.writing.earned import is_earned
 from caption.writing.filling import Filler, facts_of
 from caption.writing.outside import SLOT_MARK
 from caption.writing.templates import Sentence, read_sentence
 from cosfly.products.answer_text import Parsed
-from cosfly.products.captions import Claim, Coc, Language, SentenceState, Template
+from cosfly.products.captions import Claim, Coc, Language, SentenceState, Template, Writing
 from cosfly.products.sentences import cut_sentences
-from cosfly.work import in_place
 
 MAX_COMPLAINTS = 6  # named at once
 CONTRADICTIONS = ("false", "text says otherwise", "claims disagree", "decision")  # among the problems of claims
@@ -38,54 +39,57 @@ CLAIMED_BY: dict[str, tuple[str, ...]] = {
 _JUDGED = {state: Judged("", "", state) for state in get_args(SentenceState)}
 
 
-class Slots:
+class Slots(WayOfWriting):
     """The teacher writes templates."""
 
+    name: Writing = "slots"
     system = "system_slots_en"
     mirror_system = "mirror_slots_system"
     fields: Mapping[str, dict] = {}
     optional: Mapping[str, dict] = {"claims": QUOTED_SCHEMA}
 
     def table(self, facts: Facts) -> str:
-        return fact_table(facts)
+        return fact_table(facts, self.vocabulary)
 
     def read(self, answer: Parsed, facts: Facts) -> Draft | Refused:
         assert answer.coc is not None
-        return _fill(answer.coc, facts, "en", answer.more.get("claims"), answer.therefore)
+        filler = Filler(facts, answer.coc.flight_decision, "en", self.vocabulary)
+        return _fill(answer.coc, filler, answer.more.get("claims"), answer.therefore)
 
     def read_mirror(self, answer: Parsed, english: Draft, facts: Facts) -> Draft | Refused:
         assert answer.coc is not None
         assert english.template is not None
         if answer.coc.flight_decision != english.coc.flight_decision:
             return Refused("decision", f'"flight_decision" must stay {english.coc.flight_decision}.')
-        problem = _compare(english.template, answer.coc, facts)
+        problem = _compare(english.template, answer.coc, facts, self.vocabulary)
         if problem is not None:
             return problem
-        found = _fill(answer.coc, facts, "zh", answer.more.get("claims"))
+        filler = Filler(facts, answer.coc.flight_decision, "zh", self.vocabulary)
+        found = _fill(answer.coc, filler, answer.more.get("claims"))
         if isinstance(found, Refused):
             return found
-        missing = lacking(_terms(english.template, facts), found.coc)
+        missing = lacking(_terms(english.template, facts, self.vocabulary), found.coc)
         return Refused("glossary", missing, found) if missing else found
 
     def judge(self, draft: Draft, facts: Facts, cfg: EvidenceConfig, language: Language) -> list[Judged]:
         return list(draft.judged)
 
 
-@in_place.kept(64)  # an English text is read again when its mirror is held against it
-def read_text(text: str, language: Language, num_frames: int, step_s: float) -> tuple[Sentence | Refused, ...]:
+@lru_cache(maxsize=64)  # an English text is read again when its mirror is held against it
+def read_text(
+    text: str, language: Language, num_frames: int, step_s: float, vocabulary: Vocabulary
+) -> tuple[Sentence | Refused, ...]:
     """Read the sentences of a text."""
-    return tuple([read_sentence(part, language, num_frames, step_s) for part in cut_sentences(text)])
+    return tuple([read_sentence(part, language, num_frames, step_s, vocabulary) for part in cut_sentences(text)])
 
 
-def _fill(
-    written: Coc, facts: Facts, language: Language, claimed: Any, therefore: str | None = None
-) -> Draft | Refused:
+def _fill(written: Coc, filler: Filler, claimed: Any, therefore: str | None = None) -> Draft | Refused:
     """Fill the templates of an answer, or tell all that is wrong with their sentences.
 
     Args:
         claimed: the claims of the answer, as they came. Those of sentences that slots prove are not kept.
     """
-    filler, num_frames = Filler(facts, written.flight_decision, language), len(facts)
+    facts, language, num_frames = filler.facts, filler.language, len(filler.facts)
     judged: list[Judged] = []
     claims: list[Claim] = []
     problems: list[Refused] = []
@@ -94,7 +98,8 @@ def _fill(
     for name in TEXTS:
         filled: list[str] = []
         is_reasoning = name == "reasoning_trace"
-        for number, sentence in enumerate(read_text(getattr(written, name), language, num_frames, facts.step_s), 1):
+        sentences = read_text(getattr(written, name), language, num_frames, facts.step_s, filler.vocabulary)
+        for number, sentence in enumerate(sentences, 1):
             plain: str | Refused = (
                 sentence if isinstance(sentence, Refused) else filler.fill(sentence, is_reasoning=is_reasoning)
             )
@@ -103,11 +108,8 @@ def _fill(
                 if claimed and sentence.state == "unread":
                     key = f"{name[0].upper()}{number}"
                     own = read_quoted(claimed, {key: sentence.beside}, language)
-                    found = (
-                        found
-                        if not own
-                        else _judge_beside(key, sentence, own, written.flight_decision, facts, language)
-                    )
+                    if own:
+                        found = _judge_beside(key, sentence, own, filler)
                 judged.append(found)
                 claims += own
                 words = (*sentence.doubtful, *(claim.quote for claim in own))
@@ -135,12 +137,11 @@ def _fill(
     )
 
 
-def _judge_beside(
-    name: str, sentence: Sentence, claims: Sequence[Claim], decision: str, facts: Facts, language: Language
-) -> Judged:
+def _judge_beside(name: str, sentence: Sentence, claims: Sequence[Claim], filler: Filler) -> Judged:
     """Judge a sentence that its slots do not prove by claims of the words beside them."""
+    facts, language, actions = filler.facts, filler.language, filler.vocabulary.actions
     beside, references = sentence.beside, [place.slot.reference for place in sentence.places]
-    found = judge_sentence(name, beside, claims, (), decision, facts, EvidenceConfig(), language)
+    found = judge_sentence(name, beside, claims, (), filler.decision, facts, EvidenceConfig(), language, actions)
     problems = tuple(one for one in found.problems if one.startswith(CONTRADICTIONS))
     if problems:
         return Judged(name, "", "contradicted", problems)
@@ -167,21 +168,21 @@ def _words_of(claim: Claim, beside: str, poles: Sequence[Pole]) -> list[Pole]:
     return own if SLOT_MARK not in quote and is_of_kind and is_stated else []
 
 
-def _terms(english: Template, facts: Facts) -> list[tuple[str, str]]:
+def _terms(english: Template, facts: Facts, vocabulary: Vocabulary) -> list[tuple[str, str]]:
     """Give the glossary's terms of an English template, slots aside: these are filled in from the glossary."""
     found: list[tuple[str, str]] = []
     for name in TEXTS:
-        for sentence in read_text(getattr(english, name), "en", len(facts), facts.step_s):
+        for sentence in read_text(getattr(english, name), "en", len(facts), facts.step_s, vocabulary):
             assert isinstance(sentence, Sentence)  # else there is no English draft
             found += sentence.terms
     return list(dict.fromkeys(found))  # in their order, so that a complaint is the same in every run
 
 
-def _compare(english: Template, chinese: Coc, facts: Facts) -> Refused | None:
+def _compare(english: Template, chinese: Coc, facts: Facts, vocabulary: Vocabulary) -> Refused | None:
     """Hold the Chinese template against the English one: sentence by sentence the same slots, each in its script."""
     for name in TEXTS:
-        ours = read_text(getattr(english, name), "en", len(facts), facts.step_s)
-        theirs = read_text(getattr(chinese, name), "zh", len(facts), facts.step_s)
+        ours = read_text(getattr(english, name), "en", len(facts), facts.step_s, vocabulary)
+        theirs = read_text(getattr(chinese, name), "zh", len(facts), facts.step_s, vocabulary)
         if len(ours) != len(theirs):
             words = f"{name} has {len(ours)} sentences in English and {len(theirs)} in Chinese; write one for each."
             return Refused("sentences", words)
@@ -216,24 +217,25 @@ _WORDS = (
 )  # fmt: skip
 
 
-def fact_table(facts: Facts) -> str:
+def fact_table(facts: Facts, vocabulary: Vocabulary) -> str:
     """Give the facts of a window with the names of their slots, as they are filled in; what is not known is left
     out."""
     last = len(facts) - 1
     lines = []
     for name in _SERIES:
-        values = dict(facts_of(facts, [f"{name}@t{i}" for i in range(last + 1)]))
+        values = dict(facts_of(facts, [f"{name}@t{i}" for i in range(last + 1)], vocabulary))
         if not values:
             continue
         unit = " " + load_glossary().written_units["en"][QUANTITIES[name].unit]
         series = ", ".join(values.get(f"{name}@t{i}", "-").removesuffix(unit) for i in range(last + 1))
         more = [f"change:{name}", f"trend:{name}"] if name in _SPANNED else []
-        lines.append(f"{{{name}@t0}} to {{{name}@t{last}}}: {series}{unit}{_listed(facts, more, '; ')}")
-    seen = ", ".join(text for _, text in facts_of(facts, [f"visibility@t{i}" for i in range(last + 1)]))
+        lines.append(f"{{{name}@t0}} to {{{name}@t{last}}}: {series}{unit}{_listed(facts, more, vocabulary, '; ')}")
+    seen = ", ".join(text for _, text in facts_of(facts, [f"visibility@t{i}" for i in range(last + 1)], vocabulary))
     lines.append(f"{{visibility@t0}} to {{visibility@t{last}}}: {seen}")
-    lines += [_listed(facts, names).removeprefix("; ") for names in (_NOW, _WORDS)]
+    lines += [_listed(facts, names, vocabulary).removeprefix("; ") for names in (_NOW, _WORDS)]
     return "Table of facts (- is not known; {decision} is there too):\n" + "\n".join(lines)
 
 
-def _listed(facts: Facts, names: Sequence[str], before: str = "") -> str:
-    return before + "; ".join(f"{{{name}}} {text}" for name, text in facts_of(facts, names)) if names else ""
+def _listed(facts: Facts, names: Sequence[str], vocabulary: Vocabulary, before: str = "") -> str:
+    listed = "; ".join(f"{{{name}}} {text}" for name, text in facts_of(facts, names, vocabulary))
+    return before + listed if names else ""

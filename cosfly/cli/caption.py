@@ -113,12 +113,11 @@ def caption_doctor(
 
 def _examine_endpoint(url: str, cfg: CaptionConfig, ways: Sequence[Writing], *, as_reader: bool = False) -> None:
     """Print a table of what works; exit 1 when the endpoint is unusable."""
-    from caption.run.own_files import own_files
+    from caption.run.own_files import vocabulary_of
     from caption.teachers.doctor import examine_endpoint
     from cosfly.work.console import console
 
-    with own_files(cfg):
-        findings = examine_endpoint(url, cfg, ways, as_reader=as_reader)
+    findings = examine_endpoint(url, cfg, vocabulary_of(cfg), ways, as_reader=as_reader)
     options.tell_checks(findings, console, "What the endpoint can do")
 
 
@@ -130,16 +129,16 @@ def caption_prompts(
     check: Annotated[Path | None, Option(help="Folder with prompts of yours: say what is missing or unknown.")] = None,
 ) -> None:
     """Write the prompts into a folder, or check a folder of yours; --set caption.prompts=DIR asks with it."""
-    from caption.run.own_files import own_files
+    from caption.run.own_files import vocabulary_of
     from caption.teachers.prompt_files import export_prompts, own_prompts
 
     if (export is None) == (check is None):
         raise typer.BadParameter("give --export DIR or --check DIR")
     if check is not None:
-        typer.echo(f"{check}: {len(own_prompts(check) or {})} prompts, nothing wrong")
+        typer.echo(f"{check}: {len(own_prompts(check))} prompts, nothing wrong")
     elif export is not None:
-        with own_files(job.cfg.caption):
-            typer.echo(f"{export}: {len(export_prompts(export))} prompts")
+        found = export_prompts(export, vocabulary_of(job.cfg.caption).prompts)
+        typer.echo(f"{export}: {len(found)} prompts")
 
 
 @app.command("actions")
@@ -178,13 +177,13 @@ def caption_judge_check(
     """Measure a judge on a small gold set: agreement, position bias, unparsable answers."""
     import asyncio
 
-    from caption.run.own_files import own_files
+    from caption.run.own_files import vocabulary_of
     from caption.teachers.judge import check_judge, gold_conflicts, judge_check_table
     from cosfly.work.console import console
 
-    cfg = job.cfg
-    with own_files(cfg.caption):
-        console.print(judge_check_table(asyncio.run(check_judge(cfg.caption.judge, gold_conflicts(), cfg.seed))))
+    cfg, seed = job.cfg.caption, job.cfg.seed
+    found = asyncio.run(check_judge(cfg.judge, vocabulary_of(cfg), gold_conflicts(), seed))
+    console.print(judge_check_table(found))
 
 
 @app.command("reader-check")
@@ -200,16 +199,15 @@ def caption_reader_check(
     """Measure a reader of prose on the gold set: true captions flagged, errors caught, claims, requests, tokens."""
     import asyncio
 
-    from caption.run.own_files import own_files
+    from caption.run.own_files import vocabulary_of
     from caption.teachers.reader import check_reader, reader_check_table
     from caption.truth.gold import read_gold
     from cosfly.work.console import console
 
-    cfg, gold = job.cfg, list(read_gold())
+    cfg, gold = job.cfg.caption, list(read_gold())
     gold = gold if limit is None else gold[:: -(-len(gold) // limit)]
-    with own_files(cfg.caption):
-        found = asyncio.run(check_reader(cfg.caption.reader, gold, cfg.seed))
-        console.print(reader_check_table(found, cfg.caption.budget))
+    found = asyncio.run(check_reader(cfg.reader, vocabulary_of(cfg), gold, job.cfg.seed))
+    console.print(reader_check_table(found, cfg.budget))
 
 
 @app.command("compare-strategies")

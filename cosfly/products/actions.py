@@ -10,16 +10,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import BeforeValidator, Field, ValidationInfo, WrapSerializer, field_validator, model_validator
 
 from cosfly.errors import ConfigError, InputError, nearest
 from cosfly.reading.documents import FileFormat, read_model
 from cosfly.reading.files import read_bytes
-from cosfly.work import in_place
 from cosfly.work.config import LEFT_OUT, Config, build, read_yaml
 from cosfly.work.store import write_bytes, write_model
 
@@ -229,9 +228,22 @@ class ActionSet(Config):
             raise ValueError("; ".join(problems))
         return self
 
+    def __hash__(self) -> int:
+        return hash(self.tokens)
+
     @cached_property
     def tokens(self) -> tuple[str, ...]:
+        """The tokens in the order of schemas and of every table."""
         return tuple(self.actions)
+
+    @cached_property
+    def by_letters(self) -> dict[str, str]:
+        return {token.replace("_", ""): token for token in self.actions}
+
+    def kin_of(self, token: str) -> str:
+        """Give the action that ships whose words in texts speak of this one; the token itself where nobody says."""
+        action = self.actions.get(token)
+        return (action.reads_like if action else None) or token
 
 
 class _ActionsFile(ActionSet):
@@ -251,27 +263,22 @@ def read_actions(path: Path) -> ActionSet:
     return ActionSet.model_construct(**{name: getattr(found, name) for name in ActionSet.model_fields})
 
 
-@in_place.kept()
+@cache
 def shipped_actions() -> ActionSet:
     """Give the set that ships."""
     return read_actions(ACTIONS_FILE)
 
 
-def actions_in_use() -> ActionSet:
-    """Give the set that this process works with."""
-    return in_place.given("actions") or shipped_actions()
+def _or_shipped(value: Any) -> Any:
+    return shipped_actions() if value is None else value
 
 
-def action_tokens() -> tuple[str, ...]:
-    """Give the tokens in use. Their order is that of schemas and of every table."""
-    return actions_in_use().tokens
+def _unless_shipped(actions: ActionSet, write: Callable[[ActionSet], Any]) -> Any:
+    return None if actions == shipped_actions() else write(actions)
 
 
-@in_place.kept()
-def kin_of(token: str) -> str:
-    """Give the action that ships whose words in texts speak of this one; the token itself where nobody says."""
-    action = actions_in_use().actions.get(token)
-    return (action.reads_like if action else None) or token
+# As records have it: null for the set that ships.
+RecordedActions = Annotated[ActionSet, BeforeValidator(_or_shipped), WrapSerializer(_unless_shipped)]
 
 
 def export_actions(path: Path) -> None:
@@ -288,36 +295,35 @@ def export_actions(path: Path) -> None:
 # --- beside what was made with it -------------------------------------------------------------------------------------
 
 
-def write_own_actions(folder: Path) -> list[Path]:
-    """Put the set in use beside the captions that were made with it; nothing where it is the one that ships."""
-    actions = in_place.given("actions")
-    if actions is None:
+def write_own_actions(folder: Path, actions: ActionSet) -> list[Path]:
+    """Put a set beside the captions that were made with it; nothing where it is the one that ships."""
+    if actions == shipped_actions():
         return []
     write_model(folder / OWN_ACTIONS, actions, ACTIONS_FORMAT)
     return [folder / OWN_ACTIONS]
 
 
-def actions_beside(captions: Path) -> ActionSet | None:
-    """Give the set that captions were made with; None: the one that ships.
+def actions_beside(captions: Path) -> ActionSet:
+    """Give the set that captions were made with.
 
     Raises:
         InputError: the file is malformed.
     """
     path = captions.parent / OWN_ACTIONS
     if not path.is_file():
-        return None
+        return shipped_actions()
     return read_model(path, ActionSet, ACTIONS_FORMAT, tree=path.parent)
 
 
-def not_in_set(token: object, where: object) -> InputError:
-    """Give the error of a decision that is none of the set in use."""
-    what, expected = "not an action of the closed set", f"one of {', '.join(action_tokens())}"
+def not_in_set(token: object, where: object, actions: ActionSet) -> InputError:
+    """Give the error of a decision that is none of a set."""
+    what, expected = "not an action of the closed set", f"one of {', '.join(actions.tokens)}"
     fix = f"captions of a set of their own have {OWN_ACTIONS} beside them: keep both together"
     return InputError(what, where=str(where), got=str(token), expected=expected, fix=fix)
 
 
-def one_set(sets: Iterable[tuple[object, ActionSet | None]]) -> ActionSet | None:
-    """Give the one set that all were made with; None: the one that ships. sets: whose, and which.
+def one_set(sets: Iterable[tuple[object, ActionSet]]) -> ActionSet:
+    """Give the one set that all were made with. sets: whose, and which; one at least.
 
     Raises:
         InputError: they were made with different ones.
@@ -325,8 +331,8 @@ def one_set(sets: Iterable[tuple[object, ActionSet | None]]) -> ActionSet | None
     found = list(sets)
     for whose, one in found[1:]:
         if one != found[0][1]:
-            differ = sorted(set((one or shipped_actions()).tokens) ^ set((found[0][1] or shipped_actions()).tokens))
+            differ = sorted(set(one.tokens) ^ set(found[0][1].tokens))
             got = f"another one than {found[0][0]}" + (f": {', '.join(differ)}" if differ else ", of the same tokens")
             what, fix = "different sets of actions", "caption them with one file (caption.actions), or use them apart"
             raise InputError(what, where=str(whose), got=got, expected="one set in all of them", fix=fix)
-    return found[0][1] if found else None
+    return found[0][1]

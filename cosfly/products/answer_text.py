@@ -8,10 +8,9 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from cosfly.products.actions import action_tokens
+from cosfly.products.actions import ActionSet
 from cosfly.products.captions import FIELDS, Coc, Language
 from cosfly.reading.objects import find_object
-from cosfly.work import in_place
 
 _DECISION = re.compile(
     r"""[\s"'`*_<\[({“”‘’「『【《]*(?:[0-9]{1,2}[.)]\s*)?"""
@@ -27,14 +26,9 @@ MAX_DECISION_CHARACTERS = 100  # with all that may stand round a token
 MAX_CHARACTERS = {"critical_components": 1200, "reasoning_trace": 1600}  # bounded: a server may pad for ever
 
 
-@in_place.kept()
-def _tokens_by_letters() -> dict[str, str]:
-    return {token.replace("_", ""): token for token in action_tokens()}
-
-
-def normalize_action(text: str) -> str | None:
+def normalize_action(text: str, actions: ActionSet) -> str | None:
     """Give the token for any spelling (spaces, hyphens, case; quotes, brackets; `Decision:` before it), else None."""
-    by_letters = _tokens_by_letters()
+    by_letters = actions.by_letters
     if by_letters.get(text.replace("_", "")) == text:
         return text
     if len(text) > MAX_DECISION_CHARACTERS:
@@ -45,7 +39,7 @@ def normalize_action(text: str) -> str | None:
 
 
 def answer_schema(
-    decision: str | None = None, language: Language = "en", more: Mapping[str, dict] | None = None
+    actions: ActionSet, decision: str | None = None, language: Language = "en", more: Mapping[str, dict] | None = None
 ) -> dict:
     """Give the JSON schema of an answer; a given decision is the enum's one value.
 
@@ -57,7 +51,7 @@ def answer_schema(
         for name, characters in (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS).items()
     }
     properties |= more or {}
-    properties["flight_decision"] = {"type": "string", "enum": [decision] if decision else list(action_tokens())}
+    properties["flight_decision"] = {"type": "string", "enum": [decision] if decision else list(actions.tokens)}
     return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
 
 
@@ -89,6 +83,7 @@ _OTHER_LETTER = re.compile(r"[^\W\d_a-zA-Z\u00c0-\u024f\u4e00-\u9fff]")
 
 def parse_answer(
     text: str,
+    actions: ActionSet,
     language: Language = "en",
     more: Collection[str] = (),
     finish_reason: str | None = None,
@@ -112,11 +107,13 @@ def parse_answer(
         parsed = Parsed(None, found.reason)
     else:
         names = tuple(name for name in names if name in found.value or name not in optional)
-        parsed = _checked(found.value, language, names, recovered)
+        parsed = _checked(found.value, actions, language, names, recovered)
     return replace(parsed, recovered=tuple(recovered)) if recovered else parsed
 
 
-def _checked(value: dict[str, Any], language: Language, names: Collection[str], recovered: list[str]) -> Parsed:
+def _checked(
+    value: dict[str, Any], actions: ActionSet, language: Language, names: Collection[str], recovered: list[str]
+) -> Parsed:
     if len(value) != len(names) or not all(map(value.__contains__, names)):
         return Parsed(None, "missing_field" if set(names) - value.keys() else "extra_field")
     cleaned: dict[str, str] = {}
@@ -134,10 +131,11 @@ def _checked(value: dict[str, Any], language: Language, names: Collection[str], 
         problem = _problem_of(cleaned[name], language, characters)
         if problem is not None:
             return Parsed(None, f"{name}_{problem}")
-    action = normalize_action(cleaned["flight_decision"])
+    action = normalize_action(cleaned["flight_decision"], actions)
     if action is None:
         return Parsed(None, "decision_not_in_closed_set")
-    therefore = normalize_action(value["therefore"]) if isinstance(value.get("therefore"), str) else None
+    stated = value.get("therefore")
+    therefore = normalize_action(stated, actions) if isinstance(stated, str) else None
     if therefore is None and "therefore" in names:
         return Parsed(None, "therefore_not_in_closed_set")
     others = {name: value[name] for name in names if name not in (*FIELDS, "therefore")}

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cosfly.products.actions import ActionSet
 from cosfly.products.captions import Coc, Language, Writing
 from cosfly.products.playback import Flight
 
@@ -47,18 +48,19 @@ class ShownFlight:
     """A flight as far as it is released. flight: of the frames `frame_indices` (n,), in order, which may have gaps;
     styles: (n,).
 
-    twin: the clean flight of a perturbed one, of the same frames; None where it is not released or shows others.
-    settings: the captions' own, as they are on record; empty: the defaults. prompts: their questions, where these do
-    not ship.
+    actions: the closed set of their decisions. twin: the clean flight of a perturbed one, of the same frames; None
+    where it is not released or shows others. settings: the captions' own, as they are on record; empty: the defaults.
+    prompts: their questions, where these do not ship.
     """
 
     flight: Flight
     frame_indices: np.ndarray
     styles: Sequence[str | None]
     captions: Sequence[ShownCaption]
-    twin: Flight | None = None
-    settings: dict[str, Any] | None = None
-    prompts: dict[str, str] | None = None
+    actions: ActionSet
+    twin: Flight | None
+    settings: dict[str, Any]
+    prompts: dict[str, str]
 
 
 class Lie(NamedTuple):

@@ -16,14 +16,13 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any
 
 from cosfly.errors import CosflyError
 from cosfly.work.console import set_levels
-from cosfly.work.in_place import put_all
 from cosfly.work.items import Item, Work, attempt, counted_steps
 from cosfly.work.stage_folder import ItemRecord
 
@@ -63,12 +62,10 @@ class Manner:
 
 @dataclass(frozen=True)
 class Start:
-    """The first thing that a worker gets through its pipe; `make_worker` is a module-level function. own_files: what
-    stands in the place of files that ship (cosfly/work/in_place.py)."""
+    """The first thing that a worker gets through its pipe; `make_worker` is a module-level function."""
 
     make_worker: Callable[..., Work]
     worker_args: tuple
-    own_files: dict[str, Any] = field(default_factory=dict)
 
 
 @contextlib.contextmanager
@@ -107,8 +104,6 @@ def work_through(connection: Connection, manner: Manner) -> None:
     threading.Thread(target=voice.tell_life, args=(manner.heartbeat_s,), daemon=True).start()
     try:
         start: Start | None = _received(connection)
-        if start:
-            put_all(start.own_files)
         work = start.make_worker(*start.worker_args) if start else None
         while work and (item := _received(connection)):
             voice.begin(item)

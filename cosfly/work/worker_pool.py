@@ -21,7 +21,6 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from cosfly.errors import EnvironmentMissing
-from cosfly.work.in_place import everything
 from cosfly.work.items import Item, Work
 from cosfly.work.stage_events import LOSSES, EventLog, Loss, cpu_seconds
 from cosfly.work.stage_folder import Failed, ItemRecord
@@ -176,7 +175,7 @@ class WorkerPool:
             process.start()
         there.close()
         worker = self._workers[place] = _Worker(place, process, queue.SimpleQueue())
-        start = Start(self.make_worker, self.worker_args, everything())
+        start = Start(self.make_worker, self.worker_args)
         threading.Thread(target=_attend, args=(worker, start, here, self._messages), daemon=True).start()
         self.events.tell("restarted" if place in self._lost else "worker_started", worker=place, pid=process.pid)
         self._lost.discard(place)

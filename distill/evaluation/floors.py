@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.products.actions import action_tokens
+from cosfly.products.actions import ActionSet
 from cosfly.products.captions import Coc, Language
 from cosfly.products.predictions import PREDICTIONS, Prediction
 from cosfly.products.splits import Split
@@ -26,7 +26,7 @@ from cosfly.reading.documents import parse_document, validated
 from cosfly.work.chance import rng_for
 from cosfly.work.store import dump_json, write_bytes
 from distill.evaluation.scores import ScoredAnswer, number_of
-from distill.schema import Sample, in_its_actions, open_split
+from distill.schema import Sample, open_split, read_training_set
 
 SHUFFLED_AMONG = 1024  # samples that are scored together: what is shuffled within needs no text to be embedded twice
 WRITTEN = ("shuffled", "constant")  # floors that have texts
@@ -45,10 +45,10 @@ def coc_of(sample: Sample) -> Coc:
     return validated(Coc, parse_document(sample.answer, sample.key, what="answer"), sample.key)
 
 
-def majority(decisions: Iterable[str]) -> str | None:
+def majority(decisions: Iterable[str], actions: ActionSet) -> str | None:
     """Give the most frequent decision; a tie goes to the first in the order of the action table."""
     counts = Counter(decisions)
-    return max(action_tokens(), key=lambda action: counts[action]) if counts else None
+    return max(actions.tokens, key=lambda action: counts[action]) if counts else None
 
 
 def shuffled_groups(count: int, rng: np.random.Generator) -> list[np.ndarray]:
@@ -109,8 +109,8 @@ def _bare(decision: str) -> ScoredAnswer:
 class Floors:
     """The floors of one language, from the training split."""
 
-    def __init__(self, train: Collection[Sample], language: Language, seed: int) -> None:
-        self._seed = seed
+    def __init__(self, train: Collection[Sample], language: Language, seed: int, actions: ActionSet) -> None:
+        self._seed, self.actions = seed, actions
         counts, typical, drawn = Counter[str](), dict[str, tuple[bytes, Sample]](), list[Sample]()
         share = RULE_SAMPLES / max(1, len(train))
         for sample in train:
@@ -121,11 +121,11 @@ class Floors:
                     typical[sample.decision] = rank, sample
                 if int.from_bytes(rank[:8]) <= share * 2**64:
                     drawn.append(sample)
-        self.decision = majority(counts.elements())
+        self.decision = majority(counts.elements(), actions)
         self._constant = None if self.decision is None else coc_of(typical[self.decision][1])
         table = numbers_of(drawn)
         self._width = table.shape[1]
-        labels = np.array([number_of(sample.decision, sample) for sample in drawn], dtype=int)
+        labels = np.array([number_of(sample.decision, sample, actions) for sample in drawn], dtype=int)
         self.rule = fit_rule(table, labels) if drawn else None
 
     def groups(self, count: int) -> list[np.ndarray]:
@@ -142,19 +142,18 @@ class Floors:
             places = shuffled_places(self.groups(len(references))).tolist()
             found["shuffled"] = [ScoredAnswer(references[place]) for place in places]
         if self.rule is not None:
-            bare = [_bare(token) for token in action_tokens()]
+            bare = [_bare(token) for token in self.actions.tokens]
             found["rule"] = [bare[decide(self.rule, row)] for row in numbers_of(samples, self._width)]
         return found
 
 
-@in_its_actions
 def write_floors(dataset: Path, split: Split, out: Path, seed: int) -> list[Path]:
     """Write the floors that have texts as predictions, so that `caption --teacher student:` judges their sentences too.
 
     Raises:
         InputError: the split is empty.
     """
-    samples = open_split(dataset, split)
+    samples, actions = open_split(dataset, split), read_training_set(dataset).actions
     if not samples:
         fix = "choose another --split, or prepare more walks"
         raise InputError("the split is empty", where=dataset, got=split, fix=fix)
@@ -164,7 +163,7 @@ def write_floors(dataset: Path, split: Split, out: Path, seed: int) -> list[Path
         own = [sample for sample in samples if sample.language == language]
         if own:
             references = [coc_of(sample) for sample in own]
-            floors = Floors(open_split(dataset, "train"), language, seed).answers(own, references)
+            floors = Floors(open_split(dataset, "train"), language, seed, actions).answers(own, references)
             for name in WRITTEN:
                 for sample, answer in zip(own, floors.get(name, ()), strict=False):
                     lines[name].append(_prediction(sample, split, name, answer).model_dump_json() + "\n")

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.chat.answers import Answer, read_line
 from cosfly.errors import InputError
-from cosfly.products.actions import ActionSet, action_tokens
+from cosfly.products.actions import RecordedActions, shipped_actions
 from cosfly.products.captions import FIELDS, Coc, Language, SentenceState, read_captions
 from cosfly.products.predictions import FAILED, Prediction
 from cosfly.products.splits import Split
@@ -133,7 +133,7 @@ class Evaluation(_Strict):
     resamples: int
     seed: int
     not_asked: int
-    actions: ActionSet | None = None  # the closed set; None: the one that ships
+    actions: RecordedActions = Field(default_factory=shipped_actions)  # the closed set
     metrics: dict[Language, Metric | None]  # None: BERTScore was not computed
     judged: list[str]  # whose sentences were judged
     speed: Speed
@@ -217,16 +217,9 @@ def score_language(
         written = {name: [text_of(a.coc) for a in who[name]] for name in (STUDENT, *WRITTEN) if name in who}
         groups = floors.groups(len(samples))
         texts = score_beside_floors(scorer, groups, written, [text_of(c) for c in references], samples[0].language)
-    return {name: score_answers(samples, answers, texts.get(name), judged.get(name)) for name, answers in who.items()}
-
-
-def join(parts: Sequence[Mapping[str, Scores]]) -> dict[str, Scores]:
-    """Put the scores of several languages together; who answers in one alone is left out."""
-    names = [name for name in parts[0] if all(name in part for part in parts)]
-    columns = list(Scores.__dataclass_fields__)
     return {
-        name: Scores(**{column: np.concatenate([getattr(part[name], column) for part in parts]) for column in columns})
-        for name in names
+        name: score_answers(samples, answers, floors.actions, texts.get(name), judged.get(name))
+        for name, answers in who.items()
     }
 
 
@@ -256,7 +249,7 @@ def measure(
 
 
 def _confusion(scores: Scores) -> dict[str, dict[str, int]]:
-    names = {UNPARSED: UNPARSED_NAME, **dict(enumerate(action_tokens()))}
+    names = {UNPARSED: UNPARSED_NAME, **dict(enumerate(scores.actions.tokens))}
     pairs = np.stack([scores.reference, scores.answer], axis=1)[scores.answered]
     cells = Counter(map(tuple, pairs.tolist()))
     found: dict[str, dict[str, int]] = {}

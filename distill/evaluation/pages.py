@@ -8,7 +8,7 @@ from typing import Any
 
 from cosfly.escaping import for_markdown
 from cosfly.look.page import page
-from cosfly.products.actions import action_tokens
+from cosfly.products.actions import ActionSet
 from cosfly.products.captions import FIELDS
 from cosfly.reading.files import read_text
 from distill.evaluation.measure import STUDENT, UNPARSED_NAME, Evaluation, FigureSet, Measurement
@@ -25,7 +25,7 @@ def shown(name: str, figure: Figure, *, interval: bool = True) -> str:
     """Give a figure in words: its value and, in brackets, its interval."""
     if figure.value is None:
         return NOTHING
-    digits = "{:.2%}" if name in SHARES or name in action_tokens() else "{:.1f}" if name == "tokens" else "{:.4f}"
+    digits = "{:.2%}" if name in SHARES or name not in FIGURES else "{:.1f}" if name == "tokens" else "{:.4f}"
     text = digits.format(figure.value)
     if not interval or figure.low is None or figure.high is None:
         return text
@@ -121,7 +121,7 @@ def page_of(report: Evaluation, pictures: Mapping[str, Sequence[str]]) -> str:
         student = part.who[STUDENT]
         charts = [
             ("Accuracy by decision", decision_bars({STUDENT: student, **_beside(part, "majority", "rule")})),
-            ("Reference (rows) against answer", heat_map(student)),
+            ("Reference (rows) against answer", heat_map(student, report.actions)),
         ]
         if part.histogram_f1 is not None:
             beside = _beside(part, "shuffled", "constant")
@@ -235,11 +235,11 @@ def histogram(who: Mapping[str, Sequence[int]]) -> Chart:
     return {"names": list(who), "lines": [line], "rects": rects, "texts": texts, "view": "0 0 670 230", "width": 670}
 
 
-def heat_map(who: FigureSet) -> Chart:
+def heat_map(who: FigureSet, actions: ActionSet) -> Chart:
     """Give the confusion of decisions: rows are references, columns answers, colours the share of the row."""
-    rows = [token for token in action_tokens() if token in who.confusion]
+    rows = [token for token in actions.tokens if token in who.confusion]
     answers = {name for row in rows for name in who.confusion[row]}
-    columns = [name for name in (*action_tokens(), UNPARSED_NAME) if name in rows or name in answers]
+    columns = [name for name in (*actions.tokens, UNPARSED_NAME) if name in rows or name in answers]
     size, left, top = CELL_PX, 205, 160
     texts = [
         _shape(x=left + j * size + size / 2, y=top - 8, words=name, anchor="start", turned=-40)

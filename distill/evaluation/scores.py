@@ -11,7 +11,7 @@ bootstrap): the interval of a figure is the percentiles of what it becomes on su
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,10 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict
 
 from cosfly.errors import InputError
-from cosfly.products.actions import action_tokens, not_in_set
+from cosfly.products.actions import ActionSet, not_in_set
 from cosfly.products.captions import Coc, SentenceState, Verdict, verdict_on
 from cosfly.products.predictions import FAILED, Prediction
 from cosfly.reading.tables import arrow_errors, row_groups
-from cosfly.work import in_place
 from cosfly.work.store import atomic_file, dump_json, sha256_bytes
 from distill.schema import Sample
 
@@ -57,12 +56,14 @@ class ScoredAnswer:
 class Scores:
     """Columns over n samples.
 
-    key, walk, language (n,) str; against (n,) str, a digest of what the answer is held against; reference, answer,
-    label (n,) int8 numbers of action_tokens(), UNPARSED, NONE; answered, unmended (n,) bool; verdict (n,) int8 number
-    of VERDICTS or NONE; precision, recall, f1 (n,) of BERTScore, NaN where it was not computed; proved, contradicted,
-    unread (n,) numbers of sentences, NaN where nobody judged them; num_tokens (n,).
+    actions: the set that numbers of decisions count. key, walk, language (n,) str; against (n,) str, a digest of what
+    the answer is held against; reference, answer, label (n,) int8 numbers of decisions, UNPARSED, NONE; answered,
+    unmended (n,) bool; verdict (n,) int8 number of VERDICTS or NONE; precision, recall, f1 (n,) of BERTScore, NaN
+    where it was not computed; proved, contradicted, unread (n,) numbers of sentences, NaN where nobody judged them;
+    num_tokens (n,).
     """
 
+    actions: ActionSet
     key: np.ndarray
     walk: np.ndarray
     language: np.ndarray
@@ -86,23 +87,32 @@ class Scores:
 
     def at(self, where: np.ndarray) -> Scores:
         """Give the samples at some places."""
-        return Scores(**{field.name: getattr(self, field.name)[where] for field in fields(self)})
+        return replace(self, **{name: getattr(self, name)[where] for name in COLUMNS})
 
 
-@in_place.kept()
-def _numbers() -> dict[str, int]:
-    return {token: number for number, token in enumerate(action_tokens())}
+COLUMNS = tuple(field.name for field in fields(Scores) if field.name != "actions")
 
 
-def number_of(decision: str, sample: Sample) -> int:
+def join(parts: Sequence[Mapping[str, Scores]]) -> dict[str, Scores]:
+    """Put the scores of several languages together; who answers in one alone is left out."""
+    who = {name: [part[name] for part in parts] for name in parts[0] if all(name in part for part in parts)}
+
+    def joined(own: Sequence[Scores]) -> Scores:
+        columns: Any = {name: np.concatenate([getattr(part, name) for part in own]) for name in COLUMNS}
+        return replace(own[0], **columns)
+
+    return {name: joined(own) for name, own in who.items()}
+
+
+def number_of(decision: str, sample: Sample, actions: ActionSet) -> int:
     """Give the number of a decision.
 
     Raises:
         InputError: it is none of the closed set.
     """
-    if decision not in _numbers():
-        raise not_in_set(decision, sample.key)
-    return _numbers()[decision]
+    if decision not in actions.actions:
+        raise not_in_set(decision, sample.key, actions)
+    return actions.tokens.index(decision)
 
 
 def digest_of_reference(sample: Sample) -> str:
@@ -113,6 +123,7 @@ def digest_of_reference(sample: Sample) -> str:
 def score_answers(
     samples: Sequence[Sample],
     answers: Sequence[ScoredAnswer],
+    actions: ActionSet,
     texts: np.ndarray | None = None,
     judged: Mapping[str, Sequence[SentenceState]] | None = None,
 ) -> Scores:
@@ -129,7 +140,7 @@ def score_answers(
         else:
             verdicts.append(_VERDICT[verdict_on(answer.coc.flight_decision, sample.label, sample.contradicted)])
     both = zip(samples, answers, strict=True)
-    decisions = [number_of(a.coc.flight_decision, s) if a.coc else UNPARSED for s, a in both]
+    decisions = [number_of(a.coc.flight_decision, s, actions) if a.coc else UNPARSED for s, a in both]
     is_answered = np.array([answer.is_answered for answer in answers], dtype=bool)
     bert = np.where(is_answered[:, None], np.nan if texts is None else texts, np.nan) * np.ones((1, 3))
     found = [(judged or {}).get(sample.key) for sample in samples]
@@ -138,13 +149,14 @@ def score_answers(
         for state in STATES
     }
     return Scores(
+        actions=actions,
         key=np.array([sample.key for sample in samples], dtype=object),
         walk=np.array([sample.walk for sample in samples], dtype=object),
         language=np.array([sample.language for sample in samples], dtype=object),
         against=np.array([digest_of_reference(sample) for sample in samples], dtype=object),
-        reference=np.array([number_of(sample.decision, sample) for sample in samples], dtype=np.int8),
+        reference=np.array([number_of(sample.decision, sample, actions) for sample in samples], dtype=np.int8),
         answer=np.array(decisions, dtype=np.int8),
-        label=np.array([number_of(s.label, s) if s.label else NONE for s in samples], dtype=np.int8),
+        label=np.array([number_of(s.label, s, actions) if s.label else NONE for s in samples], dtype=np.int8),
         answered=is_answered,
         unmended=np.array([a.coc is not None and not a.mended for a in answers], dtype=bool),
         verdict=np.array(verdicts, dtype=np.int8),
@@ -156,49 +168,49 @@ def score_answers(
     )
 
 
-_TEXT, _NAMES = ("key", "walk", "language", "against"), [field.name for field in fields(Scores)]
+_TEXT = ("key", "walk", "language", "against")
 
 
-def _column(name: str, values: np.ndarray) -> pa.Array:
+def _column(name: str, scores: Scores) -> pa.Array:
+    values = getattr(scores, name)
     if name in ("reference", "answer", "label", "verdict"):
-        words = (*VERDICTS, None) if name == "verdict" else (*action_tokens(), "(unparsed)", None)
+        words = (*VERDICTS, None) if name == "verdict" else (*scores.actions.tokens, "(unparsed)", None)
         return pa.array([words[number] for number in values.tolist()], pa.string())
     return pa.array(values.tolist() if name in _TEXT else values, from_pandas=True)
 
 
 def write_scores(path: Path, scores: Scores) -> None:
     """Write `scores.parquet`: a sample a row, decisions and verdicts in words, null where something is not known."""
-    table = pa.table({name: _column(name, getattr(scores, name)) for name in _NAMES})
+    table = pa.table({name: _column(name, scores) for name in COLUMNS})
     with atomic_file(path) as file:
         pq.write_table(table, file, compression="zstd")
 
 
-def read_scores(path: Path) -> Scores:
-    """Read `scores.parquet`.
+def read_scores(path: Path, actions: ActionSet) -> Scores:
+    """Read `scores.parquet`, whose decisions are of a set.
 
     Raises:
         InputError: it is damaged, or holds something else.
     """
-    columns: dict[str, list[Any]] = {name: [] for name in _NAMES}
+    columns: dict[str, list[Any]] = {name: [] for name in COLUMNS}
     for group in row_groups(path):
-        if wrong := [name for name in _NAMES if group.column_names.count(name) != 1]:
+        if wrong := [name for name in COLUMNS if group.column_names.count(name) != 1]:
             got = f"{group.column_names.count(wrong[0])} columns {wrong[0]}"
             raise InputError("not the scores of an evaluation", where=path, got=got, expected="one")
-        for name in _NAMES:
+        for name in COLUMNS:
             with arrow_errors(path):  # text that is no UTF-8 shows here
                 columns[name] += group.column(name).to_pylist()
     try:
-        return Scores(**{name: _column_values(name, values) for name, values in columns.items()})
+        found = {name: _column_values(name, values, actions) for name, values in columns.items()}
+        return Scores(actions, **found)
     except (TypeError, ValueError, KeyError) as error:
         raise InputError("not the scores of an evaluation", where=path, got=str(error)[:200]) from None
 
 
-def _column_values(name: str, values: list[Any]) -> np.ndarray:
+def _column_values(name: str, values: list[Any], actions: ActionSet) -> np.ndarray:
     if name in ("reference", "answer", "label", "verdict"):
-        numbers: dict[Any, int] = {
-            None: NONE,
-            **(_VERDICT if name == "verdict" else _numbers() | {"(unparsed)": UNPARSED}),
-        }
+        tokens = {token: number for number, token in enumerate(actions.tokens)}
+        numbers: dict[Any, int] = {None: NONE, **(_VERDICT if name == "verdict" else tokens | {"(unparsed)": UNPARSED})}
         return np.array([numbers[word] for word in values], dtype=np.int8)
     if name in _TEXT:
         if not all(isinstance(value, str) for value in values):
@@ -252,10 +264,12 @@ class Figure(BaseModel):
 class _Sums:
     """Of each walk the sums over its samples: numerators, denominators (walks, figures).
 
-    confusion: (walks, a, a + 1) of a actions, what does not parse last.
+    names: of the figures; tokens: of the decisions. confusion: (walks, a, a + 1) of a actions, what does not parse
+    last.
     """
 
     names: list[str]
+    tokens: tuple[str, ...]
     numerators: np.ndarray
     denominators: np.ndarray
     confusion: np.ndarray
@@ -293,12 +307,13 @@ def _sums(scores: Scores, walk: np.ndarray, num_walks: int) -> _Sums:
     terms = _terms(scores)
     per_walk = [[np.bincount(walk, part.astype(float), num_walks) for part in pair] for pair in terms.values()]
     answered = scores.answered
-    count = len(action_tokens())
+    count = len(scores.actions.tokens)
     answer = np.where(scores.answer == UNPARSED, count, scores.answer)
     cell = (walk * count + scores.reference) * (count + 1) + answer
     confusion = np.bincount(cell[answered], minlength=num_walks * count * (count + 1))
     return _Sums(
         list(terms),
+        scores.actions.tokens,
         np.array([pair[0] for pair in per_walk]).T,
         np.array([pair[1] for pair in per_walk]).T,
         confusion.reshape(num_walks, count, count + 1).astype(float),
@@ -328,7 +343,7 @@ def _values(sums: _Sums, draws: np.ndarray) -> dict[str, np.ndarray]:
     diagonal = np.diagonal(counted[..., :-1], axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         recall = diagonal / counted.sum(axis=-1)
-    return found | {f"decision/{token}": recall[:, number] for number, token in enumerate(action_tokens())}
+    return found | {f"decision/{token}": recall[:, number] for number, token in enumerate(sums.tokens)}
 
 
 def draw_walks(num_walks: int, resamples: int, rng: np.random.Generator) -> np.ndarray:
@@ -344,11 +359,11 @@ def figures_of(scores: Scores, draws: np.ndarray, *, confidence: float) -> tuple
     drawn = _values(sums, draws)
     counts = dict(zip(sums.names, sums.denominators.sum(axis=0), strict=True))
     references = sums.confusion.sum(axis=(0, 2))
-    counts |= {"macro_f1": references.sum(), **{f"decision/{a}": references[i] for i, a in enumerate(action_tokens())}}
+    counts |= {"macro_f1": references.sum(), **{f"decision/{a}": references[i] for i, a in enumerate(sums.tokens)}}
     found = {
         name: _figure(float(v[0]), drawn[name], int(counts[name]), len(names), confidence) for name, v in whole.items()
     }
-    decisions = {token: found[f"decision/{token}"] for i, token in enumerate(action_tokens()) if references[i]}
+    decisions = {token: found[f"decision/{token}"] for i, token in enumerate(sums.tokens) if references[i]}
     return {name: found[name] for name in FIGURES}, decisions
 
 

@@ -17,7 +17,6 @@ from cosfly.errors import InputError
 from cosfly.look.frame_views import thumbnail
 from cosfly.products.captions import Language
 from cosfly.products.predictions import Prediction, read_predictions
-from cosfly.work import in_place
 from cosfly.work.config import Config
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import inside, write_bytes, write_model
@@ -33,7 +32,6 @@ from distill.evaluation.measure import (
     Measurement,
     SentenceStates,
     examples_of,
-    join,
     measure,
     pair_up,
     read_judged,
@@ -42,8 +40,8 @@ from distill.evaluation.measure import (
     text_of,
 )
 from distill.evaluation.pages import markdown_of, page_of
-from distill.evaluation.scores import SCORES, Scores, write_scores
-from distill.schema import Sample, in_its_actions, open_split, resolve_trees, tree_inputs
+from distill.evaluation.scores import SCORES, Scores, join, write_scores
+from distill.schema import Sample, open_split, read_training_set, resolve_trees, tree_inputs
 from distill.student.model import require
 
 THUMBNAIL_PX = 256  # width of a frame on the page
@@ -58,7 +56,6 @@ class EvaluateConfig(Config):
     bertscore: BertScoreConfig = Field(BertScoreConfig(), description="semantic similarity of the texts")
 
 
-@in_its_actions
 def run(
     cfg: EvaluateConfig,
     predictions: Path,
@@ -132,13 +129,14 @@ def _evaluate(
     seed: int,
 ) -> tuple[Evaluation, Scores]:
     given: Any = {"resamples": cfg.resamples, "confidence": cfg.confidence, "seed": seed}
+    actions = read_training_set(dataset).actions
     parts: list[dict[str, Scores]] = []
     measurements: dict[Language, Measurement] = {}
     metrics: dict[Language, Metric | None] = {}
     asked: list[tuple[Sample, Prediction]] = []
     for language in sorted({sample.language for sample, _ in pairs}):
         own = [pair for pair in pairs if pair[0].language == language]
-        floors = Floors(open_split(dataset, "train"), language, seed)
+        floors = Floors(open_split(dataset, "train"), language, seed, actions)
         scorer = None
         if language in models:
             references = [text_of(coc_of(sample)) for sample, _ in own]
@@ -155,7 +153,7 @@ def _evaluate(
         split=predictions[0].split,
         **given,
         not_asked=0,
-        actions=in_place.given("actions"),
+        actions=actions,
         metrics=metrics,
         judged=sorted(judged),
         speed={},

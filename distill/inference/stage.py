@@ -20,6 +20,7 @@ from cosfly.chat.protocol import answer_key, base_url
 from cosfly.chat.student_chat import TAUGHT, StudentEndpointConfig, picture_to_send, read_taught, student_request
 from cosfly.chat.vllm_engine import VllmConfig, VllmEngine
 from cosfly.errors import ConfigError, InputError, TeacherError
+from cosfly.products.actions import ActionSet
 from cosfly.products.answer_text import answer_schema
 from cosfly.products.predictions import PREDICTIONS, Split
 from cosfly.work.config import Config, MayDiffer
@@ -28,7 +29,7 @@ from cosfly.work.stage_folder import Resume, StageFolder, read_manifest
 from cosfly.work.store import sha256_bytes
 from distill.inference.local import AnswerSchemas, LocalAnswers
 from distill.inference.outcome import ANSWERS, OpenFlights, Results, SampleOutcome, failed, writing_results
-from distill.schema import Sample, in_its_actions, open_split, resolve_trees, tree_inputs
+from distill.schema import Sample, open_split, resolve_trees, tree_inputs
 from distill.student.checkpoint import read_adapter_facts
 from distill.student.encoding import load_pictures, most_pixels
 from distill.student.model import Device, load_student, require, student_folder, weight_files
@@ -38,7 +39,7 @@ WAITING = 4
 
 
 def make_request(
-    sample: Sample, trees: Mapping[str, Path], sampling: StudentEndpointConfig, max_pixels: int
+    sample: Sample, trees: Mapping[str, Path], sampling: StudentEndpointConfig, max_pixels: int, actions: ActionSet
 ) -> Request:
     """Give a sample as chat messages: its pictures as the student was taught to see them, then the question.
 
@@ -47,7 +48,7 @@ def make_request(
     """
     pictures = iter([picture_to_send(picture, max_pixels) for picture in load_pictures(sample, trees)])
     frames = [[next(pictures) for _ in sample.views] for _ in sample.frames]
-    return student_request(sample.prompt, frames, answer_schema(language=sample.language), sampling)
+    return student_request(sample.prompt, frames, answer_schema(actions, language=sample.language), sampling)
 
 
 class EngineAnswers:
@@ -59,6 +60,7 @@ class EngineAnswers:
         book: AnswerBook,
         trees: Mapping[str, Path],
         sampling: StudentEndpointConfig,
+        actions: ActionSet,
         *,
         max_pixels: int,
         in_flight: int,
@@ -67,7 +69,7 @@ class EngineAnswers:
         Args:
             engine: started. max_pixels: most of a picture; 0: all. in_flight: most at once.
         """
-        self.engine, self.book, self.trees, self.sampling = engine, book, trees, sampling
+        self.engine, self.book, self.trees, self.sampling, self.actions = engine, book, trees, sampling, actions
         self.max_pixels, self._most = max_pixels, in_flight
         self._slots = asyncio.Semaphore(in_flight)
         self._kept = KeptAnswers(engine, book)
@@ -103,7 +105,8 @@ class EngineAnswers:
         flight = self._flights.begun(sample)
         async with self._slots:
             try:
-                request = await asyncio.to_thread(make_request, sample, self.trees, self.sampling, self.max_pixels)
+                how = self.sampling, self.max_pixels, self.actions
+                request = await asyncio.to_thread(make_request, sample, self.trees, *how)
                 reply = await self._kept.ask(request, flight, sample.sample_id, sample.language)
             except InputError as error:
                 return failed(sample, error.code, error)
@@ -165,6 +168,7 @@ class Inputs:
     trees: Mapping[str, Path]
     model: str | Path
     adapter: Path | None
+    actions: ActionSet
 
     @property
     def taught_pixels(self) -> int:
@@ -195,7 +199,8 @@ async def _answering(
     in_flight = cfg.vllm.batch if cfg.engine == "vllm" else cfg.endpoint.concurrency
     async with started(engine):
         max_pixels = cfg.max_pixels or (inputs.taught_pixels if cfg.engine == "vllm" else 0)
-        asking = EngineAnswers(engine, book, inputs.trees, cfg.sampling, max_pixels=max_pixels, in_flight=in_flight)
+        how: Any = {"max_pixels": max_pixels, "in_flight": in_flight}
+        asking = EngineAnswers(engine, book, inputs.trees, cfg.sampling, inputs.actions, **how)
         yield asking.answers(inputs.samples, advance)
 
 
@@ -210,7 +215,7 @@ def _local(cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> LocalAnswers:
         model=inputs.name,
         batch_size=cfg.batch_size,
         max_tokens=cfg.max_new_tokens,
-        constrain=AnswerSchemas(student) if cfg.constrained else None,
+        constrain=AnswerSchemas(student, inputs.actions) if cfg.constrained else None,
         feature_bytes=int(cfg.feature_memory_gb * 1e9),
     )
 
@@ -244,7 +249,6 @@ def _identified(cfg: InferConfig, url: str, out: Path) -> tuple[InferConfig, str
     return cfg.model_copy(update={"endpoint": cfg.endpoint.model_copy(update={"model": asyncio.run(ask())})}), server
 
 
-@in_its_actions
 def run(
     cfg: InferConfig,
     dataset: Path,
@@ -294,7 +298,7 @@ def run(
         fix = "--set distill.infer.split=val, or prepare more walks"
         raise InputError("the split is empty", where=dataset, got=cfg.split, fix=fix)
     samples = split[: cfg.max_samples] if cfg.max_samples else split
-    results = _answer_all(cfg, Inputs(samples, trees, model, adapter), out)
+    results = _answer_all(cfg, Inputs(samples, trees, model, adapter, split.actions), out)
     outputs = [out / PREDICTIONS, *sorted((out / ANSWERS).glob("*.jsonl"))]
     stage.finish(outputs, results.tally, **facts, model=results.model, parsed=results.num_parsed, speed=results.speed)
     return out / PREDICTIONS
@@ -322,7 +326,7 @@ async def _write_answers(cfg: InferConfig, inputs: Inputs, out: Path) -> Results
     with AnswerBook(out / ANSWERS) as book, progress_bar(STAGE, total=len(inputs.samples)) as advance:
         async with _answering(cfg, inputs, book, advance) as answers:
             started_s = time.monotonic()
-            with writing_results(out, cfg.split, name) as results:
+            with writing_results(out, cfg.split, name, inputs.actions) as results:
                 async with contextlib.aclosing(answers) as each:
                     async for answered in each:
                         results.add(answered)

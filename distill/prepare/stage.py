@@ -19,12 +19,11 @@ from pydantic import Field, model_validator
 
 from cosfly.errors import InputError
 from cosfly.look.frame_views import DEPTH_RANGE_M, Pictures, View, scaled_size
-from cosfly.products.actions import action_tokens, actions_beside, not_in_set, one_set
+from cosfly.products.actions import ActionSet, actions_beside, not_in_set, one_set
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import PICTURES_MARK, Caption, Language, Verdict, read_captions
 from cosfly.products.places import FlightChoice
 from cosfly.products.splits import SPLITS, Split
-from cosfly.work import in_place
 from cosfly.work.console import progress_bar
 from cosfly.work.provenance import fingerprint
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
@@ -81,7 +80,14 @@ class PrepareConfig(SplitConfig):
 
 
 def make_sample(
-    caption: Caption, language: Language, cfg: PrepareConfig, *, run: str = "", walk: str = "", sample_id: str = ""
+    caption: Caption,
+    language: Language,
+    cfg: PrepareConfig,
+    actions: ActionSet,
+    *,
+    run: str = "",
+    walk: str = "",
+    sample_id: str = "",
 ) -> Sample | str:
     """Give the sample of a caption in one language, or the word for why there is none.
 
@@ -96,7 +102,7 @@ def make_sample(
     if coc is None or language not in caption.prompt:
         return f"no_{language}"
     answer = dump_json(coc.model_dump())
-    parsed = parse_answer(answer, language)
+    parsed = parse_answer(answer, actions, language)
     if parsed.coc is None:  # nothing may be taught that evaluation would call wrong
         return f"answer_{parsed.reason}"
     if PICTURES_MARK not in caption.prompt[language].user:
@@ -165,6 +171,7 @@ class _Windows:
 
     def __init__(self, cfg: PrepareConfig, sources: Sequence[RunSource]) -> None:
         self._cfg, self._sources = cfg, sources
+        self.actions = one_set((source.captions, actions_beside(source.captions)) for source in sources)
         self.flights = Flights(sources)
         self._frames_of = lru_cache(maxsize=16)(lambda flight: flight.whole_frames(cfg.modalities))
         self._is_chosen = lru_cache(maxsize=16)(lambda flight: flight.is_chosen(cfg.flights))
@@ -178,8 +185,8 @@ class _Windows:
 
     def _window(self, source: RunSource, caption: Caption) -> _Window:
         flight = self.flights.of(source, caption)
-        if caption.en is not None and caption.en.flight_decision not in action_tokens():
-            raise not_in_set(caption.en.flight_decision, f"{source.captions}: {caption.sample_id}")
+        if caption.en is not None and caption.en.flight_decision not in self.actions.actions:
+            raise not_in_set(caption.en.flight_decision, f"{source.captions}: {caption.sample_id}", self.actions)
         caption.town = flight.town  # the tree may have been converted since
         window = _Window(flight, flight.sample_id(caption), [], [])
         if not self._is_chosen(flight):
@@ -187,7 +194,8 @@ class _Windows:
             return window
         walk = self.walks.get(flight.key, "")
         for language in self._cfg.languages:
-            sample = make_sample(caption, language, self._cfg, run=source.run, walk=walk, sample_id=window.sample_id)
+            named = {"run": source.run, "walk": walk, "sample_id": window.sample_id}
+            sample = make_sample(caption, language, self._cfg, self.actions, **named)
             if isinstance(sample, str):
                 window.left_out.append(sample)
             elif reason := self._unfit(flight, sample):
@@ -238,11 +246,6 @@ def run(
     if stage.is_complete:
         return out
     check_sources(sources, cfg.unbound)
-    with in_place.put(actions=one_set((source.captions, actions_beside(source.captions)) for source in sources)):
-        return _prepare(cfg, sources, out, seed, stage)
-
-
-def _prepare(cfg: PrepareConfig, sources: Sequence[RunSource], out: Path, seed: int, stage: StageFolder) -> Path:
     windows = _Windows(cfg, sources)
     # Two passes: the splits, and what is too much, must be known before the first sample is written.
     ranks, excluded = _survey(windows, seed)
@@ -253,11 +256,11 @@ def _prepare(cfg: PrepareConfig, sources: Sequence[RunSource], out: Path, seed: 
     del ranks  # of a million windows they take as much as the writing
     with TrainingSetWriter(out).writing() as writer:
         facts, left_out = _write(windows, chosen, writer)
-    writer.finish(cfg.split_by, [SourceTree(run=s.run, sha256=fingerprint(s.data)) for s in sources])
+    writer.finish(cfg.split_by, [SourceTree(run=s.run, sha256=fingerprint(s.data)) for s in sources], windows.actions)
     counts = check_no_leak({split: open_split(out, split) for split in SPLITS}, cfg.split_by)
     excluded += left_out
     if chosen.balance is not None:
-        facts["train"]["balance"] = cost = chosen.balance.cost(left_out["balance"])
+        facts["train"]["balance"] = cost = chosen.balance.cost(left_out["balance"], windows.actions)
         log.info("%s: balance of train: %s", STAGE, ", ".join(f"{name} {value}" for name, value in cost.items()))
     _warn(facts)
     tally = Tally(input=sum(counts.values()) + excluded.total(), kept=sum(counts.values()), dropped=excluded)

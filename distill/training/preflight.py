@@ -15,9 +15,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from cosfly.errors import ConfigError, InputError
-from cosfly.products.actions import action_tokens
+from cosfly.products.actions import ActionSet
 from cosfly.work.store import write_json
-from distill.schema import Sample
+from distill.schema import Sample, Samples
 from distill.student.encoding import END_OF_ANSWER, EncodedSample, chat_text, prompt_text
 from distill.student.features import VisionFeatures
 from distill.student.model import Processor, Student
@@ -167,13 +167,13 @@ def findings(
     census: Census,
     validation: Census,
     features: VisionFeatures,
-    sample: Sample,
+    samples: Samples,
     steps: Steps,
 ) -> list[Precheck]:
     """Look at everything that can be known beforehand.
 
     Args:
-        sample: any sample that is learnt from.
+        samples: those that census counted.
     """
     tokens, answers, longest = (int(n) for n in (census.tokens.sum(), census.answer_tokens.sum(), census.tokens.max()))
     words = f"{tokens} tokens, {answers} of them answers; the longest has {longest} of {cfg.max_tokens}"
@@ -186,17 +186,17 @@ def findings(
             for reason, count in sorted(part.skipped.items())
         ),
         Precheck("validation", f"{len(validation)} samples of {len(validation.decisions)} decisions"),
-        *_about_decisions(census, validation),
-        _about_chat(student, sample),
+        *_about_decisions(census, validation, samples.actions),
+        _about_chat(student, samples[int(census.indices[0])]),
         _about_memory(cfg, student, census, features),
         _about_features(census, validation, features),
         *_about_kernels(student),
     ]
 
 
-def _about_decisions(census: Census, validation: Census) -> list[Precheck]:
+def _about_decisions(census: Census, validation: Census, actions: ActionSet) -> list[Precheck]:
     """Say once which decisions train never shows: a fact of most small sets, and of weight where val asks for them."""
-    missing = [action for action in action_tokens() if not census.decisions[action]]
+    missing = [action for action in actions.tokens if not census.decisions[action]]
     asked = {action: validation.decisions[action] for action in missing if validation.decisions[action]}
     if not asked:
         return [Precheck("decisions", f"no sample of {', '.join(missing)}")] if missing else []

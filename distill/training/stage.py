@@ -17,7 +17,7 @@ from cosfly.products.captions import Language, Prompt
 from cosfly.work.chance import rng_for
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import atomic_folder, write_json
-from distill.schema import Sample, in_its_actions, open_split, resolve_trees, tree_inputs
+from distill.schema import Sample, open_split, resolve_trees, tree_inputs
 from distill.student.checkpoint import ADAPTER_FACTS, Progress, adapter_facts, write_adapter_folder, write_model_folder
 from distill.student.features import PictureReader, VisionFeatures
 from distill.student.model import Processor, Student, is_hub_name, load_student, require, student_folder, weight_files
@@ -116,7 +116,6 @@ def made_student(cfg: TrainConfig, samples: Sequence[Sample], folder: Path, seed
     return folder
 
 
-@in_its_actions
 def run(
     cfg: TrainConfig,
     dataset: Path,
@@ -191,7 +190,7 @@ def _lesson(
     features = VisionFeatures(student, memory_bytes=memory_bytes, is_frozen=not cfg.train_vision)
     reader = PictureReader(processor, trees, student.dtype)
     lesson = Lesson(student, samples, census, validation, asked, Supply(features, reader, workers), cfg, ranks, seed)
-    found = findings(cfg, student, census, asked, features, samples[int(census.indices[0])], lesson.steps)
+    found = findings(cfg, student, census, asked, features, samples, lesson.steps)
     ranks.first_does(lambda: tell(found, out / PREFLIGHT))
     most = int(student.image_processor.size["longest_edge"])
     return lesson, taught.model_copy(update={"max_pixels": most})

@@ -273,7 +273,7 @@ def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> li
     """
     fps, size_px = _fps(flights), _size(release)
     found = {decision for flight in flights for decision in flight.decisions}
-    tasks = tuple(decision for decision in ("", *release.record.closed_set) if decision in found)
+    tasks = tuple(decision for decision in ("", *release.record.actions.tokens) if decision in found)
     if unknown := found - set(tasks):
         raise InputError(
             "a decision outside the closed set", where=release.folder, got=", ".join(sorted(unknown))[:200]

@@ -16,7 +16,7 @@ from pydantic import Field
 import cosfly
 from cosfly.errors import InputError, VerifyError
 from cosfly.escaping import for_markdown
-from cosfly.products.actions import ActionSet
+from cosfly.products.actions import RecordedActions, shipped_actions
 from cosfly.reading.documents import FileFormat, read_model
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.work.stage_folder import Resume, StageFolder, result_of
@@ -49,7 +49,7 @@ class ExportRecord(Strict):
     credits: str
     maps: list[ReleasedMap]
     coordinates: dict[str, Any]
-    actions: ActionSet | None = None
+    actions: RecordedActions = Field(default_factory=shipped_actions)
     prompts: dict[str, dict[str, str]] = Field(default_factory=dict)
     settings: dict[str, Any]
     codings: dict[str, str]

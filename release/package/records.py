@@ -17,7 +17,6 @@ import cosfly
 from cosfly.errors import VerifyError
 from cosfly.escaping import published
 from cosfly.reading.files import sha256_file
-from cosfly.work import in_place
 from cosfly.work.provenance import StageInput, stages_behind
 from cosfly.work.store import write_bytes, write_checksums
 from release import columns
@@ -186,7 +185,7 @@ def make_record(
         frame_selection=RULE,
         depth=depth_record(cfg.depth, [result.depth for result in written]) if "depth" in cfg.modalities else None,
         coordinates=columns.CONTRACT,
-        actions=in_place.given("actions"),
+        actions=plan.actions,
         prompts=prompts,
         splits=splits_of(cfg, plan, written, flights),
         numbers=numbers,

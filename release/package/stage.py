@@ -11,8 +11,6 @@ import shutil
 from pathlib import Path
 
 from cosfly.errors import VerifyError
-from cosfly.products.actions import actions_beside, one_set
-from cosfly.work import in_place
 from cosfly.work.provenance import read_stage_record
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.work.stage_folder import Failed, Resume, StageFolder, Tally, result_of
@@ -79,14 +77,6 @@ def run(
         shutil.rmtree(parts, ignore_errors=True)
         return dataset
     shutil.rmtree(dataset, ignore_errors=True)  # of another attempt: until this one is whole, nothing is published
-    with in_place.put(actions=one_set((source.captions, actions_beside(source.captions)) for source in sources)):
-        return _build(cfg, sources, out, stage, workers, watch)
-
-
-def _build(
-    cfg: ReleaseConfig, sources: list[Source], out: Path, stage: StageFolder, workers: int, watch: Watch
-) -> Path:
-    dataset, parts = out / DATASET, out / PARTS
     plan = make_plan(cfg, sources, stage)
     written = _write_parts(cfg, plan, stage, parts, workers, watch)
     with atomic_folder(dataset) as folder:

@@ -9,7 +9,6 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from cosfly.products.actions import shipped_actions
 from cosfly.products.answer_text import MIN_CHARACTERS, MIN_CHARACTERS_ZH
 from cosfly.products.captions import FIELDS
 from cosfly.products.frames import LEVEL_NAMES
@@ -276,7 +275,7 @@ def _frames(counts: Counts) -> Table:
 
 def _captions(record: ReleaseRecord, counts: Counts) -> list[Table]:
     """What captions say: decisions, verdicts, repairs, evidence, lengths."""
-    order = [name for name in (*record.closed_set, "none") if counts.labels[name] or counts.decisions[name]]
+    order = [name for name in (*record.actions.tokens, "none") if counts.labels[name] or counts.decisions[name]]
     confusion: Rows = [[label, *(counts.confusion[label, decision] for decision in order)] for label in order]
     repairs = _shares(counts.repairs.most_common(), counts.repairs.total())
     return [
@@ -286,8 +285,7 @@ def _captions(record: ReleaseRecord, counts: Counts) -> list[Table]:
 
 
 def _decisions(record: ReleaseRecord, counts: Counts) -> Table:
-    actions = record.actions or shipped_actions()
-    decisions, labels = counts.decisions, counts.labels
+    actions, decisions, labels = record.actions, counts.decisions, counts.labels
     total, labelled = decisions.total(), labels.total() - labels["none"]
     rows: Rows = []
     for name in (*actions.tokens, *sorted(decisions.keys() - {*actions.tokens, "none"})):

@@ -9,6 +9,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from cosfly.errors import InputError
+from cosfly.products.actions import ActionSet
 from cosfly.products.shown_captions import CaptionReader
 from cosfly.work.items import Item, Outcome
 from release.depth import depth_record
@@ -35,10 +36,12 @@ LOSSLESS = depth_record("float32", ())  # as in a playback tree
 
 @dataclass(frozen=True)
 class Context:
-    """What the record says that the checks of flights need. by_town: splits share no town either. both: every flight's
-    twin is released too. rounded_as: the coding that the depth went through, whatever it is stored as. settings, draws,
-    prompts: by run; settings by stage, of those that stand once in its source."""
+    """What the record says that the checks of flights need. actions: the closed set of decisions. by_town: splits
+    share no town either. both: every flight's twin is released too. rounded_as: the coding that the depth went
+    through, whatever it is stored as. settings, draws, prompts: by run; settings by stage, of those that stand once in
+    its source."""
 
+    actions: ActionSet
     window_frames: int | None = None
     depth: DepthCoding = field(default_factory=lambda: LOSSLESS)
     by_town: bool = False
@@ -61,9 +64,9 @@ class Context:
         ):  # people may have accepted what it did not
             settings = {run: {**stages, "inspect": {}} for run, stages in settings.items()}
         return cls(
-            asked.window_frames, coded, record.splits.by == "town", asked.pairs == "both" and len(asked.tracks) == 2,
-            coded.coding, settings, {run: DrawSettings.of_stages(stages) for run, stages in made.items()},
-            record.prompts,
+            record.actions, asked.window_frames, coded, record.splits.by == "town",
+            asked.pairs == "both" and len(asked.tracks) == 2, coded.coding, settings,
+            {run: DrawSettings.of_stages(stages) for run, stages in made.items()}, record.prompts,
         )  # fmt: skip
 
 
@@ -123,12 +126,13 @@ def _check_rows(
     settings = _of_run(context.settings, flight) or {}
 
     def read_captions() -> None:
-        shown = flight.shown(twin, settings.get("caption", {}), _of_run(context.prompts, flight) or {})
+        prompts = _of_run(context.prompts, flight) or {}
+        shown = flight.shown(twin, context.actions, settings.get("caption", {}), prompts)
         for lie in reader(shown) if reader is not None else ():
             findings.error(lie.code, lie.where, lie.got, lie.expected)
 
     checks: list[Callable[[], None]] = [
-        lambda: check_identity(flight, findings),
+        lambda: check_identity(flight, context.actions, findings),
         lambda: check_geometry(flight, findings),
         lambda: check_motion(flight, twin, settings.get("render", {}).get("perturbation", {}), findings),
         lambda: check_captions(flight, context.window_frames, findings),

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.products.actions import action_tokens
+from cosfly.products.actions import ActionSet
 from cosfly.products.playback import EVENTS, ORIGINAL
 from release.columns import REQUIRED, SCALARS
 from release.flight_rows import FlightRows
@@ -27,7 +27,7 @@ EVENT_WORDS = re.compile(
 _PLAIN_NAME = re.compile(r"[\w.-]+")
 
 
-def check_identity(flight: FlightRows, findings: Findings) -> None:
+def check_identity(flight: FlightRows, actions: ActionSet, findings: Findings) -> None:
     """Check ids, names, constants, closed sets, ranges and nulls of a flight's rows."""
     _check_names(flight, findings)
     for name in CONSTANT:
@@ -36,7 +36,7 @@ def check_identity(flight: FlightRows, findings: Findings) -> None:
         if any(differs):
             i = differs.index(True)
             findings.error("constant", flight.where(i, name), column[i], f"{column[0]}, as in the flight's first row")
-    closed = {name: action_tokens() if words == "actions" else words for name, words in CLOSED.items()}
+    closed = {name: actions.tokens if words == "actions" else words for name, words in CLOSED.items()}
     for i, row in enumerate(flight.rows):
         for name in (name for name in REQUIRED if name in row and row[name] is None):
             findings.error("null", flight.where(i, name), "null", "a value in every row")

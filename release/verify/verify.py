@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cosfly.errors import InputError
+from cosfly.products.actions import shipped_actions
 from cosfly.products.playback import ORIGINAL
 from cosfly.products.shown_captions import CaptionReader
-from cosfly.work import in_place
 from cosfly.work.config import Config
 from cosfly.work.items import Item
 from cosfly.work.runner import Watch, run_items
@@ -106,11 +106,6 @@ def _verify_release(folder: Path, how: _How, findings: Findings) -> None:
         where = str(error.where).replace(f"{folder}/", "")
         findings.error("record", where, error.got or error.what, error.expected or "a release record")
         return
-    with in_place.put(actions=record.actions):
-        _verify_record(folder, record, how, findings)
-
-
-def _verify_record(folder: Path, record: ReleaseRecord, how: _How, findings: Findings) -> None:
     expected: dict[str, int | None] = dict.fromkeys(RECORDS) | {shard.path: shard.bytes for shard in record.shards}
     _check_signature(folder, record, how, findings)
     if is_signed(folder):
@@ -202,7 +197,7 @@ def _verify_tree(folder: Path, how: _How, findings: Findings, coded: DepthCoding
                 findings.error("missing", f"{flight}/{name}", "no such file", f"a file of {CHECKSUMS}")
     if how.level == "structure":
         return
-    context = Context(rounded_as=(coded or LOSSLESS).coding)
+    context = Context(shipped_actions(), rounded_as=(coded or LOSSLESS).coding)
     _check_all(source, entries, context, replace(how, reader=None), findings)
     if how.level == "pixels":
         for flight, own in digests.items():

@@ -25,6 +25,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from specimens_captions import VOCABULARY
+
 from caption.run.asking import Asking
 from caption.run.flights import allot, named_flights
 from caption.run.stage import open_stage
@@ -102,7 +104,7 @@ def _client(
     The product is not merged: only asking counts.
     """
     stage = open_stage(cfg, tree, out, 0, "never")
-    allotted, _ = allot(named_flights(tree), cfg)
+    allotted, _ = allot(named_flights(tree), cfg, VOCABULARY)
     bodies: list[bytes] = []
     frames: list[SharedFrames] = []
     plain_init, plain_encode = SharedFrames.__init__, encode_body
@@ -121,7 +123,7 @@ def _client(
     client.encode_body = recording if encoder is None else plain_encode
     try:
         start_s = time.monotonic()
-        asked = asyncio.run(Asking(stage, cfg, 0).run(allotted))
+        asked = asyncio.run(Asking(stage, cfg, VOCABULARY, 0).run(allotted))
         seconds = time.monotonic() - start_s
     finally:
         SharedFrames.__init__, client.encode_body = plain_init, plain_encode  # type: ignore[method-assign, assignment]
