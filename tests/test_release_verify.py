@@ -61,7 +61,8 @@ def honest(honest_run, tmp_path_factory) -> Path:
 
 
 def released(run: Path, out: Path, **settings) -> Path:
-    return package.run(ReleaseConfig(num_frames=20, licence="cc-by-4.0", **settings), [Source.of_run(run)], out)
+    cfg = ReleaseConfig(**{"num_frames": 20, "licence": "cc-by-4.0", **settings})
+    return package.run(cfg, [Source.of_run(run)], out)
 
 
 @pytest.fixture
@@ -481,9 +482,21 @@ def test_a_frame_that_is_missing_in_a_tree_is_found(honest_run, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def honest_exports(honest, tmp_path_factory) -> dict[str, Path]:
+def near_run(tmp_path_factory) -> Path:
+    """A walk of which nothing is farther away than a PNG of millimetres holds."""
+    told = ["pedestrians.num_paths=1", "pedestrians.min_distance_m=10", "pedestrians.max_distance_m=20", *TINY[3:5]]
+    return run_here([*told, "workers=1"], tmp_path_factory.mktemp("exports") / "run")
+
+
+@pytest.fixture(scope="module")
+def near(near_run, tmp_path_factory) -> Path:
+    return released(near_run, tmp_path_factory.mktemp("exports") / "release", num_frames=16)
+
+
+@pytest.fixture(scope="module")
+def honest_exports(near, tmp_path_factory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("formats")
-    return {name: exported_as(name, honest, folder / name) for name in FORMATS}
+    return {name: exported_as(name, near, folder / name) for name in FORMATS}
 
 
 def exported_as(name: str, release: Path, out: Path) -> Path:
@@ -505,26 +518,26 @@ def test_an_honest_export_passes(honest_exports, name):
 
 
 @pytest.mark.parametrize("coding", ["float16", "millimetre_png"])
-def test_an_honest_tree_of_coded_depth_passes(honest_run, tmp_path, coding):
-    release = released(honest_run, tmp_path / "release", depth=coding)
+def test_an_honest_tree_of_coded_depth_passes(near_run, tmp_path, coding):
+    release = released(near_run, tmp_path / "release", num_frames=16, depth=coding)
     report = verify(exported_as("tree", release, tmp_path / "tree"), level="pixels", reader=read_released)
     assert report.issues == [], str(report)
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_an_export_is_what_its_release_gives(honest, honest_exports, tmp_path, name):
-    report = verify(honest_exports[name], level="structure", source=honest)
+def test_an_export_is_what_its_release_gives(near, honest_exports, tmp_path, name):
+    report = verify(honest_exports[name], level="structure", source=near)
     assert report.issues == [], str(report)
     assert any("made again" in fact for fact in report.facts)
-    other = forge(honest, tmp_path / "other", lambda rows: rows[3]["pose"].update(roll_deg=0.01))
+    other = forge(near, tmp_path / "other", lambda rows: rows[3]["pose"].update(roll_deg=0.01))
     assert "source" in errors_in(honest_exports[name], "structure", source=other)
     # A patch of one picture, which nothing else in the export tells.
-    patched = exported_as(name, forge(honest, tmp_path / "patched", _patch), tmp_path / name)
+    patched = exported_as(name, forge(near, tmp_path / "patched", _patch), tmp_path / name)
     about = read_json(patched / "export.json")
     about["release"] = read_json(honest_exports[name] / "export.json")["release"]
     (patched / "export.json").write_text(json.dumps(about))
     make_right(patched, patched / "export.json")
-    assert "source" in errors_in(patched, "structure", source=honest)
+    assert "source" in errors_in(patched, "structure", source=near)
 
 
 def _patch(rows):
@@ -534,8 +547,8 @@ def _patch(rows):
 
 
 @pytest.mark.parametrize("name", ["depth_doubled", "empty_instances", "pose_jumps"])
-def test_a_lie_is_found_in_a_tree(honest, tmp_path, name):
-    forged = forge(honest, tmp_path / "forged", LIES[name][0])
+def test_a_lie_is_found_in_a_tree(near, tmp_path, name):
+    forged = forge(near, tmp_path / "forged", LIES[name][0])
     assert errors_in(exported_as("tree", forged, tmp_path / "export"))
 
 
