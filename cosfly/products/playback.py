@@ -22,6 +22,7 @@ from pydantic import ValidationError
 
 from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations
+from cosfly.products.columns import is_number
 from cosfly.products.frames import ANGLES, COORDINATES, FRAME_FILES, FRAMES_DIR, XYZ, Camera, frame_name, frame_path
 from cosfly.products.motion import PlannedMotion, without_perturbation
 from cosfly.products.places import place_of, tree_of_flight
@@ -183,6 +184,12 @@ class Flight:
             return WeatherRecord.model_validate(self.raw.get("weather"))
         except ValidationError:
             return None
+
+    @property
+    def distortion(self) -> list[float]:
+        """How the lens bends `rgb.png`: k1, k2, p1, p2, k3 of OpenCV's model; zeros where the file says nothing."""
+        told = object_of(self.raw, "camera").get("distortion")
+        return told if isinstance(told, list) and len(told) == 5 and all(map(is_number, told)) else [0.0] * 5
 
     @property
     def keeps_sight(self) -> np.ndarray:

@@ -26,6 +26,7 @@ from cosfly.reading.documents import FileFormat
 from cosfly.reading.files import sha256_file
 from cosfly.render.camera import TargetView, hidden_shares, rendered_visibility, view_target
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
+from cosfly.render.effects import Effects
 from cosfly.render.person import Cast, Gait
 from cosfly.render.perturbation import HIDDEN, STEP_UP_M, PerturbedTrack, Poses, Surroundings
 from cosfly.space.kernels import signed_distances
@@ -88,7 +89,13 @@ class FlightScript:
     segments: tuple[Segment, ...] = ()
     mission: Mission | None = None
     weather: WeatherRecord | None = None  # in the place of `look`
+    effects: Effects | None = None
     between: np.ndarray | None = None  # planned poses that are not drawn (Flight.between)
+
+    @property
+    def distortion(self) -> tuple[float, ...] | None:
+        """k1, k2, p1, p2, k3 of the lens; None of one that bends nothing."""
+        return None if self.effects is None else self.effects.cfg.distortion
 
 
 @dataclass(frozen=True)
@@ -146,7 +153,7 @@ def render_flight(
                     frame, seen = without
             visibility.append(seen.visibility)
             annotations.append(_annotation(script, i, seen))
-            pending.append(pool.submit(_write_frame, folder, frame_name(i), frame, annotations[i], writing))
+            pending.append(pool.submit(_write_frame, folder, frame, annotations[i], writing, script))
             advance()
             while len(pending) >= FRAMES_IN_FLIGHT:
                 digests.update(pending.pop(0).result())
@@ -184,8 +191,12 @@ def draw_frame(
 # --- files of one frame -----------------------------------------------------------------------------------------------
 
 
-def _write_frame(folder: Path, name: str, frame: Frame, meta: FrameMeta, writing: Writing) -> dict[str, str]:
-    """Encode and write one frame, beside the drawing; gives file name -> sha256."""
+def _write_frame(folder: Path, frame: Frame, meta: FrameMeta, writing: Writing, script: FlightScript) -> dict[str, str]:
+    """Encode and write one frame, as the camera has it, beside the drawing; gives file name -> sha256."""
+    name = frame_name(meta.index)
+    if script.effects is not None:
+        camera = script.cameras[meta.index]
+        frame = replace(frame, rgb=script.effects.apply(frame.rgb, frame.depth, camera, meta.index))
     makers: dict[FrameFile, Callable[[], tuple[str, bytes]]] = {
         "rgb": lambda: (frames.FILE_NAMES["rgb"], frames.rgb_bytes(frame.rgb)),
         "depth": lambda: frames.depth_file(frame.depth, writing.depth_format),
@@ -216,7 +227,7 @@ def _annotation(script: FlightScript, i: int, seen: TargetSight) -> FrameMeta:
         town=script.town,
         trajectory=script.trajectory,
         variant=script.variant,
-        camera=frames.camera_meta(script.cameras[i], NEAR_M, FAR_M),
+        camera=frames.camera_meta(script.cameras[i], NEAR_M, FAR_M, script.distortion),
         drone_pose=frames.tree_pose(perturbed.poses.positions_m[i], perturbed.poses.rotations_deg[i]),
         target=TargetMeta(
             world_location=frames.tree_position(perturbed.poses.targets_m[i]),
@@ -291,6 +302,7 @@ def _flight(script: FlightScript, targets: list[TargetMeta], visibility: np.ndar
         is_original=script.is_original,
         raw={
             **({} if script.weather is None else {"weather": script.weather.model_dump()}),
+            **({} if script.distortion is None else {"camera": {"distortion": list(script.distortion)}}),
             "points": [{"perturbation": dict(state)} for state in perturbed.states],
         },
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -10,6 +10,7 @@ from cosfly.products.frames import LEAST_FOV_DEG, MOST_FOV_DEG, DepthFormat, Fra
 from cosfly.products.places import folder_name
 from cosfly.reading.arrays import LONGEST_SIDE_PX
 from cosfly.reading.meshes import MOST_TRIANGLES
+from cosfly.render.effects import EffectsConfig
 from cosfly.render.lens import ZoomConfig
 from cosfly.render.perturbation import PerturbationConfig
 from cosfly.render.weather import WeatherConfig
@@ -68,6 +69,7 @@ class RenderConfig(WeatherConfig):
     debug: bool = Field(
         False, description="also write debug.png: boxes, ids and distances projected over the colour picture"
     )
+    effects: EffectsConfig = Field(EffectsConfig(), description="what a camera does to the colours after drawing")
     visible_threshold: float = Field(
         0.1,
         ge=0,
@@ -80,6 +82,11 @@ class RenderConfig(WeatherConfig):
     mesh_triangles: MayDiffer[int] = Field(
         MOST_TRIANGLES, ge=1, description="most triangles of a file of meshes, and of all that the map draws of them"
     )
+
+    def recorded(self) -> dict[str, Any]:
+        """Without effects, the settings are those of before there were any."""
+        settings = super().recorded()
+        return {name: value for name, value in settings.items() if name != "effects" or self.effects.is_on}
 
     @field_validator("fovs_deg")
     @classmethod
