@@ -20,7 +20,17 @@ import pyarrow as pa
 from cosfly.escaping import published_name
 from cosfly.geometry import BODY_FROM_CAMERA
 from cosfly.products.captions import FIELDS, Caption, LabelFrom, Language, SentenceState, TeacherKind, Verdict, Writing
-from cosfly.products.frames import INVALID_DEPTH_M, LEAST_FOV_DEG, MOST_FOV_DEG, SKY_DEPTH_M, FrameFile, Look
+from cosfly.products.frames import (
+    INVALID_DEPTH_M,
+    LEAST_FOV_DEG,
+    LEGIBLE_CONTRAST,
+    LEGIBLE_HEIGHT_PX,
+    LEGIBLE_SHARE,
+    MOST_FOV_DEG,
+    SKY_DEPTH_M,
+    FrameFile,
+    Look,
+)
 from cosfly.products.motion import ACTION
 from cosfly.products.places import sample_id
 from cosfly.products.playback import EVENTS, Flight
@@ -63,6 +73,10 @@ CONTRACT: dict[str, Any] = {
     "depth": f"z-depth along the optical axis, metres, float32; {SKY_DEPTH_M:g} sky, {INVALID_DEPTH_M:g} invalid",
     "instance": "PNG; R semantic number (CARLA 0.9.16 CityObjectLabel), G low and B high byte of the instance id",
     "target": "hip of the tracked person; target_heading_deg, whither it walks, as yaw; null before its first step",
+    "legibility": "target_height_px, of its box in the image; target_contrast, CIE76 difference of the colours of its "
+    "pixels from those around; target_legible: visible, "
+    f"{LEGIBLE_HEIGHT_PX:g} px high, {LEGIBLE_SHARE:g} of it unhidden (visibility), contrast {LEGIBLE_CONTRAST:g}; "
+    "null where the tree does not say",
     "offsets": "the perturbation of the frame, already contained in pose and target; where a position was shifted the "
     "camera was aimed anew, and the rotation offset is its turn away from that aim",
     "perturbation": "what became of the frame's two events, position (shift of drone and person) and rotation (turn of "
@@ -167,7 +181,7 @@ class Column:
             return None if np.isnan(value).any() else (value.ravel() + 0.0).tolist()
         if self.type == "float64":
             return None if value is None or math.isnan(value) else float(value)
-        return bool(value) if self.type == "bool" else value
+        return bool(value) if self.type == "bool" and (value is not None or self.required) else value
 
 
 def _knobs(flight: Flight) -> np.ndarray | None:
@@ -299,6 +313,14 @@ FRAME = (  # everything of a frame but pictures and depth
     Column(
         "visibility", "float64", lambda f, i: f.visibility[i], ranges=NONE_TO_ONE,
         title="rendered visibility of the target", annotation=True,
+    ),
+    Column(
+        "target_height_px", "float64", lambda f, i: f.told_legibility(i)["height_px"], ranges={"": (0.0, 100_000.0)},
+    ),
+    Column("target_contrast", "float64", lambda f, i: f.told_legibility(i)["contrast"], ranges={"": (0.0, 300.0)}),
+    Column(
+        "target_legible", "bool", lambda f, i: f.told_legibility(i)["legible"], title="target can be made out",
+        annotation=True,
     ),
     Column("is_perturbed", "bool", lambda f, i: f.is_perturbed[i], required=True),
     Column(

@@ -244,6 +244,7 @@ class Numbers(Strict):
     frames_perturbed: int
     frames_target_in_view: int
     frames_target_visible: int
+    frames_target_legible: int | None = None  # null in releases of before
     coverage: Coverage
     captions: CaptionNumbers
     files: FileNumbers

@@ -30,6 +30,7 @@ COLUMNS = (
     ("five-ray", "five_ray_mean", "{:.3f}"),
     ("rendered", "rendered_visibility_mean", "{:.3f}"),
     ("visible", "visible_share", "{:.0%}"),
+    ("legible", "legible_share", "{:.0%}"),
     ("IoU", "track_quality", "{:.2f}"),
 )
 PLOT_WIDTH, PLOT_HEIGHT = 250.0, 62.0

@@ -44,6 +44,9 @@ LEAST_FOV_DEG, MOST_FOV_DEG = 0.1, 179.0
 LEVEL_NAMES: dict[float, str] = {110: "wide-angle", 90: "standard", 60: "narrow", 30: "telephoto"}  # tab:zoom_config
 SKY_DEPTH_M, INVALID_DEPTH_M = 1000.0, 0.0
 META_FORMAT = FileFormat("cosfly.frame", "1.0", "frame annotation")
+# A person is legible who is visible, so high in the picture, of so much of the box unhidden, and of so much colour
+# difference (CIE76, where 2.3 is just noticeable) from what is around.
+LEGIBLE_HEIGHT_PX, LEGIBLE_SHARE, LEGIBLE_CONTRAST = 16.0, 0.3, 5.0
 XYZ, ANGLES = ("x", "y", "z"), ("pitch", "yaw", "roll")
 
 COORDINATES = {
@@ -202,6 +205,10 @@ class TargetMeta(_Group):
     visible: bool
     visibility: float
     num_pixels: int
+    # Of the picture as written; absent in trees of before, contrast null where no pixel of the person is seen.
+    height_px: float | None = None
+    contrast: float | None = None
+    legible: bool | None = None
 
     @property
     def center_m(self) -> np.ndarray:

@@ -46,6 +46,7 @@ from cosfly.work.store import write_json
 
 ORIGINAL = "ORI"  # the folder of a clean flight
 TREE_ACTION = ("forward_mps", "right_mps", "up_mps", "yaw_rate_degps", "gimbal_pitch_deg")  # motion.ACTION, mirrored
+LEGIBILITY = ("height_px", "contrast", "legible")  # of a point's target: cosfly/render/camera.py
 EVENTS = ("position", "rotation")  # of a frame of a perturbed flight; what became of them: docs/files.md
 # A frame of a perturbed flight by what was applied to it, and the shares of the paper, where each event has a chance of
 # 0.6 (tab:augmentation_states).
@@ -190,6 +191,12 @@ class Flight:
         """How the lens bends `rgb.png`: k1, k2, p1, p2, k3 of OpenCV's model; zeros where the file says nothing."""
         told = object_of(self.raw, "camera").get("distortion")
         return told if isinstance(told, list) and len(told) == 5 and all(map(is_number, told)) else [0.0] * 5
+
+    def told_legibility(self, index: int) -> dict[str, float | bool | None]:
+        """Give what a point tells of LEGIBILITY; None where it says nothing."""
+        points = self.raw.get("points", [])
+        told = object_of(points[index], "target") if index < len(points) else {}
+        return {name: one if isinstance(one := told.get(name), bool) or is_number(one) else None for name in LEGIBILITY}
 
     @property
     def keeps_sight(self) -> np.ndarray:

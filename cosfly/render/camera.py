@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
-from cosfly.geometry import box_corners, project
-from cosfly.products.frames import Camera
+from cosfly.geometry import box_corners, mask_box, project
+from cosfly.products.frames import LEGIBLE_CONTRAST, LEGIBLE_HEIGHT_PX, LEGIBLE_SHARE, Camera, TargetMeta
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.contract import NEAR_M, PERSON_ID, Frame
 
 DEPTH_TOLERANCE_M = 0.05  # something this little in front of the target's box does not hide it
 NOT_HIDDEN = -1  # no instance id
+RING_LEAST_PX = 4  # around a person, whose colours are held against its own
 MOST_SAMPLES = 40_000  # rays through the target's box; more are thinned evenly
 
 # Pairs of corners (order of geometry.box_corners) that an edge of the box joins.
@@ -140,3 +142,40 @@ def _rays_to_box(
     at = pixels[inside, 1], pixels[inside, 0]
     free = (frame.depth[at] >= near[inside] - DEPTH_TOLERANCE_M) | (frame.ids[at] == PERSON_ID)
     return len(pixels), np.where(free, NOT_HIDDEN, frame.ids[at].astype(np.int64))
+
+
+def contrast_of(rgb: np.ndarray, is_person: np.ndarray) -> float | None:
+    """How much the person's colours differ from those around it: CIE76, of the upper or the lower half, the greater.
+
+    Args:
+        rgb: (h, w, 3) uint8; is_person: (h, w) bool.
+    Returns:
+        None where no pixel is the person's, or none is around it.
+    """
+    if not is_person.any():
+        return None
+    x0, y0, x1, y1 = mask_box(is_person).astype(int).tolist()
+    around = max(RING_LEAST_PX, (y1 - y0) // 2)
+    part = np.s_[max(0, y0 - around) : y1 + around, max(0, x0 - around) : x1 + around]
+    colours = cv2.cvtColor(rgb[part].astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
+    inside = is_person[part]
+    is_upper = np.arange(part[0].start, part[0].start + len(inside))[:, None] < (y0 + y1) / 2
+    halves = [half for half in (inside & is_upper, inside & ~is_upper) if half.any()]
+    if inside.all():
+        return None
+    ground = colours[~inside].mean(axis=0)
+    return max(float(np.linalg.norm(colours[half].mean(axis=0) - ground)) for half in halves)
+
+
+def legibility(meta: TargetMeta, contrast: float | None) -> dict[str, float | bool | None]:
+    """Give `height_px`, `contrast` and `legible` of a target in a frame: whether a person can be made out, beside
+    `visible`, which geometry tells."""
+    height_px = 0.0 if meta.bbox_2d is None else round(meta.bbox_2d[3] - meta.bbox_2d[1], 2)
+    contrast = None if contrast is None else round(contrast, 2)
+    is_legible = (
+        meta.visible
+        and height_px >= LEGIBLE_HEIGHT_PX
+        and meta.visibility >= LEGIBLE_SHARE
+        and (contrast or 0.0) >= LEGIBLE_CONTRAST
+    )
+    return {"height_px": height_px, "contrast": contrast, "legible": is_legible}

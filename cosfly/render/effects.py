@@ -131,11 +131,13 @@ def blurred(
     return np.rint(total / steps).astype(np.uint8)
 
 
-def bent(rgb: np.ndarray, intrinsic: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
+def bent(
+    image: np.ndarray, intrinsic: np.ndarray, distortion: tuple[float, ...], interpolation: int = cv2.INTER_LINEAR
+) -> np.ndarray:
     """Bend a pinhole's picture as a lens of OpenCV's model does; straightened by that, it is the pinhole's again."""
     fx, fy, cx, cy = intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    x, y = _straight(rgb.shape[1], rgb.shape[0], (fx, fy, cx, cy), distortion)
-    return cv2.remap(rgb, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    x, y = _straight(image.shape[1], image.shape[0], (fx, fy, cx, cy), distortion)
+    return cv2.remap(image, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)
 
 
 @functools.lru_cache(maxsize=4)

@@ -9,6 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from cosfly.errors import RenderError
@@ -17,16 +18,23 @@ from cosfly.look.overlay import Overlay
 from cosfly.products import frames
 from cosfly.products.frames import Camera, DepthFormat, FrameFile, FrameMeta, Look, OthersMeta, TargetMeta, frame_name
 from cosfly.products.kinds import KINDS
-from cosfly.products.playback import Flight, write_flight
+from cosfly.products.playback import LEGIBILITY, Flight, write_flight
 from cosfly.products.segments import Mission, Segment
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.products.weather import WeatherRecord
 from cosfly.reading.documents import FileFormat
 from cosfly.reading.files import sha256_file
-from cosfly.render.camera import TargetView, hidden_shares, rendered_visibility, view_target
+from cosfly.render.camera import (
+    TargetView,
+    contrast_of,
+    hidden_shares,
+    legibility,
+    rendered_visibility,
+    view_target,
+)
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
-from cosfly.render.effects import Effects
+from cosfly.render.effects import Effects, bent
 from cosfly.render.person import Cast, Gait
 from cosfly.render.perturbation import HIDDEN, STEP_UP_M, PerturbedTrack, Poses, Surroundings
 from cosfly.space.kernels import signed_distances
@@ -138,10 +146,16 @@ def render_flight(
     places = np.concatenate([poses.positions_m, poses.targets_m])
     knobs = None if script.weather is None else script.weather.params
     renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M, knobs)
-    annotations: list[FrameMeta] = []
+    targets: list[TargetMeta] = []
     visibility: list[float] = []
     pending: list[Future] = []
     digests: dict[str, str] = {}
+
+    def take(written: Future) -> None:
+        target, made = written.result()
+        targets.append(target)
+        digests.update(made)
+
     with ThreadPoolExecutor(num_threads) as pool:
         for i in range(len(script.time_s)):
             frame, seen = draw_frame(renderer, script, i, poses, writing.visible_threshold)
@@ -152,14 +166,13 @@ def render_flight(
                     script.perturbed.drop_shift(i, HIDDEN)
                     frame, seen = without
             visibility.append(seen.visibility)
-            annotations.append(_annotation(script, i, seen))
-            pending.append(pool.submit(_write_frame, folder, frame, annotations[i], writing, script))
+            pending.append(pool.submit(_write_frame, folder, frame, _annotation(script, i, seen), writing, script))
             advance()
             while len(pending) >= FRAMES_IN_FLIGHT:
-                digests.update(pending.pop(0).result())
-        for future in pending:
-            digests.update(future.result())
-    flight = _flight(script, [meta.target for meta in annotations], np.array(visibility))
+                take(pending.pop(0))
+        for written in pending:
+            take(written)
+    flight = _flight(script, targets, np.array(visibility))
     write_flight(folder, flight)
     write_json(folder / "perturbation_report.json", _report(script.perturbed))
     for name in ("trajectory.json", "perturbation_report.json"):
@@ -191,12 +204,19 @@ def draw_frame(
 # --- files of one frame -----------------------------------------------------------------------------------------------
 
 
-def _write_frame(folder: Path, frame: Frame, meta: FrameMeta, writing: Writing, script: FlightScript) -> dict[str, str]:
-    """Encode and write one frame, as the camera has it, beside the drawing; gives file name -> sha256."""
-    name = frame_name(meta.index)
+def _write_frame(
+    folder: Path, frame: Frame, meta: FrameMeta, writing: Writing, script: FlightScript
+) -> tuple[TargetMeta, dict[str, str]]:
+    """Encode and write one frame, as the camera has it, beside the drawing; gives the target's annotation, and file
+    name -> sha256."""
+    name, is_person = frame_name(meta.index), frame.ids == PERSON_ID
     if script.effects is not None:
         camera = script.cameras[meta.index]
         frame = replace(frame, rgb=script.effects.apply(frame.rgb, frame.depth, camera, meta.index))
+        if script.distortion is not None:
+            is_person = bent(is_person.astype(np.uint8), camera.intrinsic, script.distortion, cv2.INTER_NEAREST) > 0
+    person = meta.target.model_copy(update=legibility(meta.target, contrast_of(frame.rgb, is_person)))
+    meta = meta.model_copy(update={"target": person})
     makers: dict[FrameFile, Callable[[], tuple[str, bytes]]] = {
         "rgb": lambda: (frames.FILE_NAMES["rgb"], frames.rgb_bytes(frame.rgb)),
         "depth": lambda: frames.depth_file(frame.depth, writing.depth_format),
@@ -213,7 +233,7 @@ def _write_frame(folder: Path, frame: Frame, meta: FrameMeta, writing: Writing, 
         for file_name, data in contents.items():
             # No fsync here: the flight's folder gets its final name only when all of it is written.
             (target / file_name).write_bytes(data)
-    return {f"{name}/{file_name}": sha256_bytes(data) for file_name, data in contents.items()}
+    return person, {f"{name}/{file_name}": sha256_bytes(data) for file_name, data in contents.items()}
 
 
 # --- annotations ------------------------------------------------------------------------------------------------------
@@ -303,6 +323,9 @@ def _flight(script: FlightScript, targets: list[TargetMeta], visibility: np.ndar
         raw={
             **({} if script.weather is None else {"weather": script.weather.model_dump()}),
             **({} if script.distortion is None else {"camera": {"distortion": list(script.distortion)}}),
-            "points": [{"perturbation": dict(state)} for state in perturbed.states],
+            "points": [
+                {"perturbation": dict(state), "target": target.model_dump(include=set(LEGIBILITY))}
+                for state, target in zip(perturbed.states, targets, strict=True)
+            ],
         },
     )

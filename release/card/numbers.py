@@ -27,7 +27,7 @@ DIGITS = 4
 MILLION = 1_000_000
 LARGEST = 1e9  # of a value: beyond any town, flight and picture
 # Columns of yes and no whose frames are counted.
-FLAGS = ("is_perturbed", "target_in_view", "target_visible", "has_caption")
+FLAGS = ("is_perturbed", "target_in_view", "target_visible", "target_legible", "has_caption")
 COVERED = ("style", "pace", "label")
 COLUMNS = [
     "sample_id", *PLACE, "track", "style", "pace", "weather", "time_of_day", "frame_index", "time_s", "width_px",
@@ -282,6 +282,7 @@ class RowCounts:
             frames_perturbed=totals["is_perturbed"],
             frames_target_in_view=totals["target_in_view"],
             frames_target_visible=totals["target_visible"],
+            frames_target_legible=totals["target_legible"],
             coverage=self.coverage if self.rows else Coverage.of({name: np.empty(0) for name in AXES}, (), ()),
             captions=self._captions(),
             files=FileNumbers(

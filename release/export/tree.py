@@ -24,7 +24,7 @@ from cosfly.errors import InputError
 from cosfly.products.boxes import UNKNOWN_LICENCE
 from cosfly.products.frames import COORDINATES, FILE_NAMES, frame_name
 from cosfly.products.places import TOWN
-from cosfly.products.playback import Flight, write_flight
+from cosfly.products.playback import LEGIBILITY, Flight, write_flight
 from cosfly.products.segments import FOLLOW, Segment
 from cosfly.products.town import TOWN_FILE, TOWN_FORMAT, TownMap
 from cosfly.products.walks import pace_field
@@ -168,18 +168,24 @@ def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight
             "released_frames": placed.frame_index.tolist(),
             **pace_field(rows[0]["pace"]),
         },
-        raw={"points": [_point(row) for row in rows]} | _weather(rows[0]),
+        raw={"points": [_point(row) for row in rows]} | _weather(rows[0]) | _lens(rows[0]),
     )
 
 
 def _point(row: Row) -> dict[str, Any]:
     """What a point says of its perturbation beside the offsets: what became of it, or that there was one whose offsets
-    nobody knows.
+    nobody knows; and of its target whether it can be made out.
     """
     told = {name: text for name, text in (row["perturbation"] or {}).items() if text is not None}
     if row["is_perturbed"] and row["drone_offset"] is None:
         told |= {"drone_position": True, "drone_rotation": True}
-    return {"perturbation": told} if told else {}
+    target = {name: value for name in LEGIBILITY if (value := row[f"target_{name}"]) is not None}
+    return ({"perturbation": told} if told else {}) | ({"target": target} if target else {})
+
+
+def _lens(row: Row) -> dict[str, Any]:
+    bent = list(row["distortion"].values())
+    return {"camera": {"distortion": bent}} if any(bent) else {}
 
 
 def _weather(row: Row) -> dict[str, Any]:

@@ -89,6 +89,7 @@ def tiles_of(record: ReleaseRecord, stats: Stats) -> list[tuple[str, str]]:
         ("GB", round(numbers.files.bytes / 1e9, 2), None),
         ("of the flights that were found are released", found.released, found.found),
         ("of the frames show the person", numbers.frames_target_visible, numbers.frames),
+        ("of the frames show the person legibly", numbers.frames_target_legible, numbers.frames),
         ("of the person is seen, on average", seen, None if seen is None else 1),
         ("mean smoothness score", quality["mean smoothness score S"], None),
         ("of the decisions are those of the geometry", captions.decision_equals_label, captions.with_label),

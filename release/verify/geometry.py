@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from cosfly.geometry import BODY_FROM_CAMERA
+from cosfly.products.frames import LEGIBLE_CONTRAST, LEGIBLE_HEIGHT_PX, LEGIBLE_SHARE
 from release.flight_rows import FlightRows
 from release.verify.findings import Findings
 
@@ -108,6 +109,10 @@ def _check_flags(flight: FlightRows, findings: Findings) -> None:
     visibility = flight.numbers("visibility")
     has_target, has_uv = ~np.isnan(flight.target_m[:, 0]), ~np.isnan(flight.uv[:, 0])
     has_box, has_mask = ~np.isnan(flight.box[:, 0]), ~np.isnan(flight.mask_box[:, 0])
+    legible, height_px = flight.flags("target_legible"), flight.numbers("target_height_px")
+    reads = visible & (height_px >= LEGIBLE_HEIGHT_PX) & (visibility >= LEGIBLE_SHARE)
+    reads &= flight.numbers("target_contrast") >= LEGIBLE_CONTRAST
+    box_px = np.nan_to_num(flight.box[:, 3] - flight.box[:, 1])
     is_ours, ahead = not flight.is_foreign, flight.numbers("target_depth_m") > 0
     findings.judge(flight, (("flags", *rule) for rule in (
         ("target_visible", visible & ~in_view, "true, and not in view", "a target that is seen is in view"),
@@ -116,6 +121,9 @@ def _check_flags(flight: FlightRows, findings: Findings) -> None:
         ("target", ~has_target & (has_uv | has_box | has_mask), "null, but a pixel or a box", "a position"),
         ("visibility", (visibility > 0) & ~in_view & is_ours, "above 0, and not in view", "0 out of view"),
         ("target_visible", visible & (visibility <= 0), "true, visibility 0", "a visibility above 0"),
+        ("target_legible", (legible != reads) & ~np.isnan(height_px), "not as the bounds say",
+         "true where visible, height, contrast and visibility are enough, else false"),
+        ("target_height_px", np.abs(height_px - box_px) > 0.01, "another height than target_bbox", "its height"),
         ("target_bbox", (in_view != has_box) & is_ours, "null in view, or not null out of view", "a box in view alone"),
         ("target_visible", visible & ~has_mask & is_ours, "true, and no pixel of the person", "a box of its pixels"),
     )))  # fmt: skip
