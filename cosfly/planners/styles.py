@@ -68,7 +68,7 @@ TABLE: dict[str, Style] = {
     "sink": Style(("descend",), (10.0, 22.0), (50.0, 55.0), (135.0, 225.0), altitude_end_m=(8.0, 14.0)),
     "hold": Style(("hover",), (10.0, 18.0), (8.0, 25.0), (-18.0, 18.0), hop_s=(9.0, 15.0), pace_mps=(1.5, 3.0)),
     "stop_and_go": Style(
-        ("speed_up", "slow_down", "hover"), (16.0, 34.0), (8.0, 13.0), (178.0, 182.0),
+        ("speed_up", "slow_down", "hover"), (16.0, 34.0), (12.0, 20.0), (178.0, 182.0),
         hop_s=(6.0, 7.5), pace_mps=(4.0, 6.0),
     ),
     "top": Style(("track_straight",), (4.0, 8.0), (48.0, 59.0), (150.0, 210.0)),
