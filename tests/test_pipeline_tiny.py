@@ -502,7 +502,7 @@ def test_the_stages_one_by_one_make_a_town_as_the_run_does(towns, tmp_path):
     nobody = ["maps", "--config", str(towns / "run.yaml"), "--out", str(tmp_path / "none")]
     told = " ".join(CliRunner().invoke(app, nobody).output.split())
     assert "the settings and the seed of none. As `cosfly run` makes one: --town, of one, two" in told
-    with pytest.raises(ConfigError, match=r"no such town .did you mean 'one'.*--town; got oen; expected one, two"):
+    with pytest.raises(ConfigError, match=r"--town: there is no such town .did you mean 'one'.*got oen; expected one"):
         CliRunner().invoke(app, [*nobody, "--town", "oen"], catch_exceptions=False)
 
 
