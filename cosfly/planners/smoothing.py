@@ -27,6 +27,7 @@ VELOCITY_S2, ACCELERATION_S4, JERK_S6 = 8.0, 30.0, 100.0
 DIFFERENCES = ((VELOCITY_S2, (-1.0, 1.0)), (ACCELERATION_S4, (1.0, -2.0, 1.0)), (JERK_S6, (-1.0, 3.0, -3.0, 1.0)))
 SPREAD_S = 1.0  # neighbours are pulled along
 ROUNDS, ROUNDS_MAX = 12, 24  # for the sake of sight; for the sake of safety
+MENDS_MAX = 120  # rounds for a flight that breaks limits: between two boxes they draw it to and fro
 SIGHT_LOSS = 0.01  # of a waypoint that is no loss: the five rays count in fifths
 ASTRAY_SHARE = 0.3  # of the wished distance: farther from the raw flight is not the flight that was searched
 PULL_STAYS = 1e6  # of a flight that is right: within a centimetre
@@ -75,7 +76,7 @@ def within_limits(points: np.ndarray, scenario: Scenario, obstacles: BoxIndex, c
     low, high = (scenario.ground_m + bound for bound in (scenario.wish.altitude_min_m, scenario.wish.altitude_max_m))
     goal, pulls, band = points.copy(), np.full(len(points), PULL_STAYS), smoothness_band(len(points), scenario.dt_s)
     least_m = cfg.relaxed_safety_m - CLEARANCE_TOLERANCE_M
-    for _ in range(ROUNDS_MAX):
+    for _ in range(MENDS_MAX):
         written = np.round(points, 4)
         hurried = hurries(written, cfg, scenario.dt_s)
         gaps_m, shares, boxes = swept_distances(obstacles, written, cfg.relaxed_safety_m + AWAY_M)
