@@ -764,7 +764,7 @@ READERS: dict[str, Reader] = {
         (f"answers/{journal_name('flight')}", f"answers/{journal_name('closed')}"),
         lambda root, _: AnswerBook(root / "answers").latency_s("flight", "s"),
     ),
-    "evaluation's scores": _one("evaluation/scores.parquet", read_scores),
+    "evaluation's scores": _one("evaluation/scores.parquet", lambda path: read_scores(path, shipped_actions())),
     "evaluation": _one("evaluation/report.json", lambda path: read_report(path.parent)),
     "samples": Reader(
         (f"train/{RECORD}", "train/train.parquet"),

@@ -48,14 +48,17 @@ def test_lerobot_opens_it(tmp_path):
         for name, column in (("rgb", "image"), ("instance", "instance")):
             assert item[f"observation.images.{name}"] == sha256(parse_picture(row[column]["bytes"], "x")[..., ::-1])
         pose = np.array([row["pose"][member] for member in POSE])
-        assert item["observation.state"] == pose.astype(np.float32).tolist()
+        assert item["pose"] == pose.astype(np.float32).tolist()
+        if row["action"] is not None:
+            assert item["action"] == np.array(list(row["action"].values()), dtype=np.float32).tolist()
+        assert item["observation.state"][4] == np.float32(row["pose"]["pitch_deg"])
         assert item["timestamp"] == row["frame_index"] * 0.5
         assert item["caption_zh_reasoning_trace"] == (row["caption_zh_reasoning_trace"] or "")
         decision = row["decision"]
         assert item["task"].endswith(f"Now: {decision.replace('_', ' ')}." if decision else "from the air.")
-    last = np.array([[rows[i]["pose"][member] for member in POSE] for i in (indices[-1] - 1, indices[-1])])
-    assert seen["before"] == last.astype(np.float32).tolist()
-    states = np.array([[row["pose"][member] for member in POSE] for row in rows], dtype=np.float32)
-    assert np.allclose(seen["stats"]["observation.state"]["mean"], states.mean(axis=0), rtol=1e-5)
-    assert np.allclose(seen["stats"]["observation.state"]["std"], states.std(axis=0), rtol=1e-4, atol=1e-6)
+    assert seen["before"][1] == seen["items"][str(indices[-1])]["observation.state"]
+    assert seen["before"][0][4] == np.float32(rows[indices[-1] - 1]["pose"]["pitch_deg"])
+    poses = np.array([[row["pose"][member] for member in POSE] for row in rows], dtype=np.float32)
+    assert np.allclose(seen["stats"]["pose"]["mean"], poses.mean(axis=0), rtol=1e-5)
+    assert np.allclose(seen["stats"]["pose"]["std"], poses.std(axis=0), rtol=1e-4, atol=1e-6)
     assert np.shape(seen["stats"]["observation.images.rgb"]["mean"]) == (3, 1, 1)

@@ -44,8 +44,8 @@ from release.verify.records import check_shards
 from release.verify.verify import verify
 
 TINY = [
-    "pedestrians.num_paths=4", "pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25", "render.width_px=160",
-    "render.height_px=90", "render.fovs_deg=[60, 90]", "caption.window.stride=2", "workers=1",
+    "pedestrians.num_paths=4", "pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25", "render.width_px=256",
+    "render.height_px=144", "render.fovs_deg=[60, 90]", "caption.window.stride=2", "workers=1",
 ]  # fmt: skip
 
 

@@ -464,7 +464,7 @@ def test_a_whole_flight_has_the_annotations_of_the_default_renderer(renderer_nam
             assert meta.target.visibility == pytest.approx(expected.target.visibility, abs=VISIBILITY_TOLERANCE)
             assert meta.target.visible == expected.target.visible
             visibilities.append(meta.target.visibility)
-            differing = {"visibility": 0.0, "num_pixels": 0, "mask_bbox_2d": None}
+            differing = {"visibility": 0.0, "num_pixels": 0, "mask_bbox_2d": None, "contrast": None, "legible": None}
             assert meta.model_copy(update={"target": meta.target.model_copy(update=differing)}) == expected.model_copy(
                 update={"target": expected.target.model_copy(update=differing)}
             )

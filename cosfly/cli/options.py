@@ -171,7 +171,7 @@ def takes(*names: str, flights: str | None = None) -> Callable[[Callable[..., No
             extra = {one.path: one.value_of(given[name]) for name, one in chosen.items()}
             manner = {name: given[name] for name in ("resume", "verify", "repair") if name in given}
             cfg = resolve(given["config"], given.get("overrides"), extra)
-            job = Job(_town_of(cfg, given["town"]) if "town" in given else cfg, **manner)
+            job = Job(_town_of(cfg, given["town"]) if "town" in shared else cfg, **manner)
             function(job, **{name: _opened(job.cfg, given[name]) for name in taken})
 
         parameters = [
