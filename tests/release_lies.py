@@ -332,7 +332,8 @@ def not_a_number(row: Row) -> None:
 
 def boxed(row: Row) -> None:
     depth = depth_of(row)
-    depth[5:25, 5:25] = 3.0  # also where the sky is
+    side = depth.shape[1] // 8
+    depth[5 : 5 + side, 5 : 5 + side] = 3.0  # also where the sky is
     set_depth(row, depth)
 
 
