@@ -94,6 +94,15 @@ def run(
             _take_back(stage, allotted)
         asking = Asking(stage, cfg, vocabulary, seed, retry_failed=retry_failed, was_whole=was_whole)
         asked = run_until_interrupted(asking.run(allotted))
+    return _publish(stage, cfg, vocabulary, asked, allotted, foreign, is_cut=is_cut)
+
+
+def _publish(
+    stage: StageFolder, cfg: CaptionConfig, vocabulary: Vocabulary, asked: Asked, allotted: list[Allotted],
+    foreign: set[str] | None, *, is_cut: bool,
+) -> Path:  # fmt: skip
+    """Put what was answered together, with report and page; the stage is finished where no window is left."""
+    out = stage.path
     ledger = Ledger(vocabulary.actions)
     _merge(stage, ledger, allotted, foreign, with_gaps=bool(asked.unanswered))
     tally = ledger.tally(len(asked.unanswered))
