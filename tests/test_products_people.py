@@ -1,0 +1,34 @@
+"""The wardrobe: drawn, written, read, told apart."""
+
+import numpy as np
+import pytest
+
+from cosfly.errors import InputError
+from cosfly.products.people import COLORS, Appearance, draw_appearance, look_alike
+
+
+def test_a_drawn_person_is_read_back_as_written():
+    rng = np.random.default_rng(1)
+    for _ in range(200):
+        person = draw_appearance(rng)
+        assert Appearance.from_json(person.as_json(), "here") == person
+
+
+def test_a_look_alike_differs_in_one_thing():
+    rng = np.random.default_rng(2)
+    for _ in range(200):
+        person = draw_appearance(rng)
+        assert len(person.differences(look_alike(person, rng))) == 1
+
+
+@pytest.mark.parametrize(("field", "value"), [("top", "toga"), ("hat_color", "red"), ("figure", 3), ("bag", None)])
+def test_what_the_wardrobe_lacks_is_refused(field, value):
+    bare = Appearance("man", "jacket", "red", "shorts", "blue").as_json()
+    with pytest.raises(InputError, match=field):
+        Appearance.from_json(bare | {field: value}, "here")
+
+
+def test_colours_are_far_apart():
+    srgb = np.array([color for _, color in COLORS.values()]) ** (1 / 2.2)
+    apart = np.linalg.norm(srgb[:, None] - srgb[None], axis=2)[np.triu_indices(len(srgb), 1)]
+    assert apart.min() > 0.2
