@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -121,11 +122,17 @@ def test_distance_to_a_turned_box():
 def test_others_round_trip_and_bad_files(tmp_path):
     path = tmp_path / "others.json"
     write_others(
-        path, [Company("p", [going(CAR, (0, 0), (4, 3)), standing(PERSON, 1, 1)]), Company("q", [])], {"map": "T"}
+        path,
+        [
+            Company("p", [going(CAR, (0, 0), (4, 3)), replace(standing(PERSON, 1, 1), is_look_alike=True)]),
+            Company("q", []),
+        ],
+        {"map": "T"},
     )
     first, second = read_others(path)
     assert (first.path_id, second.path_id, second.others) == ("p", "q", [])
     assert [other.kind for other in first.others] == [CAR, PERSON]
+    assert [other.is_look_alike for other in first.others] == [False, True]
     np.testing.assert_allclose(first.others[0].positions_m, [[0, 0, 0], [4, 3, 0]])
     np.testing.assert_allclose(first.others[0].headings_rad, np.arctan2(3, 4), atol=1e-5)
     for old, new, words in (

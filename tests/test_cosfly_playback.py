@@ -13,6 +13,7 @@ from cosfly.errors import InputError
 from cosfly.geometry import project, world_from_camera
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
+from cosfly.products.people import People, draw_appearance
 from cosfly.products.playback import read_flight, write_flight
 from cosfly.products.segments import Mission, Segment
 from specimens import PERSON_ID, make_playback_tree
@@ -111,6 +112,23 @@ def test_styles_and_mission_survive_and_home_is_in_carlas_axes(clean, tmp_path):
     again = read_flight(folder)
     assert (again.segments, again.mission) == (parts, mission)
     assert again.keeps_sight.tolist() == [True] * 4 + [False] * 2
+
+
+def test_what_people_look_like_survives_and_somebody_elses_field_is_noted(clean, tmp_path):
+    rng = np.random.default_rng(0)
+    people = People(draw_appearance(rng), {65533: draw_appearance(rng)})
+    assert read_flight(clean).people is None
+    folder = tmp_path / "Town01" / clean.parent.name / "ORI"
+    folder.mkdir(parents=True)
+    write_flight(folder, replace(read_flight(clean), people=people))
+    assert read_flight(folder).people == people
+    for theirs in ([{"name": "Ann"}], {"target": {}}, people.as_json() | {"others": {"x": {}}}):
+        folder = rewrite(clean, tmp_path, lambda value, theirs=theirs: value.update(people=theirs))
+        with pytest.raises(InputError, match="people"):
+            read_flight(folder)
+        flight = read_flight(folder, strict=False)
+        assert (flight.people, flight.raw["people"]) == (None, theirs)
+        assert "people" in flight.issues[0]
 
 
 def test_somebody_elses_mission_is_noted_and_left(clean, tmp_path):

@@ -24,6 +24,7 @@ from cosfly.products.flights import find_flights
 from cosfly.products.frames import Camera, Look, frame_name, read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.kinds import KINDS
 from cosfly.products.others import Company, Other, write_others
+from cosfly.products.people import draw_appearance
 from cosfly.products.playback import read_flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.reading.files import sha256_file
@@ -280,7 +281,8 @@ def test_a_shift_into_somebody_falls_back():
     ]
     nothing = Surroundings(make_box_map([[0, 0, -0.5]], [[50, 50, 0.5]], np.zeros((1, 3)), [KINDS["Roads"]]))
     cfg = PerturbationConfig(position_probability=1.0, rotation_probability=0.0)
-    cast = cast_of(ring, np.arange(n) * 0.5, np.random.default_rng(0))
+    looks = draw_appearance(np.random.default_rng(1))
+    cast = cast_of(ring, np.arange(n) * 0.5, looks, np.random.default_rng(0))
     free, among = (
         perturb(planned, [CAMERA] * len(planned.positions_m), nothing, cfg, np.random.default_rng(3), others)
         for others in (NOBODY, cast)
@@ -290,6 +292,18 @@ def test_a_shift_into_somebody_falls_back():
     assert not any(state["position"] == "fallback: person in an obstacle" for state in free.states)
     for i in range(n):
         assert not cast.are_in_the_way(i, among.poses.targets_m[i])
+
+
+def test_look_alikes_differ_from_the_target_in_one_thing_and_nobody_looks_just_like_it():
+    target = draw_appearance(np.random.default_rng(1))
+    stands = Other("Pedestrians", np.zeros((2, 3)), np.zeros(2))
+    others = [Other("Car", np.zeros((2, 3)), np.zeros(2)), replace(stands, is_look_alike=True), stands] * 20
+    people = cast_of(others, np.arange(2) * 0.5, target, np.random.default_rng(0)).people(target)
+    assert list(people.others) == [other_id(number) for number in range(60) if number % 3]
+    different = np.array([len(target.differences(looks)) for looks in people.others.values()])
+    assert (different[::2] == 1).all()
+    assert (different[1::2] >= 1).all()
+    assert different[1::2].max() > 1
 
 
 def test_gait_follows_motion_and_keeps_the_heading_when_standing():
@@ -657,6 +671,7 @@ def test_both_tracks_share_camera_and_clothes_and_the_report_adds_up(finished):
         clean, shaken = read_flight(trajectory / "ORI"), read_flight(trajectory / "aug_001")
         assert clean.camera.fov_deg == pytest.approx(shaken.camera.fov_deg)
         np.testing.assert_array_equal(clean.time_s, shaken.time_s)
+        assert clean.people == shaken.people is not None
         assert not clean.is_perturbed.any()
         np.testing.assert_allclose(shaken.positions_m - shaken.drone_offsets_m, clean.positions_m, atol=1e-9)
         report = json.loads((trajectory / "aug_001/perturbation_report.json").read_text())

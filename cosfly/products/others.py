@@ -3,7 +3,7 @@ whom."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,11 +39,12 @@ BUILDS = {
 @dataclass(frozen=True)
 class Other:
     """One who moves beside the target: kind of BUILDS; positions_m (n, 3) on the ground below its middle; headings_rad
-    (n,)."""
+    (n,). A look-alike wears what the target does but for one thing."""
 
     kind: str
     positions_m: np.ndarray
     headings_rad: np.ndarray
+    is_look_alike: bool = False
 
     @property
     def build(self) -> Build:
@@ -71,15 +72,16 @@ class Other:
 
     def at(self, i: int) -> Other:
         """The same at one time alone."""
-        return Other(self.kind, self.positions_m[i : i + 1], self.headings_rad[i : i + 1])
+        return replace(self, positions_m=self.positions_m[i : i + 1], headings_rad=self.headings_rad[i : i + 1])
 
     def every(self, stride: int) -> Other:
         """The same at every so many times."""
-        return Other(self.kind, self.positions_m[::stride], self.headings_rad[::stride])
+        return replace(self, positions_m=self.positions_m[::stride], headings_rad=self.headings_rad[::stride])
 
     def as_json(self) -> dict:
         columns = {axis: rounded(self.positions_m[:, k], 4) for k, axis in enumerate("xyz")}
-        return {"kind": self.kind, **columns, "yaw": rounded(np.degrees(self.headings_rad), 3)}
+        told = {"look_alike": True} if self.is_look_alike else {}
+        return {"kind": self.kind, **told, **columns, "yaw": rounded(np.degrees(self.headings_rad), 3)}
 
     @classmethod
     def from_json(cls, record: dict, where: str) -> Other:
@@ -88,7 +90,7 @@ class Other:
             raise InputError("no such kind", where=f"{where}.kind", got=repr(kind)[:60], expected=" or ".join(BUILDS))
         x = column(record, "x", where)
         y, z, yaw = (column(record, name, where, len(x)) for name in ("y", "z", "yaw"))
-        return cls(kind, np.stack([x, y, z], axis=1), np.radians(yaw))
+        return cls(kind, np.stack([x, y, z], axis=1), np.radians(yaw), record.get("look_alike") is True)
 
 
 @dataclass(frozen=True)

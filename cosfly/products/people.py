@@ -6,7 +6,7 @@ people look alike where their rows do.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -80,12 +80,12 @@ class Appearance:
         if not isinstance(record, dict):
             raise InputError("no appearance", where=where, got=type(record).__name__, expected="an object")
         values = {}
-        for field in fields(cls):
-            value, rows = record.get(field.name), _rows(field.name, record)
+        for name in cls.__dataclass_fields__:
+            value, rows = record.get(name), _rows(name, record)
             if not isinstance(value, str) or value not in rows:
                 expected = ", ".join(repr(row) for row in rows)
-                raise InputError("no such look", where=f"{where}.{field.name}", got=repr(value)[:60], expected=expected)
-            values[field.name] = value
+                raise InputError("no such look", where=f"{where}.{name}", got=repr(value)[:60], expected=expected)
+            values[name] = value
         return cls(**values)
 
     def differences(self, other: Appearance) -> tuple[str, ...]:
@@ -96,6 +96,27 @@ class Appearance:
             slot for slot in slots
             if (mine[slot], mine.get(f"{slot}_color")) != (theirs[slot], theirs.get(f"{slot}_color"))
         )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class People:
+    """What the people of one flight look like: the target, and by instance id whoever else walks about."""
+
+    target: Appearance
+    others: dict[int, Appearance]
+
+    def as_json(self) -> dict:
+        others = {str(number): other.as_json() for number, other in self.others.items()}
+        return {"target": self.target.as_json(), "others": others}
+
+    @classmethod
+    def from_json(cls, record: object, where: str) -> People:
+        """Read the people of a flight; raises InputError where that is something else."""
+        others = record.get("others") if isinstance(record, dict) else None
+        if not isinstance(record, dict) or not isinstance(others, dict) or not all(map(str.isdecimal, others)):
+            raise InputError("no people", where=where, got=repr(record)[:60], expected="target, others by instance id")
+        found = {int(number): Appearance.from_json(o, f"{where}.others.{number}") for number, o in others.items()}
+        return cls(Appearance.from_json(record.get("target"), f"{where}.target"), found)
 
 
 def _rows(name: str, record: dict) -> tuple[str, ...]:

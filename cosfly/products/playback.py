@@ -25,6 +25,7 @@ from cosfly.geometry import mirror_positions, mirror_rotations
 from cosfly.products.columns import is_number
 from cosfly.products.frames import ANGLES, COORDINATES, FRAME_FILES, FRAMES_DIR, XYZ, Camera, frame_name, frame_path
 from cosfly.products.motion import PlannedMotion, without_perturbation
+from cosfly.products.people import People
 from cosfly.products.places import place_of, tree_of_flight
 from cosfly.products.segments import FOLLOW, Mission, Segment, flown_as_json, mirrored
 from cosfly.products.trajectory import (
@@ -75,7 +76,8 @@ class Flight:
     one). segments, mission: the styles of its parts and the order that ended it, as its plan has them. intrinsics: (n,
     3, 3) of a camera that zooms, frame by frame, `camera` is that of the first; None where it is that of all. Who
     projects asks `camera_at`. between: (n, k - 1, 6) planned poses after each frame and before the next, of a flight
-    that was planned at k times the rate of its frames; NaN after the last.
+    that was planned at k times the rate of its frames; NaN after the last. people: what they look like, None
+    where the file does not say.
     """
 
     town: str
@@ -107,6 +109,7 @@ class Flight:
     mission: Mission | None = None
     intrinsics: np.ndarray | None = None
     between: np.ndarray | None = None
+    people: People | None = None
     given_id: str | None = None  # where flights of several towns or runs share the plain one (places.py)
 
     def __len__(self) -> int:
@@ -274,6 +277,7 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
         reader.issue("points[].target", "missing", "an object, or null where there is nobody")
     segments, mission = reader.flown(raw, len(points))
     reader.weather(raw)
+    people = reader.people(raw)
     is_original = bool(object_of(raw, "augmentation").get("is_original", variant == ORIGINAL))
     drone, turn, walker = (
         offsets_of(points, name, axes, is_original)
@@ -309,6 +313,7 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
         issues=tuple(reader.issues),
         segments=segments,
         mission=mirrored(mission),
+        people=people,
     )
 
 
@@ -326,6 +331,8 @@ def write_flight(folder: Path, flight: Flight) -> None:
     raw.setdefault("coordinates", COORDINATES)
     raw["source"] = flight.source
     raw.update(flown_as_json(flight.segments, mirrored(flight.mission)))
+    if flight.people is not None:
+        raw["people"] = flight.people.as_json()
     camera = flight.camera
     raw["camera"] = {**object_of(raw, "camera"), "width": camera.width_px, "height": camera.height_px, **_focal(camera)}
     raw["augmentation"] = {

@@ -13,6 +13,7 @@ from cosfly.errors import InputError
 from cosfly.geometry import step_s
 from cosfly.products.columns import is_number, numbers
 from cosfly.products.frames import ANGLES, XYZ, Camera
+from cosfly.products.people import People
 from cosfly.products.segments import Mission, Segment, read_mission, read_segments
 from cosfly.products.weather import WeatherRecord
 from cosfly.reading.arrays import check_pixels
@@ -138,6 +139,12 @@ class FieldReader:
         if isinstance(told, dict) and ("params" in told or "mode" in told):
             with self.noted():
                 validated(WeatherRecord, told, f"{self.path}: weather")
+
+    def people(self, raw: dict) -> People | None:
+        """What people look like, None where nothing is said; somebody else's field of this name is noted and left."""
+        with self.noted():
+            return People.from_json(raw["people"], f"{self.path}: people") if "people" in raw else None
+        return None
 
     def camera(self, group: Any) -> Camera:
         if not isinstance(group, dict):

@@ -23,6 +23,7 @@ from cosfly.errors import RenderError
 from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import SKY_DEPTH_M
 from cosfly.products.kinds import GROUND_KINDS, KINDS
+from cosfly.products.people import COLORS, Appearance
 from cosfly.products.weather import WeatherParams
 
 DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"  # OpenGL without a window, on a GPU or the CPU
@@ -64,13 +65,16 @@ class Frame:
 
 @dataclass(frozen=True)
 class Clothes:
-    """Linear RGB of what one person wears, (3,) each."""
+    """What one person wears, and linear RGB, (3,) each, of what no appearance tells."""
 
-    shirt: np.ndarray
-    trousers: np.ndarray
+    looks: Appearance
     hair: np.ndarray
     skin: np.ndarray
     shoes: np.ndarray
+
+    def color(self, slot: str) -> np.ndarray:
+        """Linear RGB of what is worn there, (3,)."""
+        return np.array(COLORS[getattr(self.looks, f"{slot}_color")][1])
 
 
 @dataclass(frozen=True)

@@ -318,6 +318,7 @@ def _flight(script: FlightScript, targets: list[TargetMeta], visibility: np.ndar
         source=script.source,
         segments=script.segments,
         mission=script.mission,
+        people=script.others.people(script.clothes.looks),
         between=script.between,
         is_original=script.is_original,
         raw={

@@ -9,26 +9,21 @@ import numpy as np
 from cosfly.geometry import headings_of
 from cosfly.products.frames import OtherMeta, OthersMeta, tree_position, tree_yaw
 from cosfly.products.others import Other, distances_to_boxes_m
+from cosfly.products.people import Appearance, People, draw_appearance, look_alike
 from cosfly.render.contract import Clothes, Frame, PosedCar, PosedOther, PosedPerson, other_id
 
 STRIDE_M = 1.35  # two steps
 SLOW_MPS = 0.7  # below this speed the swing shrinks, down to standing
 
-SHIRTS = np.array([
-    [0.55, 0.04, 0.04], [0.03, 0.16, 0.45], [0.62, 0.58, 0.50], [0.60, 0.36, 0.02], [0.03, 0.28, 0.14],
-    [0.28, 0.05, 0.26], [0.68, 0.14, 0.02], [0.02, 0.25, 0.30],
-])  # fmt: skip
-TROUSERS = np.array(
-    [[0.03, 0.05, 0.11], [0.03, 0.03, 0.035], [0.20, 0.16, 0.11], [0.10, 0.11, 0.12], [0.07, 0.10, 0.19]]
-)
 HAIR = np.array([[0.02, 0.015, 0.01], [0.07, 0.035, 0.015], [0.22, 0.14, 0.05], [0.20, 0.19, 0.18]])
 SKIN = np.array([[0.58, 0.36, 0.26], [0.46, 0.27, 0.18], [0.30, 0.16, 0.10], [0.15, 0.08, 0.05]])
 SHOES = np.array([[0.03, 0.025, 0.02], [0.55, 0.55, 0.53], [0.14, 0.07, 0.03]])
 
 
-def choose_clothes(rng: np.random.Generator) -> Clothes:
-    """Draw the colours of a person."""
-    return Clothes(*(palette[rng.integers(len(palette))] for palette in (SHIRTS, TROUSERS, HAIR, SKIN, SHOES)))
+def choose_clothes(rng: np.random.Generator, looks: Appearance | None = None) -> Clothes:
+    """Draw what a person looks like, or what an appearance leaves open."""
+    looks = looks or draw_appearance(rng)
+    return Clothes(looks, *(palette[rng.integers(len(palette))] for palette in (HAIR, SKIN, SHOES)))
 
 
 @dataclass(frozen=True)
@@ -77,6 +72,11 @@ class Cast:
     def __len__(self) -> int:
         return len(self.others)
 
+    def people(self, target: Appearance) -> People:
+        """What everybody who walks looks like."""
+        walking = (number for number, other in enumerate(self.others) if other.kind == "Pedestrians")
+        return People(target, {other_id(number): self.clothes[number].looks for number in walking})
+
     def posed(self, i: int) -> list[PosedOther]:
         """All of them in frame i."""
         return [PosedOther(other_id(number), self._body(number, i)) for number in range(len(self))]
@@ -120,7 +120,12 @@ class Cast:
 NOBODY = Cast([], [], [], np.empty(0))
 
 
-def cast_of(others: list[Other], time_s: np.ndarray, rng: np.random.Generator) -> Cast:
-    """Dress the others of a flight at times (n,)."""
-    gaits = [gait_of(other.positions_m, time_s) for other in others]
-    return Cast(others, gaits, [choose_clothes(rng) for _ in others], rng.random(len(others)))
+def cast_of(others: list[Other], time_s: np.ndarray, target: Appearance, rng: np.random.Generator) -> Cast:
+    """Dress the others of a flight at times (n,): look-alikes as the target but for one thing, nobody just as it."""
+    gaits, clothes = [gait_of(other.positions_m, time_s) for other in others], []
+    for other in others:
+        looks = target
+        while not target.differences(looks):
+            looks = look_alike(target, rng) if other.is_look_alike else draw_appearance(rng)
+        clothes.append(choose_clothes(rng, looks))
+    return Cast(others, gaits, clothes, rng.random(len(others)))

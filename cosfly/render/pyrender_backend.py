@@ -227,7 +227,7 @@ def _figure(person: PosedPerson, origin: np.ndarray, instance_id: int) -> tuple[
 
     trunk = _rod((0.0, 0.0, 0.88), (0.0, 0.0, 1.50), 0.19).apply_scale((0.65, 1.0, 1.0))  # flatter than wide
     solids = [trunk, _rod((0.0, 0.0, 1.46), (0.02, 0.0, 1.60), 0.055)]
-    colors = [person.clothes.shirt, person.clothes.skin]
+    colors = [person.clothes.color("top"), person.clothes.skin]
     head = trimesh.creation.icosphere(subdivisions=2, radius=0.115)
     solids.append(head.apply_translation((0.02, 0.0, 1.68)))
     colors.append(person.clothes.hair)
@@ -235,7 +235,7 @@ def _figure(person: PosedPerson, origin: np.ndarray, instance_id: int) -> tuple[
         stride = person.swing * np.sin(phase)
         solids.append(_hanging(0.09 * side, HIP_Z_M, 0.88, LEG_SWING_RAD * stride, 0.075))
         solids.append(_hanging(0.22 * side, SHOULDER_Z_M, 0.58, -ARM_SWING_RAD * stride, 0.055))
-        colors += [person.clothes.trousers, person.clothes.shirt]
+        colors += [person.clothes.color("legs"), person.clothes.color("top")]
     turn = rotation_matrix(0.0, person.heading_rad, 0.0)
     feet = person.hip_m - [0.0, 0.0, TARGET_HEIGHT_M] - origin
     triangles = np.concatenate([solid.triangles for solid in solids]) @ turn.T + feet

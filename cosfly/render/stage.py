@@ -9,6 +9,7 @@ import importlib
 import logging
 import os
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from cosfly.errors import ConfigError, InputError
 from cosfly.look.overlay import Overlay
 from cosfly.products.boxes import BoxMap, check_ground, read_boxes
 from cosfly.products.frames import Look
-from cosfly.products.others import Company, read_others
+from cosfly.products.others import Company, Other, read_others
 from cosfly.products.places import place_of, town_folder
 from cosfly.products.shift_draws import PERTURBED, rng_of_shifts
 from cosfly.products.town import IDS_FILE, IDS_FORMAT, write_town_map
@@ -30,7 +31,7 @@ from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, 
 from cosfly.render.effects import Effects
 from cosfly.render.flight import FlightScript, Writing, check_flight, render_flight
 from cosfly.render.lens import cameras_of
-from cosfly.render.person import NOBODY, Cast, cast_of, choose_clothes, gait_of
+from cosfly.render.person import cast_of, choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbedTrack, Poses, Surroundings, perturb
 from cosfly.render.settings import RenderConfig
 from cosfly.render.weather import coverage_of, drawn_seed, read_pools, told_coverage, weather_of
@@ -81,26 +82,29 @@ def script_flight(
     surroundings: Surroundings,
     cfg: RenderConfig,
     seed: int,
-    others: Cast = NOBODY,
+    others: Sequence[Other] = (),
     weather: WeatherRecord | None = None,
 ) -> FlightScript:
-    """Decide everything about one flight. Both tracks of a trace share field of view, clothes and weather.
+    """Decide everything about one flight. Both tracks of a trace share field of view, people and weather.
 
     Args:
-        planned: the flight; every `frame_stride`-th of its poses is drawn. others: at the times of those.
+        planned: the flight; every `frame_stride`-th of its poses is drawn. others: at the same times.
     """
     assert cfg.first_timestamp is not None, "`run` settles it"
     trace = planned.every(cfg.frame_stride)
     shared = rng_for(seed, "render", trace.path_id)
     fov_deg = float(cfg.fovs_deg[int(shared.integers(len(cfg.fovs_deg)))])
     clothes = choose_clothes(shared)
+    drawn_others = [other.every(cfg.frame_stride) for other in others]
+    others_rng = rng_for(seed, "render", f"{trace.path_id}/others")
+    cast = cast_of(drawn_others, trace.time_s, clothes.looks, others_rng)
     lens_rng = rng_for(seed, "render", f"{trace.path_id}/zoom")
     size_px = cfg.width_px, cfg.height_px
     cameras = cameras_of(size_px, fov_deg, cfg.fovs_deg, cfg.zoom, trace.time_s, trace.segments, lens_rng)
     poses = Poses(trace.positions_m, trace.rotations_deg, trace.targets_m, trace.clearances_m)
     if track == "perturbed":
         rng = rng_of_shifts(seed, trace.path_id)
-        perturbed = perturb(poses, cameras, surroundings, cfg.perturbation, rng, others)
+        perturbed = perturb(poses, cameras, surroundings, cfg.perturbation, rng, cast)
     else:
         perturbed = PerturbedTrack.nothing(poses)
     return FlightScript(
@@ -112,7 +116,7 @@ def script_flight(
         perturbed=perturbed,
         gait=gait_of(trace.targets_m, trace.time_s),
         clothes=clothes,
-        others=others,
+        others=cast,
         look=cfg.look if weather is None else None,
         weather=weather,
         is_original=track == "clean",
@@ -350,14 +354,9 @@ def make_worker(
         trace = all_traces[number]
         check_flight(trace, surroundings)
         company = companies.get(trace.path_id)
-        rng = rng_for(seed, "render", f"{trace.path_id}/others")
-        cast = NOBODY
-        if company is not None:
-            drawn_others = [other.every(cfg.frame_stride) for other in company.others]
-            cast = cast_of(drawn_others, trace.time_s[:: cfg.frame_stride], rng)
-        script = script_flight(
-            trace, number, track, town, surroundings, cfg, seed, cast, weather_of(cfg, pools, number)
-        )
+        others = () if company is None else company.others
+        weather = weather_of(cfg, pools, number)
+        script = script_flight(trace, number, track, town, surroundings, cfg, seed, others, weather)
         folder = out / town / script.trajectory / script.variant
         with atomic_folder(folder) as unfinished:
             flight = render_flight(renderer, script, unfinished, writing, cfg.encoder_threads)

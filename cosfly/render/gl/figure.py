@@ -90,8 +90,8 @@ def _leg(figure: _Figure, side: float, phase: float, swing: float, clothes: Clot
     bend = swing * (0.12 + KNEE_BEND_RAD * max(0.0, np.cos(phase)) ** 1.5)  # the leg that swings forward is bent
     knee = hip + _swung(angle, HIP_M - KNEE_M)
     ankle = knee + _swung(angle - bend, KNEE_M - ANKLE_M)
-    figure.limb(knee, hip, 0.088, clothes.trousers)
-    figure.limb(ankle - [0, 0, 0.02], knee, 0.066, clothes.trousers)
+    figure.limb(knee, hip, 0.088, clothes.color("legs"))
+    figure.limb(ankle - [0, 0, 0.02], knee, 0.066, clothes.color("legs"))
     toe = 0.5 * (angle - bend)
     center = ankle + np.array([0.048 * np.cos(toe), 0.0, -0.043 + 0.048 * np.sin(toe)])
     figure.solid(meshes.ROUNDED, center.tolist(), [0.115, 0.048, 0.042], clothes.shoes, pitch_rad=-toe)
@@ -104,7 +104,7 @@ def _arm(figure: _Figure, side: float, phase: float, swing: float, clothes: Clot
     angle = -ARM_SWING_RAD * swing * np.sin(phase)
     elbow = shoulder + _swung(angle, 0.29) + [0.0, 0.025 * side, 0.0]
     wrist = elbow + _swung(angle + 0.18 + 0.3 * swing, 0.25)
-    figure.limb(elbow, shoulder, 0.058, clothes.shirt)
+    figure.limb(elbow, shoulder, 0.058, clothes.color("top"))
     figure.limb(wrist, elbow, 0.041, clothes.skin)
     figure.solid(meshes.SPHERE, (wrist + np.array([0.01, 0, -0.05])).tolist(), [0.04, 0.03, 0.065], clothes.skin)
     figure.bones.append((wrist, shoulder, 0.05))
@@ -112,9 +112,9 @@ def _arm(figure: _Figure, side: float, phase: float, swing: float, clothes: Clot
 
 def _trunk_and_head(figure: _Figure, swing: float, clothes: Clothes) -> None:
     lean = 0.03 * swing
-    figure.solid(meshes.ROUNDED, [0.0, 0.0, 0.95], [0.115, 0.165, 0.12], clothes.trousers)
-    figure.solid(meshes.LIMB, [0.01, 0.0, 1.22], [0.125, 0.195, 0.29], clothes.shirt, pitch_rad=lean)
-    figure.solid(meshes.SPHERE, [0.015, 0.0, 1.42], [0.10, 0.205, 0.085], clothes.shirt, pitch_rad=lean)
+    figure.solid(meshes.ROUNDED, [0.0, 0.0, 0.95], [0.115, 0.165, 0.12], clothes.color("legs"))
+    figure.solid(meshes.LIMB, [0.01, 0.0, 1.22], [0.125, 0.195, 0.29], clothes.color("top"), pitch_rad=lean)
+    figure.solid(meshes.SPHERE, [0.015, 0.0, 1.42], [0.10, 0.205, 0.085], clothes.color("top"), pitch_rad=lean)
     figure.limb(np.array([0.01, 0.0, 1.46]), np.array([0.025, 0.0, 1.60]), 0.055, clothes.skin)
     figure.solid(meshes.SPHERE, [0.035, 0.0, 1.665], [0.10, 0.078, 0.125], clothes.skin)
     figure.solid(meshes.SPHERE, [0.008, 0.0, 1.70], [0.105, 0.088, 0.10], clothes.hair)
