@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import random
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from test_cosfly_render import needs_gl
 from test_renderers_contract import HIP, circling, opened, pose_towards, street, write_inputs
 from typer.testing import CliRunner
 
+from cosfly.app.settings import RunConfig
 from cosfly.cli import app
 from cosfly.errors import ConfigError, InputError, RenderError
 from cosfly.geometry import intrinsic_matrix, rotation_matrices
@@ -24,7 +26,7 @@ from cosfly.products.frames import read_depth, read_instance, read_meta, read_rg
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import read_flight, write_flight
 from cosfly.products.walks import walk_id
-from cosfly.products.weather import TIMES, WEATHER_GROUPS, WEATHERS, WeatherParams, resolved
+from cosfly.products.weather import TIMES, WEATHER_GROUPS, WEATHERS, WeatherParams, resolved, sky_kind
 from cosfly.reading.documents import read_json
 from cosfly.render.contract import PosedPerson
 from cosfly.render.gl.lamps import APART_M, HIGH_M, lamps_along_streets
@@ -32,9 +34,10 @@ from cosfly.render.gl.weather_pass import fog_extinction, light_direction, light
 from cosfly.render.person import choose_clothes
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
+from cosfly.render.weather import coverage_of as weather_coverage
 from cosfly.render.weather import path_seed, read_pools, weather_of
 from cosfly.studies.weather import run as draw_gallery
-from cosfly.work.config import build
+from cosfly.work.config import build, load, shipped
 
 SIZE = (320, 180)
 RANDOM = {"weather_mode": "random_per_path"}
@@ -73,6 +76,46 @@ def test_a_draw_is_that_of_the_formula_and_uniform():
     assert 130 < min(counts.values()) <= max(counts.values()) < 280, "200 each, give or take five deviations"
     assert len({(one.weather_name, one.tod_name) for one in drawn}) == 60
     assert weather_of(config(**RANDOM, weather_seed=1), pools, 5) != drawn[5]
+
+
+def test_drawn_by_weight_skies_have_their_shares_in_each_town_and_in_all():
+    """Of ten flights a town of `diverse`, on ten seeds; a flight's sky is the same however many follow it."""
+    cfg = load(RunConfig, shipped("diverse.yaml"))
+    towns = [cfg.of_town(name).render for name in cfg.towns]
+    assert {town.weather_mode for town in towns} == {"by_weight"}
+    assert len({town.weather_seed for town in towns}) == 8
+    assert towns[0].sky_shares["day_dry"] == 0.7 * sum(towns[0].sky_shares.values())
+    for seed in range(10):
+        total = Counter()
+        for town in towns:
+            chosen = town.model_copy(update={"weather_seed": town.weather_seed + 1000 * seed})
+            skies = [weather_of(chosen, read_pools(chosen), k) for k in range(10)]
+            kinds = Counter(sky_kind(sky.params) for sky in skies)
+            assert 5 <= kinds["day_dry"] <= 9, "seven of ten, give or take two"
+            total += kinds
+        assert 0.65 <= total["day_dry"] / 80 <= 0.75
+        assert set(total) >= {kind for kind, share in towns[0].sky_shares.items() if share > 5}, "each occurs"
+
+
+def test_skies_by_weight_take_presets_of_ones_own_by_their_knobs(tmp_path):
+    (tmp_path / "sky.yaml").write_text(POOL)
+    own = {"weather_mode": "by_weight", "weather_pool": str(tmp_path / "sky.yaml")}
+    with pytest.raises(ConfigError, match=r"no presets of a kind of sky.*day_dry, day_fog, dusk_dry, night_dry"):
+        read_pools(config(**own))
+    cfg = config(**own, sky_shares={"night_rain": 1, "day_rain": 3})
+    skies = [weather_of(cfg, read_pools(cfg), k) for k in range(40)]
+    assert {sky.weather_name for sky in skies} == {"sleet"}
+    assert {sky.mode for sky in skies} == {"by_weight"}
+    assert sum(sky.tod_name == "night" for sky in skies) == pytest.approx(10, abs=2)
+    told = weather_coverage(cfg, [(sky.weather_name, sky.tod_name) for sky in skies])
+    assert told["kinds"]["day_rain"] == sum(sky.tod_name != "night" for sky in skies) - told["kinds"]["dusk_rain"]
+    assert told["expected"] == {"kinds": {"night_rain": 10, "day_rain": 30}}
+    assert "sky_shares" in cfg.recorded()
+    assert "sky_shares" not in config(**RANDOM).recorded()
+    for wrong, words in (({"sky_shares": {"day_dry": 0}}, "more than 0"), ({"sky_shares": {"day_dry": -1}}, "greater"),
+                         ({"sky_shares": {"day_snow": 1}}, "day_snow"), ({**RANDOM, "sky_shares": {"day_dry": 1}}, "by_weight, and the mode is")):  # fmt: skip
+        with pytest.raises(ConfigError, match=words):
+            config(**({"weather_mode": "by_weight"} | wrong))
 
 
 def test_off_is_the_default_and_leaves_no_trace():

@@ -6,7 +6,7 @@ from typing import Any
 
 from cosfly.look.page import fragment
 from cosfly.products.coverage import AXES, NAMED, PAIR, Axis, Coverage, default_coverage
-from cosfly.products.weather import TIMES, WEATHERS
+from cosfly.products.weather import TIMES, WEATHERS, resolved, sky_kind
 
 WIDTH_PX, HEIGHT_PX = 300.0, 110.0
 TEMPLATE = "cosfly/look/templates/coverage.html"
@@ -36,9 +36,11 @@ def _skies(frames: dict[str, int]) -> dict[str, Any] | None:
     weathers = [*WEATHERS, *sorted({weather for weather, _ in counts} - set(WEATHERS))]
     times = [*TIMES, *sorted({time for _, time in counts} - set(TIMES))]
     rows = [(weather, [counts.get((weather, time)) for time in times]) for weather in weathers]
+    shipped = [pair for pair in counts if pair[0] in WEATHERS and pair[1] in TIMES]
+    day_dry = [counts[a, b] for a, b in shipped if sky_kind(resolved(WEATHERS[a], TIMES[b])) == "day_dry"]
     note = (
-        f"{len(counts)} of {len(weathers) * len(times)} pairs; drawn uniformly, each preset is expected in "
-        f"{1 / len(weathers):.1%} of the flights"
+        f"{len(counts)} of {len(weathers) * len(times)} pairs; {sum(day_dry) / sum(counts.values()):.0%} of the frames "
+        f"by day and dry; drawn uniformly, each preset is expected in {1 / len(weathers):.1%} of the flights"
     )
     return {"times": times, "rows": rows, "note": note}
 

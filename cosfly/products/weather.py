@@ -11,7 +11,12 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.work.config import Config
 
-WeatherMode = Literal["fixed", "random_per_path"]
+WeatherMode = Literal["fixed", "random_per_path", "by_weight"]
+SkyKind = Literal[
+    "day_dry", "day_rain", "day_fog", "dusk_dry", "dusk_rain", "dusk_fog", "night_dry", "night_rain", "night_fog"
+]  # fmt: skip
+SUN_IS_DOWN_DEG = -3.0  # of its altitude; a sun on the horizon still lights walls
+DAY_FROM_DEG = 10.0  # of the sun's altitude; below it is dusk, or dawn
 Percent = Annotated[float, Field(strict=True, ge=0, le=100)]
 Metres = Annotated[float, Field(strict=True, gt=0)]
 Altitude = Annotated[float, Field(strict=True, ge=-90, le=90)]
@@ -90,3 +95,11 @@ def preset_token(text: str) -> str:
 def resolved(weather: WeatherPreset, time: TimePreset) -> WeatherParams:
     """Put the knobs of the air and of the sun together."""
     return WeatherParams(**weather.model_dump(), **time.model_dump())
+
+
+def sky_kind(knobs: WeatherParams) -> SkyKind:
+    """Give the kind of a sky by its knobs, so that presets of one's own have one like those that ship."""
+    sun_deg = knobs.sun_altitude_angle
+    light = "night" if sun_deg <= SUN_IS_DOWN_DEG else "dusk" if sun_deg < DAY_FROM_DEG else "day"
+    kind: SkyKind = f"{light}_{'rain' if knobs.precipitation else 'fog' if knobs.fog_density else 'dry'}"  # type: ignore[assignment]
+    return kind

@@ -225,7 +225,7 @@ def _weather_drawn(cfg: RenderConfig, made: list[_RenderedFlight]) -> dict:
         return {}
     # Both tracks of a trajectory have the same.
     drawn = {str(Path(one.folder).parent): (str(one.weather), str(one.time_of_day)) for one in made}
-    told = coverage_of(read_pools(cfg), drawn.values())
+    told = coverage_of(cfg, drawn.values())
     log.info("render: %s", told_coverage(told))
     return {"weather": told}
 

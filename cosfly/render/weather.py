@@ -5,33 +5,52 @@ from __future__ import annotations
 import random
 import secrets
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import islice, product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from cosfly.errors import ConfigError, nearest
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import KINDS
-from cosfly.products.weather import TIMES, WEATHERS, TimePreset, WeatherPreset, WeatherRecord, preset_token, resolved
+from cosfly.products.weather import (
+    DAY_FROM_DEG,
+    SUN_IS_DOWN_DEG,
+    TIMES,
+    WEATHERS,
+    SkyKind,
+    TimePreset,
+    WeatherPreset,
+    WeatherRecord,
+    preset_token,
+    resolved,
+    sky_kind,
+)  # fmt: skip
+from cosfly.work.chance import draw_to_quota, rng_for
 from cosfly.work.config import Config, MayDiffer, build, read_yaml
 
-SUN_IS_DOWN_DEG = -3.0  # of its altitude; a sun on the horizon still lights walls
 LIT_KINDS = tuple(KINDS[name] for name in ("Poles", "Roads", "Sidewalks"))  # lamps hang there, or stand along them
 DEFAULT_SEED = 20260423  # of the paper's production runs (app:weather:coverage)
 MOST_SEED = 2**31  # of a seed that is drawn
 
 
 class WeatherConfig(Config):
-    """The six settings of weather. Off by default, as in the paper: pictures are of `look`, without a record."""
+    """The settings of weather. Off by default, as in the paper: pictures are of `look`, without a record."""
 
-    weather_mode: Literal["off", "fixed", "random_per_path"] = Field(
+    weather_mode: Literal["off", "fixed", "random_per_path", "by_weight"] = Field(
         "off",
         description="off: sun and air as `look` says; fixed: weather_name and tod_name for every flight; "
-        "random_per_path: each "
-        "trajectory draws both by weather_seed and its index, its two tracks alike",
+        "random_per_path: each trajectory draws both by weather_seed and its index, its two tracks alike, every preset "
+        "as likely; by_weight: the trajectories of a town together have the shares of sky_shares",
+    )
+    sky_shares: dict[SkyKind, Annotated[float, Field(ge=0)]] = Field(
+        {"day_dry": 70, "day_rain": 9, "day_fog": 6, "dusk_dry": 7, "dusk_rain": 2, "night_dry": 6},
+        description="shares of mode by_weight; they need not add up to one. dusk: the sun is lower than "
+        f"{DAY_FROM_DEG:g} degrees, night: {SUN_IS_DOWN_DEG:g} or lower; rain: some precipitation, fog: fog density "
+        "without it, dry: neither. Presets of one kind are equally likely",
     )
     weather_name: str | None = Field(None, description="preset of the weather in mode fixed", examples=[*WEATHERS])
     tod_name: str | None = Field(None, description="preset of the time of day in mode fixed", examples=[*TIMES])
@@ -43,8 +62,8 @@ class WeatherConfig(Config):
     )
     weather_seed: int = Field(
         DEFAULT_SEED,
-        description="seed of random_per_path; a negative one draws a seed, another for every run, which the records "
-        "tell",
+        description="seed of random_per_path and by_weight; a negative one draws a seed, another for every run, which "
+        "the records tell",
     )
 
     @field_validator("weather_mode", mode="before")
@@ -68,14 +87,18 @@ class WeatherConfig(Config):
                 problems += _unknown(name, presets, field)
             if pool is not None and self.weather_mode == "off":
                 problems.append(f"{pool_field} is given, and weather_mode is off")
+        if not sum(self.sky_shares.values()) > 0:
+            problems.append("sky_shares must add up to more than 0")
+        if self.weather_mode != "by_weight" and self.sky_shares != type(self).model_fields["sky_shares"].default:
+            problems.append(f"sky_shares is for weather_mode by_weight, and the mode is {self.weather_mode}")
         if problems:
             raise ValueError("; ".join(problems))
         return self
 
     def recorded(self) -> dict[str, Any]:
         """Give the settings that decide what is made. Without weather none of them does."""
-        settings, own = super().recorded(), WeatherConfig.model_fields
-        return {name: value for name, value in settings.items() if name not in own or self.weather_mode != "off"}
+        unused = {"off": {*WeatherConfig.model_fields}, "by_weight": set[str]()}.get(self.weather_mode, {"sky_shares"})
+        return {name: value for name, value in super().recorded().items() if name not in unused}
 
     def pool_files(self) -> dict[str, Path]:
         """The files of presets, which are inputs of the stage."""
@@ -103,6 +126,13 @@ class Pools:
 
     weathers: Mapping[str, WeatherPreset]
     times: Mapping[str, TimePreset]
+
+    def of_kind(self) -> dict[str, list[tuple[str, str]]]:
+        """Give the pairs of weather and time of each kind of sky."""
+        found: dict[str, list[tuple[str, str]]] = {}
+        for pair in product(self.weathers, self.times):
+            found.setdefault(sky_kind(resolved(self.weathers[pair[0]], self.times[pair[1]])), []).append(pair)
+        return found
 
 
 def read_pools(cfg: WeatherConfig) -> Pools:
@@ -136,7 +166,12 @@ def read_pools(cfg: WeatherConfig) -> Pools:
         raise ConfigError("; ".join(map(str, errors)), where="weather presets")
     if errors:
         raise errors[0]
-    return Pools(*pools)
+    found = Pools(*pools)
+    lacking = [kind for kind, share in cfg.sky_shares.items() if share and kind not in found.of_kind()]
+    if cfg.weather_mode == "by_weight" and lacking:
+        got, fix = f"a share of {', '.join(lacking)}", "leave it out, or add presets to the pools"
+        raise ConfigError("no presets of a kind of sky", where="render.sky_shares", got=got, fix=fix)
+    return found
 
 
 def _unknown(name: str, presets: Mapping[str, Any], field: str) -> list[str]:
@@ -162,6 +197,8 @@ def weather_of(cfg: WeatherConfig, pools: Pools, path_index: int) -> WeatherReco
         return None
     if cfg.weather_mode == "fixed":
         names = preset_token(str(cfg.weather_name)), preset_token(str(cfg.tod_name))
+    elif cfg.weather_mode == "by_weight":
+        names = next(islice(_to_quota(cfg, pools), path_index, None))
     else:
         assert cfg.weather_seed >= 0, "`run` settles it"
         # Of Python's generators only `random()` has a sequence that is promised to stay for a seed.
@@ -185,6 +222,17 @@ def dark_flights(cfg: WeatherConfig, num_flights: int, read_map: Callable[[], Bo
     return by_night if by_night and not read_map().is_any_of(set(LIT_KINDS)).any() else []
 
 
+def _to_quota(cfg: WeatherConfig, pools: Pools) -> Iterator[tuple[str, str]]:
+    """Yield weather and time of trajectory 0, 1, ...; those of a trajectory do not depend on the ones after it."""
+    # Pairs of one kind stand next to each other, so kinds have their quota as pairs do. Tokens have no blanks.
+    of_kind = pools.of_kind()
+    shares = {kind: share / len(of_kind[kind]) for kind, share in cfg.sky_shares.items() if share}
+    weights = {f"{kind} {weather} {time}": shares[kind] for kind in shares for weather, time in of_kind[kind]}
+    for name in draw_to_quota(weights, rng_for(cfg.weather_seed, "render", "skies")):
+        _, weather, time = name.split(" ")
+        yield weather, time
+
+
 def _drawn(presets: Mapping[str, Any], rng: random.Random) -> str:
     return list(presets)[int(rng.random() * len(presets))]
 
@@ -192,20 +240,26 @@ def _drawn(presets: Mapping[str, Any], rng: random.Random) -> str:
 # --- coverage ---------------------------------------------------------------------------------------------------------
 
 
-def coverage_of(pools: Pools, drawn: Iterable[tuple[str, str]]) -> dict[str, Any]:
-    """Count trajectories by weather, time of day and both, beside uniform draws (app:weather:coverage)."""
-    pairs = Counter(drawn)
+def coverage_of(cfg: WeatherConfig, drawn: Iterable[tuple[str, str]]) -> dict[str, Any]:
+    """Count trajectories by weather, time of day and both, beside uniform draws (app:weather:coverage); beside the
+    shares of mode by_weight, by kind of sky."""
+    pools, pairs = read_pools(cfg), Counter(drawn)
     num = pairs.total()
     by = {name: dict.fromkeys(presets, 0) for name, presets in vars(pools).items()}
     for (weather, time), count in pairs.items():
         by["weathers"][weather] += count
         by["times"][time] += count
-    return {
+    told = {
         "trajectories": num,
         **by,
         "pairs": [[weather, time, count] for (weather, time), count in sorted(pairs.items())],
-        "expected": {name: round(num / len(presets), 2) for name, presets in vars(pools).items()},
     }
+    if cfg.weather_mode != "by_weight":
+        return told | {"expected": {name: round(num / len(presets), 2) for name, presets in vars(pools).items()}}
+    kinds = {kind: sum(pairs[pair] for pair in found) for kind, found in pools.of_kind().items()}
+    shares = cfg.sky_shares.items()
+    expected = {kind: round(num * share / sum(cfg.sky_shares.values()), 2) for kind, share in shares}
+    return told | {"kinds": kinds, "expected": {"kinds": expected}}
 
 
 def told_coverage(told: Mapping[str, Any]) -> str:
@@ -216,4 +270,5 @@ def told_coverage(told: Mapping[str, Any]) -> str:
         f"{told['trajectories']} trajectories in {seen['weathers']} of {of['weathers']} weathers, "
         f"{seen['times']} of {of['times']} times of "
         f"day, {len(told['pairs'])} of {of['weathers'] * of['times']} pairs"
+        + "".join(f", {count} {kind}" for kind, count in told.get("kinds", {}).items() if count)
     )

@@ -13,12 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from cosfly.products.weather import WeatherParams
+from cosfly.products.weather import SUN_IS_DOWN_DEG, WeatherParams
 from cosfly.render.contract import MAX_BOX_ID, PosedPerson
 from cosfly.render.gl import lamps as street_lamps
 from cosfly.render.gl.parts import Parts
 from cosfly.render.gl.programs import set_uniform
-from cosfly.render.weather import SUN_IS_DOWN_DEG
 
 # --- atmosphere -------------------------------------------------------------------------------------------------------
 # The six knobs of weather as the uniforms of weather.glsl: colours of sun, sky, clouds and fog, and how much of each.
