@@ -43,6 +43,7 @@ FILM_WIDTH_MM = 36.0  # of a 35 mm film's picture
 LEAST_FOV_DEG, MOST_FOV_DEG = 0.1, 179.0
 LEVEL_NAMES: dict[float, str] = {110: "wide-angle", 90: "standard", 60: "narrow", 30: "telephoto"}  # tab:zoom_config
 SKY_DEPTH_M, INVALID_DEPTH_M = 1000.0, 0.0
+PERSON_ID = 65535  # of the target in `instance.png`
 META_FORMAT = FileFormat("cosfly.frame", "1.0", "frame annotation")
 # A person is legible who is visible, so high in the picture, of so much of the box unhidden, and of so much colour
 # difference (CIE76, where 2.3 is just noticeable) from what is around.

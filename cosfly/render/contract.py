@@ -21,6 +21,7 @@ import numpy as np
 
 from cosfly.errors import RenderError
 from cosfly.products.boxes import BoxMap
+from cosfly.products.frames import PERSON_ID as PERSON_ID
 from cosfly.products.frames import SKY_DEPTH_M
 from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.products.people import COLORS, Appearance
@@ -30,8 +31,8 @@ DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"  # OpenGL without a window, o
 
 NEAR_M, FAR_M = 0.3, SKY_DEPTH_M  # clip planes (sec:step5)
 
-# Instance ids of the 16 bits that instance.png has: 0 is nobody (sky, ground plane).
-PERSON_ID, SHARED_ID, MAX_BOX_ID = 65535, 65534, 65533
+# Instance ids of the 16 bits that instance.png has, beside PERSON_ID: 0 is nobody (sky, ground plane).
+SHARED_ID, MAX_BOX_ID = 65534, 65533
 NO_INSTANCE = 0
 
 GROUND_PLANE_HALF_M = 1500.0

@@ -1,0 +1,159 @@
+"""A goal in words: the shortest description that, of all people in a picture, only the target satisfies.
+
+What it says is measured: garments as on record, places from ids, kinds and depth of the picture. So whoever has these
+can tell of whom a goal is true (`meant`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from cosfly.errors import InputError
+from cosfly.products.captions import Language
+from cosfly.products.frames import PERSON_ID
+from cosfly.products.kinds import KINDS
+from cosfly.products.people import COLORS, FIGURES, GARMENTS, Appearance, Words
+
+# What is large is said first. Slot -> how Chinese says that it is worn; what both languages say of nothing there.
+SLOTS = {"top": ("穿",), "legs": ("穿",), "bag": ("背", "no bag", "不带包"), "hat": ("戴", "no hat", "不戴帽子")}
+SIDES = {"left": ("leftmost", "最左边的"), "right": ("rightmost", "最右边的")}
+# What people stand by, and how high over somebody's middle what is seen of it must be: of plants trees alone.
+LANDMARKS = {
+    "Vegetation": ("tree", "树", 1.0), "Poles": ("post", "杆子", -np.inf), "Car": ("car", "汽车", -np.inf),
+    "TrafficLight": ("traffic light", "红绿灯", -np.inf), "Fences": ("fence", "栅栏", -np.inf),
+    "Buildings": ("building", "建筑", -np.inf),
+}  # fmt: skip
+ORDER = ("figure", *SLOTS, *SIDES, *LANDMARKS)
+_WITH = (("in", ("top", "legs")), ("with", ("bag", "hat")))
+BY_M = 4.0  # who is as near as this is by something
+MARGIN_M, MARGIN_SHARE = 2.0, 0.05  # by which it or the side is another's less, m and of the picture's width
+
+
+@dataclass(frozen=True)
+class Goal:
+    """Whom to follow, in words that are true of the target alone in one frame. says: of ORDER, what they say."""
+
+    frame: int
+    en: str
+    zh: str
+    says: tuple[str, ...]
+
+    @classmethod
+    def from_json(cls, record: object, num_frames: int, where: str) -> Goal:
+        """Read the goal of a flight; raises InputError where it is none."""
+        match record:
+            case {"frame": int(frame), "en": str(en), "zh": str(zh), "says": list(says)} if 0 <= frame < num_frames:
+                if says == [one for one in ORDER if one in says] and {*says} & {*SLOTS}:
+                    return cls(frame, en, zh, tuple(says))
+        expected = f"frame, en, zh, and says, of {', '.join(ORDER)}"
+        raise InputError("no goal", where=where, got=repr(record)[:80], expected=expected)
+
+
+@dataclass(frozen=True)
+class SeenFrame:
+    """A frame in numbers. kinds, ids, depth: (h, w), m; intrinsic: (3, 3) px; rotation: (3, 3), world from camera."""
+
+    kinds: np.ndarray
+    ids: np.ndarray
+    depth: np.ndarray
+    intrinsic: np.ndarray
+    rotation: np.ndarray
+
+    def column_px(self, number: int) -> float:
+        """Mean column of somebody's pixels."""
+        return float(np.nonzero(self.ids == number)[1].mean())
+
+    def distance_m(self, number: int, kind: str) -> float:
+        """From somebody to what is seen of a kind, over the ground; infinity where nothing is."""
+        x, y, z = np.median(self._points_m(self.ids == number), axis=0)
+        points = self._points_m(self.kinds == KINDS[kind])
+        points = points[points[:, 2] >= z + LANDMARKS[kind][2]]
+        return float(np.hypot(points[:, 0] - x, points[:, 1] - y).min(initial=np.inf))
+
+    def _points_m(self, mask: np.ndarray) -> np.ndarray:
+        """Points of pixels, (n, 3), from the camera in the world's directions."""
+        rows, columns = np.nonzero(mask)
+        rays = np.column_stack([columns + 0.5, rows + 0.5, np.ones(len(rows))]) @ np.linalg.inv(self.intrinsic).T
+        return (rays * self.depth[mask][:, None]) @ self.rotation.T
+
+
+def meant(says: Iterable[str], looks: Appearance, people: Mapping[int, Appearance], picture: SeenFrame) -> set[int]:
+    """Tell of whom in a picture a description is true. looks: what it says of slots. people: by instance id."""
+    slots = {*says} - {*SIDES, *LANDMARKS}
+    found = {n for n, one in people.items() if not slots & {*looks.differences(one)} and (picture.ids == n).any()}
+    for relation in {*says} - slots:
+        found = {n for n, off in _off(relation, found, picture).items() if off <= 0.0}
+    return found
+
+
+def _off(relation: str, numbers: Collection[int], picture: SeenFrame) -> dict[int, float]:
+    """Tell how far people are from a relation, not above 0 where it holds: m, or shares of the picture's width."""
+    if relation in LANDMARKS:
+        return {n: picture.distance_m(n, relation) - BY_M for n in numbers}
+    width_px = picture.ids.shape[1] * (-1 if relation == "right" else 1)
+    shares = {n: picture.column_px(n) / width_px for n in numbers}
+    return {n: share - min(shares.values()) for n, share in shares.items()}
+
+
+def find_says(
+    people: Mapping[int, Appearance], picture: SeenFrame, tells: Callable[[str, Appearance], bool]
+) -> tuple[str, ...] | None:
+    """Find the least that tells the target (PERSON_ID) from all others in a picture; None where nothing does.
+
+    Args:
+        tells: whether the picture shows that the target does not look so in that slot.
+    """
+    looks, best = people[PERSON_ID], None
+    rivals = {n: one for n, one in people.items() if n != PERSON_ID and (picture.ids == n).any()}
+    noun = ("figure",) if tells("figure", otherwise(looks, "figure")) else ()
+    for chosen in (c for size in range(1, len(SLOTS) + 1) for c in combinations(SLOTS, size)):
+        says = (*noun, *chosen)
+        differing = {n: {*says} & {*looks.differences(one)} for n, one in rivals.items()}
+        if best is not None and sum(not slots for slots in differing.values()) >= len(best[0]):
+            continue  # before anything is drawn
+        if all(tells(slot, otherwise(looks, slot)) for slot in chosen):
+            left = {n for n, slots in differing.items() if not any(tells(slot, rivals[n]) for slot in slots)}
+            best = (left, says) if best is None or len(left) < len(best[0]) else best
+    if best is None or not best[0]:
+        return best and best[1]
+    for relation in (*SIDES, *LANDMARKS):
+        off = _off(relation, {PERSON_ID, *best[0]}, picture)
+        own, margin = off.pop(PERSON_ID), MARGIN_SHARE if relation in SIDES else MARGIN_M
+        if own <= 0.0 and min(off.values()) >= max(own + margin, 1e-9):
+            return (*best[1], relation)
+    return None
+
+
+def otherwise(looks: Appearance, slot: str) -> Appearance:
+    """Give the same person without what is in a slot, or in another colour."""
+    if slot == "figure":
+        return replace(looks, figure=next(one for one in FIGURES if one != looks.figure))
+    worn, colors = getattr(looks, slot), list(COLORS)
+    if "" in GARMENTS[slot]:
+        bare = {slot: "", f"{slot}_color": ""}
+        return replace(looks, **bare if worn else {slot: list(GARMENTS[slot])[1], f"{slot}_color": colors[0]})
+    return replace(looks, **{f"{slot}_color": colors[colors.index(getattr(looks, f"{slot}_color")) - len(colors) // 2]})
+
+
+def words_of(says: Sequence[str], looks: Appearance) -> Words:
+    """Say it in both languages."""
+    noun = FIGURES[looks.figure] if "figure" in says else {"en": "person", "zh": "行人"}
+    side = next((SIDES[one] for one in says if one in SIDES), ("", ""))
+    mark = next((LANDMARKS[one] for one in says if one in LANDMARKS), ("", "", 0.0))
+
+    def worn(slot: str, language: Language) -> str:
+        verb, *bare = SLOTS[slot]
+        if not (color := getattr(looks, f"{slot}_color")):
+            return bare[language == "zh"]
+        words = COLORS[color][0][language], GARMENTS[slot][getattr(looks, slot)][language]
+        return f"the {words[0]} {words[1]}" if language == "en" else verb + "".join(words)
+
+    lists = [(word, [worn(slot, "en") for slot in slots if slot in says]) for word, slots in _WITH]
+    texts = [f"{word} {' and '.join(found)}" for word, found in lists if found]
+    en = " ".join(filter(None, ("the", side[0], noun["en"], *texts))) + (f", by a {mark[0]}" if mark[0] else "")
+    texts = [f"在{mark[1]}旁边"] * bool(mark[0]) + [worn(slot, "zh") for slot in SLOTS if slot in says]
+    return {"en": en, "zh": f"{side[1]}{'、'.join(texts)}的{noun['zh']}"}
