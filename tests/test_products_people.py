@@ -18,7 +18,10 @@ def test_a_look_alike_differs_in_one_thing():
     rng = np.random.default_rng(2)
     for _ in range(200):
         person = draw_appearance(rng)
-        assert len(person.differences(look_alike(person, rng))) == 1
+        other = look_alike(person, rng)
+        assert len(person.differences(other)) == 1
+        assert person.is_all_seen
+        assert other.is_all_seen
 
 
 @pytest.mark.parametrize(("field", "value"), [("top", "toga"), ("hat_color", "red"), ("figure", 3), ("bag", None)])

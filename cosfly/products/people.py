@@ -71,6 +71,11 @@ class Appearance:
     bag: str = ""
     bag_color: str = ""
 
+    @property
+    def is_all_seen(self) -> bool:
+        """Whether each thing worn can be seen: a long coat leaves nothing of shorts or a skirt."""
+        return self.top != "coat" or self.legs == "trousers"
+
     def as_json(self) -> dict[str, str]:
         return asdict(self)
 
@@ -128,11 +133,13 @@ def _rows(name: str, record: dict) -> tuple[str, ...]:
 
 
 def draw_appearance(rng: np.random.Generator) -> Appearance:
-    """Draw a person, every garment and colour equally likely, bare heads and hands by EMPTY_SHARE."""
-    drawn = {"figure": _one(rng, tuple(FIGURES))}
-    for slot in GARMENTS:
-        drawn |= _worn(rng, slot)
-    return Appearance(**drawn)
+    """Draw a person, every garment and colour equally likely where all is seen, bare heads and hands by EMPTY_SHARE."""
+    while True:
+        drawn = {"figure": _one(rng, tuple(FIGURES))}
+        for slot in GARMENTS:
+            drawn |= _worn(rng, slot)
+        if (person := Appearance(**drawn)).is_all_seen:
+            return person
 
 
 def look_alike(person: Appearance, rng: np.random.Generator) -> Appearance:
@@ -140,7 +147,7 @@ def look_alike(person: Appearance, rng: np.random.Generator) -> Appearance:
     slot = _one(rng, tuple(GARMENTS))
     while True:
         other = replace(person, **_worn(rng, slot))
-        if person.differences(other):
+        if person.differences(other) and other.is_all_seen:
             return other
 
 

@@ -1,4 +1,4 @@
-"""The second renderer, a cross-check of the default one: plain boxes, trees and a plain figure through trimesh and
+"""The second renderer, a cross-check of the default one: plain boxes, trees and figures through trimesh and
 pyrender (EGL).
 
 Slower by an order of magnitude and without shadows; what matters is that depth, kinds and ids are right. Each frame is
@@ -22,11 +22,11 @@ from cosfly.geometry import rotation_matrices, rotation_matrix
 from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import SKY_DEPTH_M, Look
 from cosfly.products.kinds import KINDS
-from cosfly.products.walks import TARGET_HEIGHT_M
 from cosfly.products.weather import WeatherParams
 from cosfly.render import contract
 from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, PosedCar, PosedOther, PosedPerson
 from cosfly.render.draping import drape, is_draped, layers_of
+from cosfly.render.figure import figure_of
 from cosfly.render.solids import are_solids, solids_of
 
 SKY_COLOR = np.array([0.52, 0.64, 0.78])  # also the haze's, linear RGB like all colours here
@@ -40,7 +40,7 @@ COLORS = {
 }  # fmt: skip
 CAR_PAINTS = ((0.30, 0.05, 0.05), (0.05, 0.10, 0.26), (0.50, 0.50, 0.50), (0.04, 0.04, 0.045))
 
-HIP_Z_M, SHOULDER_Z_M, LEG_SWING_RAD, ARM_SWING_RAD = 0.90, 1.42, 0.25, 0.38  # heights over the feet
+LIMB_SHARE = (0.85, 0.85, 0.95)  # of its half sizes, that a limb fills where it does not taper
 
 
 def _open_screen(width_px: int, height_px: int) -> Any:
@@ -222,25 +222,18 @@ def _all_boxes(box_map: BoxMap, origin: np.ndarray, num_others: int) -> tuple[np
 
 
 def _figure(person: PosedPerson, origin: np.ndarray, instance_id: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles, colours and tags of a person of cylinders with a round head; x is forward and the feet are at 0."""
+    """Triangles, colours and tags of a person, of balls, boxes and cylinders."""
     import trimesh
 
-    trunk = _rod((0.0, 0.0, 0.88), (0.0, 0.0, 1.50), 0.19).apply_scale((0.65, 1.0, 1.0))  # flatter than wide
-    solids = [trunk, _rod((0.0, 0.0, 1.46), (0.02, 0.0, 1.60), 0.055)]
-    colors = [person.clothes.color("top"), person.clothes.skin]
-    head = trimesh.creation.icosphere(subdivisions=2, radius=0.115)
-    solids.append(head.apply_translation((0.02, 0.0, 1.68)))
-    colors.append(person.clothes.hair)
-    for side, phase in ((1.0, person.phase_rad), (-1.0, person.phase_rad + np.pi)):
-        stride = person.swing * np.sin(phase)
-        solids.append(_hanging(0.09 * side, HIP_Z_M, 0.88, LEG_SWING_RAD * stride, 0.075))
-        solids.append(_hanging(0.22 * side, SHOULDER_Z_M, 0.58, -ARM_SWING_RAD * stride, 0.055))
-        colors += [person.clothes.color("legs"), person.clothes.color("top")]
-    turn = rotation_matrix(0.0, person.heading_rad, 0.0)
-    feet = person.hip_m - [0.0, 0.0, TARGET_HEIGHT_M] - origin
-    triangles = np.concatenate([solid.triangles for solid in solids]) @ turn.T + feet
-    painted = np.concatenate([np.tile(color, (len(s.faces), 1)) for s, color in zip(solids, colors, strict=True)])
-    return triangles, painted, _standing_tags("Pedestrians", instance_id, len(triangles))
+    ball, box = trimesh.creation.icosphere(subdivisions=2), trimesh.creation.box(extents=(2.0, 2.0, 2.0))
+    rod = trimesh.creation.cylinder(1.0, 2.0, sections=12)
+    units = {"ball": ball.triangles, "rounded": box.triangles, "disc": rod.triangles}
+    units["limb"] = rod.triangles * LIMB_SHARE
+    figure, triangles = figure_of(person), []
+    for shape, center, turn, half in zip(figure.shapes, figure.centers_m, figure.turns, figure.half_m, strict=True):
+        triangles.append((units[shape] * half) @ turn.T + center - origin)
+    painted = np.repeat(figure.colors, [len(solid) for solid in triangles], axis=0)
+    return np.concatenate(triangles), painted, _standing_tags("Pedestrians", instance_id, len(painted))
 
 
 def _car(car: PosedCar, origin: np.ndarray, instance_id: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -263,15 +256,3 @@ def _standing_tags(kind: str, instance_id: int, count: int) -> np.ndarray:
     """Tags of what stands or moves on the ground, (count, 4)."""
     tag = _tags(np.array([KINDS[kind]]), np.array([instance_id]), np.array([contract.STANDING_LAYER]))
     return np.repeat(tag, count, axis=0)
-
-
-def _hanging(y: float, z: float, length: float, angle_rad: float, radius: float) -> Any:
-    """A limb that hangs from a joint at the person's middle, turned forward by an angle."""
-    end = (length * np.sin(angle_rad), y, z - length * np.cos(angle_rad))
-    return _rod((0.0, y, z), end, radius)
-
-
-def _rod(low: tuple[float, float, float], high: tuple[float, float, float], radius: float) -> Any:
-    import trimesh
-
-    return trimesh.creation.cylinder(radius, sections=12, segment=[low, high])

@@ -1,13 +1,10 @@
-"""The figure of the walking person: proportions of 1.8 m, a walk cycle driven by the distance walked.
-
-It stays within the circle round the target's box (PERSON_HALF_EXTENTS_M): in mid-stride the tips of the shoes pass its
-sides by up to 12 cm.
-"""
+"""What moves, as drawable parts of one frame: the figures of people, cars, and the capsules that cast the shadows of
+others."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,14 +12,14 @@ from scipy.spatial.transform import Rotation
 from cosfly.geometry import rotation_matrix
 from cosfly.products.kinds import KINDS
 from cosfly.products.walks import TARGET_HEIGHT_M
-from cosfly.render.contract import LAYER_STEP, PERSON_ID, STANDING_LAYER, Clothes, PosedCar, PosedOther, PosedPerson
+from cosfly.render.contract import LAYER_STEP, PERSON_ID, STANDING_LAYER, PosedCar, PosedOther, PosedPerson
+from cosfly.render.figure import figure_of
 from cosfly.render.gl import meshes
 from cosfly.render.gl.parts import CLOTH, PART, Boxes, PartBuilder, tags
 from cosfly.render.gl.shapes import BUILDERS
 from cosfly.render.gl.view import CameraView
 
-HIP_SWING_RAD, ARM_SWING_RAD, KNEE_BEND_RAD = 0.25, 0.38, 0.65
-HIP_M, KNEE_M, ANKLE_M, SHOULDER_M = 0.93, 0.50, 0.085, 1.45
+SHAPES = {"ball": meshes.SPHERE, "rounded": meshes.ROUNDED, "limb": meshes.LIMB, "disc": meshes.CYLINDER}
 
 
 @dataclass(frozen=True)
@@ -41,104 +38,17 @@ class Body:
     center_m: np.ndarray
 
 
-@dataclass
-class _Figure:
-    """Collects parts in the person's own axes: x forward, y left, z up, feet at 0."""
-
-    parts: list[tuple] = field(default_factory=list)  # (mesh, center, turn, half, color)
-    bones: list[tuple[np.ndarray, np.ndarray, float]] = field(default_factory=list)
-
-    def solid(
-        self, mesh: int, center: list[float], half: list[float], color: np.ndarray, pitch_rad: float = 0.0
-    ) -> None:
-        turn = Rotation.from_euler("y", pitch_rad).as_matrix()
-        self.parts.append((mesh, np.array(center), turn, tuple(half), color))
-
-    def limb(self, low: np.ndarray, high: np.ndarray, radius: float, color: np.ndarray) -> None:
-        """A limb between two points, thicker at `high`."""
-        along = high - low
-        length = float(np.linalg.norm(along))
-        z = along / length
-        x = np.cross([0.0, 1.0, 0.0], z)
-        x /= np.linalg.norm(x)
-        turn, half = np.stack([x, np.cross(z, x), z], axis=1), (radius, radius, length / 2.0 + 0.6 * radius)
-        self.parts.append((meshes.LIMB, (low + high) / 2.0, turn, half, color))
-
-
 def make_body(person: PosedPerson, instance_id: int = PERSON_ID) -> Body:
-    """Build the figure of a posed person, the target or another."""
-    figure, swing, clothes = _Figure(), person.swing, person.clothes
-    sides = ((1.0, person.phase_rad), (-1.0, person.phase_rad + np.pi))
-    feet = [_leg(figure, side, phase, swing, clothes) for side, phase in sides]
-    lift = min(foot[2] for foot in feet) - ANKLE_M  # the lower foot stands on the ground
-    for side, phase in sides:
-        _arm(figure, side, phase, swing, clothes)
-    _trunk_and_head(figure, swing, clothes)
-    hip_m = np.asarray(person.hip_m, dtype=np.float64)
-    return _placed(figure, hip_m - [0.0, 0.0, TARGET_HEIGHT_M + lift], person.heading_rad, hip_m, instance_id)
-
-
-def _swung(angle_rad: float, length: float) -> np.ndarray:
-    """A vector hanging down, turned forward by an angle."""
-    return length * np.array([np.sin(angle_rad), 0.0, -np.cos(angle_rad)])
-
-
-def _leg(figure: _Figure, side: float, phase: float, swing: float, clothes: Clothes) -> np.ndarray:
-    """Thigh, shin and shoe; gives the ankle."""
-    hip = np.array([0.0, 0.09 * side, HIP_M])
-    angle = HIP_SWING_RAD * swing * np.sin(phase)
-    bend = swing * (0.12 + KNEE_BEND_RAD * max(0.0, np.cos(phase)) ** 1.5)  # the leg that swings forward is bent
-    knee = hip + _swung(angle, HIP_M - KNEE_M)
-    ankle = knee + _swung(angle - bend, KNEE_M - ANKLE_M)
-    figure.limb(knee, hip, 0.088, clothes.color("legs"))
-    figure.limb(ankle - [0, 0, 0.02], knee, 0.066, clothes.color("legs"))
-    toe = 0.5 * (angle - bend)
-    center = ankle + np.array([0.048 * np.cos(toe), 0.0, -0.043 + 0.048 * np.sin(toe)])
-    figure.solid(meshes.ROUNDED, center.tolist(), [0.115, 0.048, 0.042], clothes.shoes, pitch_rad=-toe)
-    figure.bones.append((ankle - [0, 0, 0.05], hip, 0.085))
-    return ankle
-
-
-def _arm(figure: _Figure, side: float, phase: float, swing: float, clothes: Clothes) -> None:
-    shoulder = np.array([0.0, 0.205 * side, SHOULDER_M - 0.03])
-    angle = -ARM_SWING_RAD * swing * np.sin(phase)
-    elbow = shoulder + _swung(angle, 0.29) + [0.0, 0.025 * side, 0.0]
-    wrist = elbow + _swung(angle + 0.18 + 0.3 * swing, 0.25)
-    figure.limb(elbow, shoulder, 0.058, clothes.color("top"))
-    figure.limb(wrist, elbow, 0.041, clothes.skin)
-    figure.solid(meshes.SPHERE, (wrist + np.array([0.01, 0, -0.05])).tolist(), [0.04, 0.03, 0.065], clothes.skin)
-    figure.bones.append((wrist, shoulder, 0.05))
-
-
-def _trunk_and_head(figure: _Figure, swing: float, clothes: Clothes) -> None:
-    lean = 0.03 * swing
-    figure.solid(meshes.ROUNDED, [0.0, 0.0, 0.95], [0.115, 0.165, 0.12], clothes.color("legs"))
-    figure.solid(meshes.LIMB, [0.01, 0.0, 1.22], [0.125, 0.195, 0.29], clothes.color("top"), pitch_rad=lean)
-    figure.solid(meshes.SPHERE, [0.015, 0.0, 1.42], [0.10, 0.205, 0.085], clothes.color("top"), pitch_rad=lean)
-    figure.limb(np.array([0.01, 0.0, 1.46]), np.array([0.025, 0.0, 1.60]), 0.055, clothes.skin)
-    figure.solid(meshes.SPHERE, [0.035, 0.0, 1.665], [0.10, 0.078, 0.125], clothes.skin)
-    figure.solid(meshes.SPHERE, [0.008, 0.0, 1.70], [0.105, 0.088, 0.10], clothes.hair)
-    figure.solid(meshes.SPHERE, [0.132, 0.0, 1.65], [0.02, 0.016, 0.025], clothes.skin)
-    figure.bones.append((np.array([0.0, 0.0, 0.95]), np.array([0.01, 0.0, 1.36]), 0.17))
-    figure.bones.append((np.array([0.02, 0.0, 1.60]), np.array([0.02, 0.0, 1.70]), 0.095))
-
-
-def _placed(figure: _Figure, feet_m: np.ndarray, heading_rad: float, hip_m: np.ndarray, instance_id: int) -> Body:
-    turn = Rotation.from_euler("z", heading_rad).as_matrix()
-    mesh, centers, turns, halves, colors = zip(*figure.parts, strict=True)
-    records = np.zeros(len(mesh), PART)
-    records["half"], records["color"][:, :3] = halves, colors
-    records["quaternion"] = Rotation.from_matrix(turn @ np.array(turns)).as_quat()
+    """Make the figure of a posed person, the target or another."""
+    figure = figure_of(person)
+    records = np.zeros(len(figure.shapes), PART)
+    records["half"], records["color"][:, :3] = figure.half_m, figure.colors
+    records["quaternion"] = Rotation.from_matrix(figure.turns).as_quat()
     records["tag"] = tags(KINDS["Pedestrians"], CLOTH, np.full(len(records), instance_id))
     records["bias"] = LAYER_STEP * STANDING_LAYER
-    ends = np.array([[low, high] for low, high, _ in figure.bones]) @ turn.T + feet_m
-    radii = np.array([radius for _, _, radius in figure.bones])
-    return Body(records, np.array(mesh), np.array(centers) @ turn.T + feet_m, ends, radii, hip_m)
-
-
-# --- moving -----------------------------------------------------------------------------------------------------------
-# What moves, as drawable parts of one frame: the figures of people, cars, and the capsules that cast the shadows of
-# others.
+    mesh = np.array([SHAPES[shape] for shape in figure.shapes])
+    hip_m = np.asarray(person.hip_m, dtype=np.float64)
+    return Body(records, mesh, figure.centers_m, figure.bones_m, figure.bone_radii_m, hip_m)
 
 
 MOST_CAPSULES = 32  # as many as the shader has room for: the nearest to the camera

@@ -1,0 +1,171 @@
+"""The figure of a walking person, as solids that any renderer draws: proportions of 1.8 m, a walk cycle driven by the
+distance walked, and what an appearance says is worn.
+
+It stays within the circle round the target's box (PERSON_HALF_EXTENTS_M): in mid-stride the tips of the shoes pass its
+sides by up to 12 cm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from cosfly.geometry import rotation_matrix
+from cosfly.products.walks import TARGET_HEIGHT_M
+from cosfly.render.contract import Clothes, PosedPerson
+
+HIP_SWING_RAD, ARM_SWING_RAD, KNEE_BEND_RAD = 0.25, 0.38, 0.65
+HIP_M, KNEE_M, ANKLE_M, SHOULDER_M = 0.93, 0.50, 0.085, 1.45
+SIZES, BREADTHS = {"woman": 0.96, "man": 1.0}, {"woman": 0.84, "man": 1.05}
+# What hangs open below the waist: low end, high end, radii ahead and aside, m.
+UPRIGHT = np.eye(3)
+HEMS = {"jacket": (0.82, 1.12, 0.15, 0.19), "coat": (0.46, 1.14, 0.22, 0.235), "skirt": (0.47, 1.04, 0.24, 0.26)}
+
+
+@dataclass(frozen=True)
+class PersonFigure:
+    """A posed figure, k solids and b bones, m, world.
+
+    shapes: k of ball, rounded (a box), limb (thicker at its upper end), disc, each within half_m (k, 3) of centers_m
+    (k, 3), turned by turns (k, 3, 3); colors: (k, 3) linear RGB; bones_m: (b, 2, 3), the ends of the capsules that cast
+    the shadow; bone_radii_m: (b,).
+    """
+
+    shapes: tuple[str, ...]
+    centers_m: np.ndarray
+    turns: np.ndarray
+    half_m: np.ndarray
+    colors: np.ndarray
+    bones_m: np.ndarray
+    bone_radii_m: np.ndarray
+
+
+@dataclass
+class _Solids:
+    """Collects solids and bones in the person's own axes: x forward, y left, z up, feet at 0."""
+
+    solids: list[tuple] = field(default_factory=list)  # (shape, center, turn, half, color)
+    bones: list[tuple[np.ndarray, np.ndarray, float]] = field(default_factory=list)
+
+    def solid(
+        self, shape: str, center: list[float], half: list[float], color: np.ndarray, pitch_rad: float = 0.0,
+        roll_rad: float = 0.0,
+    ) -> None:  # fmt: skip
+        turn = rotation_matrix(-pitch_rad, 0.0, roll_rad) if pitch_rad or roll_rad else UPRIGHT
+        self.solids.append((shape, center, turn, half, color))
+
+    def limb(self, low: np.ndarray, high: np.ndarray, radius: float, color: np.ndarray) -> None:
+        """A limb between two points, thicker at `high`."""
+        along = high - low
+        length = float(np.linalg.norm(along))
+        z = along / length
+        x = np.array([z[2], 0.0, -z[0]]) / np.hypot(z[0], z[2])
+        turn, half = np.stack([x, np.cross(z, x), z], axis=1), [radius, radius, length / 2.0 + 0.6 * radius]
+        self.solids.append(("limb", (low + high) / 2.0, turn, half, color))
+
+    def hem(self, garment: str, color: np.ndarray) -> None:
+        low, high, ahead, aside = HEMS[garment]
+        self.solid("limb", [0.0, 0.0, (low + high) / 2.0], [ahead, aside, (high - low) / 2.0], color, pitch_rad=np.pi)
+
+    def placed(self, feet_m: np.ndarray, heading_rad: float, size: float) -> PersonFigure:
+        turn = rotation_matrix(0.0, heading_rad, 0.0)
+        shapes, centers, turns, half, colors = zip(*self.solids, strict=True)
+        ends, radii = np.array([bone[:2] for bone in self.bones]), np.array([bone[2] for bone in self.bones])
+        return PersonFigure(
+            shapes, feet_m + size * np.array(centers) @ turn.T, turn @ np.array(turns), size * np.array(half),
+            np.array(colors), feet_m + size * ends @ turn.T, size * radii,
+        )  # fmt: skip
+
+
+def figure_of(person: PosedPerson) -> PersonFigure:
+    """Build the figure of a posed person."""
+    figure, swing, clothes = _Solids(), person.swing, person.clothes
+    size, breadth = SIZES[clothes.looks.figure], BREADTHS[clothes.looks.figure]
+    sides = ((1.0, person.phase_rad), (-1.0, person.phase_rad + np.pi))
+    feet = [_leg(figure, side, phase, swing, clothes) for side, phase in sides]
+    lift = size * (min(foot[2] for foot in feet) - ANKLE_M)  # the lower foot stands on the ground
+    for side, phase in sides:
+        _arm(figure, breadth * side, phase, swing, clothes)
+    _trunk(figure, breadth, swing, clothes)
+    _head(figure, clothes)
+    _bag(figure, breadth, clothes)
+    return figure.placed(person.hip_m - [0.0, 0.0, TARGET_HEIGHT_M + lift], person.heading_rad, size)
+
+
+def _swung(angle_rad: float, length: float) -> np.ndarray:
+    """A vector hanging down, turned forward by an angle."""
+    return length * np.array([np.sin(angle_rad), 0.0, -np.cos(angle_rad)])
+
+
+def _leg(figure: _Solids, side: float, phase: float, swing: float, clothes: Clothes) -> np.ndarray:
+    """Thigh, shin and shoe; gives the ankle."""
+    hip = np.array([0.0, 0.09 * side, HIP_M])
+    angle = HIP_SWING_RAD * swing * np.sin(phase)
+    bend = swing * (0.12 + KNEE_BEND_RAD * max(0.0, np.cos(phase)) ** 1.5)  # the leg that swings forward is bent
+    knee = hip + _swung(angle, HIP_M - KNEE_M)
+    ankle = knee + _swung(angle - bend, KNEE_M - ANKLE_M)
+    legs, cloth = clothes.looks.legs, clothes.color("legs")
+    figure.limb(knee, hip, 0.088, clothes.skin if legs == "skirt" else cloth)
+    figure.limb(ankle - [0, 0, 0.02], knee, 0.066, cloth if legs == "trousers" else clothes.skin)
+    toe = 0.5 * (angle - bend)
+    center = ankle + np.array([0.048 * np.cos(toe), 0.0, -0.043 + 0.048 * np.sin(toe)])
+    figure.solid("rounded", center.tolist(), [0.115, 0.048, 0.042], clothes.shoes, pitch_rad=-toe)
+    is_wide = clothes.looks.top == "coat" or legs == "skirt"
+    figure.bones.append((ankle - [0, 0, 0.05], hip, 0.12 if is_wide else 0.085))
+    return ankle
+
+
+def _arm(figure: _Solids, side: float, phase: float, swing: float, clothes: Clothes) -> None:
+    shoulder = np.array([0.0, 0.205 * side, SHOULDER_M - 0.03])
+    angle = -ARM_SWING_RAD * swing * np.sin(phase)
+    elbow = shoulder + _swung(angle, 0.29) + [0.0, 0.025 * side, 0.0]
+    wrist = elbow + _swung(angle + 0.18 + 0.3 * swing, 0.25)
+    is_bare = clothes.looks.top == "t_shirt"
+    figure.limb(elbow, shoulder, 0.058, clothes.color("top"))
+    figure.limb(wrist, elbow, 0.041 if is_bare else 0.055, clothes.skin if is_bare else clothes.color("top"))
+    figure.solid("ball", (wrist + np.array([0.01, 0, -0.05])).tolist(), [0.04, 0.03, 0.065], clothes.skin)
+    figure.bones.append((wrist, shoulder, 0.05))
+
+
+def _trunk(figure: _Solids, breadth: float, swing: float, clothes: Clothes) -> None:
+    lean, top = 0.03 * swing, clothes.color("top")
+    covered = top if clothes.looks.top in HEMS else clothes.color("legs")
+    figure.solid("rounded", [0.0, 0.0, 0.95], [0.115, 0.165, 0.12], covered)
+    figure.solid("limb", [0.01, 0.0, 1.22], [0.125, 0.195 * breadth, 0.29], top, pitch_rad=lean)
+    figure.solid("ball", [0.015, 0.0, 1.42], [0.10, 0.205 * breadth, 0.085], top, pitch_rad=lean)
+    for slot in ("top", "legs"):
+        if (garment := getattr(clothes.looks, slot)) in HEMS:
+            figure.hem(garment, clothes.color(slot))
+    figure.bones.append((np.array([0.0, 0.0, 0.95]), np.array([0.01, 0.0, 1.36]), 0.17))
+
+
+def _head(figure: _Solids, clothes: Clothes) -> None:
+    hat, skin, hair = clothes.looks.hat, clothes.skin, clothes.hair
+    figure.limb(np.array([0.01, 0.0, 1.46]), np.array([0.025, 0.0, 1.60]), 0.055, skin)
+    figure.solid("ball", [0.035, 0.0, 1.665], [0.10, 0.078, 0.125], skin)
+    figure.solid("ball", [0.008, 0.0, 1.68 if hat else 1.70], [0.105, 0.088, 0.10], hair)
+    figure.solid("ball", [0.132, 0.0, 1.65], [0.02, 0.016, 0.025], skin)
+    if clothes.looks.figure == "woman":
+        figure.solid("ball", [-0.055, 0.0, 1.55], [0.075, 0.105, 0.20], hair)
+    if hat:
+        color = clothes.color("hat")
+        figure.solid("ball", [0.01, 0.0, 1.70], [0.118, 0.102, 0.10], color)
+        if hat == "cap":
+            figure.solid("rounded", [0.14, 0.0, 1.70], [0.085, 0.075, 0.012], color, pitch_rad=0.15)
+        else:
+            figure.solid("disc", [0.01, 0.0, 1.69], [0.235, 0.225, 0.012], color)
+    figure.bones.append((np.array([0.02, 0.0, 1.60]), np.array([0.02, 0.0, 1.70]), 0.14 if hat == "brim" else 0.095))
+
+
+def _bag(figure: _Solids, breadth: float, clothes: Clothes) -> None:
+    """A backpack with two straps, or a bag at the right hip with one across."""
+    if clothes.looks.bag == "backpack":
+        color = clothes.color("bag")
+        figure.solid("rounded", [-0.205, 0.0, 1.24], [0.10, 0.155, 0.22], color)
+        for side in (-1.0, 1.0):
+            figure.solid("rounded", [0.0, 0.11 * breadth * side, 1.33], [0.145, 0.025, 0.17], color)
+    elif clothes.looks.bag:
+        color = clothes.color("bag")
+        figure.solid("rounded", [0.0, -0.285, 0.88], [0.15, 0.075, 0.12], color)
+        figure.solid("rounded", [0.0, -0.05, 1.21], [0.15, 0.025, 0.33], color, roll_rad=-0.58)
