@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from cosfly.pedestrians.astar import SQRT2, find_route, route_cost
+from cosfly.pedestrians.astar import SQRT2, UNIFORM, find_route, route_cost
 from cosfly.space.grid import connected_parts
 
 
@@ -14,20 +14,24 @@ def free_cells(text: str) -> np.ndarray:
     return np.array([[mark != "#" for mark in row] for row in text.split()])
 
 
-def shortest_costs(free: np.ndarray, start: tuple[int, int]) -> np.ndarray:
+AXES = [(1, 0), (0, 1), (1, 1), (-1, 1)]
+
+
+def shortest_costs(free: np.ndarray, start: tuple[int, int], classes=None, costs=UNIFORM) -> np.ndarray:
     """Give the optimal cost to every cell by another library, infinite where there is no route; (ny, nx)."""
+    classes = np.zeros(free.shape, dtype=int) if classes is None else classes
     num_y, num_x = free.shape
-    rows, columns, costs = [], [], []
+    rows, columns, weights = [], [], []
     for y in range(num_y):
         for x in range(num_x):
-            for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
+            for axis, (dx, dy) in enumerate(AXES):
                 a, b = x + dx, y + dy
                 if not (0 <= a < num_x and 0 <= b < num_y and free[y, x] and free[b, a] and free[y, a] and free[b, x]):
                     continue
                 rows.append(y * num_x + x)
                 columns.append(b * num_x + a)
-                costs.append(np.hypot(dx, dy))
-    graph = coo_matrix((costs, (rows, columns)), shape=(free.size, free.size)).tocsr()
+                weights.append(np.hypot(dx, dy) * (costs[classes[y, x], axis] + costs[classes[b, a], axis]) / 2)
+    graph = coo_matrix((weights, (rows, columns)), shape=(free.size, free.size)).tocsr()
     return dijkstra(graph, directed=False, indices=start[1] * num_x + start[0]).reshape(free.shape)
 
 
@@ -112,3 +116,34 @@ def test_a_route_exists_exactly_within_a_part_of_four_neighbours():
         assert (find_route(free, start, goal) is not None) == is_same_part
         outcomes.add(bool(is_same_part))
     assert outcomes == {True, False}
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 10**9), st.integers(1, 20), st.integers(1, 20))
+def test_costs_by_class_and_axis_are_the_optimum_of_another_library(seed, num_x, num_y):
+    rng = np.random.default_rng(seed)
+    free = rng.random((num_y, num_x)) >= 0.25
+    classes = rng.integers(0, 3, free.shape).astype(np.uint8)
+    costs = rng.integers(1, 30, (3, 4))
+    start, goal = (tuple(rng.integers((num_x, num_y)).tolist()) for _ in range(2))
+    free[start[1], start[0]] = free[goal[1], goal[0]] = True
+    optimum = shortest_costs(free, start, classes, costs)[goal[1], goal[0]]
+    route = find_route(free, start, goal, classes, costs)
+    if route is None:
+        assert np.isinf(optimum)
+        return
+    assert problems(free, route) == []
+    steps = np.diff(route, axis=0)
+    forward = np.where((steps[:, 1] > 0) | ((steps[:, 1] == 0) & (steps[:, 0] > 0)), 1, -1)[:, None]
+    axes = np.array([AXES.index(tuple(step)) for step in (steps * forward).tolist()], dtype=int)
+    of_cells = costs[classes[route[:, 1], route[:, 0]]]
+    each = (of_cells[np.arange(len(axes)), axes] + of_cells[np.arange(1, len(route)), axes]) / 2
+    assert (each * np.linalg.norm(steps, axis=1)).sum() == pytest.approx(optimum, abs=1e-9)
+
+
+def test_classes_that_cost_alike_change_no_route():
+    rng = np.random.default_rng(3)
+    free, classes = rng.random((40, 40)) >= 0.15, rng.integers(0, 2, (40, 40)).astype(np.uint8)
+    free[0, 0] = free[39, 39] = True
+    plain, equal = (find_route(free, (0, 0), (39, 39), *more) for more in ((), (classes, np.full((2, 4), 7))))
+    assert (plain == equal).all()

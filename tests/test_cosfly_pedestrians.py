@@ -9,6 +9,7 @@ from tables import each
 from cosfly.errors import ConfigError, NoPathError, NothingKept
 from cosfly.geometry import DT_S
 from cosfly.pedestrians.astar import find_route
+from cosfly.pedestrians.crossings import costs_of
 from cosfly.pedestrians.stage import (
     PedestriansConfig,
     WalkableGround,
@@ -60,9 +61,12 @@ def lawn(size_m: float):
 
 def ground_of(text: str) -> WalkableGround:
     """Make a ground from rows of part numbers, row 0 first."""
-    parts = np.array([[int(mark) for mark in row] for row in text.split()], dtype=np.int32)
+    return ground_in(np.array([[int(mark) for mark in row] for row in text.split()], dtype=np.int32))
+
+
+def ground_in(parts: np.ndarray) -> WalkableGround:
     grid = OccupancyGrid(0.0, 0.0, 1.0, parts == 0)
-    return WalkableGround(grid, grid, parts, Ground.flat(0.0))
+    return WalkableGround(grid, grid, parts, np.zeros(parts.shape, np.uint8), Ground.flat(0.0), costs_of(1, 1))
 
 
 @pytest.fixture
@@ -98,7 +102,7 @@ def test_goals_are_all_cells_of_the_part_at_the_wanted_distance(start):
         for y, x in np.argwhere(parts == 2).tolist()
         if 2.5 <= np.hypot(x - start[0], y - start[1]) <= 5.0
     }  # fmt: skip
-    drawn = [sample_goal(parts, start, 2.5, 5.0, rng) for _ in range(200 * len(expected))]
+    drawn = [sample_goal(ground_in(parts), start, 2.5, 5.0, rng) for _ in range(200 * len(expected))]
     assert set(drawn) == expected
     counts = np.unique(np.array(drawn), axis=0, return_counts=True)[1]
     assert abs(counts - 200).max() < 75  # 5 standard deviations
@@ -106,8 +110,8 @@ def test_goals_are_all_cells_of_the_part_at_the_wanted_distance(start):
 
 def test_no_goal_is_none():
     ground = ground_of("1111 2222")
-    assert sample_goal(ground.parts, (0, 0), 3.5, 9.0, np.random.default_rng(0)) is None
-    assert sample_goal(ground.parts, (0, 0), 3.0, 9.0, np.random.default_rng(0)) == (3, 0)
+    assert sample_goal(ground, (0, 0), 3.5, 9.0, np.random.default_rng(0)) is None
+    assert sample_goal(ground, (0, 0), 3.0, 9.0, np.random.default_rng(0)) == (3, 0)
 
 
 # --- the ground -------------------------------------------------------------------------------------------------------
@@ -137,7 +141,7 @@ def test_areas_that_touch_by_a_corner_are_one_component_but_two_parts():
     rng = np.random.default_rng(0)
     for _ in range(20):
         start = sample_start(ground, rng)
-        goal = sample_goal(ground.parts, start, 20.0, 60.0, rng)
+        goal = sample_goal(ground, start, 20.0, 60.0, rng)
         assert find_route(ground.walkable, start, goal) is not None
 
 
@@ -384,7 +388,7 @@ def test_the_stage_writes_paths_report_and_picture(map_file, tmp_path):
     assert facts["ground"]["cells_in_roi"] == 312 * 276
     manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
     assert manifest["counts"] == {"input": 3, "kept": 3, "dropped": {}, "failed": {}}
-    steps = {"read", "grid", "project", "inflate", "connectivity", "sample", "astar", "report"}
+    steps = {"read", "grid", "project", "inflate", "connectivity", "footing", "sample", "astar", "report"}
     assert set(manifest["seconds_by_step"]) == steps
     picture = cv2.imread(str(tmp_path / "out" / "paths.png"))
     assert picture.shape[1] == 1600

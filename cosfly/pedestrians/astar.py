@@ -1,9 +1,10 @@
-"""The shortest way over a grid of free cells: exact A* with octile costs and no corner cutting.
+"""The cheapest way over a grid of free cells: exact A* with octile costs and no corner cutting.
 
 A straight step costs 1, a diagonal one sqrt 2, and a diagonal step needs both straight neighbours free (sec:step3).
-Path costs are kept as two whole numbers, straight and diagonal steps, so that equal costs compare as equal whatever the
-order of the steps: the result is the true optimum, not the optimum up to rounding, and ties break the same way
-everywhere.
+Where cells are of several classes, a step costs so much times the mean of what its two cells cost along its axis.
+Path costs are kept as two whole numbers, straight and diagonal steps weighed, so that equal costs compare as equal
+whatever the order of the steps: the result is the true optimum, not the optimum up to rounding, and ties break the same
+way everywhere.
 """
 
 from __future__ import annotations
@@ -20,16 +21,26 @@ SQRT2 = math.sqrt(2.0)
 _STEP_X = np.array([1, 0, -1, 0, 1, -1, -1, 1], dtype=np.int64)
 _STEP_Y = np.array([0, 1, 0, -1, 1, 1, -1, -1], dtype=np.int64)
 
+UNIFORM = np.ones((1, 4), dtype=np.int64)
+
 _UNSEEN, _OPEN, _CLOSED = 0, 1, 2
 TOTAL, TO_GO = range(2)  # columns of the heap's keys
 STRAIGHT, DIAGONAL = range(2)  # columns of the steps
 
 
-def find_route(free: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray | None:
+def find_route(
+    free: np.ndarray,
+    start: tuple[int, int],
+    goal: tuple[int, int],
+    classes: np.ndarray | None = None,
+    costs: np.ndarray = UNIFORM,
+) -> np.ndarray | None:
     """Find a cheapest route between two cells.
 
     Args:
         free: (ny, nx) bool, contiguous; start, goal: (x index, y index).
+        classes: (ny, nx) uint8, rows of `costs`; None: all 0. costs: (classes, 4) int64, at least 1, what a cell costs
+            along x, along y, and along the diagonals of equal and of unlike signs.
     Returns:
         (k, 2) int64 cells from start to goal, both included (k is 1 if they are the same); None if there is no route.
     Raises:
@@ -48,23 +59,26 @@ def find_route(free: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) 
     steps = np.empty((free.size, 2), dtype=np.int32)
     from_direction = np.empty(free.size, dtype=np.int8)
     origin, target = int(start[1]) * num_x + int(start[0]), int(goal[1]) * num_x + int(goal[0])
-    if not _search(free, origin, target, state, steps, from_direction):
+    classes = np.zeros(free.shape, dtype=np.uint8) if classes is None else classes
+    if not _search(free, origin, target, state, steps, from_direction, classes, costs):
         return None
     return _trace_back(from_direction, num_x, origin, target)
 
 
 def route_cost(cells: np.ndarray) -> float:
-    """Give the octile cost of a route of neighbouring cells, (k, 2), in cell widths."""
+    """Give the octile length of a route of neighbouring cells, (k, 2), in cell widths: its cost where all cost 1."""
     is_diagonal = (np.diff(cells, axis=0) != 0).all(axis=1)
     num_diagonal = int(np.count_nonzero(is_diagonal))
     return len(is_diagonal) - num_diagonal + num_diagonal * SQRT2
 
 
 @njit(cache=True)
-def _search(free, origin, target, state, steps, from_direction):  # pragma: no cover (compiled)
-    """Run A* until the target is closed; tells whether it was reached. The arrays are (cells,), steps (cells, 2)."""
+def _search(free, origin, target, state, steps, from_direction, classes, costs):  # pragma: no cover (compiled)
+    """Run A* until the target is closed; tells whether it was reached. The arrays are (cells,), steps (cells, 2), in
+    halves: a step costs what its two cells cost."""
     num_y, num_x = free.shape
     target_x, target_y = target % num_x, target // num_x
+    least = 2 * costs.min()  # so that no way to the target costs less than is estimated
     # Estimated total cost, then cost still to go: depth first in a tie.
     heap_key = np.empty((1024, 2), dtype=np.float64)
     heap_cell = np.empty(1024, dtype=np.int64)
@@ -92,8 +106,10 @@ def _search(free, origin, target, state, steps, from_direction):  # pragma: no c
             neighbour = next_y * num_x + next_x
             if state[neighbour] == _CLOSED:
                 continue
-            straight = steps[cell, STRAIGHT] + (1 if direction < 4 else 0)
-            diagonal = steps[cell, DIAGONAL] + (1 if direction >= 4 else 0)
+            axis = direction % 2 + direction // 4 * 2
+            cost = costs[classes[y, x], axis] + costs[classes[next_y, next_x], axis]
+            straight = steps[cell, STRAIGHT] + (cost if direction < 4 else 0)
+            diagonal = steps[cell, DIAGONAL] + (cost if direction >= 4 else 0)
             if state[neighbour] == _OPEN:
                 known = steps[neighbour, STRAIGHT] + steps[neighbour, DIAGONAL] * SQRT2
                 if straight + diagonal * SQRT2 >= known:
@@ -102,8 +118,8 @@ def _search(free, origin, target, state, steps, from_direction):  # pragma: no c
             steps[neighbour, STRAIGHT], steps[neighbour, DIAGONAL] = straight, diagonal
             from_direction[neighbour] = direction
             apart_x, apart_y = abs(target_x - next_x), abs(target_y - next_y)
-            left_diagonal = min(apart_x, apart_y)
-            left_straight = max(apart_x, apart_y) - left_diagonal
+            left_diagonal = least * min(apart_x, apart_y)
+            left_straight = least * max(apart_x, apart_y) - left_diagonal
             total = (straight + left_straight) + (diagonal + left_diagonal) * SQRT2
             to_go = left_straight + left_diagonal * SQRT2
             heap_key, heap_cell, size = _push(heap_key, heap_cell, size, total, to_go, neighbour)

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cosfly.geometry import headings_of
-from cosfly.pedestrians.astar import find_route
 from cosfly.pedestrians.lanes import Lane
 from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, sample_goal
 from cosfly.pedestrians.walking import (
@@ -128,13 +127,12 @@ def without_meeting(course: Trip, time_s: np.ndarray, there: list[Other], height
 def draw_stroll(walk: Walk, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator) -> Trip | None:
     """Draw a person's route near a walk, there and back for as long as the walk lasts; None without a goal."""
     cells = ground.grid.cells_at(walk.polyline_m[rng.integers(len(walk.polyline_m))])
-    start = sample_goal(ground.parts, (int(cells[0]), int(cells[1])), 0.0, cfg.others_reach_m / cfg.resolution_m, rng)
+    start = sample_goal(ground, (int(cells[0]), int(cells[1])), 0.0, cfg.others_reach_m / cfg.resolution_m, rng)
     limits = cfg.min_distance_m / cfg.resolution_m, cfg.max_distance_m / cfg.resolution_m
-    goal = None if start is None else sample_goal(ground.parts, start, *limits, rng)
+    goal = None if start is None else sample_goal(ground, start, *limits, rng)
     if start is None or goal is None:
         return None
-    route = find_route(ground.walkable, start, goal)
-    assert route is not None, "two cells of one part have no route between them"
+    route = ground.route(start, goal)
     pace = PACES[draw_by_share(cfg.pace, rng)]
     way = take_pace(ground.grid.centers_of(route), pace, rng)
     speeds_mps = speeds_at(way, pace, cfg, rng) * rng.uniform(*OWN_SPEED)

@@ -28,7 +28,8 @@ from pydantic import BaseModel
 
 from cosfly.errors import NoPathError
 from cosfly.look.topview import INK, TopView, draw_dot, draw_line, draw_text, png_bytes
-from cosfly.pedestrians.astar import find_route, route_cost
+from cosfly.pedestrians.astar import route_cost
+from cosfly.pedestrians.crossings import CROSSING, ROAD, where_walked
 from cosfly.pedestrians.lanes import Lane, lanes_of
 from cosfly.pedestrians.others import company_of
 from cosfly.pedestrians.walkable import (
@@ -61,8 +62,10 @@ STRIP_PX = 64  # legend below the map
 
 # RGB
 OBSTACLE, MARGIN, UNUSED, USED = (74, 76, 84), (158, 158, 164), (232, 228, 218), (190, 219, 238)
+ON_ROAD, ON_CROSSING = (203, 201, 214), (246, 226, 150)
 ROI_LINE, PAPER = (226, 120, 20), (252, 251, 247)
-LEGEND = (("obstacle", OBSTACLE), ("safety margin", MARGIN), ("free, not used", UNUSED), ("walkable", USED))
+LEGEND = (("obstacle", OBSTACLE), ("safety margin", MARGIN), ("free, not used", UNUSED), ("walkable", USED),
+          ("carriageway", ON_ROAD), ("crossing", ON_CROSSING))  # fmt: skip
 
 
 def draw_overview(ground: WalkableGround, paths: list[Walk]) -> bytes:
@@ -96,9 +99,11 @@ def _ground_picture(ground: WalkableGround) -> tuple[np.ndarray, TopView]:
     scale = LONGER_SIDE_PX / max(num_x, num_y)
     classes = np.full((num_y, num_x), 2, dtype=np.uint8)
     classes[ground.walkable] = 3
+    classes[ground.walkable & (ground.footing >= ROAD)] = 4
+    classes[ground.walkable & (ground.footing == CROSSING)] = 5
     classes[ground.inflated.occupied] = 1
     classes[grid.occupied] = 0
-    cells = np.array([OBSTACLE, MARGIN, UNUSED, USED], dtype=np.uint8)[classes[::-1]]
+    cells = np.array([OBSTACLE, MARGIN, UNUSED, USED, ON_ROAD, ON_CROSSING], dtype=np.uint8)[classes[::-1]]
     width, height = max(1, round(num_x * scale)), max(1, round(num_y * scale))
     picture = cv2.resize(cells, (width, height), interpolation=cv2.INTER_NEAREST if scale >= 1 else cv2.INTER_AREA)
     per_m = scale / grid.resolution_m
@@ -188,13 +193,12 @@ def _draw_route(
     for _ in range(cfg.num_retries + 1):
         with clock("sample"):
             start = sample_start(ground, rng)
-            goal = sample_goal(ground.parts, start, *limits, rng)
+            goal = sample_goal(ground, start, *limits, rng)
         if goal is None:
             retries["no_goal"] += 1
             continue
         with clock("astar"):
-            cells = find_route(ground.walkable, start, goal)
-        assert cells is not None, "two cells of one part have no route between them"
+            cells = ground.route(start, goal)
         if cfg.max_detour and route_cost(cells) > cfg.max_detour * np.hypot(*(cells[-1] - cells[0])):
             retries["detour"] += 1
             continue
@@ -240,6 +244,7 @@ def report(ground: WalkableGround, paths: list[Walk], retries: list[dict[str, in
     for path, given_up in zip(paths, retries, strict=True):
         length_m = float(np.linalg.norm(np.diff(path.polyline_m, axis=0), axis=1).sum())
         walked_s = float(path.time_s[-1])
+        on_road, on_crossings = where_walked(path, ground.footing, ground.grid)
         lines.append(
             {
                 "id": path.path_id,
@@ -248,6 +253,8 @@ def report(ground: WalkableGround, paths: list[Walk], retries: list[dict[str, in
                 "length_m": round(length_m, 3),
                 "straight_m": round(float(np.linalg.norm(path.polyline_m[-1] - path.polyline_m[0])), 3),
                 "points": len(path.time_s),
+                "on_carriageway": on_road,
+                "on_crossings": on_crossings,
                 "duration_s": walked_s,
                 "mean_speed_mps": round(length_m / walked_s, 4),
                 "retries": given_up,
@@ -263,7 +270,8 @@ def report(ground: WalkableGround, paths: list[Walk], retries: list[dict[str, in
         "total": {
             "paths": len(lines),
             "cells": sum(line["cells"] for line in lines),
-            "points": sum(line["points"] for line in lines),
+            **(sums := {key: sum(line[key] for line in lines) for key in ("points", "on_carriageway", "on_crossings")}),
+            "on_carriageway_share": round(sums["on_carriageway"] / sums["points"], 4),
             "length_m": round(total_m, 3),
             "duration_s": total_s,
             "mean_speed_mps": round(total_m / total_s, 4),
@@ -341,6 +349,8 @@ def run(
             outputs.append(out / OTHERS_FILE)
             summary["others"] = _write_companies(outputs[-1], [result.company for result in results], header, cfg)
         write_json(out / "pedestrians_report.json", summary)
+        share = summary["total"]["on_carriageway_share"]
+        log.info("%.1f %% of the walked points are on carriageway away from crossings", 100 * share)
         write_bytes(out / "paths.png", draw_overview(ground, paths))
     seconds = {step: round(value, 4) for step, value in clock.seconds.items()}
     stage.finish(outputs, finished.tally, ground=ground.counts, total=summary["total"], seconds_by_step=seconds)

@@ -21,6 +21,8 @@ from pydantic import Field, field_validator, model_validator
 
 from cosfly.errors import NoPathError, nearest
 from cosfly.geometry import DT_S
+from cosfly.pedestrians.astar import find_route
+from cosfly.pedestrians.crossings import CROSSING, ROAD, costs_of, footing_of
 from cosfly.pedestrians.walking import PACES, SLOWEST_SPEED_MPS
 from cosfly.products.boxes import BoxMap
 from cosfly.products.ground import Ground
@@ -70,6 +72,16 @@ class PedestriansConfig(Config):
         "surfaces",
         description="where people walk: anywhere in the map's bounds, on any ground box (anywhere, where a map has no "
         "streets and ground boxes under less than half of it), or on streets and squares",
+    )
+    road_cost: int = Field(
+        1,
+        ge=1,
+        le=100,
+        description="what a metre of carriageway away from crossings costs a route, in metres of pavement; over 1 "
+        "walks begin and end off the carriageway too; 1: all ground costs alike, as in the paper",
+    )
+    open_cost: int = Field(
+        1, ge=1, le=100, description="what a metre of lawn and other open ground costs a route, in metres of pavement"
     )
     cruise_speed_mps: float = Field(1.2, gt=0, description="speed on straight ground, m/s")
     curvature_gain_m: float = Field(5.0, ge=0, description="alpha of eq:speed, m: how much corners slow; 0 is off")
@@ -137,13 +149,15 @@ class WalkableGround:
     cell
     to the other exists, 0 where nobody walks: obstacles, outside the region of interest, steep ground, small
     components.
-    heights: of the ground.
+    footing: (ny, nx) uint8, crossings.py. heights: of the ground. costs: of footings, for routes.
     """
 
     grid: OccupancyGrid
     inflated: OccupancyGrid
     parts: np.ndarray
+    footing: np.ndarray
     heights: Ground
+    costs: np.ndarray
     is_in_roi: np.ndarray | None = None
     counts: dict[str, Any] = field(default_factory=dict)
 
@@ -153,9 +167,20 @@ class WalkableGround:
         return self.parts > 0
 
     @cached_property
+    def may_end(self) -> np.ndarray:
+        """Where walks may begin and end, (ny, nx) bool: off the carriageway, if that costs more than pavement."""
+        return self.walkable & ((self.footing < CROSSING) | (self.costs[ROAD] == 1).all())
+
+    @cached_property
     def row_ends(self) -> np.ndarray:
-        """(ny,) int64: how many walkable cells there are up to the end of each row."""
-        return np.cumsum(np.count_nonzero(self.walkable, axis=1))
+        """(ny,) int64: how many cells there are where walks may end, up to the end of each row."""
+        return np.cumsum(np.count_nonzero(self.may_end, axis=1))
+
+    def route(self, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray:
+        """Give the cells of a cheapest route between two of one part, (k, 2)."""
+        cells = find_route(self.walkable, start, goal, self.footing, self.costs)
+        assert cells is not None, "two cells of one part have no route between them"
+        return cells
 
 
 class Clock:
@@ -228,7 +253,20 @@ def walkable_ground(
     with clock("connectivity"):
         place = where if roi is None else roi_where
         parts = _parts_of_large_components(free, cfg.min_component_cells, counts, place)
-    return WalkableGround(grid, inflated, parts, box_map.ground, is_in_roi, counts)
+    with clock("footing"):
+        costs = costs_of(cfg.open_cost, cfg.road_cost)
+        ground = WalkableGround(
+            grid, inflated, parts, footing_of(box_map, grid), box_map.ground, costs, is_in_roi, counts
+        )
+    if not ground.row_ends[-1]:
+        raise NoPathError(
+            "all walkable ground is carriageway",
+            where=where,
+            got=f"{counts['cells_used']} walkable cells, all Roads",
+            expected="pavements, squares or paths (Sidewalks, Ground) for the ends of walks",
+            fix="set road_cost to 1",
+        )
+    return ground
 
 
 def _count(mask: np.ndarray) -> int:
@@ -348,17 +386,18 @@ def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | 
 
 
 def sample_start(ground: WalkableGround, rng: np.random.Generator) -> tuple[int, int]:
-    """Draw one walkable cell (x index, y index), every one equally likely."""
+    """Draw one cell where walks may begin (x index, y index), every one equally likely."""
     drawn = int(rng.integers(ground.row_ends[-1]))
     y = int(np.searchsorted(ground.row_ends, drawn, side="right"))
-    columns = np.flatnonzero(ground.walkable[y])
+    columns = np.flatnonzero(ground.may_end[y])
     return int(columns[drawn - ground.row_ends[y]]), y  # counted from the row's end: a negative index
 
 
 def sample_goal(
-    parts: np.ndarray, start: tuple[int, int], min_cells: float, max_cells: float, rng: np.random.Generator
+    ground: WalkableGround, start: tuple[int, int], min_cells: float, max_cells: float, rng: np.random.Generator
 ) -> tuple[int, int] | None:
-    """Draw a cell of the start's part at a straight distance within [min_cells, max_cells], every one equally likely.
+    """Draw a cell where walks may end, of the start's part, at a straight distance within [min_cells, max_cells],
+    every one equally likely.
 
     Returns:
         (x index, y index), or None if there is no such cell.
@@ -366,9 +405,11 @@ def sample_goal(
     reach = int(max_cells)
     x, y = start
     left, low = max(0, x - reach), max(0, y - reach)
-    window = parts[low : y + reach + 1, left : x + reach + 1]
+    near = np.s_[low : y + reach + 1, left : x + reach + 1]
+    window = ground.parts[near]
     squared = (np.arange(window.shape[0])[:, None] + low - y) ** 2 + (np.arange(window.shape[1]) + left - x) ** 2
-    fits = (window == parts[y, x]) & (squared >= min_cells**2) & (squared <= max_cells**2)
+    fits = (window == ground.parts[y, x]) & ground.may_end[near]
+    fits &= (squared >= min_cells**2) & (squared <= max_cells**2)
     candidates = np.flatnonzero(fits)
     if len(candidates) == 0:
         return None

@@ -38,9 +38,8 @@ NO_INSTANCE = 0
 GROUND_PLANE_HALF_M = 1500.0
 GROUND_PLANE_DROP_M = 0.02  # under the lowest slab, so that the two never fight for a pixel
 
-# A layer moves the depth *test* by LAYER_STEP of the distance, never the depth written. The ground plane's layer is 0.
+# A layer moves the depth *test* by LAYER_STEP of the distance, never the depth written (kinds.LAYERS).
 LAYER_STEP = 1e-4
-LAYERS = {"Terrain": 1, "Ground": 2, "Water": 2, "Roads": 3, "RailTrack": 4, "RoadLines": 5, "Sidewalks": 6}
 STANDING_LAYER = 7
 LAWN_HALF_M = 0.2  # vegetation of a smaller half height is a lawn; it lies in the layer of road lines
 

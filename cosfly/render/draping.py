@@ -13,8 +13,8 @@ import numpy as np
 import shapely
 
 from cosfly.products.boxes import BoxMap
-from cosfly.products.kinds import GROUND_KINDS, KINDS
-from cosfly.render.contract import GROUND_PLANE_HALF_M, LAWN_HALF_M, LAYERS, STANDING_LAYER
+from cosfly.products.kinds import GROUND_KINDS, KINDS, LAYERS
+from cosfly.render.contract import GROUND_PLANE_HALF_M, LAWN_HALF_M, STANDING_LAYER
 from cosfly.space.grid import lies_off_ground
 
 DRAPED_KINDS = GROUND_KINDS | {KINDS["Water"]}

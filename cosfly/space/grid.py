@@ -18,7 +18,7 @@ import shapely
 from cosfly.errors import InputError
 from cosfly.geometry import rotation_matrices
 from cosfly.products.boxes import BoxMap
-from cosfly.products.kinds import GROUND_KINDS, KINDS
+from cosfly.products.kinds import GROUND_KINDS, KINDS, LAYERS
 from cosfly.products.roi import Roi
 from cosfly.work.compiled import njit
 
@@ -30,6 +30,8 @@ SURFACE_REACH_M = 1.0  # kerbs, lawns and carriageways differ by less; a flyover
 MAX_CELLS = 400_000_000  # 10 km x 10 km at 0.5 m; more is a stray box, or a resolution too fine for the memory
 
 WATER = KINDS["Water"]
+_LAYER_OF = np.zeros(256, dtype=np.int64)
+_LAYER_OF[[KINDS[name] for name in LAYERS]] = list(LAYERS.values())
 _CORNER_SIGNS = np.array([[x, y, z] for z in (-1.0, 1.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
 _EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
 
@@ -123,7 +125,7 @@ def occupancy(
     is_water = boxes.kinds == WATER
     lowest, highest = box_map.ground.range_under(boxes.mins, boxes.maxs)
     lows, highs = np.where(is_water, -np.inf, lowest), np.where(is_water, np.inf, highest + height_m)
-    _mark(boxes, lows, highs, grid)
+    _mark(boxes, lows, highs, grid, grid.occupied, np.ones(len(boxes), bool))
     return grid
 
 
@@ -144,24 +146,47 @@ def surface(box_map: BoxMap, kinds: Collection[int] = GROUND_KINDS, *, like: Occ
     boxes = box_map.select(box_map.is_any_of(kinds) & ~lies_off_ground(box_map, kinds))
     if len(boxes) == 0:
         return None
-    grid = replace(like, occupied=np.zeros_like(like.occupied))
-    _mark(boxes, np.full(len(boxes), -np.inf), np.full(len(boxes), np.inf), grid)
-    return grid.occupied
+    found = np.zeros_like(like.occupied)
+    _mark(boxes, np.full(len(boxes), -np.inf), np.full(len(boxes), np.inf), like, found, np.ones(len(boxes), bool))
+    return found
 
 
-def _mark(boxes: BoxMap, lows: np.ndarray, highs: np.ndarray, grid: OccupancyGrid) -> None:
-    """Mark the cells under the slices of boxes between two heights each, (n,) m."""
+def surface_kinds(box_map: BoxMap, kinds: Collection[int], *, like: OccupancyGrid) -> np.ndarray:
+    """Tell the kind of the topmost ground in the middle of each cell, (ny, nx) uint8; 0 where there is none.
+
+    Args:
+        kinds: as for `surface`; of those in one plane, to a centimetre, that of the higher layer.
+    """
+    boxes = box_map.select(box_map.is_any_of(kinds) & ~lies_off_ground(box_map, kinds))
+    tops_m = np.round(boxes.maxs[:, 2] - boxes.ground.height_at(boxes.centers), 2)
+    boxes = boxes.select(np.lexsort((_LAYER_OF[boxes.kinds], tops_m)))
+    found = np.zeros(like.occupied.shape, dtype=np.uint8)
+    ends = np.full(len(boxes), -np.inf), np.full(len(boxes), np.inf)
+    _mark(boxes, *ends, like, found, boxes.kinds, touch=0.5 - TOUCH_M)
+    return found
+
+
+def _mark(
+    boxes: BoxMap, lows: np.ndarray, highs: np.ndarray, grid: OccupancyGrid, found: np.ndarray, marks: np.ndarray,
+    *, touch: float | None = None,
+) -> None:  # fmt: skip
+    """Set the cells of `found` under the slices of boxes between two heights each, (n,) m, to the marks of the boxes.
+
+    Args:
+        touch: cells, how deep a slice must reach into a cell; TOUCH_M where None.
+    """
     turns = rotation_matrices(np.radians(boxes.rotations_deg))
     extents = np.maximum(boxes.half_extents, MIN_HALF_EXTENT_M)
     corners = np.einsum("nij,nkj->nki", turns, _CORNER_SIGNS * extents[:, None]) + boxes.centers[:, None]
     corners[..., :2] = (corners[..., :2] - [grid.x_min_m, grid.y_min_m]) / grid.resolution_m
     is_upright = np.abs(turns[:, 2, 2]) > 1.0 - 1e-12
-    _rasterise(corners, lows, highs, is_upright, TOUCH_M / grid.resolution_m, grid.occupied)
+    touch = TOUCH_M / grid.resolution_m if touch is None else touch
+    _rasterise(corners, lows, highs, is_upright, touch, marks, found)
 
 
 @njit(cache=True)
-def _rasterise(corners, lows, highs, is_upright, touch, occupied):  # pragma: no cover (compiled)
-    """Mark the cells under the slices of boxes; corners (n, 8, 3) with x and y in cells, z in m."""
+def _rasterise(corners, lows, highs, is_upright, touch, marks, cells):  # pragma: no cover (compiled)
+    """Mark the cells under the slices of boxes, in their order; corners (n, 8, 3) with x and y in cells, z in m."""
     points = np.empty((8 + 2 * len(_EDGES), 2))
     for box in range(len(corners)):
         if is_upright[box]:
@@ -171,7 +196,7 @@ def _rasterise(corners, lows, highs, is_upright, touch, occupied):  # pragma: no
         else:
             count = _slice_points(corners, box, lows[box], highs[box], points)
         if count > 0:
-            _fill_hull(points, count, touch, occupied)
+            _fill_hull(points, count, touch, marks[box], cells)
 
 
 @njit(cache=True)
@@ -196,14 +221,14 @@ def _slice_points(corners, box, low, high, points):  # pragma: no cover (compile
 
 
 @njit(cache=True)
-def _fill_hull(points, count, touch, occupied):  # pragma: no cover (compiled)
+def _fill_hull(points, count, touch, mark, cells):  # pragma: no cover (compiled)
     """Mark the cells that the convex hull of the first `count` points (k, 2), in cells, overlaps.
 
     The part of a convex shape inside one row of cells spans one interval of x, and exactly the cells that meet the
     interval overlap the shape. The ends of the interval lie on points or on lines between two of them, so the hull is
     never built.
     """
-    num_y = len(occupied)
+    num_y = len(cells)
     bottom, top = np.inf, -np.inf
     for i in range(count):
         bottom, top = min(bottom, points[i, 1]), max(top, points[i, 1])
@@ -224,9 +249,9 @@ def _fill_hull(points, count, touch, occupied):  # pragma: no cover (compiled)
                         x = xi + (y - yi) / (yj - yi) * (xj - xi)
                         left, right = min(left, x), max(right, x)
         if left <= right:
-            stop = int(max(0.0, min(float(occupied.shape[1]), np.ceil(right - touch))))
+            stop = int(max(0.0, min(float(cells.shape[1]), np.ceil(right - touch))))
             for column in range(int(max(0.0, np.floor(left + touch))), stop):
-                occupied[row, column] = True
+                cells[row, column] = mark
 
 
 def compare(one: OccupancyGrid, other: OccupancyGrid) -> tuple[float, float]:

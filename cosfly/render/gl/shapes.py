@@ -9,9 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from cosfly.products.kinds import KINDS
+from cosfly.products.kinds import KINDS, LAYERS
 from cosfly.render import contract
-from cosfly.render.contract import LAYERS
 from cosfly.render.gl import meshes, parts
 from cosfly.render.gl.parts import FAR_PX, Boxes, PartBuilder
 

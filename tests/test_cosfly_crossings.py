@@ -1,0 +1,136 @@
+"""cosfly/pedestrians/crossings.py: what is under the feet, what a crossing is, and that walkers keep to it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cosfly.app.settings import RunConfig
+from cosfly.errors import NoPathError
+from cosfly.maps.boxlist import BoxList
+from cosfly.maps.stage import load_map
+from cosfly.pedestrians.crossings import CROSSING, OPEN, PAVED, ROAD, where_walked
+from cosfly.pedestrians.others import company_of
+from cosfly.pedestrians.stage import make_walk
+from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
+from cosfly.products.walks import Walk
+from cosfly.simplify.passes import simplify
+from cosfly.work.chance import rng_for
+from cosfly.work.config import load, shipped
+
+CFG = PedestriansConfig(road_cost=20, open_cost=3, min_component_cells=100, min_distance_m=20)
+ALONG_X, ALONG_Y = ROAD + 1, ROAD + 2
+
+
+def street(*, marked: bool = False) -> BoxList:
+    """Two streets of 8 m that cross at the origin, between pavements of 4 m, on a lawn of 80 m; one has dashes."""
+    boxes = BoxList()
+    boxes.add_span("Terrain", (-40, -40), (40, 40), -0.4, -0.1)
+    for size in (80, 8), (8, 80):
+        boxes.add("Roads", (0, 0), size, -0.36, -0.06)
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            boxes.add("Sidewalks", (sx * 22, sy * 6), (36, 4), -0.3, 0.0)
+            boxes.add("Sidewalks", (sx * 6, sy * 22), (4, 36), -0.3, 0.0)
+    for x in (16, 22, 28):
+        boxes.add("RoadLines", (x, 0), (3.0, 0.16), -0.1, -0.03)
+    for y in np.arange(-3.2, 3.4, 1.2) if marked else ():
+        boxes.add("RoadLines", (10, y), (3.0, 0.55), -0.1, -0.03)
+    return boxes
+
+
+def footing_at(boxes: BoxList, *points) -> list[int]:
+    ground = walkable_ground(boxes.box_map(), CFG)
+    x, y = ground.grid.cells_at(np.array(points)).T
+    return ground.footing[y, x].tolist()
+
+
+def test_the_topmost_ground_counts_and_of_one_plane_the_higher_layer():
+    boxes = street()
+    assert footing_at(boxes, (20, 20), (20, 6), (2, 2)) == [OPEN, PAVED, ROAD]
+    boxes.add("Roads", (20, 6), (4, 2), -0.1, 0.0)  # in the pavement's plane: renderers show the pavement
+    boxes.add("Terrain", (30, 6), (4, 2), -0.1, 0.1)  # earth heaped on it
+    boxes.add("Roads", (6, 30), (4, 2), 3.0, 3.2)  # a flyover
+    assert footing_at(boxes, (20, 6), (30, 6), (6, 30)) == [PAVED, OPEN, PAVED]
+
+
+def test_unmarked_streets_are_crossed_straight_and_junctions_nowhere():
+    places = (20.2, 0.2), (0.2, 20.2), (0.2, 0.2), (3.2, 3.2)
+    assert footing_at(street(), *places) == [ALONG_Y, ALONG_X, ROAD, ROAD]
+
+
+def test_where_stripes_are_only_they_are_crossings_from_kerb_to_kerb_and_dashes_are_none():
+    places = (10.2, 0.2), (10.2, 3.7), (10.2, -3.7), (16.2, 0.2), (0.2, 20.2), (0.2, 0.2), (14.2, 2.2)
+    assert footing_at(street(marked=True), *places) == [CROSSING] * 3 + [ROAD] * 4
+
+
+@pytest.mark.parametrize(
+    ("way", "marked", "counts"),
+    [
+        ([[20.25, -6.25], [20.25, 6.25]], False, (0, 16)),  # straight across, 8 m at two points a metre
+        ([[20.25, -6.25], [20.25, 6.25]], True, (16, 0)),  # beside the stripes
+        ([[10.25, -6.25], [10.25, 6.25]], True, (0, 16)),
+        ([[14.25, 0.25], [34.25, 0.25]], False, (41, 0)),  # along the street
+        ([[14.25, 6.25], [34.25, 6.25]], False, (0, 0)),
+        ([[-6.25, -6.25], [6.25, 6.25]], False, (16, 0)),  # over the junction from corner to corner
+    ],
+)
+def test_points_are_counted_by_where_they_are_and_which_way_they_go(way, marked, counts):
+    start, goal = np.array(way)
+    length = np.abs(goal - start).max()
+    places = start + np.linspace(0, 1, int(2 * length) + 1)[:, None] * (goal - start)
+    walk = Walk("p", places, np.arange(len(places)) * 0.5, np.pad(places, ((0, 0), (0, 1))), np.ones(len(places)))
+    ground = walkable_ground(street(marked=marked).box_map(), CFG)
+    assert where_walked(walk, ground.footing, ground.grid) == counts
+
+
+def test_ends_lie_off_the_carriageway_or_nowhere():
+    ground = walkable_ground(street(marked=True).box_map(), CFG)
+    assert set(np.unique(ground.footing[ground.may_end])) == {PAVED, OPEN}
+    assert walkable_ground(street().box_map(), PedestriansConfig(min_component_cells=100)).may_end.sum() == 160 * 160
+    boxes = BoxList()
+    boxes.add_span("Roads", (0, 0), (80, 80), -0.3, 0.0)
+    with pytest.raises(NoPathError, match=r"all walkable ground is carriageway.*road_cost"):
+        walkable_ground(boxes.box_map(), CFG)
+
+
+def shares(cfg: RunConfig, name: str, num_others: int = 0) -> tuple[float, float]:
+    """Shares of the walked points of a town, on carriageway away from crossings and on crossings; the others' too."""
+    town = cfg.of_town(name)
+    walking = town.pedestrians.model_copy(update={"others": num_others})
+    ground = walkable_ground(simplify(load_map(town.maps, seed=town.seed), town.simplify).box_map, walking)
+    counts = np.zeros(3)
+    for k in range(walking.num_paths):
+        rng = rng_for(town.seed, "pedestrians", f"path_{k:05d}")
+        walk = make_walk(f"path_{k:05d}", ground, walking, rng).walk
+        everybody = [walk.positions_m]
+        if num_others:
+            everybody += [other.positions_m for other in company_of(walk, ground, [], walking, rng).others]
+        for places in everybody:
+            moves = np.r_[True, np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1) > 1e-6]
+            line = walk.polyline_m if places is walk.positions_m else places[moves, :2]
+            one = Walk("p", line, walk.time_s, places, walk.speeds_mps)
+            counts += *where_walked(one, ground.footing, ground.grid), len(places)
+    return counts[0] / counts[2], counts[1] / counts[2]
+
+
+@pytest.mark.parametrize("name", ["old_town", "park", "river"])
+def test_at_most_a_twentieth_of_the_walked_points_of_shipped_towns_is_on_the_road_away_from_crossings(name):
+    away, on_crossings = shares(load(RunConfig, shipped("diverse.yaml")), name)
+    assert away <= 0.05
+    assert on_crossings > 0.05  # people do cross
+    paper, _ = shares(load(RunConfig, shipped("diverse.yaml"), ["pedestrians.road_cost=1"]), name)
+    assert paper > 0.1
+
+
+def test_others_keep_to_pavements_as_well():
+    away, _ = shares(load(RunConfig, shipped("diverse.yaml")), "market", num_others=3)
+    assert away <= 0.05
+
+
+def test_people_of_a_foreign_city_without_marked_crossings_cross_straight(shared_data: Path):
+    world = shared_data / "simworld-progen/progen_world.json"
+    city = f"towns.city={{maps: {{source: simworld, simworld: {{world: {world}}}}}}}"
+    away, on_crossings = shares(load(RunConfig, shipped("diverse.yaml"), [city]), "city")
+    assert away <= 0.05
+    assert on_crossings > 0.05
