@@ -21,6 +21,7 @@ from cosfly.cli.distill import app as distill_app
 from cosfly.cli.release import app as release_app
 from cosfly.cli.release import export_app
 from cosfly.cli.run import app as run_app
+from cosfly.cli.sim import app as sim_app
 from cosfly.cli.stages import app as stages_app
 from cosfly.cli.studies import app as studies_app
 from cosfly.errors import CosflyError, plain
@@ -63,6 +64,7 @@ for name, named_group in (
     ("distill", distill_app),
     ("export", export_app),
     ("release", release_app),
+    ("sim", sim_app),
     ("study", studies_app),
 ):
     app.add_typer(named_group, name=name)

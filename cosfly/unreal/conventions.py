@@ -1,0 +1,64 @@
+"""What CARLA and Unreal say in other words than we do: axes, pictures of depth and of tags. Converted here alone.
+
+Their axes are left-handed (`cosfly.geometry`); a pose is x, y, z, pitch, yaw, roll, m and degrees. Pictures come as
+BGRA bytes: depth in 24 bits up to 1000 m, tags as the semantic number in red and an actor's number in green (low byte)
+and blue (high byte).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cosfly.geometry import BODY_FROM_CAMERA, mirror_positions, mirror_rotations
+
+CARLA_VERSION = "0.9.16"
+SIMULATED_STEP_S = 0.05  # of synchronous mode (sec:step5)
+DEPTH_RANGE_M, DEPTH_STEPS = 1000.0, 2**24 - 1
+DEPTH_STEP_M = DEPTH_RANGE_M / DEPTH_STEPS
+ACTOR_BITS = 0xFFFF  # of an actor's number, in pictures
+
+
+def unreal_pose(position_m: np.ndarray, rotation_deg: np.ndarray) -> list[float]:
+    """Give a pose of ours, (3,) m and (3,) pitch, yaw, roll in degrees, as x, y, z, pitch, yaw, roll of theirs."""
+    return [*(mirror_positions(position_m) + 0.0).tolist(), *(mirror_rotations(rotation_deg) + 0.0).tolist()]
+
+
+def world_pose(pose: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Give a pose of theirs as position, (3,) m, and rotation, (3,) degrees, of ours."""
+    return mirror_positions(np.array(pose[:3])) + 0.0, mirror_rotations(np.array(pose[3:])) + 0.0
+
+
+def camera_rotation_deg(camera_pose: np.ndarray) -> np.ndarray:
+    """Read pitch, yaw, roll, (3,) degrees, from a world_from_camera of OpenCV axes, (4, 4)."""
+    turn = camera_pose[:3, :3] @ BODY_FROM_CAMERA.T
+    pitch = np.arctan2(turn[2, 0], np.hypot(turn[0, 0], turn[1, 0]))
+    if np.hypot(turn[0, 0], turn[1, 0]) < 1e-9:  # straight up or down: roll is none, yaw is all of the turn
+        return np.degrees([pitch, np.arctan2(-turn[0, 1], turn[1, 1]), 0.0])
+    return np.degrees([pitch, np.arctan2(turn[1, 0], turn[0, 0]), np.arctan2(turn[2, 1], turn[2, 2])])
+
+
+def depth_picture(depth_m: np.ndarray) -> np.ndarray:
+    """Encode z-depth, (h, w) m, as BGRA, (h, w, 4) uint8; to the nearest DEPTH_STEP_M, what is farther as 1000 m."""
+    steps = np.round(np.clip(depth_m.astype(np.float64) / DEPTH_RANGE_M, 0.0, 1.0) * DEPTH_STEPS).astype("<u4")
+    picture = steps[..., None].view(np.uint8)[..., [2, 1, 0, 3]]
+    picture[..., 3] = 255
+    return picture
+
+
+def depth_of(picture: np.ndarray) -> np.ndarray:
+    """Decode z-depth, (h, w) float32 m, from BGRA."""
+    blue, green, red = (picture[..., k].astype(np.uint32) for k in range(3))
+    return ((red | green << 8 | blue << 16) * (DEPTH_RANGE_M / DEPTH_STEPS)).astype(np.float32)
+
+
+def tags_picture(kinds: np.ndarray, actors: np.ndarray) -> np.ndarray:
+    """Encode semantic numbers and actors' numbers, (h, w) each, as BGRA; of an actor's number 16 bits are left."""
+    low, high = actors & 0xFF, actors >> 8 & 0xFF
+    return np.stack([high, low, kinds, np.full_like(kinds, 255)], axis=-1).astype(np.uint8)
+
+
+def tags_of(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Decode semantic numbers, (h, w) uint8, and the 16 bits of actors' numbers, (h, w) uint16, from BGRA."""
+    return picture[..., 2].copy(), picture[..., 1] | picture[..., 0].astype(np.uint16) << 8

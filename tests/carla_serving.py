@@ -1,0 +1,53 @@
+"""A CARLA server of ours in a process of its own, and an unmodified client in another, which may crash."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from cosfly.products.boxes import BoxMap, write_boxes
+
+
+def free_port() -> int:
+    """A port that is free, and the next one too."""
+    while True:
+        with socket.socket() as one, socket.socket() as two:
+            one.bind(("127.0.0.1", 0))
+            port = one.getsockname()[1]
+            with contextlib.suppress(OSError, OverflowError):
+                two.bind(("127.0.0.1", port + 1))
+                return port
+
+
+def command(town: Path, port: int, *faults: str) -> list[str]:
+    told = [word for fault in faults for word in ("--fault", fault)]
+    return [sys.executable, "-m", "cosfly", "sim", "serve", str(town), "--port", str(port), *told]
+
+
+@contextlib.contextmanager
+def serving(box_map: BoxMap, folder: Path, *faults: str) -> Iterator[int]:
+    """Serve a map; gives the port."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_boxes(folder / "boxes_3d.json", box_map)
+    port = free_port()
+    process = subprocess.Popen(command(folder / "boxes_3d.json", port, *faults), stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        assert str(port) in process.stdout.readline()
+        yield port
+    finally:
+        process.kill()
+        process.wait()
+
+
+def as_client(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Run a function in a process of its own; BrokenProcessPool where it crashes."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result(timeout=120)
