@@ -40,7 +40,7 @@ class ObservedFrame:
     position_m, target_m (x, y, z), the target's NaN where unknown; rotation_deg: pitch, yaw, roll; target_uv (u, v) px
     and target_bbox (left, top, right, bottom) px of what is seen of the target (where a tree does not say, of its
     projected 3D box), NaN where unknown;
-    visibility: score, NaN where unknown.
+    visibility: score, NaN where unknown; legible: whether who is visible can be made out, true where a tree is silent.
     """
 
     time_s: float
@@ -52,6 +52,7 @@ class ObservedFrame:
     in_view: bool
     visible: bool
     visibility: float
+    legible: bool = True
 
 
 def observed_frames(*columns: np.ndarray) -> tuple[ObservedFrame, ...]:

@@ -140,6 +140,7 @@ class FlightRows:
             is_perturbed=self.flags("is_perturbed"), drone_offsets_m=self.drone_offset[:, :3],
             rotation_offsets_deg=self.drone_offset[:, 3:], target_offsets_m=self.target_offset,
             target_mask_bbox=self.mask_box if has_mask else None, is_original=self.is_clean,
+            target_legible=None if None in self.column("target_legible") else self.flags("target_legible"),
             intrinsics=matrices if self.zooms else None, between=between_of(self.rows),
         )  # fmt: skip
 

@@ -415,6 +415,8 @@ LIES_OF_ROWS: dict[str, Lie] = {
         lambda r: r.update(label="hover" if r["label"] != "hover" else "ascend"),
     ),
     "visibility_above_one": put(at(clean, 0), visibility=1.7),
+    "called_legible": put(at(clean, 0), target_legible=True, target_contrast=1.0),
+    "higher_than_its_box": put(first(seen, lambda r: r["target_height_px"] < 40), target_height_px=40.0),
     "visible_but_not_in_view": put(at(seen, 0), target_in_view=False),
     "perturbed_without_offsets": put(first(perturbed, lambda r: not r["is_perturbed"]), is_perturbed=True),
     "offsets_without_flag": put(shifted, is_perturbed=False),
@@ -524,6 +526,7 @@ LIES_OF_PIXELS: dict[str, Lie] = {
     "colours_meant_darker": change(middle, chunk(b"gAMA", struct.pack(">I", 200_000))),
     "one_picture_in_two_rows": lambda rows: put(at(clean, 9), image=clean(rows)[2]["image"])(rows),
     "other_visibility": put(nearest_seen, visibility=0.3),
+    "contrast_a_little_higher": change(first(seen, lambda r: r["target_contrast"] > 5), add("target_contrast", 1.0)),
     "visibility_a_little_lower": change(nearest_seen, add("visibility", -0.05)),
 }  # fmt: skip
 # name -> the lie, and whether only pixels tell it

@@ -99,6 +99,26 @@ def test_a_true_sentence_is_proved_and_one_wrong_word_is_named(language, text, c
     names_the_wrong_words(language, text, claims_of(claims), errors)
 
 
+@each(
+    ("language", "text", "claims", "state"),
+    [
+        ("en", "At t0 the person is hard to make out, at t4 in full view.", "visibility@t0=illegible; visibility@t4=visible", "proved"),
+        ("zh", "目标在 t0 时难以辨认。", "visibility@t0=illegible", "proved"),
+        ("en", "At t0 the person is barely visible.", "visibility@t0=illegible", "proved"),
+        ("en", "At t0 the person is visible.", "visibility@t0=visible", "contradicted"),
+        ("en", "At t0 the person is in full view.", "visibility@t0=illegible", "contradicted"),
+        ("zh", "目标在 t0 时清晰可见。", "visibility@t0=illegible", "contradicted"),
+        ("en", "At t0 the person is visible, the drone does 4.0 m/s.", "speed@t4=4.0 mps", "contradicted"),
+        ("en", "At t3 the person is hard to make out, the drone does 4.0 m/s.", "speed@t4=4.0 mps", "contradicted"),
+    ],
+)  # fmt: skip
+def test_who_cannot_be_made_out_is_not_said_to_be_seen(language, text, claims, state):
+    """Claims of sight are of what a stranger could see: geometry shows the person at t0, the picture does not."""
+    facts = dataclasses.replace(FACTS, visibility=("illegible", *FACTS.visibility[1:]))
+    coc = Coc(critical_components=text, reasoning_trace=FILLER, flight_decision="hover")
+    assert judge_claims(coc, claims_of(claims), facts, EvidenceConfig(), language, shipped_actions())[0].state == state
+
+
 def test_a_hypothesis_beside_a_true_sentence_leaves_it_proved():
     claims = [claim("change:altitude=2.0 m"), claim("trend:altitude=decreasing", modality="hypothetical")]
     text = "Not climbing but sinking would be wrong here; the drone has gained about 2 m."

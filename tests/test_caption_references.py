@@ -90,6 +90,7 @@ def test_what_names_nothing(address):
         ("side:offset_x", "centred", False),
         ("visibility@t2", "visible", True),
         ("visibility@t0", "partly_occluded", False),
+        ("visibility@t1", "illegible", False),
         ("comparison:speed", "slower", False),
         ("target_motion", "standing", False),
         ("heading", "left", None),

@@ -28,7 +28,7 @@ from cosfly.chat.budget import BudgetConfig
 from cosfly.errors import InputError, NothingKept, ResumeError
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights
-from cosfly.products.playback import read_flight
+from cosfly.products.playback import read_flight, write_flight
 from specimens import make_playback_tree
 
 
@@ -85,6 +85,33 @@ def test_the_report_adds_up_and_repairs_stay_on_record(done):
     read = Counter((name, state) for c in captions for name, states in c.checks.sentences.items() for state in states)
     assert {(name, state): n for name, row in report["sentences"].items() for state, n in row.items() if n} == read
     assert not (done / "parts").exists()
+
+
+def test_who_cannot_be_made_out_changes_what_is_said_to_be_seen_and_no_decision(tree, done, tmp_path):
+    """Labels, decisions and verdicts go by geometry; claims of sight by what a stranger could see."""
+    before = list(read_captions(done / "captions.jsonl"))
+    told = {}
+    for legible in (True, False):
+        dim = shutil.copytree(tree, tmp_path / f"tree_{legible}")
+        for folder in find_flights(dim):
+            flight = read_flight(folder)
+            for point in flight.raw["points"]:
+                point["target"]["legible"] = legible and point["target"]["visible"]
+            write_flight(folder, flight)
+        told[legible] = list(read_captions(run(CaptionConfig(), dim, tmp_path / f"out_{legible}")))
+    assert [one.model_dump() for one in told[True]] == [one.model_dump() for one in before], "nothing is said anew"
+    assert any("visible" in one.en.critical_components for one in before)
+    for one, other in zip(before, told[False], strict=True):
+        assert (one.label, one.verdict, one.en.flight_decision) == (
+            other.label,
+            other.verdict,
+            other.en.flight_decision,
+        )
+        text, chinese = (getattr(other, language).critical_components for language in ("en", "zh"))
+        assert not re.search(r"visible|partly|in the image|image centre", text)
+        assert not re.search("可见|部分遮挡|画面", chinese)
+        assert ("hard to make out" in text) == ("难以辨认" in chinese)
+        assert other.checks.evidence == "ok"
 
 
 def test_another_seed_changes_the_wording_only(tree, done, tmp_path):

@@ -98,6 +98,7 @@ def frames_of(flight: Flight) -> tuple[ObservedFrame, ...]:
         flight.target_in_view,
         flight.target_visible,
         flight.visibility,
+        np.ones(len(flight), dtype=bool) if flight.target_legible is None else flight.target_legible,
     )
 
 

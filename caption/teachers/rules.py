@@ -208,7 +208,7 @@ def _pace(side: int, f: Facts, c: Cues) -> Both | None:
 
 
 def _steady(f: Facts, c: Cues) -> Both | None:
-    if not f.is_visible_now or word_of(f, "side:offset_x") != "centred" or abs(c.last_turn_deg) >= 1.0:
+    if not f.is_legible_now or word_of(f, "side:offset_x") != "centred" or abs(c.last_turn_deg) >= 1.0:
         return None
     return ("The target is {side:offset_x} in the image.", "目标在画面中{side:offset_x}。")
 

@@ -32,7 +32,7 @@ def word_of(f: Facts, address: str) -> str | None:
 def describe(f: Facts) -> list[tuple[Both, ...]]:
     """Give the statements about a window, each as a tuple of wordings; those of the last state different facts."""
     parts = [_seen(f)]
-    if f.is_visible_now:
+    if f.is_legible_now:
         parts += [_box(f), _position(f)]
     parts += [_walk(f), _distance(f), _speed(f), _pace(f), _altitude(f), _yaw(f), _more(f)]
     return [part for part in parts if part]

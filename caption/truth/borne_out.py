@@ -158,8 +158,9 @@ def _is_seen(pole: Pole, facts: Facts) -> bool:
         "full": ("visible",),
         "visible": ("visible", "partly_occluded"),
         "glimpsed": ("visible", "partly_occluded"),
-        "partly": ("partly_occluded",),
-        "hidden": ("occluded", "out_of_view", "partly_occluded"),
+        "illegible": ("illegible", "partly_occluded", "visible"),  # how well somebody sees is told mildly
+        "partly": ("partly_occluded", "illegible"),  # of less than LEGIBLE_SHARE nobody makes anything out
+        "hidden": ("occluded", "out_of_view", "partly_occluded", "illegible"),
         "gone": ("occluded", "out_of_view"),
     }[pole.value]
     frames = [frame for frame in pole.frames if frame < len(facts)]

@@ -26,11 +26,12 @@ from cosfly.products.captions import Claim, Language
 # Words, negated or not, that say that the person is seen, and that not all is.
 _SEEN = {
     ("glimpsed", False), ("visible", False), ("full", False), ("partly", False), ("hidden", True), ("gone", True),
-    ("partly", True),
+    ("partly", True), ("illegible", False),
 }  # fmt: skip
 _UNSEEN = {("hidden", False), ("gone", False), ("visible", True), ("glimpsed", True)}
 _PARTLY = {("partly", False), ("hidden", False), ("visible", False), ("full", True)}
-
+_ILLEGIBLE = _PARTLY - {("visible", False)} | {("illegible", False), ("visible", True)}
+_SAID = {"visible": _SEEN, "partly_occluded": _PARTLY, "illegible": _ILLEGIBLE}
 
 _PAIRS = (
     ("increasing", "decreasing"), ("left", "right"), ("faster", "slower"), ("near", "far"), ("visible", "hidden"), ("above", "below"),
@@ -240,7 +241,7 @@ def _denied_words(stated: Stated, said: Said) -> Iterator[str]:
             and claim.modality == "observed"
             and not (is_in_other_words or all(map(_is_wish, told)))
         ):
-            says = _SEEN if claim.value == "visible" else _PARTLY if claim.value == "partly_occluded" else _UNSEEN
+            says = _SAID.get(str(claim.value), _UNSEEN)
             if not seen & says and not (("partly", False) in seen and not has_partly):
                 yield _name(claim)
         elif claim.quantity in ("side:offset_x", "side:bearing") and claim.value in ("centred", "straight"):

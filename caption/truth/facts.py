@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 from caption.schema import ObservedFrame, ObservedWindow
 
-VisibilityWord = Literal["visible", "partly_occluded", "occluded", "out_of_view"]
+VisibilityWord = Literal["visible", "partly_occluded", "illegible", "occluded", "out_of_view"]
 STANDING_MPS = 0.2  # slower than this a person stands
 PARTLY_BELOW = 0.7  # rendered score under which a visible person counts as partly hidden
 
@@ -73,6 +73,12 @@ class Facts:
 
     @property
     def is_visible_now(self) -> bool:
+        """Tell whether nothing hides the person: what labels go by, as the flight was planned."""
+        return self.visibility[-1] in ("visible", "partly_occluded", "illegible")
+
+    @property
+    def is_legible_now(self) -> bool:
+        """Tell whether somebody could see the person in the picture: what claims of sight go by."""
         return self.visibility[-1] in ("visible", "partly_occluded")
 
     @cached_property
@@ -149,7 +155,7 @@ def _measure_frame(frame: ObservedFrame, camera_px: tuple[int, int], picture_px:
         *own,
         *_rounded((distance, slant, -away_z, bearing, depression), 1),
         *_measure_picture(frame, camera_px, picture_px),
-        _word(frame.in_view, frame.visible, frame.visibility),
+        _word(frame),
     )
 
 
@@ -208,9 +214,11 @@ def _turn_deg(first: tuple[float, float], last: tuple[float, float], slowest_mps
     return round(math.degrees(math.atan2(x0 * y1 - y0 * x1, x0 * x1 + y0 * y1)), 1) + 0.0
 
 
-def _word(in_view: bool, visible: bool, score: float) -> VisibilityWord:
-    if not in_view:
+def _word(frame: ObservedFrame) -> VisibilityWord:
+    if not frame.in_view:
         return "out_of_view"
-    if not visible:
+    if not frame.visible:
         return "occluded"
-    return "partly_occluded" if score < PARTLY_BELOW else "visible"  # NaN: the flag alone decides
+    if not frame.legible:
+        return "illegible"
+    return "partly_occluded" if frame.visibility < PARTLY_BELOW else "visible"  # NaN: the flag alone decides

@@ -67,6 +67,7 @@ def poles_of(claim: Claim, actions: ActionSet) -> set[Pair]:
                 ("visibility", "hidden"),
                 ("visibility", "glimpsed"),
             },
+            "illegible": {("visibility", "illegible")},
         }.get(str(value), {("visibility", "hidden"), ("visibility", "gone")})
     if name in ("target_motion", "drone_motion"):
         is_still = value in ("standing", "hovering")

@@ -113,9 +113,7 @@ def render(
     traces: Traces,
     out: options.Out,
     others: Annotated[Path | None, Option(help="Who else moves: others.json, beside path.json.")] = None,
-    weather_mode: Annotated[
-        str | None, Option(help="off, fixed, random-per-path or by-weight."), Sets("render.weather_mode")
-    ] = None,
+    weather_mode: Annotated[str | None, Option(help="How skies are drawn."), Sets("render.weather_mode")] = None,
     weather_name: Annotated[
         str | None, Option(help="Weather of mode fixed, as heavy_rain."), Sets("render.weather_name")
     ] = None,
@@ -129,9 +127,7 @@ def render(
         Path | None, Option(help="YAML file with times of day of yours."), Sets("render.tod_pool")
     ] = None,
     weather_seed: Annotated[
-        int | None,
-        Option(help="Seed of random-per-path and by-weight; a negative one draws another."),
-        Sets("render.weather_seed"),
+        int | None, Option(help="Seed of drawn skies; a negative one draws another."), Sets("render.weather_seed")
     ] = None,
 ) -> None:
     """Step 5: RGB, depth and instance frames of the clean and the perturbed flight."""

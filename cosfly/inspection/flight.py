@@ -305,6 +305,10 @@ def _rendered_metrics(
     known = flight.visibility[~np.isnan(flight.visibility)]
     quality = float(np.mean(frames.track_ious)) if frames.track_ious else None
     invalid = max(frames.invalid_depth_shares, default=None)
+    told, heights_px = (
+        flight.target_legible,
+        (flight.target_bbox[:, 3] - flight.target_bbox[:, 1])[flight.target_in_view],
+    )
     metrics.update(
         num_frames_checked=frames.num_checked,
         num_frames_compared=frames.num_compared,
@@ -312,7 +316,8 @@ def _rendered_metrics(
         height_mean_m=float(np.nanmean(_heights_m(flight))) if not np.isnan(flight.targets_m).all() else None,
         rendered_visibility_mean=float(known.mean()) if len(known) else None,
         visible_share=float(flight.target_visible.mean()),
-        **_legible_shares(flight),
+        legible_share=None if told is None else float(told.mean()),
+        small_share=None if told is None or not len(heights_px) else float((heights_px < LEGIBLE_HEIGHT_PX).mean()),
         in_view_share=float(flight.target_in_view.mean()),
         perturbed_share=float(flight.is_perturbed.mean()),
         track_quality=quality,
@@ -325,19 +330,6 @@ def _rendered_metrics(
     if invalid is not None and invalid > cfg.invalid_depth_max:
         expected = f"at most {cfg.invalid_depth_max:g} of the pixels of a frame"
         report.warn("invalid_depth", "depth.npy", f"{invalid:.3f} of a frame", expected)
-
-
-def _legible_shares(flight: Flight) -> dict[str, float | None]:
-    """Give the shares of the frames in which the target can be made out, and of those that show it, in which it is too
-    small for that; None of flights that do not say."""
-    told = [flight.told_legibility(i) for i in range(len(flight))]
-    if any(one["legible"] is None for one in told):
-        return {"legible_share": None, "small_share": None}
-    small = [float(one["height_px"] or 0.0) < LEGIBLE_HEIGHT_PX for one in told if one["height_px"]]
-    return {
-        "legible_share": float(np.mean([one["legible"] for one in told])),
-        "small_share": float(np.mean(small)) if small else None,
-    }
 
 
 def _heights_m(flight: Flight) -> np.ndarray:

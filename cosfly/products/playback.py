@@ -69,8 +69,9 @@ class Flight:
     time_s (n,) strictly increasing; positions_m (n, 3); rotations_deg (n, 3) pitch, yaw, roll of the camera;
     targets_m (n, 3) hip height, NaN where the file has none; target_uv (n, 2) px and target_bbox (n, 4) xmin, ymin,
     xmax, ymax px of its projected 3D box, NaN where null; target_mask_bbox (n, 4) the same of the person's pixels, NaN
-    where none is seen, None where the file does not say; target_depth_m (n,) z-depth; target_in_view, target_visible
-    (n,) bool (visible = occlusion-aware); visibility (n,) rendered score in [0, 1], NaN where the file has none;
+    where none is seen, target_legible (n,) bool, both None where the file does not say; target_depth_m (n,) z-depth;
+    target_in_view, target_visible (n,) bool (visible = occlusion-aware); visibility (n,) rendered score in [0, 1], NaN
+    where the file has none;
     is_perturbed (n,) bool; drone_offsets_m, rotation_offsets_deg, target_offsets_m (n, 3): the perturbation applied to
     each point, zero where none, NaN where the file has none for a perturbed point (public files say only that there was
     one). segments, mission: the styles of its parts and the order that ended it, as its plan has them. intrinsics: (n,
@@ -99,6 +100,7 @@ class Flight:
     rotation_offsets_deg: np.ndarray
     target_offsets_m: np.ndarray
     target_mask_bbox: np.ndarray | None = None
+    target_legible: np.ndarray | None = None
     source: dict = field(default_factory=dict)
     is_original: bool = True
     folder: Path | None = None
@@ -301,6 +303,9 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
         target_uv=vectors_of(targets, "image_uv", ("u", "v")),
         target_bbox=vectors_of(targets, "bbox_2d", BBOX),
         target_mask_bbox=mask_boxes(targets),
+        target_legible=flags_of(targets, "legible")
+        if all(isinstance(t.get("legible"), bool) for t in targets)
+        else None,
         visibility=numbers_of(targets, "visibility"),
         is_perturbed=np.array([bool(p.get("is_perturbed", False)) for p in points]),
         drone_offsets_m=mirror_positions(drone),

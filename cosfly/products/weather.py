@@ -97,9 +97,8 @@ def resolved(weather: WeatherPreset, time: TimePreset) -> WeatherParams:
     return WeatherParams(**weather.model_dump(), **time.model_dump())
 
 
-def sky_kind(knobs: WeatherParams) -> SkyKind:
-    """Give the kind of a sky by its knobs, so that presets of one's own have one like those that ship."""
+def sky_kind(knobs: WeatherParams) -> str:
+    """Give the kind of a sky, one of SkyKind, by its knobs: presets of one's own have one too."""
     sun_deg = knobs.sun_altitude_angle
     light = "night" if sun_deg <= SUN_IS_DOWN_DEG else "dusk" if sun_deg < DAY_FROM_DEG else "day"
-    kind: SkyKind = f"{light}_{'rain' if knobs.precipitation else 'fog' if knobs.fog_density else 'dry'}"  # type: ignore[assignment]
-    return kind
+    return f"{light}_{'rain' if knobs.precipitation else 'fog' if knobs.fog_density else 'dry'}"

@@ -241,25 +241,22 @@ def _drawn(presets: Mapping[str, Any], rng: random.Random) -> str:
 
 
 def coverage_of(cfg: WeatherConfig, drawn: Iterable[tuple[str, str]]) -> dict[str, Any]:
-    """Count trajectories by weather, time of day and both, beside uniform draws (app:weather:coverage); beside the
-    shares of mode by_weight, by kind of sky."""
+    """Count trajectories by weather, time of day, both and kind, beside what is expected (app:weather:coverage)."""
     pools, pairs = read_pools(cfg), Counter(drawn)
     num = pairs.total()
     by = {name: dict.fromkeys(presets, 0) for name, presets in vars(pools).items()}
     for (weather, time), count in pairs.items():
         by["weathers"][weather] += count
         by["times"][time] += count
-    told = {
+    uniform = {name: round(num / len(presets), 2) for name, presets in vars(pools).items()}
+    asked = {kind: round(num * share / sum(cfg.sky_shares.values()), 2) for kind, share in cfg.sky_shares.items()}
+    return {
         "trajectories": num,
         **by,
+        "kinds": {kind: sum(pairs[pair] for pair in found) for kind, found in pools.of_kind().items()},
         "pairs": [[weather, time, count] for (weather, time), count in sorted(pairs.items())],
+        "expected": {"kinds": asked} if cfg.weather_mode == "by_weight" else uniform,
     }
-    if cfg.weather_mode != "by_weight":
-        return told | {"expected": {name: round(num / len(presets), 2) for name, presets in vars(pools).items()}}
-    kinds = {kind: sum(pairs[pair] for pair in found) for kind, found in pools.of_kind().items()}
-    shares = cfg.sky_shares.items()
-    expected = {kind: round(num * share / sum(cfg.sky_shares.values()), 2) for kind, share in shares}
-    return told | {"kinds": kinds, "expected": {"kinds": expected}}
 
 
 def told_coverage(told: Mapping[str, Any]) -> str:
@@ -270,5 +267,5 @@ def told_coverage(told: Mapping[str, Any]) -> str:
         f"{told['trajectories']} trajectories in {seen['weathers']} of {of['weathers']} weathers, "
         f"{seen['times']} of {of['times']} times of "
         f"day, {len(told['pairs'])} of {of['weathers'] * of['times']} pairs"
-        + "".join(f", {count} {kind}" for kind, count in told.get("kinds", {}).items() if count)
+        + "".join(f", {count} {kind}" for kind, count in told["kinds"].items() if count)
     )

@@ -223,6 +223,7 @@ class RowCounts:
     def _add(self, row: dict[str, Any]) -> tuple[float, ...]:
         """Count a row; give what the coverage needs: person to drone (x, y, z), heading, height in px, visibility."""
         self.totals.update(name for name in FLAGS if row[name])
+        self.totals["legible_told"] += row["target_legible"] is not None
         trajectory = row["run"], row["town"], row["trajectory"]
         self.fovs.setdefault(trajectory, Counter())[f"{row['fov_deg']:g}"] += 1
         size = f"{row['width_px']} x {row['height_px']}"
@@ -282,7 +283,7 @@ class RowCounts:
             frames_perturbed=totals["is_perturbed"],
             frames_target_in_view=totals["target_in_view"],
             frames_target_visible=totals["target_visible"],
-            frames_target_legible=totals["target_legible"],
+            frames_target_legible=totals["target_legible"] if totals["legible_told"] == self.rows else None,
             coverage=self.coverage if self.rows else Coverage.of({name: np.empty(0) for name in AXES}, (), ()),
             captions=self._captions(),
             files=FileNumbers(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from cosfly.errors import InputError
@@ -13,9 +14,11 @@ from cosfly.products.frames import SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.products.kinds import KINDS
 from cosfly.products.png import parse_png
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
+from cosfly.render.camera import contrast_of
+from cosfly.render.effects import bent
 from cosfly.space.reprojection import COLUMNS, FLAT, GRID_ROWS, View, median_of
 from cosfly.work.compiled import njit
-from release.columns import PICTURES
+from release.columns import PICTURES, matrices_of
 from release.depth import depth_of
 from release.flight_rows import FlightRows
 from release.record import DepthCoding
@@ -24,6 +27,7 @@ from release.verify.sources import Pictures
 
 SURFACE_M = PERSON_HALF_EXTENTS_M[2] + 0.3  # between the hip and the visible surface of a person along the optical axis
 LEAST_BOX_PX2 = 24.0  # a box of fewer pixels can lose the person between two pixel centres
+CONTRAST = 0.02  # rounded to 0.01
 MOST_RAYS, LEAST_RAYS = 900, 30  # through the box of a person: the score is a share of them
 # Of the visibility. Where a ray goes through each pixel of the box it is the renderer's own number: honest 0.000, of
 # depth as float16 0.002. Of fewer rays, three deviations of a share of so many; honest 0.021.
@@ -62,7 +66,11 @@ def decode(flight: FlightRows, i: int, files: Pictures, coding: DepthCoding, fin
         if size != (width, height):
             findings.error("picture", where, f"{size[0]} x {size[1]} px", f"{width} x {height} px, as the row says")
             found.pop(file)
-    return (found.get("depth", NOTHING), found.get("instance", NO_IDS)) if len(found) == len(files) else None
+    if len(found) < len(files):
+        return None
+    if "rgb" in found and "instance" in found:
+        _check_contrast(flight, i, found["rgb"], found["instance"], findings)
+    return found.get("depth", NOTHING), found.get("instance", NO_IDS)
 
 
 def _depth(data: bytes | memoryview, coding: DepthCoding, where: str) -> np.ndarray:
@@ -75,8 +83,8 @@ def _depth(data: bytes | memoryview, coding: DepthCoding, where: str) -> np.ndar
 def _colours(
     flight: FlightRows, data: bytes | memoryview, where: str, is_mask: bool, findings: Findings
 ) -> tuple[np.ndarray, tuple[int, int]]:
-    """Unpack a PNG, whose pixels only a mask needs. It is its pixels: nothing behind its end, of cosfly's own no words
-    and no other meaning of its colours, and nothing that one sees through."""
+    """Unpack a PNG. It is its pixels: nothing behind its end, of cosfly's own no words and no other meaning of its
+    colours, and nothing that one sees through."""
     png = parse_png(data, where)
     if png.channels < 3:
         raise InputError("not a colour picture", got=f"{png.channels} channels")
@@ -86,8 +94,7 @@ def _colours(
         findings.error("cargo", where, f"chunks {', '.join(png.others)}", "pixels alone, as cosfly writes them")
     if not is_mask and png.channels == 4 and (png.pixels()[..., 3] != 255).any():
         findings.error("blank", where, "pixels that one sees through", "a picture that hides what is behind it")
-    pixels = np.ascontiguousarray(png.pixels()[..., :3]) if is_mask else png.lines
-    return pixels, (png.width_px, png.height_px)
+    return np.ascontiguousarray(png.pixels()[..., :3]), (png.width_px, png.height_px)
 
 
 def view_of(flight: FlightRows, i: int, decoded: Decoded) -> View:
@@ -111,6 +118,20 @@ def check_picture(flight: FlightRows, i: int, decoded: Decoded, findings: Findin
             if not flight.is_foreign:
                 _check_visibility(flight, i, instance, depth, findings)
     return good
+
+
+def _check_contrast(flight: FlightRows, i: int, rgb: np.ndarray, instance: np.ndarray, findings: Findings) -> None:
+    """What the row says of how a person stands out, of which `target_legible` is told, is what the picture shows."""
+    row = flight.rows[i]
+    if row.get("target_height_px") is None or rgb.shape != instance.shape:
+        return
+    is_person = (instance[..., 1:] == 255).all(axis=2)  # PERSON_ID
+    if any(lens := tuple((row.get("distortion") or {}).values())):
+        matrix = matrices_of(flight.intrinsics[i : i + 1])[0]
+        is_person = bent(is_person.astype(np.uint8), matrix, lens, cv2.INTER_NEAREST) > 0
+    got, expected = row.get("target_contrast"), contrast_of(rgb, is_person)
+    if (got is None) != (expected is None) or abs((got or 0.0) - (expected or 0.0)) > CONTRAST:
+        findings.error("contrast", flight.where(i, "target_contrast"), got, f"{expected}, of the picture")
 
 
 def _check_depth(where: str, low: float, high: float, findings: Findings) -> bool:
