@@ -20,7 +20,11 @@ from cosfly.products.people import COLORS, FIGURES, GARMENTS, Appearance, Words
 
 # What is large is said first. Slot -> how Chinese says that it is worn; what both languages say of nothing there.
 SLOTS = {"top": ("穿",), "legs": ("穿",), "bag": ("背", "no bag", "不带包"), "hat": ("戴", "no hat", "不戴帽子")}
-SIDES = {"left": ("leftmost", "最左边的"), "right": ("rightmost", "最右边的")}
+# Of whom the value is least, with a sign, and by how much it must be: of the picture's width, m from the camera.
+SIDES = {
+    "left": ("leftmost", "最左边的", 1.0, 0.05), "right": ("rightmost", "最右边的", -1.0, 0.05),
+    "near": ("nearest", "离镜头最近的", 1.0, 1.0), "far": ("farthest", "离镜头最远的", -1.0, 1.0),
+}  # fmt: skip
 # What people stand by, and how high over somebody's middle what is seen of it must be: of plants trees alone.
 LANDMARKS = {
     "Vegetation": ("tree", "树", 1.0), "Poles": ("post", "杆子", -np.inf), "Car": ("car", "汽车", -np.inf),
@@ -29,8 +33,7 @@ LANDMARKS = {
 }  # fmt: skip
 ORDER = ("figure", *SLOTS, *SIDES, *LANDMARKS)
 _WITH = (("in", ("top", "legs")), ("with", ("bag", "hat")))
-BY_M = 4.0  # who is as near as this is by something
-MARGIN_M, MARGIN_SHARE = 2.0, 0.05  # by which it or the side is another's less, m and of the picture's width
+BY_M, BY_MARGIN_M = 4.0, 2.0  # who is as near as this is by something; who is not is so much farther
 
 
 @dataclass(frozen=True)
@@ -63,9 +66,13 @@ class SeenFrame:
     intrinsic: np.ndarray
     rotation: np.ndarray
 
-    def column_px(self, number: int) -> float:
-        """Mean column of somebody's pixels."""
-        return float(np.nonzero(self.ids == number)[1].mean())
+    def column_share(self, number: int) -> float:
+        """Mean column of somebody's pixels, of the picture's width."""
+        return float(np.nonzero(self.ids == number)[1].mean()) / self.ids.shape[1]
+
+    def depth_m(self, number: int) -> float:
+        """How far away somebody's pixels are, in the middle."""
+        return float(np.median(self.depth[self.ids == number]))
 
     def distance_m(self, number: int, kind: str) -> float:
         """From somebody to what is seen of a kind, over the ground; infinity where nothing is."""
@@ -94,9 +101,11 @@ def _off(relation: str, numbers: Collection[int], picture: SeenFrame) -> dict[in
     """Tell how far people are from a relation, not above 0 where it holds: m, or shares of the picture's width."""
     if relation in LANDMARKS:
         return {n: picture.distance_m(n, relation) - BY_M for n in numbers}
-    width_px = picture.ids.shape[1] * (-1 if relation == "right" else 1)
-    shares = {n: picture.column_px(n) / width_px for n in numbers}
-    return {n: share - min(shares.values()) for n, share in shares.items()}
+    sign = -1.0 if relation in ("right", "far") else 1.0
+    where = {
+        n: sign * (picture.depth_m(n) if relation in ("near", "far") else picture.column_share(n)) for n in numbers
+    }
+    return {n: one - min(where.values()) for n, one in where.items()}
 
 
 def find_says(
@@ -122,7 +131,7 @@ def find_says(
         return best and best[1]
     for relation in (*SIDES, *LANDMARKS):
         off = _off(relation, {PERSON_ID, *best[0]}, picture)
-        own, margin = off.pop(PERSON_ID), MARGIN_SHARE if relation in SIDES else MARGIN_M
+        own, margin = off.pop(PERSON_ID), SIDES[relation][3] if relation in SIDES else BY_MARGIN_M
         if own <= 0.0 and min(off.values()) >= max(own + margin, 1e-9):
             return (*best[1], relation)
     return None
@@ -142,7 +151,7 @@ def otherwise(looks: Appearance, slot: str) -> Appearance:
 def words_of(says: Sequence[str], looks: Appearance) -> Words:
     """Say it in both languages."""
     noun = FIGURES[looks.figure] if "figure" in says else {"en": "person", "zh": "行人"}
-    side = next((SIDES[one] for one in says if one in SIDES), ("", ""))
+    side = next((SIDES[one] for one in says if one in SIDES), ("", "", 0.0, 0.0))
     mark = next((LANDMARKS[one] for one in says if one in LANDMARKS), ("", "", 0.0))
 
     def worn(slot: str, language: Language) -> str:

@@ -13,7 +13,7 @@ read-write round trip.
 from __future__ import annotations
 
 import copy
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import asdict, astuple, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations
 from cosfly.products.columns import is_number
 from cosfly.products.frames import ANGLES, COORDINATES, FRAME_FILES, FRAMES_DIR, XYZ, Camera, frame_name, frame_path
+from cosfly.products.goals import Goal
 from cosfly.products.motion import PlannedMotion, without_perturbation
 from cosfly.products.people import People
 from cosfly.products.places import place_of, tree_of_flight
@@ -46,6 +47,7 @@ from cosfly.reading.documents import read_json
 from cosfly.work.store import write_json
 
 ORIGINAL = "ORI"  # the folder of a clean flight
+TARGET_FILE = "target.png"  # of a flight: the person of its goal, cut out of the frame that this is true of
 TREE_ACTION = ("forward_mps", "right_mps", "up_mps", "yaw_rate_degps", "gimbal_pitch_deg")  # motion.ACTION, mirrored
 LEGIBILITY = ("height_px", "contrast", "legible")  # of a point's target: cosfly/render/camera.py
 EVENTS = ("position", "rotation")  # of a frame of a perturbed flight; what became of them: docs/files.md
@@ -78,7 +80,7 @@ class Flight:
     3, 3) of a camera that zooms, frame by frame, `camera` is that of the first; None where it is that of all. Who
     projects asks `camera_at`. between: (n, k - 1, 6) planned poses after each frame and before the next, of a flight
     that was planned at k times the rate of its frames; NaN after the last. people: what they look like, None
-    where the file does not say.
+    where the file does not say. goal: whom to follow, None where nothing tells the target from others.
     """
 
     town: str
@@ -112,6 +114,7 @@ class Flight:
     intrinsics: np.ndarray | None = None
     between: np.ndarray | None = None
     people: People | None = None
+    goal: Goal | None = None
     given_id: str | None = None  # where flights of several towns or runs share the plain one (places.py)
 
     def __len__(self) -> int:
@@ -319,6 +322,7 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
         segments=segments,
         mission=mirrored(mission),
         people=people,
+        goal=reader.goal(raw, len(points)),
     )
 
 
@@ -338,6 +342,8 @@ def write_flight(folder: Path, flight: Flight) -> None:
     raw.update(flown_as_json(flight.segments, mirrored(flight.mission)))
     if flight.people is not None:
         raw["people"] = flight.people.as_json()
+    if flight.goal is not None:
+        raw["goal"] = asdict(flight.goal)
     camera = flight.camera
     raw["camera"] = {**object_of(raw, "camera"), "width": camera.width_px, "height": camera.height_px, **_focal(camera)}
     raw["augmentation"] = {

@@ -13,6 +13,7 @@ from cosfly.errors import InputError
 from cosfly.geometry import step_s
 from cosfly.products.columns import is_number, numbers
 from cosfly.products.frames import ANGLES, XYZ, Camera
+from cosfly.products.goals import Goal
 from cosfly.products.people import People
 from cosfly.products.segments import Mission, Segment, read_mission, read_segments
 from cosfly.products.weather import WeatherRecord
@@ -144,6 +145,13 @@ class FieldReader:
         """What people look like, None where nothing is said; somebody else's field of this name is noted and left."""
         with self.noted():
             return People.from_json(raw["people"], f"{self.path}: people") if "people" in raw else None
+        return None
+
+    def goal(self, raw: dict, num_points: int) -> Goal | None:
+        """The goal in words, None where there is none; somebody else's field of this name is noted and left."""
+        with self.noted():
+            if raw.get("goal") is not None and "absent" not in object_of(raw, "goal"):
+                return Goal.from_json(raw["goal"], num_points, f"{self.path}: goal")
         return None
 
     def camera(self, group: Any) -> Camera:

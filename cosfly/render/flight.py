@@ -18,7 +18,8 @@ from cosfly.look.overlay import Overlay
 from cosfly.products import frames
 from cosfly.products.frames import Camera, DepthFormat, FrameFile, FrameMeta, Look, OthersMeta, TargetMeta, frame_name
 from cosfly.products.kinds import KINDS
-from cosfly.products.playback import LEGIBILITY, Flight, write_flight
+from cosfly.products.people import Appearance
+from cosfly.products.playback import LEGIBILITY, TARGET_FILE, Flight, write_flight
 from cosfly.products.segments import Mission, Segment
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
@@ -35,6 +36,7 @@ from cosfly.render.camera import (
 )
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
 from cosfly.render.effects import Effects, bent
+from cosfly.render.goal import MOST_TRIED, find_goal, target_picture
 from cosfly.render.person import Cast, Gait
 from cosfly.render.perturbation import HIDDEN, STEP_UP_M, PerturbedTrack, Poses, Surroundings
 from cosfly.space.kernels import signed_distances
@@ -172,10 +174,16 @@ def render_flight(
                 take(pending.pop(0))
         for written in pending:
             take(written)
-    flight = _flight(script, targets, np.array(visibility))
+    flight = _with_goal(_flight(script, targets, np.array(visibility)), renderer, script, writing.visible_threshold)
     write_flight(folder, flight)
     write_json(folder / "perturbation_report.json", _report(script.perturbed))
-    for name in ("trajectory.json", "perturbation_report.json"):
+    made = ["trajectory.json", "perturbation_report.json"]
+    if flight.goal is not None and "rgb" in writing.files:
+        box, shown = targets[flight.goal.frame].mask_bbox_2d, frames.read_rgb(folder / frame_name(flight.goal.frame))
+        assert box is not None, "it is legible"
+        (folder / TARGET_FILE).write_bytes(frames.rgb_bytes(target_picture(shown, box)))
+        made.append(TARGET_FILE)
+    for name in made:
         digests[name] = sha256_file(folder / name)
     write_checksums(folder, digests)
     return flight
@@ -199,6 +207,23 @@ def draw_frame(
         hidden = hidden_shares(frame, target, view, pose, camera, ids)
         told = script.others.meta(i, frame, *hidden)
     return frame, TargetSight(view, mask_box(frame.ids == PERSON_ID), score, num_px, is_visible, told)
+
+
+def _with_goal(flight: Flight, renderer: Renderer, script: FlightScript, threshold: float) -> Flight:
+    """Add the goal, of the first frame in which the target can be made out and told apart, or why there is none."""
+    poses, people = script.perturbed.poses, script.others.people(script.clothes.looks)
+    legible = [i for i in range(len(flight)) if flight.told_legibility(i)["legible"]]
+    for i in legible[:MOST_TRIED]:
+
+        def draw(looks: Appearance, i: int = i) -> Frame:
+            dressed = replace(script, clothes=replace(script.clothes, looks=looks))
+            return draw_frame(renderer, dressed, i, poses, threshold)[0]
+
+        rotation = world_from_camera(poses.positions_m[i], poses.rotations_deg[i])[:3, :3]
+        if goal := find_goal(people, i, draw, script.cameras[i].intrinsic, rotation):
+            return replace(flight, goal=goal)
+        advance()
+    return replace(flight, raw=flight.raw | {"goal": {"absent": "not_told_apart" if legible else "never_legible"}})
 
 
 # --- files of one frame -----------------------------------------------------------------------------------------------

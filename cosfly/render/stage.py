@@ -197,6 +197,7 @@ def run(
         num_traces=len(all_traces),
         num_traces_not_rendered=len(all_traces) - len(passed),
         num_boxes_sharing_an_id=num_shared,
+        goals=dict(sorted(Counter(one.goal for one in made).items())),
         **_weather_drawn(cfg, made),
     )
     return out
@@ -239,6 +240,7 @@ class _RenderedFlight(BaseModel):
 
     folder: str
     num_frames: int
+    goal: str = "absent"
     weather: str | None = None
     time_of_day: str | None = None
     weather_seed: int | None = None
@@ -369,6 +371,7 @@ def make_worker(
                 "num_visible": int(flight.target_visible.sum()),
                 "mean_visibility": round(float(flight.visibility.mean()), 6),
                 "num_perturbed": int(flight.is_perturbed.sum()),
+                "goal": flight.raw["goal"]["absent"] if flight.goal is None else "told",
                 **({} if script.weather is None else _weather_told(script.weather, cfg.weather_seed)),
             }
         )

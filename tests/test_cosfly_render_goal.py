@@ -1,0 +1,106 @@
+"""Goals of drawn flights: nothing is said that the picture does not show, and of all in it they mean the target alone."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from test_cosfly_render import needs_gl
+from test_renderers_contract import circling, pose_towards, write_inputs
+
+from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.products.boxes import make_box_map
+from cosfly.products.flights import find_flights
+from cosfly.products.frames import PERSON_ID, read_depth, read_instance, read_rgb
+from cosfly.products.goals import LANDMARKS, SIDES, SeenFrame, meant, words_of
+from cosfly.products.kinds import KINDS
+from cosfly.products.others import Company, Other, write_others
+from cosfly.products.people import Appearance, People
+from cosfly.products.playback import TARGET_FILE, read_flight
+from cosfly.reading.arrays import read_picture
+from cosfly.render.contract import Frame, PosedOther, PosedPerson, other_id
+from cosfly.render.goal import are_told_apart, find_goal, target_picture
+from cosfly.render.person import choose_clothes
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import open_renderer, run
+from cosfly.work.config import build
+
+LOOKS = Appearance("man", "jacket", "blue", "trousers", "red")
+
+
+@needs_gl
+@pytest.mark.parametrize(("y_m", "says_legs"), [(8.0, True), (-8.0, False)])
+def test_what_a_wall_hides_is_not_said(y_m, says_legs):
+    """Two men whose trousers alone differ; to the south of them is a wall as high as their hips."""
+    people = People(LOOKS, {other_id(0): replace(LOOKS, legs_color="yellow")})
+    clothes = choose_clothes(np.random.default_rng(0), LOOKS)
+    wall = make_box_map([[0.0, -1.5, 0.5]], [[9.0, 0.1, 0.5]], [[0.0] * 3], [KINDS["Walls"]])
+    intrinsic, renderer = intrinsic_matrix(320, 180, 60.0), open_renderer("gl", wall, 320, 180, num_others=1)
+    hips_m, (low_m, high_m) = np.array([[0.0, 0.0, 0.9], [1.5, 0.0, 0.9]]), np.array([[-30.0] * 3, [30.0] * 3])
+    renderer.prepare(low_m, high_m)
+    pose = pose_towards([0.2, y_m, 1.3], hips_m[0])
+
+    def draw(looks: Appearance) -> Frame:
+        dressed = [replace(clothes, looks=one) for one in (looks, people.others[other_id(0)])]
+        bodies = [PosedPerson(hip_m, 0.0, 0.5, 1.0, one) for hip_m, one in zip(hips_m, dressed, strict=True)]
+        return renderer.render(pose, intrinsic, bodies[0], [PosedOther(other_id(0), bodies[1])])
+
+    goal = find_goal(people, 3, draw, intrinsic, pose[:3, :3])
+    renderer.close()
+    assert goal is not None
+    assert goal.frame == 3
+    assert ("legs" in goal.says) == says_legs
+    assert bool({*goal.says} & {*SIDES, *LANDMARKS}) != says_legs  # where they are hidden, a place is said
+
+
+def test_few_pixels_and_pale_differences_tell_nobody_apart():
+    ids, grey = np.zeros((20, 20), np.uint16), np.full((20, 20, 3), 100, np.uint8)
+    ids[5:15, 5:15] = PERSON_ID
+    other = grey.copy()
+    other[5:6, 5:12] = 250  # 7 of 100
+    frames = [Frame(rgb, np.ones((20, 20), np.float32), np.zeros((20, 20), np.uint8), ids) for rgb in (grey, other)]
+    assert not are_told_apart(*frames)
+    other[5:6, 5:14] = 250
+    assert are_told_apart(*frames)
+    other[5:15, 5:15] = 105
+    assert not are_told_apart(*frames)
+    other[5:15, 5:15], other[0:5] = 100, 250  # beside the person
+    assert not are_told_apart(*frames)
+
+
+@needs_gl
+def test_of_all_in_a_crowd_a_goal_means_the_target_alone(tmp_path):
+    traces = [circling(3, f"path_{k:03d}") for k in range(2)]
+    places_m = [[x, y, -0.9] for x in (-4.0, -1.5, 1.0, 3.5) for y in (-2.0, 2.0)]
+    crowd = [
+        Other("Pedestrians", trace.targets_m + place_m, np.zeros(3), k < 4)
+        for trace in traces for k, place_m in enumerate(places_m)
+    ]  # fmt: skip
+    write_others(tmp_path / "others.json", [Company(t.path_id, crowd[i * 8 :][:8]) for i, t in enumerate(traces)], {})
+    cfg = build(RenderConfig, {"width_px": 320, "height_px": 180, "fovs_deg": [60.0]}, "test")
+    tree = run(cfg, *write_inputs(tmp_path / "in", traces), tmp_path / "out", seed=2, others=tmp_path / "others.json")
+    flights = [read_flight(folder) for folder in find_flights(tree)]
+    assert len(flights) == 4
+    for flight in flights:
+        goal, people = flight.goal, flight.people
+        assert goal is not None
+        assert people is not None
+        frame = flight.frame_folder(goal.frame)
+        kinds, ids = read_instance(frame)
+        rotation = world_from_camera(flight.positions_m[goal.frame], flight.rotations_deg[goal.frame])[:3, :3]
+        seen = SeenFrame(kinds, ids, read_depth(frame), flight.camera_at(goal.frame).intrinsic, rotation)
+        assert len({*people.others} & {*np.unique(ids).tolist()}) > 1, "no crowd"
+        assert meant(goal.says, people.target, {PERSON_ID: people.target, **people.others}, seen) == {PERSON_ID}
+        assert {"en": goal.en, "zh": goal.zh} == words_of(goal.says, people.target)
+        assert all(not flight.told_legibility(i)["legible"] for i in range(goal.frame)) or goal.frame == 0
+        shown = read_picture(flight.folder / TARGET_FILE, tree=tree)
+        expected = target_picture(read_rgb(frame), flight.target_mask_bbox[goal.frame].tolist())
+        np.testing.assert_array_equal(cv2.cvtColor(shown, cv2.COLOR_BGR2RGB), expected)
+
+
+def test_a_target_picture_holds_the_person_and_stays_inside():
+    rgb = np.zeros((90, 160, 3), np.uint8)
+    rgb[40:60, 0:10] = 255
+    assert target_picture(rgb, [0.0, 40.0, 10.0, 60.0]).max() == 255
+    assert max(target_picture(rgb, [0.0, 40.0, 10.0, 60.0]).shape) == 160
+    assert target_picture(np.zeros((900, 900, 3), np.uint8), [300.0, 300.0, 400.0, 600.0]).shape == (450, 450, 3)
