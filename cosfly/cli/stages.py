@@ -17,18 +17,46 @@ Simplification = Annotated[Path, Option(help="Simplification map: step2_simplifi
 Traces = Annotated[Path, Option(help="Flights: drone_trace.json.")]
 
 
-@app.command()
+maps_app = options.stage_group("Step 1: a map of boxes.")
+app.add_typer(maps_app, name="maps")
+
+
+@maps_app.callback()
 @takes("town", "seed", "resume")
 def maps(
     job: Job,
     out: options.Out,
-    source: Annotated[str | None, Option(help="synthetic, simworld, cityjson or boxes."), Sets("maps.source")] = None,
+    source: Annotated[
+        str | None, Option(help="synthetic, simworld, cityjson, boxes or carla."), Sets("maps.source")
+    ] = None,
 ) -> None:
     """Step 1: make boxes_3d.json from a map source."""
     from cosfly.maps import stage
 
     cfg = job.cfg
     job.finish(stage.run(cfg.maps, out, seed=cfg.seed, resume=job.resume, follow_links=cfg.follow_links), out)
+
+
+@maps_app.command("carla")
+@takes("resume")
+def maps_carla(
+    job: Job,
+    out: options.Out,
+    host: Annotated[str | None, Option(help="Where the server is."), Sets("maps.carla.host")] = None,
+    port: Annotated[int | None, Option(help="Its port of calls."), Sets("maps.carla.port")] = None,
+    town: Annotated[str | None, Option(help="Town to load, as Town10HD_Opt."), Sets("maps.carla.town")] = None,
+) -> None:
+    """The town of a running CARLA server as boxes_3d.json, and a table of its categories."""
+    from cosfly.maps import stage
+    from cosfly.maps.carla_export import histogram
+    from cosfly.products.boxes import read_boxes
+    from cosfly.work.console import console
+
+    cfg = job.cfg.maps.model_copy(update={"source": "carla"})
+    product = stage.run(cfg, out, seed=job.cfg.seed, resume=job.resume)
+    head = ("category", "boxes", "share", "Town10HD_Opt in the paper")
+    options.tell_table(console, head, histogram(read_boxes(product)))
+    job.finish(product, out)
 
 
 @app.command()

@@ -12,8 +12,9 @@ import numpy as np
 from pydantic import Field
 
 from cosfly.look.topview import TopView, draw_map, png_bytes
-from cosfly.maps import boxfile, cityjson, simworld, synthetic
+from cosfly.maps import boxfile, carla_export, cityjson, simworld, synthetic
 from cosfly.maps.boxfile import BoxesConfig
+from cosfly.maps.carla_export import CarlaMapConfig
 from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.synthetic import SyntheticConfig
@@ -29,18 +30,21 @@ log = logging.getLogger(__name__)
 
 SOURCES: dict[str, Callable[[Any, int], BoxMap]] = {
     "synthetic": synthetic.load, "simworld": simworld.load, "cityjson": cityjson.load,
-    "boxes": boxfile.load,
+    "boxes": boxfile.load, "carla": carla_export.load,
 }  # fmt: skip
 
 
 class MapsConfig(Config):
     """Where the map comes from."""
 
-    source: Literal["synthetic", "simworld", "cityjson", "boxes"] = Field("synthetic", description="what to read")
+    source: Literal["synthetic", "simworld", "cityjson", "boxes", "carla"] = Field(
+        "synthetic", description="what to read"
+    )
     synthetic: SyntheticConfig = Field(default_factory=SyntheticConfig, description="the seeded town")
     simworld: SimWorldConfig = Field(default_factory=SimWorldConfig, description="a SimWorld world with asset sizes")
     cityjson: CityJsonConfig = Field(default_factory=CityJsonConfig, description="a CityJSON city model")
     boxes: BoxesConfig = Field(default_factory=BoxesConfig, description="boxes of your own: JSON, CSV or GeoJSON")
+    carla: CarlaMapConfig = Field(default_factory=CarlaMapConfig, description="the town of a running CARLA server")
     picture_px: int = Field(1200, ge=200, le=8000, description="longer side of the overview picture, px")
     mesh_triangles: MayDiffer[int] = Field(
         MOST_TRIANGLES, ge=1, description="most triangles of a file of meshes, and of all that the map draws of them"

@@ -1,0 +1,195 @@
+"""The town of a running CARLA server: `get_environment_objects` of every label, as boxes (sec:step1).
+
+The client can crash, so it lives in a process of its own. A building is several boxes there, as intended. What else is
+known of such exports is counted and told: labels without objects, objects twice, ids twice, boxes of no size, and one
+huge box round all of the terrain or the vegetation; and roads without anything beside them, as on large maps, of which
+the server has only the tiles around the spectator in memory.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydantic import Field
+
+from cosfly.errors import EnvironmentMissing, InputError
+from cosfly.products.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_box_map
+from cosfly.products.kinds import KINDS
+from cosfly.unreal.carla_client import CarlaConfig, connect
+from cosfly.unreal.conventions import world_pose
+from cosfly.work.store import sha256_bytes
+
+log = logging.getLogger(__name__)
+
+HUGE_KINDS, SLAB_M = ("Terrain", "Vegetation"), 2.0  # what is lower is ground to stand on
+ROAD_STEP_M, BESIDE_M = 25.0, 60.0  # of points on roads, and how near a box counts as beside one
+SLOPE_M = 1.0  # roads of heights that differ more are no flat ground
+# Boxes of Town10HD_Opt by category (tab:box_categories).
+PAPER_COUNTS = {
+    "Vegetation": 62581, "Poles": 880, "Buildings": 781, "Static": 667, "Other": 287, "Fences": 148,
+    "TrafficSigns": 147, "TrafficLight": 62, "Walls": 34, "Terrain": 23, "RailTrack": 4,
+}  # fmt: skip
+
+
+class CarlaMapConfig(CarlaConfig):
+    """The town of a running CARLA server."""
+
+    name: str | None = Field(None, min_length=1, description="map name; null takes the town's")
+    licence: LicenceId = Field("cc-by-4.0", description="licence, as the hub spells it; goes into every release")
+    credits: str = Field("CARLA Simulator, Computer Vision Center", description="who must be named: the town's makers")
+    ground_z_m: float | None = Field(None, description="height of the ground, m; null takes the roads' median top")
+    huge_m: float = Field(
+        150.0,
+        gt=0,
+        description="terrain or vegetation longer than this both ways is left out and counted, m; low slabs stay",
+    )
+
+    def inputs(self) -> dict:
+        return {}
+
+
+@dataclass
+class CarlaTown:
+    """What the server told, in its own axes. rows: label's name, id, name of the object, and 9 numbers of its box."""
+
+    town: str
+    version: str
+    rows: list[tuple[str, int, str, tuple[float, ...]]] = field(default_factory=list)
+    empty_labels: list[str] = field(default_factory=list)
+    road_points_m: list[tuple[float, float, float]] = field(default_factory=list)
+
+
+def ask(cfg: CarlaConfig) -> CarlaTown:
+    """Ask the server for everything; in a process of its own."""
+    connection = connect(cfg, cfg.port)
+    told = CarlaTown(connection.town, connection.version)
+    labels = connection.carla.CityObjectLabel.names.items()
+    with connection.asking("the objects were not given"):
+        for name, label in sorted(labels, key=lambda pair: int(pair[1])):
+            if name == "Any":
+                continue
+            objects = connection.world.get_environment_objects(label)
+            if not objects:
+                told.empty_labels.append(name)
+            for one in objects:
+                place, half, turn = one.bounding_box.location, one.bounding_box.extent, one.bounding_box.rotation
+                box = (place.x, place.y, place.z, half.x, half.y, half.z, turn.pitch, turn.yaw, turn.roll)
+                told.rows.append((name, one.id, one.name, box))
+        for waypoint in connection.world.get_map().generate_waypoints(ROAD_STEP_M):
+            place = waypoint.transform.location
+            told.road_points_m.append((place.x, place.y, place.z))
+    return told
+
+
+def load(cfg: CarlaMapConfig, seed: int) -> BoxMap:
+    """Give the town's boxes; the seed changes nothing.
+
+    Raises:
+        EnvironmentMissing: there is no server, or its client crashes. ConfigError: no such town.
+        InputError: it has no objects.
+    """
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        try:
+            told = pool.submit(ask, cfg).result()
+        except BrokenProcessPool:
+            what, fix = "the client of CARLA crashed", "see that the server is CARLA 0.9.16, then try again"
+            raise EnvironmentMissing(what, where=f"{cfg.host}:{cfg.port}", fix=fix) from None
+    return box_map_of(told, cfg)
+
+
+def box_map_of(told: CarlaTown, cfg: CarlaMapConfig) -> BoxMap:
+    """Make a map of what a server told; what is left out is counted in the header."""
+    where = f"{cfg.host}:{cfg.port} (CARLA {told.version}), {told.town}"
+    dropped, seen, ids, num_repeated = Counter[str](), set(), set[int](), 0
+    centers, halves, turns, kinds = [], [], [], []
+    numbers = list[int]()
+    for label, number, name, box in told.rows:
+        key = (label, *np.round(box, 3).tolist())
+        if reason := _unfit(label, np.array(box), cfg) or ("duplicate" if key in seen else ""):
+            dropped[reason] += 1
+            continue
+        seen.add(key)
+        if number in ids:
+            num_repeated += 1
+            number = int(sha256_bytes(f"{number} {name} {key}".encode())[:16], 16)
+        ids.add(number)
+        position_m, rotation_deg = world_pose((*box[:3], *box[6:]))
+        centers.append(position_m)
+        halves.append(box[3:6])
+        turns.append(rotation_deg)
+        kinds.append(KINDS[label])
+        numbers.append(number)
+    if not numbers:
+        expected = "objects of get_environment_objects"
+        raise InputError("the town has no objects", where=where, got=f"{len(told.rows)}", expected=expected)
+    header = MapHeader(
+        name=cfg.name or told.town,
+        source=MapSource(tool="CARLA", version=told.version, file=told.town),
+        licence=cfg.licence,
+        credits=cfg.credits,
+        extent_sources={"engine": len(numbers)},
+        num_objects=len(told.rows),
+        dropped_objects=dict(dropped),
+        empty_labels=told.empty_labels,
+        repeated_ids=num_repeated,
+    )
+    box_map = make_box_map(centers, halves, turns, kinds, numbers, header)
+    tops_m = box_map.maxs[box_map.kinds == KINDS["Roads"], 2]
+    ground_z_m = cfg.ground_z_m if cfg.ground_z_m is not None else float(np.median(tops_m)) if len(tops_m) else 0.0
+    box_map = make_box_map(centers, halves, turns, kinds, numbers, header.model_copy(update={"ground_z_m": ground_z_m}))
+    _tell(told, box_map, where, tops_m)
+    return box_map
+
+
+def _unfit(label: str, box: np.ndarray, cfg: CarlaMapConfig) -> str:
+    """Why a box tells nothing; "" if it does."""
+    if not np.isfinite(box).all():
+        return "not finite"
+    if (box[3:6] <= 0).sum() > 1 or (box[3:6] < 0).any():
+        return "no size"
+    is_huge = label in HUGE_KINDS and (2 * box[3:5] > cfg.huge_m).all() and 2 * box[5] > SLAB_M
+    return "huge" if is_huge else ""
+
+
+def _tell(told: CarlaTown, box_map: BoxMap, where: str, tops_m: np.ndarray) -> None:
+    """Tell what is known to be odd in such exports, where it is so."""
+    header = box_map.header
+    if told.empty_labels:
+        log.info("%s: no objects of %s", where, ", ".join(told.empty_labels))
+    if header.dropped_objects:
+        log.warning("%s: left out: %s", where, header.dropped_objects)
+    if num := header.model_extra and header.model_extra["repeated_ids"]:
+        log.warning("%s: %d objects had the id of another and got one of their own", where, num)
+    if len(tops_m) and np.ptp(tops_m) > SLOPE_M:
+        what = "%s: roads lie %.1f to %.1f m high, and the map's ground is flat at %.1f m: walks there leave the road"
+        log.warning(what, where, tops_m.min(), tops_m.max(), header.ground_z_m)
+    roads_m = [world_pose((*place, 0.0, 0.0, 0.0))[0][:2] for place in told.road_points_m]
+    low_m, high_m = box_map.mins[:, :2], box_map.maxs[:, :2]
+    gaps_m = [np.maximum(low_m - place, place - high_m).max(axis=1).min() for place in roads_m]
+    if num := sum(gap > BESIDE_M for gap in gaps_m):
+        what = (
+            "%s: %d of %d places on roads have no object within %.0f m: on a large map only tiles near the spectator do"
+        )
+        log.warning(what, where, num, len(roads_m), BESIDE_M)
+
+
+def histogram(box_map: BoxMap) -> list[tuple[str, str, str, str]]:
+    """Rows of a table: category, boxes, share, and the paper's boxes of Town10HD_Opt."""
+    counts = box_map.counts()
+    names = [*counts, *(name for name in PAPER_COUNTS if name not in counts)]
+    rows = [
+        (
+            name,
+            f"{counts.get(name, 0):,}",
+            f"{counts.get(name, 0) / len(box_map):.2%}",
+            f"{PAPER_COUNTS.get(name, 0):,}",
+        )
+        for name in names
+    ]
+    return [*rows, ("all", f"{len(box_map):,}", "100%", f"{sum(PAPER_COUNTS.values()):,}")]
