@@ -26,7 +26,7 @@ from cosfly.products.traces import DroneTrace
 from cosfly.render.contract import Frame
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.settings import RenderConfig
-from cosfly.render.stage import open_renderer
+from cosfly.render.stage import renderer_of
 from cosfly.render.weather import WeatherConfig, drawn_seed, read_pools, weather_of
 from cosfly.simplify.passes import SimplifyConfig, simplify
 from cosfly.work.chance import rng_for
@@ -40,7 +40,7 @@ OF_PACE = {
     "cruise_speed_mps", "curvature_gain_m", "speed_jitter", "min_speed_mps", "max_speed_mps", "pace", "hurry_speed_mps",
     "dt_s",
 }  # fmt: skip
-OF_PICTURE = {"backend", "look", "mesh_triangles", *WeatherConfig.model_fields}
+OF_PICTURE = {"backend", "look", "mesh_triangles", "rim", *WeatherConfig.model_fields}
 STEP_S = 0.5  # between the places of `render_frames`, for the person's stride
 FILE_SETTING = {"simworld": "world", "cityjson": "path", "boxes": "path"}  # of a source: which setting names its file
 
@@ -165,7 +165,7 @@ def render_frames(
     intrinsic = intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg)
     gait = None if targets is None else gait_of(targets, STEP_S * np.arange(len(targets)))
     clothes = choose_clothes(rng_for(seed, "render", "library"))
-    renderer = open_renderer(cfg.backend, box_map, cfg.width_px, cfg.height_px, cfg.look, 0, cfg.mesh_triangles)
+    renderer = renderer_of(cfg, box_map, seed)
     try:
         knobs = None if weather is None else weather.params
         renderer.prepare(positions.min(axis=0), positions.max(axis=0), knobs)

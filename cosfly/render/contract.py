@@ -8,6 +8,7 @@ Any renderer draws the same things in the same places, so that depth, kinds and 
 - a ground plane of Terrain under everything (`ground_plane`) or, on ground that slopes, its triangles and surfaces
   (draping.py) with the plane below their lowest place; and sky where nothing stands between NEAR_M and FAR_M
   (`far_as_sky`);
+- what lies beyond the map, where it is asked for (rim.py), with nobody's id;
 - of coplanar surfaces the one of the higher layer, and of one layer always the same one (draping.py).
 """
 
@@ -31,12 +32,13 @@ DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"  # OpenGL without a window, o
 
 NEAR_M, FAR_M = 0.3, SKY_DEPTH_M  # clip planes (sec:step5)
 
-# Instance ids of the 16 bits that instance.png has, beside PERSON_ID: 0 is nobody (sky, ground plane).
+# Instance ids of the 16 bits that instance.png has, beside PERSON_ID: 0 is nobody (sky, ground plane, rim).
 SHARED_ID, MAX_BOX_ID = 65534, 65533
 NO_INSTANCE = 0
 
 GROUND_PLANE_HALF_M = 1500.0
 GROUND_PLANE_DROP_M = 0.02  # under the lowest slab, so that the two never fight for a pixel
+UNDER_RIM_M = 0.5
 
 # A layer moves the depth *test* by LAYER_STEP of the distance, never the depth written (kinds.LAYERS).
 LAYER_STEP = 1e-4
@@ -114,10 +116,10 @@ class PosedOther:
 
 
 class Renderer(Protocol):
-    """Draws frames of one map. `RENDERERS[name](box_map, width_px, height_px, look, num_others)` opens one; used from
-    one thread.
+    """Draws frames of one map. `RENDERERS[name](box_map, width_px, height_px, look, num_others, rim)` opens one; used
+    from one thread.
 
-    num_others: ids of `other_id` that no box may have.
+    num_others: ids of `other_id` that no box may have. rim: boxes beyond the map (rim.py), without ids.
 
     device: what draws, one line. Opening raises EnvironmentMissing where a package or driver is not there.
     """
@@ -189,6 +191,14 @@ def instance_ids(box_map: BoxMap, num_others: int = 0) -> np.ndarray:
     return ids
 
 
+def with_rim(box_map: BoxMap, num_others: int, rim: BoxMap | None) -> tuple[BoxMap, np.ndarray]:
+    """Give all boxes to draw, n, and the id of each for `instance.png`, (n,) uint16: NO_INSTANCE of the rim's."""
+    ids = instance_ids(box_map, num_others)
+    if rim is None:
+        return box_map, ids
+    return box_map.joined(rim), np.append(ids, np.full(len(rim), NO_INSTANCE, np.uint16))
+
+
 def scene_origin(box_map: BoxMap) -> np.ndarray:
     """A whole-metre place in the middle of a map, (3,) world: what a GPU computes in float32 is best relative to it."""
     low, high = box_map.bounds() if len(box_map) else (np.zeros(3), np.zeros(3))
@@ -203,10 +213,14 @@ def plane_z_m(box_map: BoxMap) -> float:
     return float(tops.min(initial=box_map.header.ground_z_m))
 
 
-def ground_plane(box_map: BoxMap) -> tuple[np.ndarray, np.ndarray]:
-    """Centre and half sizes, (3,) each, world, of the flat box of Terrain under everything; its id is NO_INSTANCE."""
+def ground_plane(box_map: BoxMap, rim: BoxMap | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Centre and half sizes, (3,) each, world, of the flat box of Terrain under everything; its id is NO_INSTANCE.
+
+    Under a rim, whose fields lie in its place, it is deeper: so large a triangle is drawn to some centimetres.
+    """
     x, y, _ = scene_origin(box_map)
-    center = np.array([x, y, plane_z_m(box_map) - GROUND_PLANE_DROP_M - 0.5])
+    drop_m = GROUND_PLANE_DROP_M + (0.0 if rim is None else UNDER_RIM_M)
+    center = np.array([x, y, plane_z_m(box_map) - drop_m - 0.5])
     return center, np.array([GROUND_PLANE_HALF_M, GROUND_PLANE_HALF_M, 0.5])
 
 

@@ -81,7 +81,9 @@ def _keep_display(platform: Any) -> None:
 class PyrenderRenderer:
     """Draws a map as plain boxes and round crowns. Positions on the device are relative to the map's middle."""
 
-    def __init__(self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0) -> None:
+    def __init__(
+        self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0, rim: BoxMap | None = None
+    ) -> None:
         self._screen, self._look = _open_screen(width_px, height_px), look
         import pyrender
         from OpenGL.GL import GL_RENDERER, glGetString
@@ -89,7 +91,7 @@ class PyrenderRenderer:
         self.device = f"pyrender, EGL, {glGetString(GL_RENDERER).decode()}"
         self._origin = contract.scene_origin(box_map)
         self._scene = pyrender.Scene()
-        self._scene.add(self._mesh(*_all_boxes(box_map, self._origin, num_others)))
+        self._scene.add(self._mesh(*_all_boxes(box_map, self._origin, num_others, rim)))
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
         """Nothing holds for a flight alone: there are no shadows, and no weather.
@@ -173,18 +175,21 @@ def _tags(kinds: np.ndarray, ids: np.ndarray, layers: np.ndarray) -> np.ndarray:
     return np.column_stack([kinds, ids & 255, ids >> 8, contract.LAYER_STEP * layers]).astype(np.float32)
 
 
-def _all_boxes(box_map: BoxMap, origin: np.ndarray, num_others: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _all_boxes(
+    town: BoxMap, origin: np.ndarray, num_others: int, rim: BoxMap | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Triangles, colours and tags of every box and the ground plane; crowns are ellipsoids, on stems."""
     import trimesh
 
-    center, half = contract.ground_plane(box_map)
+    center, half = contract.ground_plane(town, rim)
+    box_map, own_ids = contract.with_rim(town, num_others, rim)
     centers = np.vstack([box_map.centers, center]) - origin
     halves = np.maximum(np.vstack([box_map.half_extents, half]), 1e-3)
     turns = rotation_matrices(np.radians(np.vstack([box_map.rotations_deg, np.zeros(3)])))
     kinds = np.append(box_map.kinds, KINDS["Terrain"])
     table = np.tile(PLAIN_COLOR, (256, 1))
     table[[KINDS[name] for name in COLORS]] = list(COLORS.values())
-    ids = np.append(contract.instance_ids(box_map, num_others), np.uint16(NO_INSTANCE))
+    ids = np.append(own_ids, np.uint16(NO_INSTANCE))
     tags = _tags(kinds, ids, np.append(layers_of(box_map), 0))
     is_round, low = np.zeros(len(kinds), dtype=bool), np.full(len(kinds), -1.0)
     plants = np.flatnonzero(kinds == KINDS["Vegetation"])

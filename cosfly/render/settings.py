@@ -70,6 +70,11 @@ class RenderConfig(WeatherConfig):
         False, description="also write debug.png: boxes, ids and distances projected over the colour picture"
     )
     effects: EffectsConfig = Field(EffectsConfig(), description="what a camera does to the colours after drawing")
+    rim: bool = Field(
+        False,
+        description="draw fields, roads, low houses and a skyline beyond the map, in place of a lawn to the horizon; "
+        "flights must stay within 70 m of the map's bounds",
+    )
     visible_threshold: float = Field(
         0.1,
         ge=0,
@@ -84,9 +89,9 @@ class RenderConfig(WeatherConfig):
     )
 
     def recorded(self) -> dict[str, Any]:
-        """Without effects, the settings are those of before there were any."""
-        settings = super().recorded()
-        return {name: value for name, value in settings.items() if name != "effects" or self.effects.is_on}
+        """Without effects and a rim, the settings are those of before there were any."""
+        off = {name for name, is_on in (("effects", self.effects.is_on), ("rim", self.rim)) if not is_on}
+        return {name: value for name, value in super().recorded().items() if name not in off}
 
     @field_validator("fovs_deg")
     @classmethod

@@ -33,6 +33,7 @@ from cosfly.render.flight import FlightScript, Writing, check_flight, render_fli
 from cosfly.render.lens import cameras_of
 from cosfly.render.person import cast_of, choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbedTrack, Poses, Surroundings, perturb
+from cosfly.render.rim import check_outside_rim, rim_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.weather import coverage_of, drawn_seed, read_pools, told_coverage, weather_of
 from cosfly.work.chance import rng_for
@@ -58,6 +59,7 @@ def open_renderer(
     look: Look | None = None,
     num_others: int = 0,
     mesh_triangles: int = MOST_TRIANGLES,
+    rim: BoxMap | None = None,
 ) -> Renderer:
     """Open a renderer of the table for one map, of at most so many triangles of meshes, and at most so many others.
 
@@ -68,7 +70,15 @@ def open_renderer(
         raise ConfigError("unknown renderer", where="render.backend", got=name, expected=", ".join(RENDERERS))
     module, _, attribute = RENDERERS[name].partition(":")
     box_map = replace(box_map, meshes=replace(box_map.meshes, most_triangles=mesh_triangles))
-    return getattr(importlib.import_module(module), attribute)(box_map, width_px, height_px, look or Look(), num_others)
+    make = getattr(importlib.import_module(module), attribute)
+    return make(box_map, width_px, height_px, look or Look(), num_others, rim)
+
+
+def renderer_of(cfg: RenderConfig, box_map: BoxMap, seed: int, num_others: int = 0) -> Renderer:
+    """Open the renderer that the settings ask for."""
+    rim = rim_of(box_map, seed) if cfg.rim else None
+    size_px = cfg.width_px, cfg.height_px
+    return open_renderer(cfg.backend, box_map, *size_px, cfg.look, num_others, cfg.mesh_triangles, rim)
 
 
 # --- from traces to scripts -------------------------------------------------------------------------------------------
@@ -345,8 +355,7 @@ def make_worker(
     companies = _companies(others, all_traces)
     num_others = num_others_of(companies)
     drawn = read_boxes(boxes)
-    size_px, most = (cfg.width_px, cfg.height_px), cfg.mesh_triangles
-    renderer = open_renderer(cfg.backend, drawn, *size_px, cfg.look, num_others, most)
+    renderer = renderer_of(cfg, drawn, seed, num_others)
     pools = read_pools(cfg)
     overlay = Overlay(drawn, instance_ids(drawn, num_others)) if cfg.debug else None
     writing = Writing(tuple(cfg.modalities), cfg.visible_threshold, cfg.depth_format, overlay)
@@ -355,6 +364,8 @@ def make_worker(
         number, track = item.payload
         trace = all_traces[number]
         check_flight(trace, surroundings)
+        if cfg.rim:
+            check_outside_rim(trace, drawn)
         company = companies.get(trace.path_id)
         others = () if company is None else company.others
         weather = weather_of(cfg, pools, number)

@@ -20,7 +20,7 @@ from cosfly.render.contract import PosedPerson, Renderer
 from cosfly.render.flight import MARGIN_M
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.settings import RenderConfig
-from cosfly.render.stage import open_renderer
+from cosfly.render.stage import renderer_of
 from cosfly.render.weather import Pools, read_pools
 from cosfly.work.chance import rng_for
 from cosfly.work.store import write_bytes
@@ -71,7 +71,7 @@ def run(
         )
     box_map = read_boxes(boxes)
     check_ground(box_map, boxes)
-    renderer = open_renderer(cfg.backend, box_map, cfg.width_px, cfg.height_px, cfg.look, 0, cfg.mesh_triangles)
+    renderer = renderer_of(cfg, box_map, seed)
     try:
         pictures = _drawn(
             renderer, pools, trace, index, intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg), seed, advance

@@ -27,7 +27,7 @@ from cosfly.render.contract import Renderer
 from cosfly.render.flight import MARGIN_M, FlightScript, check_flight, draw_frame
 from cosfly.render.perturbation import Surroundings
 from cosfly.render.settings import RenderConfig
-from cosfly.render.stage import open_renderer, script_flight
+from cosfly.render.stage import renderer_of, script_flight
 from cosfly.work.chance import rng_for
 from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.work.stage_folder import Resume, StageFolder, result_of
@@ -172,9 +172,7 @@ def _edges(grey: np.ndarray) -> float:
 def make_worker(cfg: ZoomStudyConfig, boxes: Path, simplified: Path, traces: Path, seed: int) -> Work:
     """Worker factory: give the function that studies one flight."""
     surroundings, all_traces = Surroundings(read_boxes(simplified)), read_traces(traces)
-    renderer = open_renderer(
-        cfg.backend, read_boxes(boxes), cfg.width_px, cfg.height_px, cfg.look, 0, cfg.mesh_triangles
-    )
+    renderer = renderer_of(cfg, read_boxes(boxes), seed)
 
     def work(item: Item) -> Outcome:
         trace = all_traces[item.payload]
@@ -292,7 +290,7 @@ def run(
     summary = summarize(studied, cfg, rng_for(seed, STAGE, "intervals"))
     write_json(product, {**FORMAT.header, "map": box_map.name, "seed": seed, **summary})
     surroundings = Surroundings(read_boxes(simplified))
-    renderer = open_renderer(cfg.backend, box_map, cfg.width_px, cfg.height_px, cfg.look, 0, cfg.mesh_triangles)
+    renderer = renderer_of(cfg, box_map, seed)
     shown = [
         (script_flight(trace, k, "clean", "study", surroundings, cfg, seed), studied[trace.path_id].best_frame)
         for k, trace in passed

@@ -55,12 +55,14 @@ class _Look:
 class GlRenderer:
     """Draws a map on EGL. One object holds one GL context and belongs to the thread that made it."""
 
-    def __init__(self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0) -> None:
+    def __init__(
+        self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0, rim: BoxMap | None = None
+    ) -> None:
         self.context = open_context()
         driver = (str(self.context.info[f"GL_{name}"]) for name in ("VENDOR", "RENDERER", "VERSION"))
         self.device = ", ".join(("EGL", *driver))
         self._is_software = SOFTWARE in self.device
-        self.scene, self.look, self.num_others = build_scene(box_map, num_others), look, num_others
+        self.scene, self.look, self.num_others = build_scene(box_map, num_others, rim), look, num_others
         self.width_px, self.height_px = width_px, height_px
         with self.context:
             self._depth_program = self.context.program(*sources(("part.glsl", "depth.vert.glsl"), ("depth.frag.glsl",)))

@@ -17,10 +17,10 @@ from cosfly.render.contract import (
     STANDING_LAYER,
     chance,
     ground_plane,
-    instance_ids,
     plane_z_m,
     scene_origin,
     seeds_of,
+    with_rim,
 )
 from cosfly.render.draping import DrapedSurfaces, drape, is_draped, layers_of
 from cosfly.render.gl import meshes, parts
@@ -170,9 +170,9 @@ class Scene:
         return centers.min(axis=0) + self.origin_m, centers.max(axis=0) + self.origin_m
 
 
-def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
-    """Turn a map into drawable parts, with a ground plane under everything; the ids of others stay free."""
-    origin, all_ids = scene_origin(box_map), instance_ids(box_map, num_others)
+def build_scene(town: BoxMap, num_others: int = 0, rim: BoxMap | None = None) -> Scene:
+    """Turn a map and its rim into drawable parts, with a ground plane under everything; the ids of others stay free."""
+    origin, (box_map, all_ids) = scene_origin(town), with_rim(town, num_others, rim)
     solids, are_meshes = solids_of(box_map), are_solids(box_map)
     builder, lies = PartBuilder(), is_draped(box_map) & ~are_meshes
     # Surfaces on a slope are made as on a plain, so that they know their neighbours, and lifted afterwards.
@@ -180,7 +180,7 @@ def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
     centers[lies, 2] -= box_map.ground.height_at(box_map.centers[lies])
     lying = np.zeros(len(box_map), PART)
     tiers = layers_of(box_map) % 1.0
-    has_paint = bool((box_map.kinds == KINDS["RoadLines"]).any())
+    has_paint = bool((town.kinds == KINDS["RoadLines"]).any())
     for kind in np.unique(box_map.kinds[~are_meshes]):
         rows = np.flatnonzero((box_map.kinds == kind) & ~are_meshes)
         boxes = Boxes(
@@ -193,7 +193,7 @@ def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
             tiers[rows],
         )
         if kind == KINDS["Roads"] and has_paint:
-            boxes = replace(boxes, seeds=np.full(len(boxes), HAS_PAINT))
+            boxes = replace(boxes, seeds=np.where(boxes.ids == NO_INSTANCE, boxes.seeds, HAS_PAINT))
         build = BUILDERS.get(int(kind), plain)
         if not lies[rows].any():
             build(builder, boxes)
@@ -204,7 +204,7 @@ def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
         lying[rows] = parts.records
         builder.add_parts(parts.select(~lies[rows]))
     plane = PartBuilder()
-    center, half = ground_plane(box_map)
+    center, half = ground_plane(town, rim)
     ids, seeds = np.full(1, NO_INSTANCE, np.uint16), np.zeros(1)
     ground = Boxes((center - origin)[None], half[None], np.eye(3)[None], ids, seeds, KINDS["Terrain"], np.zeros(1))
     plane.add(ground, meshes.BOX, half[None], GRASS, np.array([0.105, 0.14, 0.045]), layer=0)
@@ -213,8 +213,8 @@ def build_scene(box_map: BoxMap, num_others: int = 0) -> Scene:
     loose = {} if box_map.ground.is_flat else _loose(drape(box_map), origin, np.append(lying, bare.records))
     standing = loose_solids(box_map, solids, origin, all_ids)
     parts = builder.finish()
-    lamps = np.zeros((0, 3)) if len(lamps_of(parts)) else lamps_along_streets(box_map) - origin
-    return Scene(parts, origin, plane_z_m(box_map), box_map.ground, Loose.all_of(loose), standing, lamps)
+    lamps = np.zeros((0, 3)) if len(lamps_of(parts)) else lamps_along_streets(town) - origin
+    return Scene(parts, origin, plane_z_m(town), town.ground, Loose.all_of(loose), standing, lamps)
 
 
 def _loose(draped: DrapedSurfaces, origin: np.ndarray, records: np.ndarray) -> dict[int, np.ndarray]:
