@@ -25,6 +25,7 @@ from shapely.geometry import Polygon
 
 from cosfly.errors import ConfigError, InputError, nearest
 from cosfly.maps.boxlist import BoxList
+from cosfly.maps.derived_ground import with_derived_ground
 from cosfly.maps.footprints import CUT_SHARES, cover
 from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource, read_boxes
 from cosfly.products.columns import LARGEST
@@ -81,6 +82,7 @@ class BoxesConfig(Config):
     ground_z_m: float = Field(0.0, description="height of the flat ground, in the file's coordinates, m")
     outline_fill: float = Field(0.9, gt=0.0, le=1.0, description="least share of each box that an outline fills")
     outline_piece_m: float = Field(3.0, gt=0.0, description="pieces of an outline this short are not cut again, m")
+    derive_ground: bool = Field(False, description="the same as maps.cityjson.derive_ground, for boxes of one's own")
     licence: LicenceId = Field(
         UNKNOWN_LICENCE, description="licence of the boxes, as the hub spells it (cc-by-4.0); goes into every release"
     )
@@ -242,7 +244,8 @@ def _told(box_map: BoxMap, cfg: BoxesConfig, path: Path) -> BoxMap:
         offset = {"x": float(middle[0]), "y": float(middle[1]), "z": 0.0}
         header = header.model_copy(update={"offset_m": offset})
         box_map = replace(box_map, centers=box_map.centers - [*middle, 0.0])
-    return replace(box_map, header=header)
+    box_map = replace(box_map, header=header)
+    return with_derived_ground(box_map) if cfg.derive_ground else box_map
 
 
 # --- rows -------------------------------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from shapely.geometry import Polygon
 from cosfly.errors import ConfigError, InputError
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.cityjson_file import CityObject, read_model
+from cosfly.maps.derived_ground import with_derived_ground
 from cosfly.maps.footprints import CUT_SHARES, check_outline, cover, polygons_of, rectangle_polygon, united
 from cosfly.maps.solids import solid_mesh, top_within
 from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource
@@ -83,6 +84,11 @@ class CityJsonConfig(Config):
     ground_cell_m: float = Field(4.0, ge=0.5, le=100.0, description="cell of the heights of ground that slopes, m")
     flat_within_m: float = Field(3.0, ge=0.0, description="ground that rises less over the whole map is made flat, m")
     crown_min_m: float = Field(3.6, gt=0.0, description="least width of a crown, m: a street tree's plot is smaller")
+    derive_ground: bool = Field(
+        True,
+        description="a model without streets, pavements and squares gets pavement along facades, asphalt between near "
+        "buildings and lawn, derived from the buildings; the map's header and credits say so",
+    )
 
     polygon_vertices: MayDiffer[int] = Field(
         100_000, ge=3, description="most vertices of a surface, its holes included; more are refused"
@@ -160,11 +166,10 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
     if not ground.is_flat:
         header = header.model_copy(update={"ground": GroundGrid.of(ground)})
     box_map = replace(boxes.box_map(header), meshes=Meshes(refs, made=made))  # ids are rows counted from 1
-    if ground.is_flat:
-        return box_map
-    follows = ~np.isin(np.arange(len(box_map)), list(standing))
-    box_map.centers[follows, 2] += ground.height_at(box_map.centers[follows])
-    return box_map
+    if not ground.is_flat:
+        follows = ~np.isin(np.arange(len(box_map)), list(standing))
+        box_map.centers[follows, 2] += ground.height_at(box_map.centers[follows])
+    return with_derived_ground(box_map) if cfg.derive_ground else box_map
 
 
 def _over_ground(item: CityObject, ground: Ground) -> CityObject:

@@ -26,7 +26,7 @@ from cosfly.pedestrians.crossings import CROSSING, ROAD, costs_of, footing_of
 from cosfly.pedestrians.walking import PACES, SLOWEST_SPEED_MPS
 from cosfly.products.boxes import BoxMap
 from cosfly.products.ground import Ground
-from cosfly.products.kinds import GROUND_KINDS, KINDS
+from cosfly.products.kinds import GROUND_KINDS, PAVED_KINDS
 from cosfly.products.roi import MOST_VERTICES, Roi
 from cosfly.products.walks import PLAIN_PACE
 from cosfly.space.grid import (
@@ -45,7 +45,6 @@ from cosfly.work.config import Config, MayDiffer
 
 log = logging.getLogger(__name__)
 
-PAVED_KINDS = frozenset(KINDS[name] for name in ("Roads", "Sidewalks", "Ground"))
 # Surfaces of a map without paved ones are trusted down to this share of its free cells: below, they are lawns between
 # unnamed streets.
 SURFACE_SHARE_MIN = 0.5

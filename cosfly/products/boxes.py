@@ -81,6 +81,7 @@ class MapHeader(_Kept):
     extent_sources: dict[str, int] = {}  # where a box's size comes from -> boxes
     roads: dict[str, float] = {}
     added_boxes: int = 0  # boxes that the source does not hold
+    derived_ground: int = 0  # of these, ground that was derived from the buildings
     offset_m: dict[str, float] = {}  # from this map's coordinates to the source's
     building_footprint_m2: float | None = None
     building_area_ratio: float | None = None

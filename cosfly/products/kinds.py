@@ -21,6 +21,7 @@ KIND_COLORS: dict[str, str] = {
 
 # Surfaces that people and cars stand on: never an obstacle, whatever their thickness.
 GROUND_KINDS = frozenset(KINDS[name] for name in ("Roads", "Sidewalks", "Terrain", "RoadLines", "Ground", "RailTrack"))
+PAVED_KINDS = frozenset(KINDS[name] for name in ("Roads", "Sidewalks", "Ground"))
 # Of surfaces in one plane the one of the higher layer is seen, and walked on; bare ground is layer 0.
 LAYERS = {"Terrain": 1, "Ground": 2, "Water": 2, "Roads": 3, "RailTrack": 4, "RoadLines": 5, "Sidewalks": 6}
 # Never removed for lying low: carriageways, lawns, canals and decks of bridges may lie below z = 0.

@@ -1,0 +1,113 @@
+"""cosfly/maps/derived_ground.py: ground for maps that have buildings and no streets."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from specimens_slopes import on_ground, sampled, sloped_city
+
+from cosfly.maps.boxfile import BoxesConfig
+from cosfly.maps.boxlist import BoxList
+from cosfly.maps.cityjson import CityJsonConfig
+from cosfly.maps.derived_ground import CREDITS, NEAR_M, PAVEMENT_M, with_derived_ground
+from cosfly.maps.stage import MapsConfig, load_map, run
+from cosfly.pedestrians.stage import make_walk
+from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
+from cosfly.products.boxes import BoxMap, read_boxes
+from cosfly.products.kinds import GROUND_KINDS, KINDS
+from cosfly.render.draping import drape, is_draped
+from cosfly.simplify.passes import SimplifyConfig, simplify
+from cosfly.space.grid import empty_grid, lies_off_ground, surface_kinds
+from cosfly.work.chance import rng_for
+
+ROADS, SIDEWALKS, TERRAIN = (KINDS[name] for name in ("Roads", "Sidewalks", "Terrain"))
+
+
+def houses(*more: tuple[float, float, float]) -> BoxMap:
+    """Two rows of four houses of 30 m by 12 m, 18 m apart, each row along x; more: x, y and yaw of others."""
+    boxes = BoxList()
+    for x in range(-60, 61, 40):
+        for y in (-15, 15):
+            boxes.add("Buildings", (x, y), (30, 12), -1.0, 9.0)
+    for x, y, yaw_deg in more:
+        boxes.add("Buildings", (x, y), (20, 10), -1.0, 9.0, yaw_deg)
+    return boxes.box_map()
+
+
+def kinds_at(box_map: BoxMap, *points) -> list[int]:
+    grid = empty_grid(box_map, 0.25)
+    x, y = grid.cells_at(np.array(points)).T
+    return surface_kinds(box_map, GROUND_KINDS, like=grid)[y, x].tolist()
+
+
+def test_pavement_lies_along_facades_asphalt_between_near_buildings_and_lawn_elsewhere():
+    far = 21.0 + 15.0 + NEAR_M + 15.0
+    box_map = with_derived_ground(houses((0.0, far, 30.0)))
+    step = PAVEMENT_M - 0.3
+    pavement = (-60, 9 - step), (-60, -9 + step), (0, far + 5 / np.cos(np.pi / 6) + 1.0), (75 + step, 15)
+    assert kinds_at(box_map, *pavement) == [SIDEWALKS] * 4
+    assert kinds_at(box_map, (-60, 0), (0, 0), (40, 0)) == [ROADS] * 3
+    assert kinds_at(box_map, (0, 35), (20, far + 8), (-60, -29)) == [TERRAIN] * 3
+
+
+def test_what_is_derived_is_marked_and_a_map_with_ground_of_its_own_is_left_alone():
+    bare = houses()
+    box_map = with_derived_ground(bare)
+    assert len(box_map) - len(bare) == box_map.header.derived_ground == box_map.header.added_boxes
+    assert box_map.header.credits == CREDITS
+    assert len(np.unique(box_map.ids)) == len(box_map)
+    for name in ("centers", "half_extents", "ids", "kinds"):
+        assert (getattr(box_map, name)[: len(bare)] == getattr(bare, name)).all()
+    assert with_derived_ground(box_map) is box_map
+    lawn = BoxList()
+    lawn.add_span("Terrain", (0, 0), (9, 9), -1.0, 0.0)
+    assert with_derived_ground(lawn.box_map()).header.derived_ground == 0
+
+
+@pytest.mark.parametrize("shape", ["plane", "hill"])
+def test_on_a_slope_all_of_it_lies_in_the_ground(shape):
+    box_map = with_derived_ground(on_ground(houses((0.0, 100.0, 30.0)), sampled(shape)))
+    assert not lies_off_ground(box_map, GROUND_KINDS).any()
+    assert is_draped(box_map).sum() == box_map.header.derived_ground
+    draped = drape(box_map)
+    np.testing.assert_allclose(
+        draped.corners_m[..., 2].ravel(), box_map.ground.height_at(draped.corners_m.reshape(-1, 3)), atol=1e-6
+    )
+    assert kinds_at(box_map, (0, 0), (-60, 8)) == [ROADS, SIDEWALKS]
+
+
+def test_a_city_model_without_streets_gets_it_and_the_same_bytes_twice(tmp_path: Path):
+    path = tmp_path / "city.json"
+    path.write_text(json.dumps(sloped_city(terrain=False, streets=False)))
+    cfg = MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=path, credits="Its makers."))
+    first, second = (run(cfg, tmp_path / name) for name in ("one", "two"))
+    assert first.read_bytes() == second.read_bytes()
+    header = read_boxes(first).header
+    assert header.derived_ground > 16
+    assert header.credits == f"Its makers. {CREDITS}"
+    path.write_text(json.dumps(sloped_city()))
+    assert load_map(cfg).header.derived_ground == 0
+
+
+def test_boxes_of_ones_own_get_it_where_they_ask_for_it(tmp_path: Path):
+    path = tmp_path / "own.csv"
+    path.write_text("type,x,y,length,width,height\nBuildings,0,0,20,10,8\nBuildings,0,30,20,10,8\n")
+    plain, derived = (
+        load_map(MapsConfig(source="boxes", boxes=BoxesConfig(path=path, derive_ground=wanted)))
+        for wanted in (False, True)
+    )
+    assert plain.counts() == {"Buildings": 2}
+    assert {"Roads", "Sidewalks", "Terrain"} < derived.counts().keys()
+
+
+def test_people_of_a_foreign_city_of_buildings_alone_walk_on_its_pavements(shared_data: Path):
+    path = shared_data / "tudelft-3dbag" / "extension.city.jsonl.gz"
+    box_map = load_map(MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=path, solids=False)))
+    assert box_map.header.derived_ground < 2.0 * box_map.counts()["Buildings"]
+    cfg = PedestriansConfig(road_cost=20, open_cost=3)
+    ground = walkable_ground(simplify(box_map, SimplifyConfig()).box_map, cfg)
+    walks = [make_walk("p", ground, cfg, rng_for(0, "pedestrians", str(k))).walk for k in range(20)]
+    places = np.concatenate([walk.positions_m for walk in walks])
+    x, y = ground.grid.cells_at(places).T
+    assert np.isin(ground.footing[y, x], [0, 1]).mean() > 0.95
