@@ -30,12 +30,12 @@ from cosfly.products.weather import TIMES, WEATHER_GROUPS, WEATHERS, WeatherPara
 from cosfly.reading.documents import read_json
 from cosfly.render.contract import PosedPerson
 from cosfly.render.gl.lamps import APART_M, HIGH_M, lamps_along_streets
-from cosfly.render.gl.weather_pass import fog_extinction, light_direction, lights_on
+from cosfly.render.gl.weather_pass import light_direction, lights_on
 from cosfly.render.person import choose_clothes
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.render.weather import coverage_of as weather_coverage
-from cosfly.render.weather import path_seed, read_pools, weather_of
+from cosfly.render.weather import fog_extinction, fog_hides, path_seed, read_pools, weather_of
 from cosfly.studies.weather import run as draw_gallery
 from cosfly.work.config import build, load, shipped
 
@@ -515,3 +515,21 @@ def test_flights_that_nobody_can_see_are_told_before_they_are_drawn(tmp_path, ki
         told = CliRunner().invoke(app, [*command, str(tmp_path / "own.yaml")])
         assert told.exit_code == 0, told.output
         assert (words in told.output) == is_dark, told.output
+
+
+@needs_gl
+def test_flights_that_fog_hides_from_end_to_end_are_told_before_they_are_drawn(tmp_path, caplog):
+    skies = (config(weather_mode="fixed", weather_name=name, tod_name="noon") for name in ("dense_fog", "thin_fog"))
+    dense, thin = (weather_of(one, read_pools(one), 0) for one in skies)
+    assert [fog_hides(dense, distance_m) for distance_m in (5.0, 30.0, 40.0)] == [False, False, True]
+    assert not fog_hides(thin, 60.0)
+    far = circling(2, "path_001")
+    far.positions_m[:, 2] += 80.0
+    inputs = write_inputs(tmp_path / "inputs", [circling(2), far])
+    for name, told in (("dense_fog", "path_001"), ("thin_fog", "")):
+        cfg = config(**SMALL, weather_mode="fixed", weather_name=name, tod_name="noon", tracks=["clean"])
+        caplog.clear()
+        run(cfg, *inputs, tmp_path / name)
+        lines = [one.getMessage() for one in caplog.records if "fog hides" in one.getMessage()]
+        assert len(lines) == bool(told)
+        assert all(told in line and "path_000" not in line for line in lines)

@@ -215,10 +215,8 @@ def _turn_deg(first: tuple[float, float], last: tuple[float, float], slowest_mps
 
 
 def _word(frame: ObservedFrame) -> VisibilityWord:
-    if not frame.in_view:
-        return "out_of_view"
-    if not frame.visible:
-        return "occluded"
+    if not (frame.in_view and frame.visible):
+        return "occluded" if frame.in_view else "out_of_view"
     if not frame.legible:
         return "illegible"
     return "partly_occluded" if frame.visibility < PARTLY_BELOW else "visible"  # NaN: the flag alone decides

@@ -155,7 +155,7 @@ def render(
         Path | None, Option(help="YAML file with times of day of yours."), Sets("render.tod_pool")
     ] = None,
     weather_seed: Annotated[
-        int | None, Option(help="Seed of drawn skies; a negative one draws another."), Sets("render.weather_seed")
+        int | None, Option(help="Seed; a negative one draws one."), Sets("render.weather_seed")
     ] = None,
 ) -> None:
     """Step 5: RGB, depth and instance frames of the clean and the perturbed flight."""

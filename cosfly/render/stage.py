@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from pydantic import BaseModel
 
 from cosfly.errors import ConfigError, InputError
@@ -35,7 +36,7 @@ from cosfly.render.person import cast_of, choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbedTrack, Poses, Surroundings, perturb
 from cosfly.render.rim import check_outside_rim, rim_of
 from cosfly.render.settings import RenderConfig
-from cosfly.render.weather import coverage_of, drawn_seed, read_pools, told_coverage, weather_of
+from cosfly.render.weather import coverage_of, drawn_seed, fog_hides, read_pools, told_coverage, weather_of
 from cosfly.work.chance import rng_for
 from cosfly.work.provenance import checked_inputs, fingerprint
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
@@ -173,7 +174,7 @@ def run(
             renderer here.
     """
     inputs = {"boxes": boxes, "simplified": simplified, "traces": traces} | ({"others": others} if others else {})
-    read_pools(cfg)  # presets that cannot be are told before anything is written
+    pools = read_pools(cfg)  # presets that cannot be are told before anything is written
     inputs |= cfg.pool_files()
     checked_inputs(inputs)  # before the map is read for the names of its meshes, which are inputs too
     box_map = read_boxes(boxes)
@@ -190,6 +191,9 @@ def run(
         log.warning("render: %d boxes share the instance id %d: ids have 16 bits", num_shared, SHARED_ID)
     town, first_timestamp = _names(stage, cfg, box_map.name, traces, others, seed)
     cfg = cfg.model_copy(update={"first_timestamp": first_timestamp, "weather_seed": _weather_seed(stage, cfg)})
+    apart_m = {number: np.linalg.norm(trace.positions_m - trace.targets_m, axis=1) for number, trace in passed}
+    if hidden := [t.path_id for n, t in passed if fog_hides(weather_of(cfg, pools, n), float(apart_m[n].min()))]:
+        log.warning("render: fog hides the person from end to end of %s: fly nearer, or in other weather", hidden)
     items = [_item(number, trace.every(cfg.frame_stride), track) for number, trace in passed for track in cfg.tracks]
     arguments = (cfg, boxes, simplified, traces, others, out, town, seed, min(workers, len(items)))
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="render: frames")

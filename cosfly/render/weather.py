@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import random
 import secrets
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import islice, product
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,14 +16,14 @@ from pydantic import Field, field_validator, model_validator
 
 from cosfly.errors import ConfigError, nearest
 from cosfly.products.boxes import BoxMap
+from cosfly.products.frames import LEGIBLE_CONTRAST
 from cosfly.products.kinds import KINDS
 from cosfly.products.weather import (
-    DAY_FROM_DEG,
-    SUN_IS_DOWN_DEG,
     TIMES,
     WEATHERS,
     SkyKind,
     TimePreset,
+    WeatherParams,
     WeatherPreset,
     WeatherRecord,
     preset_token,
@@ -32,6 +33,11 @@ from cosfly.products.weather import (
 from cosfly.work.chance import draw_to_quota, rng_for
 from cosfly.work.config import Config, MayDiffer, build, read_yaml
 
+# Extinction per m at 100 percent; dense fog (80) leaves 5 % of what stands 60 m away.
+FOG_AT_FULL, FOG_POWER = 0.10, 2.4
+RAIN_EXTINCTION = 0.0045  # per m of the heaviest rain: a visibility of some 700 m
+# Of clothes against the ground in clear air (CIE76), and how it goes with the light that is left: measured in 15 to 50 m.
+STRONGEST_CONTRAST, CONTRAST_POWER = 75.0, 1.75
 LIT_KINDS = tuple(KINDS[name] for name in ("Poles", "Roads", "Sidewalks"))  # lamps hang there, or stand along them
 DEFAULT_SEED = 20260423  # of the paper's production runs (app:weather:coverage)
 MOST_SEED = 2**31  # of a seed that is drawn
@@ -49,7 +55,7 @@ class WeatherConfig(Config):
     sky_shares: dict[SkyKind, Annotated[float, Field(ge=0)]] = Field(
         {"day_dry": 70, "day_rain": 9, "day_fog": 6, "dusk_dry": 7, "dusk_rain": 2, "night_dry": 6},
         description="shares of mode by_weight; they need not add up to one. dusk: the sun is lower than "
-        f"{DAY_FROM_DEG:g} degrees, night: {SUN_IS_DOWN_DEG:g} or lower; rain: some precipitation, fog: fog density "
+        "10 degrees, night: -3 or lower; rain: some precipitation, fog: fog density "
         "without it, dry: neither. Presets of one kind are equally likely",
     )
     weather_name: str | None = Field(None, description="preset of the weather in mode fixed", examples=[*WEATHERS])
@@ -129,10 +135,8 @@ class Pools:
 
     def of_kind(self) -> dict[str, list[tuple[str, str]]]:
         """Give the pairs of weather and time of each kind of sky."""
-        found: dict[str, list[tuple[str, str]]] = {}
-        for pair in product(self.weathers, self.times):
-            found.setdefault(sky_kind(resolved(self.weathers[pair[0]], self.times[pair[1]])), []).append(pair)
-        return found
+        pairs = {(a, b): sky_kind(resolved(self.weathers[a], self.times[b])) for a in self.weathers for b in self.times}
+        return {kind: [pair for pair, own in pairs.items() if own == kind] for kind in dict.fromkeys(pairs.values())}
 
 
 def read_pools(cfg: WeatherConfig) -> Pools:
@@ -143,29 +147,22 @@ def read_pools(cfg: WeatherConfig) -> Pools:
             once.
     """
     errors: list[ConfigError] = []
-    pools: list[Mapping[str, Any]] = []
-    model: Any
-    chosen: tuple[tuple[Path | None, Any, Mapping[str, Any], str], ...]
-    chosen = ((cfg.weather_pool, WeatherPool, WEATHERS, "weather_name"), (cfg.tod_pool, TimePool, TIMES, "tod_name"))
-    for path, model, shipped, field in chosen:
-        pools.append(shipped)
+    pools: list[Any] = [WEATHERS, TIMES]
+    own: Any = ((cfg.weather_pool, WeatherPool, "weather_name"), (cfg.tod_pool, TimePool, "tod_name"))
+    for i, (path, model, field) in enumerate(own):
         if path is None:
             continue
         try:
-            found = build(model, read_yaml(path), path).presets
-            presets = {preset_token(name): knobs for name, knobs in found.items()}
-            if len(presets) < len(found):
-                raise ConfigError("two presets have one name", where=path, got=", ".join(found))
-            pools[-1] = presets
-            name = getattr(cfg, field)
-            if name is not None and (problems := _unknown(name, presets, field)):
+            given, name = build(model, read_yaml(path), path).presets, getattr(cfg, field)
+            pools[i] = {preset_token(name): knobs for name, knobs in given.items()}
+            if len(pools[i]) < len(given):
+                raise ConfigError("two presets have one name", where=path, got=", ".join(given))
+            if name is not None and (problems := _unknown(name, pools[i], field)):
                 raise ConfigError("; ".join(problems), where=path)
         except ConfigError as error:
             errors.append(error)
-    if len(errors) > 1:
-        raise ConfigError("; ".join(map(str, errors)), where="weather presets")
     if errors:
-        raise errors[0]
+        raise errors[0] if len(errors) == 1 else ConfigError("; ".join(map(str, errors)), where="weather presets")
     found = Pools(*pools)
     lacking = [kind for kind, share in cfg.sky_shares.items() if share and kind not in found.of_kind()]
     if cfg.weather_mode == "by_weight" and lacking:
@@ -218,8 +215,20 @@ def dark_flights(cfg: WeatherConfig, num_flights: int, read_map: Callable[[], Bo
         return []
     pools = read_pools(cfg)
     skies = [weather_of(cfg, pools, number) for number in range(num_flights)]
-    by_night = [k for k, sky in enumerate(skies) if sky and sky.params.sun_altitude_angle <= SUN_IS_DOWN_DEG]
+    by_night = [k for k, sky in enumerate(skies) if sky and sky_kind(sky.params).startswith("night")]
     return by_night if by_night and not read_map().is_any_of(set(LIT_KINDS)).any() else []
+
+
+def fog_extinction(params: WeatherParams) -> float:
+    """What fog and rain take from a colour, per m."""
+    rain = params.precipitation / 100.0
+    return float(FOG_AT_FULL * (params.fog_density / 100.0) ** FOG_POWER + RAIN_EXTINCTION * rain**1.5)
+
+
+def fog_hides(sky: WeatherRecord | None, distance_m: float) -> bool:
+    """Tell whether a sky takes so much of the colours at a distance that nobody can be made out there."""
+    thick = 0.0 if sky is None else fog_extinction(sky.params) * max(0.0, distance_m - sky.params.fog_distance)
+    return math.exp(-CONTRAST_POWER * thick) * STRONGEST_CONTRAST < LEGIBLE_CONTRAST
 
 
 def _to_quota(cfg: WeatherConfig, pools: Pools) -> Iterator[tuple[str, str]]:

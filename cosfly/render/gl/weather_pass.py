@@ -18,6 +18,7 @@ from cosfly.render.contract import MAX_BOX_ID, PosedPerson
 from cosfly.render.gl import lamps as street_lamps
 from cosfly.render.gl.parts import Parts
 from cosfly.render.gl.programs import set_uniform
+from cosfly.render.weather import fog_extinction
 
 # --- atmosphere -------------------------------------------------------------------------------------------------------
 # The six knobs of weather as the uniforms of weather.glsl: colours of sun, sky, clouds and fog, and how much of each.
@@ -28,9 +29,6 @@ from cosfly.render.gl.programs import set_uniform
 
 
 CLEAR_HAZE_M = 620.0  # air without fog, as in Look.haze_m
-# Extinction per m at 100 percent; dense fog (80) leaves 5 % of what stands 60 m away.
-FOG_AT_FULL, FOG_POWER = 0.10, 2.4
-RAIN_EXTINCTION = 0.0045  # per m of the heaviest rain: a visibility of some 700 m
 MOON = np.array([-0.35, -0.62, 0.70])  # towards the moon, which is the light where the sun is down
 LOWEST_SUN_DEG = 2.5
 MOON_DISC, SUN_DISC = 0.99993, 0.99955
@@ -84,12 +82,6 @@ def lights_on(params: WeatherParams) -> float:
     """How far street lamps and windows are lit, 0 to 1: by how light the sky is."""
     level = _at(COVERED_LEVEL, params.sun_altitude_angle) * (1.0 - 0.30 * params.precipitation / 100.0)
     return float(1.0 - _step(0.33, 0.50, float(level)))
-
-
-def fog_extinction(params: WeatherParams) -> float:
-    """What fog and rain take from a colour, per m."""
-    rain = params.precipitation / 100.0
-    return float(FOG_AT_FULL * (params.fog_density / 100.0) ** FOG_POWER + RAIN_EXTINCTION * rain**1.5)
 
 
 def uniforms(params: WeatherParams) -> dict[str, Any]:
