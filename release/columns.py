@@ -48,6 +48,7 @@ LANGUAGES: tuple[Language, ...] = get_args(Language)
 LANGUAGE_NAMES: dict[Language, str] = {"en": "English", "zh": "Chinese"}
 STATES: tuple[SentenceState, ...] = get_args(SentenceState)
 CAPTION_FIELDS = tuple(f"caption_{language}_{name}" for language in LANGUAGES for name in FIELDS)
+TARGET_PICTURE = "target_picture"
 CAPTION_SHARES = (
     "proved_en",
     "proved_zh",
@@ -73,6 +74,10 @@ CONTRACT: dict[str, Any] = {
     "depth": f"z-depth along the optical axis, metres, float32; {SKY_DEPTH_M:g} sky, {INVALID_DEPTH_M:g} invalid",
     "instance": "PNG; R semantic number (CARLA 0.9.16 CityObjectLabel), G low and B high byte of the instance id",
     "target": "hip of the tracked person; target_heading_deg, whither it walks, as yaw; null before its first step",
+    "goal": "whom to follow, in words that are true of the target and of nobody else who has a pixel in frame "
+    "goal_frame, where target_picture shows it; goal_says, what they use of people, who looks how: target, and others "
+    "by instance id; or a place: left, right, near, far, or what it stands by. Null where nothing tells the target "
+    "apart, and where the tree does not say",
     "legibility": "target_height_px, of its box in the image; target_contrast, CIE76 difference of the colours of its "
     "pixels from those around; target_legible: visible, "
     f"{LEGIBLE_HEIGHT_PX:g} px high, {LEGIBLE_SHARE:g} of it unhidden (visibility), contrast {LEGIBLE_CONTRAST:g}; "
@@ -254,6 +259,15 @@ FRAME = (  # everything of a frame but pictures and depth
     Column("walk", "string", constant=True),
     Column("split", "string", constant=True),
     Column("pair", "string", constant=True),
+    Column("people", "string", lambda f, i: f.people and dump_json(f.people.as_json()), constant=True),
+    Column(
+        "goal_en", "string", lambda f, i: f.goal and f.goal.en, constant=True, title="goal in words", annotation=True,
+        shown=True,
+    ),
+    Column("goal_zh", "string", lambda f, i: f.goal and f.goal.zh, constant=True, title="goal in Chinese", shown=True),
+    Column("goal_says", "texts", lambda f, i: f.goal and list(f.goal.says), constant=True),
+    Column("goal_frame", "int32", lambda f, i: f.goal and f.goal.frame, constant=True),
+    Column(TARGET_PICTURE, "image", lambda f, i: f.target_picture(i)),
     Column(
         "weather", "string", lambda f, i: f.weather["weather"], constant=True, title="weather", annotation=True,
         shown=True,

@@ -13,14 +13,18 @@ from cosfly.geometry import BODY_FROM_CAMERA, CORNER_SIGNS, rotation_matrices
 from cosfly.products.actions import ActionSet
 from cosfly.products.captions import FIELDS, Coc, Language
 from cosfly.products.frames import Camera
+from cosfly.products.goals import Goal
+from cosfly.products.people import People
 from cosfly.products.playback import EVENTS, Flight
 from cosfly.products.shown_captions import ShownCaption, ShownFlight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
+from cosfly.reading.documents import parse_document
 from release.columns import BOX, INTRINSICS, PICTURE_PX, POINT, POSE, WINDOW, between_of, matrices_of
 
 Row = dict[str, Any]
 LANGUAGES: tuple[Language, ...] = get_args(Language)
 NEAR_M = 0.3  # the renderers' near plane
+MOST_FRAMES = 10_000_000  # of a flight
 LEAST_ZOOMED = 3  # rows whose camera is not that of most rows
 
 
@@ -120,6 +124,19 @@ class FlightRows:
         uv[~(z > NEAR_M).all(axis=1)] = np.nan
         return uv
 
+    @cached_property
+    def people(self) -> People | None:
+        """What people look like, None where nobody says. Raises InputError, as `goal` does."""
+        told, where = self.rows[0].get("people"), self.where(0, "people")
+        return None if told is None else People.from_json(parse_document(told, where), where)
+
+    @cached_property
+    def goal(self) -> Goal | None:
+        """Whom to follow; its frame is that of the whole flight."""
+        told = {name: self.rows[0].get(f"goal_{name}") for name in ("frame", "en", "zh", "says")}
+        is_told = told["frame"] is not None
+        return Goal.from_json(told, MOST_FRAMES, self.where(0, "goal_en")) if is_told else None
+
     @property
     def is_clean(self) -> bool:
         return self.rows[0].get("track") == "clean"
@@ -142,6 +159,7 @@ class FlightRows:
             target_mask_bbox=self.mask_box if has_mask else None, is_original=self.is_clean,
             target_legible=None if None in self.column("target_legible") else self.flags("target_legible"),
             intrinsics=matrices if self.zooms else None, between=between_of(self.rows),
+            people=self.people, goal=self.goal,
         )  # fmt: skip
 
     def shown(

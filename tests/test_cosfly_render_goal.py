@@ -12,14 +12,14 @@ from cosfly.geometry import intrinsic_matrix, world_from_camera
 from cosfly.products.boxes import make_box_map
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import PERSON_ID, read_depth, read_instance, read_rgb
-from cosfly.products.goals import LANDMARKS, SIDES, SeenFrame, meant, words_of
+from cosfly.products.goals import LANDMARKS, SIDES, SeenFrame, meant, target_picture, words_of
 from cosfly.products.kinds import KINDS
 from cosfly.products.others import Company, Other, write_others
 from cosfly.products.people import Appearance, People
 from cosfly.products.playback import TARGET_FILE, read_flight
 from cosfly.reading.arrays import read_picture
 from cosfly.render.contract import Frame, PosedOther, PosedPerson, other_id
-from cosfly.render.goal import are_told_apart, find_goal, target_picture
+from cosfly.render.goal import are_told_apart, find_goal
 from cosfly.render.person import choose_clothes
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
@@ -68,17 +68,23 @@ def test_few_pixels_and_pale_differences_tell_nobody_apart():
     assert not are_told_apart(*frames)
 
 
-@needs_gl
-def test_of_all_in_a_crowd_a_goal_means_the_target_alone(tmp_path):
-    traces = [circling(3, f"path_{k:03d}") for k in range(2)]
+@pytest.fixture(scope="session")
+def crowded_tree(tmp_path_factory):
+    """Two walks, both tracks, each among eight others of whom four look alike the target but for one thing."""
+    folder, traces = tmp_path_factory.mktemp("crowd"), [circling(3, f"path_{k:03d}") for k in range(2)]
     places_m = [[x, y, -0.9] for x in (-4.0, -1.5, 1.0, 3.5) for y in (-2.0, 2.0)]
     crowd = [
         Other("Pedestrians", trace.targets_m + place_m, np.zeros(3), k < 4)
         for trace in traces for k, place_m in enumerate(places_m)
     ]  # fmt: skip
-    write_others(tmp_path / "others.json", [Company(t.path_id, crowd[i * 8 :][:8]) for i, t in enumerate(traces)], {})
+    write_others(folder / "others.json", [Company(t.path_id, crowd[i * 8 :][:8]) for i, t in enumerate(traces)], {})
     cfg = build(RenderConfig, {"width_px": 320, "height_px": 180, "fovs_deg": [60.0]}, "test")
-    tree = run(cfg, *write_inputs(tmp_path / "in", traces), tmp_path / "out", seed=2, others=tmp_path / "others.json")
+    return run(cfg, *write_inputs(folder / "in", traces), folder / "out", seed=2, others=folder / "others.json")
+
+
+@needs_gl
+def test_of_all_in_a_crowd_a_goal_means_the_target_alone(crowded_tree):
+    tree = crowded_tree
     flights = [read_flight(folder) for folder in find_flights(tree)]
     assert len(flights) == 4
     for flight in flights:

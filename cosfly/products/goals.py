@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
+import cv2
 import numpy as np
 
 from cosfly.errors import InputError
@@ -32,6 +33,7 @@ LANDMARKS = {
     "Buildings": ("building", "建筑", -np.inf),
 }  # fmt: skip
 ORDER = ("figure", *SLOTS, *SIDES, *LANDMARKS)
+PICTURE_PX, ROOM_SHARE, ROOM_PX = 160, 0.25, 8  # of a target picture: longer side at least; room round a person
 _WITH = (("in", ("top", "legs")), ("with", ("bag", "hat")))
 BY_M, BY_MARGIN_M = 4.0, 2.0  # who is as near as this is by something; who is not is so much farther
 
@@ -166,3 +168,17 @@ def words_of(says: Sequence[str], looks: Appearance) -> Words:
     en = " ".join(filter(None, ("the", side[0], noun["en"], *texts))) + (f", by a {mark[0]}" if mark[0] else "")
     texts = [f"在{mark[1]}旁边"] * bool(mark[0]) + [worn(slot, "zh") for slot in SLOTS if slot in says]
     return {"en": en, "zh": f"{side[1]}{'、'.join(texts)}的{noun['zh']}"}
+
+
+def target_picture(rgb: np.ndarray, box: list[float]) -> np.ndarray:
+    """Cut a person out of a frame, (h, w, 3) uint8, with room around, and enlarge it where it is small.
+
+    Args:
+        box: xmin, ymin, xmax, ymax px.
+    """
+    center, side = np.array([box[1] + box[3], box[0] + box[2]]) / 2.0, max(box[2] - box[0], box[3] - box[1])
+    half = side / 2.0 + max(ROOM_SHARE * side, ROOM_PX)
+    (top, left), (bottom, right) = np.maximum(center - half, 0).astype(int), np.ceil(center + half).astype(int)
+    cut = rgb[top:bottom, left:right]
+    factor = max(1.0, PICTURE_PX / max(cut.shape[:2]))
+    return cv2.resize(cut, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)

@@ -44,6 +44,7 @@ from cosfly.products.trajectory import (
 from cosfly.products.walks import pace_of
 from cosfly.products.weather import WeatherRecord
 from cosfly.reading.documents import read_json
+from cosfly.reading.files import read_bytes
 from cosfly.work.store import write_json
 
 ORIGINAL = "ORI"  # the folder of a clean flight
@@ -218,6 +219,15 @@ class Flight:
     def is_ours(self) -> bool:
         """Whether cosfly made it, and not somebody else."""
         return self.raw.get("dataset_format") == DATASET_FORMAT
+
+    def target_picture(self, index: int) -> dict[str, str | bytes] | None:
+        """Give the picture of the target and its name, at the frame of the goal alone and where there is one."""
+        if self.goal is None or self.goal.frame != index or self.folder is None:
+            return None
+        if not (path := self.folder / TARGET_FILE).is_file():
+            return None
+        data = read_bytes(path, what="target picture", tree=tree_of_flight(self.folder))
+        return {"bytes": data, "path": f"{self.flight_id}_{TARGET_FILE}"}
 
     def frame_folder(self, index: int) -> Path:
         assert self.folder is not None

@@ -17,6 +17,7 @@ from cosfly.geometry import mask_box, world_from_camera
 from cosfly.look.overlay import Overlay
 from cosfly.products import frames
 from cosfly.products.frames import Camera, DepthFormat, FrameFile, FrameMeta, Look, OthersMeta, TargetMeta, frame_name
+from cosfly.products.goals import target_picture
 from cosfly.products.kinds import KINDS
 from cosfly.products.people import Appearance
 from cosfly.products.playback import LEGIBILITY, TARGET_FILE, Flight, write_flight
@@ -36,7 +37,7 @@ from cosfly.render.camera import (
 )
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
 from cosfly.render.effects import Effects, bent
-from cosfly.render.goal import MOST_TRIED, find_goal, target_picture
+from cosfly.render.goal import MOST_TRIED, find_goal
 from cosfly.render.person import Cast, Gait
 from cosfly.render.perturbation import HIDDEN, STEP_UP_M, PerturbedTrack, Poses, Surroundings
 from cosfly.space.kernels import signed_distances

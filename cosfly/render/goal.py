@@ -16,7 +16,6 @@ from cosfly.render.contract import PERSON_ID, Frame
 MOST_TRIED = 8  # frames of a flight, the first in which the target is legible
 # Two looks are told apart by so many pixels, and such a share of a person's, of so much colour difference (CIE76).
 TOLD_PX, TOLD_SHARE, TOLD_CONTRAST = 8, 0.04, 10.0
-PICTURE_PX, ROOM_SHARE, ROOM_PX = 160, 0.25, 8  # of a target picture: longer side at least; room round a person
 
 
 def find_goal(
@@ -52,17 +51,3 @@ def are_told_apart(frame: Frame, other: Frame) -> bool:
     colors = [cv2.cvtColor(one.rgb.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[is_person] for one in (frame, other)]
     num_px = np.count_nonzero(np.linalg.norm(colors[0] - colors[1], axis=-1) >= TOLD_CONTRAST)
     return bool(num_px >= max(TOLD_PX, TOLD_SHARE * np.count_nonzero(is_person)))
-
-
-def target_picture(rgb: np.ndarray, box: list[float]) -> np.ndarray:
-    """Cut a person out of a frame, (h, w, 3) uint8, with room around, and enlarge it where it is small.
-
-    Args:
-        box: xmin, ymin, xmax, ymax px.
-    """
-    center, side = np.array([box[1] + box[3], box[0] + box[2]]) / 2.0, max(box[2] - box[0], box[3] - box[1])
-    half = side / 2.0 + max(ROOM_SHARE * side, ROOM_PX)
-    (top, left), (bottom, right) = np.maximum(center - half, 0).astype(int), np.ceil(center + half).astype(int)
-    cut = rgb[top:bottom, left:right]
-    factor = max(1.0, PICTURE_PX / max(cut.shape[:2]))
-    return cv2.resize(cut, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)

@@ -250,7 +250,7 @@ class Layout:
     index: int
     fps: int
     size_px: tuple[int, int]
-    tasks: tuple[str, ...]  # decisions; "" for frames without a caption
+    tasks: tuple[str, ...]  # in words
 
 
 def runs_of(flight: ReleasedRows) -> list[tuple[int, int]]:
@@ -260,9 +260,10 @@ def runs_of(flight: ReleasedRows) -> list[tuple[int, int]]:
     return list(itertools.pairwise(edges))
 
 
-def task_of(decision: str) -> str:
-    """Say in words what a frame is an example of."""
-    return f"{FOLLOW_TASK} Now: {decision.replace('_', ' ')}." if decision else FOLLOW_TASK
+def task_of(goal: str, decision: str) -> str:
+    """Say in words what a frame is an example of; "" where there is no goal, no decision."""
+    follow = f"Follow {goal} from the air." if goal else FOLLOW_TASK
+    return f"{follow} Now: {decision.replace('_', ' ')}." if decision else follow
 
 
 def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[ExportUnit]:
@@ -273,8 +274,9 @@ def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> li
     """
     fps, size_px = _fps(flights), _size(release)
     found = {decision for flight in flights for decision in flight.decisions}
-    tasks = tuple(decision for decision in ("", *release.record.actions.tokens) if decision in found)
-    if unknown := found - set(tasks):
+    decisions = ("", *release.record.actions.tokens)
+    tasks = tuple(dict.fromkeys(task_of(f.goal, one) for f in flights for one in decisions if one in f.decisions))
+    if unknown := found - {*decisions}:
         raise InputError(
             "a decision outside the closed set", where=release.folder, got=", ".join(sorted(unknown))[:200]
         )
@@ -380,8 +382,8 @@ def _tables(
         row for i, row in enumerate(rows_of_flight(release, flight, COLUMNS)) if episode.start <= i < episode.stop
     ]
     values = values_of(scalars)
-    decisions = flight.decisions[episode.start : episode.stop]
-    values["task_index"] = np.array([layout.tasks.index(decision) for decision in decisions], dtype=np.int64)
+    tasks = [task_of(flight.goal, decision) for decision in flight.decisions[episode.start : episode.stop]]
+    values["task_index"] = np.array([layout.tasks.index(task) for task in tasks], dtype=np.int64)
     values["frame_index"] = np.arange(n, dtype=np.int64)
     values["timestamp"] = (np.arange(n) / layout.fps).astype(np.float32)
     values["episode_index"] = np.full(n, episode.number, dtype=np.int64)
@@ -408,7 +410,7 @@ def _tables(
             stats[name] = summarize(np.asarray(values[name], dtype=np.float64).reshape(n, -1), n)
     about.append(
         {
-            "episode_index": episode.number, "tasks": [task_of(d) for d in dict.fromkeys(decisions)], "length": n,
+            "episode_index": episode.number, "tasks": list(dict.fromkeys(tasks)), "length": n,
             "flight": flight.name, "split": flight.split, "first_frame": int(flight.frame_index[episode.start]),
             "from": episode.index, "stats": stats,
         }
@@ -508,11 +510,11 @@ def finish(
 ) -> FormatFacts:
     """Write `meta/`."""
     layout: Layout = units[0].extra
-    files, tasks = Files(folder), [task_of(decision) for decision in layout.tasks]
+    files = Files(folder)
     counts = [one.facts["episodes"] for one in written]
     info = _info(release, units, counts, cfg)
     files.put("meta/stats.json", dump_json(_merge_all([one.facts["stats"] for one in written]), indent=4).encode())
-    files.put("meta/tasks.parquet", _parquet_bytes(_tasks_table(tasks)))
+    files.put("meta/tasks.parquet", _parquet_bytes(_tasks_table(list(layout.tasks))))
     files.put("meta/info.json", dump_json(info, indent=4).encode())
     num_flights = sum(len(unit.flights) for unit in units)
     codings = dict.fromkeys(release.modalities, "PNG, the released bytes")
@@ -528,8 +530,8 @@ def finish(
             "action and observation.state are mean velocities: forward, left, up in m/s in the drone's level axes, "
             "turn in degrees/s (counter-clockwise), the camera's pitch: of the step to the next frame, and of the one "
             "that led here. Zero where there is none, after an episode's last frame (next.done) and before its first.",
-            "task is the caption's decision in words; frames without a caption have the plain order. What a frame has "
-            "not is NaN, or an empty text.",
+            "task is the flight's goal and the caption's decision in words; flights without a goal tell whoever walks, "
+            "frames without a caption the order alone. What a frame has not is NaN, or an empty text.",
         ],
         how_to_open="from lerobot.datasets.lerobot_dataset import LeRobotDataset\n"
         "frames = LeRobotDataset('cosfly/flights', root='.')",

@@ -26,7 +26,7 @@ from release.record import DepthCoding, ReleaseRecord, read_record, release_fold
 
 # Names of columns below come from `release/columns.py`; those of shards from `release build`.
 SHARD_NAME = re.compile(r"data/(train|validation|test)-[0-9a-f]{12}-\d{5}-of-\d{5}\.parquet")
-LIGHT = [*PLACE, "frame_index", "time_s", "sample_id", "decision"]
+LIGHT = [*PLACE, "frame_index", "time_s", "sample_id", "decision", "goal_en"]
 # What one part of a path may be that rows name: no separator, nothing hidden, no ".."
 PART = re.compile(r"\w[\w.-]{0,200}", re.ASCII)
 
@@ -46,7 +46,7 @@ class Span:
 @dataclass
 class ReleasedRows:
     """One flight of a release, n frames. frames (n,) int32, rising; time_s (n,) float64; decisions: of the captions, ""
-    where none.
+    where none; goal: in English, "" where none.
 
     num_bytes: of its rows, unpacked.
     """
@@ -60,6 +60,7 @@ class ReleasedRows:
     frames: list[np.ndarray] = field(default_factory=list)
     times: list[np.ndarray] = field(default_factory=list)
     decisions: list[str] = field(default_factory=list)
+    goal: str = ""
     num_bytes: int = 0
 
     @property
@@ -176,6 +177,7 @@ def _scan_group(flights: dict[Place, ReleasedRows], shard: str, k: int, group: A
         flight.frames.append(np.array(rows["frame_index"][start:stop], dtype=np.int32))
         flight.times.append(np.array(times, dtype=np.float64))
         flight.decisions += [decision or "" for decision in rows["decision"][start:stop]]
+        flight.goal = rows["goal_en"][start] or ""
         flight.num_bytes += num_bytes * (stop - start) // len(group)
 
 

@@ -23,15 +23,16 @@ import numpy as np
 from cosfly.errors import InputError
 from cosfly.products.boxes import UNKNOWN_LICENCE
 from cosfly.products.frames import COORDINATES, FILE_NAMES, frame_name
+from cosfly.products.goals import Goal
 from cosfly.products.places import TOWN
-from cosfly.products.playback import LEGIBILITY, Flight, write_flight
+from cosfly.products.playback import LEGIBILITY, TARGET_FILE, Flight, write_flight
 from cosfly.products.segments import FOLLOW, Segment
 from cosfly.products.town import TOWN_FILE, TOWN_FORMAT, TownMap
 from cosfly.products.walks import pace_field
 from cosfly.reading.files import sha256_file
 from cosfly.work.runner import advance
 from cosfly.work.store import CHECKSUMS, checksum_lines, write_model
-from release.columns import PICTURES, SCALAR_NAMES, matrices_of
+from release.columns import PICTURES, SCALAR_NAMES, TARGET_PICTURE, matrices_of
 from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
 from release.export.source import Release, ReleasedRows, depth_in_words, depth_npy, picture, read_span
 from release.flight_rows import FlightRows
@@ -81,6 +82,8 @@ def write(release: Release, unit: ExportUnit, folder: Path, cfg: ExportConfig) -
             name = f"{frame_name(i)}/{FILE_NAMES[file]}"
             data = depth_npy(row, release.record.depth) if file == "depth" else picture(row, file)
             digests[name] = files.put(f"{place}/{name}", data, listed=False)
+        if row[TARGET_PICTURE] is not None:
+            digests[TARGET_FILE] = files.put(f"{place}/{TARGET_FILE}", row[TARGET_PICTURE]["bytes"], listed=False)
         scalars.append({column: row[column] for column in SCALAR_NAMES})
         advance()
     (folder / place).mkdir(parents=True, exist_ok=True)
@@ -168,8 +171,15 @@ def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight
             "released_frames": placed.frame_index.tolist(),
             **pace_field(rows[0]["pace"]),
         },
+        goal=_goal(found, placed),
         raw={"points": [_point(row) for row in rows]} | _weather(rows[0]) | _lens(rows[0]),
     )
+
+
+def _goal(rows: FlightRows, placed: ReleasedRows) -> Goal | None:
+    """Give the goal where its frame is released, under the number that this has in the tree."""
+    at = np.flatnonzero(placed.frame_index == (rows.goal.frame if rows.goal else -1))
+    return replace(rows.goal, frame=int(at[0])) if rows.goal and len(at) else None
 
 
 def _point(row: Row) -> dict[str, Any]:

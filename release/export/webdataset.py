@@ -18,7 +18,7 @@ from cosfly.errors import InputError
 from cosfly.products.frames import FrameFile
 from cosfly.work.runner import advance
 from cosfly.work.store import atomic_file, dump_json
-from release.columns import PICTURES, SPLIT_NAMES
+from release.columns import PICTURES, SPLIT_NAMES, TARGET_PICTURE
 from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
 from release.export.source import PART, Release, ReleasedRows, Span, depth_in_words, picture, read_span
 
@@ -77,6 +77,8 @@ def members(row: dict[str, Any], release: Release) -> list[tuple[str, bytes]]:
     """Give the files of one frame, by their endings in order."""
     scalars = {name: value for name, value in row.items() if name not in PICTURE_COLUMNS}
     pictures = {ending: picture(row, file) for file, ending in endings(release).items()}
+    if (target := scalars.pop(TARGET_PICTURE)) is not None:
+        pictures["target.png"] = target["bytes"]
     return sorted({"json": (dump_json(scalars) + "\n").encode(), **pictures}.items())
 
 

@@ -29,7 +29,7 @@ from cosfly.products.frames import (
     frame_path,
     tree_of,
 )
-from cosfly.products.playback import Flight
+from cosfly.products.playback import TARGET_FILE, Flight
 from cosfly.reading.arrays import PNG_HEADER_BYTES, PNG_SIGNATURE, png_size
 from cosfly.reading.files import check_stays_below, sha256_file
 from cosfly.work.items import advance
@@ -253,6 +253,7 @@ def _digests(candidate: Candidate) -> dict[str, str]:
             what = "the flight is not the one that was inspected"
             raise VerifyError(what, where=folder, got=got, expected=expected, fix=ANEW)
     _check_digest(folder, FLIGHT, None, digests)
+    _check_digest(folder, TARGET_FILE, None, digests)
     return digests
 
 

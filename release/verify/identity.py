@@ -11,7 +11,7 @@ import numpy as np
 
 from cosfly.products.actions import ActionSet
 from cosfly.products.playback import EVENTS, ORIGINAL
-from release.columns import REQUIRED, SCALARS
+from release.columns import REQUIRED, SCALARS, TARGET_PICTURE
 from release.flight_rows import FlightRows
 from release.verify.findings import Findings
 
@@ -84,7 +84,7 @@ def _check_names(flight: FlightRows, findings: Findings) -> None:
 
 def _check_numbers(flight: FlightRows, i: int, name: str, value: Any, findings: Findings) -> None:
     """Check that numbers are finite, of a sane size, and within their range; a group is whole or null."""
-    if isinstance(value, dict) and name in ("perturbation", "image", "instance"):
+    if isinstance(value, dict) and name in ("perturbation", "image", "instance", TARGET_PICTURE):
         return
     ranges = RANGES.get(name, {})
     for member, number in value.items() if isinstance(value, dict) else (("", value),):

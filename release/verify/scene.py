@@ -20,6 +20,7 @@ from cosfly.work.items import advance
 from release.flight_rows import FlightRows
 from release.record import DepthCoding, DepthCodingName
 from release.verify.findings import Findings
+from release.verify.goal import check_goal
 from release.verify.pictures import NUM_IDS, check_picture, decode, ground_beside, least_step, new_kinds, view_of
 from release.verify.sources import Pictures
 
@@ -81,6 +82,7 @@ def check_pictures(
             before = None
             continue
         depth, instance = decoded
+        check_goal(flight, i, decoded, files.get("rgb"), findings)
         if instance.size and not flight.is_foreign:
             _check_kinds(flight, i, instance, kinds, findings)
         if rounded_as == "float32" and i % max(1, len(flight) // STEPS_LOOKED_AT) == 0:

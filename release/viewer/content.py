@@ -4,6 +4,7 @@ script reads these names.
 
 from __future__ import annotations
 
+import base64
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, Literal, TypeVar
@@ -19,7 +20,7 @@ from cosfly.products.captions import Coc, Language
 from cosfly.products.kinds import GROUND_KINDS, KIND_NAMES
 from cosfly.products.sentences import sentences_of
 from cosfly.work.config import Config
-from release.columns import BOX, CAPTION, FIELDS, FRAME, LANGUAGES, POINT, Column
+from release.columns import BOX, CAPTION, FIELDS, FRAME, LANGUAGES, POINT, TARGET_PICTURE, Column
 
 Point2 = tuple[float, float]  # x, y, m
 MB = 1024 * 1024
@@ -65,7 +66,7 @@ class PageCaption(BaseModel):
 class PageFrame(BaseModel):
     """A frame. drone: x, y, z, m, and yaw, degrees; target: x, y, z, m; events: what became of its perturbation; facts:
     what else the columns say; box: of the person, xmin, ymin, xmax, ymax as shares of the picture; pictures: JPEG in
-    base64."""
+    base64; target_picture: PNG, at the goal's frame."""
 
     index: int
     time_s: float
@@ -78,6 +79,7 @@ class PageFrame(BaseModel):
     fov_deg: float
     box: tuple[float, float, float, float] | None = None
     pictures: dict[View, str] = {}
+    target_picture: str | None = None
     caption: PageCaption | None = None
 
 
@@ -138,6 +140,7 @@ def frame_of(row: Mapping[str, Any], pictures: dict[View, str], caption: PageCap
         fov_deg=round(row["fov_deg"], 1),
         box=box_of(row["target_bbox"], row["width_px"], row["height_px"]),
         pictures=pictures,
+        target_picture=base64.b64encode(cell["bytes"]).decode() if (cell := row[TARGET_PICTURE]) else None,
         caption=caption,
     )
 

@@ -149,6 +149,8 @@ function drawStage(sample) {
     frame.pictures[view] ? make("div", { class: "picture" }, make("img", { alt: `${title}, frame ${frame.index}`, src: `data:image/jpeg;base64,${frame.pictures[view]}` }), boxOf(frame.box))
       : make("div", { class: "gone" }, "no picture"),
     make("figcaption", {}, title)));
+  const shown = flight.frames.find((one) => one.target_picture);
+  if (shown) pictures.push(make("figure", {}, make("img", { alt: "the target", src: `data:image/png;base64,${shown.target_picture}` }), make("figcaption", {}, "the target")));
   const slider = make("input", { type: "range", min: 0, max: Math.max(0, mine.length - 1), value: place, "aria-label": "frame", id: "time" });
   slider.addEventListener("input", () => step(Number(slider.value) - mine.indexOf(current())));
   const back = make("button", { type: "button", "aria-label": "frame before" }, "\u25c0"), on = make("button", { type: "button", "aria-label": "next frame" }, "\u25b6");

@@ -1,0 +1,111 @@
+"""Goals in a release: in its columns, exports and pages; a false or ambiguous one, or another picture, is found."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from test_cosfly_render import needs_gl
+from test_cosfly_render_goal import crowded_tree  # noqa: F401
+
+from cosfly.products.flights import find_flights
+from cosfly.products.frames import FILE_NAMES, PERSON_ID, frame_path
+from cosfly.products.goals import SLOTS, words_of
+from cosfly.products.people import People
+from cosfly.products.playback import read_flight
+from release.columns import SCALARS, Placement
+from release.export.lerobot import task_of
+from release.export.source import ReleasedRows
+from release.export.tree import flight_of_rows
+from release.flight_rows import FlightRows, Row
+from release.verify.findings import Findings
+from release.verify.flights import LOSSLESS
+from release.verify.goal import check_goal
+from release.verify.pictures import decode
+from release.verify.verify import verify
+
+pytestmark = [needs_gl]
+
+
+@pytest.fixture(scope="module")
+def flights(crowded_tree) -> list[tuple[FlightRows, Path]]:  # noqa: F811
+    found = []
+    for folder in find_flights(crowded_tree):
+        flight, placement = read_flight(folder), Placement(walk="w", split="train")
+        rows = [{one.name: one.cell(flight, i, None, placement) for one in SCALARS} for i in range(len(flight))]
+        found.append((FlightRows("a/b/c/d", rows), folder))
+    return found
+
+
+def told(rows: list[Row], folder: Path) -> list[str]:
+    """Give what is found of the goal of a flight's rows."""
+    flight, findings = FlightRows("a/b/c/d", rows), Findings()
+    for i in range(len(rows)):
+        files = {file: frame_path(folder / f"frames_playback/frame_{i:05d}", name) for file, name in FILE_NAMES.items()}
+        pictures = {file: path.read_bytes() for file, path in files.items()}
+        decoded = decode(flight, i, pictures, LOSSLESS, findings)
+        assert decoded is not None
+        check_goal(flight, i, decoded, pictures["rgb"], findings)
+    return [f"{kind.where}: {kind.got}" for kind in findings.kinds.values()] if findings.kinds else []
+
+
+def changed(flight: FlightRows, says: list[str] | None = None, people: People | None = None, **values) -> list[Row]:
+    """Tell another goal, its words and all."""
+    says, people = says or list(flight.goal.says), people or flight.people
+    words = {f"goal_{language}": text for language, text in words_of(says, people.target).items()}
+    new = {**words, "goal_says": says, "people": json.dumps(people.as_json())} | values
+    return [{**row, **new} for row in flight.rows]
+
+
+def test_honest_goals_are_true(flights, crowded_tree):  # noqa: F811
+    assert all(not told(list(flight.rows), folder) for flight, folder in flights)
+    assert all(row["goal_en"] and row["goal_zh"] for flight, _ in flights for row in flight.rows)
+    assert {issue.code for issue in verify(crowded_tree).issues} <= {"copy"}  # both walks are one
+    pictures = [row["target_picture"] for flight, _ in flights for row in flight.rows if row["target_picture"]]
+    assert len(pictures) == len(flights)
+    assert all(cv2.imdecode(np.frombuffer(one["bytes"], np.uint8), 1) is not None for one in pictures)
+
+
+def test_a_goal_that_is_true_of_others_is_found(flights):
+    """Each goal with one thing less: as few are said as will do, so it means somebody else too."""
+    num_ambiguous = 0
+    for flight, folder in flights:
+        garments = [one for one in flight.goal.says if one in SLOTS]
+        for left_out in garments if len(garments) > 1 else []:
+            lies = told(changed(flight, [one for one in flight.goal.says if one != left_out]), folder)
+            num_ambiguous += any("goal_says: true of" in lie for lie in lies)
+    assert num_ambiguous >= 2
+
+
+def test_lies_about_goals_are_found(flights):
+    flight, folder = flights[0]
+    target, others = flight.people.target, flight.people.others
+    alike = next(one for one in others.values() if len(target.differences(one)) == 1)
+    seen = next(n for n, one in others.items() if one == alike)
+    lies = {
+        "goal_en": [{**row, "goal_en": "the person in the red hat"} for row in flight.rows],
+        "goal_zh is another": [{**row, "goal_zh": flight.rows[0]["goal_zh"] + "人"} for row in flight.rows],
+        "of nobody": changed(flight, people=replace(flight.people, others={**others, PERSON_ID: alike})),
+        "who looks so too": changed(flight, people=replace(flight.people, others={**others, seen: target})),
+        "who is not on record": changed(flight, people=replace(flight.people, others={})),
+        "no people": changed(flight, people=None) and [{**row, "people": None} for row in flight.rows],
+        "another picture": [
+            {**row, "target_picture": row["target_picture"] and flights[-1][0].rows[0]["target_picture"]}
+            for row in flight.rows
+        ],
+        "no picture": [{**row, "target_picture": row["target_picture"] and {"bytes": b"x"}} for row in flight.rows],
+    }
+    assert {name: bool(told(rows, folder)) for name, rows in lies.items()} == dict.fromkeys(lies, True)
+
+
+def test_an_exported_tree_and_its_tasks_have_the_goal(flights):
+    flight, _ = flights[0]
+    placed = ReleasedRows("r", "t", "trajectory_1", "ORI", "train", frames=[np.arange(1, 3)], times=[np.arange(2.0)])
+    rows = [{**row, "goal_frame": 1} for row in flight.rows[1:]]
+    assert flight_of_rows(rows, placed, 0).goal == replace(flight.goal, frame=0)
+    assert flight_of_rows(rows, placed, 0).people == flight.people
+    assert flight_of_rows([{**row, "goal_frame": 0} for row in rows], placed, 0).goal is None
+    assert task_of(flight.goal.en, "hover") == f"Follow {flight.goal.en} from the air. Now: hover."
+    assert task_of("", "") == "Follow the walking person from the air."
