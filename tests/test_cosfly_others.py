@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from cosfly.errors import InputError
 from cosfly.pedestrians.lanes import lanes_of
-from cosfly.pedestrians.others import CAR_FORWARD_MPS2, Trip, and_back, braked, company_of
+from cosfly.pedestrians.others import CAR_FORWARD_MPS2, PASS_M, Trip, and_back, braked, company_of
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, run, walkable_ground
 from cosfly.pedestrians.walking import PACES, speeds_at, take_pace
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, write_boxes
@@ -212,7 +212,7 @@ def test_braked_speeds_ask_for_no_more_than_a_car_gives(seed):
 
 # --- placing ----------------------------------------------------------------------------------------------------------
 
-CFG = PedestriansConfig(others=6, traffic=6, pace={"walk": 1, "stop_and_look": 1, "turn_back": 1})
+CFG = PedestriansConfig(others=6, look_alikes=2, traffic=6, pace={"walk": 1, "stop_and_look": 1, "turn_back": 1})
 
 
 @pytest.fixture(scope="module")
@@ -261,6 +261,24 @@ def test_people_walk_where_people_walk_and_cars_drive_on_the_road(placed):
                 heading = other.headings_rad[:-1][moving]
                 ahead = (along * np.column_stack([np.cos(heading), np.sin(heading)])).sum(axis=1)
                 assert (ahead > 0.5 * np.linalg.norm(along, axis=1)).all(), "forwards"
+
+
+def test_people_pass_the_walker_and_look_alikes_are_among_them(placed):
+    away_m, starts_m = [], []
+    for walk, company in placed[3]:
+        people = [other for other in company.others if other.kind == PERSON]
+        away_m += [np.linalg.norm(one.positions_m - walk.positions_m, axis=1).min() for one in people]
+        starts_m.append(np.linalg.norm(people[0].positions_m[0] - walk.positions_m[0]))
+        assert sum(other.is_look_alike for other in people) <= 2
+        assert people[0].is_look_alike
+        assert not any(other.is_look_alike for other in company.others[len(people) :])
+    assert np.mean(np.array(away_m) < PASS_M[1] + 1.5) >= 0.8
+    assert np.median(starts_m) < PASS_M[1] + 1.5
+
+
+def test_more_look_alikes_than_others_are_refused():
+    with pytest.raises(ValueError, match="look_alikes 3 is above others 2"):
+        PedestriansConfig(others=2, look_alikes=3)
 
 
 def test_the_same_numbers_give_the_same_company_and_more_keep_the_first(placed):

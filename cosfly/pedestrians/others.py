@@ -1,9 +1,10 @@
 """Who else moves while a walk lasts: people on routes of their own, and cars along lanes, all clear of the walker and
 of each other.
 
-One after the other is placed: the walker is there already, then the people, then the cars. Who would meet somebody
-waits a little way before; whom waiting does not help is drawn anew, and after some tries left out. So there may be
-fewer than the settings ask for.
+One after the other is placed: the walker is there already, then the people, then the cars. People pass the walker, each
+at a moment of its own that leads it near; the first is near from the start. Who would touch somebody waits a little way
+before; whom waiting does not help is drawn anew, and after some tries left out. So there may be fewer than the settings
+ask for.
 """
 
 from __future__ import annotations
@@ -33,6 +34,9 @@ from cosfly.work.chance import draw_by_share
 MOST_WAITS, WAIT_S = 10, 3.0  # who meets somebody again after so many waits is drawn anew
 KEEP_BACK_M = {"Pedestrians": 1.5, "Car": 7.0}  # way from where one waits to where one would have met
 TURN_S = 2.0  # people who are at the end of their route stand so long, and walk back
+PASS_M = (1.5, 7.0)  # how near to where the walker is then
+OPPOSITE_TRIES = 6  # ends of a route that are tried for the one most opposite to the other end
+GOLDEN = 0.618034  # moments k * GOLDEN % 1 are spread evenly, however many there are
 OWN_SPEED = (0.8, 1.2)  # of a person's speeds, beside those of the same pace
 CAR_SPEED_MPS = 8.0  # 30 km/h
 CAR_SIDEWAYS_MPS2, CAR_FORWARD_MPS2 = 2.0, 2.0  # what is comfortable in a curve, and along the way
@@ -42,11 +46,13 @@ CHORD_M = 1.0  # a car's heading is that of a piece of its way, so long ahead an
 
 @dataclass(frozen=True)
 class Trip:
-    """What one does: kind of BUILDS, way with its stops, limits_mps (k,): the speeds where nobody is in the way."""
+    """What one does: kind of BUILDS, way with its stops, limits_mps (k,): the speeds where nobody is in the way;
+    head_start_s: how long one has been on the way when the walk begins."""
 
     kind: str
     way: Way
     limits_mps: np.ndarray
+    head_start_s: float = 0.0
 
     def moved(self, time_s: np.ndarray, heights: Ground) -> Other:
         """Where the course leads at each time."""
@@ -64,7 +70,9 @@ class Trip:
         if self.kind == "Car":
             speeds_mps = braked(speeds_mps, self.way.along_m)
         line = np.column_stack([self.way.along_m, np.zeros(len(speeds_mps))])
-        return sample(line, speeds_mps, arrival_times(line, speeds_mps), self.way.stops_s, time_s)[0][:, 0]
+        return sample(line, speeds_mps, arrival_times(line, speeds_mps), self.way.stops_s, time_s + self.head_start_s)[
+            0
+        ][:, 0]
 
     def waiting(self, before_m: float) -> Trip:
         """The same with a stop of WAIT_S, or a longer one, at least KEEP_BACK_M before a place of the way."""
@@ -99,13 +107,13 @@ def company_of(
     """Place the others of one walk."""
     there = [Other("Pedestrians", walk.positions_m, headings_of(walk.positions_m, walk.time_s))]
     for kind, wanted in (("Pedestrians", cfg.others), ("Car", cfg.traffic)):
-        for _ in range(wanted):
+        for number in range(wanted):
             for _ in range(cfg.num_retries + 1):
                 is_car = kind == "Car"
-                course = draw_drive(walk, lanes, cfg, rng) if is_car else draw_stroll(walk, ground, cfg, rng)
+                course = draw_drive(walk, lanes, cfg, rng) if is_car else draw_stroll(walk, number, ground, cfg, rng)
                 other = None if course is None else without_meeting(course, walk.time_s, there, ground.heights)
                 if other is not None:
-                    there.append(other)
+                    there.append(replace(other, is_look_alike=not is_car and number < cfg.look_alikes))
                     break
     return Company(walk.path_id, there[1:])
 
@@ -124,22 +132,33 @@ def without_meeting(course: Trip, time_s: np.ndarray, there: list[Other], height
     return None
 
 
-def draw_stroll(walk: Walk, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator) -> Trip | None:
-    """Draw a person's route near a walk, there and back for as long as the walk lasts; None without a goal."""
-    cells = ground.grid.cells_at(walk.polyline_m[rng.integers(len(walk.polyline_m))])
-    start = sample_goal(ground, (int(cells[0]), int(cells[1])), 0.0, cfg.others_reach_m / cfg.resolution_m, rng)
-    limits = cfg.min_distance_m / cfg.resolution_m, cfg.max_distance_m / cfg.resolution_m
-    goal = None if start is None else sample_goal(ground, start, *limits, rng)
-    if start is None or goal is None:
+def draw_stroll(
+    walk: Walk, number: int, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator
+) -> Trip | None:
+    """Draw a person's route that passes the walker, there and back for as long as the walk lasts; None without one."""
+    moment_s = number * GOLDEN % 1.0 * float(walk.time_s[-1])
+    x, y = ground.grid.cells_at(walk.positions_m[int(np.searchsorted(walk.time_s, moment_s))])
+    low, high = np.array(PASS_M) / cfg.resolution_m
+    place = sample_goal(ground, (int(x), int(y)), low, high, rng)
+    if place is None:
         return None
-    route = ground.route(start, goal)
+    reach = 0.5 * cfg.others_reach_m / cfg.resolution_m, cfg.others_reach_m / cfg.resolution_m
+    drawn = [sample_goal(ground, place, *reach, rng) for _ in range(1 + OPPOSITE_TRIES)]
+    ends = [np.subtract(end, place) for end in drawn if end is not None]
+    if len(ends) < 2:
+        return None
+    pair = ends[0], min(ends[1:], key=lambda end: end @ ends[0] / np.linalg.norm(end))
+    legs = [ground.route(place, (int(x), int(y))) for x, y in pair + np.array(place)]
+    route = np.concatenate([legs[0][:0:-1], legs[1]])
     pace = PACES[draw_by_share(cfg.pace, rng)]
     way = take_pace(ground.grid.centers_of(route), pace, rng)
-    speeds_mps = speeds_at(way, pace, cfg, rng) * rng.uniform(*OWN_SPEED)
-    course = Trip("Pedestrians", way, speeds_mps)
-    while course.along_m(walk.time_s[-1:])[0] >= course.way.along_m[-1]:
+    course = Trip("Pedestrians", way, speeds_at(way, pace, cfg, rng) * rng.uniform(*OWN_SPEED))
+    while course.along_m(3.0 * walk.time_s[-1:])[0] >= course.way.along_m[-1]:
         course = and_back(course)
-    return course
+    times_s = moment_s + np.arange(0.0, walk.time_s[-1], walk.time_s[1])
+    apart_m = course.moved(times_s, ground.heights).positions_m[:, :2] - ground.grid.centers_of(np.array(place))
+    away_m = np.linalg.norm(apart_m, axis=1)
+    return replace(course, head_start_s=float(times_s[np.argmin(away_m)]) - moment_s)
 
 
 def and_back(course: Trip) -> Trip:

@@ -94,13 +94,19 @@ class PedestriansConfig(Config):
         1.6, ge=SLOWEST_SPEED_MPS, description="cruising speed of who hurries, m/s; cut to it or max_speed_mps"
     )
     others: int = Field(0, ge=0, le=500, description="other people who walk about during each walk; 0: nobody")
+    look_alikes: int = Field(
+        0,
+        ge=0,
+        le=500,
+        description="how many of the others wear what the walker does but for one thing: hard negatives",
+    )
     traffic: int = Field(
         0, ge=0, le=500, description="cars that drive about during each walk, where the map has straight roads; 0: none"
     )
     roi_vertices: MayDiffer[int] = Field(
         MOST_VERTICES, ge=3, description="most vertices of a region of interest; more are refused"
     )
-    others_reach_m: float = Field(40.0, gt=0, le=500, description="how near to a walk its others begin, m")
+    others_reach_m: float = Field(40.0, gt=0, le=500, description="how near to a walk its others keep, m")
     dt_s: float = Field(
         DT_S,
         ge=0.05,
@@ -133,6 +139,8 @@ class PedestriansConfig(Config):
             wrong.append(f"min_distance_m {self.min_distance_m} is not below max_distance_m {self.max_distance_m}")
         if self.min_speed_mps > self.max_speed_mps:
             wrong.append(f"min_speed_mps {self.min_speed_mps} is above max_speed_mps {self.max_speed_mps}")
+        if self.look_alikes > self.others:
+            wrong.append(f"look_alikes {self.look_alikes} is above others {self.others}, of whom they are")
         if 0 < self.max_detour < 1:
             wrong.append(f"max_detour {self.max_detour} is below 1: no route is shorter than straight; 0 is off")
         if wrong:

@@ -34,6 +34,7 @@ LARGEST_SHADOW_AREA_M = 420.0
 MAX_BONES = 6
 EDGE_LEVELS, EDGE_BLUR_PX = 5, 0.62
 MESH_STRIDE = 64
+MOVER_M = 4.5  # no part of a person or a car is farther from another one
 SOFTWARE = "llvmpipe"  # draws on the processor, and interpolates where hardware snaps to a grid (scene.frag.glsl)
 # Triangles that llvmpipe may have taken and not drawn yet. It begins another list of them (36 MB) whenever one is full
 # while the last is still being drawn, and keeps every list for good: without this a process grows by a seventh over
@@ -339,9 +340,10 @@ class GlRenderer:
                 set_uniform(program, count, len(capsules))
         parts = self._parts
         away = np.linalg.norm(parts.object_centers[rows] - center, axis=1) - parts.object_radii[rows]
+        near = [part for part in moving if np.linalg.norm(part[0]["center"][0] - center) < radius + MOVER_M]
         x0, y0, x1, y1 = shade.rectangle_px
         self._image.scissor = x0, y0, x1 - x0, y1 - y0
-        self._draw_scene(self._programs.near_movers, rows[away < radius], moving)
+        self._draw_scene(self._programs.near_movers, rows[away < radius], near)
         self._image.scissor = None
 
     def _draw_scene(self, programs: list[Any], rows: np.ndarray, moving: list[tuple[np.ndarray, np.ndarray]]) -> None:
