@@ -10,25 +10,27 @@ import cv2
 import numpy as np
 
 from cosfly import plan
-from cosfly.planners.styles import NAMES
+from cosfly.planners.styles import NAMES, suits
 from cosfly.products.boxes import MapHeader, make_box_map
 from cosfly.products.kinds import KINDS
 
-WAY_M = [(-40.0, 0.0), (50.0, 0.0)]
+WAY_M = [(0.5 * k, 0.0) for k in range(-80, 101)]  # a walker may stop at each
 HOUSES = [((5.0, 12.0, 14.0), (16.0, 6.0, 14.0)), ((5.0, -12.0, 14.0), (16.0, 6.0, 14.0))]  # which hide the walker
 WIDTH_PX, TOP_PX, SIDE_PX, PX_PER_M = 480, 190, 165, 2.6
 WALKER, DRONE, SIGHT, GROUND, HOUSE = (60, 60, 220), (190, 90, 20), (205, 190, 175), (150, 150, 150), (225, 225, 225)
 
 
 def flight_of(style):
-    """A flight of 75 s along a straight way, on open ground or, where a person is to be lost, between two houses."""
+    """A flight along a straight way, on open ground or, where a person is to be lost, between two houses; with stops
+    where the style is for them."""
     centers, halves = zip(*(HOUSES if style == "reacquire" else [((400.0, 400.0, 2.0), (1.0, 1.0, 2.0))]), strict=True)
     kinds, header = [KINDS["Buildings"]] * len(centers), MapHeader(name="styles", ground_z_m=0.0)
     box_map = make_box_map(centers, halves, [(0.0, 0.0, 0.0)] * len(centers), kinds, header=header)
+    walk = {"pace": {"fits_and_starts": 1}, "hurry_speed_mps": 2.4} if suits(style) == "uneven" else {}
     return next(
         trace
         for seed in range(40)
-        if (trace := plan(box_map, WAY_M, seed=seed, planner="muco", styles={style: 1})).drop_reason is None
+        if (trace := plan(box_map, WAY_M, seed=seed, walk=walk, planner="muco", styles={style: 1})).drop_reason is None
     )
 
 

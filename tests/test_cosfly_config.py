@@ -146,7 +146,7 @@ def test_what_a_setting_may_be_is_said_in_words():
 ALLOWED_VALUES = {
     "dust_haze": "render.weather_name",
     "stop_and_look": "pedestrians.pace",
-    "stop_and_go": "plan.styles",
+    "trail": "plan.styles",
     "pyrender": "render.backend",
     "multi_sample": "caption.repair.strategy",
 }

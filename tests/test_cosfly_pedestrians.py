@@ -23,7 +23,7 @@ from cosfly.products.boxes import MapHeader, make_box_map, read_boxes, write_box
 from cosfly.products.ground import Ground
 from cosfly.products.kinds import KINDS
 from cosfly.products.roi import Roi
-from cosfly.products.walks import read_paths
+from cosfly.products.walks import paces_of, read_paths
 from cosfly.space.grid import OccupancyGrid
 from cosfly.work.chance import rng_for
 from cosfly.work.config import build
@@ -278,6 +278,14 @@ def test_a_walk_depends_on_its_own_random_numbers_only():
     ]
     assert texts[0] == texts[1]
     assert len(set(texts)) == 3
+
+
+def test_paces_have_their_shares_whatever_the_seed_and_stay_where_walks_are_added():
+    shares = {"walk": 5.0, "fits_and_starts": 4.0, "hurry": 1.0}
+    for seed in range(20):
+        drawn = paces_of(40, shares, seed)
+        assert all(abs(drawn.count(name) - 4 * share) <= 2 for name, share in shares.items())
+        assert drawn[:7] == paces_of(7, shares, seed)
 
 
 def test_shares_of_paces_move_no_route_and_the_plain_one_is_the_default():

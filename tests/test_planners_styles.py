@@ -2,6 +2,7 @@
 
 import re
 from collections import Counter
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,7 +30,7 @@ from cosfly.products.boxes import MapHeader, make_box_map, write_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.products.segments import Mission, read_mission, read_segments
 from cosfly.products.traces import DroneTrace, read_traces
-from cosfly.products.walks import walk_id, write_paths
+from cosfly.products.walks import paces_of, walk_id, write_paths
 from cosfly.simplify.passes import simplify
 from cosfly.space import kernels
 from cosfly.work.chance import rng_for
@@ -38,6 +39,12 @@ from cosfly.work.stage_folder import read_manifest
 
 OPEN = kernels.obstacle_index(town_of())
 STRAIGHT = walk_along("straight", [(0, 0), (90, 0)])
+# Who jogs for 5 s and stands for 4 s.
+ALONG_M = 2.4 * np.cumsum(np.arange(180) % 18 < 10) * 0.5
+HALTING = replace(
+    walk_along("halting", [(0, 0), (89.5, 0)], speed_mps=1.0),
+    positions_m=np.column_stack([ALONG_M[:179], np.zeros((179, 2))]), speeds_mps=2.4 * (np.arange(179) % 18 < 10),
+)  # fmt: skip
 # A long house beside the walk hides a low drone on its other side for a while.
 HOUSE = kernels.obstacle_index(town_of(((45, 12, 14), (16, 6, 14)), ((45, -12, 14), (16, 6, 14))))
 
@@ -85,7 +92,8 @@ def test_rows_keep_the_ranges_of_heights_and_distances(name):
 def test_a_style_shows_the_decisions_that_it_is_for(name):
     counts = Counter()
     for seed in range(3):
-        trace = plan_flight(STRAIGHT, OPEN, styled(name), seed)
+        walk = HALTING if TABLE[name].suits == "uneven" else STRAIGHT
+        trace = plan_flight(walk, OPEN, styled(name, planner="muco"), seed)
         assert trace.drop_reason is None
         assert [part.style for part in trace.segments] == [name]
         counts += labels_of(trace)
@@ -181,25 +189,38 @@ def test_the_order_of_the_shares_draws_nothing_else():
     shares = {"top": 1.0, "side": 2.0, "follow": 1.0, "rise": 1.0}
     for seed in range(6):
         one, other = (
-            draw_styles([180], 0.5, PlanConfig(styles=styles, segment_s=10), np.random.default_rng(seed))
+            draw_styles([STRAIGHT], PlanConfig(styles=styles, segment_s=10), np.random.default_rng(seed))
             for styles in (shares, dict(reversed(shares.items())))
         )
         assert one == other
 
 
 def test_styles_are_drawn_to_their_shares_whatever_the_seed():
-    """Also both sides of a style of either; a flight's do not depend on those after it."""
-    shares = {"top": 1.0, "side": 2.0, "rise": 1.0, "reacquire": 1.0, "return_home": 1.0}
-    cfg, lengths = PlanConfig(styles=shares, segment_s=40), [240, 80, 90, 160] * 15
+    """Also both sides of a style of either."""
+    shares = {"top": 1.0, "side": 2.0, "trail": 1.0, "rise": 1.0, "reacquire": 1.0, "return_home": 1.0}
+    cfg = PlanConfig(styles=shares, segment_s=40)
+    walks = [walk_along(f"w{k}", [(0, 0), (way_m, 0)]) for k, way_m in enumerate([140, 48, 54, 96] * 15)]
     for seed in range(10):
-        drawn = draw_styles(lengths, 0.5, cfg, np.random.default_rng(seed))
-        assert drawn[:20] == draw_styles(lengths[:20], 0.5, cfg, np.random.default_rng(seed))
+        drawn = draw_styles(walks, cfg, np.random.default_rng(seed))
         whole = Counter(names[-1] for names in drawn)
-        assert abs(whole[REACQUIRE] - 10) <= 2
-        assert abs(whole[RETURN_HOME] - 10) <= 2
+        assert abs(whole[REACQUIRE] - 60 / 7) <= 2
+        assert abs(whole[RETURN_HOME] - 60 / 7) <= 2
         parts = Counter(name for names in drawn for name in names if name not in (REACQUIRE, RETURN_HOME))
-        for name in ("top", "side", OTHER_SIDE + "side", "rise"):
-            assert abs(parts[name] - parts.total() / 4) <= 2.5
+        for name in ("top", "side", OTHER_SIDE + "side", "rise", "trail"):
+            assert abs(parts[name] - parts.total() / 5) <= 2.5
+
+
+def test_a_drone_that_changes_its_pace_follows_a_walker_who_does():
+    """The style that answers a walker is of those who stop and hurry, the one beside of those who go straight on."""
+    ways = {"straight": [(0, 0), (80, 0)], "bent": [(0, 0), (20, 0), (20, 20), (0, 20), (0, 10), (10, 10)]}
+    walks = [walk_along(f"{name}{k}", way) for k in range(4) for name, way in ways.items()]
+    walks += [replace(walk, path_id=f"{k}", speeds_mps=np.tile([0.0, 2.4], len(walk.time_s))[: len(walk.time_s)])
+              for k, walk in enumerate(walks[:4])]  # fmt: skip
+    for seed in range(5):
+        drawn = draw_styles(walks, PlanConfig(styles={"trail": 1, "side": 1, "top": 2}), np.random.default_rng(seed))
+        for walk, (name,) in zip(walks, drawn, strict=True):
+            assert (name == "trail") <= walk.path_id.isdigit(), (walk.path_id, drawn)
+            assert name.endswith("side") <= (not walk.path_id.startswith("bent"))
 
 
 def test_walks_of_two_maps_with_one_id_draw_apart():
@@ -301,7 +322,7 @@ def test_ranges_bind_a_run_where_its_styles_have_them():
 
 # --- the shipped towns ------------------------------------------------------------------------------------------------
 
-ORDERS, DECISIONS_LEAST, STYLE_MOST = {"break_off", "return_to_home"}, 0.02, 0.4
+ORDERS, DECISIONS_LEAST, STYLE_MOST = {"break_off", "return_to_home"}, 0.02, 0.3
 
 
 def flights_of(cfg):
@@ -309,11 +330,16 @@ def flights_of(cfg):
     for name in cfg.towns:
         town = cfg.of_town(name)
         box_map = simplify(load_map(town.maps, seed=town.seed), town.simplify).box_map
-        ground, ids = walkable_ground(box_map, town.pedestrians), map(walk_id, range(town.pedestrians.num_paths))
-        walks = [make_walk(id_, ground, town.pedestrians, rng_for(town.seed, "pedestrians", id_)).walk for id_ in ids]
+        ground, paces = walkable_ground(box_map, town.pedestrians), paces_of(10, town.pedestrians.pace, town.seed)
+        chances = {walk_id(k): rng_for(town.seed, "pedestrians", walk_id(k)) for k in range(len(paces))}
+        walks = [
+            make_walk(id_, ground, town.pedestrians, rng, pace).walk
+            for (id_, rng), pace in zip(chances.items(), paces, strict=True)
+        ]
         obstacles, screens = kernels.obstacle_index(box_map), screens_of(box_map)
         for walk, styles in zip(walks, draw_styles_of(walks, town.plan, town.seed), strict=True):
-            yield plan_flight(walk, obstacles, town.plan, town.seed, screens, styles)
+            with suppress(NoPathError):  # a failure that the stage counts
+                yield plan_flight(walk, obstacles, town.plan, town.seed, screens, styles)
 
 
 @pytest.mark.slow
@@ -332,6 +358,10 @@ def test_diverse_shows_each_decision_and_all_heights_and_distances_whatever_the_
         assert np.percentile(found_m, 95) >= high_m
     styles = Counter(part.style for trace in kept for part in trace.segments for _ in range(part.begin, part.end))
     assert max(styles.values()) <= STYLE_MOST * sum(len(trace.time_s) for trace in kept)
+    assert styles["hold"] > 0
+    assert sum(trace.segments[0].style == REACQUIRE for trace in kept if trace.segments) >= 2
+    assert min(trace.metrics["clearance_min_m"] for trace in kept) >= 3.0 - 1e-3
+    assert np.concatenate([trace.visibility for trace in kept]).mean() >= 0.9
 
 
 # --- searching --------------------------------------------------------------------------------------------------------

@@ -45,7 +45,7 @@ from cosfly.products.boxes import read_boxes
 from cosfly.products.ground import Ground
 from cosfly.products.others import OTHERS_FILE, Company, write_others
 from cosfly.products.roi import read_roi
-from cosfly.products.walks import Walk, pace_field, walk_id, write_paths
+from cosfly.products.walks import Walk, pace_field, paces_of, walk_id, write_paths
 from cosfly.reading.documents import FileFormat
 from cosfly.work.chance import draw_by_share, rng_for
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
@@ -152,9 +152,13 @@ class WalkResult:
     seconds: dict[str, float]
 
 
-def make_walk(path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator) -> WalkResult:
+def make_walk(
+    path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator, pace: str | None = None
+) -> WalkResult:
     """Make one walk: draw its ends, find the route, take it at a pace, sample it.
 
+    Args:
+        pace: None: drawn by its share.
     Raises:
         NoPathError: no pair of ends served.
     """
@@ -162,7 +166,7 @@ def make_walk(path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng:
     pace_rng = rng.spawn(1)[0]  # a child takes no draw from its parent: shares of paces move no route
     route_m, retries = _draw_route(path_id, ground, cfg, rng, clock)
     with clock("report"):
-        walk = walk_along(path_id, route_m, ground.heights, cfg, rng, pace_rng)
+        walk = walk_along(path_id, route_m, ground.heights, cfg, rng, pace_rng, pace)
     return WalkResult(walk, retries, clock.seconds)
 
 
@@ -173,9 +177,10 @@ def walk_along(
     cfg: PedestriansConfig,
     rng: np.random.Generator,
     pace_rng: np.random.Generator,
+    pace: str | None = None,
 ) -> Walk:
-    """Walk a route, (k, 2) m, at a pace that is drawn, and sample it."""
-    name = draw_by_share(cfg.pace, pace_rng)
+    """Walk a route, (k, 2) m, at a pace, or one that is drawn, and sample it."""
+    name = pace or draw_by_share(cfg.pace, pace_rng)
     way = take_pace(route_m, PACES[name], pace_rng)
     waypoint_mps = speeds_at(way, PACES[name], cfg, rng)
     times_s = arrival_times(way.polyline_m, waypoint_mps)
@@ -225,7 +230,7 @@ def make_worker(cfg: PedestriansConfig, seed: int, ground: WalkableGround, lanes
     """Worker factory: gives the function that makes one walk, and its company where the settings ask for one."""
 
     def work(item: Item) -> Outcome:
-        made = make_walk(item.item_id, ground, cfg, rng_for(seed, STAGE, item.item_id))
+        made = make_walk(item.item_id, ground, cfg, rng_for(seed, STAGE, item.item_id), item.payload)
         result = {"path": made.walk.as_json(), "retries": made.retries, "seconds": made.seconds}
         if cfg.has_others:
             rng = rng_for(seed, STAGE, f"{item.item_id}/others")
@@ -325,7 +330,7 @@ def run(
         box_map = read_boxes(simplified_map)
         region = read_roi(roi, cfg.roi_vertices) if roi else None
     ground = walkable_ground(box_map, cfg, region, where=simplified_map, roi_where=roi or "", clock=clock)
-    items = [Item(walk_id(k)) for k in range(cfg.num_paths)]
+    items = [Item(walk_id(k), pace) for k, pace in enumerate(paces_of(cfg.num_paths, cfg.pace, seed))]
     # Workers need the labels only; the rest would cost time to send.
     lean = replace(ground, inflated=ground.grid, is_in_roi=None)
     lanes = lanes_of(box_map) if cfg.traffic else []

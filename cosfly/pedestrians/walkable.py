@@ -88,7 +88,7 @@ class PedestriansConfig(Config):
     min_speed_mps: float = Field(0.0, ge=0, description="speeds are raised to this, m/s (never below 0.05)")
     max_speed_mps: float = Field(1.6, ge=SLOWEST_SPEED_MPS, description="speeds are cut to this, m/s")
     pace: dict[str, float] = Field(
-        {PLAIN_PACE: 1.0}, description=f"share of the walks at each pace, drawn for each walk: {', '.join(PACES)}"
+        {PLAIN_PACE: 1.0}, description=f"share of the walks at each pace, drawn to a quota: {', '.join(PACES)}"
     )
     hurry_speed_mps: float = Field(
         1.6, ge=SLOWEST_SPEED_MPS, description="cruising speed of who hurries, m/s; cut to it or max_speed_mps"

@@ -151,7 +151,7 @@ PACES = {
     "stop_and_look": Pace(stop_every_m=(15.0, 35.0), stop_s=(5.0, 12.0)),
     "hurry": Pace(hurries=True),
     # What a drone that follows has cause to slow down, hover and speed up for.
-    "fits_and_starts": Pace(hurries=True, stop_every_m=(9.0, 17.0), stop_s=(4.0, 6.5)),
+    "fits_and_starts": Pace(hurries=True, stop_every_m=(8.0, 14.0), stop_s=(3.0, 5.0)),
     "turn_back": Pace(turn_at=(0.45, 0.75), back=(0.5, 0.9), stop_s=(1.0, 4.0)),
 }
 

@@ -28,7 +28,7 @@ ROUNDING_S = 1.0  # standard deviation of the smoothing of corners
 STEADY_RAD = np.radians(20.0)  # a drone does not swing round for a walker who turns by less
 
 # Parameters are drawn anew so often, until sight less the share of places too near to a box is as good as this.
-DRAWS, GOOD = 8, 0.97
+DRAWS, GOOD = 32, 0.99
 WAY_ROUND = 0.2  # of that is the price of half the way round the walker from the part before
 
 

@@ -14,8 +14,9 @@ from cosfly.geometry import look_at
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
 from cosfly.planners.courses import ROUNDING_S, wish_of
 from cosfly.planners.reacquire import finds_again, wish_of_reacquire
-from cosfly.planners.styles import OTHER_SIDE, REACQUIRE, RETURN_HOME, ROWS, WHOLE
+from cosfly.planners.styles import OTHER_SIDE, REACQUIRE, RETURN_HOME, ROWS, WHOLE, suits
 from cosfly.products.segments import FOLLOW, MISSION_KINDS, Mission, Segment
+from cosfly.products.walks import Walk
 from cosfly.work.chance import draw_to_quota
 
 if TYPE_CHECKING:
@@ -55,13 +56,12 @@ class Intent:
         return any(part.style == REACQUIRE for part in self.segments)
 
 
-def draw_styles(lengths: Sequence[int], dt_s: float, cfg: PlanConfig, rng: np.random.Generator) -> list[list[str]]:
+def draw_styles(walks: Sequence[Walk], cfg: PlanConfig, rng: np.random.Generator) -> list[list[str]]:
     """Draw the styles of the parts of each flight of a run to the quota of the settings' shares.
 
-    Flights draw among themselves which takes a style that is of a whole flight, parts which styles they have.
-
-    Args:
-        lengths: points of each flight. Those of a flight do not depend on the flights after it.
+    Flights draw among themselves which takes a style that is of a whole flight, parts which styles they have. Styles
+    that suit somebody who stops and hurries, or who goes straight on, have their share of the time in the parts with
+    most of it. So a drone that changes its pace has cause to, and shares stay what they are.
     """
     others = {style: share for style, share in cfg.styles.items() if style not in WHOLE}
     parts_share = sum(others.values())
@@ -72,14 +72,41 @@ def draw_styles(lengths: Sequence[int], dt_s: float, cfg: PlanConfig, rng: np.ra
             others[style] = others[other] = others[style] / 2.0
     whole = {style: share for style, share in cfg.styles.items() if style in WHOLE}
     flights_rng, parts_rng = rng.spawn(2)
-    flights = draw_to_quota(whole | {"": parts_share}, flights_rng)
-    parts = draw_to_quota(others, parts_rng)
-    drawn = []
-    for num_points, last in zip(lengths, flights, strict=False):
-        num = round(num_points * dt_s / cfg.segment_s) if cfg.segment_s else 1
+    lasts = [*islice(draw_to_quota(whole | {"": parts_share}, flights_rng), len(walks))]
+    parts = list[tuple[int, np.ndarray]]()  # flight, and points of its walk
+    for flight, (walk, last) in enumerate(zip(walks, lasts, strict=True)):
+        num_points, duration_s = len(walk.time_s), float(walk.time_s[-1])
+        num = round(duration_s / cfg.segment_s) if cfg.segment_s else 1
         num = 0 if last == REACQUIRE else max(1, min(num, num_points // POINTS_LEAST))
-        drawn.append([*islice(parts, num), *([last] if last else [])])
-    return drawn
+        parts += [(flight, points) for points in np.array_split(np.arange(num_points), num)] if num else []
+    free, left, of_part = [*range(len(parts))], sum(others.values()), dict[int, str]()
+    for kind, measure in MEASURES.items():
+        styles = {style: share for style, share in others.items() if suits(style) == kind}
+        if not (free and (share := sum(styles.values()))):
+            continue
+        free.sort(key=lambda k: (-measure(walks[parts[k][0]], parts[k][1]), k))
+        lengths = np.array([len(parts[k][1]) for k in free])
+        ends = np.cumsum(lengths) - parts_rng.random() * lengths
+        num, left = int((ends <= lengths.sum() * share / left).sum()), left - share
+        of_part |= zip(sorted(free[:num]), draw_to_quota(styles, parts_rng), strict=False)
+        free = free[num:]
+    drawn = [list[str]() for _ in walks]
+    for k, (flight, _) in enumerate(parts):
+        drawn[flight].append(of_part[k])
+    return [names + ([last] if last else []) for names, last in zip(drawn, lasts, strict=True)]
+
+
+def _unevenness_mps(walk: Walk, points: np.ndarray) -> float:
+    return float(np.std(walk.speeds_mps[points]))
+
+
+def _straightness(walk: Walk, points: np.ndarray) -> float:
+    steps_m = np.diff(walk.positions_m[points, :2], axis=0)
+    return float(np.hypot(*steps_m.sum(axis=0)) / max(float(np.hypot(*steps_m.T).sum()), 1e-9))
+
+
+# How much of what suits a style a walker does in a part of the way, in the order in which parts are given away.
+MEASURES = {"uneven": _unevenness_mps, "straight": _straightness, "": lambda walk, points: 0.0}
 
 
 def mirrored(names: Sequence[str]) -> list[str]:

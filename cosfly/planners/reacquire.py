@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from cosfly.products.boxes import BoxMap
     from cosfly.space.kernels import BoxIndex
 
-TRIES = 40
+TRIES = 120
 LOST_LEAST_S, LOST_MOST_S = 1.5, 15.0  # longest time without sight
 BEFORE_S, AFTER_S = 2.0, 3.0  # seen at least so long before it is lost, and at the end
 SEEN = 0.5  # mean visibility that counts as seen

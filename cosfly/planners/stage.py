@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-TRIES = 3  # of a flight that does not hold its styles: places in their ranges are drawn anew
+TRIES = 6  # of a flight that does not hold its styles: places in their ranges are drawn anew
 COORDINATE_MAX_M = 1e6  # beyond, float32 depth and four decimals of a metre in the files lose their meaning
 
 
@@ -82,7 +82,7 @@ def draw_styles_of(walks: Sequence[Walk], cfg: PlanConfig, seed: int) -> list[li
     """
     from cosfly.planners.intent import draw_styles
 
-    return draw_styles([len(walk.time_s) for walk in walks], step_s(walks[0].time_s), cfg, style_rng(walks[0], seed))
+    return draw_styles(walks, cfg, style_rng(walks[0], seed))
 
 
 def plan_flight(

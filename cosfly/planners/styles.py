@@ -33,7 +33,8 @@ class Style:
     round_mps: speed round the walker, positive counter-clockwise. hop_s: the drone stands still, and so often takes a
     new place, of which the bearing is that of the halt's beginning. pace_mps: how fast the distance changes on the way
     there.
-    purpose: what it is for, in the words of the decisions.
+    purpose: what it is for, in the words of the decisions. suits: "uneven", a walker who stops and hurries, which the
+    drone answers; "straight", one who goes straight on; else any.
     """
 
     purpose: tuple[str, ...]
@@ -47,6 +48,7 @@ class Style:
     round_mps: Range = (0.0, 0.0)
     hop_s: Range | None = None
     pace_mps: Range = (4.0, 4.0)
+    suits: str = ""
 
 
 # Distances and heights keep the slant distance from 10 to 60 m. Nearer than some 8 m in the plane, a low drone would
@@ -54,8 +56,10 @@ class Style:
 TABLE: dict[str, Style] = {
     "orbit_left": Style(("circle_left",), (8.0, 17.0), (8.0, 22.0), round_mps=(-6.0, -4.0)),
     "orbit_right": Style(("circle_right",), (8.0, 17.0), (8.0, 22.0), round_mps=(4.0, 6.0)),
-    "side": Style(("strafe_left", "strafe_right"), (8.0, 10.5), (8.0, 10.0), (75.0, 105.0), either_side=True),
-    "lead": Style(("move_backward",), (30.0, 48.0), (10.0, 32.0), (-25.0, 25.0)),
+    "side": Style(
+        ("strafe_left", "strafe_right"), (8.0, 10.5), (8.0, 10.0), (75.0, 105.0), either_side=True, suits="straight"
+    ),
+    "lead": Style(("move_backward",), (26.0, 44.0), (14.0, 32.0), (-25.0, 25.0)),
     "approach": Style(
         ("move_forward",), (40.0, 52.0), (15.0, 28.0), (150.0, 210.0),
         ground_distance_end_m=(8.0, 12.0), altitude_end_m=(8.0, 12.0),
@@ -64,14 +68,11 @@ TABLE: dict[str, Style] = {
         ("move_backward",), (8.0, 12.0), (8.0, 12.0), (-50.0, 50.0),
         ground_distance_end_m=(40.0, 52.0), altitude_end_m=(15.0, 28.0),
     ),
-    "rise": Style(("ascend",), (10.0, 22.0), (8.0, 14.0), (135.0, 225.0), altitude_end_m=(50.0, 55.0)),
-    "sink": Style(("descend",), (10.0, 22.0), (50.0, 55.0), (135.0, 225.0), altitude_end_m=(8.0, 14.0)),
+    "rise": Style(("ascend",), (14.0, 22.0), (8.0, 14.0), (135.0, 225.0), altitude_end_m=(51.0, 55.0)),
+    "sink": Style(("descend",), (14.0, 22.0), (51.0, 55.0), (135.0, 225.0), altitude_end_m=(8.0, 14.0)),
     "hold": Style(("hover",), (10.0, 18.0), (8.0, 25.0), (-18.0, 18.0), hop_s=(9.0, 15.0), pace_mps=(1.5, 3.0)),
-    "stop_and_go": Style(
-        ("speed_up", "slow_down", "hover"), (16.0, 34.0), (12.0, 20.0), (178.0, 182.0),
-        hop_s=(6.0, 7.5), pace_mps=(4.0, 6.0),
-    ),
-    "top": Style(("track_straight",), (4.0, 8.0), (48.0, 59.0), (150.0, 210.0)),
+    "trail": Style(("speed_up", "slow_down", "hover"), (16.0, 34.0), (12.0, 20.0), (178.0, 182.0), suits="uneven"),
+    "top": Style(("track_straight",), (20.0, 26.0), (50.0, 54.0), (150.0, 210.0)),
 }  # fmt: skip
 
 # Where a walker is lost behind a house or a tree, and from where the drone searches; how stands in reacquire.py.
@@ -81,6 +82,12 @@ HIDING = Style(
 
 NAMES = (FOLLOW, *TABLE, REACQUIRE, RETURN_HOME)
 WHOLE = (REACQUIRE, RETURN_HOME)  # take a whole flight; the others may take parts
+
+
+def suits(name: str) -> str:
+    """Tell what walker a style suits, by its name."""
+    row = ROWS.get(name.removeprefix(OTHER_SIDE))
+    return "" if row is None else row.suits
 
 
 # --- settings ---------------------------------------------------------------------------------------------------------

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ import numpy as np
 from cosfly.errors import InputError
 from cosfly.products.columns import column, matrix, read_items, rounded, step_field, text_id, write_items
 from cosfly.reading.documents import FileFormat
+from cosfly.work.chance import draw_to_quota, rng_for
 
 # The tracked person: an axis-aligned box round the hip point, which is the target's position everywhere.
 PERSON_HALF_EXTENTS_M = (0.3, 0.3, 0.9)
@@ -63,6 +66,11 @@ class Walk:
 def walk_id(number: int) -> str:
     """Give the id of the walk that is made as that one of a map, counted from 0."""
     return f"path_{number:05d}"
+
+
+def paces_of(num_walks: int, shares: Mapping[str, float], seed: int) -> list[str]:
+    """Draw the paces of the walks of a map to the quota of their shares; a walk's does not depend on later ones."""
+    return [*islice(draw_to_quota(shares, rng_for(seed, "pedestrians", "paces")), num_walks)]
 
 
 def pace_field(pace: str) -> dict[str, str]:

@@ -17,8 +17,7 @@ import numpy as np
 
 from cosfly.geometry import look_at, wrap_deg
 from cosfly.products.shift_draws import PERTURBED, ShiftDraw, rng_of_shifts, shift_draws
-from cosfly.products.walks import walk_id
-from cosfly.work.chance import draw_by_share, rng_for
+from cosfly.products.walks import paces_of, walk_id
 from release.flight_rows import FlightRows
 from release.record import MadeBy
 from release.verify.findings import Findings
@@ -67,11 +66,10 @@ class DrawSettings:
         }
         return shift_draws(rng, **radii, is_cubic=told["sampling"] == "cubic")
 
-    def pace(self, path_id: str) -> str | None:
-        """The pace of a walk, None where nobody tells the shares: drawn of a child of the walk's own generator, as the
-        stage does."""
-        rng, shares = rng_for(self.walks.seed, "pedestrians", path_id), self.walks.config.get("pace")
-        return None if shares is None else draw_by_share(shares, rng.spawn(1)[0])
+    def pace(self, number: int) -> str | None:
+        """The pace of a walk, None where nobody tells the shares."""
+        shares = self.walks.config.get("pace")
+        return None if shares is None else paces_of(number + 1, shares, self.walks.seed)[number]
 
 
 def check_draws(flight: FlightRows, drawn: DrawSettings | None, findings: Findings) -> None:
@@ -84,29 +82,29 @@ def check_draws(flight: FlightRows, drawn: DrawSettings | None, findings: Findin
         return
     shifted = [i for i, words in enumerate(flight.events) if words is not None and words["position"] == "applied"]
     shifted = [i for i in shifted if flight.index[i] < FRAMES_TRIED][:SHIFTS_TRIED]
-    path_id = _walk_of(flight, shifted, drawn)
-    if path_id is None:
+    number = _walk_of(flight, shifted, drawn)
+    if number is None:
         if shifted and drawn.num_walks <= MOST_WALKS:
             got = f"shifts that none of {drawn.num_walks} walks draws under seed {drawn.render.seed}"
             expected = "the seed that they were drawn from, or another version of cosfly drew them"
             findings.warn("draw", flight.where(shifted[0], "drone_offset"), got, expected)
         return
-    draws = list(islice(drawn.draws(path_id), int(flight.index[-1]) + 1))
+    draws = list(islice(drawn.draws(walk_id(number)), int(flight.index[-1]) + 1))
     for i, words in enumerate(flight.events):
         if words is not None:
             for column, got, expected in _odd_in_frame(flight, i, words, draws[flight.index[i]], drawn.perturbation):
                 findings.error("draw", flight.where(i, column), got, f"{expected}, by the seed's draw")
-    pace, own = drawn.pace(path_id), flight.rows[0].get("pace")
+    pace, own = drawn.pace(number), flight.rows[0].get("pace")
     if None not in (pace, own) and own != pace:
-        findings.error("draw", flight.where(0, "pace"), own, f"{pace}, drawn for {path_id}")
+        findings.error("draw", flight.where(0, "pace"), own, f"{pace}, drawn for {walk_id(number)}")
 
 
-def _walk_of(flight: FlightRows, shifted: list[int], drawn: DrawSettings) -> str | None:
+def _walk_of(flight: FlightRows, shifted: list[int], drawn: DrawSettings) -> int | None:
     for i in shifted:
         if len(drawn.first_shifts):
             off_m = np.abs(drawn.first_shifts[:, flight.index[i]] - flight.drone_offset[i, :3]).max(axis=1)
             if off_m.min() <= EXACT_M:
-                return walk_id(int(off_m.argmin()))
+                return int(off_m.argmin())
     return None
 
 
