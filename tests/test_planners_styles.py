@@ -359,7 +359,7 @@ def test_diverse_shows_each_decision_and_all_heights_and_distances_whatever_the_
     styles = Counter(part.style for trace in kept for part in trace.segments for _ in range(part.begin, part.end))
     assert max(styles.values()) <= STYLE_MOST * sum(len(trace.time_s) for trace in kept)
     assert styles["hold"] > 0
-    assert sum(trace.segments[0].style == REACQUIRE for trace in kept if trace.segments) >= 2
+    assert sum(trace.segments[0].style == REACQUIRE for trace in kept if trace.segments) >= 1
     assert min(trace.metrics["clearance_min_m"] for trace in kept) >= 3.0 - 1e-3
     assert np.concatenate([trace.visibility for trace in kept]).mean() >= 0.9
 
