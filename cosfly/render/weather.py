@@ -36,7 +36,7 @@ from cosfly.work.config import Config, MayDiffer, build, read_yaml
 # Extinction per m at 100 percent; dense fog (80) leaves 5 % of what stands 60 m away.
 FOG_AT_FULL, FOG_POWER = 0.10, 2.4
 RAIN_EXTINCTION = 0.0045  # per m of the heaviest rain: a visibility of some 700 m
-# Of clothes against the ground in clear air (CIE76), and how it goes with the light that is left, measured at 15 to 50 m.
+# Of clothes against the ground in clear air (CIE76), and how it goes with the light that is left: measured.
 STRONGEST_CONTRAST, CONTRAST_POWER = 75.0, 1.75
 LIT_KINDS = tuple(KINDS[name] for name in ("Poles", "Roads", "Sidewalks"))  # lamps hang there, or stand along them
 DEFAULT_SEED = 20260423  # of the paper's production runs (app:weather:coverage)
