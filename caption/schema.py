@@ -6,6 +6,7 @@ from. Only `windows.py` makes them, and nothing that builds a prompt takes a `Fu
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from cosfly.chat.protocol import check_url
 from cosfly.chat.student_chat import MAX_ANSWER_TOKENS
 from cosfly.chat.vllm_engine import VllmConfig
 from cosfly.look.frame_views import DEPTH_RANGE_M, Layout, View
-from cosfly.products.captions import KeyframeRecord, LabelFrom, SentenceState, TeacherKind, Verdict, Writing
+from cosfly.products.captions import KeyframeRecord, LabelFrom, Language, SentenceState, TeacherKind, Verdict, Writing
 from cosfly.products.places import FlightChoice
 from cosfly.products.predictions import PREDICTIONS
 from cosfly.work.config import Config, MayDiffer
@@ -41,6 +42,7 @@ class ObservedFrame:
     and target_bbox (left, top, right, bottom) px of what is seen of the target (where a tree does not say, of its
     projected 3D box), NaN where unknown;
     visibility: score, NaN where unknown; legible: whether who is visible can be made out, true where a tree is silent.
+    others_in_view, other_distance_m: other people who are seen, and from the target to the nearest; NaN where unknown.
     """
 
     time_s: float
@@ -53,6 +55,8 @@ class ObservedFrame:
     visible: bool
     visibility: float
     legible: bool = True
+    others_in_view: float = math.nan
+    other_distance_m: float = math.nan
 
 
 def observed_frames(*columns: np.ndarray) -> tuple[ObservedFrame, ...]:
@@ -65,8 +69,8 @@ class ObservedWindow:
     """The observed frames t0..t(n-1) of one sample, oldest first; the last is the current one. Right-handed axes.
 
     indices: of the n frames in their flight. mission: what the drone knows at the current frame of an order that ends
-    the pursuit, its kind (MISSION_KINDS), None before; frame_folders: n folders; frame_files: the names that each
-    holds.
+    the pursuit, its kind (MISSION_KINDS), None before; goal: whom it follows, in words, None in flights without other
+    people; frame_folders: n folders; frame_files: the names that each holds.
     """
 
     sample_id: str
@@ -80,6 +84,7 @@ class ObservedWindow:
     frame_folders: tuple[Path, ...]
     frame_files: tuple[frozenset[str], ...]
     mission: str | None = None
+    goal: dict[Language, str] | None = None
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,8 @@ CONTRACT: dict[str, Any] = {
     "goal_frame, where target_picture shows it; goal_says, what they use of people, who looks how: target, and others "
     "by instance id; or a place: left, right, near, far, or what it stands by. Null where nothing tells the target "
     "apart, and where the tree does not say",
+    "others": "others_in_view, other people who have a pixel in the frame; other_distance_m, from the target to the "
+    "nearest of them over the ground, null without any",
     "legibility": "target_height_px, of its box in the image; target_contrast, CIE76 difference of the colours of its "
     "pixels from those around; target_legible: visible, "
     f"{LEGIBLE_HEIGHT_PX:g} px high, {LEGIBLE_SHARE:g} of it unhidden (visibility), contrast {LEGIBLE_CONTRAST:g}; "
@@ -335,6 +337,14 @@ FRAME = (  # everything of a frame but pictures and depth
     Column(
         "target_legible", "bool", lambda f, i: f.told_legibility(i)["legible"], title="target can be made out",
         annotation=True,
+    ),
+    Column(
+        "others_in_view", "int32", lambda f, i: None if f.company is None else int(f.company[i, 0]),
+        title="other people in view", annotation=True, shown=True,
+    ),
+    Column(
+        "other_distance_m", "float64", lambda f, i: None if f.company is None else f.company[i, 1],
+        ranges={"": (0.0, 1e6)},
     ),
     Column("is_perturbed", "bool", lambda f, i: f.is_perturbed[i], required=True),
     Column(

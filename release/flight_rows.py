@@ -159,7 +159,8 @@ class FlightRows:
             target_mask_bbox=self.mask_box if has_mask else None, is_original=self.is_clean,
             target_legible=None if None in self.column("target_legible") else self.flags("target_legible"),
             intrinsics=matrices if self.zooms else None, between=between_of(self.rows),
-            people=self.people, goal=self.goal,
+            people=self.people, goal=self.goal, company=None if None in self.column("others_in_view")
+            else np.stack([self.numbers("others_in_view"), self.numbers("other_distance_m")], axis=1),
         )  # fmt: skip
 
     def shown(

@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from caption.run.windows import LabelMotion, cut_future, frames_of, label_motion
+from caption.run.windows import LabelMotion, cut_future, frames_of, goal_of, label_motion
 from caption.schema import EvidenceConfig, FutureMotion, LabelConfig, ObservedFrame, ObservedWindow
 from caption.teachers.prompt_files import shipped_prompts
 from caption.teachers.prompts import mission_lines, system_prompt, user_prompts
@@ -74,7 +74,7 @@ def _window(
         sample_id=caption.sample_id, town=flight.town, trajectory=flight.trajectory, variant=flight.variant,
         indices=caption.window, width_px=flight.camera.width_px, height_px=flight.camera.height_px,
         frames=tuple(frames[row] for row in rows),
-        frame_folders=(), frame_files=(), mission=mission,
+        frame_folders=(), frame_files=(), mission=mission, goal=goal_of(flight),
     )  # fmt: skip
 
 

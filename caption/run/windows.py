@@ -22,7 +22,7 @@ from caption.schema import (
     observed_frames,
 )
 from caption.truth.actions import ActionTable, measure
-from cosfly.products.captions import KeyframeRecord, LabelFrom
+from cosfly.products.captions import KeyframeRecord, LabelFrom, Language
 from cosfly.products.frames import files_in
 from cosfly.products.places import sample_id
 from cosfly.products.playback import Flight
@@ -99,7 +99,13 @@ def frames_of(flight: Flight) -> tuple[ObservedFrame, ...]:
         flight.target_visible,
         flight.visibility,
         np.ones(len(flight), dtype=bool) if flight.target_legible is None else flight.target_legible,
+        *(np.full((len(flight), 2), np.nan) if flight.company is None else flight.company).T,
     )
+
+
+def goal_of(flight: Flight) -> dict[Language, str] | None:
+    """Give the goal in words, of a flight in which there are other people."""
+    return None if flight.goal is None or flight.company is None else {"en": flight.goal.en, "zh": flight.goal.zh}
 
 
 def _observe(
@@ -118,6 +124,7 @@ def _observe(
         frame_folders=tuple(folders[span]),
         frame_files=tuple(files[span]),
         mission=known_of(flight.mission, span.stop - 1),
+        goal=goal_of(flight),
     )
 
 

@@ -17,7 +17,7 @@ from caption.truth.glossary import load_glossary
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft, WayOfWriting, way_of
 from cosfly.look.frame_views import Pictures, frame_label
-from cosfly.products.captions import PICTURES_MARK, Language, Prompt, Writing
+from cosfly.products.captions import GOAL_WORDS, PICTURES_MARK, Language, Prompt, Writing
 from cosfly.products.segments import MISSION_KINDS
 from cosfly.work.store import dump_json, sha256_bytes
 
@@ -135,7 +135,23 @@ def _user_prompt(
         "target": "; ".join([_target_text(frame) or unknown for frame in window.frames]),
     }
     told = prompt_format(f"user_{language}", vocabulary) % (numbers | own)
+    told = "\n".join([told, *_company_lines(window, facts, language)])
     return told if window.mission is None else f"{told}\n{_MISSION[language][window.mission]}"
+
+
+def _company_lines(window: ObservedWindow, facts: Facts, language: Language) -> list[str]:
+    """Tell whom to follow and who else is there, in windows of flights with other people."""
+    lines = [GOAL_WORDS[language] % window.goal[language]] if window.goal else []
+    if None in facts.others_in_view:
+        return lines
+    away = ["-" if one is None else f"{one:.1f}" for one in facts.other_distance_m]
+    return [*lines, _OTHERS[language] % (", ".join(map(str, facts.others_in_view)), ", ".join(away))]
+
+
+_OTHERS: dict[Language, str] = {
+    "en": "Other people in view: [%s]; from the target to the nearest: [%s] m.",
+    "zh": "视野内其他行人数：[%s]；其中最近者距目标：[%s] 米。",
+}
 
 
 # A state of the drone like its speed: told from the frame on at which it knows, and not what follows from it.

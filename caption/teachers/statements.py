@@ -34,7 +34,7 @@ def describe(f: Facts) -> list[tuple[Both, ...]]:
     parts = [_seen(f)]
     if f.is_legible_now:
         parts += [_box(f), _position(f)]
-    parts += [_walk(f), _distance(f), _speed(f), _pace(f), _altitude(f), _yaw(f), _more(f)]
+    parts += [_walk(f), _distance(f), _speed(f), _pace(f), _altitude(f), _yaw(f), _others(f), _more(f)]
     return [part for part in parts if part]
 
 
@@ -107,6 +107,13 @@ def _altitude(f: Facts) -> tuple[Both, ...]:
 
 def _yaw(f: Facts) -> tuple[Both, ...]:
     return _wordings()["yaw_straight" if word_of(f, "side:yaw") == "straight" else "yaw"]
+
+
+def _others(f: Facts) -> tuple[Both, ...]:
+    """Tell of other people, where there are some."""
+    if not f.others_in_view or not f.others_in_view[-1]:
+        return ()
+    return _wordings()["nearest_other"] + (_wordings()["others"] if f.others_in_view[-1] > 1 else ())
 
 
 def _more(f: Facts) -> tuple[Both, ...]:

@@ -37,6 +37,7 @@ class Facts:
     where the person is, against the drone's heading, positive to the left; depression_deg: of the line of sight below
     the horizon.
     mission: the kind of the order that ends the pursuit, once it stands.
+    Of other people: others_in_view, how many have a pixel; other_distance_m, from the target to the nearest of them.
     In the picture of width_px x height_px, in its pixels: the target's box and its middle's offset from the image
     centre, positive to the right and down.
     """
@@ -67,6 +68,8 @@ class Facts:
     bearing_deg: tuple[float | None, ...] = ()
     depression_deg: tuple[float | None, ...] = ()
     mission: str | None = None
+    others_in_view: tuple[int | None, ...] = ()
+    other_distance_m: tuple[float | None, ...] = ()
 
     def __len__(self) -> int:
         return len(self.yaw_deg)
@@ -131,6 +134,8 @@ def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = N
         bearing_deg=bearing,
         depression_deg=depression,
         mission=window.mission,
+        others_in_view=_whole([frame.others_in_view for frame in frames]),
+        other_distance_m=_rounded([frame.other_distance_m for frame in frames], 1),
     )
 
 
@@ -170,7 +175,7 @@ def _measure_picture(
     left, top, right, bottom = left * x_scale, top * y_scale, right * x_scale, bottom * y_scale
     # The middle of the box is where the person is seen; uv (the hip) stands in where a tree has no box.
     u, v = (u * x_scale, v * y_scale) if left != left else ((left + right) / 2.0, (top + bottom) / 2.0)
-    return _pixels([right - left, bottom - top, u - width_px / 2.0, v - height_px / 2.0])
+    return _whole([right - left, bottom - top, u - width_px / 2.0, v - height_px / 2.0])
 
 
 @lru_cache(maxsize=64)
@@ -202,7 +207,7 @@ def _rounded(values: Iterable[float], digits: int) -> tuple[float | None, ...]:
     return tuple([None if v != v else round(v, digits) + 0.0 for v in values])  # NaN is not equal to itself
 
 
-def _pixels(values: list[float]) -> tuple[int | None, ...]:
+def _whole(values: list[float]) -> tuple[int | None, ...]:
     return tuple([None if v != v else round(v) for v in values])
 
 

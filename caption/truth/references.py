@@ -95,6 +95,8 @@ QUANTITIES: dict[str, Quantity] = {
     "depression": Quantity(attrgetter("depression_deg"), "deg", 1, 1.0),
     "box_width": Quantity(attrgetter("box_width_px"), "px", 0, 2.0, 0.08),
     "box_height": Quantity(attrgetter("box_height_px"), "px", 0, 2.0, 0.08),
+    "others_in_view": Quantity(attrgetter("others_in_view"), "people", 0, 0.0),
+    "other_distance": Quantity(attrgetter("other_distance_m"), "m", 1, 0.5),
     "offset_x": Quantity(attrgetter("offset_x_px"), "px", 0, 5.0, sides=("right", "left", "centred")),
     "offset_y": Quantity(attrgetter("offset_y_px"), "px", 0, 5.0, sides=("below", "above", "centred")),
 }

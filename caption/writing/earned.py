@@ -20,7 +20,7 @@ from caption.truth.references import ANGLES, QUANTITIES, STEPS, TURNING, Referen
 from cosfly.products.captions import Language
 
 _PLACES = ("offset_x", "offset_y")
-_IN_PICTURE = ("visibility", "framing", "box_width", "box_height", *_PLACES)
+_IN_PICTURE = ("visibility", "framing", "box_width", "box_height", "others_in_view", *_PLACES)
 _MOTIONS = ("target_motion", "drone_motion", "walking")
 _STATES = ("visibility", "framing", *_MOTIONS)
 _OF_TARGET = ("target_speed", "target_heading", "target_travelled", "target_motion", "walking", *_IN_PICTURE)
@@ -163,7 +163,7 @@ class _Word:
         return any(reference.aspect in self.token.names for reference in self.references)
 
     def _away(self) -> bool:
-        return self.last.reference is not None and self.last.reference.quantity == "distance"
+        return self.last.reference is not None and self.last.reference.quantity in ("distance", "other_distance")
 
     def _approx(self) -> bool:
         return self.next.reference is not None and self.next.reference.quantity in QUANTITIES

@@ -208,7 +208,7 @@ _SPANNED = ("speed", "altitude", "distance", "target_speed", "box_height")  # sh
 _NOW = (
     "mean:target_speed", "target_travelled", "travelled", "displacement", "climb_rate", "slant", "height_over_target",
     "depression",
-    "heading", "target_heading", "change:target_heading",
+    "heading", "target_heading", "change:target_heading", "others_in_view", "other_distance",
 )  # fmt: skip
 _WORDS = (
     "target_motion", "drone_motion", "comparison:speed", "side:yaw", "side:target_heading", "side:bearing",

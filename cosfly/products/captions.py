@@ -73,6 +73,8 @@ def verdict_on(decision: str, label: str | None, contradicted: Collection[str]) 
 
 OWN_PROMPTS = "prompts"  # beside `captions.jsonl`: the prompts of whoever made them, where these do not ship
 QUESTIONS = ("user_en", "user_zh")  # of them, what is asked of a window
+GOAL_WORDS: dict[Language, str] = {"en": "Goal: follow %s.", "zh": "任务：跟踪%s。"}  # in a prompt, a line of its own
+GOAL_BEGINS = tuple(words.partition("%s")[0] for words in GOAL_WORDS.values())
 PICTURES_MARK = "<pictures>"  # in a prompt: the place of the sentence that says what pictures are given
 
 
@@ -87,9 +89,12 @@ class Prompt(BaseModel):
     user: str
 
     def told(self, pictures: str, *, measured: bool = True) -> Prompt:
-        """Give the question with the sentence about the pictures at its mark, with or without what was measured."""
+        """Give the question with the sentence about the pictures at its mark, with or without what was measured; the
+        goal stays."""
         begin, mark, end = self.user.partition(PICTURES_MARK)
-        user = self.user if measured or not mark else begin + mark + end.partition("\n")[0]
+        first, *lines = end.split("\n")
+        kept = [first, *(line for line in lines if line.startswith(GOAL_BEGINS))]
+        user = self.user if measured or not mark else begin + mark + "\n".join(kept)
         return Prompt(system=self.system, user=user.replace(PICTURES_MARK, pictures))
 
 

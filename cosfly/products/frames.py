@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations, world_from_camera
+from cosfly.products.kinds import KINDS
 from cosfly.products.places import tree_of_flight
 from cosfly.products.png import areas_png, colours_png, floats_of, floats_png
 from cosfly.products.weather import WeatherRecord
@@ -48,6 +49,7 @@ META_FORMAT = FileFormat("cosfly.frame", "1.0", "frame annotation")
 # A person is legible who is visible, so high in the picture, of so much of the box unhidden, and of so much colour
 # difference (CIE76, where 2.3 is just noticeable) from what is around.
 LEGIBLE_HEIGHT_PX, LEGIBLE_SHARE, LEGIBLE_CONTRAST = 16.0, 0.3, 5.0
+COMPANY = ("in_view", "nearest_m")  # of a point's `others`
 XYZ, ANGLES = ("x", "y", "z"), ("pitch", "yaw", "roll")
 
 COORDINATES = {
@@ -254,6 +256,13 @@ class OthersMeta(_Group):
     target_hidden_by_others: float
     target_hidden_by_map: float
     others: list[OtherMeta]
+
+    def people_of(self, target_m: np.ndarray) -> dict[str, float | None]:
+        """How many other people have a pixel (COMPANY), and how far from the target, over the ground, the nearest is;
+        null without any."""
+        seen = [one for one in self.others if one.semantic_id == KINDS["Pedestrians"] and one.num_pixels]
+        away_m = [float(np.hypot(*(one.center_m - target_m)[:2])) for one in seen]
+        return dict(zip(COMPANY, (len(seen), round(min(away_m), 3) if away_m else None), strict=True))
 
 
 class FrameMeta(_Group):

@@ -23,7 +23,17 @@ from pydantic import ValidationError
 from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations
 from cosfly.products.columns import is_number
-from cosfly.products.frames import ANGLES, COORDINATES, FRAME_FILES, FRAMES_DIR, XYZ, Camera, frame_name, frame_path
+from cosfly.products.frames import (
+    ANGLES,
+    COMPANY,
+    COORDINATES,
+    FRAME_FILES,
+    FRAMES_DIR,
+    XYZ,
+    Camera,
+    frame_name,
+    frame_path,
+)
 from cosfly.products.goals import Goal
 from cosfly.products.motion import PlannedMotion, without_perturbation
 from cosfly.products.people import People
@@ -82,6 +92,8 @@ class Flight:
     projects asks `camera_at`. between: (n, k - 1, 6) planned poses after each frame and before the next, of a flight
     that was planned at k times the rate of its frames; NaN after the last. people: what they look like, None
     where the file does not say. goal: whom to follow, None where nothing tells the target from others.
+    company: (n, 2), how many other people are seen, and how far the nearest of them is from the target, m, NaN where
+    there is none; None where the file does not say.
     """
 
     town: str
@@ -116,6 +128,7 @@ class Flight:
     between: np.ndarray | None = None
     people: People | None = None
     goal: Goal | None = None
+    company: np.ndarray | None = None
     given_id: str | None = None  # where flights of several towns or runs share the plain one (places.py)
 
     def __len__(self) -> int:
@@ -287,9 +300,10 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
     reader.header(raw, variant)
     points = reader.points(raw)
     time_s, poses = reader.times(points), reader.poses(points)
-    targets = [object_of(p, "target") for p in points]
+    targets, others = ([object_of(p, name) for p in points] for name in ("target", "others"))
     if not all(target or p.get("target", "missing") is None for target, p in zip(targets, points, strict=True)):
         reader.issue("points[].target", "missing", "an object, or null where there is nobody")
+    company = np.column_stack([numbers_of(others, name) for name in COMPANY])
     segments, mission = reader.flown(raw, len(points))
     reader.weather(raw)
     people = reader.people(raw)
@@ -333,6 +347,7 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
         mission=mirrored(mission),
         people=people,
         goal=reader.goal(raw, len(points)),
+        company=None if np.isnan(company[:, 0]).any() else company,
     )
 
 

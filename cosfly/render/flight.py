@@ -151,6 +151,7 @@ def render_flight(
     renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M, knobs)
     targets: list[TargetMeta] = []
     visibility: list[float] = []
+    company: list[dict] = []
     pending: list[Future] = []
     digests: dict[str, str] = {}
 
@@ -169,13 +170,15 @@ def render_flight(
                     script.perturbed.drop_shift(i, HIDDEN)
                     frame, seen = without
             visibility.append(seen.visibility)
+            company.append({} if seen.others is None else {"others": seen.others.people_of(poses.targets_m[i])})
             pending.append(pool.submit(_write_frame, folder, frame, _annotation(script, i, seen), writing, script))
             advance()
             while len(pending) >= FRAMES_IN_FLIGHT:
                 take(pending.pop(0))
         for written in pending:
             take(written)
-    flight = _with_goal(_flight(script, targets, np.array(visibility)), renderer, script, writing.visible_threshold)
+    flight = _flight(script, targets, np.array(visibility), company)
+    flight = _with_goal(flight, renderer, script, writing.visible_threshold)
     write_flight(folder, flight)
     write_json(folder / "perturbation_report.json", _report(script.perturbed))
     made = ["trajectory.json", "perturbation_report.json"]
@@ -317,7 +320,7 @@ def _report(perturbed: PerturbedTrack) -> dict:
     }
 
 
-def _flight(script: FlightScript, targets: list[TargetMeta], visibility: np.ndarray) -> Flight:
+def _flight(script: FlightScript, targets: list[TargetMeta], visibility: np.ndarray, company: list[dict]) -> Flight:
     perturbed = script.perturbed
     zooms = any(camera is not script.cameras[0] for camera in script.cameras)
     return Flight(
@@ -351,8 +354,8 @@ def _flight(script: FlightScript, targets: list[TargetMeta], visibility: np.ndar
             **({} if script.weather is None else {"weather": script.weather.model_dump()}),
             **({} if script.distortion is None else {"camera": {"distortion": list(script.distortion)}}),
             "points": [
-                {"perturbation": dict(state), "target": target.model_dump(include=set(LEGIBILITY))}
-                for state, target in zip(perturbed.states, targets, strict=True)
+                {"perturbation": dict(state), "target": target.model_dump(include=set(LEGIBILITY)), **others}
+                for state, target, others in zip(perturbed.states, targets, company, strict=True)
             ],
         },
     )

@@ -22,7 +22,7 @@ import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.products.boxes import UNKNOWN_LICENCE
-from cosfly.products.frames import COORDINATES, FILE_NAMES, frame_name
+from cosfly.products.frames import COMPANY, COORDINATES, FILE_NAMES, frame_name
 from cosfly.products.goals import Goal
 from cosfly.products.places import TOWN
 from cosfly.products.playback import LEGIBILITY, TARGET_FILE, Flight, write_flight
@@ -190,7 +190,9 @@ def _point(row: Row) -> dict[str, Any]:
     if row["is_perturbed"] and row["drone_offset"] is None:
         told |= {"drone_position": True, "drone_rotation": True}
     target = {name: value for name in LEGIBILITY if (value := row[f"target_{name}"]) is not None}
-    return ({"perturbation": told} if told else {}) | ({"target": target} if target else {})
+    others = dict(zip(COMPANY, (row["others_in_view"], row["other_distance_m"]), strict=True))
+    point = {"perturbation": told, "target": target, "others": others if others["in_view"] is not None else {}}
+    return {name: one for name, one in point.items() if one}
 
 
 def _lens(row: Row) -> dict[str, Any]:

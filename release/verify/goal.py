@@ -22,6 +22,7 @@ def check_goal(
 ) -> None:
     """Check the goal in the row that it is of. decoded: depth and instance, empty where there is none."""
     depth, instance = decoded
+    _check_company(flight, i, instance, found)
     goal, people = flight.goal, flight.people
     if goal is None or goal.frame != flight.index[i] or not instance.size:
         return
@@ -30,7 +31,7 @@ def check_goal(
         return
     if (words := words_of(goal.says, people.target)) != (told := {"en": goal.en, "zh": goal.zh}):
         found.error("goal", flight.where(i, "goal_en"), str(told), f"{words}, of goal_says and people")
-    kinds, ids = instance[..., 0], instance[..., 1] | instance[..., 2].astype(np.uint16) << 8
+    kinds, ids = instance[..., 0], _ids(instance)
     looks = {PERSON_ID: people.target, **people.others}
     if unknown := sorted({*np.unique(ids[kinds == KINDS["Pedestrians"]]).tolist()} - {*looks}):
         found.error("goal", flight.where(i, "people"), f"{unknown[:4]} are seen", "all who are, by instance id")
@@ -50,3 +51,17 @@ def check_goal(
         expected = target_picture(of_frame, flight.mask_box[i].tolist()).astype(float)
         if pixels.shape != expected.shape or np.abs(pixels - expected).mean() > SAME_LEVELS:
             found.error("goal", where, "another picture", "target_mask_bbox of image, with room around")
+
+
+def _check_company(flight: FlightRows, i: int, instance: np.ndarray, findings: Findings) -> None:
+    """Check how many other people a row says are in view."""
+    told = flight.rows[i].get("others_in_view")
+    if told is None or flight.people is None or not instance.size:
+        return
+    pixels = np.bincount(_ids(instance).ravel(), minlength=PERSON_ID + 1)
+    if (seen := sum(bool(pixels[number]) for number in flight.people.others)) != told:
+        findings.error("others", flight.where(i, "others_in_view"), told, f"{seen}, of `people` who have a pixel")
+
+
+def _ids(instance: np.ndarray) -> np.ndarray:
+    return instance[..., 1] | instance[..., 2].astype(np.uint16) << 8

@@ -1,0 +1,90 @@
+"""Goals and other people in what teachers are told and say, held against the geometry; nothing of it without them."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from caption.run.windows import cut_windows
+from caption.schema import LabelConfig, WindowConfig
+from caption.teachers.prompt_files import shipped_prompts
+from caption.teachers.prompts import user_prompts
+from caption.teachers.statements import describe
+from caption.truth.actions import table_of
+from caption.truth.facts import measure_facts
+from caption.truth.references import find_fact, number_holds, parse_reference
+from caption.truth.vocabulary import Vocabulary
+from caption.writing.contract import way_of
+from cosfly.products.actions import shipped_actions
+from cosfly.products.answer_text import Parsed
+from cosfly.products.captions import Coc, Prompt
+from cosfly.products.flights import find_flights
+from cosfly.products.goals import Goal
+from cosfly.products.playback import read_flight
+from specimens import make_playback_tree
+
+GOAL = Goal(0, "the woman in the red jacket", "穿红色夹克的女子", ("figure", "top"))
+COMPANY = np.array([[0.0, np.nan], [1.0, 4.04], [2.0, 3.5], [3.0, 2.26], [3.0, 2.5]])
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    return read_flight(find_flights(make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 12))[0])
+
+
+@pytest.fixture(scope="module")
+def vocabulary():
+    return Vocabulary(shipped_actions(), shipped_prompts())
+
+
+def window_of(flight):
+    return next(
+        cut_windows(flight, WindowConfig(require_images=False), table_of(shipped_actions(), LabelConfig()))
+    ).observed
+
+
+def in_company(flight):
+    rows = np.vstack([COMPANY, np.tile(COMPANY[-1], (len(flight) - 5, 1))])
+    return window_of(replace(flight, goal=GOAL, company=rows))
+
+
+def test_a_prompt_tells_the_goal_and_the_others_in_both_languages(flight, vocabulary):
+    window = in_company(flight)
+    prompts = user_prompts(window, measure_facts(window), vocabulary)
+    assert "\nGoal: follow the woman in the red jacket.\nOther people in view: [0, 1, 2, 3, 3];" in prompts["en"]
+    assert "\n任务：跟踪穿红色夹克的女子。\n" in prompts["zh"]
+    numbers = [re.findall(r"\d+(?:\.\d+)?", text.rpartition("\n")[2]) for text in prompts.values()]
+    assert numbers == [["0", "1", "2", "3", "3", "4.0", "3.5", "2.3", "2.5"]] * 2
+    for text in prompts.values():  # pictures alone: the goal stays
+        assert Prompt(system="", user=text).told("P", measured=False).user.count("\n") == 1
+
+
+def test_without_other_people_a_prompt_is_as_it_was(flight, vocabulary):
+    plain, alone = window_of(flight), window_of(replace(flight, goal=GOAL))
+    told = [user_prompts(one, measure_facts(one), vocabulary) for one in (plain, alone)]
+    assert told[0] == told[1]
+    assert describe(measure_facts(alone)) == describe(measure_facts(plain))
+    assert not any("other" in en for part in describe(measure_facts(plain)) for en, _ in part)
+
+
+def test_what_is_said_of_others_is_judged_by_the_geometry(flight):
+    facts = measure_facts(in_company(flight))
+    found = {name: find_fact(parse_reference(name), facts) for name in ("others_in_view@t2", "other_distance@t3")}
+    assert [(fact.value, fact.unit) for fact in found.values()] == [(2, "people"), (2.3, "m")]
+    assert not number_holds(4.0, 0, found["others_in_view@t2"])
+    assert find_fact(parse_reference("other_distance@t0"), facts) == "unknown_fact"
+
+
+def test_sentences_of_others_are_proved_and_read_well(flight, vocabulary):
+    facts = measure_facts(in_company(flight))
+    way = way_of("slots", vocabulary)
+    for en, _ in describe(facts)[-2]:
+        told = Coc(critical_components=en, reasoning_trace="It is {visibility}.", flight_decision="hover")
+        draft = way.read(Parsed(told), facts)
+        assert draft.judged[0].state == "proved"
+        assert draft.coc.critical_components in (
+            "In the image are 3 other people.", "The nearest other person to it is 2.5 m away.",
+        )  # fmt: skip
+    assert len(describe(facts)[-2]) == 2
+    assert "{others_in_view} 3 other people" in way.table(facts)
