@@ -90,6 +90,7 @@ def test_lies_about_goals_are_found(flights):
         "of nobody": changed(flight, people=replace(flight.people, others={**others, PERSON_ID: alike})),
         "who looks so too": changed(flight, people=replace(flight.people, others={**others, seen: target})),
         "who is not on record": changed(flight, people=replace(flight.people, others={})),
+        "one other more": [{**row, "others_in_view": row["others_in_view"] + 1} for row in flight.rows],
         "no people": changed(flight, people=None) and [{**row, "people": None} for row in flight.rows],
         "another picture": [
             {**row, "target_picture": row["target_picture"] and flights[-1][0].rows[0]["target_picture"]}

@@ -5,7 +5,7 @@
 
 LeRobot counts time by frames, so an episode holds frames that follow each other without a gap. Pictures are the
 released PNG bytes in the parquet files; depth is TIFF of float32, LeRobot's own lossless form. The task of a frame is
-its caption's decision in words.
+the goal of its flight and the decision of its caption, in words.
 `observation.*` is what a policy sees, `action` what it answers, `timestamp` counts from the start of an episode.
 """
 
