@@ -140,6 +140,7 @@ def render(
     simplified: Simplification,
     traces: Traces,
     out: options.Out,
+    backend: Annotated[str | None, Option(help="gl, pyrender or carla."), Sets("render.backend")] = None,
     others: Annotated[Path | None, Option(help="Who else moves: others.json, beside path.json.")] = None,
     weather_mode: Annotated[str | None, Option(help="How skies are drawn."), Sets("render.weather_mode")] = None,
     weather_name: Annotated[

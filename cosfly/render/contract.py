@@ -121,9 +121,11 @@ class Renderer(Protocol):
 
     num_others: ids of `other_id` that no box may have. rim: boxes beyond the map (rim.py), without ids.
 
+    dresses: whether people wear what they are told to; else a flight says nothing of what they look like.
     device: what draws, one line. Opening raises EnvironmentMissing where a package or driver is not there.
     """
 
+    dresses: bool
     device: str
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:

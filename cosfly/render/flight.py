@@ -215,6 +215,8 @@ def draw_frame(
 
 def _with_goal(flight: Flight, renderer: Renderer, script: FlightScript, threshold: float) -> Flight:
     """Add the goal, of the first frame in which the target can be made out and told apart, or why there is none."""
+    if not renderer.dresses:
+        return replace(flight, people=None, raw=flight.raw | {"goal": {"absent": "clothes_unknown"}})
     poses, people = script.perturbed.poses, script.others.people(script.clothes.looks)
     legible = [i for i in range(len(flight)) if flight.told_legibility(i)["legible"]]
     for i in legible[:MOST_TRIED]:

@@ -81,6 +81,8 @@ def _keep_display(platform: Any) -> None:
 class PyrenderRenderer:
     """Draws a map as plain boxes and round crowns. Positions on the device are relative to the map's middle."""
 
+    dresses = True
+
     def __init__(
         self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0, rim: BoxMap | None = None
     ) -> None:

@@ -10,21 +10,23 @@ from cosfly.products.frames import LEAST_FOV_DEG, MOST_FOV_DEG, DepthFormat, Fra
 from cosfly.products.places import folder_name
 from cosfly.reading.arrays import LONGEST_SIDE_PX
 from cosfly.reading.meshes import MOST_TRIANGLES
+from cosfly.render.carla_backend import CarlaRenderConfig
 from cosfly.render.effects import EffectsConfig
 from cosfly.render.lens import ZoomConfig
 from cosfly.render.perturbation import PerturbationConfig
 from cosfly.render.weather import WeatherConfig
-from cosfly.work.config import MayDiffer
+from cosfly.work.config import Config, MayDiffer
 
 
 class RenderConfig(WeatherConfig):
     """Camera, tracks, weather and files of the frames."""
 
-    backend: Literal["gl", "pyrender"] = Field(
+    backend: Literal["gl", "pyrender", "carla"] = Field(
         "gl",
         description="renderer; gl is OpenGL without a window, on a GPU or the CPU; pyrender is a plain and slow "
-        "cross-check",
+        "cross-check; carla asks a running CARLA 0.9.16",
     )
+    carla: CarlaRenderConfig = Field(CarlaRenderConfig(), description="the server of backend carla")
     width_px: int = Field(1280, ge=16, le=LONGEST_SIDE_PX, description="image width, px")
     height_px: int = Field(720, ge=16, le=LONGEST_SIDE_PX, description="image height, px")
     fovs_deg: tuple[float, ...] = Field(
@@ -88,10 +90,15 @@ class RenderConfig(WeatherConfig):
         MOST_TRIANGLES, ge=1, description="most triangles of a file of meshes, and of all that the map draws of them"
     )
 
+    @property
+    def of_backend(self) -> Config | None:
+        """The settings of the chosen renderer alone; None where it has none."""
+        return getattr(self, self.backend, None)
+
     def recorded(self) -> dict[str, Any]:
-        """Without effects and a rim, the settings are those of before there were any."""
-        off = {name for name, is_on in (("effects", self.effects.is_on), ("rim", self.rim)) if not is_on}
-        return {name: value for name, value in super().recorded().items() if name not in off}
+        """Without effects, a rim, or a renderer of settings of its own, they are those of before there were any."""
+        used = {"effects": self.effects.is_on, "rim": self.rim, "carla": self.backend == "carla"}
+        return {name: value for name, value in super().recorded().items() if used.get(name, True)}
 
     @field_validator("fovs_deg")
     @classmethod
@@ -104,10 +111,12 @@ class RenderConfig(WeatherConfig):
 
     @model_validator(mode="after")
     def _weather_can_be_drawn(self) -> RenderConfig:
+        if self.backend == "carla" and (self.look != Look() or self.rim):
+            raise ValueError("backend carla has a sun, an air and a horizon of its own: leave look and rim out")
         if self.weather_mode == "off":
             return self
-        if self.backend != "gl":
-            raise ValueError(f"backend {self.backend} draws no weather: take gl, or weather_mode off")
+        if self.backend == "pyrender":
+            raise ValueError(f"backend {self.backend} draws no weather: take gl or carla, or weather_mode off")
         if self.look != Look():
             raise ValueError(
                 "look is for flights without weather: leave it out (--set 'render.look={}'), or take weather_mode off"

@@ -38,6 +38,7 @@ from cosfly.render.rim import check_outside_rim, rim_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.weather import coverage_of, drawn_seed, fog_hides, read_pools, told_coverage, weather_of
 from cosfly.work.chance import rng_for
+from cosfly.work.config import Config
 from cosfly.work.provenance import checked_inputs, fingerprint
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.work.stage_folder import Kept, Resume, StageFolder, Tally, result_of
@@ -45,7 +46,11 @@ from cosfly.work.store import CHECKSUMS, atomic_folder, dump_json, inside, sha25
 
 log = logging.getLogger(__name__)
 
-RENDERERS = {"gl": "cosfly.render.gl.backend:GlRenderer", "pyrender": "cosfly.render.pyrender_backend:PyrenderRenderer"}
+RENDERERS = {
+    "gl": "cosfly.render.gl.backend:GlRenderer",
+    "pyrender": "cosfly.render.pyrender_backend:PyrenderRenderer",
+    "carla": "cosfly.render.carla_backend:CarlaRenderer",
+}
 VARIANTS = {"clean": "ORI", "perturbed": PERTURBED}
 TRAJECTORY = "trajectory_"
 FIRST_S, SPAN_S = 1_000_000_000, 999_000_000  # seconds of ten digits, as those of the public release
@@ -61,8 +66,12 @@ def open_renderer(
     num_others: int = 0,
     mesh_triangles: int = MOST_TRIANGLES,
     rim: BoxMap | None = None,
+    settings: Config | None = None,
 ) -> Renderer:
     """Open a renderer of the table for one map, of at most so many triangles of meshes, and at most so many others.
+
+    Args:
+        settings: of this renderer alone, where it has any; None takes its defaults.
 
     Raises:
         ConfigError: unknown name. EnvironmentMissing: what it needs is not there.
@@ -71,15 +80,16 @@ def open_renderer(
         raise ConfigError("unknown renderer", where="render.backend", got=name, expected=", ".join(RENDERERS))
     module, _, attribute = RENDERERS[name].partition(":")
     box_map = replace(box_map, meshes=replace(box_map.meshes, most_triangles=mesh_triangles))
+    own = {} if settings is None else {"settings": settings}
     make = getattr(importlib.import_module(module), attribute)
-    return make(box_map, width_px, height_px, look or Look(), num_others, rim)
+    return make(box_map, width_px, height_px, look or Look(), num_others, rim, **own)
 
 
 def renderer_of(cfg: RenderConfig, box_map: BoxMap, seed: int, num_others: int = 0) -> Renderer:
     """Open the renderer that the settings ask for."""
-    rim = rim_of(box_map, seed) if cfg.rim else None
-    size_px = cfg.width_px, cfg.height_px
-    return open_renderer(cfg.backend, box_map, *size_px, cfg.look, num_others, cfg.mesh_triangles, rim)
+    rim, size_px = rim_of(box_map, seed) if cfg.rim else None, (cfg.width_px, cfg.height_px)
+    most = cfg.mesh_triangles
+    return open_renderer(cfg.backend, box_map, *size_px, cfg.look, num_others, most, rim, cfg.of_backend)
 
 
 # --- from traces to scripts -------------------------------------------------------------------------------------------

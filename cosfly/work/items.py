@@ -38,8 +38,20 @@ class Outcome:
 
 Work = Callable[[Item], Outcome]
 
+_place = 0
 _on_steps: Callable[[int], None] | None = None
 _num_steps = 0
+
+
+def worker_place() -> int:
+    """Which of a stage's workers this process is, from 0; one that replaces another has its place."""
+    return _place
+
+
+def take_place(place: int) -> None:
+    """Be the worker of a place."""
+    global _place
+    _place = place
 
 
 def advance(num_steps: int = 1) -> None:

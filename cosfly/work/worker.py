@@ -23,7 +23,7 @@ from typing import Any
 
 from cosfly.errors import CosflyError
 from cosfly.work.console import set_levels
-from cosfly.work.items import Item, Work, attempt, counted_steps
+from cosfly.work.items import Item, Work, attempt, counted_steps, take_place
 from cosfly.work.stage_folder import ItemRecord
 
 LEFT_TO_THE_PARENT = frozenset({signal.SIGINT, signal.SIGTERM})  # it ends its workers, and alone speaks of it
@@ -58,6 +58,7 @@ class Manner:
     parent_pid: int
     heartbeat_s: float
     log_level: int
+    place: int = 0
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,7 @@ def work_through(connection: Connection, manner: Manner) -> None:
     voice = _Voice(connection)
     logging.getLogger().handlers = [voice]
     set_levels(manner.log_level)
+    take_place(manner.place)
     keep_freed_memory()
     threading.Thread(target=voice.tell_life, args=(manner.heartbeat_s,), daemon=True).start()
     try:

@@ -169,7 +169,7 @@ class WorkerPool:
     def _start(self, place: int) -> _Worker:
         context = multiprocessing.get_context("spawn")  # fork would copy GL and thread-pool state
         here, there = context.Pipe()
-        manner = Manner(os.getpid(), self.watch.heartbeat_s, logging.getLogger().level)
+        manner = Manner(os.getpid(), self.watch.heartbeat_s, logging.getLogger().level, place)
         process = context.Process(target=work_through, args=(there, manner), daemon=True)
         with signals_held_back():
             process.start()

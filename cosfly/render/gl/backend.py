@@ -56,6 +56,8 @@ class _Look:
 class GlRenderer:
     """Draws a map on EGL. One object holds one GL context and belongs to the thread that made it."""
 
+    dresses = True
+
     def __init__(
         self, box_map: BoxMap, width_px: int, height_px: int, look: Look, num_others: int = 0, rim: BoxMap | None = None
     ) -> None:

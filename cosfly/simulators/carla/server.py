@@ -125,14 +125,13 @@ class CarlaServer:
 
     def _answer(self, connection: socket.socket, call_id: int, method: str, arguments: list) -> None:
         """Answer one call; the first argument is the client's metadata."""
-        answer, result = self._answers.get(method), None
-        if answer is None:
-            log.debug("%s: not answered here", method)
-        else:
-            try:
-                result = [[1, answer(*arguments[1:])]]
-            except (ValueError, KeyError, IndexError, TypeError) as error:
-                result = [[0, [f"{method}: {error}"]]]
+        result: list[list]
+        try:
+            value = self._answers[method](*arguments[1:])  # KeyError: this server does not know it
+            result = [[False]] if value is None else [[1, value]]  # nothing is told as: no error
+        except (ValueError, KeyError, IndexError, TypeError) as error:
+            result = [[0, [f"{method}: {error}"]]]
+            log.info("%s: %r", method, error)
         if method == "tick_cue" and (fault := self._due("late")):
             time.sleep(fault.seconds)
         if self._due("hang") or (method == "version" and self._due("unhealthy")):
@@ -160,11 +159,13 @@ class CarlaServer:
             "get_all_level_BBs": lambda label: [box for _, box in world.boxes(label)],
             "get_actor_definitions": world.definitions,
             "get_actors_by_id": lambda numbers: [self._told(world.actors[n]) for n in numbers if n in world.actors],
+            "get_actor_bounding_box": lambda number: world.actors[number].box(),
             "spawn_actor": lambda description, transform, *_: self._told(world.spawn(description, transform)),
             "destroy_actor": lambda number: world.actors.pop(number, None) is not None,
             "set_actor_transform": self._move,
             "set_actor_location": lambda number, place: world.actors[number].pose.__setitem__(slice(3), place),
             "apply_control_to_walker": self._control,
+            **{f"set_actor_{name}": lambda *_: None for name in ("collisions", "enable_gravity", "simulate_physics")},
             "tick_cue": self._led_tick,
         }
 

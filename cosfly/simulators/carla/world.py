@@ -18,6 +18,7 @@ from cosfly.products.weather import WeatherParams
 from cosfly.render.contract import (
     NO_INSTANCE,
     PERSON_ID,
+    Clothes,
     Frame,
     PosedCar,
     PosedOther,
@@ -213,13 +214,12 @@ class World:
     def _body(self, actor: Actor) -> PosedPerson | PosedCar:
         place_m, rotation_deg = world_pose(actor.pose)
         heading_rad = float(np.radians(rotation_deg[1]))
-        dice = rng_for(0, "simulators", actor.blueprint)
         if actor.blueprint.startswith("walker."):
             phase_rad = 2.0 * np.pi * actor.walked_m / STRIDE_M
             swing = float(np.clip(actor.speed_mps / SLOW_MPS, 0.0, 1.0))
-            return PosedPerson(place_m, heading_rad, phase_rad, swing, choose_clothes(dice))
+            return PosedPerson(place_m, heading_rad, phase_rad, swing, clothes_of(actor.blueprint))
         middle_m = place_m + np.array([0.0, 0.0, actor.half_extents_m[2]])
-        return PosedCar(middle_m, heading_rad, actor.half_extents_m, float(dice.random()))
+        return PosedCar(middle_m, heading_rad, actor.half_extents_m, _rng_of(actor.blueprint).random())
 
     def _numbered(self, ids: np.ndarray) -> np.ndarray:
         """Give the actors' numbers, as far as pictures hold them, in the place of the renderer's ids."""
@@ -229,3 +229,12 @@ class World:
             table[PERSON_ID if is_person else other_id(num_others)] = actor.number
             num_others += not is_person
         return table[ids] & ACTOR_BITS
+
+
+def clothes_of(blueprint: str) -> Clothes:
+    """What a walker of this blueprint wears, always."""
+    return choose_clothes(_rng_of(blueprint))
+
+
+def _rng_of(blueprint: str) -> np.random.Generator:
+    return rng_for(0, "simulators", blueprint)

@@ -1,0 +1,247 @@
+"""Frames of a CARLA server: through the unmodified client from a server of ours, against the embedded renderer's."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from carla_serving import as_client, command, free_port, serving
+from test_renderers_contract import circling, street, write_inputs
+
+from cosfly.errors import ConfigError, EnvironmentMissing, InputError, RenderError
+from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.products.boxes import BoxMap, write_boxes
+from cosfly.products.flights import find_flights
+from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
+from cosfly.products.kinds import KINDS
+from cosfly.products.traces import DroneTrace
+from cosfly.render.carla_backend import CarlaRenderConfig
+from cosfly.render.contract import PERSON_ID, PosedPerson
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import open_renderer, run
+from cosfly.simulators.carla.world import clothes_of
+from cosfly.unreal.conventions import DEPTH_STEP_M
+from cosfly.work.config import build
+from cosfly.work.runner import Watch
+
+pytest.importorskip("carla")
+FRAMES = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0], "town": "Street", "first_timestamp": 1776000000}
+CLEAN = {**FRAMES, "tracks": ["clean"]}
+QUICK = {"timeout_s": 20.0, "picture_s": 5.0}
+
+
+def on_the_wire(trace: DroneTrace) -> DroneTrace:
+    """The same flight at poses that single precision holds."""
+    trace.positions_m[:], trace.rotations_deg[:] = (
+        np.round(trace.positions_m * 64) / 64,
+        np.round(trace.rotations_deg * 64) / 64,
+    )
+    return trace
+
+
+def flown(folder: Path, num_flights: int = 1, num_frames: int = 3) -> list[Path]:
+    return write_inputs(folder, [on_the_wire(circling(num_frames, f"path_{k:03d}")) for k in range(num_flights)])
+
+
+def config(port: int, settings: dict = CLEAN, **own) -> RenderConfig:
+    return build(RenderConfig, {**settings, "backend": "carla", "carla": {"port": port, **QUICK, **own}}, "test")
+
+
+def files_of(tree: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(tree)): p.read_bytes() for p in sorted(tree.rglob("frames_playback/**/*")) if p.is_file()}
+
+
+def pictures_of(tree: Path) -> list[tuple]:
+    return [
+        (folder.name, frame.name, read_rgb(frame), read_depth(frame), *read_instance(frame), read_meta(frame))
+        for folder in find_flights(tree)
+        for frame in sorted((folder / "frames_playback").iterdir())
+    ]
+
+
+def found_settings(port: int) -> tuple:
+    import carla
+
+    client = carla.Client("127.0.0.1", port)
+    client.set_timeout(20.0)
+    world = client.get_world()
+    return (
+        world.get_settings().synchronous_mode,
+        len(world.get_actors(list(range(200, 300)))),
+        world.get_weather().cloudiness,
+    )
+
+
+@pytest.mark.slow
+def test_a_tree_is_the_embedded_renderers_frame_by_frame(tmp_path):
+    inputs = flown(tmp_path / "in", 2, 4)
+    reference = run(build(RenderConfig, FRAMES, "test"), *inputs, tmp_path / "gl", seed=5)
+    with serving(street(), tmp_path / "town") as port:
+        tree = run(config(port, FRAMES), *inputs, tmp_path / "carla", seed=5, workers=1)
+        assert as_client(found_settings, port) == (False, 0, 5.0), "the server is left as it was found"
+    assert [p.relative_to(tree) for p in find_flights(tree)] == [
+        p.relative_to(reference) for p in find_flights(reference)
+    ]
+    assert files_of(tree).keys() == files_of(reference).keys()
+    for folder in find_flights(tree):
+        ours, theirs = (
+            json.loads((root / folder.relative_to(tree) / "trajectory.json").read_text()) for root in (tree, reference)
+        )
+        for one, other in zip(ours["points"], theirs["points"], strict=True):
+            for name in ("drone_pose", "nav_waypoint", "timing"):
+                assert json.dumps(one[name]) == json.dumps(other[name])
+            assert one["target"]["world_location"] == other["target"]["world_location"]
+        assert "people" not in ours, "nobody knows what CARLA's walkers wear"
+        assert ours["camera"] == theirs["camera"]
+    for ours, theirs in zip(pictures_of(tree), pictures_of(reference), strict=True):
+        _same_but_for_the_person(ours, theirs, exact=ours[0] == "ORI")
+
+
+def _same_but_for_the_person(ours: tuple, theirs: tuple, *, exact: bool) -> None:
+    """Depth within the encoding's step, kinds and ids equal; perturbed poses are rounded on the wire: edges move."""
+    _, name, rgb, depth, kinds, ids, meta = ours
+    _, _, their_rgb, their_depth, their_kinds, their_ids, their_meta = theirs
+    rest = (ids != PERSON_ID) & (their_ids != PERSON_ID)
+    assert rest.mean() > 0.9
+    # Half a step of the encoding, and what the device's single precision makes of another origin.
+    apart = rest & (np.abs(depth - their_depth) > (2.0 * DEPTH_STEP_M if exact else 2e-3))
+    differs = rest & ((ids != their_ids) | (kinds != their_kinds))
+    assert max(apart.sum(), differs.sum()) <= (0 if exact else 8), name
+    assert np.abs(rgb[rest].astype(int) - their_rgb[rest]).mean() < 5.0, (
+        "light is prepared for the town, not the flight"
+    )
+    assert ((ids == PERSON_ID) == (kinds == KINDS["Pedestrians"])).all()
+    assert meta.target.num_pixels == pytest.approx(their_meta.target.num_pixels, rel=0.5)
+    assert meta.target.visibility == pytest.approx(their_meta.target.visibility, abs=0.05)
+    assert meta.drone_pose == their_meta.drone_pose
+
+
+def _drawn(port: int) -> tuple:
+    """Two frames of a walker in step 0, by CARLA and by the embedded renderer."""
+    settings = build(CarlaRenderConfig, {"port": port, **QUICK}, "test")
+    frames = []
+    clothes, found = clothes_of("walker.pedestrian.0001"), street()
+    pose = world_from_camera(np.array([-1.0, -9.5, 5.5]), np.array([-32.5, 60.0, 0.0]))
+    for own in ({"settings": settings}, {}):
+        renderer = open_renderer("carla" if own else "gl", found, 160, 90, **own)
+        person = PosedPerson(np.array([4.0, -3.0, 0.90625]), 0.0, 0.0, 1.0, clothes)
+        frames.append(renderer.render(pose, intrinsic_matrix(160, 90, 60.0), person))
+        if own:
+            frames.append(renderer.render(pose, intrinsic_matrix(160, 90, 30.0), person))  # cameras anew
+            with pytest.raises(RenderError, match=r"no such lens.*square pixels"):
+                renderer.render(pose, intrinsic_matrix(160, 90, 60.0) + np.eye(3)[0], None)
+        renderer.close()
+    return frames
+
+
+def test_a_person_is_drawn_where_it_stands_and_zoom_takes_other_cameras(tmp_path):
+    with serving(street(), tmp_path) as port:
+        ours, near, theirs = as_client(_drawn, port)
+    masks = [frame.ids == PERSON_ID for frame in (ours, theirs)]
+    assert masks[0].sum() > 30
+    assert np.argwhere(masks[0]).mean(axis=0) == pytest.approx(np.argwhere(masks[1]).mean(axis=0), abs=1.5)
+    assert (near.ids == PERSON_ID).sum() > 2.5 * masks[0].sum()
+    rest = ~masks[0] & ~masks[1]
+    assert (ours.ids != theirs.ids)[rest].sum() == 0
+
+
+# --- what goes wrong --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_lost_late_double_and_disordered_pictures_change_nothing(tmp_path):
+    inputs = flown(tmp_path / "in", 1, 5)
+    trees = []
+    for name, faults in {
+        "plain": (),
+        "faulty": ("drop:depth@5", "duplicate@7", "reorder:rgb@9", "delay:instance@11=7"),
+    }.items():
+        with serving(street(), tmp_path / name, *faults) as port:
+            trees.append(run(config(port, picture_s=2.0), *inputs, tmp_path / f"tree_{name}", workers=1))
+    assert files_of(trees[0]) == files_of(trees[1])
+
+
+@pytest.mark.slow
+def test_a_silent_sensor_fails_the_flight_with_its_name_and_keeps_the_finished_ones(tmp_path):
+    inputs = flown(tmp_path / "in", 3, 4)
+    with serving(street(), tmp_path / "town", "drop:depth@9+") as port:
+        tree = run(config(port, picture_s=1.5, retries=1), *inputs, tmp_path / "tree", workers=1)
+    failures = [json.loads(line) for line in (tree / "failures.jsonl").read_text().splitlines()]
+    assert len(failures) == 2
+    for failure in failures:
+        assert re.search(rf"CARLA 0\.9\.16 at 127\.0\.0\.1:{port}, street.*camera depth", failure["message"]), failure
+    assert len(find_flights(tree)) == 1
+
+
+@pytest.mark.slow
+def test_a_server_that_dies_is_named_and_the_run_goes_on_with_the_next(tmp_path):
+    inputs = flown(tmp_path / "in", 2, 5)
+    with serving(street(), tmp_path / "town", "die@10") as port:
+        cfg = config(port, timeout_s=2.0)
+        with pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port}"):
+            run(cfg, *inputs, tmp_path / "tree", workers=1)
+    assert len(find_flights(tmp_path / "tree")) == 1
+    kept = files_of(tmp_path / "tree")
+    with serving(street(), tmp_path / "town") as port:
+        tree = run(config(port), *inputs, tmp_path / "tree", workers=1)
+    files = files_of(tree)
+    assert len(find_flights(tree)) == 2
+    assert {name: files[name] for name in kept} == kept
+
+
+@pytest.mark.slow
+def test_a_server_that_we_start_is_started_again(tmp_path):
+    """The first dies after some ticks; two workers have ports of their own."""
+    inputs = flown(tmp_path / "in", 2, 5)
+    write_boxes(tmp_path / "boxes_3d.json", street())
+    port = free_port()
+    plain = " ".join(command(tmp_path / "boxes_3d.json", 0)).replace(" 0", " {port}")
+    start = f"sh -c 'mkdir {tmp_path}/{{port}} 2>/dev/null && exec {plain} --fault die@6; exec {plain}'"
+    cfg = config(port, timeout_s=15.0, server_command=start)
+    tree = run(cfg, *inputs, tmp_path / "tree", workers=2)
+    assert len(find_flights(tree)) == 2
+    assert (tmp_path / str(port)).is_dir()
+    assert (tmp_path / str(port + 10)).is_dir(), "ports 10 apart"
+    with pytest.raises(EnvironmentMissing, match="no CARLA server"):
+        open_renderer(
+            "carla", street(), 160, 90, settings=build(CarlaRenderConfig, {"port": port, "timeout_s": 1.0}, "test")
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["malformed:depth@7", "hang@7"])
+def test_a_worker_whose_client_crashes_or_whose_server_hangs_is_replaced(fault, tmp_path):
+    inputs = flown(tmp_path / "in", 1, 5)
+    with serving(street(), tmp_path / "town", fault) as port:
+        cfg = config(port, timeout_s=8.0, health_check_s=0.5)
+        if fault.startswith("hang"):
+            with pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port}"):
+                run(cfg, *inputs, tmp_path / "tree", workers=1, watch=Watch(heartbeat_s=0.5, check_s=1.0))
+        else:
+            assert (
+                len(
+                    find_flights(
+                        run(cfg, *inputs, tmp_path / "tree", workers=1, watch=Watch(heartbeat_s=0.5, check_s=1.0))
+                    )
+                )
+                == 1
+            )
+    events = (tmp_path / "tree/events.jsonl").read_text()
+    assert '"worker_died"' in events
+    assert '"restarted"' in events
+
+
+def test_settings_and_maps_that_cannot_be_are_told(tmp_path):
+    with pytest.raises(ConfigError, match="a sun, an air and a horizon of its own"):
+        config(2000, {**CLEAN, "look": {"haze_m": 10.0}})
+    elsewhere = street((500.0, 0.0, 0.0))
+    expected = r"127\.0\.0\.1:\d+ \(CARLA 0\.9\.16\), street.*no box of the map"
+    with serving(street(), tmp_path / "town") as port, pytest.raises(InputError, match=expected):
+        as_client(_open, elsewhere, port)
+
+
+def _open(box_map: BoxMap, port: int) -> None:
+    open_renderer("carla", box_map, 160, 90, settings=build(CarlaRenderConfig, {"port": port, **QUICK}, "test"))
