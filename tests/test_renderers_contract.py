@@ -7,6 +7,7 @@ differ by one level of colour in 0.5 % of the pixels, and by 5 mm of depth away 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import multiprocessing
@@ -18,6 +19,7 @@ from typing import get_args
 import cv2
 import numpy as np
 import pytest
+from carla_serving import serving
 
 from cosfly.errors import EnvironmentMissing, RenderError
 from cosfly.geometry import box_corners, intrinsic_matrix, look_at, project, rotation_matrices, world_from_camera
@@ -34,6 +36,7 @@ from cosfly.products.others import Company, Other, write_others
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.camera import hidden_shares, rendered_visibility, view_target
+from cosfly.render.carla_backend import CarlaRenderConfig
 from cosfly.render.contract import (
     FAR_M,
     GROUND_PLANE_DROP_M,
@@ -151,8 +154,9 @@ def away_from_silhouettes(depth: np.ndarray, ids: np.ndarray) -> np.ndarray:
     return ~cv2.dilate((bent | differs).astype(np.uint8), np.ones((3, 3))).astype(bool)
 
 
-# The second renderer is an extra, and draws slowly.
-NAMES = [pytest.param(name, marks=pytest.mark.slow if name == "pyrender" else ()) for name in sorted(RENDERERS)]
+# The second renderer is an extra, and draws slowly; CARLA needs a server, of one town (tests/test_render_carla.py).
+EMBEDDED = sorted(RENDERERS.keys() - {"carla"})
+NAMES = [pytest.param(name, marks=pytest.mark.slow if name == "pyrender" else ()) for name in EMBEDDED]
 
 
 @pytest.fixture(scope="module", params=NAMES)
@@ -167,11 +171,17 @@ def opened(name: str, box_map: BoxMap):
         pytest.skip(str(error))
 
 
-@pytest.fixture(scope="module")
-def renderer(renderer_name):
-    renderer = opened(renderer_name, street())
-    yield renderer
-    renderer.close()
+@pytest.fixture(scope="module", params=[*NAMES, pytest.param("carla", marks=pytest.mark.slow)])
+def renderer(request, tmp_path_factory):
+    with contextlib.ExitStack() as stack:
+        if request.param == "carla":
+            pytest.importorskip("carla")
+            port = stack.enter_context(serving(street(), tmp_path_factory.mktemp("carla")))
+            renderer = open_renderer("carla", street(), *SIZE, settings=CarlaRenderConfig(port=port))
+        else:
+            renderer = opened(request.param, street())
+        yield renderer
+        renderer.close()
 
 
 VIEWS = [
@@ -188,7 +198,8 @@ ODD_LENS = np.array([[230.0, 0.0, 131.5], [0.0, 260.0, 104.25], [0.0, 0.0, 1.0]]
 
 def test_depth_and_ids_agree_with_computed_rays(renderer, subtests):
     lenses = [(eye, target, intrinsic_matrix(*SIZE, fov_deg)) for eye, target, fov_deg in VIEWS]
-    for eye, target, intrinsic in [*lenses, (*VIEWS[0][:2], ODD_LENS)]:
+    odd = [] if renderer.device.startswith("CARLA") else [(*VIEWS[0][:2], ODD_LENS)]  # which has no such lens
+    for eye, target, intrinsic in [*lenses, *odd]:
         with subtests.test(eye=eye, focal_px=intrinsic[0, 0]):
             pose = pose_towards(eye, target)
             frame = renderer.render(pose, intrinsic, None)
@@ -395,7 +406,7 @@ def test_the_look_is_in_the_picture(renderer_name):
 def test_another_process_gives_the_same_picture_and_closing_a_renderer_leaves_others_alone(renderer_name):
     renderer = opened(renderer_name, street())
     here = _digest(renderer)
-    for other in sorted(RENDERERS):
+    for other in EMBEDDED:
         closed = opened(other, street())
         _digest(closed)
         closed.close()

@@ -13,6 +13,7 @@ import numpy as np
 from cosfly.geometry import intrinsic_matrix, world_from_camera
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import KINDS
+from cosfly.products.others import BUILDS
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.products.weather import WeatherParams
 from cosfly.render.contract import (
@@ -43,7 +44,8 @@ KNOBS = {
 }  # fmt: skip
 FAIR_WEATHER = [5.0, 0.0, 0.0, 10.0, 215.0, 42.0, 0.0, 60.0, 0.0, 0.0, 1.0, 0.03, 0.0331, 0.0]
 NUM_WALKERS = 16
-VEHICLES = {  # half extents, m
+VEHICLES = {  # half extents, m; the first is the car of our own flights
+    "vehicle.cosfly.car": BUILDS["Car"].half_extents_m,
     "vehicle.mini.cooper_s": (1.9, 0.97, 0.74), "vehicle.tesla.model3": (2.4, 1.08, 0.74),
     "vehicle.nissan.patrol": (2.3, 0.97, 0.93), "vehicle.mercedes.sprinter": (2.96, 0.99, 1.28),
 }  # fmt: skip
