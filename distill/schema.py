@@ -28,7 +28,7 @@ from cosfly.reading.tables import TableRows
 from cosfly.work.provenance import fingerprint
 from cosfly.work.store import atomic_file, write_bytes, write_model
 
-RECORD, RECORD_FORMAT = "training_set.json", FileFormat("cosfly.training_set", "3.0", "training set")
+RECORD, RECORD_FORMAT = "training_set.json", FileFormat("cosfly.training_set", "4.0", "training set")
 PAGE = "README.md"
 # Rows of a row group. One look at a sample, in an order drawn by lot, decodes them; the footer, of which a reader and
 # the writer hold all, grows by the groups.
@@ -72,6 +72,8 @@ class Sample(SplitMember):
     proved: float | None  # share of the answer's sentences that the geometry proves; None: none was judged
     repair: str | None  # strategy of the repair that made the answer; None: as the teacher gave it
     weight: float
+    past: tuple[float, ...] = ()  # what its frames tell without a picture (cosfly/space/blind.py); () where not known
+    drawn_ahead: bool | None = None  # something was drawn within the label's future; None: not known
 
     @property
     def key(self) -> str:
@@ -159,13 +161,13 @@ def tree_inputs(trees: Mapping[str, Path]) -> dict[str, Path]:
 
 
 def arrow_type(of: Any) -> pa.DataType:
-    """Give the type of a column that holds values of a field: text, float, a tuple of one of them, or nothing."""
+    """Give the type of a column that holds values of a field: text, number, flag, a tuple of one, or nothing."""
     if (parts := get_args(of)) and get_origin(of) is not Literal:
         first = parts[0]
         if get_origin(of) is tuple:
             return pa.list_(pa.field("element", arrow_type(first)))
         return arrow_type(first)  # or None
-    return {int: pa.int32(), float: pa.float64()}.get(of, pa.string())
+    return {int: pa.int32(), float: pa.float64(), bool: pa.bool_()}.get(of, pa.string())
 
 
 def columns_of(model: type[SplitMember], **changed: pa.DataType) -> pa.Schema:

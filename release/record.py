@@ -170,6 +170,20 @@ class Repairs(Strict):
     shares: dict[str, float]
 
 
+class Ceilings(Strict):
+    """What is told of labels without a picture (cosfly/space/blind.py), shares of `tested` ones of `split`, fitted on
+    some of train; null where these are too few. drawn_ahead: share of `known` ones that may hang on what came later."""
+
+    split: str
+    fitted_on: int
+    tested: int
+    majority: float | None = None
+    rule: float | None = None
+    blind: float | None = None
+    known: int
+    drawn_ahead: float | None = None
+
+
 class Provenance(Strict):
     """Where it all comes from: versions of what built it, its sources, teachers, repairs, and tokens of all asks."""
 
@@ -317,6 +331,7 @@ class ReleaseRecord(Strict):
     content_digest: str
     shards: list[Shard]
     part_of: PartOf | None = None
+    ceilings: Ceilings | None = None  # of a part they are not measured
 
 
 def numbers_of_splits(flights: Sequence[ReleasedFlight], captions: Mapping[str, int]) -> dict[SplitName, SplitNumbers]:

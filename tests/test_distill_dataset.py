@@ -14,12 +14,15 @@ from hypothesis import settings as bounded
 from hypothesis import strategies as st
 from pydantic import ValidationError
 from specimens_distill import make_caption, make_captions, prepared
+from specimens_foreign import write_foreign_tree
 
 from cosfly.errors import InputError, NothingKept, ResumeError, VerifyError
 from cosfly.products.actions import shipped_actions
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import write_captions
+from cosfly.products.playback import read_flight
 from cosfly.products.splits import SPLITS
+from cosfly.space.blind import past_of
 from distill.prepare import stage
 from distill.prepare.choice import Balance, WindowRanks, balance_of, keeps, limit_to
 from distill.prepare.sources import RunSource
@@ -188,6 +191,24 @@ def test_run_writes_leak_free_splits_and_counts_that_add_up(tree, captions, tmp_
     if split_by == "walk":
         assert splits["val"]
         assert splits["test"]
+
+
+def test_a_sample_has_its_past_and_whether_something_was_drawn_after_it(tree, captions, tmp_path):
+    """Of its own frames; both languages and, as it is without perturbation, both tracks nearly the same. Who flew a
+    foreign tree, and by what choice, nobody knows."""
+    samples = [sample for split in SPLITS for sample in open_split(prepared(tree, captions, tmp_path / "set"), split)]
+    pasts = {}
+    for sample in samples:
+        past = past_of(read_flight(tree / sample.folder), sample.window, False)
+        np.testing.assert_allclose(sample.past, past, atol=1e-4)
+        pasts.setdefault((sample.town, sample.trajectory, sample.window), []).append(past[:12])
+    assert all(np.ptp(found, axis=0).max() < 1e-3 for found in pasts.values())
+    assert {sample.drawn_ahead for sample in samples} <= {True, False}
+    foreign = write_foreign_tree(tmp_path / "foreign", trajectories=("trajectory_1", "trajectory_9"))
+    own = [make_caption("Town01", "trajectory_9", "ORI", frame, picture_px=(96, 54)) for frame in range(4, 9)]
+    write_captions(tmp_path / "captions.jsonl", own)
+    out = prepared(foreign, tmp_path / "captions.jsonl", tmp_path / "set2", val_fraction=0, test_fraction=0)
+    assert {sample.drawn_ahead for sample in open_split(out, "train")} == {None}
 
 
 def test_run_twice_gives_the_same_bytes(tree, captions, tmp_path):

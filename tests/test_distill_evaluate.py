@@ -22,6 +22,7 @@ from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import write_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.predictions import Prediction, read_predictions
+from cosfly.space.blind import LEAST_WINDOWS
 from cosfly.work.journal import Journal
 from cosfly.work.stage_folder import StageFolder, Tally
 from cosfly.work.store import dump_json
@@ -185,7 +186,7 @@ def made_up(num_walks: int, rng: np.random.Generator, *, size: int = 6, skill: f
     reference = rng.integers(0, 3, count).astype(np.int8)
     texts = {name: np.full(count, "x", dtype=object) for name in ("language", "against")}
     texts |= {"key": np.array([f"{name}/{i}" for i, name in enumerate(walk)], dtype=object), "walk": walk}
-    unknown = {name: np.full(count, np.nan) for name in ("precision", "recall", "f1", *STATES)}
+    unknown = {name: np.full(count, np.nan) for name in ("precision", "recall", "f1", "drawn_ahead", *STATES)}
     codes = {name: np.full(count, -1, dtype=np.int8) for name in ("label", "verdict")}
     flags = {name: np.ones(count, dtype=bool) for name in ("answered", "unmended")}
     answer, tokens = np.where(right, reference, 5).astype(np.int8), np.zeros(count, dtype=np.int64)
@@ -237,7 +238,7 @@ def test_scores_survive_the_disk(tmp_path, samples):
     again = read_scores(tmp_path / "scores.parquet", shipped_actions())
     for name in COLUMNS:
         found, wanted = getattr(again, name), getattr(scores, name)
-        assert np.array_equal(found, wanted, equal_nan=name in STATES), name
+        assert np.array_equal(found, wanted, equal_nan=name in (*STATES, "drawn_ahead")), name
         assert found.dtype == wanted.dtype
 
 
@@ -264,18 +265,17 @@ def test_floors_by_hand(samples):
     )  # a tie goes to the first of the action table
 
 
-def test_a_rule_on_the_numbers_of_the_prompt_beats_the_majority(samples):
-    """What two comparisons of numbers tell is no merit of a student: decisions by speed and distance, among numbers
-    that mean nothing."""
+def test_a_rule_and_a_network_that_see_no_picture_beat_the_majority(samples):
+    """What the past's numbers tell is no merit of a student: decisions by speed and distance, among numbers that mean
+    nothing. Too few windows, or one without a past, give no such floor."""
     rng = np.random.default_rng(0)
 
     def told(count: int) -> list[Sample]:
         found = []
         for distance, speed in rng.uniform(0, 10, (count, 2)).round(2).tolist():
             decision = "slow_down" if speed <= 4 else "hover" if distance <= 3 else "track_straight"
-            text = f"Frame {rng.integers(99)}: {distance} m away at {speed} m/s, {rng.integers(99)} s."
-            prompt = samples[0].prompt.model_copy(update={"user": text})
-            found.append(samples[0].model_copy(update={"prompt": prompt, "decision": decision}))
+            past = (float(rng.integers(99)), distance, speed, float(rng.integers(99)))
+            found.append(samples[0].model_copy(update={"past": past, "decision": decision}))
         return found
 
     floors, asked = Floors(told(400), "en", 0, shipped_actions()), told(100)
@@ -283,7 +283,27 @@ def test_a_rule_on_the_numbers_of_the_prompt_beats_the_majority(samples):
     decisions = {name: np.array([answer.coc.flight_decision for answer in own]) for name, own in answers.items()}
     wanted = np.array([sample.decision for sample in asked])
     assert (decisions["rule"] == wanted).sum() >= 97
+    assert (decisions["blind"] == wanted).sum() >= 90
     assert (decisions["majority"] == wanted).sum() < 60
+    few, mixed = told(LEAST_WINDOWS - 1), [*told(400), samples[0]]
+    for train, left_out in ((few, {"blind"}), (mixed, {"rule", "blind"}), (samples, {"rule", "blind"})):
+        found = Floors(train, "en", 0, shipped_actions()).answers(asked, [coc_of(sample) for sample in asked])
+        assert answers.keys() - found.keys() == left_out
+
+
+def test_what_was_drawn_after_the_window_is_counted_apart(samples):
+    """Half of the samples: right in one of these and in all others; where nobody knows there is no figure."""
+    ahead = [None, True, True, True, True, False, False, False]
+    wrong = [sample.model_copy(update={"drawn_ahead": a}) for sample, a in zip(samples, ahead, strict=True)]
+    answers = [ScoredAnswer(coc_of(sample)) for sample in wrong]
+    other = next(token for token in shipped_actions().tokens if token not in DECISIONS)
+    for place in (1, 2, 3):
+        answers[place] = ScoredAnswer(answers[place].coc.model_copy(update={"flight_decision": other}))
+    figures, _ = figures_of(score_answers(wrong, answers, shipped_actions()), np.ones((1, 1)), confidence=0.9)
+    assert (figures["drawn_ahead"].value, figures["drawn_ahead"].count) == (4 / 7, 7)
+    assert (figures["accuracy_settled"].value, figures["accuracy_settled"].count) == (1.0, 3)
+    figures, _ = figures_of(score_answers(samples, answers, shipped_actions()), np.ones((1, 1)), confidence=0.9)
+    assert figures["drawn_ahead"].value is figures["accuracy_settled"].value is None
 
 
 def test_floors_are_predictions_that_a_verifier_can_judge(place):
@@ -329,7 +349,7 @@ def test_without_a_model_the_report_says_so_and_gives_no_number(place):
     assert (student["parsed"].value, student["bertscore_f1"].value) == (0.75, None)
     accuracy = {name: own.figures["accuracy"].value for name, own in report.all.who.items()}
     assert (accuracy.pop(STUDENT), accuracy.pop("majority"), accuracy.pop("teacher")) == (8 / 16, 8 / 16, 1)
-    assert accuracy.keys() == {"shuffled", "constant", "rule"}
+    assert accuracy.keys() == {"shuffled", "constant"}  # no sample has a past
     assert (teacher["accuracy_on_labels"].value, teacher["bertscore_f1"].value) == (1, None)
     page = (place / "out" / "evaluation.md").read_text()
     assert "BERTScore of en: not computed, no model folder" in page
@@ -353,7 +373,7 @@ def test_the_page_opens_with_what_a_person_asks_first(place):
     run(CFG, place / "predictions.jsonl", place / "own", place / "out", data=[tree])
     html = (place / "out" / "evaluation.html").read_text()
     assert "<h1>unknown <small>evaluation on test</small></h1>" in html
-    marks = ['<div class="tile"><b>16</b>samples', "decisions right", "rule on two numbers", "of the teacher", "<img",
+    marks = ['<div class="tile"><b>16</b>samples', "decisions right", "the most frequent", "of the teacher", "<img",
              "<svg", "<table", "samples side by side", "How it was measured"]  # fmt: skip
     assert [html.index(mark) for mark in marks] == sorted(html.index(mark) for mark in marks)
     assert html.count("<img") == 5 * (12 + 1)  # of each sample shown, and of the first once more

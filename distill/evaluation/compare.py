@@ -47,7 +47,7 @@ from distill.evaluation.scores import (
 )
 
 STAGE = "distill.report"
-FLOORS = ("majority", "rule", "shuffled", "constant", "teacher")
+FLOORS = ("majority", "rule", "blind", "shuffled", "constant", "teacher")
 Names = dict[str, Evaluation]
 
 
@@ -169,6 +169,7 @@ def _mismatches(reports: Names) -> list[str]:
 # The paper's table, and what its text adds.
 _TABLE = (
     *("parsed", "bertscore_precision", "bertscore_recall", "bertscore_f1", "accuracy", "accuracy_parsed", "macro_f1"),
+    *("accuracy_settled", "drawn_ahead"),
     *("consistent", "hard_conflict", "proved", "contradicted", "tokens"),
 )
 

@@ -3,16 +3,17 @@
 majority    the decision that train has most often; no text
 shuffled    the reference of another sample of the split
 constant    one answer of train, with the majority's decision, for every sample
-rule        a decision tree of depth two on the prompt's numbers, fitted on train (CART, Breiman et al. 1984); no text
+rule        a decision tree of depth two on the past's geometry, fitted on train (CART, Breiman et al. 1984); no text
+blind       a small network on the same, exact numbers, fitted on train (cosfly/space/blind.py); no text
 teacher     no floor but the reference itself: what it reaches in figures that are measured against the geometry
 """
 
 from __future__ import annotations
 
 import hashlib
-import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from cosfly.products.captions import Coc, Language
 from cosfly.products.predictions import PREDICTIONS, Prediction
 from cosfly.products.splits import Split
 from cosfly.reading.documents import parse_document, validated
+from cosfly.space.blind import FITTED_ON, Decider, fit_deciders
 from cosfly.work.chance import rng_for
 from cosfly.work.store import dump_json, write_bytes
 from distill.evaluation.scores import ScoredAnswer, number_of
@@ -30,10 +32,6 @@ from distill.schema import Sample, open_split, read_training_set
 
 SHUFFLED_AMONG = 1024  # samples that are scored together: what is shuffled within needs no text to be embedded twice
 WRITTEN = ("shuffled", "constant")  # floors that have texts
-RULE_SAMPLES = 20_000  # of train that the rule is fitted on, drawn by their names
-_NUMERAL = re.compile(r"-?\d+(?:\.\d+)?")
-# A decision's number, or column, threshold, and the rules up to it and above.
-Rule = int | tuple[int, float, "Rule", "Rule"]
 
 
 def coc_of(sample: Sample) -> Coc:
@@ -64,46 +62,13 @@ def shuffled_places(groups: Sequence[np.ndarray]) -> np.ndarray:
     return others
 
 
-def numbers_of(samples: Iterable[Sample], width: int | None = None) -> np.ndarray:
-    """Give the numbers of each prompt in their order, (n, width), inf where it has fewer; None: the longest's width."""
-    rows = [list(map(float, _NUMERAL.findall(sample.prompt.user)))[:width] for sample in samples]
-    table = np.full((len(rows), max(map(len, rows), default=0) if width is None else width), np.inf)
-    for place, row in enumerate(rows):
-        table[place, : len(row)] = row
-    return table
-
-
-def fit_rule(table: np.ndarray, labels: np.ndarray, depth: int = 2) -> Rule:
-    """Fit a decision tree: at each node the threshold of the least Gini impurity; labels (n,): numbers of decisions."""
-    counts, best = np.bincount(labels), (-1.0, 0, 0.0)
-    if depth == 0 or (counts > 0).sum() < 2:
-        return int(counts.argmax())
-    is_label, sizes = np.eye(len(counts))[labels], np.arange(1, len(labels))[:, None]
-    for column in range(table.shape[1]):
-        order = np.argsort(table[:, column])
-        values, below = table[order, column], np.cumsum(is_label[order], axis=0)[:-1]
-        purity = (below**2 / sizes + (counts - below) ** 2 / (len(labels) - sizes)).sum(axis=1)
-        purity[values[1:] == values[:-1]] = -1.0  # no threshold lies between equals
-        place = int(purity.argmax())
-        best = max(best, (float(purity[place]), column, float(values[place])))
-    if best[0] < 0:
-        return int(counts.argmax())
-    _, column, threshold = best
-    low = table[:, column] <= threshold
-    below_it, above_it = (fit_rule(table[rows], labels[rows], depth - 1) for rows in (low, ~low))
-    return column, threshold, below_it, above_it
-
-
-def decide(rule: Rule, row: np.ndarray) -> int:
-    """Give the number of the decision that a rule makes of the numbers of a prompt."""
-    while isinstance(rule, tuple):
-        column, threshold, low, high = rule
-        rule = low if row[column] <= threshold else high
-    return rule
-
-
 def _bare(decision: str) -> ScoredAnswer:
     return ScoredAnswer(Coc(critical_components="", reasoning_trace="", flight_decision=decision))
+
+
+def _pasts(samples: Sequence[Sample]) -> np.ndarray | None:
+    """Give the pasts of samples, (n, d); None where one has none."""
+    return np.array([sample.past for sample in samples]) if samples and all(s.past for s in samples) else None
 
 
 class Floors:
@@ -112,7 +77,7 @@ class Floors:
     def __init__(self, train: Collection[Sample], language: Language, seed: int, actions: ActionSet) -> None:
         self._seed, self.actions = seed, actions
         counts, typical, drawn = Counter[str](), dict[str, tuple[bytes, Sample]](), list[Sample]()
-        share = RULE_SAMPLES / max(1, len(train))
+        share = FITTED_ON / max(1, len(train))
         for sample in train:
             if sample.language == language:
                 counts[sample.decision] += 1
@@ -123,10 +88,13 @@ class Floors:
                     drawn.append(sample)
         self.decision = majority(counts.elements(), actions)
         self._constant = None if self.decision is None else coc_of(typical[self.decision][1])
-        table = numbers_of(drawn)
-        self._width = table.shape[1]
-        labels = np.array([number_of(sample.decision, sample, actions) for sample in drawn], dtype=int)
-        self.rule = fit_rule(table, labels) if drawn else None
+        self._labels = np.array([number_of(sample.decision, sample, actions) for sample in drawn], dtype=int)
+        self._pasts = _pasts(drawn)
+
+    @cached_property
+    def deciders(self) -> dict[str, Decider]:
+        rng = rng_for(self._seed, "distill.floor", "blind")
+        return {} if self._pasts is None else fit_deciders(self._pasts, self._labels, rng)
 
     def groups(self, count: int) -> list[np.ndarray]:
         """Deal samples into groups, within which references are shuffled; in both languages of windows the same."""
@@ -141,9 +109,9 @@ class Floors:
         if len(references) > 1:
             places = shuffled_places(self.groups(len(references))).tolist()
             found["shuffled"] = [ScoredAnswer(references[place]) for place in places]
-        if self.rule is not None:
-            bare = [_bare(token) for token in self.actions.tokens]
-            found["rule"] = [bare[decide(self.rule, row)] for row in numbers_of(samples, self._width)]
+        bare, pasts = [_bare(token) for token in self.actions.tokens], _pasts(samples)
+        if pasts is not None:
+            found |= {name: [bare[k] for k in decide(pasts).tolist()] for name, decide in self.deciders.items()}
         return found
 
 

@@ -17,6 +17,7 @@ from cosfly.products.captions import FIELDS, Coc, Language, SentenceState, read_
 from cosfly.products.predictions import FAILED, Prediction
 from cosfly.products.splits import Split
 from cosfly.reading.documents import FileFormat, read_model, read_object, validated
+from cosfly.space.blind import DRAWN_AHEAD, FITTED_ON, LEAST_WINDOWS, LOOKS_BACK
 from cosfly.work.chance import rng_for
 from cosfly.work.journal import Journal
 from cosfly.work.provenance import MANIFEST_FORMAT
@@ -85,7 +86,7 @@ def _last_start(folder: Path) -> tuple[float | None, int]:
     return found.seconds, found.answers
 
 
-REPORT, REPORT_FORMAT = "report.json", FileFormat("cosfly.distill_report", "2.0", "report")
+REPORT, REPORT_FORMAT = "report.json", FileFormat("cosfly.distill_report", "3.0", "report")
 STAGE = "distill.evaluate"
 STUDENT = "student"
 UNPARSED_NAME = "(unparsed)"  # column of the confusion table beside the decisions
@@ -147,7 +148,10 @@ NOTES = [
     "reference: the teacher's accepted answer; an answer that does not parse is a wrong one and scores 0 in BERTScore",
     "a sample that got no answer is no wrong answer: it is counted under `answered` and in nothing else",
     "intervals: whole walks are drawn with replacement: windows of a flight overlap, flights of a walk are alike",
-    "floor rule: a tree of depth two on the numbers of the prompt, fitted on train; `teacher`: the reference itself",
+    "floors rule and blind: a tree of depth two and a network of one hidden layer on the exact geometry of a window's "
+    f"last {LOOKS_BACK} frames, no picture, fitted on {FITTED_ON:,} samples of train at most, the network on "
+    f"{LEAST_WINDOWS} at least; `teacher`: the reference itself",
+    f"drawn after the window: within the label's future {DRAWN_AHEAD}; no past tells that but by luck",
     "verdicts: against what the flight did after the window, as the captions' own were made",
 ]
 

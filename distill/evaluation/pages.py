@@ -120,7 +120,7 @@ def page_of(report: Evaluation, pictures: Mapping[str, Sequence[str]]) -> str:
     for title, part in _parts(report).items():
         student = part.who[STUDENT]
         charts = [
-            ("Accuracy by decision", decision_bars({STUDENT: student, **_beside(part, "majority", "rule")})),
+            ("Accuracy by decision", decision_bars({STUDENT: student, **_beside(part, "majority", "blind")})),
             ("Reference (rows) against answer", heat_map(student, report.actions)),
         ]
         if part.histogram_f1 is not None:
@@ -140,10 +140,12 @@ def _tiles(part: Measurement) -> list[tuple[str, str]]:
     tiles = [(f"{part.samples:,}", "samples"), (f"{part.walks:,}", "walks")]
     for figure, who, words in (
         ("accuracy", STUDENT, "decisions right"),
-        ("accuracy", "rule", "by a rule on two numbers of the prompt"),
+        ("accuracy", "blind", "by a network that sees no picture"),
+        ("accuracy", "rule", "by a rule on two numbers"),
         ("accuracy", "majority", "by the most frequent decision"),
         ("accuracy_on_labels", STUDENT, "are the geometric label"),
         ("accuracy_on_labels", "teacher", "of the teacher's are"),
+        ("drawn_ahead", STUDENT, "may hang on what came after"),
         ("parsed", STUDENT, "answers parse"),
     ):
         if who in part.who and (value := part.who[who].figures[figure].value) is not None:

@@ -58,9 +58,9 @@ class Scores:
 
     actions: the set that numbers of decisions count. key, walk, language (n,) str; against (n,) str, a digest of what
     the answer is held against; reference, answer, label (n,) int8 numbers of decisions, UNPARSED, NONE; answered,
-    unmended (n,) bool; verdict (n,) int8 number of VERDICTS or NONE; precision, recall, f1 (n,) of BERTScore, NaN
-    where it was not computed; proved, contradicted, unread (n,) numbers of sentences, NaN where nobody judged them;
-    num_tokens (n,).
+    unmended (n,) bool; drawn_ahead (n,) 1, 0, or NaN where it is not known; verdict (n,) int8 number of VERDICTS or
+    NONE; precision, recall, f1 (n,) of BERTScore, NaN where it was not computed; proved, contradicted, unread (n,)
+    numbers of sentences, NaN where nobody judged them; num_tokens (n,).
     """
 
     actions: ActionSet
@@ -72,6 +72,7 @@ class Scores:
     answer: np.ndarray
     label: np.ndarray
     answered: np.ndarray
+    drawn_ahead: np.ndarray
     unmended: np.ndarray
     verdict: np.ndarray
     precision: np.ndarray
@@ -158,6 +159,7 @@ def score_answers(
         answer=np.array(decisions, dtype=np.int8),
         label=np.array([number_of(s.label, s, actions) if s.label else NONE for s in samples], dtype=np.int8),
         answered=is_answered,
+        drawn_ahead=np.array([s.drawn_ahead for s in samples], dtype=np.float64),
         unmended=np.array([a.coc is not None and not a.mended for a in answers], dtype=bool),
         verdict=np.array(verdicts, dtype=np.int8),
         precision=bert[:, 0],
@@ -232,6 +234,8 @@ FIGURES: dict[str, str] = {
     "accuracy_parsed": "decision accuracy, parsed answers",
     "macro_f1": "macro-F1 over decisions",
     "accuracy_on_labels": "decision is the geometric label",
+    "drawn_ahead": "samples whose label may hang on what was drawn after the window",
+    "accuracy_settled": "decision accuracy, the other samples",
     "consistent": "true future: consistent",
     "soft_conflict": "true future: soft conflict",
     "hard_conflict": "true future: hard conflict",
@@ -246,7 +250,7 @@ FIGURES: dict[str, str] = {
     "tokens": "tokens of an answer",
 }
 LESS_IS_BETTER = ("hard_conflict", "contradicted", "unread")
-NEITHER = ("soft_conflict", "abstain", "tokens")  # more of it is neither better nor worse
+NEITHER = ("soft_conflict", "abstain", "drawn_ahead", "tokens")  # more of it is neither better nor worse
 
 
 class Figure(BaseModel):
@@ -282,7 +286,7 @@ def _terms(scores: Scores) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     right = parsed & (scores.answer == scores.reference)
     labelled = answered & (scores.label != NONE)
     judged = answered & (scores.verdict != NONE)
-    known = answered & ~np.isnan(scores.f1)
+    known, ahead = answered & ~np.isnan(scores.f1), scores.drawn_ahead
     sentences = sum((np.nan_to_num(getattr(scores, state)) for state in STATES), np.zeros(len(scores)))
     terms: dict[str, tuple[np.ndarray, np.ndarray]] = {
         "answered": (answered, np.ones(len(scores))),
@@ -291,6 +295,8 @@ def _terms(scores: Scores) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         "accuracy": (right, answered),
         "accuracy_parsed": (right, parsed),
         "accuracy_on_labels": (labelled & (scores.answer == scores.label), labelled),
+        "drawn_ahead": (ahead == 1, ~np.isnan(ahead)),
+        "accuracy_settled": (right & (ahead == 0), answered & (ahead == 0)),
         "tokens": (scores.num_tokens * answered, answered & (scores.num_tokens > 0)),
     }
     for number, verdict in enumerate(VERDICTS):

@@ -23,7 +23,9 @@ from cosfly.products.actions import ActionSet, actions_beside, not_in_set, one_s
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import PICTURES_MARK, Caption, Language, Verdict, read_captions
 from cosfly.products.places import FlightChoice
+from cosfly.products.playback import read_flight
 from cosfly.products.splits import SPLITS, Split
+from cosfly.space.blind import is_drawn_ahead, past_of
 from cosfly.work.console import progress_bar
 from cosfly.work.provenance import fingerprint
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
@@ -36,6 +38,7 @@ from distill.schema import Sample, SourceTree, TrainingSetWriter, open_split
 log = logging.getLogger(__name__)
 
 STAGE = "distill.prepare"
+DIGITS = 4  # of a past: a tenth of a millimetre, as trees have it
 
 
 class PrepareConfig(SplitConfig):
@@ -174,6 +177,7 @@ class _Windows:
         self.actions = one_set((source.captions, actions_beside(source.captions)) for source in sources)
         self.flights = Flights(sources)
         self._frames_of = lru_cache(maxsize=16)(lambda flight: flight.whole_frames(cfg.modalities))
+        self._read = lru_cache(maxsize=16)(lambda flight: read_flight(flight.folder, strict=False))
         self._is_chosen = lru_cache(maxsize=16)(lambda flight: flight.is_chosen(cfg.flights))
         self.walks: Mapping[str, str] = {}
         self.count = 0
@@ -201,8 +205,16 @@ class _Windows:
             elif reason := self._unfit(flight, sample):
                 window.left_out.append(reason)
             else:
-                window.samples.append(sample)
+                window.samples.append(sample.model_copy(update=self._without_pictures(flight, caption)))
         return window
+
+    def _without_pictures(self, flight: CaptionedFlight, caption: Caption) -> dict[str, Any]:
+        """Give what is known of a window beside its pictures: its past in numbers, and whether any was drawn after."""
+        read, now = self._read(flight), caption.window[-1]
+        is_ordered = read.mission is not None and read.mission.order_at(now) is not None
+        ahead = is_drawn_ahead(read, now, max(caption.future), is_ordered) if read.is_ours and caption.future else None
+        past = past_of(read, caption.window, is_ordered).round(DIGITS)
+        return {"past": tuple(past.tolist()), "drawn_ahead": ahead}
 
     def _unfit(self, flight: CaptionedFlight, sample: Sample) -> str | None:
         """Say why the frames of a flight are not those that a sample speaks of."""

@@ -22,6 +22,7 @@ from cosfly.products.captions import FIELDS
 from cosfly.products.coverage import NAMED
 from cosfly.products.frames import FrameFile
 from cosfly.reading.files import read_text
+from cosfly.space.blind import DRAWN_AHEAD, LEAST_WINDOWS, LOOKS_BACK
 from release.columns import CAPTION, PICTURES, SCALARS, SPLIT_NAMES, schema
 from release.record import DepthCodingName, History, ReleaseRecord, SourceRecord, shard_pattern
 
@@ -66,6 +67,9 @@ def render_card(record: ReleaseRecord) -> str:
         captions=captions,
         splits=splits,
         modalities=record.settings.modalities,
+        looks_back=LOOKS_BACK,
+        least=LEAST_WINDOWS,
+        drawn_ahead=DRAWN_AHEAD,
         depth=None if record.depth is None else DEPTH[record.depth.coding],
         front_matter=_front_matter(record),
         ours=[source.run for source in record.provenance.sources if _is_rendered_by_us(source)],

@@ -15,6 +15,7 @@ from cosfly.work.provenance import read_stage_record
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.work.stage_folder import Failed, Resume, StageFolder, Tally, result_of
 from cosfly.work.store import CHECKSUMS, atomic_folder
+from release.card.ceilings import ceilings_of
 from release.card.numbers import compute_numbers
 from release.package.config import ReleaseConfig
 from release.package.plan import Faults, ReleasePlan, make_plan
@@ -85,7 +86,7 @@ def run(
         provenance = provenance_of(sources, read_stage_record(out).inputs, plan.account)
         prompts = {source.run: source.questions for source in sources if source.questions}
         record = make_record(cfg, plan, written, shards, numbers, provenance, prompts)
-        write_records(folder, record)
+        write_records(folder, record.model_copy(update={"ceilings": ceilings_of(folder, record)}))
         _check_release(folder)
     # checksums.sha256 speaks for the shards: hashing them again would only cost time.
     outputs = [dataset / name for name in ("README.md", "release.json", CHECKSUMS)]

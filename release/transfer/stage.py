@@ -501,5 +501,6 @@ def part_record(
             "content_digest": content_digest((shard.split, shard.sha256) for shard in shards),
             "shards": shards,
             "part_of": part,
+            "ceilings": None,
         }
     )

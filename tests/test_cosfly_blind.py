@@ -1,0 +1,105 @@
+"""cosfly/space/blind.py: a past without places, what was drawn after it, and deciders that beat the most frequent."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cosfly.geometry import rotation_matrices
+from cosfly.products.segments import Segment
+from cosfly.space.blind import decide, fit_network, fit_rule, is_drawn_ahead, past_of
+from specimens import make_flight
+
+NUM = 12
+
+
+def flight_of(walked_m, **changes):
+    """A flight 20 m behind and 10 m above a walker at places (n, 2)."""
+    flight, _ = make_flight(len(walked_m))
+    targets = np.column_stack([walked_m, np.full(len(walked_m), 0.9)])
+    still = {"target_offsets_m": np.zeros_like(targets), "is_original": True}
+    return replace(flight, targets_m=targets, positions_m=targets + np.array([-20.0, 3.0, 10.0]), **still, **changes)
+
+
+def straight(steps_m):
+    return np.column_stack([np.cumsum(steps_m), np.zeros(len(steps_m))])
+
+
+EVEN = straight(np.full(NUM, 0.6))
+
+
+@given(st.integers(0, 2**31))
+@settings(max_examples=25, deadline=None)
+def test_a_past_is_the_same_wherever_and_whenever_it_was(seed):
+    rng = np.random.default_rng(seed)
+    flight = flight_of(rng.normal(size=(NUM, 2)).cumsum(axis=0), time_s=0.5 * np.arange(NUM))
+    flight = replace(flight, rotations_deg=rng.uniform(-60, 60, (NUM, 3)))
+    yaw_deg, moved_m = float(rng.uniform(-180, 180)), rng.uniform(-1e3, 1e3, 3)
+    turn = rotation_matrices(np.radians(np.array([[0.0, yaw_deg, 0.0]])))[0]
+    there = replace(
+        flight, positions_m=flight.positions_m @ turn.T + moved_m, targets_m=flight.targets_m @ turn.T + moved_m,
+        rotations_deg=flight.rotations_deg + np.array([0.0, yaw_deg, 0.0]), time_s=flight.time_s + 77.0,
+    )  # fmt: skip
+    here = past_of(flight, range(5), False)
+    np.testing.assert_allclose(past_of(there, range(5), False), here, atol=1e-6)
+    later = flight.positions_m.copy()
+    later[5:] += 9.0
+    assert np.array_equal(past_of(replace(flight, positions_m=later), range(5), False), here)  # nothing of the future
+    assert not np.array_equal(past_of(flight, range(5), True), here)
+
+
+def test_a_past_is_without_perturbation_where_it_is_known_and_finite_where_nobody_is_seen():
+    (flight, _), (shaken, _) = make_flight(NUM), make_flight(NUM, variant="aug_001")
+    unknown = replace(shaken, drone_offsets_m=np.full((NUM, 3), np.nan))
+    clean = past_of(flight, range(5), False)[:6]  # velocities of the drone
+    np.testing.assert_allclose(past_of(shaken, range(5), False)[:6], clean, atol=1e-6)
+    assert np.abs(past_of(unknown, range(5), False)[:6] - clean).max() > 0.1
+    lost = replace(flight, targets_m=np.full((NUM, 3), np.nan))
+    assert np.isfinite(past_of(lost, range(5), False)).all()
+
+
+@pytest.mark.parametrize(
+    ("steps_m", "first", "last"),
+    [
+        ([0.6] * 8 + [0.0] * 4, 3, 7),  # it stops on the way to frame 8
+        ([0.0] * 8 + [0.6] * 4, 3, 7),  # it sets off
+    ],
+)
+def test_who_stops_or_sets_off_within_the_labels_future_was_drawn_ahead(steps_m, first, last):
+    flight = flight_of(straight(steps_m))
+    found = [now for now in range(1, NUM - 5) if is_drawn_ahead(flight, now, now + 5, False)]
+    assert found == [now for now in range(first, last + 1) if now < NUM - 5]
+
+
+def test_turns_and_other_parts_are_drawn_ahead_and_bends_and_orders_are_not():
+    right_angle = np.vstack([EVEN[:8], EVEN[7] + np.column_stack([np.zeros(4), 0.6 * np.arange(1, 5)])])
+    bend = np.column_stack([np.linspace(0, 6, NUM), np.linspace(0, 1, NUM) ** 2])
+    assert not any(is_drawn_ahead(flight_of(way), now, now + 5, False) for way in (EVEN, bend) for now in range(1, 6))
+    assert [now for now in range(1, 7) if is_drawn_ahead(flight_of(right_angle), now, now + 5, False)] == [3, 4, 5, 6]
+    parts = flight_of(EVEN, segments=(Segment("side", 0, 7), Segment("top", 7, NUM)))
+    assert [now for now in range(1, NUM - 5) if is_drawn_ahead(parts, now, now + 5, False)] == [2, 3, 4, 5, 6]
+    assert is_drawn_ahead(parts, 4, 9, True) is False
+    nobody = replace(parts, targets_m=np.full((NUM, 3), np.nan))
+    assert is_drawn_ahead(nobody, 4, 9, False) is None
+    assert is_drawn_ahead(parts, 0, 5, False) is None
+
+
+def test_a_network_tells_what_two_comparisons_cannot_and_does_so_again():
+    """Four quarters of a circle that has a decision in every other eighth; the scale of a column does not matter."""
+    rng = np.random.default_rng(1)
+    table, spare = rng.normal(size=(600, 3)), rng.normal(size=(400, 3))
+
+    def told(rows):
+        return (np.floor(4.0 * np.arctan2(rows[:, 1], rows[:, 0]) / np.pi).astype(int) % 2) + (rows[:, 2] > 1.0)
+
+    networks = [
+        fit_network(table * scale, told(table), np.random.default_rng(0)) for scale in (1.0, 1.0, [1e3, 1e-3, 1.0])
+    ]
+    first, again, scaled = (net(spare * s) for net, s in zip(networks, (1.0, 1.0, [1e3, 1e-3, 1.0]), strict=True))
+    rule = fit_rule(table, told(table))
+    by_rule = np.array([decide(rule, row) for row in spare])
+    assert np.array_equal(first, again)
+    assert (scaled == first).mean() > 0.9
+    assert (first == told(spare)).mean() > (by_rule == told(spare)).mean() + 0.1
