@@ -13,6 +13,7 @@ from cosfly.pedestrians.crossings import CROSSING, OPEN, PAVED, ROAD, where_walk
 from cosfly.pedestrians.others import company_of
 from cosfly.pedestrians.stage import make_walk
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
+from cosfly.products.kinds import KINDS
 from cosfly.products.walks import Walk
 from cosfly.simplify.passes import simplify
 from cosfly.work.chance import rng_for
@@ -134,3 +135,19 @@ def test_people_of_a_foreign_city_without_marked_crossings_cross_straight(shared
     away, on_crossings = shares(load(RunConfig, shipped("diverse.yaml"), [city]), "city")
     assert away <= 0.05
     assert on_crossings > 0.05
+
+
+@pytest.mark.parametrize("name", ["old_town", "market"])
+def test_people_walk_under_passages_and_arcades_of_the_simplified_town(name):
+    town = load(RunConfig, shipped("diverse.yaml")).of_town(name)
+    box_map = simplify(load_map(town.maps, seed=town.seed), town.simplify).box_map
+    ground = walkable_ground(box_map, town.pedestrians)
+    roofs = box_map.select(
+        (box_map.kinds == KINDS["Buildings"]) & (box_map.mins[:, 2] > town.pedestrians.human_height_m)
+    )
+    num_under = 0
+    for k in range(40):
+        places = make_walk("p", ground, town.pedestrians, rng_for(0, "pedestrians", f"path_{k:05d}")).walk.positions_m
+        is_under = (places[:, None, :2] >= roofs.mins[:, :2]) & (places[:, None, :2] <= roofs.maxs[:, :2])
+        num_under += bool(is_under.all(axis=2).any())
+    assert num_under >= 4

@@ -10,6 +10,7 @@ from cosfly.maps.boxlist import BoxList
 PAVED_TOP_M, LAWN_TOP_M, PAINT_TOP_M, ROAD_TOP_M, BASE_TOP_M = 0.0, -0.02, -0.03, -0.06, -0.12
 WATER_TOP_M = 0.05  # over the ground, so that it is an obstacle: nobody walks on a pond
 SLAB_M = 0.3
+PASSAGE_M, ARCADE_M = 3.2, 3.0  # what people walk under: its clear height, the depth of an arcade
 
 
 def ring(
@@ -181,7 +182,7 @@ def _towers(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Ge
 
 
 def _lanes(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> None:
-    """Terraces of narrow old houses of unlike heights, with paved lanes between them."""
+    """Terraces of narrow old houses of unlike heights, with lanes between them, one way through built over."""
     _ground(boxes, "Sidewalks", low, high)
     lane, depth = 5.6, 8.5
     rows = max(2, int((high[1] - low[1] + lane) // (depth + lane)))
@@ -194,7 +195,9 @@ def _lanes(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Gen
             width = min(rng.uniform(5.5, 9.0), high[0] - at)
             height, ridge = rng.uniform(6.5, 13.0), rng.uniform(1.6, 2.6)
             is_passage = at <= passage < at + width
-            if not is_passage:
+            if is_passage and row == gap_row:
+                _between(boxes, (at, base), (at + lane, base + depth), PASSAGE_M, height)
+            elif not is_passage:
                 _between(boxes, (at, base), (at + width, base + depth), -1.0, height)
                 low_y, high_y = base + depth * 0.28, base + depth * 0.72
                 _between(boxes, (at + 0.2, low_y), (at + width - 0.2, high_y), height, height + ridge)
@@ -263,12 +266,16 @@ def _farm(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Gene
 
 
 def _market(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> None:
-    """Rows of stalls with awnings round a market hall."""
+    """Rows of stalls with awnings round a market hall that has arcades on its long sides."""
     _ground(boxes, "Sidewalks", low, high)
     size, middle = high - low, (low + high) / 2
     hall = size * (0.34, 0.26)
-    boxes.add("Buildings", middle, hall, -0.5, 7.0)
+    boxes.add("Buildings", middle, hall - (0.0, 2 * ARCADE_M), -0.5, PASSAGE_M)
+    boxes.add("Buildings", middle, hall, PASSAGE_M, 7.0)
     boxes.add("Buildings", middle, hall * (0.9, 0.4), 7.0, 9.5)
+    for x in np.linspace(-0.5, 0.5, 6) * (hall[0] - 0.5):
+        for side in (-1, 1):
+            boxes.add("Poles", middle + np.array([x, side * (hall[1] / 2 - 0.25)]), (0.5, 0.5), 0.0, PASSAGE_M)
     for y in np.arange(low[1] + 4.0, high[1] - 3.0, 7.0):
         for x in np.arange(low[0] + 4.0, high[0] - 3.0, 5.2):
             clear = (np.abs(np.array([x, y]) - middle) > hall / 2 + 3.5).any()

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
+import shapely
 from pydantic import Field
 
 from cosfly.geometry import axis_aligned_half_extents
@@ -52,7 +53,7 @@ def merge(
 
     Args:
         rules: kind -> rule; other kinds stay.
-        groups: (n,) bool, vegetation of different groups is no neighbour; None: one group.
+        groups: (n,) bool, boxes of different groups are no neighbours; None: one group.
         by_center: neighbours are boxes whose centres, not faces, lie within the gap on every axis.
     Source: sec:step2, "Merging adjacent boxes"; by centres: app:simworld:step3; the guard is ours.
     """
@@ -61,7 +62,7 @@ def merge(
     for kind, rule in sorted(rules.items()):
         of_kind = box_map.kinds == kind
         min_fill[of_kind] = rule.min_fill
-        split = groups if groups is not None and kind == VEGETATION else np.zeros(len(box_map), dtype=bool)
+        split = np.zeros(len(box_map), dtype=bool) if groups is None else groups
         for group in np.unique(split[of_kind]):
             rows = np.flatnonzero(of_kind & (split == group))
             lows, highs = (box_map.centers, box_map.centers) if by_center else (mins, maxs)
@@ -312,10 +313,16 @@ def _merge_rules(cfg: SimplifyConfig) -> dict[int, MergeRule]:
 
 
 def _merge_groups(box_map: BoxMap, cfg: SimplifyConfig) -> np.ndarray:
-    """Groups that never merge, (n,): with stems, bushes and hedges must not vanish below the cut of a tree."""
-    if not _has_stems(cfg):
-        return np.zeros(len(box_map), dtype=bool)
-    return box_map.maxs[:, 2] > _ground_z_m(box_map) + cfg.cut_height_m
+    """Groups that never merge, (n,): with stems, bushes and hedges must not vanish below the cut of a tree; what is
+    built over a passage or an arcade, not on what stands below, must not close it."""
+    cut_m = _ground_z_m(box_map) + cfg.cut_height_m
+    mins, maxs = box_map.mins, box_map.maxs
+    is_plant, stands = box_map.kinds == VEGETATION, mins[:, 2] <= cut_m
+    outlines = shapely.box(*mins[:, :2].T, *maxs[:, :2].T)
+    above, below = shapely.STRtree(outlines[stands]).query(outlines, predicate="covered_by")
+    is_built_over = ~stands & ~is_plant
+    is_built_over[above[box_map.kinds[above] == box_map.kinds[stands][below]]] = False
+    return is_built_over | (is_plant & (maxs[:, 2] > cut_m) & _has_stems(cfg))
 
 
 def _ground_z_m(box_map: BoxMap) -> np.ndarray:
