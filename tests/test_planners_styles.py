@@ -15,7 +15,7 @@ from caption.schema import FutureMotion
 from caption.truth.actions import measure
 from cosfly.app.settings import RunConfig
 from cosfly.errors import InputError, NoPathError
-from cosfly.geometry import look_at, wrap_deg
+from cosfly.geometry import intrinsic_matrix, look_at, world_from_camera, wrap_deg
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.stage import make_walk
 from cosfly.pedestrians.walkable import walkable_ground
@@ -27,10 +27,12 @@ from cosfly.planners.stage import draw_styles_of, make_scenario, plan_flight, ru
 from cosfly.planners.styles import ALTITUDE_LEAST_M, FOLLOW, HIDING, NAMES, OTHER_SIDE, REACQUIRE, RETURN_HOME, TABLE
 from cosfly.products.actions import shipped_actions
 from cosfly.products.boxes import MapHeader, make_box_map, write_boxes
+from cosfly.products.frames import LEGIBLE_HEIGHT_PX, Camera
 from cosfly.products.kinds import KINDS
 from cosfly.products.segments import Mission, read_mission, read_segments
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.walks import paces_of, walk_id, write_paths
+from cosfly.render.camera import view_target
 from cosfly.simplify.passes import simplify
 from cosfly.space import kernels
 from cosfly.work.chance import rng_for
@@ -342,10 +344,23 @@ def flights_of(cfg):
                 yield plan_flight(walk, obstacles, town.plan, town.seed, screens, styles)
 
 
+def heights_px(trace, cfg):
+    """Of the target in every tenth frame that has it in view, at each field of view."""
+    for fov_deg in cfg.fovs_deg:
+        camera = Camera(cfg.width_px, cfg.height_px, intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg))
+        for place_m, rotation_deg, target_m in zip(
+            trace.positions_m[::10], trace.rotations_deg[::10], trace.targets_m[::10], strict=True
+        ):
+            view = view_target(target_m, world_from_camera(place_m, rotation_deg), camera)
+            if view.in_view:
+                yield view.bbox_px[3] - view.bbox_px[1]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10))
 def test_diverse_shows_each_decision_and_all_heights_and_distances_whatever_the_seed(seed):
-    flights = flights_of(load(RunConfig, shipped("diverse.yaml"), [f"seed={seed}"]))
+    cfg = load(RunConfig, shipped("diverse.yaml"), [f"seed={seed}"])
+    flights = flights_of(cfg)
     kept = [trace for trace in flights if trace.drop_reason is None]
     assert len(kept) >= 78
     labels = sum(map(labels_of, kept), Counter())
@@ -362,6 +377,7 @@ def test_diverse_shows_each_decision_and_all_heights_and_distances_whatever_the_
     assert sum(trace.segments[0].style == REACQUIRE for trace in kept if trace.segments) >= 1
     assert min(trace.metrics["clearance_min_m"] for trace in kept) >= 3.0 - 1e-3
     assert np.concatenate([trace.visibility for trace in kept]).mean() >= 0.9
+    assert np.mean([px < LEGIBLE_HEIGHT_PX for trace in kept for px in heights_px(trace, cfg.render)]) <= 0.05
 
 
 # --- searching --------------------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 # How fast the wish goes from one part to the next, relative to the walker; within the drone's 10 m/s.
-APART_MPS, ROUND_MPS, CLIMB_MPS = 4.0, 6.5, 2.5
+APART_MPS, ROUND_MPS, CLIMB_MPS = 4.0, 6.5, 3.5
 # Least and greatest speed of a distance and of a height that change all through a part.
 EVEN_APART_MPS, EVEN_CLIMB_MPS = (0.8, 2.0), (1.0, 2.2)
 ROUNDING_S = 1.0  # standard deviation of the smoothing of corners
