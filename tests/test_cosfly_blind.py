@@ -58,6 +58,11 @@ def test_a_past_is_without_perturbation_where_it_is_known_and_finite_where_nobod
     assert np.abs(past_of(unknown, range(5), False)[:6] - clean).max() > 0.1
     lost = replace(flight, targets_m=np.full((NUM, 3), np.nan))
     assert np.isfinite(past_of(lost, range(5), False)).all()
+    of_one, of_two = past_of(flight, [7], False), past_of(flight, [6, 7], False)  # windows shorter than the past
+    assert of_one.shape == of_two.shape == past_of(flight, range(5), False).shape
+    assert np.isfinite(of_one).all()
+    assert not of_one[:6].any()
+    np.testing.assert_allclose(of_two[3:6], past_of(flight, range(3, 8), False)[3:6])
 
 
 @pytest.mark.parametrize(

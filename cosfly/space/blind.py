@@ -31,11 +31,12 @@ def past_of(flight: Flight, window: Sequence[int], is_ordered: bool) -> np.ndarr
     last frame: velocities and speeds of drone and walker, yaw and pitch, where the walker is and how far; from where it
     is seen, whether it is visible, and whether an order of the mission stands. m, s, degrees; bearings in radians.
     """
-    at = list(window[-LOOKS_BACK:])
+    at = [window[0]] * (LOOKS_BACK - len(window)) + list(window[-LOOKS_BACK:])
     planned, walked_m = flight.planned[0][at], flight.walked_m[at]
     poses = np.where(np.isnan(planned), np.hstack([flight.positions_m[at], flight.rotations_deg[at]]), planned)
     targets_m = np.where(np.isnan(walked_m), flight.targets_m[at], walked_m)
     yaw_deg, step_s = float(poses[-1, 4]), np.diff(flight.time_s[at])[:, None]
+    step_s[step_s == 0] = np.nan  # a frame that stands in for one that is not
     drone, walker = (in_axes_of(yaw_deg, places_m - poses[-1, :3]) for places_m in (poses[:, :3], targets_m))
     flown, walked, away = np.diff(drone, axis=0) / step_s, np.diff(walker, axis=0) / step_s, walker - drone
     apart_m, speeds = np.hypot(away[:, 0], away[:, 1]), np.linalg.norm(walked, axis=1)
