@@ -7,6 +7,7 @@ import gzip
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -65,11 +66,12 @@ from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, read_boxes, w
 from cosfly.products.captions import Coc, read_captions
 from cosfly.products.flights import find_flights, read_twin
 from cosfly.products.frames import DEPTH_PNG, read_depth, read_instance, read_meta, read_rgb
+from cosfly.products.goals import Goal
 from cosfly.products.inspection import read_inspection
 from cosfly.products.kinds import KINDS
 from cosfly.products.meshes import write_meshes
 from cosfly.products.others import BUILDS, Company, Other, read_others, write_others
-from cosfly.products.playback import read_flight
+from cosfly.products.playback import TARGET_FILE, read_flight
 from cosfly.products.png import parse_png
 from cosfly.products.predictions import read_predictions
 from cosfly.products.roi import read_roi
@@ -204,6 +206,7 @@ def make_specimens(root: Path) -> Path:
     }
     write_json(tree / "Town01" / IDS_FILE, {**IDS_FORMAT.header, **ids})
     pack_depth(root / TREE / "aug_001")
+    shutil.copy(root / TREE / "ORI" / FRAME / "rgb.png", root / TREE / "ORI" / TARGET_FILE)
     for folder in find_flights(tree):
         write_checksums(
             folder, {name: digest for name, digest in provenance.folder_digests(folder).items() if name != CHECKSUMS}
@@ -557,6 +560,14 @@ def _captioned(root: Path, scratch: Path, **settings: Any) -> None:
     _stage(lambda: caption_stage.run(cfg, root / "render", scratch / "out"), scratch / "out")
 
 
+def _targeted(root: Path, scratch: Path) -> None:
+    """Take the picture of a target as a release does, and open it as its verification does."""
+    goal = Goal(0, "the person in the red jacket", "穿红色夹克的行人", ("top",))
+    shown = replace(read_flight(root / TREE / "ORI"), goal=goal).target_picture(0)
+    if shown is not None:
+        parse_png(shown["bytes"], TARGET_FILE).pixels()
+
+
 def _resumed(root: Path, scratch: Path) -> None:
     inputs = {"data": root / "render"}
     record = provenance.read_stage_record(root / "inspect")
@@ -718,6 +729,7 @@ READERS: dict[str, Reader] = {
     "depth": _one(PICTURES[1], lambda path: read_depth(path.parent)),
     "depth, packed": _one(f"{TREE}/aug_001/{FRAME}/{DEPTH_PNG}", lambda path: read_depth(path.parent)),
     "instance": _one(PICTURES[2], lambda path: read_instance(path.parent)),
+    "target's picture": Reader((f"{TREE}/ORI/{TARGET_FILE}",), _targeted),
     "PNG, by rows": Reader(
         PICTURES[::2],
         lambda root, _: [parse_png(read_bytes(root / name, what="picture"), name).pixels() for name in PICTURES[::2]],

@@ -705,7 +705,7 @@ def test_scripts_depend_on_the_seed_only():
 class Curtain:
     """A renderer of a map with one thing in it: whoever stands beyond `x_m` is hidden."""
 
-    device = "none"
+    dresses, device = False, "none"
 
     def __init__(self, x_m: float) -> None:
         self.x_m, self.num_drawn = x_m, 0
