@@ -37,11 +37,18 @@ def serving(box_map: BoxMap, folder: Path, *faults: str) -> Iterator[int]:
     folder.mkdir(parents=True, exist_ok=True)
     write_boxes(folder / "boxes_3d.json", box_map)
     port = free_port()
-    process = subprocess.Popen(command(folder / "boxes_3d.json", port, *faults), stdout=subprocess.PIPE, text=True)
+    with listening(command(folder / "boxes_3d.json", port, *faults)):
+        yield port
+
+
+@contextlib.contextmanager
+def listening(words: list[str]) -> Iterator[None]:
+    """Run a server by its command, once it has told its port."""
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
-        assert str(port) in process.stdout.readline()
-        yield port
+        assert words[words.index("--port") + 1] in process.stdout.readline()
+        yield
     finally:
         process.kill()
         process.wait()

@@ -155,9 +155,19 @@ def _served(place: Place) -> str:
     return address
 
 
+def _carla(place: Place) -> int:
+    from carla_serving import serving
+
+    from cosfly.products.boxes import read_boxes
+
+    town = read_boxes(Path(place.given("base")) / "maps/boxes_3d.json")
+    return place.stack.enter_context(serving(town, place.root / "carla"))
+
+
 INPUTS: dict[str, Callable[[Place], object]] = {
     "base": _base, "students": _students, "trained": _trained, "inferred": _inferred, "evaluated": _evaluated,
     "walk": _walk, "teacher": _teacher, "judge": _judge, "served": _served, "key": _key,
+    "carla": _carla,
 }  # fmt: skip
 
 TRAINING = (
@@ -199,6 +209,7 @@ def lose_release(_: Place, out: Path) -> None:
 # same folder; a function is what comes before.
 COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "maps": ["maps --out {out} {tiny}"],
+    "maps carla": ["maps carla --port {carla} --out {out}"],
     "simplify": ["simplify --map {maps} --out {out} {tiny}"],
     "pedestrians": ["pedestrians --map {simple} --out {out} {tiny}"],
     "pedestrians, more": [

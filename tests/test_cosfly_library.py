@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 import cosfly
 from cosfly.app import library
-from cosfly.errors import ConfigError, InputError
+from cosfly.errors import ConfigError, EnvironmentMissing, InputError
 from cosfly.maps import stage as maps_stage
 from cosfly.maps.stage import MapsConfig
 from cosfly.pedestrians import stage as pedestrians_stage
@@ -95,7 +95,8 @@ def test_files_and_sources_are_loaded(town, tmp_path):
 def test_what_is_wrong_is_said_as_on_the_command_line(town):
     for call, error, words in (
         (lambda: cosfly.load_map(sise_m=3), ConfigError, "sise_m: unknown setting.*'size_m'"),
-        (lambda: cosfly.load_map(source="carla"), ConfigError, "no such source of maps; got carla; expected synthetic"),
+        (lambda: cosfly.load_map(source="gta"), ConfigError, "no such source of maps; got gta; expected synthetic"),
+        (lambda: cosfly.load_map(source="carla", port=1), EnvironmentMissing, r"127\.0\.0\.1:1 .*no CARLA server"),
         (lambda: cosfly.load_map("a.json", source="synthetic"), ConfigError, "reads no file"),
         (lambda: cosfly.load_map("nowhere.json"), InputError, r"nowhere\.json"),
         (lambda: cosfly.load_map(**TOWN | {"seed": "x"}), ConfigError, "not a seed; got 'x'"),

@@ -9,9 +9,11 @@ import csv
 import glob
 import gzip
 import json
+import re
 import shlex
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,6 +22,7 @@ from typing import Any
 
 import pytest
 import yaml
+from carla_serving import free_port, listening, serving
 from specimens_foreign import write_foreign_tree
 from specimens_slopes import sloped_city
 from teacher_server import TeacherServer
@@ -100,6 +103,7 @@ class Place:
     root: Path
     teacher: str
     release: str
+    carla_port: int
 
     def make(self, text: str) -> None:
         """Make what a command takes for given and nobody has made yet."""
@@ -112,6 +116,8 @@ class Place:
     def words(self, text: str) -> list[str]:
         """The words of a command as a shell gives them on, with what is small in place of what is large."""
         text = text.replace("http://localhost:8000", self.teacher).replace("https://host/release", self.release)
+        port = free_port() if text.startswith("sim serve") else self.carla_port
+        text = re.sub(r"(port[ =])2000\b", rf"\g<1>{port}", text)
         words = [part for word in shlex.split(text, comments=True) for part in (sorted(glob.glob(word)) or [word])]
         small = max((name for name in SMALL if text.startswith(f"{name} ")), key=len, default=None)
         return options_first([*words, *SMALL.get(small or "", [])])
@@ -242,8 +248,13 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
         (root / name).write_text(yaml.safe_dump(small_run(name)))
     (root / "configs").mkdir()
     shutil.copy(root / "learning", root / "configs/learning.yaml")
-    with TeacherServer(respond=answer) as teacher, served(root / "work/theirs/release/dataset") as (_, release):
-        yield Place(root, teacher.url, release)
+    town = invent(SyntheticConfig(name="Town10HD_Opt", size_m=150.0, num_blocks=1), 0)
+    with (
+        TeacherServer(respond=answer) as teacher,
+        served(root / "work/theirs/release/dataset") as (_, release),
+        serving(town, tmp_path / "carla") as port,
+    ):
+        yield Place(root, teacher.url, release, port)
 
 
 def in_order() -> list[tuple[str, str]]:
@@ -290,6 +301,9 @@ def test_every_command_runs(place, in_this_process, room_on_the_disk):
         place.make(text)
         place.clear(text)
         start = time.monotonic()
+        if text.startswith("sim serve"):  # it never ends; the page's other commands have a server of the right town
+            with listening([sys.executable, "-m", "cosfly", *place.words(text)]):
+                continue
         result = CliRunner().invoke(app, place.words(text))
         print(f"{time.monotonic() - start:6.1f} s, {result.exit_code}: {page}: cosfly {text}", flush=True)
         if result.exit_code:

@@ -35,7 +35,9 @@ from cosfly.work.config import build
 __all__ = ["BoxMap", "DroneTrace", "Frame", "load_map", "plan", "read_captions", "render_frames"]
 
 # Settings that a function makes something of; it refuses the others of the section.
-OF_WALK = PedestriansConfig.model_fields.keys() - {"num_paths", "others", "traffic", "others_reach_m", "roi_vertices"}
+OF_WALK = PedestriansConfig.model_fields.keys() - {
+    *("num_paths", "others", "look_alikes", "traffic", "others_reach_m", "roi_vertices")
+}
 OF_PACE = {
     "cruise_speed_mps", "curvature_gain_m", "speed_jitter", "min_speed_mps", "max_speed_mps", "pace", "hurry_speed_mps",
     "dt_s",
@@ -51,10 +53,11 @@ def load_map(path: str | Path | None = None, *, source: str | None = None, seed:
     Args:
         path: `boxes_3d.json`, `step2_simplified.json`, a table or GeoJSON of boxes, or a source's file; None invents a
             town.
-        source: `synthetic`, `simworld`, `cityjson` or `boxes`; None goes by the file.
+        source: `synthetic`, `simworld`, `cityjson`, `boxes` or `carla`; None goes by the file. A running CARLA is asked
+            by a process of its own: a script that asks it needs `if __name__ == "__main__":`.
         settings: of the source, as in `maps.<source>` of a configuration: `load_map(size_m=400)`.
     Raises:
-        ConfigError: an unknown source or setting. InputError: the file is malformed.
+        ConfigError: an unknown source or setting. InputError: the file is malformed. EnvironmentMissing: no server.
     """
     if not isinstance(seed, int):
         raise ConfigError("not a seed", where="load_map", got=repr(seed)[:40], expected="a whole number")
