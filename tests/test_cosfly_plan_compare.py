@@ -12,7 +12,7 @@ from cosfly.cli import app
 from cosfly.errors import ConfigError, NoPathError, NothingKept, ResumeError
 from cosfly.planners import compare
 from cosfly.planners.compare import CompareConfig, text_tables
-from cosfly.planners.contract import PLANNERS
+from cosfly.planners.contract import ALL_PLANNERS, PLANNERS
 from cosfly.products.boxes import write_boxes
 from cosfly.products.traces import read_traces
 from cosfly.products.walks import write_paths
@@ -204,7 +204,7 @@ def test_intervals_hold_the_difference_and_narrow_with_alike_walks():
 
 
 def test_three_planners_and_another_order(inputs, tmp_path, monkeypatch):
-    monkeypatch.setitem(PLANNERS, "again", PLANNERS["muco"])
+    monkeypatch.setitem(ALL_PLANNERS, "again", ALL_PLANNERS["muco"])
     out = tmp_path / "three"
     cfg = CompareConfig(planners=("muco", "again", "track_astar"))
     record = json.loads(compare.run(cfg, *inputs, out).read_text())

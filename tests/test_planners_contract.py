@@ -1,4 +1,4 @@
-"""What every planner must keep (cosfly/planners/contract.py), over every entry of PLANNERS and several worlds."""
+"""What every planner must keep (cosfly/planners/contract.py), over every entry of ALL_PLANNERS and several worlds."""
 
 import json
 from dataclasses import replace
@@ -10,7 +10,7 @@ from specimens_planning import CANYON, WORLDS, assert_safe, town_of, walk_along
 from cosfly.errors import NoPathError
 from cosfly.geometry import look_at
 from cosfly.planners import contract
-from cosfly.planners.contract import PLANNERS, Plan, PlanConfig, load_planner
+from cosfly.planners.contract import ALL_PLANNERS, REFERENCES, Plan, PlanConfig, load_planner
 from cosfly.planners.stage import make_scenario, plan_flight
 from cosfly.space import kernels
 from cosfly.work.chance import rng_for
@@ -19,30 +19,38 @@ UP_M = 30.0
 ON_A_HILL = {"on_a_hill": (town_of(*CANYON), [(0, 0), (40, 0)])}  # lifted by UP_M, walk and all
 TWO_POINTS = {"two_points": (town_of(((10, 9, 5), (2, 2, 5))), [(0, 0), (0.7, 0)])}
 ALL = WORLDS | ON_A_HILL | TWO_POINTS
+# Straight through the middle of a block: repair of what knows no way round it does not come to an end.
+NOT_REPAIRED = {("minimum_jerk", "corner"), ("trajopt", "corner")}
 
 
 @pytest.mark.parametrize("world", ALL)
-@pytest.mark.parametrize("name", PLANNERS)
+@pytest.mark.parametrize("name", ALL_PLANNERS)
 def test_a_flight_is_whole_safe_and_smooth_and_sees_the_target_it_looks_at(name, world):
     box_map, corners = ALL[world]
     walk, up = walk_along(world, corners), np.array([0.0, 0.0, UP_M * (world in ON_A_HILL)])
     walk = replace(walk, positions_m=walk.positions_m + up)
     obstacles = kernels.obstacle_index(replace(box_map, centers=box_map.centers + up))
     cfg = PlanConfig(planner=name)
+    if (name, world) in NOT_REPAIRED:
+        with pytest.raises(NoPathError, match=f"{world}: no flight within the limits"):
+            plan_flight(walk, obstacles, cfg, 0)
+        return
     trace = plan_flight(walk, obstacles, cfg, 0)
     assert trace.positions_m.shape == (len(walk.time_s), 3)
     assert_safe(trace.positions_m, obstacles, cfg, ground_m=up[2])
     json.dumps(trace.solver, allow_nan=False)
     assert trace.planner == cfg.planner
-    assert trace.drop_reason is None
     assert trace.metrics["accel_rms_mps2"] <= cfg.accel_rms_max_mps2
     assert trace.metrics["jerk_rms_mps3"] <= cfg.jerk_rms_max_mps3
     assert trace.metrics["clearance_min_m"] >= cfg.relaxed_safety_m
-    assert trace.visibility.mean() >= 0.88
     assert trace.metrics["five_ray_mean"] == pytest.approx(trace.visibility.mean(), abs=1e-4)
     assert np.isfinite(trace.clearances_m).all()
     pitch, yaw = look_at(trace.positions_m, trace.targets_m)
     np.testing.assert_allclose(trace.rotations_deg, np.degrees(np.stack([pitch, yaw, 0 * yaw], axis=1)))
+    if name in REFERENCES:
+        return  # it knows nothing of sight, and goes by itself
+    assert trace.drop_reason is None
+    assert trace.visibility.mean() >= 0.88
     assert (trace.rotations_deg[:, 0] < -20).all()
     np.testing.assert_allclose(np.linalg.norm(trace.positions_m - trace.targets_m, axis=1), 28, atol=8)
     if name == "foresight":  # it sees at least as well as from where it would best like to be
@@ -56,10 +64,10 @@ def test_a_flight_is_whole_safe_and_smooth_and_sees_the_target_it_looks_at(name,
         assert trace.solver["smooth"]
 
 
-@pytest.mark.parametrize("name", PLANNERS)
+@pytest.mark.parametrize("name", ALL_PLANNERS)
 def test_the_same_seed_gives_the_same_flight_and_inputs_stay_as_they_are(name):
     """Planned twice: alone, and by the stage with a generator of the same seed."""
-    box_map, corners = WORLDS["corner"]
+    box_map, corners = WORLDS["tower_midway"]
     walk, obstacles, cfg = walk_along("w", corners), kernels.obstacle_index(box_map), PlanConfig(planner=name)
     scenario = make_scenario(walk, obstacles, cfg)
     before = [part.copy() for part in (scenario.targets_m, *obstacles)]
@@ -72,10 +80,10 @@ def test_the_same_seed_gives_the_same_flight_and_inputs_stay_as_they_are(name):
 
 
 @pytest.mark.parametrize("dt_s", [0.25, 1.0])
-@pytest.mark.parametrize("name", PLANNERS)
+@pytest.mark.parametrize("name", ALL_PLANNERS)
 def test_the_time_step_is_the_walks(name, dt_s):
     """Speed limit, metrics and duration count in the walk's own step."""
-    box_map, corners = WORLDS["corner"]
+    box_map, corners = WORLDS["canyon"]
     walk = walk_along("w", corners, dt_s=dt_s)
     cfg = PlanConfig(planner=name, speed_max_mps=3.0)
     trace = plan_flight(walk, kernels.obstacle_index(box_map), cfg, 0)
@@ -87,7 +95,7 @@ def test_the_time_step_is_the_walks(name, dt_s):
     assert trace.metrics["accel_rms_mps2"] == pytest.approx(np.sqrt((accel**2).mean()), abs=1e-3)
 
 
-@pytest.mark.parametrize("name", PLANNERS)
+@pytest.mark.parametrize("name", ALL_PLANNERS)
 def test_where_there_is_no_way_it_says_so(name):
     roof = kernels.obstacle_index(town_of(((0, 0, 60), (300, 300, 50))))
     scenario = make_scenario(walk_along("w", [(0, 0), (50, 0)]), roof, PlanConfig())
@@ -101,7 +109,7 @@ def fly_low_and_straight(scenario, obstacles, cfg, rng):
 
 
 def test_a_planner_that_flies_into_a_tower_is_found_out(monkeypatch):
-    monkeypatch.setitem(contract.PLANNERS, "low", f"{__name__}:fly_low_and_straight")
+    monkeypatch.setitem(contract.ALL_PLANNERS, "low", f"{__name__}:fly_low_and_straight")
     box_map, corners = WORLDS["tower_behind"]
     with pytest.raises(NoPathError, match="planner low found no flight that is free of collisions"):
         plan_flight(walk_along("w", corners), kernels.obstacle_index(box_map), PlanConfig(planner="low"), 0)

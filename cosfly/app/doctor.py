@@ -27,6 +27,7 @@ OPTIONAL_PACKAGES = {  # what it is for, and what brings it
     "datasets": ("opening the release as a user would", "datasets"),
     "vllm": ("a teacher in this process", "cosfly[vllm]"),
     "pyrender": ("the second renderer", "cosfly[pyrender]"),
+    "ompl": ("the sampling planners of plan benchmark", "cosfly[ompl]"),
     "carla": ("CARLA's maps and pictures", "cosfly[carla]"),
 }
 

@@ -20,7 +20,7 @@ from pydantic import BaseModel, Field, field_validator
 
 from cosfly.errors import InputError, NoPathError
 from cosfly.look.topview import INK, PAPER, add_caption, draw_area, draw_dot, draw_line, draw_text, png_bytes
-from cosfly.planners.contract import PLANNERS, PlanConfig, known_planner, title_of
+from cosfly.planners.contract import ALL_PLANNERS, PLANNERS, PlanConfig, known_planner, title_of
 from cosfly.planners.overview import draw_walks
 from cosfly.planners.stage import check_ids, draw_styles_of, plan_flight, warm_up
 from cosfly.products.boxes import BoxMap, read_boxes
@@ -179,7 +179,7 @@ class CompareConfig(PlanConfig):
             raise ValueError("a planner is named twice")
         known = tuple(known_planner(name) for name in names)  # first, so that a wrong name is what one hears of
         if len(known) < 2:
-            raise ValueError(f"a comparison needs at least 2 planners; name another of {', '.join(PLANNERS)}")
+            raise ValueError(f"a comparison needs at least 2 planners; name another of {', '.join(ALL_PLANNERS)}")
         return known
 
 
@@ -252,7 +252,7 @@ def run(
         raise stage.nothing_kept(finished.tally, expected="a walk that all planners fly")
     flights = {name: _flights_of(name, shared, out) for name in cfg.planners}
     header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.model_dump(mode="json")}
-    named = {name: PLANNERS[name] for name in flights}
+    named = {name: ALL_PLANNERS[name] for name in flights}
     summary = {
         "planners": named,
         **summarize(flights, rng_for(seed, "plan_compare", "intervals")),
@@ -329,7 +329,7 @@ FAINT = (215, 215, 215)
 
 def color_of(planner: str) -> tuple[int, int, int]:
     """Give a planner's color, the same in every comparison."""
-    return PALETTE[list(PLANNERS).index(planner) % len(PALETTE)]
+    return PALETTE[list(ALL_PLANNERS).index(planner) % len(PALETTE)]
 
 
 def _legend(picture: np.ndarray, planners: Collection[str], y: float) -> None:

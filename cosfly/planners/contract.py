@@ -1,6 +1,6 @@
 """What a planner is: what it gets, what it gives, and what it must keep. All settings of step 4 stand here.
 
-A planner is one function, named in PLANNERS, with the signature
+A planner is one function, named in PLANNERS or, if it is a generic one, in REFERENCES, with the signature
 
     plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan
 
@@ -41,7 +41,28 @@ PLANNERS = {
     "track_astar": "cosfly.planners.track_astar:plan",
     "muco": "cosfly.planners.muco.muco:plan",
 }
-TITLES = {"track_astar": "TA* + Smooth", "muco": "MuCO"}  # in tables and pictures; others go by their names
+# Generic planners that know nothing of sight, beside which `plan benchmark` holds those above (app:three_axis_eval).
+REFERENCES = {
+    "rrt_star": "cosfly.planners.reference.sampling:plan_rrt_star",
+    "prm": "cosfly.planners.reference.sampling:plan_prm",
+    "bspline_prm": "cosfly.planners.reference.sampling:plan_bspline_prm",
+    "elastic_band": "cosfly.planners.reference.elastic_band:plan",
+    "minimum_jerk": "cosfly.planners.reference.minimum_jerk:plan",
+    "astar": "cosfly.planners.reference.grid_search:plan_astar",
+    "weighted_astar": "cosfly.planners.reference.grid_search:plan_weighted",
+    "theta_star": "cosfly.planners.reference.grid_search:plan_theta",
+    "visibility_astar": "cosfly.planners.reference.visibility_astar:plan",
+    "potential_field": "cosfly.planners.reference.potential_field:plan",
+    "chomp": "cosfly.planners.reference.chomp:plan",
+    "trajopt": "cosfly.planners.reference.trajopt:plan",
+}
+ALL_PLANNERS = PLANNERS | REFERENCES
+# In tables and pictures; others go by their names.
+TITLES = {
+    "track_astar": "TA* + Smooth", "muco": "MuCO", "rrt_star": "RRT*", "prm": "PRM", "bspline_prm": "B-spline PRM",
+    "astar": "3D A*", "weighted_astar": "weighted A*", "theta_star": "Theta*", "visibility_astar": "visibility-A*",
+    "chomp": "CHOMP-lite", "trajopt": "L-BFGS-B TrajOpt",
+}  # fmt: skip
 
 
 def title_of(name: str) -> str:
@@ -53,10 +74,10 @@ def known_planner(name: str) -> str:
     """Give the name back.
 
     Raises:
-        ValueError: it is not in PLANNERS.
+        ValueError: it is not in ALL_PLANNERS.
     """
-    if name not in PLANNERS:
-        raise ValueError(f"there is no such planner{nearest(name, PLANNERS)}; there are {', '.join(PLANNERS)}")
+    if name not in ALL_PLANNERS:
+        raise ValueError(f"there is no such planner{nearest(name, ALL_PLANNERS)}; there are {', '.join(ALL_PLANNERS)}")
     return name
 
 
@@ -348,6 +369,6 @@ Planner = Callable[[Scenario, "BoxIndex", PlanConfig, np.random.Generator], Plan
 
 
 def load_planner(name: str) -> Planner:
-    """Import a planner of PLANNERS."""
-    module, _, function = PLANNERS[name].partition(":")
+    """Import a planner of ALL_PLANNERS."""
+    module, _, function = ALL_PLANNERS[name].partition(":")
     return getattr(importlib.import_module(module), function)

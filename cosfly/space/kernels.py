@@ -377,8 +377,16 @@ def _signed_distances(index, points, reach_m):
 
 def normals(index: BoxIndex, points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     """Give the unit vectors away from boxes (k,) at points (k, 3), (k, 3), as `normal_of_box` does."""
-    found = [normal_of_box(index.rows, box, *map(float, p)) for box, p in zip(boxes, points, strict=True)]
-    return np.array(found).reshape(-1, 3)
+    return _normals(index, _points(points, "points"), np.ascontiguousarray(boxes, dtype=np.int64))
+
+
+@njit(cache=True)
+def _normals(index, points, boxes):
+    found = np.empty((len(points), 3))
+    for i in range(len(points)):
+        x, y, z = normal_of_box(index.rows, boxes[i], points[i, 0], points[i, 1], points[i, 2])
+        found[i, 0], found[i, 1], found[i, 2] = x, y, z
+    return found
 
 
 def segments_hit(index: BoxIndex, starts: np.ndarray, ends: np.ndarray, inflate_m: float = 0.0) -> np.ndarray:

@@ -1,0 +1,109 @@
+"""What the reference planners share: where from, where to, what is free, and the repair of what they find.
+
+A generic planner knows no target: it goes from the place that is wished first to the one that is wished last, in the
+time of the walk, free of boxes. Repair is `within_limits` of smoothing.py, for all alike; a flight that it cannot mend
+is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from cosfly.planners.contract import Plan, PlanConfig, Scenario
+from cosfly.planners.smoothing import within_limits
+from cosfly.space.kernels import BoxIndex, normals, segments_hit, signed_distances
+
+FREE_STEP_M, FREE_REACH_M = 2.0, 40.0  # of the search for a free place near one that is not
+
+
+@dataclass(frozen=True)
+class Task:
+    """One way to find, from `start` to `goal`, (3,) m, between the corners `low` and `high` of a volume, (3,) m.
+
+    clearance_m: what boxes grow by on every side. num: points of the flight.
+    """
+
+    start: np.ndarray
+    goal: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    obstacles: BoxIndex
+    clearance_m: float
+    num: int
+    dt_s: float
+
+    def hits(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        """Tell which ways between (n, 3) points are not free, (n,) bool."""
+        return segments_hit(self.obstacles, starts, ends, self.clearance_m)
+
+    def near(self, points: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
+        """Give the distance of points (n, 3) to boxes, (n,) m, at most `reach_m`, and unit vectors away from the
+        nearest, (n, 3), zero where none is in reach.
+        """
+        gaps_m, boxes = signed_distances(self.obstacles, points, reach_m)
+        away, found = np.zeros_like(points), boxes >= 0
+        away[found] = normals(self.obstacles, points[found], boxes[found])
+        return gaps_m, away
+
+    def line(self) -> np.ndarray:
+        """Give the straight flight of even speed, (num, 3)."""
+        return self.start + np.linspace(0.0, 1.0, self.num)[:, None] * (self.goal - self.start)
+
+    def along(self, route: np.ndarray) -> np.ndarray:
+        """Give the flight of even speed along a route (m, 3), (num, 3)."""
+        lengths_m = np.linalg.norm(np.diff(route, axis=0), axis=1)
+        far_m = np.concatenate([[0.0], np.cumsum(lengths_m)])
+        wanted_m = np.linspace(0.0, far_m[-1], self.num)
+        return np.stack([np.interp(wanted_m, far_m, route[:, axis]) for axis in range(3)], axis=1)
+
+
+def make_task(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, clearance_m: float) -> Task | None:
+    """Give the task of a scenario; None where no free place is near its first or last wished one."""
+    wish, targets = scenario.wish, scenario.targets_m
+    margin_m = cfg.track_astar.corridor_m
+    low_z, high_z = (scenario.ground_m + wish.altitude_min_m).max(), (scenario.ground_m + wish.altitude_max_m).min()
+    low = np.array([*(targets[:, :2].min(axis=0) - margin_m), low_z])
+    high = np.array([*(targets[:, :2].max(axis=0) + margin_m), high_z])
+    wished = wish.places_m(targets, scenario.ground_m)[[0, -1]]
+    ends = [_free_place(place, low, high, obstacles, clearance_m) for place in wished]
+    if ends[0] is None or ends[1] is None:
+        return None
+    return Task(ends[0], ends[1], low, high, obstacles, clearance_m, len(targets), scenario.dt_s)
+
+
+def _free_place(
+    place: np.ndarray, low: np.ndarray, high: np.ndarray, obstacles: BoxIndex, clearance_m: float
+) -> np.ndarray | None:
+    steps = np.arange(-FREE_REACH_M, FREE_REACH_M + 1e-9, FREE_STEP_M)
+    offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    offsets = offsets[np.argsort((offsets**2).sum(axis=1), kind="stable")]
+    places = np.clip(place, low, high) + offsets
+    places = places[((places >= low) & (places <= high)).all(axis=1)]
+    for begin in range(0, len(places), 1024):
+        some = places[begin : begin + 1024]
+        free = ~segments_hit(obstacles, some, some, clearance_m)
+        if free.any():
+            return some[int(np.argmax(free))]
+    return None
+
+
+def fly(find: Callable[[Task], np.ndarray | None], scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> Plan:
+    """Find a way, at the nominal distance to boxes and else at the relaxed one, and repair it.
+
+    Args:
+        find: gives the flight (num, 3) of a task, or None.
+    Raises:
+        NoPathError: there is none, or repair did not come to an end.
+    """
+    for clearance_m in (cfg.safety_distance_m, cfg.relaxed_safety_m):
+        task = make_task(scenario, obstacles, cfg, clearance_m)
+        found = None if task is None else find(task)
+        if task is not None and found is not None:
+            found = np.clip(found, task.low, task.high)
+            mended = within_limits(found, scenario, obstacles, cfg)
+            moved_m = float(np.linalg.norm(mended - found, axis=1).max())
+            return Plan(mended, {"clearance_m": clearance_m, "repaired_m": round(moved_m, 4)})
+    raise scenario.no_way("no free way leads from the first wished place to the last", cfg.relaxed_safety_m)
