@@ -42,7 +42,8 @@ class ObservedFrame:
     and target_bbox (left, top, right, bottom) px of what is seen of the target (where a tree does not say, of its
     projected 3D box), NaN where unknown;
     visibility: score, NaN where unknown; legible: whether who is visible can be made out, true where a tree is silent.
-    others_in_view, other_distance_m: other people who are seen, and from the target to the nearest; NaN where unknown.
+    others_in_view, other_distance_m, alike_differences: other people who are seen, from the target to the nearest, and
+    in how many things the most alike looks otherwise; NaN where unknown.
     """
 
     time_s: float
@@ -57,6 +58,7 @@ class ObservedFrame:
     legible: bool = True
     others_in_view: float = math.nan
     other_distance_m: float = math.nan
+    alike_differences: float = math.nan
 
 
 def observed_frames(*columns: np.ndarray) -> tuple[ObservedFrame, ...]:

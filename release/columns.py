@@ -27,6 +27,7 @@ from cosfly.products.frames import (
     LEGIBLE_HEIGHT_PX,
     LEGIBLE_SHARE,
     MOST_FOV_DEG,
+    PERSON_ID,
     SKY_DEPTH_M,
     FrameFile,
     Look,
@@ -49,6 +50,7 @@ LANGUAGE_NAMES: dict[Language, str] = {"en": "English", "zh": "Chinese"}
 STATES: tuple[SentenceState, ...] = get_args(SentenceState)
 CAPTION_FIELDS = tuple(f"caption_{language}_{name}" for language in LANGUAGES for name in FIELDS)
 TARGET_PICTURE = "target_picture"
+COMPANY_COLUMNS = ("others_in_view", "other_distance_m", "other_id", "alike_id", "alike_differences")  # frames.COMPANY
 CAPTION_SHARES = (
     "proved_en",
     "proved_zh",
@@ -79,7 +81,8 @@ CONTRACT: dict[str, Any] = {
     "by instance id; or a place: left, right, near, far, or what it stands by. Null where nothing tells the target "
     "apart, and where the tree does not say",
     "others": "others_in_view, other people who have a pixel in the frame; other_distance_m, from the target to the "
-    "nearest of them over the ground, null without any",
+    "nearest of them, other_id, over the ground; alike_id, who of them looks most like the target, and in how many of "
+    "figure, top, legs, hat and bag that one differs (alike_differences); null without any",
     "legibility": "target_height_px, of its box in the image; target_contrast, CIE76 difference of the colours of its "
     "pixels from those around; target_legible: visible, "
     f"{LEGIBLE_HEIGHT_PX:g} px high, {LEGIBLE_SHARE:g} of it unhidden (visibility), contrast {LEGIBLE_CONTRAST:g}; "
@@ -195,6 +198,11 @@ def _knobs(flight: Flight) -> np.ndarray | None:
     """The six knobs of weather, (6,), None where the file has none."""
     record = flight.weather_record
     return None if record is None else np.array([getattr(record.params, name) for name in WEATHER_PARAMS])
+
+
+def _of_company(k: int, flight: Flight, i: int) -> int | None:
+    value = math.nan if flight.company is None else flight.company[i, k]
+    return None if math.isnan(value) else int(value)
 
 
 def _repair(caption: Caption) -> str | None:
@@ -339,12 +347,17 @@ FRAME = (  # everything of a frame but pictures and depth
         annotation=True,
     ),
     Column(
-        "others_in_view", "int32", lambda f, i: None if f.company is None else int(f.company[i, 0]),
-        title="other people in view", annotation=True, shown=True,
+        "others_in_view", "int32", partial(_of_company, 0), title="other people in view", annotation=True, shown=True,
     ),
     Column(
         "other_distance_m", "float64", lambda f, i: None if f.company is None else f.company[i, 1],
         ranges={"": (0.0, 1e6)},
+    ),
+    Column("other_id", "int32", partial(_of_company, 2), ranges={"": (0, PERSON_ID)}),
+    Column("alike_id", "int32", partial(_of_company, 3), ranges={"": (0, PERSON_ID)}),
+    Column(
+        "alike_differences", "int32", partial(_of_company, 4), title="most alike other person", annotation=True,
+        shown=True,
     ),
     Column("is_perturbed", "bool", lambda f, i: f.is_perturbed[i], required=True),
     Column(

@@ -19,7 +19,7 @@ from cosfly.products.playback import EVENTS, Flight
 from cosfly.products.shown_captions import ShownCaption, ShownFlight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.reading.documents import parse_document
-from release.columns import BOX, INTRINSICS, PICTURE_PX, POINT, POSE, WINDOW, between_of, matrices_of
+from release.columns import BOX, COMPANY_COLUMNS, INTRINSICS, PICTURE_PX, POINT, POSE, WINDOW, between_of, matrices_of
 
 Row = dict[str, Any]
 LANGUAGES: tuple[Language, ...] = get_args(Language)
@@ -160,7 +160,7 @@ class FlightRows:
             target_legible=None if None in self.column("target_legible") else self.flags("target_legible"),
             intrinsics=matrices if self.zooms else None, between=between_of(self.rows),
             people=self.people, goal=self.goal, company=None if None in self.column("others_in_view")
-            else np.stack([self.numbers("others_in_view"), self.numbers("other_distance_m")], axis=1),
+            else np.stack([self.numbers(name) for name in COMPANY_COLUMNS], axis=1),
         )  # fmt: skip
 
     def shown(

@@ -25,7 +25,9 @@ from cosfly.products.playback import read_flight
 from specimens import make_playback_tree
 
 GOAL = Goal(0, "the woman in the red jacket", "穿红色夹克的女子", ("figure", "top"))
-COMPANY = np.array([[0.0, np.nan], [1.0, 4.04], [2.0, 3.5], [3.0, 2.26], [3.0, 2.5]])
+COMPANY = np.array(
+    [[0, np.nan, np.nan, np.nan, np.nan], [1, 4.04, 9, 9, 2], [2, 3.5, 9, 8, 1], [3, 2.26, 7, 8, 1], [3, 2.5, 7, 8, 1]]
+)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +57,7 @@ def test_a_prompt_tells_the_goal_and_the_others_in_both_languages(flight, vocabu
     assert "\nGoal: follow the woman in the red jacket.\nOther people in view: [0, 1, 2, 3, 3];" in prompts["en"]
     assert "\n任务：跟踪穿红色夹克的女子。\n" in prompts["zh"]
     numbers = [re.findall(r"\d+(?:\.\d+)?", text.rpartition("\n")[2]) for text in prompts.values()]
-    assert numbers == [["0", "1", "2", "3", "3", "4.0", "3.5", "2.3", "2.5"]] * 2
+    assert numbers == [["0", "1", "2", "3", "3", "4.0", "3.5", "2.3", "2.5", "2", "1", "1", "1"]] * 2
     for text in prompts.values():  # pictures alone: the goal stays
         assert Prompt(system="", user=text).told("P", measured=False).user.count("\n") == 1
 
@@ -73,6 +75,7 @@ def test_what_is_said_of_others_is_judged_by_the_geometry(flight):
     found = {name: find_fact(parse_reference(name), facts) for name in ("others_in_view@t2", "other_distance@t3")}
     assert [(fact.value, fact.unit) for fact in found.values()] == [(2, "people"), (2.3, "m")]
     assert not number_holds(4.0, 0, found["others_in_view@t2"])
+    assert [find_fact(parse_reference(f"alike_differences@t{i}"), facts).value for i in (1, 4)] == [2, 1]
     assert find_fact(parse_reference("other_distance@t0"), facts) == "unknown_fact"
 
 
@@ -85,6 +88,7 @@ def test_sentences_of_others_are_proved_and_read_well(flight, vocabulary):
         assert draft.judged[0].state == "proved"
         assert draft.coc.critical_components in (
             "In the image are 3 other people.", "The nearest other person to it is 2.5 m away.",
+            "The most alike other person differs from it in 1 of the items of appearance.",
         )  # fmt: skip
-    assert len(describe(facts)[-2]) == 2
+    assert len(describe(facts)[-2]) == 3
     assert "{others_in_view} 3 other people" in way.table(facts)

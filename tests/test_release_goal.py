@@ -91,6 +91,11 @@ def test_lies_about_goals_are_found(flights):
         "who looks so too": changed(flight, people=replace(flight.people, others={**others, seen: target})),
         "who is not on record": changed(flight, people=replace(flight.people, others={})),
         "one other more": [{**row, "others_in_view": row["others_in_view"] + 1} for row in flight.rows],
+        "nobody is near": [{**row, "other_id": None, "other_distance_m": None} for row in flight.rows],
+        "nearer than it is": [{**row, "other_distance_m": 0.1} for row in flight.rows],
+        "another is nearest": [{**row, "other_id": min({*others} - {row["other_id"]})} for row in flight.rows],
+        "another is most alike": [{**row, "alike_id": min({*others} - {row["alike_id"]})} for row in flight.rows],
+        "more alike than it is": [{**row, "alike_differences": 0} for row in flight.rows],
         "no people": changed(flight, people=None) and [{**row, "people": None} for row in flight.rows],
         "another picture": [
             {**row, "target_picture": row["target_picture"] and flights[-1][0].rows[0]["target_picture"]}

@@ -99,7 +99,7 @@ def frames_of(flight: Flight) -> tuple[ObservedFrame, ...]:
         flight.target_visible,
         flight.visibility,
         np.ones(len(flight), dtype=bool) if flight.target_legible is None else flight.target_legible,
-        *(np.full((len(flight), 2), np.nan) if flight.company is None else flight.company).T,
+        *(np.full((len(flight), 5), np.nan) if flight.company is None else flight.company).T[[0, 1, 4]],
     )
 
 

@@ -145,12 +145,15 @@ def _company_lines(window: ObservedWindow, facts: Facts, language: Language) -> 
     if None in facts.others_in_view:
         return lines
     away = ["-" if one is None else f"{one:.1f}" for one in facts.other_distance_m]
-    return [*lines, _OTHERS[language] % (", ".join(map(str, facts.others_in_view)), ", ".join(away))]
+    alike = ["-" if one is None else str(one) for one in facts.alike_differences]
+    told = (map(str, facts.others_in_view), away, alike)
+    return [*lines, _OTHERS[language] % tuple(", ".join(one) for one in told)]
 
 
 _OTHERS: dict[Language, str] = {
-    "en": "Other people in view: [%s]; from the target to the nearest: [%s] m.",
-    "zh": "视野内其他行人数：[%s]；其中最近者距目标：[%s] 米。",
+    "en": "Other people in view: [%s]; from the target to the nearest: [%s] m; the most alike differs from it in [%s] "
+    "of the items of appearance.",
+    "zh": "视野内其他行人数：[%s]；其中最近者距目标：[%s] 米；外观与目标最相近者有 [%s] 项不同。",
 }
 
 

@@ -113,7 +113,8 @@ def _others(f: Facts) -> tuple[Both, ...]:
     """Tell of other people, where there are some."""
     if not f.others_in_view or not f.others_in_view[-1]:
         return ()
-    return _wordings()["nearest_other"] + (_wordings()["others"] if f.others_in_view[-1] > 1 else ())
+    alike = () if f.alike_differences[-1] is None else _wordings()["most_alike"]
+    return _wordings()["nearest_other"] + alike + (_wordings()["others"] if f.others_in_view[-1] > 1 else ())
 
 
 def _more(f: Facts) -> tuple[Both, ...]:

@@ -37,7 +37,8 @@ class Facts:
     where the person is, against the drone's heading, positive to the left; depression_deg: of the line of sight below
     the horizon.
     mission: the kind of the order that ends the pursuit, once it stands.
-    Of other people: others_in_view, how many have a pixel; other_distance_m, from the target to the nearest of them.
+    Of other people: others_in_view, how many have a pixel; other_distance_m, from the target to the nearest of them;
+    alike_differences, in how many things, of figure, top, legs, hat and bag, who looks most like the target differs.
     In the picture of width_px x height_px, in its pixels: the target's box and its middle's offset from the image
     centre, positive to the right and down.
     """
@@ -70,6 +71,7 @@ class Facts:
     mission: str | None = None
     others_in_view: tuple[int | None, ...] = ()
     other_distance_m: tuple[float | None, ...] = ()
+    alike_differences: tuple[int | None, ...] = ()
 
     def __len__(self) -> int:
         return len(self.yaw_deg)
@@ -136,6 +138,7 @@ def measure_facts(window: ObservedWindow, picture_px: tuple[int, int] | None = N
         mission=window.mission,
         others_in_view=_whole([frame.others_in_view for frame in frames]),
         other_distance_m=_rounded([frame.other_distance_m for frame in frames], 1),
+        alike_differences=_whole([frame.alike_differences for frame in frames]),
     )
 
 

@@ -97,6 +97,7 @@ QUANTITIES: dict[str, Quantity] = {
     "box_height": Quantity(attrgetter("box_height_px"), "px", 0, 2.0, 0.08),
     "others_in_view": Quantity(attrgetter("others_in_view"), "people", 0, 0.0),
     "other_distance": Quantity(attrgetter("other_distance_m"), "m", 1, 0.5),
+    "alike_differences": Quantity(attrgetter("alike_differences"), "items", 0, 0.0),
     "offset_x": Quantity(attrgetter("offset_x_px"), "px", 0, 5.0, sides=("right", "left", "centred")),
     "offset_y": Quantity(attrgetter("offset_y_px"), "px", 0, 5.0, sides=("below", "above", "centred")),
 }

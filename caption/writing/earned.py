@@ -20,7 +20,7 @@ from caption.truth.references import ANGLES, QUANTITIES, STEPS, TURNING, Referen
 from cosfly.products.captions import Language
 
 _PLACES = ("offset_x", "offset_y")
-_IN_PICTURE = ("visibility", "framing", "box_width", "box_height", "others_in_view", *_PLACES)
+_IN_PICTURE = ("visibility", "framing", "box_width", "box_height", "others_in_view", "alike_differences", *_PLACES)
 _MOTIONS = ("target_motion", "drone_motion", "walking")
 _STATES = ("visibility", "framing", *_MOTIONS)
 _OF_TARGET = ("target_speed", "target_heading", "target_travelled", "target_motion", "walking", *_IN_PICTURE)

@@ -209,6 +209,7 @@ _NOW = (
     "mean:target_speed", "target_travelled", "travelled", "displacement", "climb_rate", "slant", "height_over_target",
     "depression",
     "heading", "target_heading", "change:target_heading", "others_in_view", "other_distance",
+    "alike_differences",
 )  # fmt: skip
 _WORDS = (
     "target_motion", "drone_motion", "comparison:speed", "side:yaw", "side:target_heading", "side:bearing",

@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations, world_from_camera
 from cosfly.products.kinds import KINDS
+from cosfly.products.people import People
 from cosfly.products.places import tree_of_flight
 from cosfly.products.png import areas_png, colours_png, floats_of, floats_png
 from cosfly.products.weather import WeatherRecord
@@ -49,7 +50,7 @@ META_FORMAT = FileFormat("cosfly.frame", "1.0", "frame annotation")
 # A person is legible who is visible, so high in the picture, of so much of the box unhidden, and of so much colour
 # difference (CIE76, where 2.3 is just noticeable) from what is around.
 LEGIBLE_HEIGHT_PX, LEGIBLE_SHARE, LEGIBLE_CONTRAST = 16.0, 0.3, 5.0
-COMPANY = ("in_view", "nearest_m")  # of a point's `others`
+COMPANY = ("in_view", "nearest_m", "nearest_id", "alike_id", "alike_differences")  # of a point's `others`
 XYZ, ANGLES = ("x", "y", "z"), ("pitch", "yaw", "roll")
 
 COORDINATES = {
@@ -257,12 +258,15 @@ class OthersMeta(_Group):
     target_hidden_by_map: float
     others: list[OtherMeta]
 
-    def people_of(self, target_m: np.ndarray) -> dict[str, float | None]:
-        """How many other people have a pixel (COMPANY), and how far from the target, over the ground, the nearest is;
-        null without any."""
+    def people_of(self, target_m: np.ndarray, people: People | None) -> dict[str, float | None]:
+        """Tell of other people who have a pixel (COMPANY): how many, who is nearest to the target and how far, m over
+        the ground, and who looks most like it; null without any, and the last where nobody says what they look like."""
         seen = [one for one in self.others if one.semantic_id == KINDS["Pedestrians"] and one.num_pixels]
-        away_m = [float(np.hypot(*(one.center_m - target_m)[:2])) for one in seen]
-        return dict(zip(COMPANY, (len(seen), round(min(away_m), 3) if away_m else None), strict=True))
+        away_m = {one.instance_id: float(np.hypot(*(one.center_m - target_m)[:2])) for one in seen}
+        nearest = min(away_m, key=away_m.__getitem__, default=None)
+        how_far_m = None if nearest is None else round(away_m[nearest], 3)
+        alike = (None, None) if people is None else people.most_alike(away_m)
+        return dict(zip(COMPANY, (len(seen), how_far_m, nearest, *alike), strict=True))
 
 
 class FrameMeta(_Group):

@@ -76,9 +76,13 @@ class SeenFrame:
         """How far away somebody's pixels are, in the middle."""
         return float(np.median(self.depth[self.ids == number]))
 
+    def place_m(self, number: int) -> np.ndarray:
+        """Where somebody's pixels are in the middle, (3,), from the camera in the world's directions."""
+        return np.median(self._points_m(self.ids == number), axis=0)
+
     def distance_m(self, number: int, kind: str) -> float:
         """From somebody to what is seen of a kind, over the ground; infinity where nothing is."""
-        x, y, z = np.median(self._points_m(self.ids == number), axis=0)
+        x, y, z = self.place_m(number)
         points = self._points_m(self.kinds == KINDS[kind])
         points = points[points[:, 2] >= z + LANDMARKS[kind][2]]
         return float(np.hypot(points[:, 0] - x, points[:, 1] - y).min(initial=np.inf))

@@ -6,6 +6,7 @@ people look alike where their rows do.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -109,6 +110,15 @@ class People:
 
     target: Appearance
     others: dict[int, Appearance]
+
+    def most_alike(self, numbers: Iterable[int]) -> tuple[int, int] | tuple[None, None]:
+        """Give who of some others looks most like the target, the greatest id of several, and in how many things that
+        one differs; nobody of nobody."""
+        differing = [(len(self.target.differences(self.others[number])), -number) for number in numbers]
+        if not differing:
+            return None, None
+        num_differences, number = min(differing)
+        return -number, num_differences
 
     def as_json(self) -> dict:
         others = {str(number): other.as_json() for number, other in self.others.items()}

@@ -92,8 +92,9 @@ class Flight:
     projects asks `camera_at`. between: (n, k - 1, 6) planned poses after each frame and before the next, of a flight
     that was planned at k times the rate of its frames; NaN after the last. people: what they look like, None
     where the file does not say. goal: whom to follow, None where nothing tells the target from others.
-    company: (n, 2), how many other people are seen, and how far the nearest of them is from the target, m, NaN where
-    there is none; None where the file does not say.
+    company: (n, 5), frames.COMPANY: how many other people are seen, how far the nearest of them is from the target, m,
+    its id, the id of who looks most like the target, in how many things that one differs; NaN where there is none, None
+    where the file does not say.
     """
 
     town: str

@@ -152,6 +152,7 @@ def render_flight(
     targets: list[TargetMeta] = []
     visibility: list[float] = []
     company: list[dict] = []
+    people = script.others.people(script.clothes.looks) if renderer.dresses else None
     pending: list[Future] = []
     digests: dict[str, str] = {}
 
@@ -170,7 +171,8 @@ def render_flight(
                     script.perturbed.drop_shift(i, HIDDEN)
                     frame, seen = without
             visibility.append(seen.visibility)
-            company.append({} if seen.others is None else {"others": seen.others.people_of(poses.targets_m[i])})
+            told = {} if seen.others is None else {"others": seen.others.people_of(poses.targets_m[i], people)}
+            company.append(told)
             pending.append(pool.submit(_write_frame, folder, frame, _annotation(script, i, seen), writing, script))
             advance()
             while len(pending) >= FRAMES_IN_FLIGHT:

@@ -32,7 +32,7 @@ from cosfly.products.walks import pace_field
 from cosfly.reading.files import sha256_file
 from cosfly.work.runner import advance
 from cosfly.work.store import CHECKSUMS, checksum_lines, write_model
-from release.columns import PICTURES, SCALAR_NAMES, TARGET_PICTURE, matrices_of
+from release.columns import COMPANY_COLUMNS, PICTURES, SCALAR_NAMES, TARGET_PICTURE, matrices_of
 from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
 from release.export.source import Release, ReleasedRows, depth_in_words, depth_npy, picture, read_span
 from release.flight_rows import FlightRows
@@ -190,7 +190,7 @@ def _point(row: Row) -> dict[str, Any]:
     if row["is_perturbed"] and row["drone_offset"] is None:
         told |= {"drone_position": True, "drone_rotation": True}
     target = {name: value for name in LEGIBILITY if (value := row[f"target_{name}"]) is not None}
-    others = dict(zip(COMPANY, (row["others_in_view"], row["other_distance_m"]), strict=True))
+    others = dict(zip(COMPANY, (row[name] for name in COMPANY_COLUMNS), strict=True))
     point = {"perturbation": told, "target": target, "others": others if others["in_view"] is not None else {}}
     return {name: one for name, one in point.items() if one}
 
