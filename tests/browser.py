@@ -20,7 +20,7 @@ NAMES = ("chromium", "chromium-browser", "google-chrome")
 PATIENCE_S = 60.0
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
-    "--hide-scrollbars", "--disable-dev-shm-usage", "--remote-debugging-pipe",
+    "--hide-scrollbars", "--disable-dev-shm-usage", "--remote-debugging-pipe", "--enable-unsafe-swiftshader",
 )  # fmt: skip
 
 
@@ -79,9 +79,9 @@ class Page:
         return json.loads(line)
 
     def open(
-        self, path: Path, fragment: str = "", *, width: int = 1400, height: int = 1000, dark: bool = False
+        self, path: Path | str, fragment: str = "", *, width: int = 1400, height: int = 1000, dark: bool = False
     ) -> None:
-        """Load a file in a window of some size, anew."""
+        """Load a file or an address in a window of some size, anew."""
         self.send(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
         )
@@ -90,11 +90,8 @@ class Page:
             features=[{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}],
         )
         self.send("Page.navigate", url="about:blank")
-        self.send("Page.navigate", url=path.absolute().as_uri() + fragment)
-        end = time.monotonic() + PATIENCE_S
-        while self.run("document.readyState") != "complete":
-            assert time.monotonic() < end, "the page does not load"
-            time.sleep(0.02)
+        self.send("Page.navigate", url=(path if isinstance(path, str) else path.absolute().as_uri()) + fragment)
+        self.wait("document.readyState === 'complete'")
 
     def run(self, script: str) -> Any:
         """Evaluate an expression in the page."""
@@ -102,9 +99,33 @@ class Page:
         assert "exceptionDetails" not in got, got["exceptionDetails"]
         return got["result"].get("value")
 
-    def press(self, key: str) -> None:
+    def press(self, key: str, modifiers: int = 0) -> None:
+        """Press a key; modifiers: 2 is Ctrl, 8 Shift."""
         for kind in ("keyDown", "keyUp"):
-            self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key)
+            self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key, modifiers=modifiers)
+
+    def mouse(self, kind: str, x: float, y: float, button: str = "left", **more: Any) -> None:
+        """Move, press, release or turn the wheel: kind is mouseMoved, mousePressed, mouseReleased, mouseWheel."""
+        self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, **more)
+
+    def click(self, x: float, y: float, count: int = 1) -> None:
+        for kind in ("mousePressed", "mouseReleased"):
+            self.mouse(kind, x, y, clickCount=count)
+
+    def drag(self, begin: tuple[float, float], end: tuple[float, float], button: str = "left", steps: int = 5) -> None:
+        """Press at one place, move in steps, and let go at another."""
+        self.mouse("mousePressed", *begin, button, clickCount=1)
+        for k in range(1, steps + 1):
+            at = [a + (b - a) * k / steps for a, b in zip(begin, end, strict=True)]
+            self.mouse("mouseMoved", *at, button, buttons={"left": 1, "right": 2}[button])
+        self.mouse("mouseReleased", *end, button, clickCount=1)
+
+    def wait(self, script: str) -> None:
+        """Wait until an expression is true."""
+        end = time.monotonic() + PATIENCE_S
+        while not self.run(script):
+            assert time.monotonic() < end, f"never true: {script}; {self.said}"
+            time.sleep(0.02)
 
     def picture(self) -> bytes:
         """Give the whole page as PNG."""

@@ -216,6 +216,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
         "pedestrians --map {simple} --out {out} {tiny}",
         "pedestrians --map {simple} --out {out} {tiny} --set pedestrians.num_paths=2",
     ],
+    "roi propose": ["roi propose {simple} --out {out}/roi_polygon.json {tiny}"],
     "plan": ["plan --map {simple} --paths {walks} --out {out} {tiny}"],
     "plan compare": ["plan compare {simple} {walks} --out {out} {tiny} --planner foresight --planner track_astar"],
     "render": ["render {three} --out {out} --set render.width_px=64 --set render.height_px=36"],

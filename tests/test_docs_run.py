@@ -58,6 +58,7 @@ NOT_HERE = {
     "python tests/benchmarks/": "minutes each; what they measure stands beside them in the documents",
     "python docs/window_card.py": "a page for the browser of the next line",
     "chromium --headless": "a browser; tests/browser.py drives one for the pages that run a script",
+    "roi edit work/": "it serves until it is stopped; tests/test_cosfly_roi_editor.py draws on its page",
     "hf://datasets/": "a hub is asked; tests/test_release_get.py reads the same through fsspec from elsewhere",
     "--repo OWNER/NAME --yes": "a hub is written to; tests/test_release_push.py sends to one of its own",
     "--teacher vllm:": "vLLM needs an accelerator; tests/test_engines_contract.py holds its engine to the documents",

@@ -85,6 +85,44 @@ def pedestrians(
     job.finish(product, out)
 
 
+roi_app = typer.Typer(help="Region of interest: where people may walk.", no_args_is_help=True)
+app.add_typer(roi_app, name="roi")
+MapArgument = Annotated[Path, Argument(metavar="MAP", help="Boxes: step2_simplified.json.")]
+
+
+@roi_app.command("edit")
+@takes("town")
+def roi_edit(
+    job: Job,
+    map_: MapArgument,
+    roi: Annotated[Path, Option(help="The region: opened where it is there, written when the page saves.")] = Path(
+        "roi_polygon.json"
+    ),
+    backdrop: Annotated[
+        Path | None, Option(help="Picture from above, PNG, with its world frame beside it as JSON.")
+    ] = None,
+    port: Annotated[int, Option(min=0, max=65535, help="Port on this machine; 0 takes a free one.")] = 0,
+) -> None:
+    """Draw the region of interest on a local page, over the planning grid; Ctrl-C ends it."""
+    from cosfly.pedestrians.roi_editor import open_editor
+
+    server = open_editor(map_, job.cfg.pedestrians, roi, port, backdrop)
+    typer.echo(f"open {server.address}")
+    server.serve()
+
+
+@roi_app.command("propose")
+@takes("town")
+def roi_propose(
+    job: Job, map_: MapArgument, out: Annotated[Path, Option(help="The region: roi_polygon.json.")]
+) -> None:
+    """Write a first region: the outline of the walkable ground, to go on with in `cosfly roi edit`."""
+    from cosfly.pedestrians.roi_editor import run_propose
+
+    typer.echo(run_propose(map_, job.cfg.pedestrians, out))
+    typer.echo(out)
+
+
 plan_app = options.stage_group("Step 4: drone flights.")
 app.add_typer(plan_app, name="plan")
 
@@ -105,7 +143,7 @@ def plan(
 @takes(*STAGE)
 def plan_compare(
     job: Job,
-    map_: Annotated[Path, Argument(metavar="MAP", help="Boxes: step2_simplified.json.")],
+    map_: MapArgument,
     paths: Annotated[Path, Argument(metavar="PATHS", help="Walks: path.json.")],
     out: options.Out,
     planner: Annotated[

@@ -1,11 +1,10 @@
-"use strict";
 // Gathers what was chosen into the file that `cosfly inspect review --decisions` reads. Nothing here makes markup of text.
 (() => {
-const { file, ...about } = JSON.parse(document.getElementById("data").textContent);
-const tell = (text) => { document.getElementById("state").textContent = text; };
+const { file, ...about } = pageData();
+const tell = (text) => { byId("state").textContent = text; };
 
-document.getElementById("save").addEventListener("click", () => {
-  const by = document.getElementById("by").value.trim();
+byId("save").addEventListener("click", () => {
+  const by = byId("by").value.trim();
   const choices = [];
   let unsaid = 0;
   for (const part of document.querySelectorAll(".choice")) {
@@ -18,10 +17,10 @@ document.getElementById("save").addEventListener("click", () => {
   if (unsaid) { tell(`${unsaid} decisions without a reason`); return; }
   if (!choices.length) { tell("nothing is decided yet"); return; }
   const text = JSON.stringify({ ...about, by, choices }, null, 1) + "\n";
-  const shown = document.getElementById("text");
+  const shown = byId("text");
   shown.value = text;
   shown.hidden = false;
-  const link = document.createElement("a");
+  const link = make("a");
   link.href = URL.createObjectURL(new Blob([text], { type: "application/json" }));
   link.download = file;
   link.click();

@@ -11,7 +11,7 @@ from cosfly.inspection.flight import InspectedFlight
 from cosfly.inspection.report import cards
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.view import FlightView
-from cosfly.look.page import page, run_name
+from cosfly.look.page import page, run_name, scripts
 from cosfly.products.inspection import read_inspection
 from cosfly.products.review import Choice, Decision, Verdict, add_decisions, read_decisions, undecided
 from cosfly.reading.documents import FileFormat, read_model
@@ -22,7 +22,7 @@ from cosfly.work.store import write_bytes
 
 FORMAT = FileFormat("cosfly.review", "1.0", "file of decisions")
 FILLED = "decisions.json"  # as the page saves it
-SCRIPT = read_text(Path(__file__).with_name("review.js"))
+SCRIPT = scripts("tools.js") + read_text(Path(__file__).with_name("review.js"))
 
 
 class ReviewForm(BaseModel):

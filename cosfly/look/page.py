@@ -24,17 +24,22 @@ from cosfly.work.store import dump_json
 ROOT = Path(cosfly.__file__).parents[1]  # cosfly, caption, distill and release stand side by side
 
 
-def page(template: str, *, title: str, style: str = "", script: str = "", **values: Any) -> str:
+def page(template: str, *, title: str, style: str = "", script: str = "", asks: bool = False, **values: Any) -> str:
     """Give a page.
 
     Args:
         template: its path from the folder of the packages. title: the name of what it shows. style, script: our own,
-            beside the base page's.
+            beside the base page's. asks: it may ask the server that it came from.
     """
-    style = read_text(Path(__file__).with_name("templates") / "page.css") + style
+    style = scripts("page.css") + style
     return _environment().get_template(template).render(
-        title=title, style=Markup(style), script=Markup(script), policy=Markup(_policy(script)), **values
+        title=title, style=Markup(style), script=Markup(script), policy=Markup(_policy(script, asks)), **values
     )  # fmt: skip
+
+
+def scripts(*names: str) -> str:
+    """Give what several pages share, one after the other: `tools.js`, `canvas.js` (a map), `space.js` (WebGL)."""
+    return "".join(read_text(Path(__file__).with_name("templates") / name) for name in names)
 
 
 def fragment(template: str, **values: Any) -> str:
@@ -53,11 +58,11 @@ def run_name(folder: Path) -> str:
     return folder.parent.name if (folder.parent / "run.yaml").is_file() else folder.name
 
 
-def _policy(script: str) -> str:
+def _policy(script: str, asks: bool) -> str:
     """Let a page show itself and run the one script of ours, named by its hash: no other script, request or form, even
     where an escape fails."""
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    allowed = f"script-src 'sha256-{digest}'; " if script else ""
+    allowed = (f"script-src 'sha256-{digest}'; " if script else "") + ("connect-src 'self'; " if asks else "")
     return f"default-src 'none'; {allowed}img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 

@@ -350,7 +350,12 @@ def _parts_of_large_components(
 
 
 def _check_roi(roi: Roi, box_map: BoxMap, where: str | Path) -> str:
-    """Warn if most of a region lies outside the map; gives a remark if x and y look changed over."""
+    """Warn if most of a region lies outside the map; gives a remark if x and y look changed over.
+
+    Raises:
+        InputError: it says that it is of another map.
+    """
+    roi.check_map(box_map, where)
     low, high = box_map.bounds()
     region, bounds = roi.region(), shapely.box(*low[:2], *high[:2])
     inside, turned = (

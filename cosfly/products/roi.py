@@ -12,11 +12,14 @@ from pydantic import BaseModel
 from shapely.geometry.base import BaseGeometry
 
 from cosfly.errors import InputError
+from cosfly.products.boxes import AXES, BoxMap
 from cosfly.products.columns import numbers
-from cosfly.reading.documents import read_json, validated
-from cosfly.reading.files import over_limit
+from cosfly.reading.documents import parse_document, validated
+from cosfly.reading.files import over_limit, read_bytes
 from cosfly.reading.geojson import Feature, features_of, is_geojson
+from cosfly.work.store import write_json
 
+WHAT = "region of interest"
 MOST_VERTICES = 100_000  # of a region; to see that a spiky ring does not cross itself takes 8 s then
 SMALLEST_M = 1.0  # nobody walks in less; a region drawn in degrees is smaller
 
@@ -29,8 +32,14 @@ class RoiPolygon(BaseModel):
 
 
 class Roi(RoiPolygon):
-    """`roi_polygon.json`: the paper's form (one closed ring), and ours with holes and several outer rings."""
+    """`roi_polygon.json`: the paper's form (one closed ring), and ours with holes and several outer rings.
 
+    map, axes: of the map that it was drawn on, where the file says so.
+    """
+
+    description: str = ""
+    map: str = ""
+    axes: str = ""
     closed: bool = True
     polygons: list[RoiPolygon] = []
 
@@ -46,14 +55,37 @@ class Roi(RoiPolygon):
         ]
         return shapely.union_all(areas)
 
+    def check_map(self, box_map: BoxMap, where: str | Path) -> None:
+        """Check that a file which says where it was drawn was drawn on this map.
+
+        Raises:
+            InputError: it names another map, or other axes.
+        """
+        for name, got, expected in (("map", self.map, box_map.name), ("axes", self.axes, AXES)):
+            if got not in ("", expected):
+                what, fix = "a region of interest of another map", "draw it on this map: cosfly roi edit"
+                raise InputError(what, where=f"{where}: {name}", got=got, expected=expected, fix=fix)
+
+
+def write_roi(path: Path, roi: Roi) -> None:
+    """Write what `read_roi` reads; one polygon without holes is the paper's form (subsec:appendix_g_editor)."""
+    told = roi.model_dump(exclude_defaults=True)
+    points = {name: told.pop(name) for name in ("points_world", "holes", "polygons") if name in told}
+    write_json(path, {**told, "closed": True, **points}, indent=None)
+
 
 def read_roi(path: Path, most_vertices: int = MOST_VERTICES) -> Roi:
-    """Read a region of interest of at most so many vertices in all its rings.
+    """Read a region of interest of at most so many vertices in all its rings; raises as `parse_roi`."""
+    return parse_roi(read_bytes(path, what=WHAT), path, most_vertices)
+
+
+def parse_roi(data: bytes, path: Path, most_vertices: int = MOST_VERTICES) -> Roi:
+    """Give the region of interest of a file's bytes.
 
     Raises:
-        InputError: malformed, not closed, crossing itself, or a ring of fewer than three finite points.
+        InputError: malformed, not closed, crossing or touching itself, or a ring of fewer than three finite points.
     """
-    value = read_json(path, what="region of interest")
+    value = parse_document(data, path, what=WHAT)
     if is_geojson(value):
         value = {"polygons": _polygons_of(features_of(value, path), path)}
     roi = validated(Roi, value, path)

@@ -1,27 +1,10 @@
-"use strict";
 // Everything foreign is written with textContent or as an attribute of a picture that we encoded; nothing here makes markup of text.
 (() => {
-const data = JSON.parse(document.getElementById("data").textContent);
+const data = pageData();
 const FIELDS = { critical_components: ["critical components", "关键要素"], reasoning_trace: ["reasoning", "推理"] };
 const LANGUAGES = { en: "English", zh: "Chinese" };
 const VIEWS = [["rgb", "colour"], ["depth", "depth, bright is near"], ["segmentation", "instances, the person in red"]];
 const NONE = "none";
-const SVG = "http://www.w3.org/2000/svg";
-
-// --- small tools -----------------------------------------------------------------------------------------------------
-
-function fill(node, properties, children) {
-  for (const [name, value] of Object.entries(properties || {})) {
-    if (value === null || value === undefined || value === false) continue;
-    node.setAttribute(name, value === true ? "" : String(value));
-  }
-  for (const child of children) if (child !== null) node.append(child);
-  return node;
-}
-const make = (tag, properties, ...children) => fill(document.createElement(tag), properties, children);
-const draw = (tag, properties, ...children) => fill(document.createElementNS(SVG, tag), properties, children);
-const words = (token) => String(token).replaceAll("_", " ");
-const show = (id, ...children) => document.getElementById(id).replaceChildren(...children.filter((child) => child !== null));
 
 // --- what is filtered ------------------------------------------------------------------------------------------------
 
@@ -113,7 +96,7 @@ function drawFilters() {
 function drawLead() {
   const frames = data.flights.reduce((sum, flight) => sum + flight.num_frames, 0);
   const captions = data.flights.reduce((sum, flight) => sum + flight.num_captions, 0);
-  document.getElementById("lead").textContent = `A ${data.kind}: ${data.flights.length} flights with ${frames.toLocaleString("en")} frames and ` +
+  byId("lead").textContent = `A ${data.kind}: ${data.flights.length} flights with ${frames.toLocaleString("en")} frames and ` +
     `${captions.toLocaleString("en")} captions; ${samples.length.toLocaleString("en")} frames are shown here. Keys: \u2190 \u2192 frame, \u2191 \u2193 flight.`;
 }
 
@@ -232,7 +215,7 @@ function update() {
   drawStage(sample);
   drawMap(sample);
   drawCaption(sample);
-  document.getElementById("count").textContent = `${matching.length.toLocaleString("en")} of ${samples.length.toLocaleString("en")} frames`;
+  byId("count").textContent = `${matching.length.toLocaleString("en")} of ${samples.length.toLocaleString("en")} frames`;
   writeHash();
 }
 function step(by) {
@@ -241,7 +224,7 @@ function step(by) {
   state.index = flightOf(sample).frames[sample.frame].index;
   const held = document.activeElement && document.activeElement.id === "time";
   update();
-  if (held) document.getElementById("time").focus();
+  if (held) byId("time").focus();
 }
 function stepFlight(by) {
   const numbers = [...new Set(matching.map((sample) => sample.flight))], place = numbers.indexOf(state.flight) + by;
@@ -256,7 +239,7 @@ document.addEventListener("keydown", (event) => {
   const inField = ["INPUT", "SELECT"].includes(event.target.tagName);
   if (!inField && KEYS[event.key] && !event.altKey && !event.ctrlKey && !event.metaKey) { event.preventDefault(); KEYS[event.key](); }
 });
-document.getElementById("filters").addEventListener("submit", (event) => event.preventDefault());
+byId("filters").addEventListener("submit", (event) => event.preventDefault());
 window.addEventListener("hashchange", () => { readHash(); drawFilters(); update(); });
 readHash();
 drawLead();

@@ -1,0 +1,361 @@
+"""`cosfly roi`: the region of interest of a map, proposed, and drawn on a local page (subsec:appendix_g_editor).
+
+The page draws; what it shows of a region is computed here, by the code that the stage walks with. It is served to this
+machine alone, under an address that nobody can guess, and writes the one file that the command named.
+"""
+
+from __future__ import annotations
+
+import base64
+import hmac
+import json
+import logging
+import secrets
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import shapely
+from scipy.ndimage import find_objects
+from scipy.signal import fftconvolve
+from shapely.geometry.base import BaseGeometry
+
+from cosfly.errors import CosflyError, EnvironmentMissing, InputError, StorageError
+from cosfly.look.page import page, scripts
+from cosfly.look.topview import TopView, draw_map, png_bytes
+from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, walkable_ground
+from cosfly.products.backdrop import Backdrop
+from cosfly.products.boxes import AXES, BoxMap, check_ground, read_boxes
+from cosfly.products.roi import Roi, RoiPolygon, parse_roi, write_roi
+from cosfly.reading.files import read_bytes, read_text
+from cosfly.space.grid import OccupancyGrid, empty_grid
+from cosfly.work.store import sha256_bytes
+
+log = logging.getLogger(__name__)
+
+HOST = "127.0.0.1"
+MOST_SIDE, MOST_CELLS = 16_000, 64_000_000  # what browsers draw on one canvas
+MOST_BYTES = 32 * 1024 * 1024  # of a request: 100,000 vertices take 4 MB
+OCCUPIED, MARGIN, UNUSED, FREE = 128, 190, 228, 255  # grey levels of the backdrop
+IN_REGION, WALKABLE = (90, 160, 230, 60), (60, 150, 240, 110)  # RGBA over the backdrop
+TOLERANCE_M, SMALLEST_HOLE_M2 = 1.0, 100.0  # of a proposal, which a person goes on with
+FROM_ABOVE_PX = 2400
+
+
+# --- figures ----------------------------------------------------------------------------------------------------------
+
+
+def endpoint_pairs(ground: WalkableGround, cfg: PedestriansConfig) -> tuple[int, float]:
+    """Count the pairs of ends that a walk may have: of one part, and as far apart as the settings want.
+
+    Returns:
+        pairs, each once; the share of cells where walks begin that have another end.
+    """
+    low, high = cfg.min_distance_m / cfg.resolution_m, cfg.max_distance_m / cfg.resolution_m
+    offsets = np.arange(-int(high), int(high) + 1)
+    squared = offsets[:, None] ** 2 + offsets**2
+    ring = ((squared >= low**2) & (squared <= high**2)).astype(np.float64)
+    num_pairs, num_starts = 0, 0
+    parts = np.where(ground.may_end, ground.parts, 0)
+    for number, box in enumerate(find_objects(parts), start=1):
+        if box is None or np.hypot(*(side.stop - side.start for side in box)) < low:
+            continue
+        ends = parts[box] == number
+        goals = np.rint(fftconvolve(ends.astype(np.float64), ring, mode="same"))[ends]
+        num_pairs += int(goals.sum()) // 2
+        num_starts += int(np.count_nonzero(goals))
+    return num_pairs, num_starts / max(1, int(np.count_nonzero(parts)))
+
+
+def figures(ground: WalkableGround, cfg: PedestriansConfig) -> dict[str, Any]:
+    """Give what the page tells of a ground: cells, components, pairs of ends, walks that find ends."""
+    counts, (num_pairs, share) = ground.counts, endpoint_pairs(ground, cfg)
+    return {
+        "region": counts["cells_in_roi"],
+        "walkable": counts["cells_walkable"],
+        "used": counts["cells_used"],
+        "components": counts["components"],
+        "large": counts["components_used"],
+        "largest": counts["component_sizes_used"][0],
+        "pairs": num_pairs,
+        "walks": cfg.num_paths * (1.0 - (1.0 - share) ** (1 + cfg.num_retries)),
+        "of_walks": cfg.num_paths,
+    }
+
+
+# --- a first region ---------------------------------------------------------------------------------------------------
+
+
+def propose(ground: WalkableGround, name: str) -> Roi:
+    """Outline the ground that walks are drawn on, less holes of SMALLEST_HOLE_M2 and more, to TOLERANCE_M.
+
+    Args:
+        name: of the map.
+    """
+    grid, half_m = ground.grid, 0.5 * ground.grid.resolution_m  # outlines run through the middles of cells
+    outlines, tree = cv2.findContours(ground.walkable.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    shapes: dict[bool, list[BaseGeometry]] = {False: [], True: []}
+    for outline, parent in zip(outlines, tree[0, :, 3], strict=True):
+        ring = grid.centers_of(outline[:, 0])
+        shape = shapely.Polygon(ring) if len(ring) > 2 else shapely.MultiPoint(ring).convex_hull
+        shapes[bool(parent >= 0)].append(shapely.make_valid(shape))
+    outer, holes = (
+        shapely.buffer(shapely.union_all(shapes[is_hole]), -half_m if is_hole else half_m, join_style="mitre")
+        for is_hole in (False, True)
+    )
+    region = shapely.simplify(outer - holes, TOLERANCE_M)
+    parts = shapely.get_parts(shapely.set_precision(region, 0.001))
+    first, *others = (
+        RoiPolygon(points_world=_ring(part.exterior), holes=[_ring(hole) for hole in part.interiors if _is_large(hole)])
+        for part in sorted(parts, key=lambda part: -part.area)
+        if _is_large(part.exterior) or part is parts[0]
+    )
+    return Roi(**first.model_dump(), polygons=others, description="outline of the walkable ground", map=name, axes=AXES)
+
+
+def _ring(ring: shapely.LinearRing) -> list[tuple[float, float]]:
+    return [(round(x, 3), round(y, 3)) for x, y in ring.coords[:-1]]
+
+
+def _is_large(ring: shapely.LinearRing) -> bool:
+    return shapely.Polygon(ring).area >= SMALLEST_HOLE_M2
+
+
+def run_propose(map_: Path, cfg: PedestriansConfig, out: Path) -> str:
+    """Reads a map, writes a first `roi_polygon.json`, says what it holds.
+
+    Raises:
+        InputError: the map says nowhere where its ground is, or the file is there already.
+        NoPathError: nobody can walk on it.
+    """
+    if out.exists():
+        what, fix = "there is a region already", "name another file, or remove this one"
+        raise InputError(what, where=out, fix=fix)
+    box_map = _read_map(map_)
+    roi = propose(walkable_ground(box_map, cfg, where=map_), box_map.name)
+    ground = walkable_ground(box_map, cfg, roi, where=map_, roi_where=out)
+    write_roi(out, roi)
+    num_holes = sum(len(polygon.holes) for polygon in roi.rings())
+    return f"{len(roi.rings())} polygons with {num_holes} holes, {ground.counts['cells_used']:,} walkable cells"
+
+
+def _read_map(path: Path) -> BoxMap:
+    box_map = read_boxes(path)
+    check_ground(box_map, path)
+    return box_map
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Editor:
+    """What the page asks for: one map, and one file that it may write.
+
+    digest: of the file as it was read or written last; None where there was none. backdrop: a picture from above.
+    """
+
+    box_map: BoxMap
+    cfg: PedestriansConfig
+    path: Path
+    where: Path
+    backdrop: Backdrop | None = None
+    digest: str | None = None
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def __post_init__(self) -> None:
+        num_x, num_y = empty_grid(self.box_map, self.cfg.resolution_m).size
+        if max(num_x, num_y) > MOST_SIDE or num_x * num_y > MOST_CELLS:
+            got, expected = f"{num_x} x {num_y} cells", f"sides of {MOST_SIDE}, {MOST_CELLS:,} cells in all"
+            fix = "take a coarser pedestrians.resolution_m to draw with: a region is in metres"
+            raise InputError("the grid is too large for a page", where=self.where, got=got, expected=expected, fix=fix)
+        self.bare, self.opened = walkable_ground(self.box_map, self.cfg, where=self.where), None
+        if self.path.exists():
+            data = read_bytes(self.path, what="region of interest")
+            self.opened = self.region_of(data, self.path)["roi"]
+            self.digest = sha256_bytes(data)
+
+    def page_html(self) -> str:
+        """Give the page."""
+        folder, grid = Path(__file__).parent, self.bare.grid
+        data = {
+            "map": self.box_map.name, "file": self.path.name, "axes": AXES, "roi": self.opened,
+            "x_min": grid.x_min_m, "y_min": grid.y_min_m, "cell": grid.resolution_m, "size": grid.size,
+            "grid": _encoded(self._backdrop_cells()), "levels": [OCCUPIED, MARGIN, UNUSED, FREE],
+            "alphas": [IN_REGION[3], WALKABLE[3]], "picture": self.backdrop and self.backdrop.frame(),
+            **self.cells(None),
+        }  # fmt: skip
+        style = read_text(folder / "roi_editor.css")
+        script = scripts("tools.js", "canvas.js") + read_text(folder / "roi_editor.js")
+        template = "cosfly/pedestrians/roi_editor.html"
+        return page(template, title=self.box_map.name, style=style, script=script, asks=True, data=data)
+
+    def _backdrop_cells(self) -> np.ndarray:
+        ground, levels = self.bare, np.full(self.bare.grid.occupied.shape, FREE, dtype=np.uint8)
+        levels[~ground.walkable] = UNUSED
+        levels[ground.inflated.occupied] = MARGIN
+        levels[ground.grid.occupied] = OCCUPIED
+        return levels
+
+    def region_of(self, data: bytes, where: Path) -> dict[str, Any]:
+        """Read a file's bytes as the stage would; gives the region and its cells."""
+        roi = parse_roi(data, where, self.cfg.roi_vertices)
+        return {"roi": roi.model_dump(), **self.cells(roi, where)}
+
+    def cells(self, roi: Roi | None, where: str | Path = "region of interest") -> dict[str, Any]:
+        """Give the cells of a region, a PNG over the backdrop in base64, and its figures."""
+        ground = walkable_ground(self.box_map, self.cfg, roi, where=self.where, roi_where=where)
+        picture = np.zeros((*ground.walkable.shape, 4), dtype=np.uint8)
+        if ground.is_in_roi is not None:
+            picture[ground.is_in_roi] = IN_REGION
+        picture[ground.walkable] = WALKABLE
+        return {"cells": _encoded(picture), "figures": figures(ground, self.cfg)}
+
+    def save(self, data: bytes) -> dict[str, Any]:
+        """Write the region, unless somebody else has written the file meanwhile."""
+        roi = parse_roi(data, Path("the page"), self.cfg.roi_vertices)
+        found = self.cells(roi)
+        with self.lock:
+            known = sha256_bytes(read_bytes(self.path)) if self.path.exists() else None
+            if known != self.digest:
+                what, fix = "the file was changed by somebody else; nothing is written", "start the editor again"
+                raise InputError(what, where=self.path, fix=fix)
+            write_roi(self.path, roi)
+            self.digest = sha256_bytes(read_bytes(self.path))
+        return {"figures": found["figures"], "saved": str(self.path)}
+
+    def answer(self, name: str, data: bytes) -> bytes:
+        """Answer what the page asks for.
+
+        Raises:
+            CosflyError: as a message for the page.
+        """
+        if name == "above":
+            return png_bytes(_from_above(self.box_map, self.bare.grid))
+        if name == "picture" and self.backdrop:
+            return png_bytes(self.backdrop.picture)
+        asked: dict[str, Callable[[], dict[str, Any]]] = {
+            "cells": lambda: self.cells(parse_roi(data, Path("the page"), self.cfg.roi_vertices) if data else None),
+            "open": lambda: self.region_of(data, Path("the file")),
+            "propose": lambda: {"roi": propose(self.bare, self.box_map.name).model_dump()},
+            "save": lambda: self.save(data),
+        }
+        if name not in asked:
+            raise KeyError(name)
+        return json.dumps(asked[name]()).encode()
+
+
+def _encoded(picture: np.ndarray) -> str:
+    """Encode cells, (ny, nx) or RGBA, as a PNG in base64, north up."""
+    if picture.ndim == 3:
+        picture = picture[..., [2, 1, 0, 3]]
+    done, data = cv2.imencode(".png", np.ascontiguousarray(picture[::-1]), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    assert done, "OpenCV encodes any 8-bit picture"
+    return base64.b64encode(data.tobytes()).decode()
+
+
+def _from_above(box_map: BoxMap, grid: OccupancyGrid) -> np.ndarray:
+    """Draw the map over just the grid's cells."""
+    per_m = FROM_ABOVE_PX / max(grid.size) / grid.resolution_m
+    width, height = (max(1, round(size * grid.resolution_m * per_m)) for size in grid.size)
+    north_m = grid.y_min_m + grid.size[1] * grid.resolution_m
+    # A place is 0 in the middle of the first pixel.
+    view = TopView(grid.x_min_m + 0.5 / per_m, north_m - 0.5 / per_m, per_m, (width, height))
+    return draw_map(box_map, view)
+
+
+# --- the server -------------------------------------------------------------------------------------------------------
+
+
+def open_editor(map_: Path, cfg: PedestriansConfig, roi: Path, port: int, backdrop: Path | None) -> Server:
+    """Read all that the page shows, and listen; `Server.serve` answers until it is interrupted.
+
+    Raises:
+        InputError: the map says nowhere where its ground is, or the region is not of this map.
+        EnvironmentMissing: the port is in use.
+    """
+    box_map = _read_map(map_)
+    picture = None if backdrop is None else Backdrop.read(backdrop)
+    if picture is not None and not picture.covers(box_map):
+        what = "the picture shows no part of the map"
+        raise InputError(what, where=backdrop, got=str(picture.frame()), expected=f"a picture of {box_map.name}")
+    return Server(Editor(box_map, cfg, roi, map_, picture), port)
+
+
+class Server:
+    """Serves the page to this machine, under `address` alone."""
+
+    def __init__(self, editor: Editor, port: int) -> None:
+        self.editor, self.token = editor, secrets.token_urlsafe(24)
+        try:
+            self.http = ThreadingHTTPServer((HOST, port), type("Handler", (_Handler,), {"ours": self}))
+        except OSError as error:
+            fix = "give another --port, or none: a free one is taken"
+            raise EnvironmentMissing("cannot listen", where=f"{HOST}:{port}", got=error.strerror, fix=fix) from None
+        self.host = f"{HOST}:{self.http.server_address[1]}"
+        self.address = f"http://{self.host}/{self.token}/"
+
+    def serve(self) -> None:
+        try:
+            self.http.serve_forever()
+        finally:
+            self.http.server_close()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    ours: Server
+    timeout = 30
+    server_version, sys_version = "cosfly", ""
+
+    def do_GET(self) -> None:
+        if self._name() == "":
+            self._send(200, self.ours.editor.page_html().encode(), "text/html; charset=utf-8")
+        else:
+            self._send(404, b"", "text/plain")
+
+    def do_POST(self) -> None:
+        """Answer our page alone: another one that a browser shows has another origin, and does not know the token."""
+        name, length = self._name(), self.headers.get("Content-Length", "")
+        if name is None or self.headers.get("Origin") != f"http://{self.ours.host}":
+            return self._send(404, b"", "text/plain")
+        if not length.isdecimal() or int(length) > MOST_BYTES:
+            return self._tell(
+                InputError("the request is too large", got=length, expected=f"at most {MOST_BYTES} bytes")
+            )
+        try:
+            self._send(200, self.ours.editor.answer(name, self.rfile.read(int(length))), "application/octet-stream")
+        except CosflyError as error:
+            self._tell(error)
+        except KeyError:
+            self._send(404, b"", "text/plain")
+
+    def _name(self) -> str | None:
+        """Give what is asked for below our address; None where the address is not ours, whatever name led here."""
+        begin = f"/{self.ours.token}/"
+        is_ours = hmac.compare_digest(self.path[: len(begin)].encode(), begin.encode())
+        return self.path[len(begin) :] if is_ours and self.headers.get("Host") == self.ours.host else None
+
+    def _tell(self, error: CosflyError) -> None:
+        self._send(
+            409 if isinstance(error, StorageError) else 400,
+            json.dumps({"error": str(error)}).encode(),
+            "application/json",
+        )
+
+    def _send(self, status: int, data: bytes, kind: str) -> None:
+        self.close_connection = True
+        self.send_response(status)
+        headers = {"Content-Type": kind, "Content-Length": str(len(data)), "Cache-Control": "no-store"}
+        headers |= {"Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff", "X-Frame-Options": "DENY"}
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(data)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        log.debug("answered %s", args[1] if len(args) > 1 else "")  # the address stays out of logs

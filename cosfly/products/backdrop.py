@@ -1,0 +1,61 @@
+"""A picture of a map from above, PNG, with its world frame beside it as JSON: what a region is drawn on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from cosfly.products.boxes import BoxMap
+from cosfly.products.columns import LARGEST
+from cosfly.reading.arrays import read_picture
+from cosfly.reading.documents import FileFormat, read_model
+from cosfly.work.store import write_bytes, write_model
+
+FORMAT = FileFormat("cosfly.backdrop", "1.0", "world frame of a picture")
+
+
+class WorldFrame(BaseModel):
+    """Where a picture lies, north up: the world place of its top left corner, and the side of a pixel, m."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    west_m: float = Field(ge=-LARGEST, le=LARGEST)
+    north_m: float = Field(ge=-LARGEST, le=LARGEST)
+    metres_per_px: float = Field(gt=0, le=1000)
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """picture: (height, width, 3) uint8 RGB."""
+
+    picture: np.ndarray
+    world: WorldFrame
+
+    @classmethod
+    def read(cls, path: Path) -> Backdrop:
+        """Read a picture, and the file of its name that ends in `.json`.
+
+        Raises:
+            InputError: one of them is missing or cannot be used.
+        """
+        return cls(read_picture(path)[..., ::-1], read_model(path.with_suffix(".json"), WorldFrame, FORMAT))
+
+    def frame(self) -> dict[str, float]:
+        """Give west, north, width and height, m."""
+        height, width = (side * self.world.metres_per_px for side in self.picture.shape[:2])
+        return {"west": self.world.west_m, "north": self.world.north_m, "width": width, "height": height}
+
+    def covers(self, box_map: BoxMap) -> bool:
+        """Tell whether any of the map lies in the picture."""
+        (low, high), frame = box_map.bounds(), self.frame()
+        is_beside = frame["west"] > high[0] or frame["west"] + frame["width"] < low[0]
+        return not (is_beside or frame["north"] < low[1] or frame["north"] - frame["height"] > high[1])
+
+
+def write_backdrop(path: Path, png: bytes, world: WorldFrame) -> None:
+    """Write a picture and its frame; the frame first, so that a picture never stands without."""
+    write_model(path.with_suffix(".json"), world, FORMAT)
+    write_bytes(path, png)
