@@ -155,19 +155,19 @@ def _served(place: Place) -> str:
     return address
 
 
-def _carla(place: Place) -> int:
-    from carla_serving import serving
+def _simulator(protocol: str, place: Place) -> int:
+    from simulator_serving import serving
 
     from cosfly.products.boxes import read_boxes
 
     town = read_boxes(Path(place.given("base")) / "maps/boxes_3d.json")
-    return place.stack.enter_context(serving(town, place.root / "carla"))
+    return place.stack.enter_context(serving(town, place.root / protocol, protocol=protocol))
 
 
 INPUTS: dict[str, Callable[[Place], object]] = {
     "base": _base, "students": _students, "trained": _trained, "inferred": _inferred, "evaluated": _evaluated,
     "walk": _walk, "teacher": _teacher, "judge": _judge, "served": _served, "key": _key,
-    "carla": _carla,
+    "carla": partial(_simulator, "carla"), "unrealcv": partial(_simulator, "unrealcv"),
 }  # fmt: skip
 
 TRAINING = (
@@ -210,6 +210,7 @@ def lose_release(_: Place, out: Path) -> None:
 COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "maps": ["maps --out {out} {tiny}"],
     "maps carla": ["maps carla --port {carla} --out {out}"],
+    "maps unrealcv": ["maps unrealcv --port {unrealcv} --out {out}"],
     "simplify": ["simplify --map {maps} --out {out} {tiny}"],
     "pedestrians": ["pedestrians --map {simple} --out {out} {tiny}"],
     "pedestrians, more": [

@@ -136,7 +136,7 @@ def test_what_a_setting_may_be_is_said_in_words():
         "workers": "whole number >= 0",
         "item_limit_s": "number >= 0, or null",
         "roi": "path, or null",
-        "maps.source": "one of synthetic, simworld, cityjson, boxes, carla",
+        "maps.source": "one of synthetic, simworld, cityjson, boxes, carla, unrealcv",
         "render.fovs_deg": "list of: number",
         "plan.muco": "",
     }

@@ -23,13 +23,14 @@ from cosfly.maps.census_town import CENSUS
 from cosfly.maps.cityjson import CityJsonConfig, crowns
 from cosfly.maps.cityjson_file import rule_of
 from cosfly.maps.footprints import Rectangle, cover, oriented_rectangle, rectangle_polygon, united
-from cosfly.maps.simworld import ASSETS, SimWorldConfig, asset_of
+from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.stage import MapsConfig, load_map, run
 from cosfly.maps.synthetic import PRESETS
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.simplify.passes import SimplifyConfig, simplify
 from cosfly.simplify.stage import cross_validate
+from cosfly.unreal.assets import ASSETS, asset_of
 from cosfly.work.config import apply_overrides, build
 
 

@@ -7,7 +7,7 @@ import os
 
 import numpy as np
 import pytest
-from carla_serving import free_port, serving
+from simulator_serving import free_port, serving
 from test_renderers_contract import street
 from typer.testing import CliRunner
 

@@ -22,7 +22,7 @@ from typing import Any
 
 import pytest
 import yaml
-from carla_serving import free_port, listening, serving
+from simulator_serving import free_port, listening, serving
 from specimens_foreign import write_foreign_tree
 from specimens_slopes import sloped_city
 from teacher_server import TeacherServer
@@ -55,6 +55,7 @@ NOT_HERE = {
     "make test": "that is this",
     "make fuzz": "an hour; tests/test_fuzz.py begins it",
     "pip install -e": "the tests stand in that environment",
+    "pip install --no-deps": "the same",
     "python tests/benchmarks/": "minutes each; what they measure stands beside them in the documents",
     "python docs/window_card.py": "a page for the browser of the next line",
     "chromium --headless": "a browser; tests/browser.py drives one for the pages that run a script",
@@ -104,7 +105,7 @@ class Place:
     root: Path
     teacher: str
     release: str
-    carla_port: int
+    ports: dict[str, int]  # of simulators, by those in the documents
 
     def make(self, text: str) -> None:
         """Make what a command takes for given and nobody has made yet."""
@@ -117,8 +118,9 @@ class Place:
     def words(self, text: str) -> list[str]:
         """The words of a command as a shell gives them on, with what is small in place of what is large."""
         text = text.replace("http://localhost:8000", self.teacher).replace("https://host/release", self.release)
-        port = free_port() if text.startswith("sim serve") else self.carla_port
-        text = re.sub(r"(port[ =])2000\b", rf"\g<1>{port}", text)
+        for told, served in self.ports.items():
+            port = free_port() if text.startswith("sim serve") else served
+            text = re.sub(rf"(port[ =]){told}\b", rf"\g<1>{port}", text)
         words = [part for word in shlex.split(text, comments=True) for part in (sorted(glob.glob(word)) or [word])]
         small = max((name for name in SMALL if text.startswith(f"{name} ")), key=len, default=None)
         return options_first([*words, *SMALL.get(small or "", [])])
@@ -253,9 +255,10 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
     with (
         TeacherServer(respond=answer) as teacher,
         served(root / "work/theirs/release/dataset") as (_, release),
-        serving(town, tmp_path / "carla") as port,
+        serving(town, tmp_path / "carla") as carla,
+        serving(town, tmp_path / "unrealcv", protocol="unrealcv") as unrealcv,
     ):
-        yield Place(root, teacher.url, release, port)
+        yield Place(root, teacher.url, release, {"2000": carla, "9000": unrealcv})
 
 
 def in_order() -> list[tuple[str, str]]:

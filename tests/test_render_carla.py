@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from carla_serving import as_client, command, free_port, serving
+from simulator_serving import as_client, command, free_port, serving
 from test_renderers_contract import circling, street, write_inputs
 
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, RenderError
@@ -22,7 +22,7 @@ from cosfly.render.carla_backend import CarlaRenderConfig
 from cosfly.render.contract import PERSON_ID, PosedPerson
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
-from cosfly.simulators.carla.world import clothes_of
+from cosfly.simulators.scene import clothes_of
 from cosfly.unreal.conventions import DEPTH_STEP_M
 from cosfly.work.config import build
 from cosfly.work.runner import Watch

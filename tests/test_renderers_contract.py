@@ -19,7 +19,7 @@ from typing import get_args
 import cv2
 import numpy as np
 import pytest
-from carla_serving import serving
+from simulator_serving import serving
 
 from cosfly.errors import EnvironmentMissing, RenderError
 from cosfly.geometry import box_corners, intrinsic_matrix, look_at, project, rotation_matrices, world_from_camera

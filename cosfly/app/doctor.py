@@ -29,6 +29,7 @@ OPTIONAL_PACKAGES = {  # what it is for, and what brings it
     "pyrender": ("the second renderer", "cosfly[pyrender]"),
     "ompl": ("the sampling planners of plan benchmark", "cosfly[ompl]"),
     "carla": ("CARLA's maps and pictures", "cosfly[carla]"),
+    "unrealcv": ("UnrealCV's maps and pictures", "cosfly[unrealcv]; then --no-deps unrealcv"),
 }
 
 

@@ -27,7 +27,7 @@ def maps(
     job: Job,
     out: options.Out,
     source: Annotated[
-        str | None, Option(help="synthetic, simworld, cityjson, boxes or carla."), Sets("maps.source")
+        str | None, Option(help="synthetic, simworld, cityjson, boxes, carla or unrealcv."), Sets("maps.source")
     ] = None,
 ) -> None:
     """Step 1: make boxes_3d.json from a map source."""
@@ -56,6 +56,33 @@ def maps_carla(
     product = stage.run(cfg, out, seed=job.cfg.seed, resume=job.resume)
     head = ("category", "boxes", "share", "Town10HD_Opt in the paper")
     options.tell_table(console, head, histogram(read_boxes(product)))
+    job.finish(product, out)
+
+
+@maps_app.command("unrealcv")
+@takes("resume")
+def maps_unrealcv(
+    job: Job,
+    out: options.Out,
+    host: Annotated[str | None, Option("--host", "--cvip", help="Where it is."), Sets("maps.unrealcv.host")] = None,
+    port: Annotated[int | None, Option("--port", "--cvport", help="Its port."), Sets("maps.unrealcv.port")] = None,
+    level: Annotated[str | None, Option(help="Level to open."), Sets("maps.unrealcv.level")] = None,
+    most_default: Annotated[
+        float | None,
+        Option(help="Fail where more than this share of sizes is a default."),
+        Sets("maps.unrealcv.most_default"),
+    ] = None,
+) -> None:
+    """The level of a running UnrealCV server as boxes_3d.json, what each box is, a page, and where sizes come from."""
+    from cosfly.maps import stage
+    from cosfly.products.boxes import read_boxes
+    from cosfly.work.console import console
+
+    cfg = job.cfg.maps.model_copy(update={"source": "unrealcv"})
+    product = stage.run(cfg, out, seed=job.cfg.seed, resume=job.resume)
+    counts = read_boxes(product).header.extent_sources
+    rows = [(name, f"{num:,}", f"{num / sum(counts.values()):.2%}") for name, num in counts.items()]
+    options.tell_table(console, ("size from", "boxes", "share"), rows)
     job.finish(product, out)
 
 

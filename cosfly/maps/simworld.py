@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import itertools
 import logging
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -25,6 +24,7 @@ from cosfly.products.boxes import BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.products.columns import LARGEST
 from cosfly.products.kinds import KIND_NAMES
 from cosfly.reading.documents import read_json, validated
+from cosfly.unreal.assets import Asset, asset_of
 from cosfly.work.config import Config
 
 log = logging.getLogger(__name__)
@@ -38,35 +38,6 @@ KERB_M = 0.5  # from the kerb to the middle of the row of street furniture
 ROAD_SHARE_OF_FRONT = 0.43  # carriageway half width / distance of the fronts, where no furniture marks the kerb
 DEFAULT_FRONT_M = 27.0  # where no building stands along a road: the generator's usual distance
 MAP_MARGIN_M = 10.0
-
-
-class Asset(NamedTuple):
-    """One family of assets: its kind, and its full size (3,) m where the size table has a placeholder."""
-
-    pattern: str
-    kind: str
-    default_size_m: tuple[float, float, float] | None = None
-
-
-# The first pattern that matches an asset's name decides.
-ASSETS = (
-    Asset("BP_Building_*", "Buildings"),
-    Asset("BP_Tree*", "Vegetation"),
-    Asset("BP_RoadCone_C", "Static", (0.4, 0.4, 0.75)),
-    Asset("BP_RoadBlocker_C", "Static", (2.0, 0.6, 1.0)),
-    Asset("BP_Road*", "Roads"),
-    Asset("BP_Scooter_*", "Motorcycle", (1.8, 0.7, 1.2)),
-    Asset("BP_Hydrant_C", "Static", (0.4, 0.4, 0.9)),
-    Asset("BP_Trash_bin_*", "Static", (0.8, 0.8, 1.2)),
-    Asset("BP_Trash_can_C", "Static", (0.6, 0.6, 1.0)),
-    Asset("BP_Rabbish_C", "Static", (1.0, 1.0, 0.6)),
-    Asset("BP_Can*_C", "Static", (0.5, 0.5, 0.8)),
-    Asset("BP_Box*_C", "Static", (0.8, 0.6, 0.6)),
-    Asset("BP_Cart*_C", "Static", (2.0, 1.1, 2.1)),
-    Asset("BP_Couch_C", "Static", (2.0, 0.9, 0.9)),
-    Asset("BP_Table*_C", "Static", (1.6, 1.6, 0.9)),
-    Asset("BP_Soda*_C", "Static", (1.1, 0.9, 1.9)),  # vending machines
-)
 
 
 class SimWorldConfig(Config):
@@ -167,7 +138,7 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
     cfg.inputs()
     assert cfg.world is not None
     nodes = _read_nodes(cfg.world)
-    sizes = _read_sizes(cfg.size_tables())
+    sizes = read_sizes(cfg.size_tables())
     boxes, sources, dropped, road_nodes = BoxList(), {"road": 0, "bbox": 0, "engine": 0, "default": 0}, 0, []
     for node in nodes:
         asset = asset_of(node.instance_name)
@@ -199,11 +170,6 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
     return boxes.box_map(header)
 
 
-def asset_of(name: str) -> Asset | None:
-    """Find an asset's entry by its name."""
-    return next((asset for asset in ASSETS if fnmatchcase(name, asset.pattern)), None)
-
-
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
@@ -232,8 +198,8 @@ def _read_nodes(path: Path) -> list[_Node]:
     return nodes
 
 
-def _read_sizes(paths: list[Path]) -> dict[str, np.ndarray]:
-    """Full sizes in cm by asset name; groups (buildings, elements, details) are joined."""
+def read_sizes(paths: list[Path]) -> dict[str, np.ndarray]:
+    """Give full sizes in cm by asset name; groups (buildings, elements, details) are joined."""
     sizes: dict[str, np.ndarray] = {}
     for path in paths:
         table = read_json(path, what="asset size table")
@@ -252,7 +218,7 @@ def _read_sizes(paths: list[Path]) -> dict[str, np.ndarray]:
 def _unknown(cfg: SimWorldConfig, node: _Node, what: str) -> int:
     """Count an asset that cannot be placed, or stop because of it."""
     if cfg.unknown == "error":
-        to_size, to_kinds = "a size table that has it to maps.simworld.sizes", "it to ASSETS in cosfly/maps/simworld.py"
+        to_size, to_kinds = "a size table that has it to maps.simworld.sizes", "it to ASSETS in cosfly/unreal/assets.py"
         raise InputError(
             f"an asset without a {what}", where=f"{cfg.world}: {node.id}.instance_name", got=node.instance_name,
             fix=f"add {to_size if what == 'size' else to_kinds}, or leave such out: --set maps.simworld.unknown=drop",

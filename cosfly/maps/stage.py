@@ -12,12 +12,13 @@ import numpy as np
 from pydantic import Field
 
 from cosfly.look.topview import TopView, draw_map, png_bytes
-from cosfly.maps import boxfile, carla_export, cityjson, simworld, synthetic
+from cosfly.maps import boxfile, carla_export, cityjson, simworld, synthetic, unrealcv_export
 from cosfly.maps.boxfile import BoxesConfig
 from cosfly.maps.carla_export import CarlaMapConfig
 from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.synthetic import SyntheticConfig
+from cosfly.maps.unrealcv_export import UnrealCvMapConfig
 from cosfly.products.boxes import BoxMap, check_ground, write_boxes
 from cosfly.products.meshes import MESHES_FILE
 from cosfly.reading.files import LinkedPath
@@ -30,14 +31,14 @@ log = logging.getLogger(__name__)
 
 SOURCES: dict[str, Callable[[Any, int], BoxMap]] = {
     "synthetic": synthetic.load, "simworld": simworld.load, "cityjson": cityjson.load,
-    "boxes": boxfile.load, "carla": carla_export.load,
+    "boxes": boxfile.load, "carla": carla_export.load, "unrealcv": unrealcv_export.load,
 }  # fmt: skip
 
 
 class MapsConfig(Config):
     """Where the map comes from."""
 
-    source: Literal["synthetic", "simworld", "cityjson", "boxes", "carla"] = Field(
+    source: Literal["synthetic", "simworld", "cityjson", "boxes", "carla", "unrealcv"] = Field(
         "synthetic", description="what to read"
     )
     synthetic: SyntheticConfig = Field(default_factory=SyntheticConfig, description="the seeded town")
@@ -45,6 +46,9 @@ class MapsConfig(Config):
     cityjson: CityJsonConfig = Field(default_factory=CityJsonConfig, description="a CityJSON city model")
     boxes: BoxesConfig = Field(default_factory=BoxesConfig, description="boxes of your own: JSON, CSV or GeoJSON")
     carla: CarlaMapConfig = Field(default_factory=CarlaMapConfig, description="the town of a running CARLA server")
+    unrealcv: UnrealCvMapConfig = Field(
+        default_factory=UnrealCvMapConfig, description="the level of a running UnrealCV server, as SimWorld's"
+    )
     picture_px: int = Field(1200, ge=200, le=8000, description="longer side of the overview picture, px")
     mesh_triangles: MayDiffer[int] = Field(
         MOST_TRIANGLES, ge=1, description="most triangles of a file of meshes, and of all that the map draws of them"
@@ -86,6 +90,8 @@ def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same"
     box_map = load_map(cfg, seed=seed, follow_links=follow_links)
     check_ground(box_map, next(iter(inputs.values()), product))
     write_boxes(product, box_map)
+    beside = unrealcv_export.write_beside(box_map, out) if cfg.source == "unrealcv" else []
+    beside += [out / MESHES_FILE] if box_map.meshes.refs else []
     view = TopView.around(np.stack(box_map.bounds()), cfg.picture_px)
     write_bytes(out / "map.png", png_bytes(draw_map(box_map, view)))
     dropped = box_map.header.dropped_objects
@@ -93,5 +99,7 @@ def run(cfg: MapsConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same"
     tally = Tally(input=num_objects, kept=num_objects - sum(dropped.values()), dropped=dropped)
     log.info("%d boxes of %d objects", len(box_map), num_objects)
     meshes = [out / MESHES_FILE] if box_map.meshes.refs else []
-    stage.finish([product, *meshes, out / "map.png"], tally, num_boxes=len(box_map), counts_by_kind=box_map.counts())
+    stage.finish(
+        [product, *meshes, *beside, out / "map.png"], tally, num_boxes=len(box_map), counts_by_kind=box_map.counts()
+    )
     return product

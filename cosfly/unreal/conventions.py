@@ -18,6 +18,8 @@ SIMULATED_STEP_S = 0.05  # of synchronous mode (sec:step5)
 DEPTH_RANGE_M, DEPTH_STEPS = 1000.0, 2**24 - 1
 DEPTH_STEP_M = DEPTH_RANGE_M / DEPTH_STEPS
 ACTOR_BITS = 0xFFFF  # of an actor's number, in pictures
+CM_PER_M = 100.0
+FAR_CM = 65504.0  # the largest of half precision, in which UnrealCV's depth comes: what is farther, and the sky
 
 
 def unreal_pose(position_m: np.ndarray, rotation_deg: np.ndarray) -> list[float]:

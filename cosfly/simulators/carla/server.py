@@ -9,18 +9,17 @@ from __future__ import annotations
 import logging
 import os
 import queue
-import re
 import socket
 import struct
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
-from cosfly.errors import ConfigError, EnvironmentMissing
+from cosfly.errors import EnvironmentMissing
 from cosfly.products.boxes import BoxMap
 from cosfly.simulators.carla.world import CAMERAS, Actor, World
+from cosfly.simulators.serving import Fault, due, listen, send
 from cosfly.unreal.conventions import CARLA_VERSION, SIMULATED_STEP_S
 
 log = logging.getLogger(__name__)
@@ -33,40 +32,7 @@ ROADS = (
     '<?xml version="1.0"?><OpenDRIVE><header revMajor="1" revMinor="4" name="" version="1.00" date="" north="0" '
     'south="0" east="0" west="0"><geoReference>+proj=tmerc +lat_0=0 +lon_0=0</geoReference></header></OpenDRIVE>'
 )
-FAULTS = (
-    "drop",
-    "delay",
-    "duplicate",
-    "reorder",
-    "malformed",
-    "late",
-    "unhealthy",
-    "hang",
-    "die",
-)  # docs/simulators.md
-
-
-@dataclass(frozen=True)
-class Fault:
-    """What goes wrong, at which tick, or from there on; sensor: the end of a blueprint's name, "" for all."""
-
-    name: str
-    sensor: str
-    tick: int
-    goes_on: bool
-    seconds: float
-
-    @classmethod
-    def of(cls, text: str) -> Fault:
-        """Read NAME[:SENSOR]@TICK[+][=SECONDS], as `delay:depth@3=2.5`."""
-        found = re.fullmatch(r"(\w+)(?::(\w+))?@(\d+)(\+?)(?:=([\d.]+))?", text)
-        if found is None or found[1] not in FAULTS:
-            expected = f"NAME[:SENSOR]@TICK[+][=SECONDS], NAME one of {', '.join(FAULTS)}"
-            raise ConfigError("no such fault", where="--fault", got=text, expected=expected)
-        return cls(found[1], found[2] or "", int(found[3]), bool(found[4]), float(found[5] or 1.0))
-
-    def is_due(self, tick: int) -> bool:
-        return tick == self.tick or (tick > self.tick and (self.goes_on or self.name in ("unhealthy", "hang")))
+FAULTS = ("drop", "delay", "duplicate", "reorder", "malformed", "late", "unhealthy", "hang", "die")  # simulators.md
 
 
 class CarlaServer:
@@ -84,13 +50,8 @@ class CarlaServer:
         self._calls: queue.SimpleQueue[tuple[socket.socket, list]] = queue.SimpleQueue()
         self._streams: dict[int, list[socket.socket]] = {}
         self._held: dict[int, bytes] = {}  # messages that are sent after the next one
-        for number, talk in ((port, self._read_calls), (port + 1, self._read_subscription)):
-            try:
-                listener = socket.create_server((host, number))
-            except OSError as error:
-                fix = "choose another with --port; it takes that port and the next"
-                raise EnvironmentMissing("cannot listen", where=f"{host}:{number}", got=str(error), fix=fix) from None
-            threading.Thread(target=_accept, args=(listener, talk), daemon=True).start()
+        listen(host, port, self._read_calls, "; it takes that port and the next")
+        listen(host, port + 1, self._read_subscription)
         self._answers = self._make_answers()
 
     def serve(self) -> None:
@@ -110,9 +71,7 @@ class CarlaServer:
         return float(step_s[0]) if is_fixed and step_s[0] > 0 else SIMULATED_STEP_S
 
     def _due(self, name: str, sensor: str = "") -> Fault | None:
-        return next(
-            (f for f in self.faults if f.name == name and f.is_due(self.num_ticks) and f.sensor in ("", sensor)), None
-        )
+        return due(self.faults, name, self.num_ticks, sensor)
 
     # --- calls --------------------------------------------------------------------------------------------------------
 
@@ -136,7 +95,7 @@ class CarlaServer:
             time.sleep(fault.seconds)
         if self._due("hang") or (method == "version" and self._due("unhealthy")):
             return
-        _send(connection, self._msgpack.packb([1, call_id, None, result]))
+        send(connection, self._msgpack.packb([1, call_id, None, result]))
 
     def _make_answers(self) -> dict[str, Callable[..., Any]]:
         world = self.world
@@ -181,7 +140,7 @@ class CarlaServer:
 
     def _told(self, actor: Actor) -> list:
         """An actor as clients are told of it; with a token it is a sensor."""
-        is_sensor = actor.blueprint in CAMERAS
+        is_sensor = actor.model in CAMERAS
         token = self._token(FIRST_SENSOR_STREAM + actor.number) if is_sensor else b""
         return [actor.number, 0, actor.description, actor.box(), bytes([actor.semantic_tag]), token]
 
@@ -207,9 +166,9 @@ class CarlaServer:
         self._send_state(self._streams.get(EPISODE_STREAM, []))
         for actor in list(self.world.actors.values()):
             connections = self._streams.get(FIRST_SENSOR_STREAM + actor.number)
-            if connections and actor.blueprint in CAMERAS:
+            if connections and actor.model in CAMERAS:
                 width, height, fov_deg, picture = self.world.picture(actor)
-                message = self._head(CAMERAS[actor.blueprint], actor.pose) + struct.pack("<IIf", width, height, fov_deg)
+                message = self._head(CAMERAS[actor.model], actor.pose) + struct.pack("<IIf", width, height, fov_deg)
                 self._send_sensor(actor, connections, message + picture)
 
     def _head(self, sensor: int, pose: list[float]) -> bytes:
@@ -226,7 +185,7 @@ class CarlaServer:
 
     def _send_sensor(self, actor: Actor, connections: list[socket.socket], message: bytes) -> None:
         """Send a picture, with what is planted for it."""
-        sensor, stream = actor.blueprint.split(".")[2].split("_")[0], FIRST_SENSOR_STREAM + actor.number
+        sensor, stream = actor.model.split(".")[2].split("_")[0], FIRST_SENSOR_STREAM + actor.number
         if self._due("drop", sensor):
             return
         if self._due("malformed", sensor):
@@ -243,7 +202,7 @@ class CarlaServer:
 
     def _send_stream(self, stream: int, connections: list[socket.socket], message: bytes) -> None:
         for connection in list(connections):
-            if not _send(connection, struct.pack("<I", len(message)) + message):
+            if not send(connection, struct.pack("<I", len(message)) + message):
                 connections.remove(connection)
 
     def _read_subscription(self, connection: socket.socket) -> None:
@@ -262,27 +221,3 @@ class CarlaServer:
     def _token(self, stream: int) -> bytes:
         """Where a stream is: its number, port, TCP, an address of version 4 that the client fills in with its host."""
         return struct.pack("<IHBB", stream, self.port + 1, 1, 1) + bytes([127, 0, 0, 1]) + bytes(12)
-
-
-def _accept(listener: socket.socket, talk: Callable[[socket.socket], None]) -> None:
-    while True:
-        connection, _ = listener.accept()
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        threading.Thread(target=_talk, args=(connection, talk), daemon=True).start()
-
-
-def _talk(connection: socket.socket, talk: Callable[[socket.socket], None]) -> None:
-    with connection:
-        try:
-            talk(connection)
-        except OSError as error:  # the client is gone
-            log.debug("%s", error)
-
-
-def _send(connection: socket.socket, data: bytes) -> bool:
-    """Send all of it; False: nobody is there any more."""
-    try:
-        connection.sendall(data)
-    except OSError:
-        return False
-    return True

@@ -1,4 +1,4 @@
-"""A CARLA server of ours in a process of its own, and an unmodified client in another, which may crash."""
+"""A simulator's server of ours in a process of its own, and an unmodified client in another, which may crash."""
 
 from __future__ import annotations
 
@@ -26,18 +26,19 @@ def free_port() -> int:
                 return port
 
 
-def command(town: Path, port: int, *faults: str) -> list[str]:
+def command(town: Path, port: int, *faults: str, protocol: str = "carla") -> list[str]:
     told = [word for fault in faults for word in ("--fault", fault)]
-    return [sys.executable, "-m", "cosfly", "sim", "serve", str(town), "--port", str(port), *told]
+    words = ["sim", "serve", str(town), "--port", str(port), "--protocol", protocol]
+    return [sys.executable, "-m", "cosfly", *words, *told]
 
 
 @contextlib.contextmanager
-def serving(box_map: BoxMap, folder: Path, *faults: str) -> Iterator[int]:
+def serving(box_map: BoxMap, folder: Path, *faults: str, protocol: str = "carla") -> Iterator[int]:
     """Serve a map; gives the port."""
     folder.mkdir(parents=True, exist_ok=True)
     write_boxes(folder / "boxes_3d.json", box_map)
     port = free_port()
-    with listening(command(folder / "boxes_3d.json", port, *faults)):
+    with listening(command(folder / "boxes_3d.json", port, *faults, protocol=protocol)):
         yield port
 
 

@@ -1,0 +1,239 @@
+"""The objects of a running UnrealCV server's level as boxes (app:simworld, step 2).
+
+Where a box's size comes from is counted, as the paper does: `road`, bounds of a road; `bbox`, a table of sizes of
+assets, if one is given; `engine`, bounds of anything else; `default`, nothing was told, so that it is the plausible
+size of its asset or a cube of 1 m. Bounds are along the world's axes; of a turned object the box that has these bounds
+is found again. An id is made of the object's name, so that pictures of the same level find the box (`id_of`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from cosfly.errors import InputError
+from cosfly.look.page import page
+from cosfly.maps.simworld import read_sizes
+from cosfly.products.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_box_map
+from cosfly.products.kinds import KIND_COLORS, KIND_NAMES, KINDS
+from cosfly.unreal.assets import asset_of, id_of, is_nothing, kind_of
+from cosfly.unreal.conventions import CM_PER_M, world_pose
+from cosfly.unreal.unrealcv_client import UnrealCvConfig, UnrealCvConnection, connect
+from cosfly.work.store import write_bytes, write_json
+
+log = logging.getLogger(__name__)
+
+QUESTIONS = {"uclass_name": 0, "location": 3, "rotation": 3, "bounds": 6, "scale": 3}  # and how many numbers they give
+SOURCES = ("road", "bbox", "engine", "default")
+LEAST_M = 0.01  # bounds of an object that has none
+CUBE_M = 1.0
+SKEWED = 0.2  # cosine of twice a yaw, below which bounds do not tell the sides of what is turned
+SIDECAR, VIEWER = "boxes_meta.json", "boxes.html"
+STYLE = (
+    "svg{width:100%;height:80vh;background:var(--ground)}polygon{fill-opacity:.6;stroke:#0008;stroke-width:.1}"
+    "polygon:hover{fill-opacity:1;stroke:var(--ink);stroke-width:.4}label{margin-right:14px}"
+)
+
+
+class UnrealCvMapConfig(UnrealCvConfig):
+    """The level of a running UnrealCV server."""
+
+    name: str | None = Field(None, min_length=1, description="map name; null takes the level's")
+    licence: LicenceId = Field("apache-2.0", description="licence, as the hub spells it; goes into every release")
+    credits: str = Field("SimWorld, maitrix-org and contributors", description="who must be named: the level's makers")
+    sizes: list[Path] = Field([], description="asset size tables of SimWorld, the first with an asset counts")
+    ground_z_m: float | None = Field(None, description="height of the ground, m; null takes the roads' median top")
+    huge_m: float = Field(
+        150.0, gt=0, description="what is longer both ways and higher than 2 m is left out and counted, m: landscapes"
+    )
+    most_default: float | None = Field(
+        None, ge=0, le=1, description="largest share of boxes of a `default` size; more fail the export; null: any"
+    )
+
+    def inputs(self) -> dict[str, Path]:
+        return {f"sizes_{k}": path for k, path in enumerate(self.sizes)}
+
+
+@dataclass(frozen=True)
+class LevelMap(BoxMap):
+    """A map, and of each box the object that it is of: name, class, and where its size comes from."""
+
+    objects: tuple[tuple[str, str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class _Object:
+    """What the server told of one object; numbers in its own units and axes, None where it told none."""
+
+    name: str
+    class_name: str
+    location: tuple[float, ...] | None
+    rotation: tuple[float, ...] | None
+    bounds: tuple[float, ...] | None
+    scale: tuple[float, ...] | None
+
+
+def load(cfg: UnrealCvMapConfig, seed: int) -> BoxMap:
+    """Give the level's boxes; the seed changes nothing.
+
+    Raises:
+        EnvironmentMissing: there is no server. ConfigError: no such level.
+        InputError: it has no objects, or too many of a `default` size.
+    """
+    connection = connect(cfg, cfg.port)
+    try:
+        with connection.asking("the objects were not given"):
+            objects = list(_asked(connection))
+    finally:
+        connection.close()
+    return level_map(objects, cfg, connection.where, connection.version, connection.level)
+
+
+def _asked(connection: UnrealCvConnection) -> Iterator[_Object]:
+    names = str(*connection.ask("vget /objects")).split()
+    answers = iter(connection.ask(*(f"vget /object/{name}/{what}" for name in names for what in QUESTIONS)))
+    for name in names:
+        class_name = str(next(answers))
+        yield _Object(name, class_name, *(connection.numbers(next(answers), num) for num in QUESTIONS.values() if num))
+
+
+def level_map(objects: list[_Object], cfg: UnrealCvMapConfig, where: str, version: str, level: str) -> LevelMap:
+    """Make a map of what a server told; what is left out is counted in the header."""
+    sizes = read_sizes(cfg.sizes) if cfg.sizes else {}
+    dropped, rows, kinds, told = Counter[str](), [], [], []
+    for one in objects:
+        kind = kind_of(one.class_name)
+        box, source = _box(one, kind, sizes, cfg)
+        if reason := _unfit(one, kind, box, source, cfg):
+            dropped[reason] += 1
+            continue
+        assert box is not None
+        rows.append(box)
+        kinds.append(KINDS[kind or "Other"])
+        told.append((one.name, one.class_name, source))
+    counts = {source: sum(row[2] == source for row in told) for source in SOURCES}
+    if not rows:
+        raise InputError("the level has no objects", where=where, got=f"{len(objects)}", expected="vget /objects")
+    share = counts["default"] / len(rows)
+    if cfg.most_default is not None and share > cfg.most_default:
+        classes = Counter(row[1] for row in told if row[2] == "default").most_common(5)
+        raise InputError(
+            "too many boxes of a default size: the server tells no bounds of them", where=where,
+            got=f"{share:.1%}: {', '.join(f'{name} ({num})' for name, num in classes)}",
+            expected=f"at most {cfg.most_default:.1%} (maps.unrealcv.most_default)",
+            fix="give their sizes in a table (maps.unrealcv.sizes), or mend the assets' bounds",
+        )  # fmt: skip
+    boxes = np.array(rows)
+    is_road = np.array([row[2] == "road" for row in told])
+    tops_m = boxes[is_road, 2] + boxes[is_road, 5]
+    ground_z_m = cfg.ground_z_m if cfg.ground_z_m is not None else float(np.median(tops_m)) if len(tops_m) else 0.0
+    header = MapHeader(
+        name=cfg.name or level or "Unreal",
+        source=MapSource(tool="UnrealCV", version=version, file=level),
+        licence=cfg.licence,
+        credits=cfg.credits,
+        ground_z_m=ground_z_m,
+        extent_sources=counts,
+        num_objects=len(objects),
+        dropped_objects=dict(dropped),
+    )
+    log.info("%s: sizes from %s", where, counts)
+    if dropped:
+        log.warning("%s: left out: %s", where, dict(dropped))
+    plain = make_box_map(boxes[:, :3], boxes[:, 3:6], boxes[:, 6:], kinds, [id_of(row[0]) for row in told], header)
+    return LevelMap(**vars(plain), objects=tuple(told))
+
+
+def _unfit(one: _Object, kind: str | None, box: np.ndarray | None, source: str, cfg: UnrealCvMapConfig) -> str:
+    """Why an object is no box of the map; "" if it is."""
+    if kind is None and is_nothing(one.class_name):
+        return "not of the town"
+    if box is None or (kind is None and source == "default"):
+        return "no body"
+    is_huge = (2 * box[3:5] > cfg.huge_m).all() and 2 * box[5] > 2.0
+    return "huge" if is_huge and kind != "Roads" else ""
+
+
+def _box(
+    one: _Object, kind: str | None, sizes: dict[str, np.ndarray], cfg: UnrealCvMapConfig
+) -> tuple[np.ndarray | None, str]:
+    """Centre, half sizes and rotation of ours, (9,), of an object, and the source of its size."""
+    turn = one.rotation or (0.0, 0.0, 0.0)
+    if one.bounds is not None and one.class_name not in sizes:
+        low, high = np.reshape(one.bounds, (2, 3)) / cfg.coord_scale
+        if (high - low >= 0).all() and (high - low >= LEAST_M).sum() >= 2:
+            half, upright = _unturned((high - low) / 2, turn)
+            center, rotation_deg = world_pose([*(low + high) / 2, *((0.0, turn[1], 0.0) if upright else (0.0,) * 3)])
+            return np.concatenate([center, half, rotation_deg]), "road" if kind == "Roads" else "engine"
+    if one.location is None:
+        return None, "default"
+    asset = asset_of(one.class_name)
+    size_cm = sizes.get(one.class_name)
+    plausible_m = (asset and asset.default_size_m) or (CUBE_M,) * 3
+    size_m = np.array(plausible_m) if size_cm is None else size_cm / CM_PER_M
+    half = size_m * (one.scale or (1.0,) * 3) / 2
+    foot, rotation_deg = world_pose([*(part / cfg.coord_scale for part in one.location), *turn])
+    center = foot + np.array([0.0, 0.0, half[2]])
+    return np.concatenate([center, half, rotation_deg]), "default" if size_cm is None else "bbox"
+
+
+def _unturned(half_m: np.ndarray, rotation_deg: tuple[float, ...]) -> tuple[np.ndarray, bool]:
+    """Half sizes of a box whose bounds these are, and whether it is turned about the vertical; else the bounds' own."""
+    pitch, yaw, roll = rotation_deg
+    c, s = abs(np.cos(np.radians(yaw))), abs(np.sin(np.radians(yaw)))
+    if max(abs(pitch), abs(roll)) > 1e-3 or abs(c * c - s * s) < SKEWED:
+        return half_m, False
+    x, y = np.linalg.solve([[c, s], [s, c]], half_m[:2])
+    return (np.array([x, y, half_m[2]]), True) if min(x, y) > LEAST_M / 2 else (half_m, False)
+
+
+# --- beside the map ---------------------------------------------------------------------------------------------------
+
+
+def write_beside(box_map: BoxMap, out: Path) -> list[Path]:
+    """Write what is known of each box's object, and the page to look at it; gives both paths."""
+    assert isinstance(box_map, LevelMap)
+    header = box_map.header
+    objects = [
+        {"id": int(number), "name": name, "class": class_name, "type": KIND_NAMES[int(kind)], "extent_source": source}
+        for number, kind, (name, class_name, source) in zip(box_map.ids, box_map.kinds, box_map.objects, strict=True)
+    ]
+    sidecar = {
+        "schema": "cosfly.boxes_meta", "schema_version": "1.0", "map": header.name,
+        "source": header.source.model_dump(mode="json"), "extent_sources": header.extent_sources,
+        "counts_by_kind": box_map.counts(), "num_objects": header.num_objects,
+        "dropped_objects": header.dropped_objects, "objects": objects,
+    }  # fmt: skip
+    write_json(out / SIDECAR, sidecar, indent=None)
+    write_bytes(out / VIEWER, _viewer(box_map, objects).encode())
+    return [out / SIDECAR, out / VIEWER]
+
+
+def _viewer(box_map: LevelMap, objects: list[dict[str, Any]]) -> str:
+    """A page with the map from above, north up: a shape for each box, to point at and to hide by category."""
+    low, high = box_map.bounds()
+    order = np.argsort(box_map.maxs[:, 2], kind="stable").tolist()
+    shapes = []
+    for k in order:
+        yaw = np.radians(box_map.rotations_deg[k, 1])
+        (x, y, _), (a, b, c) = box_map.centers[k], box_map.half_extents[k]
+        ahead, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+        corners = [np.array([x, y]) + i * a * ahead + j * b * left for i, j in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
+        points = " ".join(f"{px - low[0]:.2f},{high[1] - py:.2f}" for px, py in corners)
+        shapes.append({**objects[k], "points": points, "size": f"{2 * a:.1f} x {2 * b:.1f} x {2 * c:.1f} m"})
+    style = STYLE + "".join(
+        f"#{name}:not(:checked)~svg .{name}{{display:none}}.{name}{{fill:{color};background:{color}}}"
+        for name, color in KIND_COLORS.items()
+    )
+    box = f"-1 -1 {high[0] - low[0] + 2:.2f} {high[1] - low[1] + 2:.2f}"
+    return page(
+        "cosfly/maps/boxes.html", title=box_map.name, style=style, box=box,
+        shapes=shapes, counts=box_map.counts(), header=box_map.header, total=len(box_map),
+    )  # fmt: skip

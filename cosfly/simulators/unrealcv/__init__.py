@@ -1,0 +1,1 @@
+"""UnrealCV's protocol, as an unmodified client of the package `unrealcv` speaks it."""

@@ -1,0 +1,76 @@
+"""What the assets of a SimWorld city are, by their names, and what the objects of a level are by their classes."""
+
+from __future__ import annotations
+
+import re
+from fnmatch import fnmatchcase
+from typing import NamedTuple
+
+from cosfly.products.kinds import KINDS
+from cosfly.work.store import sha256_bytes
+
+
+class Asset(NamedTuple):
+    """One family of assets: its kind, and its full size (3,) m where the size table has a placeholder."""
+
+    pattern: str
+    kind: str
+    default_size_m: tuple[float, float, float] | None = None
+
+
+# The first pattern that matches an asset's name decides.
+ASSETS = (
+    Asset("BP_Building_*", "Buildings"),
+    Asset("BP_Tree*", "Vegetation"),
+    Asset("BP_RoadCone_C", "Static", (0.4, 0.4, 0.75)),
+    Asset("BP_RoadBlocker_C", "Static", (2.0, 0.6, 1.0)),
+    Asset("BP_Road*", "Roads"),
+    Asset("BP_Scooter_*", "Motorcycle", (1.8, 0.7, 1.2)),
+    Asset("BP_Hydrant_C", "Static", (0.4, 0.4, 0.9)),
+    Asset("BP_Trash_bin_*", "Static", (0.8, 0.8, 1.2)),
+    Asset("BP_Trash_can_C", "Static", (0.6, 0.6, 1.0)),
+    Asset("BP_Rabbish_C", "Static", (1.0, 1.0, 0.6)),
+    Asset("BP_Can*_C", "Static", (0.5, 0.5, 0.8)),
+    Asset("BP_Box*_C", "Static", (0.8, 0.6, 0.6)),
+    Asset("BP_Cart*_C", "Static", (2.0, 1.1, 2.1)),
+    Asset("BP_Couch_C", "Static", (2.0, 0.9, 0.9)),
+    Asset("BP_Table*_C", "Static", (1.6, 1.6, 0.9)),
+    Asset("BP_Soda*_C", "Static", (1.1, 0.9, 1.9)),  # vending machines
+)
+
+PEOPLE = ("*User_Agent*", "*Pedestrian*", "*Humanoid*")
+# What has bounds and is nothing that stands there: who moves, and what the engine itself puts into a level.
+NOTHING = (
+    *PEOPLE, "*Vehicle*", "*Robot*", "*Volume*", "*Sky*", "*Camera*", "*Pawn*", "*Character*", "*Controller*",
+    "*Light", "*Manager*", "*Reflection*", "*Fog*", "*NavMesh*", "*LevelBounds*", "*WorldSettings*", "*Brush*",
+)  # fmt: skip
+
+
+def asset_of(name: str) -> Asset | None:
+    """Find an asset's entry by its name."""
+    return next((asset for asset in ASSETS if fnmatchcase(name, asset.pattern)), None)
+
+
+def kind_of(class_name: str) -> str | None:
+    """Find the kind of an object by its class: an asset's, or that which the class is named after, as Buildings_C;
+    None: it is no part of a town, or nobody knows.
+    """
+    if asset := asset_of(class_name):
+        return asset.kind
+    found = re.match(r"(?:BP_)?([A-Za-z]+)", class_name)
+    return found[1] if found and found[1] in KINDS and not is_nothing(class_name) else None
+
+
+def is_nothing(class_name: str) -> bool:
+    """Tell whether a class is one of NOTHING."""
+    return any(fnmatchcase(class_name, pattern) for pattern in NOTHING)
+
+
+def is_person(path: str) -> bool:
+    """Tell whether an asset is one of people, by its path."""
+    return any(fnmatchcase(path, pattern) for pattern in PEOPLE)
+
+
+def id_of(name: str) -> int:
+    """Give the id of an object's box: 48 bits of its name's hash, so that everybody who asks a level finds the same."""
+    return int(sha256_bytes(name.encode())[:12], 16)

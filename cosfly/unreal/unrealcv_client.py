@@ -1,0 +1,194 @@
+"""The way to an UnrealCV server, as SimWorld runs one: its settings, a checked connection, and errors that name host,
+port and version.
+
+The client is the package `unrealcv`. What it does badly is mended here: it waits for ever for a greeting, reads on from
+a connection that is closed, and prints. A server has one client at a time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import re
+import socket
+import time
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+from pydantic import Field
+
+from cosfly.errors import ConfigError, EnvironmentMissing
+from cosfly.work.config import Config, MayDiffer
+
+PROBE_S = 5.0  # for a server to accept a connection
+LEAST_VERSION = (0, 4, 0)  # the first with bounds, classes, and more than one camera
+MOST_AT_ONCE = 200  # commands of a batch, so that neither side waits for the other with full buffers
+INSTALL = 'pip install "cosfly[unrealcv]" && pip install --no-deps "unrealcv>=1.3.2"'
+
+
+class UnrealCvConfig(Config):
+    """An UnrealCV server."""
+
+    host: MayDiffer[str] = Field("127.0.0.1", min_length=1, description="where the server is")
+    port: MayDiffer[int] = Field(9000, ge=1, le=65535, description="its port; often 9001 where 9000 is taken")
+    level: str | None = Field(
+        None, pattern=r"^[\w/.-]+$", description="level to open; null takes the one that is open, as a SimWorld city"
+    )
+    timeout_s: MayDiffer[float] = Field(60.0, gt=0, description="how long the server may take to answer, s")
+    coord_scale: float = Field(100.0, gt=0, description="Unreal's units in 1 m: centimetres")
+
+
+class NoAnswerError(Exception):
+    """The server did not answer in time, closed the connection, or answered what was not asked."""
+
+
+class UnrealCvConnection:
+    """One client of one server, until an error: what comes late would be taken for the next answer."""
+
+    def __init__(self, cfg: UnrealCvConfig, port: int) -> None:
+        self.endpoint, self.version, self.level = f"{cfg.host}:{port}", "unknown", ""
+        self._client = _client(cfg, port)
+        if self._client is None:
+            raise NoAnswerError(_why_not(cfg.host, port))
+
+    @property
+    def where(self) -> str:
+        return f"{self.endpoint} (UnrealCV {self.version})" + (f", {self.level}" if self.level else "")
+
+    def ask(self, *commands: str) -> list[str | bytes]:
+        """Give the answers, in order: text, or bytes of pictures. An answer that begins with `error` is one too."""
+        answers: list[str | bytes] = []
+        for first in range(0, len(commands), MOST_AT_ONCE):
+            try:
+                with contextlib.redirect_stdout(io.StringIO()):
+                    answers += self._client.request_batch(list(commands[first : first + MOST_AT_ONCE]))
+            except (OSError, AttributeError) as error:  # the socket is gone
+                raise NoAnswerError(f"{self._client.ended or error} ({commands[first]})") from None
+        return answers
+
+    def tell(self, *commands: str) -> None:
+        """Have the server do it all."""
+        for command, answer in zip(commands, self.ask(*commands), strict=True):
+            if is_refusal(answer):
+                what, fix = "the server refuses a command", "see that its build of UnrealCV has it"
+                raise EnvironmentMissing(what, where=self.where, got=f"{command}: {answer!r}", fix=fix)
+
+    def numbers(self, answer: str | bytes, num: int) -> tuple[float, ...] | None:
+        """Read finite numbers; None: it is something else."""
+        words = answer.split() if isinstance(answer, str) else []
+        with contextlib.suppress(ValueError):
+            found = tuple(map(float, words))
+            if len(found) == num and all(abs(number) < 1e12 for number in found):
+                return found
+        return None
+
+    def close(self) -> None:
+        self._client.disconnect()
+
+    @contextlib.contextmanager
+    def asking(self, what: str) -> Iterator[None]:
+        """Make an error of ours of a server that is silent or gone: `what` could not be done."""
+        with _told(what, self.where):
+            yield
+
+
+def is_refusal(answer: str | bytes | None) -> bool:
+    return not isinstance(answer, bytes) and (answer is None or answer.lstrip().lower().startswith("error"))
+
+
+def connect(cfg: UnrealCvConfig, port: int) -> UnrealCvConnection:
+    """Connect to the server at a port and have it open the level.
+
+    Raises:
+        EnvironmentMissing: the package is not there, nobody answers, or a server that is too old.
+        ConfigError: it has no such level.
+    """
+    with _told("no UnrealCV server", f"{cfg.host}:{port} (UnrealCV unknown)"):
+        connection = UnrealCvConnection(cfg, port)
+        version, level = connection.ask("vget /unrealcv/version", "vget /level/name")
+    found = re.match(r"v?(\d+)\.(\d+)(?:\.(\d+))?", str(version))
+    if found is None or tuple(int(part or 0) for part in found.groups()) < LEAST_VERSION:
+        expected = f"{'.'.join(map(str, LEAST_VERSION))} or newer"
+        what, fix = "an UnrealCV server of another version", "run a newer build, as SimWorld ships"
+        raise EnvironmentMissing(what, where=connection.endpoint, got=repr(version)[:80], expected=expected, fix=fix)
+    connection.version, connection.level = str(version).strip(), "" if is_refusal(level) else str(level).strip()
+    if cfg.level in (None, connection.level):
+        return connection
+    return _opened(cfg, port, connection)
+
+
+def _opened(cfg: UnrealCvConfig, port: int, connection: UnrealCvConnection) -> UnrealCvConnection:
+    """Open the level and wait for it; a server may drop its client meanwhile."""
+    before, until_s, answer = connection.where, time.monotonic() + cfg.timeout_s, None
+    with contextlib.suppress(NoAnswerError):
+        (answer,) = connection.ask(f"vset /action/game/level {cfg.level}")
+    while answer is None or not is_refusal(answer):
+        connection.close()
+        with contextlib.suppress(EnvironmentMissing):
+            connection = connect(cfg.model_copy(update={"level": None}), port)
+            if connection.level == cfg.level:
+                return connection
+        if time.monotonic() > until_s:
+            break
+        time.sleep(0.5)
+    connection.close()
+    fix = "see `vget /level/name` in the level that is wanted, or leave the level out"
+    raise ConfigError("the server has no such level", where=before, got=cfg.level, fix=fix)
+
+
+def _client(cfg: UnrealCvConfig, port: int) -> Any:
+    """Give a connected client of the package; None: nobody greeted it."""
+    try:
+        import unrealcv
+    except ModuleNotFoundError as error:
+        what = "the client of UnrealCV is not installed"
+        raise EnvironmentMissing(what, got=str(error), fix=INSTALL) from None
+    logging.getLogger("unrealcv").setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", message="The connected UnrealCV server")
+
+    class _Client(unrealcv.Client):
+        ended = ""  # why nothing comes any more
+
+        def receive(self) -> bytes:
+            since_s = time.monotonic()
+            message = unrealcv.SocketMessage.ReceivePayload(self.sock)
+            if not message:
+                is_late = time.monotonic() - since_s >= 0.9 * cfg.timeout_s
+                told = f"no answer in {cfg.timeout_s:g} s" if is_late else "the server closed the connection"
+                raise ConnectionError(told)
+            return message
+
+        def receive_loop_queue(self) -> None:
+            try:
+                super().receive_loop_queue()
+            except (OSError, AssertionError, AttributeError) as error:
+                self.ended = self.ended or str(error)
+                self.recv_data_q.put(ConnectionError(self.ended))
+
+    client, before_s = _Client((cfg.host, port)), socket.getdefaulttimeout()
+    socket.setdefaulttimeout(cfg.timeout_s)  # the package opens the socket itself, and sets none
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            return client if client.connect() else None
+    finally:
+        socket.setdefaulttimeout(before_s)
+
+
+def _why_not(host: str, port: int) -> str:
+    """Why no client was greeted, of which the package says nothing."""
+    try:
+        socket.create_connection((host, port), PROBE_S).close()
+    except OSError as error:
+        return str(error)
+    return "it does not greet as UnrealCV does, or has another client"
+
+
+@contextlib.contextmanager
+def _told(what: str, where: str) -> Iterator[None]:
+    try:
+        yield
+    except NoAnswerError as error:
+        fix = "see that the server runs and listens there, or give it more time with timeout_s"
+        raise EnvironmentMissing(what, where=where, got=str(error), fix=fix) from None
