@@ -118,8 +118,8 @@ class Place:
     def words(self, text: str) -> list[str]:
         """The words of a command as a shell gives them on, with what is small in place of what is large."""
         text = text.replace("http://localhost:8000", self.teacher).replace("https://host/release", self.release)
-        for told, served in self.ports.items():
-            port = free_port() if text.startswith("sim serve") else served
+        for told, port_here in self.ports.items():
+            port = free_port() if text.startswith("sim serve") else port_here
             text = re.sub(rf"(port[ =]){told}\b", rf"\g<1>{port}", text)
         words = [part for word in shlex.split(text, comments=True) for part in (sorted(glob.glob(word)) or [word])]
         small = max((name for name in SMALL if text.startswith(f"{name} ")), key=len, default=None)

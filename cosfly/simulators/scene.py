@@ -66,7 +66,7 @@ class Mover:
         return PosedCar(middle_m, heading_rad, self.half_extents_m, _rng_of(self.model).random())
 
 
-class Scene:
+class ServedScene:
     """Draws. All of it belongs to one thread."""
 
     def __init__(self, town: BoxMap, renderer: str = "gl") -> None:

@@ -12,7 +12,7 @@ from cosfly.products.kinds import KINDS
 from cosfly.products.others import BUILDS
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.products.weather import WeatherParams
-from cosfly.simulators.scene import MOST_MOVERS, Mover, Scene
+from cosfly.simulators.scene import MOST_MOVERS, Mover, ServedScene
 from cosfly.unreal.conventions import ACTOR_BITS, depth_picture, tags_picture, unreal_pose
 
 BOOL, INT, FLOAT, STRING = 1, 2, 3, 4  # types of attributes
@@ -72,7 +72,7 @@ class World:
     """Town, actors and weather. All of it belongs to one thread, which draws."""
 
     def __init__(self, town: BoxMap) -> None:
-        self.town, self._scene = town, Scene(town)
+        self.town, self._scene = town, ServedScene(town)
         self.actors: dict[int, Actor] = {}
         self.weather = list(FAIR_WEATHER)
         self._numbers = itertools.count(201)

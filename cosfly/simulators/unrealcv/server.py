@@ -26,7 +26,7 @@ from cosfly.products.kinds import KIND_NAMES, KINDS
 from cosfly.products.others import BUILDS
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.contract import Frame
-from cosfly.simulators.scene import MOST_MOVERS, Mover, Scene
+from cosfly.simulators.scene import MOST_MOVERS, Mover, ServedScene
 from cosfly.simulators.serving import Fault, due, listen, send
 from cosfly.unreal.assets import is_person
 from cosfly.unreal.conventions import CM_PER_M, FAR_CM, unreal_pose
@@ -47,7 +47,7 @@ class UnrealCvServer:
 
     def __init__(self, town: BoxMap, host: str, port: int, faults: list[Fault]) -> None:
         self.town, self.faults, self.num_lit = town.name, faults, 0
-        self._scene, self._map = Scene(town), town
+        self._scene, self._map = ServedScene(town), town
         names = [f"{KIND_NAMES[int(kind)]}_{number}" for kind, number in zip(town.kinds, town.ids, strict=True)]
         self._rows = {name: row for row, name in enumerate(names)}
         self._movers: dict[str, Mover] = {}
