@@ -220,6 +220,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "roi propose": ["roi propose {simple} --out {out}/roi_polygon.json {tiny}"],
     "plan": ["plan --map {simple} --paths {walks} --out {out} {tiny}"],
     "plan compare": ["plan compare {simple} {walks} --out {out} {tiny} --planner foresight --planner track_astar"],
+    "plan benchmark": ["plan benchmark {simple} {walks} --out {out} {tiny} --planner theta_star --planner track_astar"],
     "render": ["render {three} --out {out} --set render.width_px=64 --set render.height_px=36"],
     "study weather": ["study weather --map {maps} --traces {traces} --out {out} {tiny}"],
     "study zoom": ["study zoom {three} --out {out} --every 10"],

@@ -50,7 +50,7 @@ from cosfly.look.gallery import contact_sheet, preview_gif
 from cosfly.maps import boxfile, cityjson, simworld
 from cosfly.pedestrians import stage as pedestrians
 from cosfly.pedestrians.walkable import PedestriansConfig
-from cosfly.planners import compare
+from cosfly.planners import benchmark, compare
 from cosfly.planners.compare import text_tables
 from cosfly.products import review
 from cosfly.products.actions import (
@@ -464,6 +464,13 @@ def _records(root: Path) -> None:
     timings = {name: {"mean_ms": 1.0, "max_ms": 1.0} for name in names}
     flown = compare.summarize(dict.fromkeys(names, traces), np.random.default_rng(0))
     write_json(root / "compare/compare.json", {"settings": {}} | flown)
+    flights = dict.fromkeys(("track_astar", "muco"), traces[0].as_json())
+    raw = benchmark.ScenarioRecord(id="a", flights=flights, infeasible={"prm": "no free way"})
+    summary = benchmark.summarize([raw], ("track_astar", "muco", "prm"), np.random.default_rng(0))
+    (root / "benchmark").mkdir()
+    (root / "benchmark/scenarios.jsonl").write_text(raw.model_dump_json() + "\n", encoding="utf-8")
+    header = {"map": "m", "num_boxes": 1, "seed": 0, "settings": {}}
+    write_model(root / "benchmark/benchmark.json", benchmark.Benchmark(**header, **summary), benchmark.FORMAT)
     write_json(
         root / "compare/manifest.json",
         {
@@ -907,6 +914,10 @@ READERS: dict[str, Reader] = {
     "failures": _one("failures.jsonl", read_failures),
     "events": _one("events.jsonl", lambda path: read_events(path.parent)),
     "summary": _one("summary.json", read_json),
+    "scenarios of a benchmark": _one(
+        "benchmark/scenarios.jsonl", lambda path: [record.traces() for record in benchmark.read_scenarios(path)]
+    ),
+    "benchmark": _one("benchmark/benchmark.json", lambda path: benchmark.text_tables(benchmark.read_benchmark(path))),
     "comparison": Reader(("compare/compare.json", "compare/manifest.json"), _tables),
     "presets of weather": _one(
         "sky.yaml",

@@ -193,6 +193,30 @@ def plan_compare(
     typer.echo(product)
 
 
+@plan_app.command("benchmark")
+@takes(*STAGE)
+def plan_benchmark(
+    job: Job,
+    map_: Annotated[Path, Argument(metavar="MAP", help="Boxes: step2_simplified.json.")],
+    paths: Annotated[Path, Argument(metavar="PATHS", help="Walks: path.json.")],
+    out: options.Out,
+    scenarios: Annotated[int, Option(help="Walks, from the first one on.")] = 20,
+    planner: Annotated[list[str] | None, Option(show_default="all", help="A planner; repeat it.")] = None,
+) -> None:
+    """The paper's comparison of 14 planners and ours: tables with intervals, benchmark.json, raw flights, figures."""
+    from cosfly.planners import benchmark
+    from cosfly.work.config import build
+    from cosfly.work.console import console
+
+    settings = job.cfg.plan.model_dump() | {"scenarios": scenarios} | ({"planners": planner} if planner else {})
+    cfg = build(benchmark.BenchmarkConfig, settings, "plan benchmark")
+    job.begin(out, map_, paths)
+    product = benchmark.run(cfg, map_, paths, out, seed=job.cfg.seed, **job.manner)
+    for table in benchmark.text_tables(benchmark.read_benchmark(product)):
+        options.tell_table(console, table.columns, table.rows, title=table.title)
+    typer.echo(product)
+
+
 render_app = options.stage_group("Step 5: frames of flights.")
 app.add_typer(render_app, name="render")
 

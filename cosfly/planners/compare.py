@@ -186,8 +186,11 @@ class CompareConfig(PlanConfig):
 # --- stage ------------------------------------------------------------------------------------------------------------
 
 
-def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int) -> Work:
-    """Load and index the map once; give the function that plans one walk with each of the planners."""
+def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int, keeps_all: bool = False) -> Work:
+    """Load and index the map once; give the function that plans one walk with each of the planners.
+
+    keeps_all: a walk that one of them does not fly is kept, with the others' flights.
+    """
     from cosfly.planners.reacquire import screens_of
     from cosfly.space.kernels import obstacle_index
 
@@ -210,7 +213,7 @@ def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int) -> Work:
             times_ms[name] = round(1000.0 * (time.perf_counter() - begin_s), 2)
         if len(errors) == len(settings):
             raise errors[cfg.planners[0]]
-        missing = f"no_{next(iter(errors))}_flight" if errors else None
+        missing = f"no_{next(iter(errors))}_flight" if errors and not keeps_all else None
         result = {"flights": flights, "errors": {k: str(e) for k, e in errors.items()}, "times_ms": times_ms}
         return Outcome(result, missing)
 
@@ -273,11 +276,11 @@ def run(
     for name, picture in pictures.items():
         outputs.append(out / name)
         write_bytes(outputs[-1], picture)
-    stage.finish(outputs, finished.tally, timings=_timings(shared, cfg.planners))
+    stage.finish(outputs, finished.tally, timings=timings(shared, cfg.planners))
     return product
 
 
-class _FlightsOfWalk(BaseModel):
+class FlightsOfWalk(BaseModel):
     """What the journal holds of a walk, by planner."""
 
     flights: dict[str, dict[str, Any]]
@@ -288,7 +291,7 @@ class _FlightsOfWalk(BaseModel):
 def _flights_of(planner: str, shared: list[Kept], out: Path) -> list[DroneTrace]:
     return [
         DroneTrace.from_json(
-            result_of(record, _FlightsOfWalk).flights.get(planner) or {}, f"{out}/items.jsonl: {record.id}: {planner}"
+            result_of(record, FlightsOfWalk).flights.get(planner) or {}, f"{out}/items.jsonl: {record.id}: {planner}"
         )
         for record in shared
     ]
@@ -303,17 +306,19 @@ def _left_out(records: list[ItemRecord]) -> list[dict[str, str]]:
         elif isinstance(record, Dropped):
             rows += [
                 {"id": record.id, "planner": k, "message": v}
-                for k, v in result_of(record, _FlightsOfWalk).errors.items()
+                for k, v in result_of(record, FlightsOfWalk).errors.items()
             ]
     return rows
 
 
-def _timings(shared: list[Kept], planners: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Planning times over the compared walks: they differ from run to run, so they stand in the manifest alone."""
+def timings(shared: list[Kept], planners: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Give planning times over the compared walks: they differ from run to run, so they stand in the manifest alone."""
     table = {}
     for name in planners:
-        times_ms = np.array([result_of(record, _FlightsOfWalk).times_ms.get(name, 0.0) for record in shared])
-        table[name] = {"mean_ms": round(float(times_ms.mean()), 1), "max_ms": round(float(times_ms.max()), 1)}
+        times_ms = np.array([result_of(record, FlightsOfWalk).times_ms.get(name, 0.0) for record in shared])
+        p50, p95 = np.percentile(times_ms, (50, 95))
+        figures = {"mean_ms": times_ms.mean(), "p50_ms": p50, "p95_ms": p95, "max_ms": times_ms.max()}
+        table[name] = {figure: round(float(value), 1) for figure, value in figures.items()}
     return table
 
 

@@ -1,0 +1,478 @@
+"""The paper's comparison of planners on the same scenarios: `cosfly plan benchmark` (app:three_axis_eval).
+
+Figures and axes are those of compare.py. Here nothing is left out: a scenario that a planner does not fly counts as one
+where the walker is never seen (visibility 0), every place collides and no box is kept away from (clearance 0); lengths
+and dynamics, of which there are none, are means over what is flown, and of one that flies nothing as bad as can be.
+
+The 14-way score of the paper (tab:appendix_h_extended_ranking) is printed without its weights. Its rows give them away:
+with each criterion normalised from the worst planner, 0, to the best, 1, all fourteen scores are 0.35 visibility + 0.30
+collision + 0.35 clearance to the last digit but one, and path length, acceleration and jerk count for nothing. (Blocked
+sight is 1 - visibility, so that any part of the 0.35 may be its.) How far the ranks depend on that stands in
+`ranking`: with equal weights, and with any weights at all, drawn evenly.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, Field
+
+from cosfly.errors import InputError
+from cosfly.planners import compare
+from cosfly.planners.compare import AXES, FIGURES, INTERVAL_PERCENT, NUM_RESAMPLES, CompareConfig, TextTable
+from cosfly.planners.contract import ALL_PLANNERS, title_of
+from cosfly.planners.stage import check_ids, draw_styles_of
+from cosfly.products.boxes import read_boxes
+from cosfly.products.traces import DroneTrace
+from cosfly.products.walks import read_paths
+from cosfly.reading.documents import FileFormat, model_lines, read_model
+from cosfly.work.chance import rng_for
+from cosfly.work.runner import Item, Watch, run_items
+from cosfly.work.stage_folder import Resume, StageFolder, result_of
+from cosfly.work.store import dump_json, write_bytes, write_model
+
+log = logging.getLogger(__name__)
+
+FORMAT = FileFormat("cosfly.plan_benchmark", "1.0", "benchmark of planners")
+NAMES = [name for name, _, _ in FIGURES]
+INFEASIBLE = {"five_ray_mean": 0.0, "blocked_fraction": 1.0, "collision_fraction": 1.0, "clearance_min_m": 0.0}
+GROUPS = {
+    "our own": ("foresight",),
+    "target-aware": ("track_astar", "muco"),
+    "A* family": ("astar", "weighted_astar", "theta_star", "visibility_astar"),
+    "sampling, spline": ("rrt_star", "prm", "bspline_prm"),
+    "gradient, optimization": ("elastic_band", "minimum_jerk", "potential_field", "chomp", "trajopt"),
+}
+GROUP_OF = {planner: group for group, members in GROUPS.items() for planner in members}
+# Criteria of the weighted score: its figure, and whether more is better.
+CRITERIA = {
+    "visibility": ("five_ray_mean", True), "collision": ("collision_fraction", False),
+    "clearance": ("clearance_min_m", True), "length": ("length_m", False), "acceleration": ("accel_rms_mps2", False),
+    "jerk": ("jerk_rms_mps3", False),
+}  # fmt: skip
+WEIGHTS = {"visibility": 0.35, "collision": 0.30, "clearance": 0.35}  # the paper's, see above
+EQUAL_WEIGHTS = {"visibility": 2 / 7} | dict.fromkeys([*CRITERIA][1:], 1 / 7)  # of seven: blocked sight is visibility
+RANDOM_WEIGHTS = 1000
+
+
+class PaperRow(BaseModel):
+    """What the paper prints of a planner: mean of the four axes (of seven planners), weighted score, visibility,
+    clearance, and scenarios of 20 without collision.
+    """
+
+    axes_mean: float | None
+    weighted: float
+    visibility: float
+    clearance_m: float
+    num_free: int
+
+
+_PRINTED = {
+    "track_astar": (0.782, 1.0, 0.9787, 4.0291, 20), "muco": (0.699, 0.7861, 0.8941, 2.7543, 20),
+    "rrt_star": (0.573, 0.4123, 0.6164, 1.5066, 20), "prm": (0.578, 0.4319, 0.6009, 1.7984, 20),
+    "bspline_prm": (0.596, 0.4161, 0.6077, 1.6059, 20), "elastic_band": (0.596, 0.3, 0.5639, 0.8981, 20),
+    "minimum_jerk": (0.558, 0.2776, 0.6235, 1.1371, 19), "astar": (None, 0.389, 0.6151, 1.3078, 20),
+    "weighted_astar": (None, 0.401, 0.6189, 1.3871, 20), "theta_star": (None, 0.4012, 0.6234, 1.3548, 20),
+    "visibility_astar": (None, 0.4141, 0.6246, 1.46, 20), "potential_field": (None, 0.1325, 0.6345, 1.5505, 19),
+    "chomp": (None, 0.2249, 0.5995, 1.2535, 19), "trajopt": (None, 0.4129, 0.6159, 1.5161, 20),
+}  # fmt: skip
+PAPER = {p: PaperRow(**dict(zip(PaperRow.model_fields, row, strict=True))) for p, row in _PRINTED.items()}
+PAPER_SHORTEST_M = 85.73  # to which the paper normalises path efficiency
+PAPER_GROUPS = dict(zip(list(GROUPS)[1:], (0.9364, 0.6205, 0.6083, 0.6075), strict=True))  # visibility
+PAPER_WINS = {
+    "visibility_higher": 18, "path_shorter": 14, "jerk_lower": 11, "clearance_larger": 17, "both_collision_free": 20,
+}  # fmt: skip
+
+
+class BenchmarkConfig(CompareConfig):
+    """Settings of a benchmark: those of a comparison, and how many scenarios."""
+
+    planners: tuple[str, ...] = Field(tuple(ALL_PLANNERS), description="who takes part")
+    scenarios: int = Field(20, ge=1, description="walks from the beginning of the file, at most")
+
+
+# --- the raw record ---------------------------------------------------------------------------------------------------
+
+
+class ScenarioRecord(BaseModel):
+    """A line of `scenarios.jsonl`: what became of one walk.
+
+    flights: planner -> flight, as in `drone_trace.json`. infeasible: planner -> why it flew nothing. Together they name
+    every planner of the benchmark.
+    """
+
+    schema_version: Literal["1.0"] = "1.0"
+    id: str
+    flights: dict[str, dict[str, Any]]
+    infeasible: dict[str, str]
+
+    def traces(self) -> dict[str, DroneTrace]:
+        """Give the flights.
+
+        Raises:
+            InputError: one is not what a planner's flight must be.
+        """
+        return {name: DroneTrace.from_json(f, f"{self.id}: flights.{name}") for name, f in self.flights.items()}
+
+
+def read_scenarios(path: Path) -> list[ScenarioRecord]:
+    """Read `scenarios.jsonl` back.
+
+    Raises:
+        InputError: names the line and the field.
+    """
+    lines = model_lines(path, ScenarioRecord, what="scenarios of a benchmark", fix="run cosfly plan benchmark")
+    return [record for _, record in lines]
+
+
+# --- stage ------------------------------------------------------------------------------------------------------------
+
+
+def run(
+    cfg: BenchmarkConfig,
+    simplified_map: Path,
+    paths: Path,
+    out: Path,
+    *,
+    seed: int = 0,
+    workers: int = 0,
+    watch: Watch = Watch(),
+    resume: Resume = "if-same",
+) -> Path:
+    """Reads a simplified map and `path.json`, writes `scenarios.jsonl` and from it `benchmark.json` and the figures;
+    gives `benchmark.json`.
+
+    A walk that no planner flies, as one through a house, is a failure and no scenario. Planning times stand in
+    `items.jsonl` and in the manifest, the only files that differ when all is done again.
+
+    Raises:
+        InputError: a file is not what it must be.
+        NothingKept: no walk is flown by anybody.
+    """
+    cfg = _without_missing(cfg)
+    inputs = {"map": simplified_map, "paths": paths}
+    stage = StageFolder.open(out, "plan_benchmark", config=cfg, inputs=inputs, seed=seed, resume=resume)
+    product, raw, page = (out / name for name in ("benchmark.json", "scenarios.jsonl", "benchmark.md"))
+    if stage.is_complete:
+        return product
+    box_map, walks = read_boxes(simplified_map), read_paths(paths)
+    check_ids(walks, paths)
+    walks = walks[: cfg.scenarios]
+    items = [Item(w.path_id, (w, styles)) for w, styles in zip(walks, draw_styles_of(walks, cfg, seed), strict=True)]
+    done = run_items(stage, items, compare.make_worker, (cfg, simplified_map, seed, True), workers=workers, watch=watch)
+    if not done.kept:
+        raise stage.nothing_kept(done.tally, expected="a walk that a planner flies")
+    flown = [result_of(record, compare.FlightsOfWalk) for record in done.kept]
+    lines = [
+        ScenarioRecord(id=record.id, flights=f.flights, infeasible=f.errors)
+        for record, f in zip(done.kept, flown, strict=True)
+    ]
+    write_bytes(raw, "".join(dump_json(line.model_dump()) + "\n" for line in lines).encode())
+    header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.model_dump(mode="json")}
+    summary = summarize(read_scenarios(raw), cfg.planners, rng_for(seed, "plan_benchmark", "intervals"))
+    found = Benchmark(**header, **summary)
+    write_model(product, found, FORMAT)
+    write_bytes(page, markdown(found).encode())
+    stage.finish([product, raw, page], done.tally, timings=compare.timings(done.kept, cfg.planners))
+    return product
+
+
+def _without_missing(cfg: BenchmarkConfig) -> BenchmarkConfig:
+    """Leave out the planners whose package is not installed, with one line that says so."""
+    sampling = [name for name in cfg.planners if ALL_PLANNERS[name].startswith("cosfly.planners.reference.sampling")]
+    if not sampling or importlib.util.find_spec("ompl") is not None:
+        return cfg
+    log.warning('OMPL is not installed, so %s are left out: pip install "cosfly[ompl]"', ", ".join(sampling))
+    return cfg.model_copy(update={"planners": tuple(name for name in cfg.planners if name not in sampling)})
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+Interval = tuple[float, float]
+
+
+class AxisRow(BaseModel):
+    """Scores of a planner and 95 % of what other scenarios would give."""
+
+    scores: dict[str, float]
+    intervals: dict[str, Interval]
+
+
+class RankRow(BaseModel):
+    """normalized: criterion -> 0 (worst) to 1 (best). ranks: lowest and highest of 95 % of all weights."""
+
+    rank: int
+    score: float
+    interval: Interval
+    normalized: dict[str, float]
+    rank_equal_weights: int
+    ranks_any_weights: Interval
+    first_any_weights: float
+
+
+class GroupRow(BaseModel):
+    """Means over the planners of a group."""
+
+    num_planners: int
+    figures: dict[str, float | None]
+    visibility_interval: Interval
+
+
+class Benchmark(BaseModel):
+    """`benchmark.json`. figures: planner -> a row for each scenario, null where it flew nothing; means: see above."""
+
+    map: str
+    num_boxes: int
+    seed: int
+    settings: dict[str, Any]
+    scenarios: list[str] = Field(min_length=1)
+    infeasible: dict[str, dict[str, str]]
+    figures: dict[str, list[dict[str, float] | None]]
+    means: dict[str, dict[str, float | None]]
+    shortest_mean_m: float
+    axes: dict[str, AxisRow]
+    deltas: dict[str, dict[str, float | None]] = {}
+    delta_intervals: dict[str, Interval] = {}
+    win_rates: dict[str, dict[str, float]] = {}
+    weights: dict[str, float]
+    ranking: dict[str, RankRow]
+    groups: dict[str, GroupRow]
+
+
+def read_benchmark(path: Path) -> Benchmark:
+    """Read `benchmark.json` back; raises InputError."""
+    return read_model(path, Benchmark, FORMAT)
+
+
+def summarize(records: list[ScenarioRecord], planners: tuple[str, ...], rng: np.random.Generator) -> dict[str, Any]:
+    """Make the tables of `benchmark.json` from the raw records. rng: draws scenarios and weights."""
+    traces = [record.traces() for record in records]
+    figures = {p: [compare.flight_figures(t[p]) if p in t else None for t in traces] for p in planners}
+    tables = {p: np.array([_row(flight) for flight in rows]) for p, rows in figures.items()}
+    means = _means(tables, np.arange(len(records)))
+    drawn = [_means(tables, draw) for draw in rng.integers(len(records), size=(NUM_RESAMPLES, len(records)))]
+    axes, axes_drawn = compare.axis_scores(means), [compare.axis_scores(found) for found in drawn]
+    axis_rows = {
+        p: AxisRow(scores=row, intervals={axis: _interval([found[p][axis] for found in axes_drawn]) for axis in row})
+        for p, row in axes.items()
+    }
+    free_m = [row["length_m"] for row in means.values() if row["collision_fraction"] == 0]
+    return {
+        "scenarios": [record.id for record in records],
+        "infeasible": {record.id: record.infeasible for record in records if record.infeasible},
+        "figures": figures,
+        "means": {p: {n: _number(value) for n, value in row.items()} for p, row in means.items()},
+        "shortest_mean_m": round(min(free_m or [row["length_m"] for row in means.values()]), 4),
+        "axes": axis_rows,
+        **(_versus(tables, means, drawn) if set(GROUPS["target-aware"]) <= set(planners) else {}),
+        "weights": WEIGHTS,
+        "ranking": _ranking(means, drawn, rng),
+        "groups": _groups(means, drawn),
+    }
+
+
+def _versus(tables: dict[str, np.ndarray], means: dict, drawn: list[dict]) -> dict[str, Any]:
+    """Give TA*+Smooth less MuCO, and how often it wins."""
+    (one, other), changes = GROUPS["target-aware"], {}
+    for name in NAMES:
+        change, base = means[one][name] - means[other][name], means[other][name]
+        changes[name] = {"delta": _number(change), "relative_percent": _number(100.0 * change / base) if base else None}
+    flown = [np.nan_to_num(tables[planner], nan=np.inf).tolist() for planner in (one, other)]
+    first, second = ([dict(zip(NAMES, row, strict=True)) for row in rows] for rows in flown)
+    return {
+        "deltas": changes,
+        "delta_intervals": {n: _interval([found[one][n] - found[other][n] for found in drawn]) for n in NAMES},
+        "win_rates": compare.win_rates(first, second),
+    }
+
+
+def _row(flight: dict[str, float] | None) -> list[float]:
+    """Give the figures of a flight in the order of NAMES, NaN where one that was not flown has none."""
+    return [flight[name] if flight else INFEASIBLE.get(name, np.nan) for name in NAMES]
+
+
+def _means(tables: dict[str, np.ndarray], draw: np.ndarray) -> dict[str, dict[str, float]]:
+    """Average over drawn scenarios; infinite where a planner flew none of them."""
+    found = {}
+    for planner, table in tables.items():
+        rows = table[draw]
+        counts = (~np.isnan(rows)).sum(axis=0)
+        means = np.where(counts > 0, np.nansum(rows, axis=0) / np.maximum(counts, 1), np.inf)
+        found[planner] = dict(zip(NAMES, means.tolist(), strict=True))
+    return found
+
+
+def _normalized(means: dict[str, dict[str, float]]) -> np.ndarray:
+    """Give (planners, criteria) from 0, the worst, to 1, the best; all 1 where there is no difference."""
+    columns = []
+    for figure, more_is_better in CRITERIA.values():
+        values = np.array([row[figure] for row in means.values()])
+        known = np.isfinite(values)
+        low, span = values[known].min(), np.ptp(values[known])
+        share = (values - low) / span if span > 0 else np.full(len(values), float(more_is_better))
+        columns.append(np.where(known, share if more_is_better else 1.0 - share, 0.0))
+    return np.stack(columns, axis=1)
+
+
+def _ranks(scores: np.ndarray) -> np.ndarray:
+    """Give places from 1 for scores (planners, k), ties in the order of planners."""
+    return np.argsort(np.argsort(-np.round(scores, 9), axis=0, kind="stable"), axis=0, kind="stable") + 1
+
+
+def _ranking(means: dict, drawn: list[dict], rng: np.random.Generator) -> dict[str, RankRow]:
+    chosen, equal = ([weights.get(name, 0.0) for name in CRITERIA] for weights in (WEIGHTS, EQUAL_WEIGHTS))
+    normalized = _normalized(means)
+    scores = normalized @ chosen
+    scores_drawn = np.array([_normalized(found) @ chosen for found in drawn])
+    ranks_any = _ranks(normalized @ rng.dirichlet(np.ones(len(CRITERIA)), size=RANDOM_WEIGHTS).T)
+    ranks, ranks_equal = _ranks(scores[:, None])[:, 0], _ranks((normalized @ equal)[:, None])[:, 0]
+    rows = {
+        planner: RankRow(
+            rank=ranks[k],
+            score=round(scores[k], 4),
+            interval=_interval(scores_drawn[:, k]),
+            normalized=dict(zip(CRITERIA, np.round(normalized[k], 4).tolist(), strict=True)),
+            rank_equal_weights=ranks_equal[k],
+            ranks_any_weights=_interval(ranks_any[k]),
+            first_any_weights=round(float((ranks_any[k] == 1).mean()), 4),
+        )
+        for k, planner in enumerate(means)
+    }
+    return dict(sorted(rows.items(), key=lambda entry: entry[1].rank))
+
+
+def _groups(means: dict, drawn: list[dict]) -> dict[str, GroupRow]:
+    rows = {}
+    for group, all_members in GROUPS.items():
+        if members := [planner for planner in all_members if planner in means]:
+
+            def mean(found: dict, name: str, members: list[str] = members) -> float:
+                return float(np.mean([found[planner][name] for planner in members]))
+
+            rows[group] = GroupRow(
+                num_planners=len(members),
+                figures={name: _number(mean(means, name)) for name in NAMES},
+                visibility_interval=_interval([mean(found, "five_ray_mean") for found in drawn]),
+            )
+    return rows
+
+
+def _interval(values: Any) -> Interval:
+    low, high = np.percentile(np.nan_to_num(np.asarray(values, dtype=np.float64)), INTERVAL_PERCENT)
+    return round(float(low), 4), round(float(high), 4)
+
+
+def _number(value: float | None) -> float | None:
+    return round(value, 4) if value is not None and np.isfinite(value) else None
+
+
+# --- tables of text ---------------------------------------------------------------------------------------------------
+
+
+def text_tables(found: Benchmark) -> list[TextTable]:
+    """Give the tables of the paper with its figures beside ours.
+
+    Raises:
+        InputError: a planner or figure is in one part of the benchmark and not in another.
+    """
+    makers = (_axes_table, _versus_table, _wins_table, _ranking_table, _feasibility_table, _groups_table)
+    try:
+        return [table for make in makers if (table := make(found)).rows]
+    except KeyError as error:
+        raise InputError("a table lacks a part", where=FORMAT.what, got=str(error), fix="run it again") from None
+
+
+def markdown(found: Benchmark) -> str:
+    """Give the tables as a page of text."""
+    parts = [f"# Planners on {len(found.scenarios)} scenarios of {found.map}, seed {found.seed}"]
+    for table in text_tables(found):
+        lines = [table.columns, ["---", *["---:"] * (len(table.columns) - 1)], *table.rows]
+        parts.append("\n".join([f"## {table.title}\n", *(f"| {' | '.join(line)} |" for line in lines)]))
+    return "\n\n".join(parts).replace("*", "\\*") + "\n"
+
+
+def _cell(value: float | None, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _span(interval: Interval, digits: int = 3) -> str:
+    return f"{interval[0]:.{digits}f} to {interval[1]:.{digits}f}"
+
+
+def _printed(planner: str, name: str, digits: int = 3) -> str:
+    return _cell(getattr(PAPER[planner], name), digits) if planner in PAPER else "-"
+
+
+def _axes_table(found: Benchmark) -> TextTable:
+    rows = []
+    for planner, row in sorted(found.axes.items(), key=lambda entry: -entry[1].scores["mean"]):
+        scores, means = [_cell(row.scores[axis]) for axis in (*AXES, "mean")], found.means[planner]
+        beside = [_span(row.intervals["mean"]), _printed(planner, "axes_mean"), _cell(means["collision_fraction"])]
+        rows.append([title_of(planner), *scores, *beside, _cell(means["clearance_min_m"], 2)])
+    title = f"Four axes; efficiency to the shortest mean, {found.shortest_mean_m:.2f} m (paper: {PAPER_SHORTEST_M} m)"
+    columns = ["visibility", "efficiency", "smoothness", "safety", "mean", "95 %", "paper", "collision", "clearance"]
+    return TextTable(title, ["planner", *columns], rows)
+
+
+def _versus_table(found: Benchmark) -> TextTable:
+    rows = []
+    for name, title, digits in FIGURES if found.deltas else ():
+        both = [_cell(found.means[planner][name], digits) for planner in GROUPS["target-aware"]]
+        change, span = found.deltas[name], _span(found.delta_intervals[name], digits)
+        rows.append([title, *both, _cell(change["delta"], digits), _cell(change["relative_percent"], 1), span])
+    columns = ["figure", *map(title_of, GROUPS["target-aware"]), "delta", "%", "95 % of the delta"]
+    return TextTable("TA* + Smooth less MuCO", columns, rows)
+
+
+def _wins_table(found: Benchmark) -> TextTable:
+    rows = []
+    for name, row in found.win_rates.items():
+        count, printed = f"{row['count']:.0f} of {row['of']:.0f}", f"{PAPER_WINS[name]} of 20"
+        rows.append([name.replace("_", " "), count, _cell(row["rate"]), printed])
+    return TextTable("TA* + Smooth against MuCO", ["criterion", "count", "rate", "paper"], rows)
+
+
+def _ranking_table(found: Benchmark) -> TextTable:
+    rows = []
+    for planner, row in found.ranking.items():
+        normalized = [_cell(row.normalized[name]) for name in found.weights]
+        low, high = row.ranks_any_weights
+        beside = [_printed(planner, "weighted"), str(row.rank_equal_weights), f"{low:.0f} to {high:.0f}"]
+        rows.append([f"{row.rank} {title_of(planner)}", _cell(row.score), _span(row.interval), *normalized, *beside])
+    words = ", ".join(f"{weight:g} {name}" for name, weight in found.weights.items())
+    columns = ["planner", "score", "95 %", *found.weights, "paper", "rank, equal weights", "ranks, any weights"]
+    return TextTable(f"Weighted score: {words}; each from the worst, 0, to the best, 1", columns, rows)
+
+
+def _feasibility_table(found: Benchmark) -> TextTable:
+    rows, num = [], len(found.scenarios)
+    for planner, flights in found.figures.items():
+        num_flown = sum(flight is not None for flight in flights)
+        num_free = sum(flight is not None and flight["collision_fraction"] == 0 for flight in flights)
+        counts, means = [f"{num_flown} of {num}", f"{num_free} of {num}"], found.means[planner]
+        ours = [
+            _cell(means["collision_fraction"], 4),
+            _cell(means["five_ray_mean"]),
+            _cell(means["clearance_min_m"], 2),
+        ]
+        paper = [_printed(planner, name, k) for name, k in (("num_free", 0), ("visibility", 3), ("clearance_m", 2))]
+        rows.append([title_of(planner), GROUP_OF[planner], *counts, *ours, *paper])
+    columns = ["flown", "free of collisions", "collision", "visibility", "clearance (m)"]
+    paper = ["paper: free of 20", "paper: visibility", "paper: clearance"]
+    title = "Feasibility; what is not flown collides and sees nothing"
+    return TextTable(title, ["planner", "group", *columns, *paper], rows)
+
+
+def _groups_table(found: Benchmark) -> TextTable:
+    rows = []
+    names = {"five_ray_mean": 3, "blocked_fraction": 3, "collision_fraction": 3, "clearance_min_m": 2, "length_m": 1}
+    for group, row in found.groups.items():
+        values = [_cell(row.figures[name], digits) for name, digits in names.items()]
+        beside = [_span(row.visibility_interval), _cell(PAPER_GROUPS.get(group))]
+        rows.append([group, str(row.num_planners), *values, *beside])
+    columns = ["visibility", "blocked", "collision", "clearance", "length (m)", "95 % of visibility", "paper"]
+    return TextTable("Groups", ["group", "planners", *columns], rows)

@@ -1,0 +1,147 @@
+"""The benchmark of planners: the paper's printed rows as known answers, what is not flown, the stage and its command."""
+
+import importlib.util
+import json
+
+import numpy as np
+import pytest
+from specimens_planning import WORLDS, walk_along
+from typer.testing import CliRunner
+
+from cosfly.cli import app
+from cosfly.errors import InputError
+from cosfly.planners import benchmark
+from cosfly.planners.benchmark import CRITERIA, PAPER, WEIGHTS, BenchmarkConfig, read_benchmark, read_scenarios
+from cosfly.planners.contract import ALL_PLANNERS
+from cosfly.products.boxes import write_boxes
+from cosfly.products.walks import write_paths
+
+FEW = ("foresight", "track_astar", "muco", "minimum_jerk", "theta_star")
+
+
+def test_the_weights_are_those_of_the_papers_printed_scores():
+    """tab:appendix_h_extended_ranking from tab:appendix_h_extended_feasibility, all fourteen rows."""
+    collides = {"potential_field": 0.0074, "minimum_jerk": 0.0024, "chomp": 0.0036}
+    means = {
+        name: {figure: 0.0 for figure, _ in CRITERIA.values()}
+        | {
+            "five_ray_mean": row.visibility,
+            "clearance_min_m": row.clearance_m,
+            "collision_fraction": collides.get(name, 0),
+        }
+        for name, row in PAPER.items()
+    }
+    scores = benchmark._normalized(means) @ [WEIGHTS.get(name, 0.0) for name in CRITERIA]
+    assert len(scores) == 14
+    np.testing.assert_allclose(scores, [row.weighted for row in PAPER.values()], atol=2.5e-3)
+    assert list(benchmark._ranks(scores[:, None])[:, 0]) == list(
+        benchmark._ranks(np.array([[row.weighted] for row in PAPER.values()]))[:, 0]
+    )
+
+
+def test_every_planner_has_its_group_and_every_one_of_the_papers_its_row():
+    assert sorted(benchmark.GROUP_OF) == sorted(ALL_PLANNERS)
+    assert set(ALL_PLANNERS) - set(PAPER) == {"foresight"}
+
+
+def test_who_flies_nothing_is_the_worst_and_every_number_is_finite():
+    rows = np.array([[0.5] * len(benchmark.NAMES)] * 3)
+    nothing = np.array([benchmark._row(None)] * 3)
+    means = benchmark._means({"a": rows, "b": nothing}, np.arange(3))
+    assert benchmark._normalized(means)[1].max() == 0.0
+    scores = benchmark.compare.axis_scores(means)
+    assert scores["b"]["mean"] == 0.0
+    assert scores["a"]["path_efficiency"] == 1.0
+
+
+# --- the stage --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    """A walk round a corner, through whose block minimum jerk finds no way, and one along a wall."""
+    folder, (box_map, corners) = tmp_path_factory.mktemp("inputs"), WORLDS["corner"]
+    write_boxes(folder / "map.json", box_map)
+    walks = [
+        walk_along("round", corners),
+        walk_along("along", [(-30, 0), (0, 0)]),
+        walk_along("more", [(0, 0), (9, 0)]),
+    ]
+    write_paths(folder / "path.json", walks, {"map": "hand", "seed": 0})
+    return folder / "map.json", folder / "path.json"
+
+
+@pytest.fixture(scope="module")
+def made(inputs, tmp_path_factory):
+    out = tmp_path_factory.mktemp("made") / "benchmark"
+    benchmark.run(BenchmarkConfig(planners=FEW, scenarios=2), *inputs, out)
+    return out
+
+
+def test_what_is_not_flown_is_counted_and_stays_in_every_table(made):
+    found = read_benchmark(made / "benchmark.json")
+    assert found.scenarios == ["round", "along"]
+    assert list(found.infeasible) == ["round"]
+    assert "no flight within the limits" in found.infeasible["round"]["minimum_jerk"]
+    assert found.figures["minimum_jerk"][0] is None
+    flown = found.figures["minimum_jerk"][1]
+    means = found.means["minimum_jerk"]
+    assert means["five_ray_mean"] == pytest.approx(flown["five_ray_mean"] / 2, abs=1e-4)
+    assert means["clearance_min_m"] == pytest.approx(flown["clearance_min_m"] / 2, abs=1e-4)
+    assert means["collision_fraction"] == 0.5
+    assert means["length_m"] == pytest.approx(flown["length_m"], abs=1e-4)
+    assert found.ranking["minimum_jerk"].normalized["collision"] == 0.0
+    for table in (found.axes, found.ranking, found.means):
+        assert set(table) == set(FEW)
+    page = (made / "benchmark.md").read_text()
+    assert "| minimum jerk | gradient, optimization | 1 of 2 | 1 of 2 | 0.5000 |" in page
+    assert json.loads((made / "manifest.json").read_text())["counts"]["kept"] == 2
+
+
+def test_the_tables_are_those_of_the_raw_records(made):
+    found, records = read_benchmark(made / "benchmark.json"), read_scenarios(made / "scenarios.jsonl")
+    assert [set(r.flights) | set(r.infeasible) for r in records] == [set(FEW)] * 2
+    traces = [record.traces() for record in records]
+    for planner in ("track_astar", "muco", "theta_star"):
+        seen = np.mean([flown[planner].visibility.mean() for flown in traces])
+        assert found.means[planner]["five_ray_mean"] == pytest.approx(seen, abs=1e-4)
+        low, high = found.axes[planner].intervals["visibility"]
+        assert low <= found.axes[planner].scores["visibility"] <= high
+    change = found.means["track_astar"]["length_m"] - found.means["muco"]["length_m"]
+    assert found.deltas["length_m"]["delta"] == pytest.approx(change, abs=1e-3)
+    pair = found.groups["target-aware"]
+    assert pair.num_planners == 2
+    mean = (found.means["track_astar"]["five_ray_mean"] + found.means["muco"]["five_ray_mean"]) / 2
+    assert pair.figures["five_ray_mean"] == pytest.approx(mean, abs=1e-4)
+
+
+def test_the_same_bytes_again_and_with_two_workers(inputs, made, tmp_path):
+    benchmark.run(BenchmarkConfig(planners=FEW, scenarios=2), *inputs, tmp_path / "two", workers=2)
+    for entry in json.loads((made / "manifest.json").read_text())["outputs"]:
+        assert (tmp_path / "two" / entry["path"]).read_bytes() == (made / entry["path"]).read_bytes(), entry["path"]
+
+
+def test_without_ompl_a_line_names_the_extra_and_the_others_fly(inputs, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    cfg = BenchmarkConfig(planners=("prm", "theta_star", "rrt_star"), scenarios=1)
+    found = read_benchmark(benchmark.run(cfg, *inputs, tmp_path / "out"))
+    assert list(found.means) == ["theta_star"]
+    assert [r.message for r in caplog.records if "ompl" in r.message] == [
+        'OMPL is not installed, so prm, rrt_star are left out: pip install "cosfly[ompl]"'
+    ]
+
+
+def test_a_damaged_record_is_named(made, tmp_path):
+    path = tmp_path / "scenarios.jsonl"
+    path.write_text((made / "scenarios.jsonl").read_text().replace('"id"', '"di"', 1))
+    with pytest.raises(InputError, match=r"scenarios.jsonl:1: id"):
+        read_scenarios(path)
+
+
+def test_the_command_shows_all_tables(inputs, tmp_path):
+    words = ["plan", "benchmark", *map(str, inputs), "--out", str(tmp_path / "out"), "--scenarios", "1"]
+    result = CliRunner().invoke(app, [*words, *(f"--planner={name}" for name in ("track_astar", "muco"))])
+    assert result.exit_code == 0, result.output
+    for title in ("Four axes", "less MuCO", "against MuCO", "Weighted score", "Feasibility", "Groups"):
+        assert title in result.output
+    assert CliRunner().invoke(app, [*words, "--planner", "musco", "--planner", "prm"]).exit_code == 1
