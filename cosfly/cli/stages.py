@@ -86,6 +86,26 @@ def maps_unrealcv(
     job.finish(product, out)
 
 
+@maps_app.command("roi-backdrop")
+@takes("seed")
+def maps_roi_backdrop(
+    job: Job,
+    map_: options.Map,
+    out: Annotated[Path, Option(help="PNG to write, and beside it a JSON that tells where it lies.")],
+    backend: Annotated[str | None, Option(help="gl, pyrender or carla."), Sets("render.backend")] = None,
+    bounds: Annotated[
+        tuple[float, float, float, float] | None,
+        Option(metavar="W S E N", show_default="the whole map", help="What to show, world m."),
+    ] = None,
+    pixels_per_m: Annotated[float, Option(min=0.01, max=100, help="Scale.")] = 4.0,
+) -> None:
+    """The map from above as a renderer draws it, for `roi edit --backdrop`."""
+    from cosfly.render import backdrop
+
+    cfg = job.cfg
+    typer.echo(backdrop.run(cfg.render, map_, out, bounds_m=bounds, pixels_per_m=pixels_per_m, seed=cfg.seed))
+
+
 @app.command()
 @takes("town", "verify", "resume")
 def simplify(job: Job, map_: options.Map, out: options.Out) -> None:

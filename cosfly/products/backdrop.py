@@ -57,5 +57,6 @@ class Backdrop:
 
 def write_backdrop(path: Path, png: bytes, world: WorldFrame) -> None:
     """Write a picture and its frame; the frame first, so that a picture never stands without."""
+    path.unlink(missing_ok=True)  # which may lie elsewhere
     write_model(path.with_suffix(".json"), world, FORMAT)
     write_bytes(path, png)

@@ -1,0 +1,82 @@
+"""A map from above as a renderer draws it: the backdrop on which regions are marked (sec:appendix_g_mask_editor).
+
+Of square tiles, each seen from straight above its middle, so that the ground lies where the world has it, to the pixel,
+and what stands on it leans little: a wall of 30 m by 2 m at most.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from cosfly.errors import ConfigError
+from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.look.topview import TopView, png_bytes
+from cosfly.products.backdrop import WorldFrame, write_backdrop
+from cosfly.products.boxes import BoxMap, check_ground, read_boxes
+from cosfly.reading.arrays import LONGEST_SIDE_PX
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import renderer_of
+
+HEIGHT_M, TILE_M = 400.0, 50.0  # of the camera over the ground, and of a tile
+NORTH_UP_DEG = np.array([-90.0, 90.0, 0.0])
+NO_HAZE_M = 1e9
+Bounds = tuple[float, float, float, float]  # west, south, east, north, m
+
+
+def draw_backdrop(cfg: RenderConfig, box_map: BoxMap, view: TopView, seed: int = 0) -> np.ndarray:
+    """Draw the window of the world by the backend of the settings, without weather and haze; CARLA in its own air.
+
+    Returns:
+        (h, w, 3) uint8 RGB of the view's size.
+    Raises:
+        EnvironmentMissing: no such renderer here. RenderError: it gave no picture.
+    """
+    side_px = max(16, round(TILE_M * view.pixels_per_m))
+    side_m = side_px / view.pixels_per_m
+    look = cfg.look.model_copy(update={"haze_m": NO_HAZE_M})
+    cfg = cfg.model_copy(update={"width_px": side_px, "height_px": side_px, "look": look, "rim": False})
+    intrinsic = intrinsic_matrix(side_px, side_px, float(np.degrees(2.0 * np.arctan(side_m / 2.0 / HEIGHT_M))))
+    width, height = view.size_px
+    picture = np.empty((height, width, 3), dtype=np.uint8)
+    renderer = renderer_of(cfg, box_map, seed)
+    try:
+        for top in range(0, height, side_px):
+            for left in range(0, width, side_px):
+                middle_m = np.array([left + side_px / 2.0, -top - side_px / 2.0]) / view.pixels_per_m
+                middle_m += [view.west_m, view.north_m]
+                place_m = np.append(middle_m, box_map.ground.height_at(middle_m[None])[0])
+                eye_m = np.add(place_m, [0.0, 0.0, HEIGHT_M])
+                renderer.prepare(place_m - side_m / 2.0, eye_m + side_m / 2.0)
+                pose = world_from_camera(eye_m, NORTH_UP_DEG)
+                room = picture[top : top + side_px, left : left + side_px]
+                room[:] = renderer.render(pose, intrinsic, None).rgb[: room.shape[0], : room.shape[1]]
+        return picture
+    finally:
+        renderer.close()
+
+
+def run(
+    cfg: RenderConfig, boxes: Path, out: Path, *, bounds_m: Bounds | None = None, pixels_per_m: float, seed: int = 0
+) -> Path:
+    """Reads `boxes_3d.json`; writes the PNG `out`, whose path it gives, and its frame beside it.
+
+    Args:
+        bounds_m: what is shown; None shows the whole map.
+    Raises:
+        ConfigError: bounds without an area, or more pixels than a picture may have. Others as `draw_backdrop`.
+    """
+    box_map = read_boxes(boxes)
+    check_ground(box_map, boxes)
+    low, high = box_map.bounds()
+    west, south, east, north = bounds_m or (*low[:2].tolist(), *high[:2].tolist())
+    size = np.ceil(np.array([east - west, north - south]) * pixels_per_m)
+    if not (np.isfinite(size).all() and (size >= 1).all() and size.max() <= LONGEST_SIDE_PX):
+        got = f"{size[0]:g} x {size[1]:g} px of {west:g} {south:g} {east:g} {north:g}"
+        expected, fix = f"1 to {LONGEST_SIDE_PX} px each way", "give other --bounds or fewer --pixels-per-m"
+        raise ConfigError("no picture of this size", where="--bounds", got=got, expected=expected, fix=fix)
+    frame = WorldFrame(west_m=west, north_m=north, metres_per_px=1.0 / pixels_per_m)
+    view = TopView(west, north, pixels_per_m, (int(size[0]), int(size[1])))
+    write_backdrop(out, png_bytes(draw_backdrop(cfg, box_map, view, seed)), frame)
+    return out
