@@ -95,7 +95,9 @@ def test_what_is_not_flown_is_counted_and_stays_in_every_table(made):
         assert set(table) == set(FEW)
     page = (made / "benchmark.md").read_text()
     assert "| minimum jerk | gradient, optimization | 1 of 2 | 1 of 2 | 0.5000 |" in page
-    assert json.loads((made / "manifest.json").read_text())["counts"]["kept"] == 2
+    manifest = json.loads((made / "manifest.json").read_text())
+    assert manifest["counts"]["kept"] == 2
+    assert len([entry for entry in manifest["outputs"] if entry["path"].endswith(".png")]) == 5
 
 
 def test_the_tables_are_those_of_the_raw_records(made):
@@ -129,6 +131,13 @@ def test_without_ompl_a_line_names_the_extra_and_the_others_fly(inputs, tmp_path
     assert [r.message for r in caplog.records if "ompl" in r.message] == [
         'OMPL is not installed, so prm, rrt_star are left out: pip install "cosfly[ompl]"'
     ]
+
+
+def test_without_matplotlib_a_line_says_so_and_the_tables_are_made(made, monkeypatch, caplog):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    records = read_scenarios(made / "scenarios.jsonl")
+    assert benchmark._pictures(read_benchmark(made / "benchmark.json"), records, WORLDS["corner"][0]) == {}
+    assert "cosfly[ompl]" in caplog.text
 
 
 def test_a_damaged_record_is_named(made, tmp_path):

@@ -26,7 +26,7 @@ from cosfly.planners import compare
 from cosfly.planners.compare import AXES, FIGURES, INTERVAL_PERCENT, NUM_RESAMPLES, CompareConfig, TextTable
 from cosfly.planners.contract import ALL_PLANNERS, title_of
 from cosfly.planners.stage import check_ids, draw_styles_of
-from cosfly.products.boxes import read_boxes
+from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import read_paths
 from cosfly.reading.documents import FileFormat, model_lines, read_model
@@ -177,7 +177,14 @@ def run(
     found = Benchmark(**header, **summary)
     write_model(product, found, FORMAT)
     write_bytes(page, markdown(found).encode())
-    stage.finish([product, raw, page], done.tally, timings=compare.timings(done.kept, cfg.planners))
+    pictures = _pictures(found, lines, box_map)
+    for name, picture in pictures.items():
+        write_bytes(out / name, picture)
+    stage.finish(
+        [product, raw, page, *(out / name for name in pictures)],
+        done.tally,
+        timings=compare.timings(done.kept, cfg.planners),
+    )
     return product
 
 
@@ -188,6 +195,16 @@ def _without_missing(cfg: BenchmarkConfig) -> BenchmarkConfig:
         return cfg
     log.warning('OMPL is not installed, so %s are left out: pip install "cosfly[ompl]"', ", ".join(sampling))
     return cfg.model_copy(update={"planners": tuple(name for name in cfg.planners if name not in sampling)})
+
+
+def _pictures(found: Benchmark, records: list[ScenarioRecord], box_map: BoxMap) -> dict[str, bytes]:
+    """Draw the figures; none, with one line that says so, where matplotlib is not installed."""
+    if importlib.util.find_spec("matplotlib") is None:
+        log.warning('matplotlib is not installed, so there are no figures: pip install "cosfly[ompl]"')
+        return {}
+    from cosfly.planners.benchmark_figures import draw
+
+    return draw(found, records, box_map)
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------

@@ -1,0 +1,186 @@
+"""The figures of a benchmark, by matplotlib (extra `ompl`): axes as radar, bars and projections; deltas; flights in 3D.
+
+Target-aware planners have a color each, generic ones are gray, as in the paper.
+"""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+
+from cosfly.geometry import rotation_matrices
+from cosfly.planners.benchmark import PAPER, Benchmark, ScenarioRecord
+from cosfly.planners.compare import AXES, FIGURES, color_of
+from cosfly.planners.contract import PLANNERS, title_of
+from cosfly.products.boxes import BoxMap
+from cosfly.products.kinds import KINDS
+from cosfly.products.walks import TARGET_HEIGHT_M
+
+GRAY = "#9a9a9a"
+AXIS_TITLES = {axis: axis.replace("_", " ") for axis in AXES}
+FLIGHTS_SHOWN, ROOM_M, LEAST_M = (
+    4,
+    10.0,
+    5.0,
+)  # scenarios in 3D; how far round flights, and from which height, boxes are drawn
+NOT_DRAWN = [KINDS[name] for name in ("Roads", "Sidewalks", "Terrain", "Ground", "RoadLines", "Water")]
+FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
+SIGNS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+
+
+def draw(found: Benchmark, records: list[ScenarioRecord], box_map: BoxMap) -> dict[str, bytes]:
+    """Give the figures, name -> PNG; those of TA*+Smooth against MuCO only where both took part."""
+    pictures = {"axes_radar.png": _radar(found), "axes_bars.png": _bars(found), "axes_pairs.png": _pairs(found)}
+    if found.deltas:
+        pictures |= {"deltas.png": _deltas(found), "flights_3d.png": _flights(found, records, box_map)}
+    return pictures
+
+
+def _color(planner: str) -> Any:
+    return np.array(color_of(planner)) / 255.0 if planner in PLANNERS else GRAY
+
+
+def _primary(found: Benchmark) -> list[str]:
+    """Give the planners of the paper's table of axes, and ours."""
+    return [p for p in found.axes if p not in PAPER or PAPER[p].axes_mean is not None]
+
+
+def _figure(width: float, height: float) -> Any:
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), dpi=110, layout="constrained")
+
+
+def _png(figure: Any) -> bytes:
+    file = io.BytesIO()
+    figure.savefig(file, format="png", metadata={"Software": None})
+    return file.getvalue()
+
+
+def _radar(found: Benchmark) -> bytes:
+    figure = _figure(9.0, 7.0)
+    axes = figure.add_subplot(projection="polar")
+    angles = np.linspace(0.0, 2.0 * np.pi, len(AXES) + 1)
+    for number, planner in enumerate(reversed(_primary(found))):
+        row = found.axes[planner].scores
+        values, label = [row[axis] for axis in (*AXES, AXES[0])], f"{title_of(planner)}, mean {row['mean']:.3f}"
+        style = {"ls": "-", "lw": 2.5} if planner in PLANNERS else {"ls": ("--", ":", "-.")[number % 3], "lw": 1.2}
+        axes.plot(angles, values, color=_color(planner), label=label, **style)
+    axes.set_theta_offset(np.pi / 4.0)  # titles at the corners, where they have room
+    axes.set_xticks(angles[:-1], [AXIS_TITLES[axis] for axis in AXES])
+    axes.tick_params(pad=20)
+    axes.set_rlabel_position(45.0)
+    axes.set_ylim(0.0, 1.05)
+    axes.set_title("Four axes, higher is better")
+    figure.legend(loc="outside right upper", reverse=True, fontsize=9, handlelength=3.5)
+    return _png(figure)
+
+
+def _bars(found: Benchmark) -> bytes:
+    figure = _figure(13.0, 5.5)
+    axes, names = figure.add_subplot(), (*AXES, "mean")
+    places, width = np.arange(len(found.axes)), 0.8 / len(names)
+    shades = ("#3a6ea5", "#8fb8de", "#7fb069", "#e6aa68", "#303030")
+    for k, (name, shade) in enumerate(zip(names, shades, strict=True)):
+        values = np.array([row.scores[name] for row in found.axes.values()])
+        spans = np.array([row.intervals[name] for row in found.axes.values()])
+        whiskers = np.clip([values - spans[:, 0], spans[:, 1] - values], 0.0, None)
+        style = {"yerr": whiskers, "error_kw": {"lw": 0.8}, "color": shade, "label": name.replace("_", " ")}
+        axes.bar(places + (k - 2) * width, values, width, **style)
+    printed = [PAPER[p].axes_mean if p in PAPER else None for p in found.axes]
+    shown = [(k + 2 * width, value) for k, value in enumerate(printed) if value is not None]
+    if shown:
+        axes.plot(*zip(*shown, strict=True), "D", color="#d1495b", ms=5, label="mean in the paper")
+    axes.set_xticks(places, [title_of(planner) for planner in found.axes], rotation=35, ha="right")
+    axes.set_title("Four axes, with 95 % of what other scenarios would give")
+    figure.legend(loc="outside right upper")
+    return _png(figure)
+
+
+def _pairs(found: Benchmark) -> bytes:
+    figure = _figure(13.5, 8.0)
+    pairs = [(one, other) for k, one in enumerate(AXES) for other in AXES[k + 1 :]]
+    for place, (one, other) in enumerate(pairs, 1):
+        axes = figure.add_subplot(2, 3, place)
+        for planner, row in found.axes.items():
+            x, y = row.scores[one], row.scores[other]
+            is_named = planner in PLANNERS
+            label = title_of(planner) if is_named else None
+            axes.plot(x, y, "o", color=_color(planner), ms=8 if is_named else 5, label=label)
+        axes.set_xlabel(AXIS_TITLES[one])
+        axes.set_ylabel(AXIS_TITLES[other])
+        axes.margins(0.2)
+        axes.grid(alpha=0.3)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=len(PLANNERS))
+    figure.suptitle("The axes in pairs; gray: generic planners")
+    return _png(figure)
+
+
+def _deltas(found: Benchmark) -> bytes:
+    """Draw relative changes, so that right is always where TA*+Smooth is better."""
+    more_is_better = {"five_ray_mean", "clearance_min_m", "smoothness_score"}
+    shown = {"blocked_fraction", "length_m", "accel_rms_mps2", "jerk_rms_mps3"} | more_is_better
+    figure, rows = _figure(9.0, 4.5), []
+    for name, title, _ in reversed(FIGURES):
+        base = found.means["muco"][name]
+        if name in shown and base:
+            sign = 100.0 / base * (1.0 if name in more_is_better else -1.0)
+            ends = sorted(sign * end for end in found.delta_intervals[name])
+            words = title if name in more_is_better else f"less {title}"
+            rows.append((words, sign * (found.deltas[name]["delta"] or 0.0), ends))
+    axes = figure.add_subplot()
+    for place, (_, change, (low, high)) in enumerate(rows):
+        axes.barh(place, change, color=_color("track_astar") if change >= 0 else _color("muco"))
+        axes.plot([low, high], [place, place], color="black", lw=1.0)
+        axes.annotate(f"{change:+.1f} %", (max(change, high, 0.0), place), xytext=(6, -4), textcoords="offset points")
+    axes.axvline(0.0, color="black", lw=0.8)
+    axes.set_yticks(range(len(rows)), [words for words, _, _ in rows])
+    axes.margins(x=0.15)
+    axes.set_xlabel("relative to MuCO, %; to the right TA* + Smooth is better; lines: 95 %")
+    axes.set_title("TA* + Smooth against MuCO")
+    return _png(figure)
+
+
+def _flights(found: Benchmark, records: list[ScenarioRecord], box_map: BoxMap) -> bytes:
+    """Draw the scenarios where TA*+Smooth sees most more than MuCO."""
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    def gain(record: ScenarioRecord) -> float:
+        rows = [found.figures[planner][found.scenarios.index(record.id)] for planner in ("track_astar", "muco")]
+        return (rows[0] or {}).get("five_ray_mean", 0.0) - (rows[1] or {}).get("five_ray_mean", 0.0)
+
+    figure = _figure(14.0, 11.0)
+    for place, record in enumerate(sorted(records, key=gain, reverse=True)[:FLIGHTS_SHOWN], 1):
+        traces = record.traces()
+        points = np.concatenate([trace.positions_m for trace in traces.values()])
+        targets = next(iter(traces.values())).targets_m
+        low, high = np.minimum(points.min(axis=0), targets.min(axis=0)), points.max(axis=0)
+        axes = figure.add_subplot(2, 2, place, projection="3d")
+        near = (np.abs(box_map.centers - (low + high) / 2) <= (high - low) / 2 + ROOM_M)[:, :2].all(axis=1)
+        near &= ~np.isin(box_map.kinds, NOT_DRAWN) & (box_map.half_extents[:, 2] >= LEAST_M / 2.0)
+        turns = rotation_matrices(np.radians(box_map.rotations_deg[near]))
+        corners = (
+            np.einsum("kij,ksj->ksi", turns, SIGNS * box_map.half_extents[near][:, None])
+            + box_map.centers[near][:, None]
+        )
+        faces = corners[:, FACES, :].reshape(-1, 4, 3)
+        axes.add_collection3d(Poly3DCollection(faces, facecolor="#b9b9b9", edgecolor="#909090", lw=0.2, alpha=0.12))
+        for planner, trace in reversed(traces.items()):
+            is_ours = planner in PLANNERS
+            axes.plot(
+                *trace.positions_m.T,
+                color=_color(planner),
+                lw=2.2 if is_ours else 0.8,
+                label=title_of(planner) if is_ours else None,
+            )
+        axes.plot(*targets.T, "--", color="black", lw=1.5, label="walker")
+        low[2] = targets[:, 2].min() - TARGET_HEIGHT_M
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+        axes.set_box_aspect(high - low, zoom=1.15)
+        axes.locator_params(nbins=5)
+        axes.set_title(f"{record.id}: visibility {gain(record):+.3f}")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    figure.suptitle("Where TA* + Smooth sees most more than MuCO; gray: generic planners")
+    return _png(figure)
