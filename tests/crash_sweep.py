@@ -226,6 +226,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "study weather": ["study weather --map {maps} --traces {traces} --out {out} {tiny}"],
     "study zoom": ["study zoom {three} --out {out} --every 10"],
     "render sample": ["render sample --data {tree} --map {maps} --out {out}/sample.png"],
+    "viewer": ["viewer {simple} --out {out}/scene.html --paths {walks} --traces {traces} --data {tree}"],
     "gallery": ["gallery --data {tree} --out {out}"],
     "inspect": ["inspect --map {simple} --traces {traces} --data {tree} --out {out} {tiny}"],
     "inspect review": [

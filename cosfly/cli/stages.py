@@ -313,6 +313,31 @@ def gallery(
     typer.echo(out)
 
 
+@app.command("viewer")
+@takes()
+def viewer(
+    job: Job,
+    map_: MapArgument,
+    out: Annotated[Path, Option(help="The page.")],
+    paths: Annotated[Path | None, Option(help="Walks: path.json.")] = None,
+    traces: Annotated[
+        list[Path] | None, Option(help="Flights: drone_trace.json; repeat it for planners side by side.")
+    ] = None,
+    data: Annotated[Path | None, Option(help="Playback tree: both tracks and their frames.")] = None,
+    most_paths: Annotated[int, Option(min=1, help="Most paths on the page.")] = 100,
+    picture_px: Annotated[int, Option(min=32, max=1280, help="Width of a frame, px.")] = 320,
+    max_mb: Annotated[float, Option(min=1, help="Size of the page, MB: frames are left out to keep it.")] = 24.0,
+) -> None:
+    """Make one page that works offline: the map in 3D, walks and flights played back, matrix, frames, planners."""
+    from cosfly.look import scene_page
+
+    written = scene_page.run(
+        map_, out, paths=paths, traces=traces or [], data=data,
+        most_paths=most_paths, picture_px=picture_px, max_mb=max_mb,
+    )  # fmt: skip
+    typer.echo(f"{written}: {written.stat().st_size / 1e6:,.1f} MB")
+
+
 inspect_app = options.stage_group("Step 6: accept, route to review or reject every flight.")
 app.add_typer(inspect_app, name="inspect")
 

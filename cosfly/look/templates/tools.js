@@ -15,5 +15,9 @@ const words = (token) => String(token).replaceAll("_", " ");
 const byId = (id) => document.getElementById(id);
 const show = (id, ...children) => byId(id).replaceChildren(...children.filter((child) => child !== null));
 const pageData = () => JSON.parse(byId("data").textContent);
-const bytesOf = (base64) => Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
-const colorOf = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+function bytesOf(base64) {
+  const text = atob(base64), bytes = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i += 1) bytes[i] = text.charCodeAt(i);
+  return bytes;
+}
+const floatsOf = (base64) => new Float32Array(bytesOf(base64).buffer);  // little-endian, as every browser's machine

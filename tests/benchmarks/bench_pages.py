@@ -1,0 +1,78 @@
+"""How fast the pages are: the editor's and the viewer's, on a town of the paper's size, in a headless Chromium.
+
+`python tests/benchmarks/bench_pages.py`: a minute. WebGL is drawn by the processor there.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from browser import Page, browser
+
+from cosfly.look.scene_page import run as write_scene
+from cosfly.maps.synthetic import SyntheticConfig, load
+from cosfly.pedestrians.roi_editor import open_editor
+from cosfly.pedestrians.walkable import PedestriansConfig
+from cosfly.products.boxes import write_boxes
+from cosfly.simplify.passes import SimplifyConfig, simplify
+
+READY = "document.body.dataset.ready === 'yes'"
+TURNS = 3
+
+
+def opened_s(page: Page, address: Path | str) -> float:
+    """Give the least time until the page says that it is ready."""
+    times = []
+    for _ in range(TURNS):
+        start = time.perf_counter()
+        page.open(address)
+        page.wait(READY)
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def frames_per_s(page: Page, counter: str, button: str) -> float:
+    """Drag for a while and count what is drawn."""
+    before, start = page.run(counter), time.perf_counter()
+    for _ in range(4):
+        page.drag((700, 500), (400, 350), button, steps=60)
+    return (page.run(counter) - before) / (time.perf_counter() - start)
+
+
+def main() -> None:
+    box_map = load(SyntheticConfig(preset="town10"), 0)
+    with tempfile.TemporaryDirectory() as name:
+        root = Path(name)
+        write_boxes(root / "map.json", box_map)
+        write_boxes(root / "simple.json", simplify(box_map, SimplifyConfig()).box_map)
+        with browser(root / "profile") as page:
+            open_editor(root / "simple.json", PedestriansConfig(), root / "warm.json", 0, None).http.server_close()
+            start = time.perf_counter()
+            server = open_editor(root / "simple.json", PedestriansConfig(), root / "roi.json", 0, None)
+            listens_s = time.perf_counter() - start
+            threading.Thread(target=server.serve, daemon=True).start()
+            size = "{} x {}".format(*server.editor.bare.grid.size)
+            print(
+                f"editor, {size} cells of {len(server.editor.box_map):,} boxes: listens after {listens_s:.2f} s, ",
+                end="",
+            )
+            print(f"page after {opened_s(page, server.address):.2f} s, ", end="")
+            print(f"pans at {frames_per_s(page, 'window.editor.map.frames', 'right'):.0f} frames/s", flush=True)
+            server.http.shutdown()
+            start = time.perf_counter()
+            scene = write_scene(root / "map.json", root / "scene.html")
+            print(
+                f"viewer: written in {time.perf_counter() - start:.1f} s, {scene.stat().st_size / 1e6:.1f} MB, ", end=""
+            )
+            print(f"opens in {opened_s(page, scene):.2f} s, ", end="")
+            print(f"turns at {frames_per_s(page, 'window.scene.space.frames', 'left'):.0f} frames/s")
+
+
+if __name__ == "__main__":
+    main()
