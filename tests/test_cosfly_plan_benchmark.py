@@ -128,7 +128,7 @@ def test_without_ompl_a_line_names_the_extra_and_the_others_fly(inputs, tmp_path
     cfg = BenchmarkConfig(planners=("prm", "theta_star", "rrt_star"), scenarios=1)
     found = read_benchmark(benchmark.run(cfg, *inputs, tmp_path / "out"))
     assert list(found.means) == ["theta_star"]
-    assert [r.message for r in caplog.records if "ompl" in r.message] == [
+    assert [r.message for r in caplog.records if "OMPL" in r.message] == [
         'OMPL is not installed, so prm, rrt_star are left out: pip install "cosfly[ompl]"'
     ]
 
