@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from simulator_serving import as_client, command, free_port, serving
+from simulator_serving import as_client, command, free_port, listening, serving
 from test_renderers_contract import circling, street, write_inputs
 
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, RenderError
 from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.maps import carla_export
+from cosfly.maps.carla_export import CarlaMapConfig
 from cosfly.products.boxes import BoxMap, write_boxes
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.kinds import KINDS
 from cosfly.products.traces import DroneTrace
+from cosfly.products.weather import WeatherParams
 from cosfly.render.carla_backend import CarlaRenderConfig
 from cosfly.render.contract import PERSON_ID, PosedPerson
 from cosfly.render.settings import RenderConfig
@@ -245,3 +251,81 @@ def test_settings_and_maps_that_cannot_be_are_told(tmp_path):
 
 def _open(box_map: BoxMap, port: int) -> None:
     open_renderer("carla", box_map, 160, 90, settings=build(CarlaRenderConfig, {"port": port, **QUICK}, "test"))
+
+
+def _in_weather(port: int) -> tuple:
+    """A picture in a night of rain by CARLA and by the embedded renderer, one in the found weather, and knobs read
+    back."""
+    import carla
+
+    settings, found = build(CarlaRenderConfig, {"port": port, **QUICK}, "test"), street()
+    pose = world_from_camera(np.array([-1.0, -9.5, 5.5]), np.array([-22.5, 60.0, 0.0]))
+    pictures = []
+    for own in ({"settings": settings}, {}):
+        renderer = open_renderer("carla" if own else "gl", found, 160, 90, **own)
+        for weather in (RAINY_NIGHT, None):
+            renderer.prepare(*found.bounds(), weather)
+            pictures.append(renderer.render(pose, intrinsic_matrix(160, 90, 60.0), None).rgb.astype(float))
+            if own and weather:
+                told = carla.Client("127.0.0.1", port).get_world().get_weather()
+        renderer.close()
+    return pictures, {name: getattr(told, name) for name in RAINY_NIGHT.model_dump()}
+
+
+RAINY_NIGHT = WeatherParams(
+    cloudiness=90.0, precipitation=60.0, fog_density=35.0, fog_distance=8.0, sun_azimuth_angle=30.0,
+    sun_altitude_angle=-40.0,
+)  # fmt: skip
+
+
+def test_weather_goes_over_the_wire_and_back(tmp_path):
+    with serving(street(), tmp_path) as port:
+        (rainy, fair, same, their_fair), told = as_client(_in_weather, port)
+        assert as_client(found_settings, port) == (False, 0, 5.0)
+    assert told == RAINY_NIGHT.model_dump()
+    assert fair.mean() > rainy.mean() + 30.0
+    assert np.abs(rainy - same).mean() < 2.0
+    assert np.abs(fair - their_fair).mean() < 2.0
+
+
+_WORKER = """
+import sys, time, numpy as np, test_render_carla as t
+from cosfly.geometry import intrinsic_matrix, world_from_camera
+settings = t.build(t.CarlaRenderConfig, {"port": int(sys.argv[1]), **t.QUICK}, "test")
+renderer = t.open_renderer("carla", t.street(), 160, 90, settings=settings)
+renderer.prepare(*t.street().bounds(), t.RAINY_NIGHT)
+person = t.PosedPerson(np.array([4.0, -3.0, 0.9]), 0.0, 0.0, 1.0, t.clothes_of("walker.pedestrian.0001"))
+pose = world_from_camera(np.array([-1.0, -9.5, 5.5]), np.array([-22.5, 60.0, 0.0]))
+renderer.render(pose, intrinsic_matrix(160, 90, 60.0), person)
+print("drawn", flush=True)
+time.sleep(600)
+"""
+
+
+def test_a_killed_client_leaves_the_world_as_it_was_found(tmp_path):
+    with serving(street(), tmp_path) as port:
+        words = [sys.executable, "-c", _WORKER, str(port)]
+        worker = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parent)
+        assert worker.stdout is not None
+        assert worker.stdout.readline() == "drawn\n"
+        assert as_client(found_settings, port) == (True, 4, 90.0), "three cameras and a walker"
+        worker.kill()
+        worker.wait()
+        until_s = time.monotonic() + 30.0
+        while (found := as_client(found_settings, port)) != (False, 0, 5.0) and time.monotonic() < until_s:
+            time.sleep(0.5)
+    assert found == (False, 0, 5.0)
+
+
+def test_a_server_of_another_version_is_refused_by_name(tmp_path):
+    write_boxes(tmp_path / "boxes_3d.json", street())
+    port = free_port()
+    old = "import sys; from cosfly.simulators.carla import server; server.CARLA_VERSION = '0.9.15'; "
+    words = command(tmp_path / "boxes_3d.json", port)
+    told = rf"127\.0\.0\.1:{port}: a CARLA server of another version; got 0\.9\.15; expected 0\.9\.16"
+    cfg = build(CarlaRenderConfig, {"port": port, **QUICK}, "test")
+    with listening([sys.executable, "-c", old + "from cosfly.cli import app; app()", *words[3:]]):
+        with pytest.raises(EnvironmentMissing, match=told):
+            open_renderer("carla", street(), 160, 90, settings=cfg)
+        with pytest.raises(EnvironmentMissing, match=told):
+            carla_export.load(CarlaMapConfig(port=port), 0)

@@ -142,7 +142,7 @@ class World:
         width, height = (int(camera.attributes[f"image_size_{axis}"]) for axis in "xy")
         fov_deg = float(camera.attributes["fov"])
         knobs = {name: float(self.weather[place]) for name, place in KNOBS.items()}
-        weather = None if self.weather == FAIR_WEATHER else WeatherParams(**knobs)
+        weather = None if np.allclose(self.weather, FAIR_WEATHER) else WeatherParams(**knobs)  # single precision
         frame = self._scene.draw((width, height), fov_deg, camera.pose, self.movers(), weather)
         match CAMERAS[camera.model]:
             case 1:
