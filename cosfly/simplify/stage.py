@@ -10,7 +10,7 @@ import numpy as np
 from cosfly.errors import InputError
 from cosfly.look.topview import TopView, add_caption, draw_map, png_bytes
 from cosfly.products.boxes import BoxMap, read_boxes, write_boxes
-from cosfly.products.kinds import SURFACE_KINDS
+from cosfly.products.kinds import KINDS, SURFACE_KINDS
 from cosfly.reading.documents import FileFormat
 from cosfly.simplify.passes import Simplification, SimplifyConfig, simplify
 from cosfly.space.grid import blocks_walking, compare, connected_parts, empty_grid, inflate, occupancy
@@ -33,12 +33,24 @@ def cross_validate(raw: BoxMap, simplified: BoxMap) -> dict:
     before, after = (occupancy(m, like=grid) for m in (raw, simplified))
     cell_agreement, iou = compare(before, after)
     facts: dict = {"cells": list(grid.size), "cell_agreement": round(cell_agreement, 4), "iou": round(iou, 4)}
+    facts["agreement"] = _cell_by_cell(before.occupied, after.occupied)
+    for kind in ("Vegetation", "Buildings"):
+        under = [occupancy(m.select(m.kinds == KINDS[kind]), like=grid).occupied for m in (raw, simplified)]
+        differ = (before.occupied != after.occupied) & (under[0] | under[1])
+        facts["agreement"][f"differ_under_{kind}"] = int(differ.sum())
     for name, occupied in (("raw", before), ("simplified", after)):
         _, sizes = connected_parts(~inflate(occupied, SAFETY_RADIUS_M).occupied, 8)
         cell_m2 = grid.resolution_m**2
         facts[f"{name}_walkable_m2"] = round(float(sizes.sum()) * cell_m2, 1)
         facts[f"{name}_largest_part_m2"] = round(float(sizes.max()) * cell_m2, 1)
     return facts
+
+
+def _cell_by_cell(before: np.ndarray, after: np.ndarray) -> dict[str, int]:
+    """Count cells by what they are before and after, (ny, nx) bool each."""
+    table = {"free_in_both": ~before & ~after, "occupied_in_both": before & after}
+    table |= {"raw_alone": before & ~after, "simplified_alone": after & ~before}
+    return {name: int(found.sum()) for name, found in table.items()}
 
 
 def report(raw: BoxMap, result: Simplification, cfg: SimplifyConfig) -> dict:
