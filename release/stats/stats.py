@@ -54,9 +54,6 @@ def run(dataset: Path, out: Path, *, pixels: int = 200) -> Path:
 STYLE = """
 .tables { columns: 560px 2; column-gap: 12px; } .tables .panel { break-inside: avoid; }
 .tables .wide { column-span: all; margin-top: 12px; } figure.first img { max-width: 100%; border-radius: 8px; }
-td.bar { width: 26%; min-width: 80px; } td.bar .stack { height: 11px; margin: 6px 0 0; }
-td.bar > i { display: block; height: 11px; margin-top: 6px; border-radius: 2px; min-width: 1px; }
-.k0 { --own: var(--good); } .k1 { --own: var(--bad); } .k2 { --own: var(--unread); }
 """
 
 
@@ -70,8 +67,7 @@ def page_html(
     """
     return page(
         "release/stats/page.html", title=", ".join(stats.runs) or stats.name, style=STYLE, stats=stats, tiles=tiles,
-        picture=picture, coverage=coverage_html(coverage), shown=shown, numeric_columns=_numeric_columns,
-        greatest=_greatest,
+        picture=picture, coverage=coverage_html(coverage), look=TABLE_LOOK,
     )  # fmt: skip
 
 
@@ -119,6 +115,9 @@ def shown(cell: Cell) -> str:
     if isinstance(cell, str):
         return cell
     return f"{cell:,}" if isinstance(cell, int) else f"{cell:,.4f}".rstrip("0").rstrip(".")
+
+
+TABLE_LOOK = {"shown": shown, "numeric_columns": _numeric_columns, "greatest": _greatest}  # of macros of tables.html
 
 
 def markdown(stats: Stats) -> str:
