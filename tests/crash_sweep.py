@@ -238,6 +238,8 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
         lambda place, out: copy_stage(place, out, "pedestrians", damaged="items.jsonl"),
         "pedestrians --map {simple} --out {out} {tiny} --set pedestrians.ground=paved --repair",
     ],
+    "study muco": ["study muco {simple} {walks} --out {out} {tiny}"],
+    "reproduce": ["reproduce {base} --out {out} --walks 1 --workers 1"],
     "study depth": ["study depth --data {tree} --out {out}"],
     "caption": ["caption --data {tree} --out {out} {tiny}"],
     "caption, limited": [

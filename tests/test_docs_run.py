@@ -82,6 +82,7 @@ SMALL = {
     "run quickstart --out runs/five": _set("pedestrians.num_paths=2"),
     "run runs/five --set": _set("pedestrians.num_paths=3"),
     "bench": ["--workers", "2"],
+    "reproduce": ["--walks", "1", "--workers", "1"],
     "caption reader-check": ["--limit", "12"],
     "distill train": _set(
         *("distill.train.max_steps=2", "distill.train.max_pixels=4096", "distill.train.samples_per_step=2"),

@@ -1,0 +1,346 @@
+"""`cosfly reproduce`: the paper's tables and figures from one run, each beside the paper's own, on one page.
+
+What the run recorded is read from its stages. What it has not is measured anew in folders of their own below `out`:
+planners, TA*'s beam, MuCO's weights and zoom are stages that go on after a kill; depth, weather and single pictures are
+done again. `paper.yaml` says where each figure stands, what the paper's is, why they differ, and what is left out.
+"""
+
+from __future__ import annotations
+
+import base64
+import logging
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from pydantic import BaseModel, Field
+
+import cosfly
+import cosfly.pedestrians.stage
+from cosfly.app import bench as benchmark
+from cosfly.app.failure_case import failure_case
+from cosfly.app.runs import look
+from cosfly.app.settings import RunConfig, manner_of_work
+from cosfly.errors import InputError
+from cosfly.look.frame_views import small_jpeg
+from cosfly.look.gallery import four_panels
+from cosfly.look.page import page, run_name
+from cosfly.planners import compare
+from cosfly.products.boxes import read_boxes
+from cosfly.products.captions import FIELDS, read_captions
+from cosfly.products.segments import FOLLOW
+from cosfly.reading.arrays import read_picture
+from cosfly.reading.documents import FileFormat, read_model, read_object
+from cosfly.reading.files import read_bytes
+from cosfly.studies import depth, variants, weather, zoom
+from cosfly.work.config import build, read_yaml
+from cosfly.work.journal import Journal
+from cosfly.work.stage_events import read_events
+from cosfly.work.stage_folder import Resume, read_manifest
+from cosfly.work.store import write_bytes, write_json
+from distill.prepare.dual_track import windows_of
+from release.stats.stats import TABLE_LOOK
+from release.stats.stats import run as release_stats
+from release.stats.tables import Cell, Rows, Table
+
+log = logging.getLogger(__name__)
+
+FORMAT = FileFormat("cosfly.reproduction", "1.0")
+STAGES = ("maps", "simplify", "pedestrians", "plan")  # of a run without which nothing can be told
+PLANNERS = ("track_astar", "muco", "foresight")  # the first is held against the others, as in the paper
+BEAMS = (64, 256, 512, 1024, 2048, 4096)
+LENSES_DEG = (120, 110, 90, 70, 60, 45, 30)  # tab:zoom_conversion
+ZOOM = {"fovs_deg": (110, 90, 60, 30), "every": 12, "modalities": ("rgb", "depth", "instance")}
+WIDTH_PX = 1100  # of pictures on the page
+STYLE = """
+.pair { display: flex; flex-wrap: wrap; gap: 12px 34px; align-items: flex-start; }
+.pair img { flex: 1 1 420px; min-width: 0; max-width: min(100%, 860px); border-radius: 4px; }
+.panel h2 { margin-top: 2px; } #muco_visibility img { max-width: 100%; }
+"""
+# Of `cosfly release stats` the tables that name one of the paper; the others are told of plans here.
+OF_RELEASE = ("release", "decisions", "confusion", "repairs", "text_lengths", "fovs", "weather")
+
+
+class Part(Table):
+    """A table of the paper as this run gives it; `paper`: its labels. picture: JPEG in base64, on the page alone."""
+
+    source: Literal["recorded", "measured anew"] = "recorded"
+    picture: str | None = Field(None, exclude=True)
+
+
+class Printed(BaseModel):
+    """A table of `paper.yaml`. here: row -> place of its figures, or what `from` wants; "*": all rows of a place."""
+
+    title: str
+    head: str
+    here: dict[str, str]
+    why: str = ""
+    paper: dict[str, Any] = {}
+    also: str = ""
+    picture: str | None = None
+    place: str = Field("{}", alias="from")
+
+
+class Paper(BaseModel):
+    """`paper.yaml`. settings: label -> setting -> value; left_out: labels -> why."""
+
+    settings: dict[str, dict[str, Any]]
+    tables: dict[str, Printed]
+    left_out: dict[str, str]
+
+
+class _Absent(Exception):
+    """A file that a table is made of is not there."""
+
+
+def run(
+    cfg: RunConfig, folder: Path, out: Path, *, walks: int = 20, beside: Sequence[Path] = (), resume: Resume
+) -> Path:
+    """Reads a run folder, writes `reproduction.html` and `reproduction.json`, and what it measures; gives the page.
+
+    Args:
+        walks: how many planners are measured on. beside: folders of `cosfly bench` and `cosfly plan benchmark`.
+    Raises:
+        InputError: it is no run folder, one of several towns, or one that has no flights yet.
+    """
+    done = [stage.name for stage in look(folder).stages if stage.state == "complete"]
+    if missing := [name for name in STAGES if name not in done]:
+        fix = f"one town at a time: {folder}/{next(iter(cfg.towns))}" if cfg.towns else f"cosfly run {folder}"
+        raise InputError(
+            "the run has not come to its flights", where=folder, got=f"no {', no '.join(missing)}", fix=fix
+        )
+    paper = Path(__file__).with_name("paper.yaml")
+    printed = build(Paper, read_yaml(paper), paper)
+    made = measure(cfg, folder, out, walks, done, {**manner_of_work(cfg), "resume": resume})
+    places = Places([*beside, folder, out], made)
+    made |= work(cfg, folder, places, done)
+    parts, left_out = [settings(cfg, printed)], dict(printed.left_out)
+    for label, table in printed.tables.items():
+        try:
+            parts.append(part(label, table, places, folder))
+        except _Absent as absent:
+            left_out[f"{label}, {table.also}".strip(", ")] = f"this run has no {absent}"
+    if "release" in done:
+        tables = read_object(out / "release/stats.json", what="statistics")["tables"]
+        parts += [Part(**one) for one in tables if one["key"] in OF_RELEASE]
+    name, machine = run_name(folder / "plan"), f"cosfly {cosfly.__version__}, {len(os.sched_getaffinity(0))} cores"
+    told = {"run": name, "made_by": machine, "walks": walks, "left_out": left_out}
+    listed = [one.model_dump(mode="json") for one in parts]
+    write_json(out / "reproduction.json", {**FORMAT.header, **told, "parts": listed})
+    text = page("cosfly/app/reproduce.html", title=name, style=STYLE, told=told, parts=parts, look=TABLE_LOOK)
+    write_bytes(out / "reproduction.html", text.encode())
+    return out / "reproduction.html"
+
+
+# --- where figures stand ----------------------------------------------------------------------------------------------
+
+FUNCTIONS: dict[str, Callable[[Any], Any]] = {
+    "mean": lambda values: float(np.mean(values)), "std": lambda values: float(np.std(values)), "min": min, "max": max,
+    "p50": lambda values: float(np.percentile(values, 50)), "p95": lambda values: float(np.percentile(values, 95)),
+    "count": len,
+    "peak": lambda probes: max(sum(one.values()) for one in probes),  # memory of all workers
+    "shares": lambda counts: {name: 100.0 * count / sum(counts.values()) for name, count in counts.items()},
+}  # fmt: skip
+
+
+@dataclass
+class Places:
+    """Reads figures by their places. roots: folders in which files are looked for, in order; made: `work`."""
+
+    roots: Sequence[Path]
+    made: dict[str, Any]
+    _read: dict[str, Any] = field(default_factory=dict)
+
+    def file(self, name: str) -> Path:
+        found = next((root / name for root in self.roots if (root / name).is_file()), None)
+        if found is None:
+            raise _Absent(name)
+        return found
+
+    def figures(self, place: str) -> list[Any]:
+        """Give the figures of a place of `paper.yaml`; None where a part of one is not there.
+
+        Raises:
+            _Absent: the file is not there. InputError: it does not hold what it should.
+        """
+        found = list[Any]()
+        for one in place.split(" + "):
+            path, _, functions = one.partition("|")
+            name, _, keys = path.partition(":")
+            *way, last = keys.split(".")
+            try:
+                values = [_at(self._document(name), [*way, key]) for key in last.split(",")]
+                found += (
+                    [FUNCTIONS[f](v) if v else None for v in values for f in functions.split(",")]
+                    if functions
+                    else values
+                )
+            except (TypeError, ValueError, AttributeError) as error:
+                raise InputError("not what a stage writes", where=f"{name}: {keys}", got=str(error)) from None
+        return found
+
+    def _document(self, name: str) -> Any:
+        if name not in self._read:
+            if name == "work":
+                self._read[name] = self.made
+            elif name.endswith(".jsonl"):
+                self._read[name] = list(Journal(self.file(name)).read())
+            else:
+                self._read[name] = read_object(self.file(name), what="report")
+        return self._read[name]
+
+
+def _at(value: Any, way: list[str]) -> Any:
+    """Follow keys; of a list a number, or an element's id or key, or * for all that have the rest."""
+    for k, key in enumerate(way):
+        if key == "*":
+            found = [_at(one, way[k + 1 :]) for one in (value.values() if isinstance(value, dict) else value)]
+            return [one for one in found if one is not None]
+        if isinstance(value, list):
+            by_id = {str(one.get("id", one.get("key"))): one for one in value if isinstance(one, dict)}
+            index = int(key) if key.lstrip("-").isdecimal() else None
+            value = by_id.get(key) if index is None else value[index] if -len(value) <= index < len(value) else None
+        else:
+            value = value.get(key) if isinstance(value, dict) else None
+    return value
+
+
+def part(label: str, printed: Printed, places: Places, run: Path) -> Part:
+    """Make a table of the paper: our figures, the paper's beside or below them."""
+    files, ours = set[str](), dict[str, list[Any]]()
+    for name, row in printed.here.items():
+        place = row if ":" in row else printed.place.format(row)
+        files |= {one.partition(":")[0] for one in place.split(" + ")} - {"work"}
+        found = places.figures(place)
+        ours |= {key: _values(row) for key, row in (found[0] or {}).items()} if name == "*" else {name: found}
+    names, rows, theirs = printed.head.split("|"), Rows(), {name: _values(row) for name, row in printed.paper.items()}
+    is_beside = names[1] == "here"  # ours is one column, the paper's stand beside it; else the paper's rows stand below
+    for name in dict.fromkeys([*ours, *theirs]):
+        here, paper = ([*map(_cell, found.get(name, [])), *[None] * len(names)] for found in (ours, theirs))
+        if is_beside:
+            rows.append([name, here[0], *paper[: len(names) - 2]])
+            continue
+        width = len(names) - 1
+        rows += [[name, *(["here"] if theirs else []), *here[:width]]] if name in ours else []
+        rows += [["" if name in ours else name, "paper", *paper[:width]]] if name in theirs else []
+    if theirs and not is_beside:
+        names.insert(1, "")
+    if printed.picture:
+        files.add(printed.picture)
+    is_recorded = all((run / file).is_file() for file in files)
+    said = printed.why if theirs else printed.why[:1].upper() + printed.why[1:]
+    why = f"{'Differs: ' * bool(theirs)}{said}. " if said else ""
+    return Part(
+        key=label, title=printed.title, head=names, rows=rows, paper=", ".join(filter(None, (label, printed.also))),
+        note=why + (f"From {', '.join(sorted(files))}." if files else ""),
+        source="recorded" if is_recorded else "measured anew",
+        picture=_jpeg(places.file(printed.picture)) if printed.picture else None,
+    )  # fmt: skip
+
+
+def _values(row: Any) -> list[Any]:
+    return list(row.values()) if isinstance(row, dict) else row if isinstance(row, list) else [row]
+
+
+def _cell(value: Any) -> Cell:
+    """Give what a cell shows: numbers and words as they are, counts by a word and lists as words."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in value.items()) or "none"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(str, value))
+    if isinstance(value, float):
+        return round(value, 1) if abs(value) >= 1000.0 else float(f"{value:.4g}")
+    return value
+
+
+def _jpeg(path: Path) -> str:
+    if path.suffix == ".jpg":
+        return base64.b64encode(read_bytes(path)).decode("ascii")
+    picture = cv2.cvtColor(read_picture(path), cv2.COLOR_BGR2RGB)
+    return small_jpeg(picture, min(WIDTH_PX, picture.shape[1]))
+
+
+def settings(cfg: RunConfig, printed: Paper) -> Part:
+    """Set the settings of the run beside what the paper prints."""
+    data, rows = cfg.model_dump(mode="json"), Rows()
+    for label, wanted in printed.settings.items():
+        for name, theirs in wanted.items():
+            own = _at(data, name.split("."))
+            rows.append([name, str(_cell(own)), str(_cell(theirs)), "" if own == theirs else "other", label])
+    note = (
+        "What the paper prints for its own planner, its trunks and its SimWorld runs are settings here, not defaults."
+    )
+    head, labels = ["setting", "here", "paper", "", "label"], ", ".join(printed.settings)
+    return Part(key="settings", title="Settings", head=head, rows=rows, paper=labels, note=note)
+
+
+# --- what is measured anew --------------------------------------------------------------------------------------------
+
+
+def measure(
+    cfg: RunConfig, run: Path, out: Path, num_walks: int, done: Sequence[str], manner: dict[str, Any]
+) -> dict[str, Any]:
+    """Do what the run has not recorded, in folders of their own below `out`; give what of it stands in no file.
+
+    Planners fly the paper's wish, whatever styles the run has, on walks that are drawn on its map by its settings: its
+    own are the first of them.
+    """
+    boxes, simplified = run / "maps/boxes_3d.json", run / "simplify/step2_simplified.json"
+    traces, tree, how = run / "plan/drone_trace.json", run / "render", {"seed": cfg.seed, **manner}
+    walking = cfg.pedestrians.model_copy(update={"num_paths": num_walks, "others": 0, "traffic": 0, "look_alikes": 0})
+    paths = cosfly.pedestrians.stage.run(walking, simplified, out / "walks", roi=cfg.roi, **how)
+    plan = cfg.plan.model_copy(update={"styles": {FOLLOW: 1.0}})
+    compared = build(compare.CompareConfig, plan.model_dump() | {"planners": PLANNERS}, "planners")
+    compare.run(compared, simplified, paths, out / "compare", **how)
+    variants.run(variants.beam_study(plan, BEAMS), simplified, paths, out / "beam", **how)
+    variants.run(variants.weight_study(plan), simplified, paths, out / "muco", **how)
+    if "release" in done:
+        release_stats(run / "release/dataset", out / "release", pixels=0)
+    if "render" not in done:
+        return {}
+    log.info("reproduce: pictures")
+    frame = four_panels(tree, out / "sample.png", box_map=read_boxes(boxes))
+    depth.run(tree / frame, out / "depth")
+    weather.run(cfg.render, boxes, traces, out / "weather", seed=cfg.seed)
+    lenses = build(zoom.ZoomStudyConfig, cfg.render.model_dump() | ZOOM, "zoom")
+    zoom.run(lenses, boxes, simplified, traces, out / "zoom", **how)
+    return {"sample": frame, "failure": failure_case(run, out / "failure.png")}
+
+
+def work(cfg: RunConfig, run: Path, places: Places, done: Sequence[str]) -> dict[str, Any]:
+    """Give `work`: what is put together of several files, or of none."""
+    manifests = {name: read_manifest(run / name) for name in benchmark.STAGES if name in done}
+    watched = benchmark.stage_rows(run, benchmark.STAGES)
+    lens = build(zoom.ZoomStudyConfig, {"width_px": 1280, "height_px": 720}, "lenses")
+    lenses = {str(fov): zoom.camera_of(lens, fov) for fov in LENSES_DEG}
+    points = places.figures("plan/drone_trace.json:traces.*.metrics.num_points")[0]
+    found: dict[str, Any] = {
+        "budget": {name: [m.seconds, m.counts.input, m.seconds / m.counts.input] for name, m in manifests.items()},
+        "watchdog": {row.stage: [row.launches, row.restarts, row.seconds, row.modes] for row in watched},
+        "lenses": {fov: [one.focal_px, one.focal_35mm_mm] for fov, one in lenses.items()},
+        "samples": [len(windows_of(count, cfg.distill.dual_track)) for count in points],
+    }
+    if "render" in manifests:
+        events = read_events(run / "render")
+        workers = max((event.workers or 1 for event in events if event.event == "began"), default=1)
+        rows = [benchmark.row_of(events, manifests["render"], workers, counts_frames=True)]
+        if any((root / "bench.json").is_file() for root in places.roots):
+            rows = read_model(places.file("bench.json"), benchmark.Bench, benchmark.FORMAT).rows
+        found["rendering"] = {
+            f"{one.workers} workers": [
+                one.seconds, one.attempted, one.successful, one.per_s, one.per_s / rows[0].per_s, one.cores_used,
+                one.peak_memory_mib, one.restarts, one.failed,
+            ]
+            for one in rows
+        }  # fmt: skip
+    captions = read_captions(run / "caption/captions.jsonl") if {"caption", "render"} <= {*done} else iter(())
+    if kept := [one for one in captions if one.en and one.zh and one.status == "accepted"]:
+        *_, trajectory, _, _, name = places.made["sample"].split("/")
+        near = min(kept, key=lambda c: (c.trajectory != trajectory, abs(c.frame_index - int(name.rpartition("_")[2]))))
+        texts = {name: [getattr(near.en, name), getattr(near.zh, name)] for name in FIELDS}
+        found["caption"] = {"sample id": [near.sample_id], **texts}
+    return found
