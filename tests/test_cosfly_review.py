@@ -19,7 +19,7 @@ from cosfly.inspection import review
 from cosfly.inspection.report import cards, report_html
 from cosfly.inspection.stage import run
 from cosfly.inspection.view import PLOTS, draw_plan, in_question
-from cosfly.products.flights import find_flights
+from cosfly.products.flights import find_flights, read_tracks_beside
 from cosfly.products.inspection import read_inspection
 from cosfly.products.issues import Issue
 from cosfly.products.playback import read_flight
@@ -223,6 +223,38 @@ def test_what_the_page_saves_is_what_the_command_takes(product):
 
 
 @pytest.mark.slow
+def test_a_flight_is_decided_by_a_key(product):
+    """J and K go, A and R decide: the first time a reason is asked for, then the last one of its kind is taken."""
+    flights = folders_of(product)
+    with browser(product.parent / "profile") as page:
+        page.open(review.write_page(product))
+        here = lambda: page.run("document.querySelector('.here .choice').dataset.folder")  # noqa: E731
+        assert here() == flights[0]
+        page.press("a")
+        page.send("Input.insertText", text="steady")
+        page.press("Enter")
+        assert here() == flights[1]
+        page.press("j")
+        page.press("k")
+        page.press("a")
+        assert here() == flights[2], "the last reason is taken, and the next flight shown"
+        page.press("r")
+        page.send("Input.insertText", text="a jump")
+        page.press("Enter")
+        page.press("r")
+        page.press("u")
+        page.press("s")
+        assert "who decides" in page.run("document.getElementById('state').textContent")
+        page.run("document.getElementById('by').value = 'Eve'; document.activeElement.blur()")
+        page.press("s")
+        form = json.loads(page.run("document.getElementById('text').value"))
+        assert not page.said
+    assert [(one["folder"], one["verdict"], one["reason"]) for one in form["choices"]] == [
+        (flights[0], "accepted", "steady"), (flights[1], "accepted", "steady"), (flights[2], "rejected", "a jump"),
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
 def test_the_pages_do_not_scroll_sideways(product):
     """Neither on a desk nor on a phone, with every flight open."""
     pages = (product.with_name("report.html"), review.write_page(product))
@@ -278,5 +310,6 @@ def test_the_map_shows_both_ways(inspected):
     """Of a flight whose person nobody knows, the drone's alone."""
     flight = read_flight(first_flight(inspected.parent.parent))
     both = draw_plan(flight, None)
+    assert draw_plan(flight, None, read_tracks_beside(flight)) != both, "and the other track of the trajectory"
     flight.targets_m[:] = np.nan
     assert draw_plan(flight, None) != both

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.inspection.view import PLOTS, FlightView
+from cosfly.inspection.view import PLOTS, FlightView, in_question
 from cosfly.look.coverage_page import coverage_html
 from cosfly.look.page import fragment, page
 from cosfly.products.inspection import RESULTS, FlightInspection, Inspection
@@ -97,6 +97,7 @@ def _card(flight: FlightInspection, view: FlightView | None, decisions: Mapping[
     plots = [] if view is None else [plot for name in PLOTS if (plot := _plot(name, view)) is not None]
     return fragment(
         "cosfly/inspection/card.html", flight=flight, columns=COLUMNS, issues=issues, view=view, plots=plots,
+        asked=in_question(flight.issues, int(flight.metrics.get("num_frames") or 0)),
         is_queue=decisions is not None, decision=(decisions or {}).get(flight.folder),
     )  # fmt: skip
 

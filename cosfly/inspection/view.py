@@ -12,6 +12,7 @@ from pydantic import BaseModel, Field, FiniteFloat, model_validator
 from cosfly.look.frame_views import small_jpeg, thumbnail
 from cosfly.look.topview import INK, PAPER, TopView, draw_dot, draw_line, draw_map, draw_text
 from cosfly.products.boxes import BoxMap
+from cosfly.products.flights import read_tracks_beside
 from cosfly.products.issues import Issue, sort_key
 from cosfly.products.playback import Flight
 from cosfly.space.flight_metrics import CLEARANCE_CAP_M
@@ -28,7 +29,7 @@ PLOTS: dict[str, tuple[str, str, tuple[float | None, float | None]]] = {
 OF_FRAME = re.compile(r"(?:frame_|points\[|frame )(\d+)")  # in the place of a finding
 BETWEEN_FRAMES = ("temporal_jump", "frozen_frame", "teleport")
 PLAN_PX, MARGIN_M = 300, 12.0
-DRONE, PERSON = (35, 100, 220), (235, 120, 20)  # RGB
+DRONE, PERSON, BESIDE = (35, 100, 220), (235, 120, 20), (150, 80, 190)  # RGB
 JPEG = Annotated[str, Field(pattern=r"^[A-Za-z0-9+/=]*$")]
 
 
@@ -80,7 +81,7 @@ def draw_flight(
         time_s=[round(float(at_s), 2) for at_s in flight.time_s[rows]],
         curves={name: _numbers(values[rows]) for name, values in curves.items() if values is not None},
         pictures=[thumbnail(flight.frame_folder(i), width_px) for i in chosen],
-        plan=draw_plan(flight, box_map),
+        plan=draw_plan(flight, box_map, read_tracks_beside(flight)),
         frames=chosen,
     )
 
@@ -99,10 +100,15 @@ def _numbers(values: np.ndarray) -> list[float | None]:
     return [round(float(value), 3) if np.isfinite(value) else None for value in values]
 
 
-def draw_plan(flight: Flight, box_map: BoxMap | None) -> str:
-    """Draw the ways of drone and person on the map from above, or on paper where there is none; a JPEG in base64."""
+def draw_plan(flight: Flight, box_map: BoxMap | None, beside: Sequence[Flight] = ()) -> str:
+    """Draw the ways of drone and person on the map from above, or on paper where there is none; a JPEG in base64.
+
+    Args:
+        beside: the other tracks of the trajectory.
+    """
     person_m = flight.targets_m[~np.isnan(flight.targets_m).any(axis=1)]
-    view = TopView.around(np.concatenate([flight.positions_m, person_m]), PLAN_PX, MARGIN_M)
+    others_m = [other.positions_m for other in beside]
+    view = TopView.around(np.concatenate([flight.positions_m, person_m, *others_m]), PLAN_PX, MARGIN_M)
     if box_map is None:
         picture = np.full((*view.size_px[::-1], 3), PAPER, dtype=np.uint8)
     else:
@@ -116,6 +122,8 @@ def draw_plan(flight: Flight, box_map: BoxMap | None) -> str:
             draw_line(picture, places, color, 2, halo=4)
             draw_dot(picture, places[0], 5, color)
             draw_dot(picture, places[-1], 5, color, 2)
+    for points_m in others_m:
+        draw_line(picture, view.pixels(points_m), BESIDE)
     _draw_scale(picture, view)
     return small_jpeg(picture, picture.shape[1])
 

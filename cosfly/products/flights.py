@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from collections.abc import Sequence
@@ -91,6 +92,16 @@ def read_twin(flight: Flight) -> Flight | None:
     if len(twin) != len(flight) or np.abs(twin.time_s - flight.time_s).max() >= TWIN_TOLERANCE_S:
         raise _no_twin(flight, twin)
     return twin
+
+
+def read_tracks_beside(flight: Flight) -> list[Flight]:
+    """Read the other flights of a trajectory, of the same walk; those that cannot be read are left out."""
+    found = list[Flight]()
+    if flight.folder is not None:
+        for path in sorted(flight.folder.parent.glob("[!.]*/trajectory.json")):
+            with contextlib.suppress(InputError):
+                found += [read_flight(path.parent, strict=False)] if path.parent != flight.folder else []
+    return found
 
 
 def _no_twin(flight: Flight, other: Flight) -> VerifyError:
