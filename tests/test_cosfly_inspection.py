@@ -21,7 +21,7 @@ from cosfly.inspection import frames
 from cosfly.inspection.files import check_recorded
 from cosfly.inspection.flight import check_motion, check_plan, check_poses, is_shifted
 from cosfly.inspection.frames import Jumps, check_others, choose_frames, others_told, pedestrian_region, pixels_iou
-from cosfly.inspection.pixels import unpack
+from cosfly.inspection.pixels import Picture, look_at, unpack
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
 from cosfly.products.boxes import make_box_map, read_boxes, write_boxes
@@ -39,7 +39,7 @@ from cosfly.products.frames import (
 from cosfly.products.inspection import read_inspection
 from cosfly.products.issues import Issue, Report
 from cosfly.products.kinds import KINDS
-from cosfly.products.playback import read_flight
+from cosfly.products.playback import read_flight, write_flight
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
@@ -303,6 +303,19 @@ def test_a_post_between_two_poses_is_a_collision(workplace):
     assert findings(workplace, InspectConfig(clearance_min_m=0.0))["ORI"]["collision"] == "error"
 
 
+@pytest.mark.parametrize(("up_m", "is_hit"), [(0.0, False), (3.0, True)])
+def test_the_way_between_frames_is_the_one_that_was_flown(workplace, up_m, is_hit):
+    """Of a flight whose drawn frames leave poses out, which lie 3 m over the straight line from frame to frame."""
+    folder = first_flight(workplace)
+    flight = read_flight(folder)
+    middles = 0.5 * (flight.planned[0] + np.roll(flight.planned[0], -1, axis=0)) + [0.0, 0.0, 3.0, 0.0, 0.0, 0.0]
+    write_flight(folder, replace(flight, between=middles[:, None]))
+    i = int(np.argmax(np.linalg.norm(np.diff(flight.positions_m, axis=0), axis=1)))
+    write_map(workplace, (middles[i, :3] + [0.0, 0.0, up_m - 3.0], [0.01, 0.01, 0.01]))
+    found = findings(workplace, InspectConfig(clearance_min_m=0.0, check_checksums=False))
+    assert ("collision" in found["ORI"]) == is_hit
+
+
 def test_what_hides_or_holds_the_person_is_found(workplace):
     flight = read_flight(first_flight(workplace))
     write_map(workplace, (flight.targets_m[4], [0.1, 0.1, 0.1]))
@@ -471,6 +484,16 @@ def let_fight(folder: Path) -> None:
         return image
 
     edit_image(folder / FRAME / "instance.png", change)
+
+
+@pytest.mark.parametrize(("number", "is_found"), [(0, False), (5, True)])
+def test_narrow_stripes_of_far_fields_do_not_fight(number, is_found):
+    """Beyond the map nothing has an id: fields are kinds that alternate. Of a thing of the map it is Z-fighting."""
+    instance = np.zeros((36, 64, 3), np.uint8)
+    instance[..., 0] = KINDS["Terrain"]
+    instance[::2] = (KINDS["Roads"], number, 0)
+    picture = Picture(instance * 9, np.full((36, 64), 20.0, np.float32), instance)
+    assert (look_at(picture, np.zeros(1 << 16, np.bool_), 0.9).fighting > 0.5) == is_found
 
 
 def at_upper_left(values: np.ndarray, metres: float) -> np.ndarray:

@@ -72,6 +72,18 @@ def test_points_come_out_in_a_picture_of_another_size():
     assert (found.agree, found.through, found.same) == (found.seen, 0, found.seen)
 
 
+def test_what_another_thing_hides_is_not_gone_and_what_comes_nearer_by_itself_is():
+    """From behind a corner a wall stands before what was seen; seen from the first place it lies outside or is hidden.
+    A wall that comes nearer without a camera that moves is before what the first picture shows."""
+    corner, street = building_at(6.0), building_at(20.0)
+    corner = View(corner.depth, corner.instance, np.eye(3), np.array([30.0, 0.0, 0.0]))
+    around = compare_views(View(street.depth, street.instance, np.eye(3), np.zeros(3)), corner, CAMERA)
+    assert around.hidden == around.seen > 500
+    assert around.gone == 0.0
+    assert compare_views(street, building_at(6.0), CAMERA).gone == 1.0
+    assert compare_views(building_at(6.0), street, CAMERA).gone == 1.0
+
+
 @pytest.mark.parametrize("num", [1, 2, 5, 8])
 def test_median(num):
     values = np.random.default_rng(num).normal(size=num).astype(np.float32)

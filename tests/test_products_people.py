@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cosfly.errors import InputError
-from cosfly.products.people import COLORS, Appearance, draw_appearance, look_alike
+from cosfly.products.people import COLORS, HAIR, Appearance, People, draw_appearance, look_alike
 
 
 def test_a_drawn_person_is_read_back_as_written():
@@ -12,6 +12,7 @@ def test_a_drawn_person_is_read_back_as_written():
     for _ in range(200):
         person = draw_appearance(rng)
         assert Appearance.from_json(person.as_json(), "here") == person
+        assert person.hat_color not in HAIR
 
 
 def test_a_look_alike_differs_in_one_thing():
@@ -22,6 +23,18 @@ def test_a_look_alike_differs_in_one_thing():
         assert len(person.differences(other)) == 1
         assert person.is_all_seen
         assert other.is_all_seen
+
+
+def test_the_most_alike_differs_least_the_greatest_id_of_several():
+    target = Appearance("man", "jacket", "red", "shorts", "blue")
+    one, two = (Appearance("man", "jacket", color, "shorts", color) for color in ("red", "green"))
+    people = People(
+        target, {9: two, 8: one, 7: one, 6: Appearance("woman", "coat", "pink", "trousers", "pink", "cap", "red")}
+    )
+    assert people.most_alike([9, 8, 7, 6]) == (8, 1)
+    assert people.most_alike([6, 9]) == (9, 2)
+    assert people.most_alike([6]) == (6, 4)
+    assert people.most_alike([]) == (None, None)
 
 
 @pytest.mark.parametrize(("field", "value"), [("top", "toga"), ("hat_color", "red"), ("figure", 3), ("bag", None)])

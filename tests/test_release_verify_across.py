@@ -154,7 +154,7 @@ def test_twins_stand_on_one_ground(tmp_path, off_m, num_frames, is_found):
 
 WHOLE = Agreement(
     seen=2000, agree=2000, hidden=0, through=0, same=2000, planes=1700, shifted=0, renamed=0, error=0.0,
-    error_flat=0.0, error_standing=0.0
+    error_flat=0.0, error_standing=0.0, seen_back=2000, through_back=0
 )  # fmt: skip
 
 
@@ -163,7 +163,8 @@ WHOLE = Agreement(
     [
         ({}, None), ({"renamed": 34}, "scene_instance"), ({"same": 1800}, "scene_instance"),
         ({"shifted": 20}, "scene_depth"),
-        ({"agree": 900, "same": 900}, "scene_depth"), ({"through": 60}, "scene_depth"),
+        ({"agree": 200, "hidden": 1800, "same": 200}, None), ({"through": 60}, "scene_depth"),
+        ({"through_back": 60}, "scene_depth"),
         ({"error": 0.001}, "scene_depth"),
         ({"error_flat": 0.0001, "error_standing": 0.001}, None),
     ],

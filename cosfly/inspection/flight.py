@@ -159,8 +159,14 @@ def check_surroundings(
     """
     from cosfly.space.kernels import signed_distances, swept_distances, visibility
 
-    clearances = swept_distances if flight.is_original else signed_distances
-    gaps_m = clearances(obstacles, flight.positions_m, CLEARANCE_CAP_M)[0]
+    gaps_m = signed_distances(obstacles, flight.positions_m, CLEARANCE_CAP_M)[0]
+    if flight.is_original:
+        way_m = flight.positions_m[:, None]
+        if flight.between is not None:  # what was not drawn was flown: no straight line from frame to frame
+            between_m = flight.between[..., :3]
+            way_m = np.concatenate([way_m, np.where(np.isnan(between_m), way_m, between_m)], axis=1)
+        swept_m = swept_distances(obstacles, way_m.reshape(-1, 3), CLEARANCE_CAP_M)[0]
+        gaps_m = swept_m.reshape(len(flight), -1).min(axis=1)
     metrics.update(clearance_min_m=float(gaps_m.min()))
     for i in np.flatnonzero((gaps_m < cfg.clearance_min_m - CLEARANCE_TOLERANCE_M) | (gaps_m <= 0)):
         code, where = "collision" if gaps_m[i] <= 0 else "clearance", f"trajectory.json: points[{i}].drone_pose"

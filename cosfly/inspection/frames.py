@@ -37,7 +37,7 @@ from cosfly.products.playback import Flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.reading.files import read_bytes
 from cosfly.space.flight_metrics import CLEARANCE_TOLERANCE_M
-from cosfly.space.reprojection import Agreement, View, compare_views
+from cosfly.space.reprojection import LEAST_SEEN, Agreement, View, compare_views
 from cosfly.work.runner import advance
 
 # --- jumps ------------------------------------------------------------------------------------------------------------
@@ -47,7 +47,6 @@ from cosfly.work.runner import advance
 
 
 NEAR_FRAMES = 2  # farther apart, more is hidden behind other things than is seen twice
-LEAST_SEEN = 150  # points, for a share of them to mean something
 USUAL_AGREE, ROUGH_ERROR = 0.8, 1e-3  # of the points; of planes, as a share of the depth
 
 
@@ -77,15 +76,9 @@ class Jumps:
         if not self.flight.is_ours and not self._is_one_world():
             return 0
         for i, pair in zip(self._frames, self._found, strict=True):
-            if pair.seen < LEAST_SEEN:
-                continue
-            gone, agree, where = pair.through / pair.seen, pair.agree / pair.seen, _depth_place(self.flight, i)
-            if gone > cfg.jump_gone_max:
-                got = f"{gone:.1%} of what the frame before shows is gone"
-                report.warn("temporal_jump", where, got, f"at most {cfg.jump_gone_max:.1%}")
-            elif agree < cfg.jump_agree_min:
-                got = f"{agree:.0%} of what the frame before shows is where the poses put it"
-                report.warn("temporal_jump", where, got, f"at least {cfg.jump_agree_min:.0%}")
+            if pair.gone > cfg.jump_gone_max:
+                got = f"{pair.gone:.1%} of what this frame or the one before shows is not there in the other"
+                report.warn("temporal_jump", _depth_place(self.flight, i), got, f"at most {cfg.jump_gone_max:.1%}")
         return len(self._found)
 
     def _is_one_world(self) -> bool:

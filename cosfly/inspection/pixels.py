@@ -200,6 +200,7 @@ def _look(colours, instance, depth, left_out):  # type: ignore[no-untyped-def]
                     and first1 - first2 <= SHORTEST_RUN_PX
                     and number != SHARED_ID
                     and id1 >> 8 != SHARED_ID
+                    and (code | id1) >> 8 != 0  # far fields are narrow stripes, all of them nobody's
                     and _is_plane(depth, y, first2 - 1, y, begin)
                     and _differs(colours, instance, y, first1 - 1, y, first1)
                     and _differs(colours, instance, y, begin - 1, y, begin)
@@ -221,6 +222,7 @@ def _look(colours, instance, depth, left_out):  # type: ignore[no-untyped-def]
                         and b - a <= SHORTEST_RUN_PX
                         and code >> 8 != SHARED_ID
                         and ids[0, x] >> 8 != SHARED_ID
+                        and (code | ids[0, x]) >> 8 != 0
                         and _is_plane(depth, a - 1, x, y, x)
                         and _differs(colours, instance, b - 1, x, b, x)
                         and _differs(colours, instance, y - 1, x, y, x)

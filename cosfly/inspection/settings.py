@@ -75,13 +75,8 @@ class InspectConfig(Config):
     )
     jump_gone_max: Share = Field(
         0.02,
-        description="share of what stood still in the frame before and is looked through in this one; more goes to "
-        "review; renders have 0; 1 turns the rule off",
-    )
-    jump_agree_min: Share = Field(
-        0.5,
-        description="share of what stood still that is where the poses put it, seen from the frame before; less goes "
-        "to review (the rest is hidden by what is nearer); renders have 0.8 and more; 0 turns the rule off",
+        description="share of what stood still in this frame or the one before and is looked through in the other; "
+        "more goes to review; renders have 0; 1 turns the rule off",
     )
     thumbnail_px: int = Field(240, ge=32, le=640, description="width of the pictures in report.html, px")
     page_mb: float = Field(

@@ -53,6 +53,7 @@ GARMENTS: dict[str, dict[str, Words]] = {
 }
 FIGURES: dict[str, Words] = {"woman": _words("woman", "女子"), "man": _words("man", "男子")}
 EMPTY_SHARE = {"hat": 0.6, "bag": 0.4}  # of people, who have none
+HAIR = ("brown", "grey", "black")  # a cap of such a colour is taken for hair from the air: no hat has it
 
 
 @dataclass(frozen=True)
@@ -164,7 +165,8 @@ def look_alike(person: Appearance, rng: np.random.Generator) -> Appearance:
 def _worn(rng: np.random.Generator, slot: str) -> dict[str, str]:
     if rng.random() < EMPTY_SHARE.get(slot, 0.0):
         return {slot: "", f"{slot}_color": ""}
-    return {slot: _one(rng, tuple(filter(None, GARMENTS[slot]))), f"{slot}_color": _one(rng, tuple(COLORS))}
+    colors = tuple(color for color in COLORS if slot != "hat" or color not in HAIR)
+    return {slot: _one(rng, tuple(filter(None, GARMENTS[slot]))), f"{slot}_color": _one(rng, colors)}
 
 
 def _one(rng: np.random.Generator, names: tuple[str, ...]) -> str:

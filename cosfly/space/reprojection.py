@@ -16,6 +16,7 @@ from cosfly.work.compiled import njit
 
 COLUMNS, GRID_ROWS = 64, 36  # points are taken at the middle of so many cells
 NEAR_M, FAR_M = 0.3, 999.0  # beyond stands the sky
+LEAST_SEEN = 150  # points, for a share of them to mean something
 LEAST_PLANES = 30  # points, for their depth to say something
 LEAST_SHIFTED = 12  # points of a thing
 SHARED_ID = 65534  # of several things: docs/files.md
@@ -51,7 +52,8 @@ class Agreement:
     instance, of flat ground the same kind. planes: of those that agree, on planes there; error: median of these, as a
     share of the depth; error_flat, error_standing: of those of them that are ground and that are not; NaN: too few.
     shifted: points of one thing that is farther there, as most of it is; renamed: of one that has its depth there and
-    another id, as most of it has; 0 where there is none.
+    another id, as most of it has; 0 where there is none. seen_back, through_back: the same of the other's points in the
+    first.
     """
 
     seen: int
@@ -65,6 +67,17 @@ class Agreement:
     error_standing: float
     shifted: int
     renamed: int
+    seen_back: int
+    through_back: int
+
+    @property
+    def gone(self) -> float:
+        """Share of what one of the two shows and the other looks through, 0 to 1. However far apart frames are, of one
+        world it is 0: what is not there any more, from there, is hidden by what is nearer, and that by something else
+        from here.
+        """
+        both = ((self.through, self.seen), (self.through_back, self.seen_back))
+        return max((through / seen for through, seen in both if seen >= LEAST_SEEN), default=0.0)
 
 
 def compare_views(
@@ -82,10 +95,14 @@ def compare_views(
     counts, errors, standing, firm, moved, renamed = _carry(
         one.depth, one.instance, other.depth, other.instance, intrinsics, others, turn, shift, MOVING, FLAT
     )
+    back = _carry(
+        other.depth, other.instance, one.depth, one.instance, others, intrinsics, turn.T, -turn.T @ shift, MOVING, FLAT
+    )[0]
     seen, agree, hidden, through, same = counts.tolist()
     return Agreement(
         seen, agree, hidden, through, same, len(errors), _error_of(errors), _error_of(errors[~standing]),
         _error_of(errors[standing]), _most_of_one(firm, moved), _most_of_one(firm, renamed),
+        int(back[0]), int(back[3]),
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cosfly.space.reprojection import Agreement, View, compare_views
+from cosfly.space.reprojection import LEAST_SEEN, Agreement, View, compare_views
 from cosfly.work.items import advance
 from release.flight_rows import FlightRows
 from release.record import DepthCoding, DepthCodingName
@@ -25,10 +25,9 @@ from release.verify.pictures import NUM_IDS, check_picture, decode, ground_besid
 from release.verify.sources import Pictures
 
 KEPT_GROUNDS = 200  # frames of a flight
-LEAST_SEEN, LEAST_AGREE = 150, 100  # points, for a share to mean something
+LEAST_AGREE = 100  # points, for a share to mean something
 NEAR_FRAMES = 2  # farther apart, more is hidden behind other things
-AGREE_LEAST = 0.5  # honest 0.81 and more
-THROUGH_MOST = 0.02  # points in front of what is drawn: honest 0.001
+GONE_MOST = 0.02  # points before what the other frame draws: honest 0.001
 ERROR_MOST = {"float32": 2e-4, "float16": 2e-3, "millimetre_png": 2e-3}  # of planes; honest below 1e-5 as float32
 SAME_LEAST = 0.95  # of the instances, of ground the kinds; honest 0.985
 # Between the two nearest depths of a frame's sample: honest 4e-6 m; of so many frames of a flight the least counts.
@@ -176,11 +175,10 @@ def _judge_pairs(flight: FlightRows, pairs: list[Pair], rounded_as: DepthCodingN
 def _odd_pair(pair: Agreement, is_near: bool, is_foreign: bool, limit: float) -> tuple[str, str, str] | None:
     """Give code, got and expected of two frames that do not show one world, else None. limit: of the error of
     planes."""
-    share, through = pair.agree / pair.seen, pair.through / pair.seen
-    if pair.error > limit or (is_near and (share < AGREE_LEAST or through > THROUGH_MOST)):
+    if pair.error > limit or (is_near and pair.gone > GONE_MOST):
         off = f", planes {pair.error:.2%} off" if np.isfinite(pair.error) else ""
-        got = f"{share:.0%} of the points where the frame before has them, {through:.1%} before what is drawn{off}"
-        most = f"at least {AGREE_LEAST:.0%}, at most {THROUGH_MOST:.1%} and planes {limit:.2%} off"
+        got = f"{pair.gone:.1%} of the points before what this frame or the one before draws{off}"
+        most = f"at most {GONE_MOST:.1%} and planes {limit:.2%} off"
         return "scene_depth", got, f"{most}: depth, pose and camera that agree with the frame before"
     is_ours = is_near and not is_foreign
     if is_ours and pair.shifted:
