@@ -37,7 +37,7 @@ def run(folder: Path, out: Path, cfg: ViewerConfig, captions: Path | None = None
 def page_html(shown: ViewerPage) -> str:
     """Give the page's text."""
     style, script = (read_text(Path(__file__).with_name(name)) for name in ("viewer.css", "viewer.js"))
-    script = scripts("tools.js") + script
+    script = scripts("tools.js", "canvas.js") + script
     data = _printable(shown.model_dump(mode="json", exclude_defaults=False))
     return page(
         "release/viewer/viewer.html", title=shown.title, style=style, script=script, notes=shown.notes, data=data

@@ -152,33 +152,34 @@ function drawStage(sample) {
     make("ul", { class: "facts" }, ...facts.map((fact) => make("li", {}, fact))));
 }
 
+const KIND_COLORS = { Buildings: "--house", Walls: "--house", Vegetation: "--plant", Roads: "--card", Sidewalks: "--card", Terrain: "--card", Ground: "--card", RoadLines: "--card" };
+const map = new MapCanvas(byId("plan"), [0, 0, 1, 1], () => {});
 function drawMap(sample) {
-  const flight = data.flights[state.flight];
-  if (!flight) { show("map"); return; }
-  const both = data.flights.filter((one) => one.group === flight.group && one !== flight);
-  const points = [flight, ...both].flatMap((one) => [...one.drone_path, ...one.target_path]);
-  if (!points.length) { show("map", make("p", { class: "nothing" }, "No place is known.")); return; }
-  const xs = points.map((point) => point[0]), ys = points.map((point) => point[1]);
-  const margin = 12, low = [Math.min(...xs) - margin, Math.min(...ys) - margin], high = [Math.max(...xs) + margin, Math.max(...ys) + margin];
-  const side = Math.max(high[0] - low[0], high[1] - low[1]), west = (low[0] + high[0] - side) / 2, north = (low[1] + high[1] + side) / 2;
-  const at = (point) => `${(point[0] - west).toFixed(1)},${(north - point[1]).toFixed(1)}`;
-  const line = (path, name) => draw("polyline", { points: path.map(at).join(" "), class: name });
-  const boxes = (data.maps[flight.map] || []).map((box) => draw("polygon", { points: box.corners.map(at).join(" "), class: `box ${box.kind}` }, draw("title", {}, box.kind)));
-  const parts = [...boxes, ...both.map((one) => line(one.drone_path, `drone other ${one.track}`)), line(flight.target_path, "target"), line(flight.drone_path, `drone ${flight.track}`)];
-  if (sample) {
+  const flight = data.flights[state.flight], both = flight ? data.flights.filter((one) => one.group === flight.group && one !== flight) : [];
+  const points = flight ? [flight, ...both].flatMap((one) => [...one.drone_path, ...one.target_path]) : [];
+  byId("plan").hidden = !points.length;
+  if (!points.length) { show("key", make("span", { class: "nothing" }, flight ? "No place is known." : "")); return; }
+  const xs = points.map((point) => point[0]), ys = points.map((point) => point[1]), margin = 12;
+  const bounds = [Math.min(...xs) - margin, Math.min(...ys) - margin, Math.max(...xs) + margin, Math.max(...ys) + margin], side = Math.max(bounds[2] - bounds[0], bounds[3] - bounds[1]);
+  const boxes = data.maps[flight.map] || [], color = colorOf, ownColor = color(`--${flight.track}`);
+  map.paint = () => {
+    for (const box of boxes) map.area(box.corners, color(KIND_COLORS[box.kind] || "--other"));
+    for (const one of both) map.line(one.drone_path, color(`--${one.track}`), 2, [4, 3]);
+    map.line(flight.target_path, color("--person"));
+    map.line(flight.drone_path, ownColor);
+    if (!sample) return;
     const frame = flight.frames[sample.frame], [x, y, , yaw] = frame.drone, open = (frame.fov_deg / 360) * Math.PI;
     const away = frame.target ? Math.hypot(x - frame.target[0], y - frame.target[1]) : 0, reach = Math.max(side / 8, (1.25 * away) / Math.max(0.2, Math.cos(open)));
-    const ray = (turn) => { const angle = ((yaw + turn) * Math.PI) / 180; return at([x + reach * Math.cos(angle), y + reach * Math.sin(angle)]); };
-    parts.push(draw("polygon", { points: [at([x, y]), ray(-frame.fov_deg / 2), ray(frame.fov_deg / 2)].join(" "), class: "view" }));
-    const dot = (place, name) => { const [cx, cy] = at(place).split(","); return draw("circle", { cx, cy, r: side / 80, class: name }); };
-    if (frame.target) parts.push(dot(frame.target, "target dot"));
-    parts.push(dot([x, y], `drone dot ${flight.track}`));
-  }
-  const bar = 10 ** Math.floor(Math.log10(side / 2)), end = side - side / 40;
-  parts.push(draw("line", { x1: end - bar, x2: end, y1: end, y2: end, class: "bar" }), draw("text", { x: end, y: end - side / 60, "font-size": side / 28, "text-anchor": "end" }, `${bar} m`));
-  const key = [[`drone ${flight.track}`, `drone, ${flight.track}`], ...both.map((one) => [`drone other ${one.track}`, `drone, ${one.track}`]), ["target", "person"]];
-  show("map", draw("svg", { viewBox: `0 0 ${side.toFixed(1)} ${side.toFixed(1)}`, role: "img", "aria-label": "map from above, north up" }, ...parts),
-    make("p", { class: "key" }, ...key.map(([name, title]) => make("span", {}, draw("svg", { viewBox: "0 0 20 6", class: "swatch" }, draw("line", { x1: 0, x2: 20, y1: 3, y2: 3, class: name })), title)), make("span", {}, "north up")));
+    const ray = (turn) => { const angle = ((yaw + turn) * Math.PI) / 180; return [x + reach * Math.cos(angle), y + reach * Math.sin(angle)]; };
+    map.area([[x, y], ray(-frame.fov_deg / 2), ray(frame.fov_deg / 2)], `${color("--accent")}2e`);
+    if (frame.target) map.dot(frame.target, 5, color("--person"), color("--card"));
+    map.dot([x, y], 5, ownColor, color("--card"));
+  };
+  byId("plan").setAttribute("aria-label", `map from above, north up: ${boxes.length} boxes, ${both.length + 2} ways`);
+  if (map.flight === flight) map.redraw();
+  else { Object.assign(map, { flight, bounds, moved: false }); map.resize(); }
+  const key = [[flight.track, `drone, ${flight.track}`], ...both.map((one) => [`other ${one.track}`, `drone, ${one.track}`]), ["target", "person"]];
+  show("key", ...key.map(([name, title]) => make("span", {}, draw("svg", { viewBox: "0 0 20 6", class: "swatch" }, draw("line", { x1: 0, x2: 20, y1: 3, y2: 3, class: name })), title)), make("span", {}, "north up; wheel and right drag"));
 }
 
 function drawCaption(sample) {

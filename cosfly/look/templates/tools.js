@@ -21,3 +21,4 @@ function bytesOf(base64) {
   return bytes;
 }
 const floatsOf = (base64) => new Float32Array(bytesOf(base64).buffer);  // little-endian, as every browser's machine
+const colorOf = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
