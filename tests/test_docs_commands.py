@@ -19,6 +19,8 @@ VARIABLES = {
     "name": "both",
     "size": "2B",
     "DATA": "data",
+    "flights": "--map work/town10/maps/boxes_3d.json --simplified work/town10/simplify/step2_simplified.json "
+    "--traces work/town10/plan/drone_trace.json",
 }  # of loops in a page
 COMMAND = re.compile(r"^(?:\$ )?(?:.*; )?(?:[A-Z_]+=\S+ )*(?:.* -m )?cosfly (.*)$")
 

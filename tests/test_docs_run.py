@@ -62,6 +62,7 @@ NOT_HERE = {
     "roi edit work/": "it serves until it is stopped; tests/test_cosfly_roi_editor.py draws on its page",
     "hf://datasets/": "a hub is asked; tests/test_release_get.py reads the same through fsspec from elsewhere",
     "--repo OWNER/NAME --yes": "a hub is written to; tests/test_release_push.py sends to one of its own",
+    "render.carla.server_command=": "CARLA itself; tests/test_render_carla.py starts a server of ours by that setting",
     "--teacher vllm:": "vLLM needs an accelerator; tests/test_engines_contract.py holds its engine to the documents",
     "--engine vllm": "the same",
     "--out work/students-captions": "of a random student nothing is kept; docs/distillation.md has one that answers",
