@@ -183,7 +183,8 @@ def test_what_the_page_refuses(map_file, tmp_path):
         for content, words in (
             ({"points_world": SQUARE, "map": "Town07"}, "another map"),
             ({"points_world": SQUARE, "axes": "left-handed, centimetres"}, "another map"),
-            ({"points_world": [[5000, 0], [5100, 0], [5100, 90]]}, "leaves no walkable cell"),
+            ({"points_world": [[5000, 0], [5100, 0], [5100, 90]]}, "0% of it on this map"),
+            ({"points_world": [[10, 81], [50, 81], [50, 119], [10, 119]]}, "100% with x and y changed over"),
             ({"points_world": SQUARE, "closed": False}, "not closed"),
             ({"points_world": [[k, k % 7] for k in range(100_001)]}, "over the limit"),
             ([[1, 2]], "not an object"),

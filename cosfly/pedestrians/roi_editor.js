@@ -16,7 +16,7 @@ const LABELS = {
     region: "cells in the region", walkable_cells: "walkable cells", components: "components", large: "large enough", largest: "largest", used: "cells used", pairs: "pairs of ends", walks: "walks that find ends",
     of: "of", saved: "saved to", whole: "the whole map: no polygon is closed", few: "a polygon needs three vertices", nowhere: "a hole begins inside a closed polygon",
     size: "the mask has another size", expected: "expected", masked: "mask", same_region: "equal to the region", same_walkable: "equal to walkable cells", here: "only here", there: "only in the mask",
-    not_saved: "close the open polygon first", drawing: "click to add vertices, then close the polygon", lost: "the editor's server does not answer: is it still running?", no_picture: "cannot be read as a picture",
+    not_saved: "close the open polygon first", drawing: "click to add vertices, then close the polygon", lost: "the editor's server does not answer: is it still running?", no_picture: "cannot be read as a picture", large_file: "the file is too large",
   },
   zh: {
     title: "感兴趣区域", fit: "全图", backdrop: "底图", grid: "规划栅格", above: "俯视图", picture: "图片", outer: "新多边形", hole: "新孔洞",
@@ -27,7 +27,7 @@ const LABELS = {
     region: "区域内栅格", walkable_cells: "可行走栅格", components: "连通块", large: "足够大", largest: "最大", used: "使用的栅格", pairs: "端点对", walks: "能找到端点的路径",
     of: "/", saved: "已保存到", whole: "整张地图：没有闭合的多边形", few: "多边形至少需要三个顶点", nowhere: "孔洞须从已闭合的多边形内开始",
     size: "掩膜尺寸不同", expected: "应为", masked: "掩膜", same_region: "与区域相同", same_walkable: "与可行走栅格相同", here: "仅此处", there: "仅掩膜",
-    not_saved: "请先闭合多边形", drawing: "单击添加顶点，然后闭合多边形", lost: "编辑器服务没有应答：它还在运行吗？", no_picture: "无法作为图片读取",
+    not_saved: "请先闭合多边形", drawing: "单击添加顶点，然后闭合多边形", lost: "编辑器服务没有应答：它还在运行吗？", no_picture: "无法作为图片读取", large_file: "文件太大",
   },
 };
 const state = { rings: [], ring: -1, vertex: -1, kind: "outer", cross: null, answer: data, mask: null, language: navigator.language.startsWith("zh") ? "zh" : "en", said: ["drawing", ""] };
@@ -161,6 +161,7 @@ function put(roi) {
   change(ofRoi(roi), -1, -1);
 }
 const openFile = (file) => attempt(async () => {  // refused as the pipeline would refuse it: nothing here changes then
+  if (file.size > data.most_bytes) throw new Error(`${file.name}: ${say("large_file")}`);
   const answer = await (await request("open", file)).json();
   put(answer.roi);
   map.redraw();

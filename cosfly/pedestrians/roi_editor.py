@@ -28,7 +28,13 @@ from shapely.geometry.base import BaseGeometry
 from cosfly.errors import CosflyError, EnvironmentMissing, InputError, StorageError
 from cosfly.look.page import page, scripts
 from cosfly.look.topview import TopView, draw_map, png_bytes
-from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, walkable_ground
+from cosfly.pedestrians.walkable import (
+    ROI_SHARE_MIN,
+    PedestriansConfig,
+    WalkableGround,
+    shares_on_map,
+    walkable_ground,
+)
 from cosfly.products.backdrop import Backdrop
 from cosfly.products.boxes import AXES, BoxMap, check_ground, read_boxes
 from cosfly.products.roi import Roi, RoiPolygon, parse_roi, write_roi
@@ -184,7 +190,7 @@ class Editor:
         """Give the page."""
         folder, grid = Path(__file__).parent, self.bare.grid
         data = {
-            "map": self.box_map.name, "file": self.path.name, "axes": AXES, "roi": self.opened,
+            "map": self.box_map.name, "most_bytes": MOST_BYTES, "axes": AXES, "roi": self.opened,
             "x_min": grid.x_min_m, "y_min": grid.y_min_m, "cell": grid.resolution_m, "size": grid.size,
             "grid": _encoded(self._backdrop_cells()), "levels": [OCCUPIED, MARGIN, UNUSED, FREE],
             "alphas": [IN_REGION[3], WALKABLE[3]], "picture": self.backdrop and self.backdrop.frame(),
@@ -203,8 +209,18 @@ class Editor:
         return levels
 
     def region_of(self, data: bytes, where: Path) -> dict[str, Any]:
-        """Read a file's bytes as the stage would; gives the region and its cells."""
+        """Read a file's bytes; gives the region and its cells.
+
+        Raises:
+            InputError: the stage would not take it, or most of it lies outside the map.
+        """
         roi = parse_roi(data, where, self.cfg.roi_vertices)
+        roi.check_map(self.box_map, where)
+        inside, turned = shares_on_map(roi, self.box_map)
+        if inside < ROI_SHARE_MIN:
+            what, got = "a region of interest of another map, or of other axes", f"{inside:.0%} of it on this map"
+            got += f", {turned:.0%} with x and y changed over" if turned > inside else ""
+            raise InputError(what, where=where, got=got, expected=f"at least {ROI_SHARE_MIN:.0%}")
         return {"roi": roi.model_dump(), **self.cells(roi, where)}
 
     def cells(self, roi: Roi | None, where: str | Path = "region of interest") -> dict[str, Any]:

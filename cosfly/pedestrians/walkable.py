@@ -349,6 +349,17 @@ def _parts_of_large_components(
     return parts
 
 
+def shares_on_map(roi: Roi, box_map: BoxMap) -> tuple[float, float]:
+    """Give the share of a region that lies within a map's bounds, and that with x and y changed over."""
+    low, high = box_map.bounds()
+    region, bounds = roi.region(), shapely.box(*low[:2], *high[:2])
+    inside, turned = (
+        shapely.intersection(area, bounds).area / max(region.area, 1e-9)
+        for area in (region, shapely.transform(region, lambda points: points[:, ::-1]))
+    )
+    return inside, turned
+
+
 def _check_roi(roi: Roi, box_map: BoxMap, where: str | Path) -> str:
     """Warn if most of a region lies outside the map; gives a remark if x and y look changed over.
 
@@ -356,12 +367,7 @@ def _check_roi(roi: Roi, box_map: BoxMap, where: str | Path) -> str:
         InputError: it says that it is of another map.
     """
     roi.check_map(box_map, where)
-    low, high = box_map.bounds()
-    region, bounds = roi.region(), shapely.box(*low[:2], *high[:2])
-    inside, turned = (
-        shapely.intersection(area, bounds).area / max(region.area, 1e-9)
-        for area in (region, shapely.transform(region, lambda points: points[:, ::-1]))
-    )
+    inside, turned = shares_on_map(roi, box_map)
     remark = f"; with x and y changed over, {turned:.0%} of it would lie inside: are they?" if turned > inside else ""
     if 0.0 < inside < ROI_SHARE_MIN:
         log.warning("%s: %.0f %% of the region of interest lies outside the map%s", where, 100 * (1 - inside), remark)
