@@ -7,8 +7,8 @@ and dynamics, of which there are none, are means over what is flown, and of one 
 The 14-way score of the paper (tab:appendix_h_extended_ranking) is printed without its weights. Its rows give them away:
 with each criterion normalised from the worst planner, 0, to the best, 1, all fourteen scores are 0.35 visibility + 0.30
 collision + 0.35 clearance within 0.0001, and path length, acceleration and jerk count for nothing. (Blocked sight is
-1 - visibility, so that any part of the 0.35 may be its.) How far the ranks depend on that stands in `ranking`: with equal
-weights, and with any weights at all, drawn evenly.
+1 - visibility, so that any part of the 0.35 may be its.) How far the ranks depend on that stands in `ranking`: with
+equal weights, and with any weights at all, drawn evenly.
 """
 
 from __future__ import annotations
