@@ -15,8 +15,9 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, Field
@@ -59,7 +60,7 @@ EQUAL_WEIGHTS = {"visibility": 2 / 7} | dict.fromkeys([*CRITERIA][1:], 1 / 7)  #
 RANDOM_WEIGHTS = 1000
 
 
-class PaperRow(BaseModel):
+class PaperRow(NamedTuple):
     """What the paper prints of a planner: mean of the four axes (of seven planners), weighted score, visibility,
     clearance, and scenarios of 20 without collision.
     """
@@ -80,7 +81,7 @@ _PRINTED = {
     "visibility_astar": (None, 0.4141, 0.6246, 1.46, 20), "potential_field": (None, 0.1325, 0.6345, 1.5505, 19),
     "chomp": (None, 0.2249, 0.5995, 1.2535, 19), "trajopt": (None, 0.4129, 0.6159, 1.5161, 20),
 }  # fmt: skip
-PAPER = {p: PaperRow(**dict(zip(PaperRow.model_fields, row, strict=True))) for p, row in _PRINTED.items()}
+PAPER = {planner: PaperRow(*row) for planner, row in _PRINTED.items()}
 PAPER_SHORTEST_M = 85.73  # to which the paper normalises path efficiency
 PAPER_GROUPS = dict(zip(list(GROUPS)[1:], (0.9364, 0.6205, 0.6083, 0.6075), strict=True))  # visibility
 PAPER_WINS = {
@@ -111,20 +112,12 @@ class ScenarioRecord(BaseModel):
     infeasible: dict[str, str]
 
     def traces(self) -> dict[str, DroneTrace]:
-        """Give the flights.
-
-        Raises:
-            InputError: one is not what a planner's flight must be.
-        """
+        """Give the flights; raises InputError where one is not what a flight must be."""
         return {name: DroneTrace.from_json(f, f"{self.id}: flights.{name}") for name, f in self.flights.items()}
 
 
 def read_scenarios(path: Path) -> list[ScenarioRecord]:
-    """Read `scenarios.jsonl` back.
-
-    Raises:
-        InputError: names the line and the field.
-    """
+    """Read `scenarios.jsonl` back; raises InputError, with the line and the field."""
     lines = model_lines(path, ScenarioRecord, what="scenarios of a benchmark", fix="run cosfly plan benchmark")
     return [record for _, record in lines]
 
@@ -228,7 +221,6 @@ class RankRow(BaseModel):
     normalized: dict[str, float]
     rank_equal_weights: int
     ranks_any_weights: Interval
-    first_any_weights: float
 
 
 class GroupRow(BaseModel):
@@ -285,7 +277,7 @@ def summarize(records: list[ScenarioRecord], planners: tuple[str, ...], rng: np.
         "means": {p: {n: _number(value) for n, value in row.items()} for p, row in means.items()},
         "shortest_mean_m": round(min(free_m or [row["length_m"] for row in means.values()]), 4),
         "axes": axis_rows,
-        **(_versus(tables, means, drawn) if set(GROUPS["target-aware"]) <= set(planners) else {}),
+        **_versus(tables, means, drawn),
         "weights": WEIGHTS,
         "ranking": _ranking(means, drawn, rng),
         "groups": _groups(means, drawn),
@@ -293,15 +285,14 @@ def summarize(records: list[ScenarioRecord], planners: tuple[str, ...], rng: np.
 
 
 def _versus(tables: dict[str, np.ndarray], means: dict, drawn: list[dict]) -> dict[str, Any]:
-    """Give TA*+Smooth less MuCO, and how often it wins."""
-    (one, other), changes = GROUPS["target-aware"], {}
-    for name in NAMES:
-        change, base = means[one][name] - means[other][name], means[other][name]
-        changes[name] = {"delta": _number(change), "relative_percent": _number(100.0 * change / base) if base else None}
+    """Give TA*+Smooth less MuCO, and how often it wins; nothing where one of them took no part or flew nothing."""
+    one, other = GROUPS["target-aware"]
+    if not all(p in means and np.isfinite(list(means[p].values())).all() for p in (one, other)):
+        return {}
     flown = [np.nan_to_num(tables[planner], nan=np.inf).tolist() for planner in (one, other)]
     first, second = ([dict(zip(NAMES, row, strict=True)) for row in rows] for rows in flown)
     return {
-        "deltas": changes,
+        "deltas": compare.deltas(means[one], means[other]),
         "delta_intervals": {n: _interval([found[one][n] - found[other][n] for found in drawn]) for n in NAMES},
         "win_rates": compare.win_rates(first, second),
     }
@@ -355,7 +346,6 @@ def _ranking(means: dict, drawn: list[dict], rng: np.random.Generator) -> dict[s
             normalized=dict(zip(CRITERIA, np.round(normalized[k], 4).tolist(), strict=True)),
             rank_equal_weights=ranks_equal[k],
             ranks_any_weights=_interval(ranks_any[k]),
-            first_any_weights=round(float((ranks_any[k] == 1).mean()), 4),
         )
         for k, planner in enumerate(means)
     }
@@ -366,15 +356,9 @@ def _groups(means: dict, drawn: list[dict]) -> dict[str, GroupRow]:
     rows = {}
     for group, all_members in GROUPS.items():
         if members := [planner for planner in all_members if planner in means]:
-
-            def mean(found: dict, name: str, members: list[str] = members) -> float:
-                return float(np.mean([found[planner][name] for planner in members]))
-
-            rows[group] = GroupRow(
-                num_planners=len(members),
-                figures={name: _number(mean(means, name)) for name in NAMES},
-                visibility_interval=_interval([mean(found, "five_ray_mean") for found in drawn]),
-            )
+            figures = {name: _number(float(np.mean([means[p][name] for p in members]))) for name in NAMES}
+            seen = [np.mean([found[p]["five_ray_mean"] for p in members]) for found in drawn]
+            rows[group] = GroupRow(num_planners=len(members), figures=figures, visibility_interval=_interval(seen))
     return rows
 
 
@@ -396,9 +380,8 @@ def text_tables(found: Benchmark) -> list[TextTable]:
     Raises:
         InputError: a planner or figure is in one part of the benchmark and not in another.
     """
-    makers = (_axes_table, _versus_table, _wins_table, _ranking_table, _feasibility_table, _groups_table)
     try:
-        return [table for make in makers if (table := make(found)).rows]
+        return [table for table in _tables(found) if table.rows]
     except KeyError as error:
         raise InputError("a table lacks a part", where=FORMAT.what, got=str(error), fix="run it again") from None
 
@@ -412,84 +395,77 @@ def markdown(found: Benchmark) -> str:
     return "\n\n".join(parts).replace("*", "\\*") + "\n"
 
 
-def _cell(value: float | None, digits: int = 3) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+def _cells(values: Iterable[float | None], digits: int = 3) -> list[str]:
+    return ["-" if value is None else f"{value:.{digits}f}" for value in values]
 
 
 def _span(interval: Interval, digits: int = 3) -> str:
     return f"{interval[0]:.{digits}f} to {interval[1]:.{digits}f}"
 
 
-def _printed(planner: str, name: str, digits: int = 3) -> str:
-    return _cell(getattr(PAPER[planner], name), digits) if planner in PAPER else "-"
+def _printed(planner: str, *names: str) -> list[str]:
+    """Give what the paper prints of a planner."""
+    digits = {"num_free": 0, "clearance_m": 2}
+    row = PAPER.get(planner)
+    return [cell for name in names for cell in _cells([getattr(row, name, None)], digits.get(name, 3))]
 
 
-def _axes_table(found: Benchmark) -> TextTable:
+def _tables(found: Benchmark) -> Iterator[TextTable]:
+    num, pair = len(found.scenarios), GROUPS["target-aware"]
     rows = []
-    for planner, row in sorted(found.axes.items(), key=lambda entry: -entry[1].scores["mean"]):
-        scores, means = [_cell(row.scores[axis]) for axis in (*AXES, "mean")], found.means[planner]
-        beside = [_span(row.intervals["mean"]), _printed(planner, "axes_mean"), _cell(means["collision_fraction"])]
-        rows.append([title_of(planner), *scores, *beside, _cell(means["clearance_min_m"], 2)])
-    title = f"Four axes; efficiency to the shortest mean, {found.shortest_mean_m:.2f} m (paper: {PAPER_SHORTEST_M} m)"
+    for p, row in sorted(found.axes.items(), key=lambda entry: -entry[1].scores["mean"]):
+        scores, spread = _cells(row.scores[axis] for axis in (*AXES, "mean")), _span(row.intervals["mean"])
+        ours = _cells(found.means[p][name] for name in ("collision_fraction", "clearance_min_m"))
+        rows.append([title_of(p), *scores, spread, *_printed(p, "axes_mean"), *ours])
     columns = ["visibility", "efficiency", "smoothness", "safety", "mean", "95 %", "paper", "collision", "clearance"]
-    return TextTable(title, ["planner", *columns], rows)
+    title = f"Four axes; efficiency to the shortest mean, {found.shortest_mean_m:.2f} m (paper: {PAPER_SHORTEST_M} m)"
+    yield TextTable(title, ["planner", *columns], rows)
 
-
-def _versus_table(found: Benchmark) -> TextTable:
     rows = []
-    for name, title, digits in FIGURES if found.deltas else ():
-        both = [_cell(found.means[planner][name], digits) for planner in GROUPS["target-aware"]]
-        change, span = found.deltas[name], _span(found.delta_intervals[name], digits)
-        rows.append([title, *both, _cell(change["delta"], digits), _cell(change["relative_percent"], 1), span])
-    columns = ["figure", *map(title_of, GROUPS["target-aware"]), "delta", "%", "95 % of the delta"]
-    return TextTable("TA* + Smooth less MuCO", columns, rows)
+    for name, words, digits in FIGURES if found.deltas else ():
+        values = [*(found.means[p][name] for p in pair), found.deltas[name]["delta"]]
+        relative = _cells([found.deltas[name]["relative_percent"]], 1)
+        rows.append([words, *_cells(values, digits), *relative, _span(found.delta_intervals[name], digits)])
+    columns = ["figure", *map(title_of, pair), "delta", "%", "95 % of the delta"]
+    yield TextTable("TA* + Smooth less MuCO", columns, rows)
 
+    rows = [
+        [
+            name.replace("_", " "),
+            f"{row['count']:.0f} of {row['of']:.0f}",
+            f"{row['rate']:.3f}",
+            f"{PAPER_WINS[name]} of 20",
+        ]
+        for name, row in found.win_rates.items()
+    ]
+    yield TextTable("TA* + Smooth against MuCO", ["criterion", "count", "rate", "paper"], rows)
 
-def _wins_table(found: Benchmark) -> TextTable:
     rows = []
-    for name, row in found.win_rates.items():
-        count, printed = f"{row['count']:.0f} of {row['of']:.0f}", f"{PAPER_WINS[name]} of 20"
-        rows.append([name.replace("_", " "), count, _cell(row["rate"]), printed])
-    return TextTable("TA* + Smooth against MuCO", ["criterion", "count", "rate", "paper"], rows)
-
-
-def _ranking_table(found: Benchmark) -> TextTable:
-    rows = []
-    for planner, row in found.ranking.items():
-        normalized = [_cell(row.normalized[name]) for name in found.weights]
-        low, high = row.ranks_any_weights
-        beside = [_printed(planner, "weighted"), str(row.rank_equal_weights), f"{low:.0f} to {high:.0f}"]
-        rows.append([f"{row.rank} {title_of(planner)}", _cell(row.score), _span(row.interval), *normalized, *beside])
+    for p, place in found.ranking.items():
+        normalized, (low, high) = _cells(place.normalized[name] for name in found.weights), place.ranks_any_weights
+        beside = [*_printed(p, "weighted"), str(place.rank_equal_weights), f"{low:.0f} to {high:.0f}"]
+        rows.append(
+            [f"{place.rank} {title_of(p)}", *_cells([place.score]), _span(place.interval), *normalized, *beside]
+        )
     words = ", ".join(f"{weight:g} {name}" for name, weight in found.weights.items())
     columns = ["planner", "score", "95 %", *found.weights, "paper", "rank, equal weights", "ranks, any weights"]
-    return TextTable(f"Weighted score: {words}; each from the worst, 0, to the best, 1", columns, rows)
+    yield TextTable(f"Weighted score: {words}; each from the worst, 0, to the best, 1", columns, rows)
 
-
-def _feasibility_table(found: Benchmark) -> TextTable:
-    rows, num = [], len(found.scenarios)
-    for planner, flights in found.figures.items():
-        num_flown = sum(flight is not None for flight in flights)
-        num_free = sum(flight is not None and flight["collision_fraction"] == 0 for flight in flights)
-        counts, means = [f"{num_flown} of {num}", f"{num_free} of {num}"], found.means[planner]
-        ours = [
-            _cell(means["collision_fraction"], 4),
-            _cell(means["five_ray_mean"]),
-            _cell(means["clearance_min_m"], 2),
-        ]
-        paper = [_printed(planner, name, k) for name, k in (("num_free", 0), ("visibility", 3), ("clearance_m", 2))]
-        rows.append([title_of(planner), GROUP_OF[planner], *counts, *ours, *paper])
-    columns = ["flown", "free of collisions", "collision", "visibility", "clearance (m)"]
-    paper = ["paper: free of 20", "paper: visibility", "paper: clearance"]
-    title = "Feasibility; what is not flown collides and sees nothing"
-    return TextTable(title, ["planner", "group", *columns, *paper], rows)
-
-
-def _groups_table(found: Benchmark) -> TextTable:
     rows = []
-    names = {"five_ray_mean": 3, "blocked_fraction": 3, "collision_fraction": 3, "clearance_min_m": 2, "length_m": 1}
-    for group, row in found.groups.items():
-        values = [_cell(row.figures[name], digits) for name, digits in names.items()]
-        beside = [_span(row.visibility_interval), _cell(PAPER_GROUPS.get(group))]
-        rows.append([group, str(row.num_planners), *values, *beside])
-    columns = ["visibility", "blocked", "collision", "clearance", "length (m)", "95 % of visibility", "paper"]
-    return TextTable("Groups", ["group", "planners", *columns], rows)
+    for p, flights in found.figures.items():
+        fractions = [flight["collision_fraction"] for flight in flights if flight]
+        ours = _cells(found.means[p][name] for name in ("collision_fraction", "five_ray_mean", "clearance_min_m"))
+        counts = [f"{count} of {num}" for count in (len(fractions), fractions.count(0.0))]
+        rows.append([title_of(p), GROUP_OF[p], *counts, *ours, *_printed(p, "num_free", "visibility", "clearance_m")])
+    columns = ["flown", "free of collisions", "collision", "visibility", "clearance"]
+    printed = ["paper: free of 20", "paper: visibility", "paper: clearance"]
+    title = "Feasibility; what is not flown collides and sees nothing"
+    yield TextTable(title, ["planner", "group", *columns, *printed], rows)
+
+    rows = []
+    names = ("five_ray_mean", "blocked_fraction", "collision_fraction", "clearance_min_m", "length_m")
+    for group, means in found.groups.items():
+        beside = [_span(means.visibility_interval), *_cells([PAPER_GROUPS.get(group)])]
+        rows.append([group, str(means.num_planners), *_cells(means.figures[name] for name in names), *beside])
+    columns = ["visibility", "blocked", "collision", "clearance", "length", "95 % of visibility", "paper"]
+    yield TextTable("Groups; clearance and length in m", ["group", "planners", *columns], rows)

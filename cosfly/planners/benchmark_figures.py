@@ -15,17 +15,12 @@ from cosfly.planners.benchmark import PAPER, Benchmark, ScenarioRecord
 from cosfly.planners.compare import AXES, FIGURES, color_of
 from cosfly.planners.contract import PLANNERS, title_of
 from cosfly.products.boxes import BoxMap
-from cosfly.products.kinds import KINDS
 from cosfly.products.walks import TARGET_HEIGHT_M
+from cosfly.space.kernels import NO_OBSTACLE_KINDS
 
 GRAY = "#9a9a9a"
-AXIS_TITLES = {axis: axis.replace("_", " ") for axis in AXES}
-FLIGHTS_SHOWN, ROOM_M, LEAST_M = (
-    4,
-    10.0,
-    5.0,
-)  # scenarios in 3D; how far round flights, and from which height, boxes are drawn
-NOT_DRAWN = [KINDS[name] for name in ("Roads", "Sidewalks", "Terrain", "Ground", "RoadLines", "Water")]
+# Scenarios in 3D; how far round flights, and from which height on, boxes are drawn.
+FLIGHTS_SHOWN, ROOM_M, LEAST_M = 4, 10.0, 5.0
 FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
 SIGNS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
@@ -40,11 +35,6 @@ def draw(found: Benchmark, records: list[ScenarioRecord], box_map: BoxMap) -> di
 
 def _color(planner: str) -> Any:
     return np.array(color_of(planner)) / 255.0 if planner in PLANNERS else GRAY
-
-
-def _primary(found: Benchmark) -> list[str]:
-    """Give the planners of the paper's table of axes, and ours."""
-    return [p for p in found.axes if p not in PAPER or PAPER[p].axes_mean is not None]
 
 
 def _figure(width: float, height: float) -> Any:
@@ -63,13 +53,14 @@ def _radar(found: Benchmark) -> bytes:
     figure = _figure(9.0, 7.0)
     axes = figure.add_subplot(projection="polar")
     angles = np.linspace(0.0, 2.0 * np.pi, len(AXES) + 1)
-    for number, planner in enumerate(reversed(_primary(found))):
+    primary = [p for p in found.axes if p not in PAPER or PAPER[p].axes_mean is not None]  # the paper's, and ours
+    for number, planner in enumerate(reversed(primary)):
         row = found.axes[planner].scores
         values, label = [row[axis] for axis in (*AXES, AXES[0])], f"{title_of(planner)}, mean {row['mean']:.3f}"
         style = {"ls": "-", "lw": 2.5} if planner in PLANNERS else {"ls": ("--", ":", "-.")[number % 3], "lw": 1.2}
         axes.plot(angles, values, color=_color(planner), label=label, **style)
     axes.set_theta_offset(np.pi / 4.0)  # titles at the corners, where they have room
-    axes.set_xticks(angles[:-1], [AXIS_TITLES[axis] for axis in AXES])
+    axes.set_xticks(angles[:-1], [axis.replace("_", " ") for axis in AXES])
     axes.tick_params(pad=20)
     axes.set_rlabel_position(45.0)
     axes.set_ylim(0.0, 1.05)
@@ -89,8 +80,8 @@ def _bars(found: Benchmark) -> bytes:
         whiskers = np.clip([values - spans[:, 0], spans[:, 1] - values], 0.0, None)
         style = {"yerr": whiskers, "error_kw": {"lw": 0.8}, "color": shade, "label": name.replace("_", " ")}
         axes.bar(places + (k - 2) * width, values, width, **style)
-    printed = [PAPER[p].axes_mean if p in PAPER else None for p in found.axes]
-    shown = [(k + 2 * width, value) for k, value in enumerate(printed) if value is not None]
+    printed = {k: PAPER[p].axes_mean for k, p in enumerate(found.axes) if p in PAPER}
+    shown = [(k + 2 * width, value) for k, value in printed.items() if value is not None]
     if shown:
         axes.plot(*zip(*shown, strict=True), "D", color="#d1495b", ms=5, label="mean in the paper")
     axes.set_xticks(places, [title_of(planner) for planner in found.axes], rotation=35, ha="right")
@@ -105,12 +96,9 @@ def _pairs(found: Benchmark) -> bytes:
     for place, (one, other) in enumerate(pairs, 1):
         axes = figure.add_subplot(2, 3, place)
         for planner, row in found.axes.items():
-            x, y = row.scores[one], row.scores[other]
-            is_named = planner in PLANNERS
-            label = title_of(planner) if is_named else None
-            axes.plot(x, y, "o", color=_color(planner), ms=8 if is_named else 5, label=label)
-        axes.set_xlabel(AXIS_TITLES[one])
-        axes.set_ylabel(AXIS_TITLES[other])
+            style = {"ms": 8, "label": title_of(planner)} if planner in PLANNERS else {"ms": 5}
+            axes.plot(row.scores[one], row.scores[other], "o", color=_color(planner), **style)
+        axes.set(xlabel=one.replace("_", " "), ylabel=other.replace("_", " "))
         axes.margins(0.2)
         axes.grid(alpha=0.3)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=len(PLANNERS))
@@ -159,22 +147,15 @@ def _flights(found: Benchmark, records: list[ScenarioRecord], box_map: BoxMap) -
         low, high = np.minimum(points.min(axis=0), targets.min(axis=0)), points.max(axis=0)
         axes = figure.add_subplot(2, 2, place, projection="3d")
         near = (np.abs(box_map.centers - (low + high) / 2) <= (high - low) / 2 + ROOM_M)[:, :2].all(axis=1)
-        near &= ~np.isin(box_map.kinds, NOT_DRAWN) & (box_map.half_extents[:, 2] >= LEAST_M / 2.0)
+        near &= ~box_map.is_any_of(NO_OBSTACLE_KINDS) & (box_map.half_extents[:, 2] >= LEAST_M / 2.0)
         turns = rotation_matrices(np.radians(box_map.rotations_deg[near]))
-        corners = (
-            np.einsum("kij,ksj->ksi", turns, SIGNS * box_map.half_extents[near][:, None])
-            + box_map.centers[near][:, None]
-        )
+        corners = np.einsum("kij,ksj->ksi", turns, SIGNS * box_map.half_extents[near][:, None])
+        corners += box_map.centers[near][:, None]
         faces = corners[:, FACES, :].reshape(-1, 4, 3)
         axes.add_collection3d(Poly3DCollection(faces, facecolor="#b9b9b9", edgecolor="#909090", lw=0.2, alpha=0.12))
         for planner, trace in reversed(traces.items()):
-            is_ours = planner in PLANNERS
-            axes.plot(
-                *trace.positions_m.T,
-                color=_color(planner),
-                lw=2.2 if is_ours else 0.8,
-                label=title_of(planner) if is_ours else None,
-            )
+            style = {"lw": 2.2, "label": title_of(planner)} if planner in PLANNERS else {"lw": 0.8}
+            axes.plot(*trace.positions_m.T, color=_color(planner), **style)
         axes.plot(*targets.T, "--", color="black", lw=1.5, label="walker")
         low[2] = targets[:, 2].min() - TARGET_HEIGHT_M
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))

@@ -9,19 +9,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import solveh_banded
 
-from cosfly.planners.contract import Plan, PlanConfig, Scenario
-from cosfly.planners.reference.task import Task, fly
+from cosfly.planners.reference.task import Task, planner
 from cosfly.planners.smoothing import PULL_STAYS, smoothness_band
-from cosfly.space.kernels import BoxIndex
 
 ITERATIONS, RATE = 200, 0.1
 OBSTACLE_WEIGHT = 400.0
 BEYOND_M = 2.0  # the cost of a place begins so far beyond the clearance
-
-
-def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
-    """Plan one flight (the signature of `planners.contract`); nothing here is random."""
-    return fly(descended, scenario, obstacles, cfg)
 
 
 def descended(task: Task) -> np.ndarray:
@@ -37,3 +30,6 @@ def descended(task: Task) -> np.ndarray:
         points = points - RATE * (points - line - OBSTACLE_WEIGHT * solveh_banded(metric, slopes, lower=True))
         points = np.clip(points, task.low, task.high)
     return points
+
+
+plan = planner(descended)

@@ -4,19 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosfly.planners.contract import Plan, PlanConfig, Scenario
 from cosfly.planners.reference.grid_search import along_voxels
-from cosfly.planners.reference.task import Task, fly
-from cosfly.space.kernels import BoxIndex
+from cosfly.planners.reference.task import Task, planner
 
 ITERATIONS = 200
 CONTRACTION, REPULSION = 0.4, 0.3  # of the way to the middle of both neighbours; of the intrusion
 INFLUENCE_M = 2.0  # beyond the clearance
-
-
-def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
-    """Plan one flight (the signature of `planners.contract`); nothing here is random."""
-    return fly(tightened, scenario, obstacles, cfg)
 
 
 def tightened(task: Task) -> np.ndarray | None:
@@ -30,3 +23,6 @@ def tightened(task: Task) -> np.ndarray | None:
         drawn = CONTRACTION * (0.5 * (band[:-2] + band[2:]) - inner)
         band[1:-1] = np.clip(inner + drawn + REPULSION * (reach_m - gaps_m)[:, None] * away, task.low, task.high)
     return band
+
+
+plan = planner(tightened)

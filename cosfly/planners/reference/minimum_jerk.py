@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosfly.planners.contract import Plan, PlanConfig, Scenario
-from cosfly.planners.reference.task import Task, fly
-from cosfly.space.kernels import BoxIndex
-
-
-def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
-    """Plan one flight (the signature of `planners.contract`); nothing here is random."""
-    return fly(from_rest_to_rest, scenario, obstacles, cfg)
+from cosfly.planners.reference.task import Task, planner
 
 
 def from_rest_to_rest(task: Task) -> np.ndarray:
     """Give the flight, (num, 3), whatever stands in its way."""
     share = np.linspace(0.0, 1.0, task.num)[:, None]
     return task.start + share**3 * (10.0 - 15.0 * share + 6.0 * share**2) * (task.goal - task.start)
+
+
+plan = planner(from_rest_to_rest)

@@ -7,18 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosfly.planners.contract import Plan, PlanConfig, Scenario
-from cosfly.planners.reference.task import Task, fly
-from cosfly.space.kernels import BoxIndex
+from cosfly.planners.reference.task import Task, planner
 
 STEP_M, ITERATIONS = 0.5, 4000
 INFLUENCE_M = 8.0
 REPULSION_M3 = 40.0  # against an attraction of 1: even 3.4 m from a box
-
-
-def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
-    """Plan one flight (the signature of `planners.contract`); nothing here is random."""
-    return fly(downhill, scenario, obstacles, cfg)
 
 
 def downhill(task: Task) -> np.ndarray | None:
@@ -36,3 +29,6 @@ def downhill(task: Task) -> np.ndarray | None:
         force = left / left_m + push
         route.append(np.clip(here + STEP_M * force / max(float(np.linalg.norm(force)), 1e-9), task.low, task.high))
     return None
+
+
+plan = planner(downhill)

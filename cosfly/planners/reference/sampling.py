@@ -7,14 +7,13 @@ control points of a cubic B-spline).
 from __future__ import annotations
 
 import itertools
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from cosfly.errors import EnvironmentMissing
-from cosfly.planners.contract import Plan, PlanConfig, Scenario
-from cosfly.planners.reference.task import Task, fly
-from cosfly.space.kernels import BoxIndex
+from cosfly.planners.reference.task import Task, planner
 
 RRT_CALLS, PRM_CALLS = 4000, 6000  # of the condition to stop, one or two for each sample
 RRT_RANGE_M = 15.0
@@ -22,33 +21,14 @@ CONTROL_M = 8.0  # between control points
 EXACT_M = 1e-6
 
 
-def plan_rrt_star(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
-    """Plan with RRT* (the signature of `planners.contract`)."""
-    return fly(lambda task: _along(task, _sampled(task, rng, "RRTstar")), scenario, obstacles, cfg)
-
-
-def plan_prm(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
-    """Plan with PRM (the signature of `planners.contract`)."""
-    return fly(lambda task: _along(task, _sampled(task, rng, "PRM")), scenario, obstacles, cfg)
-
-
-def plan_bspline_prm(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
-    """Plan with PRM and a B-spline (the signature of `planners.contract`)."""
-    return fly(lambda task: _along(task, _splined(_sampled(task, rng, "PRM"))), scenario, obstacles, cfg)
-
-
-def _along(task: Task, route: np.ndarray | None) -> np.ndarray | None:
-    return None if route is None else task.along(route)
-
-
-def _sampled(task: Task, rng: np.random.Generator, method: str) -> np.ndarray | None:
-    """Give the way that a planner of OMPL finds, (m, 3); None if it does not reach the goal.
+def sampled(task: Task, method: str, *, is_spline: bool = False) -> np.ndarray | None:
+    """Give the flight along the way that a planner of OMPL finds, (num, 3); None if it does not reach the goal.
 
     Raises:
         EnvironmentMissing: OMPL is not installed.
     """
     base, geometric, util = load_ompl()
-    util.RNG.setSeed(int(rng.integers(1, 2**31)))
+    util.RNG.setSeed(int(task.rng.integers(1, 2**31)))
     space, bounds = base.RealVectorStateSpace(3), base.RealVectorBounds(3)
     for axis in range(3):
         bounds.setLow(axis, float(task.low[axis]))
@@ -73,22 +53,24 @@ def _sampled(task: Task, rng: np.random.Generator, method: str) -> np.ndarray | 
             state[axis] = float(place[axis])
     problem.setStartAndGoalStates(*ends)
     problem.setOptimizationObjective(base.PathLengthOptimizationObjective(about))
-    planner, calls = getattr(geometric, method)(about), itertools.count()
-    planner.setProblemDefinition(problem)
+    search, calls = getattr(geometric, method)(about), itertools.count()
+    search.setProblemDefinition(problem)
     if method == "RRTstar":
-        planner.setRange(RRT_RANGE_M)
-        planner.setInformedSampling(True)
-        planner.setTreePruning(True)
-        planner.setup()
-        planner.solve(base.PlannerTerminationCondition(lambda: next(calls) >= RRT_CALLS))
+        search.setRange(RRT_RANGE_M)
+        search.setInformedSampling(True)
+        search.setTreePruning(True)
+        search.setup()
+        search.solve(base.PlannerTerminationCondition(lambda: next(calls) >= RRT_CALLS))
     else:  # a roadmap first: PRM's own loop counts seconds, and asks the finished map when it must stop at once
-        planner.setup()
-        planner.growRoadmapPtc(base.PlannerTerminationCondition(lambda: next(calls) >= PRM_CALLS))
-        planner.solve(base.plannerAlwaysTerminatingCondition())
+        search.setup()
+        search.growRoadmapPtc(base.PlannerTerminationCondition(lambda: next(calls) >= PRM_CALLS))
+        search.solve(base.plannerAlwaysTerminatingCondition())
     path = problem.getSolutionPath()
     states = [] if path is None else [path.getState(k) for k in range(path.getStateCount())]
     route = np.array([[state[0], state[1], state[2]] for state in states]).reshape(-1, 3)
-    return route if len(route) and np.linalg.norm(route[-1] - task.goal) <= EXACT_M else None
+    if not len(route) or np.linalg.norm(route[-1] - task.goal) > EXACT_M:
+        return None
+    return task.along(splined(route) if is_spline else route)
 
 
 def load_ompl() -> tuple[Any, Any, Any]:
@@ -106,12 +88,10 @@ def load_ompl() -> tuple[Any, Any, Any]:
     return base, geometric, util
 
 
-def _splined(route: np.ndarray | None) -> np.ndarray | None:
+def splined(route: np.ndarray) -> np.ndarray:
     """Give the cubic B-spline whose control points lie on a route (m, 3), CONTROL_M apart at most."""
     from scipy.interpolate import BSpline
 
-    if route is None:
-        return None
     counts = np.maximum(np.ceil(np.linalg.norm(np.diff(route, axis=0), axis=1) / CONTROL_M), 1).astype(int)
     shares = np.concatenate([k + np.arange(count) / count for k, count in enumerate(counts)] + [[len(counts)]])
     control = np.stack([np.interp(shares, np.arange(len(route)), route[:, axis]) for axis in range(3)], axis=1)
@@ -120,3 +100,8 @@ def _splined(route: np.ndarray | None) -> np.ndarray | None:
         return route
     knots = np.concatenate([[0.0] * degree, np.linspace(0.0, 1.0, len(control) - degree + 1), [1.0] * degree])
     return BSpline(knots, control, degree)(np.linspace(0.0, 1.0, 10 * len(control)))
+
+
+plan_rrt_star = planner(partial(sampled, method="RRTstar"))
+plan_prm = planner(partial(sampled, method="PRM"))
+plan_bspline_prm = planner(partial(sampled, method="PRM", is_spline=True))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosfly.planners.contract import Plan, PlanConfig, Scenario
+from cosfly.planners.contract import Plan, PlanConfig, Planner, Scenario
 from cosfly.planners.smoothing import within_limits
 from cosfly.space.kernels import BoxIndex, normals, segments_hit, signed_distances
 
@@ -34,6 +34,7 @@ class Task:
     clearance_m: float
     num: int
     dt_s: float
+    rng: np.random.Generator
 
     def hits(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
         """Tell which ways between (n, 3) points are not free, (n,) bool."""
@@ -60,7 +61,9 @@ class Task:
         return np.stack([np.interp(wanted_m, far_m, route[:, axis]) for axis in range(3)], axis=1)
 
 
-def make_task(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, clearance_m: float) -> Task | None:
+def make_task(
+    scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator, clearance_m: float
+) -> Task | None:
     """Give the task of a scenario; None where no free place is near its first or last wished one."""
     wish, targets = scenario.wish, scenario.targets_m
     margin_m = cfg.track_astar.corridor_m
@@ -71,7 +74,7 @@ def make_task(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, clearanc
     ends = [_free_place(place, low, high, obstacles, clearance_m) for place in wished]
     if ends[0] is None or ends[1] is None:
         return None
-    return Task(ends[0], ends[1], low, high, obstacles, clearance_m, len(targets), scenario.dt_s)
+    return Task(ends[0], ends[1], low, high, obstacles, clearance_m, len(targets), scenario.dt_s, rng)
 
 
 def _free_place(
@@ -90,20 +93,23 @@ def _free_place(
     return None
 
 
-def fly(find: Callable[[Task], np.ndarray | None], scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> Plan:
-    """Find a way, at the nominal distance to boxes and else at the relaxed one, and repair it.
+def planner(find: Callable[[Task], np.ndarray | None]) -> Planner:
+    """Make a planner (the signature of `planners.contract`) that finds a way at the nominal distance to boxes, else at
+    the relaxed one, and repairs it.
 
     Args:
         find: gives the flight (num, 3) of a task, or None.
-    Raises:
-        NoPathError: there is none, or repair did not come to an end.
     """
-    for clearance_m in (cfg.safety_distance_m, cfg.relaxed_safety_m):
-        task = make_task(scenario, obstacles, cfg, clearance_m)
-        found = None if task is None else find(task)
-        if task is not None and found is not None:
-            found = np.clip(found, task.low, task.high)
-            mended = within_limits(found, scenario, obstacles, cfg)
-            moved_m = float(np.linalg.norm(mended - found, axis=1).max())
-            return Plan(mended, {"clearance_m": clearance_m, "repaired_m": round(moved_m, 4)})
-    raise scenario.no_way("no free way leads from the first wished place to the last", cfg.relaxed_safety_m)
+
+    def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
+        for clearance_m in (cfg.safety_distance_m, cfg.relaxed_safety_m):
+            task = make_task(scenario, obstacles, cfg, rng, clearance_m)
+            found = find(task) if task else None
+            if task and found is not None:
+                found = np.clip(found, task.low, task.high)
+                mended = within_limits(found, scenario, obstacles, cfg)
+                moved_m = float(np.linalg.norm(mended - found, axis=1).max())
+                return Plan(mended, {"clearance_m": clearance_m, "repaired_m": round(moved_m, 4)})
+        raise scenario.no_way("no free way leads from the first wished place to the last", cfg.relaxed_safety_m)
+
+    return plan

@@ -7,19 +7,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import minimize
 
-from cosfly.planners.contract import Plan, PlanConfig, Scenario
-from cosfly.planners.reference.task import Task, fly
-from cosfly.space.kernels import BoxIndex
+from cosfly.planners.reference.task import Task, planner
 
 ITERATIONS = 80  # for each weight of the hinge
 HINGE_WEIGHTS = (1.0, 10.0, 100.0)
 BEYOND_M = 0.5  # the hinge begins so far beyond the clearance
 DIFFERENCES = ((1.0, 1), (5.0, 2))  # weight and order of squared differences
-
-
-def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator) -> Plan:
-    """Plan one flight (the signature of `planners.contract`); nothing here is random."""
-    return fly(optimized, scenario, obstacles, cfg)
 
 
 def optimized(task: Task) -> np.ndarray:
@@ -49,3 +42,6 @@ def _loss(inner: np.ndarray, task: Task, weight: float) -> tuple[float, np.ndarr
     loss += weight * float((intrusions_m**2).sum())
     slopes -= 2.0 * weight * intrusions_m[:, None] * away
     return loss, slopes[1:-1].ravel()
+
+
+plan = planner(optimized)
