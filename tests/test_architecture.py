@@ -168,7 +168,7 @@ ALLOWED_TO_READ = {
     ("cosfly.chat.wire", "decompress"),  # of a reply, up to that size
     ("distill.student.random_student", "loads"),  # what the tokenizer's own library gives
     ("distill.student.checkpoint", "load_file"),  # tensors, whose checksums were compared
-    ("cosfly.unreal.carla_guard", "loads"),  # lines of the process that started it
+    ("cosfly.unreal.guard", "loads"),  # lines of the process that started it
     ("release.transfer.remote", "open"),  # files of another place, by ranges of known length
 }
 

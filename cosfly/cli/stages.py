@@ -249,7 +249,7 @@ def render(
     simplified: Simplification,
     traces: Traces,
     out: options.Out,
-    backend: Annotated[str | None, Option(help="gl, pyrender or carla."), Sets("render.backend")] = None,
+    backend: Annotated[str | None, Option(help="gl, pyrender, carla or unrealcv."), Sets("render.backend")] = None,
     others: Annotated[Path | None, Option(help="Who else moves: others.json, beside path.json.")] = None,
     weather_mode: Annotated[str | None, Option(help="How skies are drawn."), Sets("render.weather_mode")] = None,
     weather_name: Annotated[
@@ -267,13 +267,49 @@ def render(
     weather_seed: Annotated[
         int | None, Option(help="Seed; a negative one draws one."), Sets("render.weather_seed")
     ] = None,
+    cvip: Annotated[str | None, Option(help="Where UnrealCV is."), Sets("render.unrealcv.host")] = None,
+    cvport: Annotated[int | None, Option(help="Its port."), Sets("render.unrealcv.port")] = None,
+    path_index: Annotated[
+        str | None, Option(help="One flight of the traces, or all."), Sets("render.path_index", {"all": None})
+    ] = None,
+    require_rgb: Annotated[
+        bool | None, Option("--require-rgb/--no-require-rgb", help="Write colours.", show_default="as in settings")
+    ] = None,
+    require_depth: Annotated[
+        bool | None, Option("--require-depth/--no-require-depth", help="Write depth.", show_default="as in settings")
+    ] = None,
+    settle_delay: Annotated[
+        float | None,
+        Option(help="UnrealCV: seconds from a pose to its pictures."),
+        Sets("render.unrealcv.settle_delay_s"),
+    ] = None,
+    coord_scale: Annotated[
+        float | None, Option(help="UnrealCV: its units in 1 m."), Sets("render.unrealcv.coord_scale")
+    ] = None,
+    coord_z_offset: Annotated[
+        float | None, Option(help="UnrealCV: added to heights, m."), Sets("render.unrealcv.coord_z_offset")
+    ] = None,
+    gif: Annotated[bool, Option("--gif", help="Also make an animation of the first flight.")] = False,
+    gif_fps: Annotated[float, Option(min=0.1, max=50, help="Its frames a second.")] = 4.0,
+    gif_name: Annotated[str, Option(help="Its name, in the folder.")] = "preview.gif",
 ) -> None:
     """Step 5: RGB, depth and instance frames of the clean and the perturbed flight."""
+    from cosfly.look.gallery import preview_gif
     from cosfly.render import stage
+    from cosfly.render.settings import RenderConfig
+    from cosfly.work.config import build
+    from cosfly.work.store import inside
 
+    wanted = {"rgb": require_rgb, "depth": require_depth}
+    modalities: list[str] = [name for name in job.cfg.render.modalities if wanted.get(name) is not False]
+    modalities += [name for name, is_wanted in wanted.items() if is_wanted and name not in modalities]
+    cfg = build(RenderConfig, job.cfg.render.model_dump() | {"modalities": modalities}, "render")
     job.begin(out, map_, simplified, traces, others)
     manner = job.manner | {"seed": job.cfg.seed, "others": others}
-    job.finish(stage.run(job.cfg.render, map_, simplified, traces, out, **manner), out)
+    product = stage.run(cfg, map_, simplified, traces, out, **manner)
+    if gif:
+        preview_gif(product, inside(out, gif_name), frames_per_s=gif_fps)
+    job.finish(product, out)
 
 
 @render_app.command("sample")

@@ -42,7 +42,9 @@ def contact_sheet(tree: Path, out_png: Path, choice: FlightChoice = ALL_FLIGHTS)
     write_bytes(out_png, _png_below(sheet, SHEET_BYTES))
 
 
-def preview_gif(tree: Path, out_gif: Path, choice: FlightChoice = ALL_FLIGHTS) -> None:
+def preview_gif(
+    tree: Path, out_gif: Path, choice: FlightChoice = ALL_FLIGHTS, frames_per_s: float = 1000 / GIF_FRAME_MS
+) -> None:
     """Reads a playback tree, writes its first clean flight as an animation below 4 MB, the target's box drawn in.
 
     Raises:
@@ -54,7 +56,7 @@ def preview_gif(tree: Path, out_gif: Path, choice: FlightChoice = ALL_FLIGHTS) -
     width, num = GIF_WIDTH_PX, 60
     while True:
         chosen = [frames[i] for i in _spread(len(frames), num)]
-        data = _gif([_preview(flight, i, width) for i in chosen])
+        data = _gif([_preview(flight, i, width) for i in chosen], round(1000 / frames_per_s))
         if len(data) < GIF_BYTES or num <= 4:
             break
         num = max(4, int(num * 0.9 * GIF_BYTES / len(data)))
@@ -182,14 +184,14 @@ def _preview(flight: Flight, i: int, width_px: int) -> Image.Image:
     return Image.fromarray(cv2.resize(picture, (width_px, height_px), interpolation=cv2.INTER_AREA))
 
 
-def _gif(frames: list[Image.Image]) -> bytes:
+def _gif(frames: list[Image.Image], frame_ms: int) -> bytes:
     # One palette for all frames: colours do not flicker, and undithered areas compress better.
     sample = np.vstack([np.asarray(frames[i]) for i in _spread(len(frames), 6)])
     palette = Image.fromarray(sample).quantize(128)
     frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     buffer = io.BytesIO()
     frames[0].save(
-        buffer, format="GIF", save_all=True, append_images=frames[1:], duration=GIF_FRAME_MS, loop=0, optimize=False
+        buffer, format="GIF", save_all=True, append_images=frames[1:], duration=frame_ms, loop=0, optimize=False
     )
     return buffer.getvalue()
 

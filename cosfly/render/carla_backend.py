@@ -12,7 +12,6 @@ import logging
 import multiprocessing
 import os
 import queue
-import socket
 import threading
 import time
 from collections.abc import Sequence
@@ -21,10 +20,9 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from cosfly.errors import EnvironmentMissing, InputError, RenderError
-from cosfly.geometry import focal_px
+from cosfly.errors import InputError, RenderError
 from cosfly.products.boxes import BoxMap
-from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, Camera, Look
+from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, Look
 from cosfly.products.kinds import KIND_NAMES, KINDS
 from cosfly.products.weather import WeatherParams
 from cosfly.render.contract import (
@@ -39,8 +37,8 @@ from cosfly.render.contract import (
     far_as_sky,
     instance_ids,
 )
+from cosfly.render.engines import WALK_MPS, NoPictureError, fov_of, keep_asking
 from cosfly.unreal.carla_client import CarlaConfig, CarlaConnection, connect
-from cosfly.unreal.carla_guard import CarlaGuard, values_of, with_values
 from cosfly.unreal.conventions import (
     ACTOR_BITS,
     SIMULATED_STEP_S,
@@ -50,6 +48,7 @@ from cosfly.unreal.conventions import (
     unreal_pose,
     world_pose,
 )
+from cosfly.unreal.guard import EngineGuard, values_of, with_values
 from cosfly.work.config import MayDiffer
 from cosfly.work.items import worker_place
 from cosfly.work.store import dump_json, sha256_bytes
@@ -60,7 +59,6 @@ PORT_STEP = 10  # a server takes three ports from its own on
 HEALTH_CHECKS = 3  # in a row that fail: the worker ends
 SENSORS = {"rgb": "rgb", "depth": "depth", "tags": "instance_segmentation"}
 MOVER_KINDS = ("Pedestrians", "Rider", "Car", "Truck", "Bus", "Motorcycle", "Bicycle")
-WALK_MPS = 1.4  # of a person whose swing is full
 SAME_BOX_M = 0.05
 SPAWN_M = 300.0  # over the map, where nothing stands in the way
 
@@ -82,10 +80,6 @@ class CarlaRenderConfig(CarlaConfig):
     health_check_s: MayDiffer[float] = Field(
         5.0, gt=0, description="seconds between health checks, and for each; three that fail end the worker"
     )
-
-
-class _NoPictureError(Exception):
-    """A camera did not send the picture of a tick."""
 
 
 class CarlaRenderer:
@@ -115,10 +109,9 @@ class CarlaRenderer:
 
     def _open(self) -> None:
         """Start the server if that is ours to do, connect, and lead its clock."""
-        self._guard = CarlaGuard(self._cfg.host, self._port, self._cfg.server_command.format(port=self._port))
+        cfg = self._cfg
+        self._guard = EngineGuard("carla", cfg.host, self._port, cfg.server_command, cfg.timeout_s)
         try:
-            if self._cfg.server_command:
-                _wait_for(self._cfg.host, self._port, self._cfg.timeout_s)
             self._server = connect(self._cfg, self._port)
             self.device = f"CARLA {self._server.version} at {self._server.endpoint}, {self._server.town}"
             with self._server.asking("the world was not given"):
@@ -197,36 +190,17 @@ class CarlaRenderer:
             EnvironmentMissing: the server does not answer any more.
         """
         check_pose(camera_pose, intrinsic)
-        fov_deg = self._fov_of(intrinsic)
+        fov_deg = fov_of(intrinsic, self._size_px, self.device)
         bodies = ({} if person is None else {PERSON_ID: person}) | {one.instance_id: one.body for one in others}
-        problem: Exception | None = None
-        for attempt in range(self._cfg.retries + 1):
-            try:
-                if attempt and isinstance(problem, _NoPictureError):
-                    self._stop_cameras()
-                elif attempt:
-                    self._open_again()
-                return self._frame(camera_pose, fov_deg, bodies)
-            except (_NoPictureError, RuntimeError, EnvironmentMissing) as error:
-                problem = error
-                log.warning("%s: a frame failed (%d of %d): %s", self.device, attempt + 1, self._cfg.retries + 1, error)
-        if isinstance(problem, EnvironmentMissing):
-            raise problem
-        fix = "see the server's log, then run the same command again: finished flights are kept"
-        if isinstance(problem, _NoPictureError):
-            raise RenderError("a camera sends no picture", where=self.device, got=str(problem), fix=fix)
-        raise EnvironmentMissing("the server does not answer any more", where=self.device, got=str(problem), fix=fix)
+        return keep_asking(
+            lambda: self._frame(camera_pose, fov_deg, bodies), self._mend, self._cfg.retries, self.device
+        )
 
-    def _fov_of(self, intrinsic: np.ndarray) -> float:
-        width, height = self._size_px
-        fov_deg = round(Camera(width, height, intrinsic).fov_deg, 6)
-        f = focal_px(width, fov_deg)
-        if not np.allclose(intrinsic, [[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]], atol=1e-3):
-            expected = "square pixels and the principal point in the middle"
-            raise RenderError(
-                "CARLA has no such lens", where=self.device, got=str(intrinsic.tolist()), expected=expected
-            )
-        return fov_deg
+    def _mend(self, problem: Exception) -> None:
+        if isinstance(problem, NoPictureError):
+            self._stop_cameras()
+        else:
+            self._open_again()
 
     def _frame(self, camera_pose: np.ndarray, fov_deg: float, bodies: dict[int, PosedPerson | PosedCar]) -> Frame:
         pose = self._transform(camera_pose[:3, 3], camera_rotation_deg(camera_pose))
@@ -256,7 +230,7 @@ class CarlaRenderer:
                     number, data = inbox.get(timeout=max(0.0, until_s - time.monotonic()))
                 except queue.Empty:
                     what = f"camera {name}: nothing of tick {frame} in {self._cfg.picture_s:g} s"
-                    raise _NoPictureError(what) from None
+                    raise NoPictureError(what) from None
                 if number == frame:
                     pictures[name] = np.frombuffer(data, np.uint8).reshape(*self._size_px[::-1], 4)
         return pictures
@@ -361,18 +335,6 @@ class CarlaRenderer:
     def _transform(self, position_m: np.ndarray, rotation_deg: np.ndarray) -> Any:
         carla, (x, y, z, pitch, yaw, roll) = self._server.carla, unreal_pose(position_m, rotation_deg)
         return carla.Transform(carla.Location(x, y, z), carla.Rotation(pitch, yaw, roll))
-
-
-def _wait_for(host: str, port: int, timeout_s: float) -> None:
-    """Wait until somebody listens at a port, or the time is over."""
-    until_s = time.monotonic() + timeout_s
-    while time.monotonic() < until_s:
-        try:
-            socket.create_connection((host, port), 1.0).close()
-        except OSError:
-            time.sleep(0.2)
-        else:
-            return
 
 
 def _ids_in_pictures(server: CarlaConnection, box_map: BoxMap, num_others: int) -> np.ndarray:

@@ -14,19 +14,23 @@ from cosfly.render.carla_backend import CarlaRenderConfig
 from cosfly.render.effects import EffectsConfig
 from cosfly.render.lens import ZoomConfig
 from cosfly.render.perturbation import PerturbationConfig
+from cosfly.render.unrealcv_backend import UnrealCvRenderConfig
 from cosfly.render.weather import WeatherConfig
 from cosfly.work.config import Config, MayDiffer
+
+ENGINES = ("carla", "unrealcv")  # renderers that are running somewhere
 
 
 class RenderConfig(WeatherConfig):
     """Camera, tracks, weather and files of the frames."""
 
-    backend: Literal["gl", "pyrender", "carla"] = Field(
+    backend: Literal["gl", "pyrender", "carla", "unrealcv"] = Field(
         "gl",
         description="renderer; gl is OpenGL without a window, on a GPU or the CPU; pyrender is a plain and slow "
-        "cross-check; carla asks a running CARLA 0.9.16",
+        "cross-check; carla asks a running CARLA 0.9.16, unrealcv a running UnrealCV, as SimWorld's",
     )
     carla: CarlaRenderConfig = Field(CarlaRenderConfig(), description="the server of backend carla")
+    unrealcv: UnrealCvRenderConfig = Field(UnrealCvRenderConfig(), description="the server of backend unrealcv")
     width_px: int = Field(1280, ge=16, le=LONGEST_SIDE_PX, description="image width, px")
     height_px: int = Field(720, ge=16, le=LONGEST_SIDE_PX, description="image height, px")
     fovs_deg: tuple[float, ...] = Field(
@@ -60,6 +64,9 @@ class RenderConfig(WeatherConfig):
         "png",
         description="png: float32 without loss in depth_float32.png, an eighth of the size; npy: depth.npy, as in the "
         "public layout",
+    )
+    path_index: int | None = Field(
+        None, ge=0, description="draw the flight of this place in the traces alone; null: all"
     )
     frame_stride: int = Field(
         1,
@@ -96,8 +103,9 @@ class RenderConfig(WeatherConfig):
         return getattr(self, self.backend, None)
 
     def recorded(self) -> dict[str, Any]:
-        """Without effects, a rim, or a renderer of settings of its own, they are those of before there were any."""
-        used = {"effects": self.effects.is_on, "rim": self.rim, "carla": self.backend == "carla"}
+        """Without effects, a rim, a flight alone, or a renderer of settings of its own, they are those of before."""
+        used = {"effects": self.effects.is_on, "rim": self.rim, "path_index": self.path_index is not None}
+        used |= {name: self.backend == name for name in ENGINES}
         return {name: value for name, value in super().recorded().items() if used.get(name, True)}
 
     @field_validator("fovs_deg")
@@ -111,11 +119,13 @@ class RenderConfig(WeatherConfig):
 
     @model_validator(mode="after")
     def _weather_can_be_drawn(self) -> RenderConfig:
-        if self.backend == "carla" and (self.look != Look() or self.rim):
-            raise ValueError("backend carla has a sun, an air and a horizon of its own: leave look and rim out")
+        if self.backend in ENGINES and (self.look != Look() or self.rim):
+            raise ValueError(
+                f"backend {self.backend} has a sun, an air and a horizon of its own: leave look and rim out"
+            )
         if self.weather_mode == "off":
             return self
-        if self.backend == "pyrender":
+        if self.backend in ("pyrender", "unrealcv"):
             raise ValueError(f"backend {self.backend} draws no weather: take gl or carla, or weather_mode off")
         if self.look != Look():
             raise ValueError(

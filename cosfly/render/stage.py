@@ -50,6 +50,7 @@ RENDERERS = {
     "gl": "cosfly.render.gl.backend:GlRenderer",
     "pyrender": "cosfly.render.pyrender_backend:PyrenderRenderer",
     "carla": "cosfly.render.carla_backend:CarlaRenderer",
+    "unrealcv": "cosfly.render.unrealcv_backend:UnrealCvRenderer",
 }
 VARIANTS = {"clean": "ORI", "perturbed": PERTURBED}
 TRAJECTORY = "trajectory_"
@@ -189,13 +190,15 @@ def run(
     checked_inputs(inputs)  # before the map is read for the names of its meshes, which are inputs too
     box_map = read_boxes(boxes)
     inputs |= {f"mesh {name}": path for name, path in box_map.meshes.files().items()}
+    if cfg.path_index is not None and cfg.path_index >= (num := len(read_traces(traces))):
+        raise ConfigError("no such flight", where="render.path_index", got=cfg.path_index, expected=f"below {num}")
     stage = StageFolder.open(out, "render", config=cfg, inputs=inputs, seed=seed, resume=resume)
     if stage.is_complete:
         return out
     check_ground(box_map, boxes)
     all_traces = read_traces(traces)
     _check_ids(all_traces, traces)
-    passed = _passed(stage, all_traces)
+    passed = _passed(stage, all_traces, cfg.path_index)
     ids_record = _ids_record(box_map, num_others_of(_companies(others, all_traces)))
     if num_shared := ids_record["num_shared"]:
         log.warning("render: %d boxes share the instance id %d: ids have 16 bits", num_shared, SHARED_ID)
@@ -231,13 +234,13 @@ def _item(number: int, trace: DroneTrace, track: str) -> Item:
     return Item(f"{trace.path_id}/{VARIANTS[track]}", (number, track), len(trace.time_s))
 
 
-def _passed(stage: StageFolder, traces: list[DroneTrace]) -> list[tuple[int, DroneTrace]]:
-    """Give the flights that are drawn, each with its number among all.
+def _passed(stage: StageFolder, traces: list[DroneTrace], chosen: int | None) -> list[tuple[int, DroneTrace]]:
+    """Give the flights that are drawn, all or the chosen one, each with its number among all.
 
     Raises:
         NothingKept: there is none.
     """
-    passed = [(number, trace) for number, trace in enumerate(traces) if trace.drop_reason is None]
+    passed = [(n, trace) for n, trace in enumerate(traces) if trace.drop_reason is None and chosen in (None, n)]
     if not passed:
         tally = Tally(input=len(traces), dropped=Counter(str(trace.drop_reason) for trace in traces))
         raise stage.nothing_kept(tally, expected="a flight that the planner kept")

@@ -25,6 +25,7 @@ ASSETS = (
     Asset("BP_RoadCone_C", "Static", (0.4, 0.4, 0.75)),
     Asset("BP_RoadBlocker_C", "Static", (2.0, 0.6, 1.0)),
     Asset("BP_Road*", "Roads"),
+    Asset("Landscape*", "Terrain"),
     Asset("BP_Scooter_*", "Motorcycle", (1.8, 0.7, 1.2)),
     Asset("BP_Hydrant_C", "Static", (0.4, 0.4, 0.9)),
     Asset("BP_Trash_bin_*", "Static", (0.8, 0.8, 1.2)),

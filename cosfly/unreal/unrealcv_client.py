@@ -40,6 +40,9 @@ class UnrealCvConfig(Config):
     coord_scale: float = Field(100.0, gt=0, description="Unreal's units in 1 m: centimetres")
 
 
+OURS = "COSFLY_"  # in front of the names of what is spawned here
+
+
 class NoAnswerError(Exception):
     """The server did not answer in time, closed the connection, or answered what was not asked."""
 
@@ -61,6 +64,8 @@ class UnrealCvConnection:
         """Give the answers, in order: text, or bytes of pictures. An answer that begins with `error` is one too."""
         answers: list[str | bytes] = []
         for first in range(0, len(commands), MOST_AT_ONCE):
+            if self._client.ended:  # nobody reads any more, and the package would wait for ever
+                raise NoAnswerError(self._client.ended)
             try:
                 with contextlib.redirect_stdout(io.StringIO()):
                     answers += self._client.request_batch(list(commands[first : first + MOST_AT_ONCE]))
@@ -92,6 +97,11 @@ class UnrealCvConnection:
         """Make an error of ours of a server that is silent or gone: `what` could not be done."""
         with _told(what, self.where):
             yield
+
+
+def ours(names: str) -> list[str]:
+    """Of the answer to `vget /objects`, what a run of ours spawned."""
+    return [name for name in names.split() if name.startswith(OURS)]
 
 
 def is_refusal(answer: str | bytes | None) -> bool:

@@ -1,0 +1,111 @@
+"""Leaves an engine's server as it was found, however the process that used it ends: normally, killed, or by a crash.
+
+A process of its own. It starts the server, if there is a command for that, and then ends it too. Its input is lines of
+JSON: of CARLA first how the world was found, then the number of each actor that is spawned; of UnrealCV the commands
+that put the camera back. Where the input ends, so has the process that wrote it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import time
+from typing import Any
+
+from cosfly.errors import EnvironmentMissing
+
+PATIENCE_S = 20.0  # for a server that is to be left in order
+
+
+class EngineGuard:
+    """The guard, from the side of the process that it watches; engine: carla or unrealcv."""
+
+    def __init__(self, engine: str, host: str, port: int, command: str, patience_s: float) -> None:
+        filled = command.replace("{port}", str(port))
+        words = [sys.executable, "-m", "cosfly.unreal.guard", engine, host, str(port), filled]
+        # A session of its own: Ctrl-C is not for it.
+        self._process = subprocess.Popen(words, stdin=subprocess.PIPE, text=True, start_new_session=True)
+        if command:
+            _wait_for(host, port, patience_s)
+
+    def note(self, what: Any) -> None:
+        """Tell it how the world was found, or of an actor."""
+        assert self._process.stdin is not None
+        print(json.dumps(what), file=self._process.stdin, flush=True)
+
+    def close(self) -> None:
+        """Have everything put back, and wait for that."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait()
+
+
+def values_of(thing: Any) -> dict[str, Any]:
+    """Give the plain values of the client's object, as of settings, by name."""
+    names = [name for name in dir(thing) if not name.startswith("_")]
+    return {name: getattr(thing, name) for name in names if isinstance(getattr(thing, name), bool | int | float | None)}
+
+
+def with_values(thing: Any, values: dict[str, Any]) -> Any:
+    """Set what `values_of` gave."""
+    for name, value in values.items():
+        setattr(thing, name, value)
+    return thing
+
+
+def _wait_for(host: str, port: int, timeout_s: float) -> None:
+    """Wait until somebody listens at a port, or the time is over."""
+    until_s = time.monotonic() + timeout_s
+    while time.monotonic() < until_s:
+        try:
+            socket.create_connection((host, port), 1.0).close()
+        except OSError:
+            time.sleep(0.2)
+        else:
+            return
+
+
+def _put_back_carla(host: str, port: int, found: dict[str, Any], actors: list[int]) -> None:
+    import carla
+
+    client = carla.Client(host, port)
+    client.set_timeout(PATIENCE_S)
+    world = client.get_world()
+    for actor in world.get_actors(actors):
+        actor.destroy()
+    world.set_weather(with_values(carla.WeatherParameters(), found["weather"]))
+    world.apply_settings(with_values(carla.WorldSettings(), found["settings"]))
+
+
+def _put_back_unrealcv(host: str, port: int, commands: list[str]) -> None:
+    from cosfly.unreal.unrealcv_client import UnrealCvConfig, connect, ours
+
+    connection = connect(UnrealCvConfig(host=host, timeout_s=PATIENCE_S), port)
+    with connection.asking("the level was not put in order"):
+        names = ours(str(*connection.ask("vget /objects")))
+        connection.ask("vset /action/game/resume", *(f"vset /object/{name}/destroy" for name in names), *commands)
+    connection.close()
+
+
+def main(engine: str, host: str, port: str, command: str) -> None:
+    server = subprocess.Popen(shlex.split(command), start_new_session=True) if command else None
+    lines = [json.loads(line) for line in sys.stdin]
+    if server is not None:
+        os.killpg(server.pid, signal.SIGKILL)
+    elif lines:
+        try:
+            if engine == "carla":
+                _put_back_carla(host, int(port), lines[0], lines[1:])
+            else:
+                _put_back_unrealcv(host, int(port), lines[0])
+        except (RuntimeError, EnvironmentMissing) as error:  # it is gone, and with it all that there was to put back
+            print(f"{engine} at {host}:{port} was not left as it was found: {error}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

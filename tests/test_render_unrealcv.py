@@ -1,0 +1,279 @@
+"""Frames of an UnrealCV server: through the real client from a server of ours, against the embedded renderer's."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from simulator_serving import command, free_port, serving
+from test_cosfly_maps_unrealcv import beside
+from test_render_carla import FRAMES, files_of, flown, pictures_of
+from test_renderers_contract import street
+from typer.testing import CliRunner
+
+from cosfly.cli import app
+from cosfly.errors import ConfigError, EnvironmentMissing, InputError, RenderError
+from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.maps import unrealcv_export
+from cosfly.maps.unrealcv_export import UnrealCvMapConfig
+from cosfly.products.boxes import BoxMap, write_boxes
+from cosfly.products.flights import find_flights
+from cosfly.products.kinds import KINDS
+from cosfly.render.contract import PERSON_ID, PosedCar, PosedOther, PosedPerson, other_id
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import open_renderer, run
+from cosfly.render.unrealcv_backend import UnrealCvRenderConfig
+from cosfly.simulators.scene import clothes_of
+from cosfly.unreal.assets import id_of
+from cosfly.unreal.unrealcv_client import UnrealCvConfig, connect
+from cosfly.work.config import build
+
+pytest.importorskip("unrealcv")
+CLEAN = {**FRAMES, "tracks": ["clean"]}
+QUICK = {"timeout_s": 20.0, "settle_delay_s": 0.02}
+
+
+def exported() -> BoxMap:
+    """The street as `maps unrealcv` gives it."""
+    with beside(street()) as port:
+        return unrealcv_export.load(UnrealCvMapConfig(port=port), 0)
+
+
+def inputs(folder: Path, num_flights: int = 1, num_frames: int = 3) -> list[Path]:
+    boxes, simplified, traces = flown(folder, num_flights, num_frames)
+    for path in (boxes, simplified):
+        write_boxes(path, exported())
+    return [boxes, simplified, traces]
+
+
+def config(port: int, settings: dict = CLEAN, **own) -> RenderConfig:
+    return build(RenderConfig, {**settings, "backend": "unrealcv", "unrealcv": {"port": port, **QUICK, **own}}, "test")
+
+
+def opened(port: int, box_map: BoxMap, **own):
+    settings = build(UnrealCvRenderConfig, {"port": port, **QUICK, **own}, "test")
+    return open_renderer("unrealcv", box_map, 160, 90, settings=settings, num_others=4)
+
+
+def schema_of(value: object) -> object:
+    """Names and types, without values."""
+    if isinstance(value, dict):
+        return {name: schema_of(one) for name, one in value.items()}
+    if isinstance(value, list):
+        return [schema_of(value[0])] if value else []
+    return "number" if isinstance(value, int | float) and not isinstance(value, bool) else type(value).__name__
+
+
+@pytest.mark.slow
+def test_a_tree_is_the_embedded_renderers_by_recursive_diff(tmp_path):
+    """Step 6's contract: the same folders, files, schemas and frames; poses byte for byte; other pixels of people."""
+    given = inputs(tmp_path / "in", 2, 4)
+    reference = run(build(RenderConfig, FRAMES, "test"), *given, tmp_path / "gl", seed=5, workers=1)
+    with serving(street(), tmp_path / "town", protocol="unrealcv") as port:
+        tree = run(config(port, FRAMES), *given, tmp_path / "unrealcv", seed=5, workers=1)
+        time.sleep(3.0)  # a guard puts it in order when the worker is gone
+        connection = connect(UnrealCvConfig(port=port), port)
+        objects, pose, size = connection.ask("vget /objects", "vget /camera/0/pose", "vget /camera/0/size")
+        assert "COSFLY" not in str(objects), "nobody is left"
+        assert (str(pose).split()[0], size) == ("0.000000", "640 480"), "the camera is where it was"
+        connection.close()
+    # target.png shows what the person wears, which nobody knows of an engine's: CARLA's trees have none either.
+    every = [
+        {str(p.relative_to(root)) for p in root.rglob("*") if p.name != "target.png"} for root in (tree, reference)
+    ]
+    assert every[0] == every[1]
+    for folder in find_flights(tree):
+        ours, theirs = (
+            json.loads((root / folder.relative_to(tree) / "trajectory.json").read_text()) for root in (tree, reference)
+        )
+        for absent in ("people", "goal"):  # nobody knows what the level's people wear
+            ours.pop(absent, None), theirs.pop(absent, None)
+        assert ours.keys() == theirs.keys()
+        assert schema_of(ours["camera"]) == schema_of(theirs["camera"])
+        for one, other in zip(ours["points"], theirs["points"], strict=True):
+            assert schema_of(one).keys() == schema_of(other).keys()
+            for name in ("drone_pose", "nav_waypoint", "timing"):
+                assert json.dumps(one[name]) == json.dumps(other[name])
+            assert json.dumps(one["target"]["world_location"]) == json.dumps(other["target"]["world_location"])
+        assert ours["camera"] == theirs["camera"]
+    for ours, theirs in zip(pictures_of(tree), pictures_of(reference), strict=True):
+        _, name, rgb, depth, kinds, ids, meta = ours
+        _, _, their_rgb, their_depth, their_kinds, their_ids, their_meta = theirs
+        rest = (ids != PERSON_ID) & (their_ids != PERSON_ID)
+        is_sky = their_depth >= 650.0
+        apart = np.abs(depth - their_depth) > np.maximum(their_depth * 2.0**-11, 1e-3) * 1.01
+        assert (apart & rest & ~is_sky).sum() <= 8, name
+        assert (depth[is_sky & rest] == 1000.0).all(), "half precision ends at 655 m"
+        assert ((ids != their_ids) & rest & ~is_sky).sum() <= 8, name
+        assert ((kinds != their_kinds) & rest & ~is_sky).sum() <= 8, name
+        assert np.abs(rgb[rest].astype(int) - their_rgb[rest]).mean() < 10.0, "houses are painted by other ids"
+        assert ((ids == PERSON_ID) == (kinds == KINDS["Pedestrians"])).all()
+        assert meta.target.num_pixels == pytest.approx(their_meta.target.num_pixels, rel=0.5)
+        assert meta.drone_pose == their_meta.drone_pose
+        assert schema_of(meta.model_dump()) == schema_of(their_meta.model_dump())
+
+
+def test_people_and_cars_stand_where_they_are_and_the_lens_changes():
+    clothes = clothes_of("Base_User_Agent_C")
+    pose = world_from_camera(np.array([-1.0, -9.5, 5.5]), np.array([-32.5, 60.0, 0.0]))
+    person = PosedPerson(np.array([4.0, -3.0, 0.90625]), 0.0, 0.0, 1.0, clothes)
+    car = PosedOther(other_id(0), PosedCar(np.array([1.0, -4.0, 0.75]), 1.0, (2.25, 0.9, 0.75), 0.3))
+    frames = []
+    with beside(street()) as port:
+        ours = opened(port, exported())
+        theirs = open_renderer("gl", exported(), 160, 90, num_others=4)
+        for renderer in (ours, theirs):
+            frames.append(renderer.render(pose, intrinsic_matrix(160, 90, 60.0), person, [car]))
+        near = ours.render(pose, intrinsic_matrix(160, 90, 30.0), person)
+        with pytest.raises(RenderError, match=r"no such lens.*square pixels"):
+            ours.render(pose, intrinsic_matrix(160, 90, 60.0) + np.eye(3)[0], None)
+        ours.close()
+        theirs.close()
+    for number in (PERSON_ID, other_id(0)):
+        masks = [frame.ids == number for frame in frames]
+        assert masks[0].sum() > 30
+        assert np.argwhere(masks[0]).mean(axis=0) == pytest.approx(np.argwhere(masks[1]).mean(axis=0), abs=1.5)
+    assert (near.ids == PERSON_ID).sum() > 2.5 * (frames[0].ids == PERSON_ID).sum()
+    assert not (near.ids == other_id(0)).any(), "who is gone is taken away"
+
+
+def test_a_level_of_another_scale_is_found_before_a_frame_is_drawn():
+    """The pitfall: metres taken for centimetres park the camera at ground level, and pictures show legs."""
+    with beside(street()) as port:
+        for own, told in (
+            ({"coord_scale": 1.0}, r"coord_scale 1, .*expected coord_scale 100, coord_z_offset -?0\.00.*--coord-scale"),
+            (
+                {"coord_z_offset": 7.0},
+                r"coord_z_offset 7: objects are 7\.0 m.*expected coord_scale 100, coord_z_offset",
+            ),
+        ):
+            with pytest.raises(
+                ConfigError, match=rf"127\.0\.0\.1:{port} \(UnrealCV 1\.1\.0\), street.*ground level.*{told}"
+            ):
+                opened(port, exported(), **own)
+        with pytest.raises(InputError, match=rf"127\.0\.0\.1:{port}.*no box of the map is in the level"):
+            opened(port, street())
+
+
+def test_a_camera_that_falls_is_found(monkeypatch):
+    from cosfly.simulators.unrealcv.server import UnrealCvServer
+
+    done = UnrealCvServer._done
+
+    def fallen(server, command: str) -> bytes:
+        if command.startswith("vset /camera/0/pose"):
+            words = command.split()
+            words[4] = "60.0"  # a pawn that gravity takes down
+            command = " ".join(words)
+        return done(server, command)
+
+    monkeypatch.setattr(UnrealCvServer, "_done", fallen)
+    with beside(street()) as port:
+        renderer = opened(port, exported())
+        pose = world_from_camera(np.array([-1.0, -9.5, 12.5]), np.array([-32.5, 60.0, 0.0]))
+        told = rf"127\.0\.0\.1:{port}, street: the camera is not where it was put.*0\.6 m over the ground.*12\.5 m over"
+        with pytest.raises(RenderError, match=told):
+            renderer.render(pose, intrinsic_matrix(160, 90, 60.0), None)
+        renderer.close()
+
+
+# --- what goes wrong --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_lost_late_double_and_broken_pictures_are_asked_again(tmp_path):
+    given = inputs(tmp_path / "in", 1, 5)
+    trees = []
+    faults = ("drop:depth@2", "duplicate:lit@4", "malformed:object_mask@6", "malformed:depth@8", "delay:lit@10=4")
+    for name, planted in {"plain": (), "faulty": faults}.items():
+        with serving(street(), tmp_path / name, *planted, protocol="unrealcv") as port:
+            cfg = config(port, timeout_s=3.0, animate=False)
+            trees.append(run(cfg, *given, tmp_path / f"tree_{name}", workers=1))
+    assert files_of(trees[0]) == files_of(trees[1])
+
+
+@pytest.mark.slow
+def test_a_silent_camera_fails_the_flight_with_its_name_and_keeps_the_finished_ones(tmp_path):
+    given = inputs(tmp_path / "in", 2, 4)
+    with serving(street(), tmp_path / "town", "drop:depth@6+", protocol="unrealcv") as port:
+        tree = run(config(port, timeout_s=2.0, retries=1), *given, tmp_path / "tree", workers=1)
+    (failure,) = [json.loads(line) for line in (tree / "failures.jsonl").read_text().splitlines()]
+    told = rf"UnrealCV 1\.1\.0 at 127\.0\.0\.1:{port}, street: a camera sends no picture.*camera 0: no answer in 2 s"
+    assert re.search(told, failure["message"]), failure
+    assert len(find_flights(tree)) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("fault", "told"), [("die@6", "refused"), ("hang@6", "no answer in 2 s")])
+def test_a_server_that_ends_is_named_and_the_run_goes_on_with_the_next(fault, told, tmp_path):
+    given = inputs(tmp_path / "in", 2, 4)
+    with (
+        serving(street(), tmp_path / "town", fault, protocol="unrealcv") as port,
+        pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port} \(UnrealCV.*{told}"),
+    ):
+        run(config(port, timeout_s=2.0, retries=1), *given, tmp_path / "tree", workers=1)
+    assert len(find_flights(tmp_path / "tree")) == 1
+    kept = files_of(tmp_path / "tree")
+    with serving(street(), tmp_path / "town", protocol="unrealcv") as port:
+        files = files_of(run(config(port), *given, tmp_path / "tree", workers=1))
+    assert len(find_flights(tmp_path / "tree")) == 2
+    assert {name: files[name] for name in kept} == kept
+
+
+@pytest.mark.slow
+def test_a_server_that_we_start_is_started_again(tmp_path):
+    """The first dies after some frames; two workers have ports of their own, one after the other."""
+    given = inputs(tmp_path / "in", 2, 4)
+    write_boxes(tmp_path / "boxes_3d.json", street())
+    port = free_port()
+    plain = " ".join(command(tmp_path / "boxes_3d.json", 0, protocol="unrealcv")).replace(" 0 ", " {port} ")
+    start = f"sh -c 'mkdir {tmp_path}/{{port}} 2>/dev/null && exec {plain} --fault die@3; exec {plain}'"
+    tree = run(config(port, timeout_s=20.0, server_command=start), *given, tmp_path / "tree", workers=2)
+    assert len(find_flights(tree)) == 2
+    assert (tmp_path / str(port)).is_dir()
+    assert (tmp_path / str(port + 1)).is_dir()
+
+
+@pytest.mark.slow
+def test_the_papers_options(tmp_path):
+    boxes, simplified, traces = inputs(tmp_path / "in", 2, 3)
+    with serving(street(), tmp_path / "town", protocol="unrealcv") as port:
+        words = [
+            *("render", "--backend", "unrealcv", "--cvip", "127.0.0.1", "--cvport", str(port), "--path-index", "1"),
+            *("--no-require-depth", "--require-rgb", "--settle-delay", "0.02", "--coord-scale", "100.0"),
+            *("--coord-z-offset", "0.0", "--gif", "--gif-fps", "8", "--gif-name", "look.gif", "--workers", "1"),
+            *("--map", str(boxes), "--simplified", str(simplified), "--traces", str(traces)),
+            *("--out", str(tmp_path / "render"), "--set", "render.width_px=160", "--set", "render.height_px=90"),
+        ]
+        done = CliRunner().invoke(app, words, catch_exceptions=False)
+    words[words.index("--path-index") + 1], words[words.index("--out") + 1] = "7", str(tmp_path / "other")
+    other = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    flights = find_flights(tmp_path / "render")
+    assert {json.loads((f / "trajectory.json").read_text())["source"]["path_index"] for f in flights} == {1}
+    names = {p.name for p in (tmp_path / "render").rglob("frame_00000/*")}
+    assert "rgb.png" in names
+    assert not any(name.startswith("depth") for name in names)
+    from PIL import Image
+
+    with Image.open(tmp_path / "render/look.gif") as gif:
+        assert (gif.n_frames, gif.info["duration"]) == (3, 120)
+    assert "render.path_index: no such flight; got 7; expected below 2" in str(other.exception)
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_level_that_is_not_there_and_nobody_there_are_told(tmp_path):
+    port = free_port()
+    with pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port} \(UnrealCV unknown\): no UnrealCV server"):
+        opened(port, street())
+    with beside(street()) as port, pytest.raises(ConfigError, match=rf"127\.0\.0\.1:{port}.*no such level; got Town99"):
+        opened(port, street(), level="Town99")
+    with pytest.raises(ConfigError, match="a sun, an air and a horizon of its own"):
+        config(9000, {**CLEAN, "look": {"haze_m": 10.0}})
+    with pytest.raises(ConfigError, match="draws no weather"):
+        config(9000, {**CLEAN, "weather_mode": "random_per_path"})
+    assert id_of("Walls_55") in exported().ids.tolist()
