@@ -53,7 +53,7 @@ from cosfly.render.contract import (
 )
 from cosfly.render.draping import layers_of
 from cosfly.render.person import choose_clothes
-from cosfly.render.settings import RenderConfig
+from cosfly.render.settings import ENGINES, RenderConfig
 from cosfly.render.stage import RENDERERS, open_renderer, run
 from cosfly.work.config import build
 
@@ -154,8 +154,9 @@ def away_from_silhouettes(depth: np.ndarray, ids: np.ndarray) -> np.ndarray:
     return ~cv2.dilate((bent | differs).astype(np.uint8), np.ones((3, 3))).astype(bool)
 
 
-# The second renderer is an extra, and draws slowly; CARLA needs a server, of one town (tests/test_render_carla.py).
-EMBEDDED = sorted(RENDERERS.keys() - {"carla"})
+# The second renderer is an extra, and draws slowly; engines need a server, of one town (tests/test_render_carla.py),
+# and ids of objects of its own (tests/test_render_unrealcv.py).
+EMBEDDED = sorted(RENDERERS.keys() - set(ENGINES))
 NAMES = [pytest.param(name, marks=pytest.mark.slow if name == "pyrender" else ()) for name in EMBEDDED]
 
 

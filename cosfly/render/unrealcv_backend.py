@@ -14,6 +14,7 @@ from __future__ import annotations
 import logging
 import re
 import time
+import weakref
 from collections.abc import Sequence
 
 import cv2
@@ -105,6 +106,7 @@ class UnrealCvRenderer:
             self._guard = EngineGuard("unrealcv", cfg.host, self._port, cfg.server_command, cfg.timeout_s)
         try:
             self._server = connect(cfg, self._port)
+            weakref.finalize(self, self._server.close)  # one client at a time: who asks no more makes room
             try:
                 with self._server.asking("the level was not given"):
                     self._begin(self._guard if is_first else None)
