@@ -29,6 +29,7 @@ from caption.truth.facts import Facts
 from caption.truth.gold import GOLD, read_gold
 from caption.truth.prose import judge_prose
 from caption.truth.references import parse_reference
+from cosfly.app import reproduce
 from cosfly.app.settings import RunConfig
 from cosfly.chat.answers import TOTALS, AnswerBook, journal_name
 from cosfly.chat.contract import Request
@@ -460,6 +461,9 @@ def _records(root: Path) -> None:
     log.close()
     traces = read_traces(root / "drone_trace.json")
     (root / "compare").mkdir()
+    (root / "simplify").mkdir()
+    counted = {"passes": [{"counts": {"Vegetation": 3}}], "trunks": {"full": {"iou": 0.9}}, "grid": {"cells": [2, 2]}}
+    write_json(root / "simplify/simplify_report.json", {"num_boxes": {"raw": 3}} | counted)
     names = list(compare.PLANNERS)[:2]
     timings = {name: {"mean_ms": 1.0, "max_ms": 1.0} for name in names}
     flown = compare.summarize(dict.fromkeys(names, traces), np.random.default_rng(0))
@@ -604,6 +608,14 @@ def _tree(root: Path, scratch: Path) -> None:
 
 def _tables(root: Path, scratch: Path) -> None:
     text_tables(root / "compare/compare.json")
+
+
+def _reproduced(root: Path, scratch: Path) -> None:
+    """Make every table of the paper for which there are files."""
+    places = reproduce.Places([root], {})
+    for label, printed in reproduce.read_paper().tables.items():
+        with contextlib.suppress(reproduce.MissingFile):
+            reproduce.part(label, printed, places, root)
 
 
 def _simplified(root: Path, scratch: Path) -> None:
@@ -918,6 +930,7 @@ READERS: dict[str, Reader] = {
         "benchmark/scenarios.jsonl", lambda path: [record.traces() for record in benchmark.read_scenarios(path)]
     ),
     "benchmark": _one("benchmark/benchmark.json", lambda path: benchmark.text_tables(benchmark.read_benchmark(path))),
+    "reproduction": Reader(("compare/compare.json", "simplify/simplify_report.json"), _reproduced),
     "comparison": Reader(("compare/compare.json", "compare/manifest.json"), _tables),
     "presets of weather": _one(
         "sky.yaml",

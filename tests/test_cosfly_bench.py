@@ -22,12 +22,14 @@ EVENTS = [
     event(0, "began", workers=2),
     event(0, "worker_started", worker=0, pid=1),
     event(0, "worker_started", worker=1, pid=2),
-    event(4, "probe", rss_mib={0: 100.0, 1: 120.0}, cores_used=1.0, disk_free_mib=1.0),
+    event(
+        4, "probe", rss_mib={0: 100.0, 1: 120.0}, cores_used=1.0, disk_free_mib=1.0, gpu_percent=40.0, gpu_mib=2048.0
+    ),
     event(10, "item_done", worker=0, item="a", status="kept", seconds=8.0, steps=40),
     event(12, "worker_died", worker=1, pid=2, item="b", seconds=9.0, steps=30),
     event(12, "retried", item="b", attempt=1),
     event(13, "restarted", worker=1, pid=3),
-    event(14, "probe", rss_mib={0: 90.0}, cores_used=2.0, disk_free_mib=1.0),
+    event(14, "probe", rss_mib={0: 90.0}, cores_used=2.0, disk_free_mib=1.0, gpu_percent=50.0, gpu_mib=1024.0),
     event(20, "item_done", worker=1, item="b", status="kept", seconds=5.0, steps=40),
     event(20, "item_done", worker=0, item="c", status="dropped", seconds=5.0, steps=10),
     event(20, "ended"),
@@ -40,6 +42,9 @@ def test_figures_of_a_run():
     assert (row.attempted, row.successful, row.per_s) == (120, 80, 4.0)
     assert (row.restarts, row.failed) == (1, 0)
     assert (row.peak_memory_mib, row.cores_used) == (220.0, 1.5)
+    assert (row.gpu_percent, row.gpu_gib) == (45.0, 2.0)
+    without = [one.model_copy(update={"gpu_percent": None, "gpu_mib": None}) for one in EVENTS]
+    assert row_of(without, MANIFEST, 2, counts_frames=True).gpu_percent is None
     items = row_of(EVENTS, MANIFEST, 2, counts_frames=False)
     assert (items.attempted, items.successful) == (4, 2)
 

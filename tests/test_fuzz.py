@@ -70,7 +70,7 @@ FOR_PEOPLE = [
     "compare_series.png", "compare_strategies.json",
     "contact_sheet.png", "depth_study.json", "depth_study.png", "map.png", "paths.png", "pedestrians_report.json",
     "perturbation_report.json",
-    "plan.png", "preflight.json", "report.json", "simplify.png", "simplify_report.json", "zoom_fidelity.png",
+    "plan.png", "preflight.json", "report.json", "simplify.png", "zoom_fidelity.png",
     "zoom_levels.png", "zoom_study.json", "reproduction.json", "variants.json", "variants.png",
 ]  # fmt: skip
 

@@ -39,6 +39,8 @@ class BenchRun(BaseModel):
     successful: int
     cores_used: float
     peak_memory_mib: float
+    gpu_percent: float | None = None  # the mean of the probes, and the most memory; None on a machine without
+    gpu_gib: float | None = None
     restarts: int
     failed: int
 
@@ -112,6 +114,7 @@ def row_of(events: list[Event], manifest: Manifest, workers: int, *, counts_fram
     done = [event for event in events if event.event == "item_done"]
     lost = [event for event in events if event.event in LOSSES]
     probes = [event for event in events if event.event == "probe"]
+    loads = [probe.gpu_percent for probe in probes if probe.gpu_percent is not None]
     size = (lambda event: event.steps or 0) if counts_frames else (lambda event: 1)
     return BenchRun(
         workers=workers,
@@ -120,6 +123,8 @@ def row_of(events: list[Event], manifest: Manifest, workers: int, *, counts_fram
         successful=sum(size(event) for event in done if event.status == "kept"),
         cores_used=round(float(np.mean([probe.cores_used or 0.0 for probe in probes] or [0.0])), 2),
         peak_memory_mib=max((sum((probe.rss_mib or {}).values()) for probe in probes), default=0.0),
+        gpu_percent=round(float(np.mean(loads)), 1) if loads else None,
+        gpu_gib=round(max(probe.gpu_mib or 0.0 for probe in probes) / 1024.0, 2) if loads else None,
         restarts=sum(event.event == "restarted" for event in events),
         failed=manifest.counts.failed.total(),
     )

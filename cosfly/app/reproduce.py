@@ -29,6 +29,7 @@ from cosfly.errors import InputError
 from cosfly.look.frame_views import small_jpeg
 from cosfly.look.gallery import four_panels
 from cosfly.look.page import page, run_name
+from cosfly.planners import benchmark as plan_benchmark
 from cosfly.planners import compare
 from cosfly.products.boxes import read_boxes
 from cosfly.products.captions import FIELDS, read_captions
@@ -55,12 +56,21 @@ PLANNERS = ("track_astar", "muco", "foresight")  # the first is held against the
 BEAMS = (64, 256, 512, 1024, 2048, 4096)
 LENSES_DEG = (120, 110, 90, 70, 60, 45, 30)  # tab:zoom_conversion
 ZOOM = {"fovs_deg": (110, 90, 60, 30), "every": 12, "modalities": ("rgb", "depth", "instance")}
-WIDTH_PX = 1100  # of pictures on the page
+WIDTH_PX = 1500  # of pictures on the page
 STYLE = """
 .pair { display: flex; flex-wrap: wrap; gap: 12px 34px; align-items: flex-start; }
 .pair img { flex: 1 1 420px; min-width: 0; max-width: min(100%, 860px); border-radius: 4px; }
-.panel h2 { margin-top: 2px; } #muco_visibility img { max-width: 100%; }
+.panel h2 { margin-top: 2px; } [id="muco_visibility"] img, [id$="failure"] img { flex-basis: 100%; max-width: 100%; }
 """
+# Of `cosfly plan benchmark`, by the first words of its tables: their labels, and a figure of each.
+OF_BENCHMARK: dict[str, tuple[str, str]] = {
+    "Four axes": ("tab:appendix_h_four_axis_scores, fig:appendix_h_alg3d_measured", "axes_radar.png"),
+    "TA* + Smooth less": ("tab:appendix_h_tastar_muco_delta, fig:appendix_h_tastar_muco_deltas", "deltas.png"),
+    "TA* + Smooth against": ("tab:appendix_h_tastar_muco_win_rates", ""),
+    "Weighted score": ("tab:appendix_h_extended_ranking, fig:appendix_h_four_axis_bar", "axes_bars.png"),
+    "Feasibility": ("tab:appendix_h_extended_feasibility, fig:appendix_h_alg3d_projections", "axes_pairs.png"),
+    "Groups": ("tab:appendix_h_group_summary, fig:appendix_h_measured_trajectory_grid", "flights_3d.png"),
+}
 # Of `cosfly release stats` the tables that name one of the paper; the others are told of plans here.
 OF_RELEASE = ("release", "decisions", "confusion", "repairs", "text_lengths", "fovs", "weather")
 
@@ -93,8 +103,14 @@ class Paper(BaseModel):
     left_out: dict[str, str]
 
 
-class _Absent(Exception):
+class MissingFile(Exception):
     """A file that a table is made of is not there."""
+
+
+def read_paper() -> Paper:
+    """Read what the paper prints, and where ours stands."""
+    path = Path(__file__).with_name("paper.yaml")
+    return build(Paper, read_yaml(path), path)
 
 
 def run(
@@ -113,8 +129,7 @@ def run(
         raise InputError(
             "the run has not come to its flights", where=folder, got=f"no {', no '.join(missing)}", fix=fix
         )
-    paper = Path(__file__).with_name("paper.yaml")
-    printed = build(Paper, read_yaml(paper), paper)
+    printed = read_paper()
     made = measure(cfg, folder, out, walks, done, {**manner_of_work(cfg), "resume": resume})
     places = Places([*beside, folder, out], made)
     made |= work(cfg, folder, places, done)
@@ -122,8 +137,14 @@ def run(
     for label, table in printed.tables.items():
         try:
             parts.append(part(label, table, places, folder))
-        except _Absent as absent:
+        except MissingFile as absent:
             left_out[f"{label}, {table.also}".strip(", ")] = f"this run has no {absent}"
+    try:
+        parts += benchmarked(places)
+    except MissingFile:
+        left_out[", ".join(OF_BENCHMARK)] = (
+            "of 14 planners: `cosfly plan benchmark MAP PATHS --out DIR`, then --beside DIR"
+        )
     if "release" in done:
         tables = read_object(out / "release/stats.json", what="statistics")["tables"]
         parts += [Part(**one) for one in tables if one["key"] in OF_RELEASE]
@@ -158,14 +179,14 @@ class Places:
     def file(self, name: str) -> Path:
         found = next((root / name for root in self.roots if (root / name).is_file()), None)
         if found is None:
-            raise _Absent(name)
+            raise MissingFile(name)
         return found
 
     def figures(self, place: str) -> list[Any]:
         """Give the figures of a place of `paper.yaml`; None where a part of one is not there.
 
         Raises:
-            _Absent: the file is not there. InputError: it does not hold what it should.
+            MissingFile: the file is not there. InputError: it does not hold what it should.
         """
         found = list[Any]()
         for one in place.split(" + "):
@@ -216,6 +237,10 @@ def part(label: str, printed: Printed, places: Places, run: Path) -> Part:
         place = row if ":" in row else printed.place.format(row)
         files |= {one.partition(":")[0] for one in place.split(" + ")} - {"work"}
         found = places.figures(place)
+        if name == "*" and not isinstance(found[0] or {}, dict):
+            raise InputError(
+                "not what a stage writes", where=place, got=str(found[0])[:80], expected="names with figures"
+            )
         ours |= {key: _values(row) for key, row in (found[0] or {}).items()} if name == "*" else {name: found}
     names, rows, theirs = printed.head.split("|"), Rows(), {name: _values(row) for name, row in printed.paper.items()}
     is_beside = names[1] == "here"  # ours is one column, the paper's stand beside it; else the paper's rows stand below
@@ -234,8 +259,9 @@ def part(label: str, printed: Printed, places: Places, run: Path) -> Part:
     is_recorded = all((run / file).is_file() for file in files)
     said = printed.why if theirs else printed.why[:1].upper() + printed.why[1:]
     why = f"{'Differs: ' * bool(theirs)}{said}. " if said else ""
+    labels = ", ".join(name for name in (label, printed.also) if ":" in name)
     return Part(
-        key=label, title=printed.title, head=names, rows=rows, paper=", ".join(filter(None, (label, printed.also))),
+        key=label, title=printed.title, head=names, rows=rows, paper=labels,
         note=why + (f"From {', '.join(sorted(files))}." if files else ""),
         source="recorded" if is_recorded else "measured anew",
         picture=_jpeg(places.file(printed.picture)) if printed.picture else None,
@@ -276,6 +302,21 @@ def settings(cfg: RunConfig, printed: Paper) -> Part:
     )
     head, labels = ["setting", "here", "paper", "", "label"], ", ".join(printed.settings)
     return Part(key="settings", title="Settings", head=head, rows=rows, paper=labels, note=note)
+
+
+def benchmarked(places: Places) -> list[Part]:
+    """Give the tables of `cosfly plan benchmark`, in which the paper's figures stand, and what it drew."""
+    file, parts = places.file("benchmark.json"), list[Part]()
+    for table in plan_benchmark.text_tables(plan_benchmark.read_benchmark(file)):
+        labels, picture = next(row for words, row in OF_BENCHMARK.items() if table.title.startswith(words))
+        drawn = _jpeg(file.with_name(picture)) if picture and file.with_name(picture).is_file() else None
+        note, rows = (
+            f"Of all planners, from {file.parent.name}/benchmark.json.",
+            [list[Cell](row) for row in table.rows],
+        )
+        told = {"title": table.title, "head": ["planner or figure", *table.columns[1:]], "rows": rows, "paper": labels}
+        parts.append(Part(key=f"benchmark_{len(parts)}", **told, note=note, source="measured anew", picture=drawn))
+    return parts
 
 
 # --- what is measured anew --------------------------------------------------------------------------------------------
@@ -333,7 +374,7 @@ def work(cfg: RunConfig, run: Path, places: Places, done: Sequence[str]) -> dict
         found["rendering"] = {
             f"{one.workers} workers": [
                 one.seconds, one.attempted, one.successful, one.per_s, one.per_s / rows[0].per_s, one.cores_used,
-                one.peak_memory_mib, one.restarts, one.failed,
+                one.peak_memory_mib, one.restarts, one.failed, one.gpu_percent, one.gpu_gib,
             ]
             for one in rows
         }  # fmt: skip

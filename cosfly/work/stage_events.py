@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -49,8 +51,9 @@ class HowFar(NamedTuple):
 class Event(BaseModel):
     """A line of `events.jsonl`. at_s: seconds since 1970. worker: its place, 0 and up; a restarted one keeps it.
 
-    Of a probe: rss_mib by worker (the most since the probe before), cores in use by all workers, free disk space, and
-    how far the stage is: `done` of `total`, of steps, as frames, or of items.
+    Of a probe: rss_mib by worker (the most since the probe before), cores in use by all workers, free disk space, mean
+    load and memory in use of all NVIDIA devices of the machine where it has some, and how far the stage is: `done` of
+    `total`, of steps, as frames, or of items.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -68,6 +71,8 @@ class Event(BaseModel):
     rss_mib: dict[int, float] | None = None
     cores_used: float | None = None
     disk_free_mib: float | None = None
+    gpu_percent: float | None = None
+    gpu_mib: float | None = None
     done: int | None = None
     total: int | None = None
     unit: Literal["steps", "items"] | None = None
@@ -106,7 +111,7 @@ class EventLog:
         elapsed_s = time.monotonic() - self._probed_s
         cores = round(self._used_s / elapsed_s, 2) if elapsed_s else 0.0
         free = shutil.disk_usage(self._folder).free / MEBIBYTE
-        far = self._how_far()._asdict() if self._how_far else {}
+        far = (self._how_far()._asdict() if self._how_far else {}) | gpu_use()
         self.tell("probe", rss_mib=self._peaks_mib, cores_used=cores, disk_free_mib=round(free, 1), **far)
         self._peaks_mib, self._used_s, self._probed_s = {}, 0.0, time.monotonic()
         if self._num_probes == self._pace * PROBES_OF_ONE_PACE:
@@ -150,6 +155,34 @@ def cpu_seconds(pid: int) -> float:
     """Give the processor time of a process and all its threads; 0 where the system does not tell, or it is gone."""
     fields = _stat(pid)
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK") if fields else 0.0  # utime, stime: proc(5)
+
+
+def gpu_use() -> dict[str, float]:
+    """Give what the driver says of the machine's NVIDIA devices: `gpu_percent`, their mean load, and `gpu_mib`, their
+    memory in use together; nothing where there is none."""
+    library = _nvml()
+    count, loads, used_mib = ctypes.c_uint(), [], 0.0
+    if library is None or library.nvmlDeviceGetCount_v2(ctypes.byref(count)):
+        return {}
+    for index in range(count.value):
+        device, rates, memory = ctypes.c_void_p(), (ctypes.c_uint * 2)(), (ctypes.c_ulonglong * 3)()
+        if library.nvmlDeviceGetHandleByIndex_v2(index, ctypes.byref(device)):
+            continue
+        if not library.nvmlDeviceGetUtilizationRates(device, rates):  # of the device, of its memory's bus
+            loads.append(rates[0])
+        if not library.nvmlDeviceGetMemoryInfo(device, memory):  # total, free, used
+            used_mib += memory[2] / MEBIBYTE
+    return {"gpu_percent": round(sum(loads) / len(loads), 1), "gpu_mib": round(used_mib, 1)} if loads else {}
+
+
+@lru_cache(maxsize=1)
+def _nvml() -> ctypes.CDLL | None:
+    """Load the library of the NVIDIA driver; None where there is none, or no device."""
+    try:
+        library = ctypes.CDLL("libnvidia-ml.so.1")
+    except OSError:
+        return None
+    return None if library.nvmlInit_v2() else library
 
 
 def _stat(pid: int) -> list[bytes]:
