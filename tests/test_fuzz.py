@@ -66,6 +66,7 @@ def test_every_file_that_is_documented_is_read_by_one_of_them_or_by_nobody():
 ALIKE = ["debug.png", "roi_polygon.json", "step2_simplified.json", "test.parquet"]
 # Written, and read by no command.
 FOR_PEOPLE = [
+    "axes_bars.png", "axes_pairs.png", "axes_radar.png", "boxes_meta.json", "deltas.png", "flights_3d.png",
     "bench.json", "caption_report.json", "comparison.json", "compare_overlay.png", "compare_radar.png",
     "compare_series.png", "compare_strategies.json",
     "contact_sheet.png", "depth_study.json", "depth_study.png", "map.png", "paths.png", "pedestrians_report.json",
