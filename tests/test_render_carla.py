@@ -106,6 +106,20 @@ def test_a_tree_is_the_embedded_renderers_frame_by_frame(tmp_path):
         _same_but_for_the_person(ours, theirs, exact=ours[0] == "ORI")
 
 
+@pytest.mark.slow
+def test_a_flight_zooms_by_other_cameras(tmp_path):
+    inputs = flown(tmp_path / "in", 1, 8)
+    zoom = {"fovs_deg": [90.0, 30.0], "zoom": {"mode": "dynamic", "part_s": 1.0, "ramp_s": 0.5}}
+    reference = run(build(RenderConfig, CLEAN | zoom, "test"), *inputs, tmp_path / "gl", seed=5)
+    with serving(street(), tmp_path / "town") as port:
+        tree = run(config(port, CLEAN | zoom), *inputs, tmp_path / "carla", seed=5, workers=1)
+    frames = list(zip(pictures_of(tree), pictures_of(reference), strict=True))
+    assert {frame[0][-1].camera.fov_deg for frame in frames} == {30.0, 90.0}
+    for ours, theirs in frames:
+        assert ours[-1].camera == theirs[-1].camera
+        _same_but_for_the_person(ours, theirs, exact=False)
+
+
 def _same_but_for_the_person(ours: tuple, theirs: tuple, *, exact: bool) -> None:
     """Depth within the encoding's step, kinds and ids equal; perturbed poses are rounded on the wire: edges move."""
     _, name, rgb, depth, kinds, ids, meta = ours
@@ -215,6 +229,21 @@ def test_a_server_that_we_start_is_started_again(tmp_path):
         open_renderer(
             "carla", street(), 160, 90, settings=build(CarlaRenderConfig, {"port": port, "timeout_s": 1.0}, "test")
         )
+
+
+@pytest.mark.slow
+def test_a_server_that_we_start_and_that_hangs_is_ended_and_started_again(tmp_path):
+    """By the health checks, long before its client gives up."""
+    inputs = flown(tmp_path / "in", 1, 5)
+    write_boxes(tmp_path / "boxes_3d.json", street())
+    plain = " ".join(command(tmp_path / "boxes_3d.json", 0)).replace(" 0", " {port}")
+    start = f"sh -c 'mkdir {tmp_path}/first 2>/dev/null && exec {plain} --fault hang@7; exec {plain}'"
+    cfg = config(free_port(), timeout_s=300.0, server_command=start, health_check_s=2.0)
+    begin_s = time.monotonic()
+    tree = run(cfg, *inputs, tmp_path / "tree", workers=1, watch=Watch(heartbeat_s=0.5, check_s=1.0))
+    assert time.monotonic() - begin_s < 200.0
+    assert len(find_flights(tree)) == 1
+    assert (tree / "events.jsonl").read_text().count('"worker_died"') == 1
 
 
 @pytest.mark.slow
