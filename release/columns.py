@@ -356,8 +356,8 @@ FRAME = (  # everything of a frame but pictures and depth
     Column("other_id", "int32", partial(_of_company, 2), ranges={"": (0, PERSON_ID)}),
     Column("alike_id", "int32", partial(_of_company, 3), ranges={"": (0, PERSON_ID)}),
     Column(
-        "alike_differences", "int32", partial(_of_company, 4), title="most alike other person", annotation=True,
-        shown=True,
+        "alike_differences", "int32", partial(_of_company, 4), title="things in which the most alike differs",
+        annotation=True, shown=True,
     ),
     Column("is_perturbed", "bool", lambda f, i: f.is_perturbed[i], required=True),
     Column(

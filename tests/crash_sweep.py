@@ -222,7 +222,9 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "plan": ["plan --map {simple} --paths {walks} --out {out} {tiny}"],
     "plan compare": ["plan compare {simple} {walks} --out {out} {tiny} --planner foresight --planner track_astar"],
     "plan benchmark": ["plan benchmark {simple} {walks} --out {out} {tiny} --planner theta_star --planner track_astar"],
-    "render": ["render {three} --out {out} --set render.width_px=64 --set render.height_px=36"],
+    "render": [  # so narrow a view that the target is made out, and its picture written
+        "render {three} --out {out} --set render.width_px=64 --set render.height_px=36 --set render.fovs_deg=[12]"
+    ],
     "study weather": ["study weather --map {maps} --traces {traces} --out {out} {tiny}"],
     "study zoom": ["study zoom {three} --out {out} --every 10"],
     "render sample": ["render sample --data {tree} --map {maps} --out {out}/sample.png"],
