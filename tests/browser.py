@@ -90,6 +90,7 @@ class Page:
             features=[{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}],
         )
         self.send("Page.navigate", url="about:blank")
+        self.wait("location.href === 'about:blank'")  # a page that follows at once is answered never, now and then
         self.send("Page.navigate", url=(path if isinstance(path, str) else path.absolute().as_uri()) + fragment)
         self.wait("document.readyState === 'complete'")
 

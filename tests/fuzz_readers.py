@@ -48,6 +48,7 @@ from cosfly.inspection import stage as inspection
 from cosfly.inspection.review import read_filled
 from cosfly.inspection.settings import InspectConfig
 from cosfly.look.gallery import contact_sheet, preview_gif
+from cosfly.look.topview import png_bytes
 from cosfly.maps import boxfile, cityjson, simworld
 from cosfly.pedestrians import stage as pedestrians
 from cosfly.pedestrians.walkable import PedestriansConfig
@@ -63,6 +64,7 @@ from cosfly.products.actions import (
     shipped_actions,
 )
 from cosfly.products.answer_text import Parsed, parse_answer
+from cosfly.products.backdrop import Backdrop, WorldFrame, write_backdrop
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.products.captions import Coc, read_captions
 from cosfly.products.flights import find_flights, read_twin
@@ -304,6 +306,8 @@ def _maps(root: Path) -> None:
         "properties": {"type": "Vegetation", "height": 5, "length": 2, "width": 2},
         "geometry": {"type": "Point", "coordinates": [40, 9]},
     }
+    png = png_bytes(np.zeros((4, 6, 3), np.uint8))
+    write_backdrop(root / "above.png", png, WorldFrame(west_m=-3, north_m=2, metres_per_px=0.5))
     (root / "own.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [house, tree]}))
     (root / "roi.geojson").write_text(json.dumps({"type": "MultiPolygon", "coordinates": [around, around]}))
     (root / "own.csv").write_text(
@@ -724,6 +728,7 @@ READERS: dict[str, Reader] = {
     ),
     "meshes, OBJ": Reader(("mesh.obj", "mesh.mtl"), lambda root, _: read_meshes(root / "mesh.obj", tree=root)),
     "region of interest": _one("roi.json", read_roi),
+    "picture from above": Reader(("above.png", "above.json"), lambda root, _: Backdrop.read(root / "above.png")),
     "region of interest, GeoJSON": _one("roi.geojson", read_roi),
     "table of boxes": _one("own.csv", lambda path: boxfile.load(boxfile.BoxesConfig(path=path))),
     "boxes, GeoJSON": _one("own.geojson", lambda path: boxfile.load(boxfile.BoxesConfig(path=path))),

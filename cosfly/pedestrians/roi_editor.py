@@ -225,7 +225,9 @@ class Editor:
 
     def cells(self, roi: Roi | None, where: str | Path = "region of interest") -> dict[str, Any]:
         """Give the cells of a region, a PNG over the backdrop in base64, and its figures."""
-        ground = walkable_ground(self.box_map, self.cfg, roi, where=self.where, roi_where=where)
+        ground = self.bare
+        if roi is not None:
+            ground = walkable_ground(self.box_map, self.cfg, roi, where=self.where, roi_where=where)
         picture = np.zeros((*ground.walkable.shape, 4), dtype=np.uint8)
         if ground.is_in_roi is not None:
             picture[ground.is_in_roi] = IN_REGION
