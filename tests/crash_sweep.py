@@ -212,6 +212,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "maps carla": ["maps carla --port {carla} --out {out}"],
     "maps unrealcv": ["maps unrealcv --port {unrealcv} --out {out}"],
     "maps roi-backdrop": ["maps roi-backdrop --map {maps} --out {out}/above.png --bounds -9 -9 9 9 --pixels-per-m 1"],
+    "world": ["world 'a small village with a well' --out {out}"],
     "simplify": ["simplify --map {maps} --out {out} {tiny}"],
     "pedestrians": ["pedestrians --map {simple} --out {out} {tiny}"],
     "pedestrians, more": [

@@ -21,6 +21,7 @@ from cosfly.simplify.passes import SimplifyConfig
 from cosfly.work.chance import rng_for
 from cosfly.work.config import Config, build
 from cosfly.work.worker_pool import Watch
+from cosfly.worlds.settings import WorldConfig
 from distill.evaluation.compare import ReportConfig
 from distill.evaluation.stage import EvaluateConfig
 from distill.inference.merge import MergeConfig
@@ -84,6 +85,7 @@ class RunConfig(Config):
     inspect: InspectConfig = Field(default_factory=InspectConfig, description="step 6")
     caption: CaptionConfig = Field(default_factory=CaptionConfig, description="step 7")
     release: ReleaseConfig = Field(default_factory=ReleaseConfig, description="the published data set")
+    world: WorldConfig = Field(default_factory=WorldConfig, description="text to world; not part of `cosfly run`")
     distill: DistillConfig = Field(default_factory=DistillConfig, description="students; not part of `cosfly run`")
 
     def opened(self, path: Path) -> Path:

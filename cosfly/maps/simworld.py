@@ -4,6 +4,8 @@ The source is Unreal's: centimetres, left-handed, y to the right, yaw clockwise;
 A box stands with its foot at the node's location, its size is the table's full size times the node's scale. What the
 source does not hold: street furniture has placeholder cubes in the size table, so ASSETS gives plausible sizes (counted
 as `default`); roads have no size, so carriageway and pavement come from what stands beside them (counted as `road`).
+A world that names its own surfaces, as `cosfly world` writes it (nodes such as Sidewalks_C, named after a kind), is
+taken at its word: nothing is added to it.
 `header.extent_sources` holds the counts.
 """
 
@@ -24,7 +26,7 @@ from cosfly.products.boxes import BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.products.columns import LARGEST
 from cosfly.products.kinds import KIND_NAMES
 from cosfly.reading.documents import read_json, validated
-from cosfly.unreal.assets import Asset, asset_of
+from cosfly.unreal.assets import Asset, asset_of, kind_of
 from cosfly.work.config import Config
 
 log = logging.getLogger(__name__)
@@ -38,6 +40,8 @@ KERB_M = 0.5  # from the kerb to the middle of the row of street furniture
 ROAD_SHARE_OF_FRONT = 0.43  # carriageway half width / distance of the fronts, where no furniture marks the kerb
 DEFAULT_FRONT_M = 27.0  # where no building stands along a road: the generator's usual distance
 MAP_MARGIN_M = 10.0
+ROAD_PIECES = "BP_Road*"  # of ASSETS: pieces without a size
+SURFACE_NODE = "Sidewalks_C"  # a world with such states its own surfaces
 
 
 class SimWorldConfig(Config):
@@ -141,8 +145,8 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
     sizes = read_sizes(cfg.size_tables())
     boxes, sources, dropped, road_nodes = BoxList(), {"road": 0, "bbox": 0, "engine": 0, "default": 0}, 0, []
     for node in nodes:
-        asset = asset_of(node.instance_name)
-        if asset is not None and asset.kind == "Roads":
+        asset = _asset(node.instance_name)
+        if asset is not None and asset.pattern == ROAD_PIECES:
             road_nodes.append(node)
             continue
         size = sizes.get(node.instance_name)
@@ -150,11 +154,14 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
             dropped += _unknown(cfg, node, "kind" if asset is None else "size")
             continue
         sources[_add_node(boxes, cfg, node, asset, size)] += 1
-    lines = _centerlines(cfg, road_nodes)
-    widths = _add_roads(boxes, lines)
-    sources["road"] = widths.pop("num_boxes")
+    widths: dict = {}
     num_asset_boxes = len(boxes)
-    _add_unsourced(boxes, cfg, lines, widths)
+    if SURFACE_NODE not in {node.instance_name for node in nodes}:
+        lines = _centerlines(cfg, road_nodes)
+        widths = _add_roads(boxes, lines)
+        sources["road"] = widths.pop("num_boxes")
+        num_asset_boxes = len(boxes)
+        _add_unsourced(boxes, cfg, lines, widths)
     header = MapHeader(
         name=cfg.name,
         source=MapSource(tool=cfg.tool, version="world file", file=cfg.world.name),
@@ -171,6 +178,12 @@ def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def _asset(name: str) -> Asset | None:
+    """Find an asset by its name, or the kind that a node of a world of ours is named after."""
+    kind = None if (asset := asset_of(name)) else kind_of(name)
+    return Asset(name, kind) if kind else asset
 
 
 def _group(value: object, name: str, kind: type, path: Path):

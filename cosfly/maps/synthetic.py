@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,9 @@ from cosfly.maps.town_blocks import (
     ROAD_TOP_M,
     SLAB_M,
     WATER_TOP_M,
+    LotsConfig,
     bench,
+    lots,
     point,
     ring,
     tree,
@@ -104,9 +107,14 @@ class SyntheticConfig(Config):
     blocks: dict[str, float] = Field(
         {}, description="share of each kind of block (a name in BLOCKS); none: a park, a square, the rest built up"
     )
+    center: str | None = Field(None, description="kind of block in the middle, of those in `blocks`; none: any")
+    lots: LotsConfig = Field(default_factory=LotsConfig, description="buildings of blocks of kind `lots`")
     river_m: float = Field(0.0, ge=0.0, le=120.0, description="width of a river in place of a boulevard, m; 0: none")
+    bridges: int = Field(0, ge=0, description="streets that cross the river; 0: all")
+    shore_m: float = Field(0.0, ge=0.0, le=500.0, description="open water along the south edge, how wide, m; 0: none")
     verge_m: float = Field(10.0, ge=4.0, description="lawn round the town, m")
     parked_share: float = Field(0.4, ge=0.0, le=1.0, description="share of parking places that are taken; 0 for none")
+    tree_parts: bool = Field(True, description="trees of wide streets in parts, as simulators export them; no: one box")
     tree_share: float = Field(0.85, ge=0.0, le=1.0, description="share of street tree places planted; 0 for none")
 
     @model_validator(mode="before")
@@ -118,7 +126,10 @@ class SyntheticConfig(Config):
 
     @model_validator(mode="after")
     def _names_are_known(self) -> SyntheticConfig:
-        for name, known in ((self.preset, list(PRESETS)), *((block, list(BLOCKS)) for block in self.blocks)):
+        center = [(self.center, list(self.blocks))] if self.center else []
+        for name, known in (
+            (self.preset, list(PRESETS)), *((block, list(BLOCKS)) for block in self.blocks), *center
+        ):  # fmt: skip
             if name not in known:
                 raise ValueError(f"there is no {name!r}{nearest(name, known)}; there are {', '.join(known)}")
         if self.blocks and (min(self.blocks.values()) < 0 or sum(self.blocks.values()) <= 0):
@@ -183,7 +194,7 @@ def load(cfg: SyntheticConfig, seed: int) -> BoxMap:
     if cfg.preset == "town10":
         return census_town(cfg.name, seed)
     boxes = BoxList()
-    streets = _streets(cfg, seed)
+    streets = street_grid(cfg, seed)
     half = cfg.size_m / 2
     boxes.add_span("Terrain", (-half, -half), (half, half), BASE_TOP_M - SLAB_M, BASE_TOP_M)
     _surfaces(boxes, cfg, streets)
@@ -195,18 +206,22 @@ def load(cfg: SyntheticConfig, seed: int) -> BoxMap:
     _verge(boxes, cfg, streets, rng_for(seed, "maps", "verge"))
     if streets.river is not None:
         _river(boxes, cfg, streets, streets.river)
+    if cfg.shore_m:
+        _shore(boxes, cfg)
     kinds = _block_kinds(cfg, rng_for(seed, "maps", "plan"))
+    makers = BLOCKS | {"lots": partial(lots, style=cfg.lots)}
     for row in range(cfg.num_blocks):
         for column in range(cfg.num_blocks):
             low = np.array([streets.columns[column].high_m, streets.rows[row].high_m])
             high = np.array([streets.columns[column + 1].low_m, streets.rows[row + 1].low_m])
             kind = kinds[row * cfg.num_blocks + column]
-            BLOCKS[kind](boxes, low, high, rng_for(seed, "maps", f"block {row} {column}"))
+            makers[kind](boxes, low, high, rng_for(seed, "maps", f"block {row} {column}"))
     source = MapSource(tool="cosfly maps synthetic", version=GENERATOR_VERSION, seed=seed)
     return boxes.box_map(MapHeader(name=cfg.name, source=source, licence=OUR_LICENCE, ground_z_m=0.0))
 
 
-def _streets(cfg: SyntheticConfig, seed: int) -> Streets:
+def street_grid(cfg: SyntheticConfig, seed: int) -> Streets:
+    """Give the streets of a town, and its river."""
     wide = 1 if cfg.num_blocks > 1 else 0  # the boulevard's place
     rows = _strips(cfg, cfg.river_m or cfg.boulevard_m, wide, rng_for(seed, "maps", "rows"))
     columns = _strips(cfg, cfg.boulevard_m, wide, rng_for(seed, "maps", "columns"))
@@ -249,17 +264,28 @@ def _surfaces(boxes: BoxList, cfg: SyntheticConfig, streets: Streets) -> None:
 def _river(boxes: BoxList, cfg: SyntheticConfig, streets: Streets, river: Strip) -> None:
     """Water from edge to edge between quays, and a bridge with railings where a street along y crosses it."""
     low, high = river.road
-    edges = [-cfg.size_m / 2, *(m for strip in streets.columns for m in (strip.low_m, strip.high_m)), cfg.size_m / 2]
+    count = len(streets.columns)
+    crossing = streets.columns  # those with a bridge, as evenly spread as they can be
+    if 0 < cfg.bridges < count:
+        crossing = [streets.columns[int((k + 0.5) * count / cfg.bridges)] for k in range(cfg.bridges)]
+    edges = [-cfg.size_m / 2, *(m for strip in crossing for m in (strip.low_m, strip.high_m)), cfg.size_m / 2]
     for a, b in zip(edges[::2], edges[1::2], strict=True):
         boxes.add_span("Water", (a, low), (b, high), -1.2, WATER_TOP_M)
         for quay in (low, high):
             boxes.add_span("Walls", (a, quay - RAILING_M), (b, quay + RAILING_M), -1.2, 0.5)
-    for strip in streets.columns:
+    for strip in crossing:
         boxes.add_span("Roads", (strip.road[0], low), (strip.road[1], high), ROAD_TOP_M - SLAB_M, ROAD_TOP_M)
         for side, kerb, edge in ((-1, strip.road[0], strip.low_m), (1, strip.road[1], strip.high_m)):
             boxes.add_span("Sidewalks", (min(kerb, edge), low), (max(kerb, edge), high), -SLAB_M, PAVED_TOP_M)
             railing = edge - side * RAILING_M
             boxes.add_span("Fences", (min(railing, edge), low), (max(railing, edge), high), -SLAB_M, 1.1)
+
+
+def _shore(boxes: BoxList, cfg: SyntheticConfig) -> None:
+    """Open water south of the town, and the wall of a quay before it."""
+    half = cfg.size_m / 2
+    boxes.add_span("Water", (-half, -half - cfg.shore_m), (half, -half - RAILING_M), -1.2, WATER_TOP_M)
+    boxes.add_span("Walls", (-half, -half - RAILING_M), (half, -half), -1.2, 0.4)
 
 
 def _road_paint(boxes: BoxList, streets: Streets) -> None:
@@ -293,7 +319,14 @@ def _street_furniture(
                     _lamp(boxes, axis, along, furniture, -side)
                 elif (wide or number % 3 == 1) and rng.random() < cfg.tree_share:
                     crown = rng.uniform(2.6, 3.4) if not wide else rng.uniform(3.4, 4.6)
-                    tree(boxes, point(axis, along, furniture), crown, rng.uniform(5.5, 9.5), rng, in_parts=wide)
+                    tree(
+                        boxes,
+                        point(axis, along, furniture),
+                        crown,
+                        rng.uniform(5.5, 9.5),
+                        rng,
+                        in_parts=wide and cfg.tree_parts,
+                    )
                 elif rng.random() < 0.5:
                     bench(boxes, axis, along, furniture, rng)
             for along in np.arange(low + 9.5, high - 11.0, 6.6):
@@ -363,7 +396,11 @@ def _block_kinds(cfg: SyntheticConfig, rng: np.random.Generator) -> list[str]:
         share = max(1, count // 9)
         kinds = ["park"] * (share if count > 1 else 0) + ["square"] * (share if count > 3 else 0)
         kinds += [built[i % 3] for i in range(count - len(kinds))]
-    return [kinds[i] for i in rng.permutation(count)]
+    kinds = [kinds[i] for i in rng.permutation(count)]
+    if cfg.center in kinds:
+        middle, at = cfg.num_blocks // 2 * (cfg.num_blocks + 1), kinds.index(cfg.center)
+        kinds[middle], kinds[at] = kinds[at], kinds[middle]
+    return kinds
 
 
 def _shared_out(shares: dict[str, float], count: int) -> list[str]:

@@ -2,15 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
+from pydantic import Field
 
 from cosfly.maps.boxlist import BoxList
+from cosfly.work.config import Config
 
 # Tops of the surfaces, m. Two centimetres apart at least: a depth buffer tells them apart at 300 m.
 PAVED_TOP_M, LAWN_TOP_M, PAINT_TOP_M, ROAD_TOP_M, BASE_TOP_M = 0.0, -0.02, -0.03, -0.06, -0.12
 WATER_TOP_M = 0.05  # over the ground, so that it is an obstacle: nobody walks on a pond
 SLAB_M = 0.3
 PASSAGE_M, ARCADE_M = 3.2, 3.0  # what people walk under: its clear height, the depth of an arcade
+LEAST_FRONT_M = 7.0  # what is left of a row is built up if it is longer
+
+
+class LotsConfig(Config):
+    """The buildings of blocks of kind `lots`."""
+
+    footprints_m: list[tuple[float, float]] = Field(
+        [(12.0, 10.0), (18.0, 13.0), (26.0, 15.0)], min_length=1, description="sizes to choose from: front, depth, m"
+    )
+    heights_m: tuple[float, float] = Field((8.0, 20.0), description="lowest and highest building, m")
+    fall_m: float = Field(
+        0.0, ge=0.0, description="distance from the middle of the town at which only the lowest stand, m; 0: anywhere"
+    )
+    gap_m: float = Field(2.0, ge=0.5, le=60.0, description="least gap between two buildings, m")
+    setback_m: float = Field(1.0, ge=0.0, le=20.0, description="from the pavement to the fronts, m")
 
 
 def ring(
@@ -304,7 +324,56 @@ def _meadow(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Ge
     bench(boxes, 0, middle[0], middle[1] + 2.4, rng)
 
 
-BLOCKS = {
+def lots(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Generator, style: LotsConfig) -> None:
+    """Two rows of building lots, each with its front to a street, back to back; before a front there is a path."""
+    has_gardens = style.setback_m >= 2.5
+    _ground(boxes, "Terrain" if has_gardens else "Sidewalks", low, high)
+    size, (lowest, highest) = high - low, style.heights_m
+    depth = size[1] / 2 - max(2.5, 0.08 * size[1]) - style.setback_m
+    fall = min(1.0, float(np.linalg.norm((low + high) / 2)) / style.fall_m) if style.fall_m else 0.0
+    for row, side in ((low[1], 1), (high[1], -1)):
+        at = low[0] + style.gap_m / 2
+        while (room := high[0] - style.gap_m / 2 - at) >= LEAST_FRONT_M:
+            front, deep = style.footprints_m[rng.integers(len(style.footprints_m))]
+            share = min(1.0, depth / deep)
+            front, deep = front * share, deep * share
+            front = room if room < front + LEAST_FRONT_M + style.gap_m else front
+            height = lowest + (highest - lowest) * rng.beta(1.3, 1.7) * (1.0 - 0.9 * fall)
+            middle = np.array([at + front / 2, row + side * (style.setback_m + deep / 2)])
+            boxes.add("Buildings", middle, (front, deep), 0.0, height)
+            if has_gardens:
+                ends = (middle[0] - 0.8, row), (middle[0] + 0.8, row + side * style.setback_m)
+                _between(boxes, *ends, -SLAB_M, PAVED_TOP_M, "Sidewalks")
+            at += front + style.gap_m * rng.uniform(1.0, 1.6)
+
+
+def _plaza(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> None:
+    """A paved square, free in the middle, with trees and benches along its edges."""
+    _ground(boxes, "Sidewalks", low, high)
+    for x in np.arange(low[0] + 6.0, high[0] - 5.0, 11.0):
+        for y, inwards in ((low[1] + 2.5, 1), (high[1] - 2.5, -1)):
+            tree(boxes, (x, y), rng.uniform(2.8, 3.8), rng.uniform(5.5, 8.0), rng)
+            if rng.random() < 0.4:
+                bench(boxes, 0, x + 4.0, y + inwards * 1.2, rng)
+
+
+def _green(boxes: BoxList, low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> None:
+    """A lawn between two crossing paths, free in the middle of each quarter, with trees along its edges."""
+    middle, lane = (low + high) / 2, 1.5
+    boxes.add_span("Sidewalks", (low[0], middle[1] - lane), (high[0], middle[1] + lane), -SLAB_M, PAVED_TOP_M)
+    for a, b in ((low[1], middle[1] - lane), (middle[1] + lane, high[1])):
+        boxes.add_span("Sidewalks", (middle[0] - lane, a), (middle[0] + lane, b), -SLAB_M, PAVED_TOP_M)
+        for c, d in ((low[0], middle[0] - lane), (middle[0] + lane, high[0])):
+            boxes.add_span("Terrain", (c, a), (d, b), LAWN_TOP_M - SLAB_M, LAWN_TOP_M)
+    for axis in (0, 1):
+        for along in np.arange(low[axis] + 6.0, high[axis] - 5.0, 9.0):
+            for across in (low[1 - axis] + 4.0, high[1 - axis] - 4.0):
+                if abs(along - middle[axis]) > 4.0:
+                    tree(boxes, point(axis, along, across), rng.uniform(3.5, 5.5), rng.uniform(7.0, 12.0), rng)
+
+
+BLOCKS: dict[str, Callable[..., None]] = {
     "park": _park, "square": _square, "courtyard": _courtyard, "houses": _houses, "towers": _towers, "lanes": _lanes,
     "skyscrapers": _skyscrapers, "campus": _campus, "farm": _farm, "market": _market, "meadow": _meadow,
+    "plaza": _plaza, "green": _green, "lots": partial(lots, style=LotsConfig()),
 }  # fmt: skip

@@ -1,0 +1,77 @@
+"""The command `cosfly world`: from a prompt to a world, to several, and on to a data set."""
+
+from __future__ import annotations
+
+import re
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from typer import Argument, Option
+
+from cosfly.cli import options
+from cosfly.cli.options import Job, Sets, takes
+
+app = typer.Typer()
+
+
+@app.command()
+@takes("seed", "workers", "resume")
+def world(
+    job: Job,
+    prompt: Annotated[str, Argument(help="What the world shall be, in plain English."), Sets("world.prompt")],
+    out: Annotated[
+        Path | None, Option(show_default="worlds/<prompt>-<time>", help="New folder for the world, or the worlds.")
+    ] = None,
+    planner: Annotated[
+        str | None, Option(metavar="URL", help="Language model that plans; none: rules."), Sets("world.planner")
+    ] = None,
+    model: Annotated[str | None, Option(help="Its name."), Sets("world.endpoint.model")] = None,
+    count: Annotated[int, Option(min=1, max=1000, help="So many worlds, each of a seed of its own.")] = 1,
+    against: Annotated[
+        list[Path] | None,
+        Option(help="A SimWorld world to compare buildings with, its Bbox.json beside it; repeat it."),
+    ] = None,
+    run: Annotated[
+        bool, Option("--run", help="Go on: walks, flights, frames and all that `cosfly run` makes.")
+    ] = False,
+) -> None:
+    """Text to world: a town that a prompt describes, as SimWorld's combined_world.json."""
+    from cosfly.worlds import stage
+
+    words = "-".join(re.findall(r"[a-z0-9]+", prompt.lower())[:5]) or "world"
+    out = out or Path("worlds") / f"{words[:40]}-{time.strftime('%Y%m%d-%H%M%S')}"
+    folders = [out] if count == 1 else [out / f"world_{number:03}" for number in range(count)]
+    products = [
+        stage.run(job.cfg.world, folder, seed=job.cfg.seed + number, resume=job.resume, against=against or ())
+        for number, folder in enumerate(folders)
+    ]
+    for product in products:
+        job.finish(product, product.parent)
+    if count > 1:
+        found = stage.write_diversity(products, out)
+        typer.echo(
+            f"not shared of two worlds' built-up ground: {found['mean_unlike']:.0%}, least {found['least_unlike']:.0%}"
+        )
+    if run:
+        for folder in folders:
+            _go_on(job, folder)
+
+
+def _go_on(job: Job, folder: Path) -> None:
+    """Do the rest of the loop: a first region is proposed from the simplified map, then all stages follow."""
+    from cosfly.app import pipeline
+    from cosfly.cli.run import _closing_table
+    from cosfly.pedestrians.roi_editor import run_propose
+    from cosfly.worlds.stage import LOOP_FILE
+
+    given = {"seed": job.cfg.seed, "workers": job.cfg.workers}
+    cfg, out = options.resolve(folder / LOOP_FILE, None, given), folder / "run"
+    for first in pipeline.stages(cfg, out)[:2]:
+        first.work()
+    roi = out / "roi_polygon.json"
+    if not roi.exists():
+        run_propose(out / "simplify/step2_simplified.json", cfg.pedestrians, roi)
+    cfg = options.resolve(folder / LOOP_FILE, None, given | {"roi": roi})
+    _closing_table(pipeline.run(cfg, out), out)
