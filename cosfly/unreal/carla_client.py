@@ -87,6 +87,6 @@ def _told(what: str, endpoint: str, version: str) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, OSError) as error:
-        fix = "see that the server runs and listens there, or give it more time with timeout_s"
+        fix = "see that a server runs there (of each of --workers one, ports 10 apart), or give it time with timeout_s"
         where = f"{endpoint} (CARLA {version})"
         raise EnvironmentMissing(what, where=where, got=str(error) or type(error).__name__, fix=fix) from None
