@@ -54,6 +54,7 @@ FORMAT = FileFormat("cosfly.reproduction", "1.0")
 STAGES = ("maps", "simplify", "pedestrians", "plan")  # of a run without which nothing can be told
 PLANNERS = ("track_astar", "muco", "foresight")  # the first is held against the others, as in the paper
 BEAMS = (64, 256, 512, 1024, 2048, 4096)
+BESIDE = ("bench.json", "benchmark.json")  # of `cosfly bench` and `cosfly plan benchmark`
 LENSES_DEG = (120, 110, 90, 70, 60, 45, 30)  # tab:zoom_conversion
 ZOOM = {"fovs_deg": (110, 90, 60, 30), "every": 12, "modalities": ("rgb", "depth", "instance")}
 WIDTH_PX = 1500  # of pictures on the page
@@ -129,6 +130,9 @@ def run(
         raise InputError(
             "the run has not come to its flights", where=folder, got=f"no {', no '.join(missing)}", fix=fix
         )
+    for one in beside:
+        if not any((one / name).is_file() for name in BESIDE):
+            raise InputError("nothing to set beside", where=one, expected=" or ".join(BESIDE))
     printed = read_paper()
     made = measure(cfg, folder, out, walks, done, {**manner_of_work(cfg), "resume": resume})
     places = Places([*beside, folder, out], made)
@@ -138,13 +142,12 @@ def run(
         try:
             parts.append(part(label, table, places, folder))
         except MissingFile as absent:
-            left_out[f"{label}, {table.also}".strip(", ")] = f"this run has no {absent}"
+            left_out[f"{label}, {table.also}".strip(", ")] = f"needs {absent}, to which this run has not come"
     try:
         parts += benchmarked(places)
     except MissingFile:
-        left_out[", ".join(OF_BENCHMARK)] = (
-            "of 14 planners: `cosfly plan benchmark MAP PATHS --out DIR`, then --beside DIR"
-        )
+        labels = ", ".join(labels for labels, _ in OF_BENCHMARK.values())
+        left_out[labels] = "of all 14 planners: `cosfly plan benchmark MAP PATHS --out DIR`, then --beside DIR"
     if "release" in done:
         tables = read_object(out / "release/stats.json", what="statistics")["tables"]
         parts += [Part(**one) for one in tables if one["key"] in OF_RELEASE]
