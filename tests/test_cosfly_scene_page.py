@@ -17,7 +17,7 @@ from test_cosfly_inspection import plan_of
 from cosfly.errors import InputError
 from cosfly.geometry import box_corners
 from cosfly.look.scene_page import run
-from cosfly.products.boxes import MapHeader, make_box_map, write_boxes
+from cosfly.products.boxes import MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.products.flights import find_flights
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import read_flight
@@ -77,6 +77,17 @@ def test_what_is_packed_is_what_was_read(place, tmp_path):
     assert np.allclose(floats(data["tracks"][number]["rows"], 10)[:, 1:4], flight.positions_m, atol=1e-3)
     assert len(data["tracks"][number]["pictures"]) == len(flight)
     assert len({track["kind"] for track in data["tracks"]}) == 4
+
+
+def test_flights_of_other_towns_stay_out(place, tmp_path):
+    """Where any is of the map's; walks of two towns have the same names."""
+    tree = make_playback_tree(tmp_path / "tree", 2, 8, width_px=96, height_px=54, towns=("Town01", "Town02"))
+    town = read_boxes(place / "map.json")
+    write_boxes(tmp_path / "map.json", replace(town, header=town.header.model_copy(update={"name": "Town02"})))
+    page = run(tmp_path / "map.json", tmp_path / "scene.html", data=tree)
+    own = [flight for flight in map(read_flight, find_flights(tree)) if flight.town == "Town02"]
+    assert len(data_of(page)["tracks"]) == len(own) == 2
+    assert "2 flights are of other towns" in page.read_text()
 
 
 def test_frames_are_left_out_to_keep_the_size(place, tmp_path):

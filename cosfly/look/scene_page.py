@@ -23,6 +23,7 @@ from cosfly.look.topview import COLORS, OTHER_COLOR
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.flights import find_flights
 from cosfly.products.kinds import GROUND_KINDS, KIND_NAMES, KINDS, LAYERS
+from cosfly.products.places import town_folder
 from cosfly.products.playback import Flight, read_flight
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.walks import read_paths
@@ -74,7 +75,11 @@ def run(
     box_map, notes = read_boxes(map_), list[str]()
     walks = [] if paths is None else read_paths(paths)
     tracks = [_of_trace(trace) for path in traces for trace in read_traces(path)]
-    tracks += [] if data is None else [_of_flight(read_flight(place, strict=False)) for place in find_flights(data)]
+    flights = [] if data is None else [read_flight(place, strict=False) for place in find_flights(data)]
+    own = [flight for flight in flights if town_folder(flight.town) == town_folder(box_map.name)] or flights
+    if len(own) < len(flights):
+        notes.append(f"{len(flights) - len(own):,} flights are of other towns")
+    tracks += [_of_flight(flight) for flight in own]
     names = list(dict.fromkeys([walk.path_id for walk in walks] + [track.path for track in tracks]))
     if len(names) > most_paths:
         notes.append(f"{most_paths:,} of {len(names):,} paths are shown")
@@ -100,7 +105,7 @@ def run(
     content["tracks"] = [
         {
             "path": known.index(track.path), "kind": for_terminal(track.kind), "rows": _packed(track.rows),
-            "figures": track.figures, "pictures": track.pictures, "fov": track.flight and track.flight.fovs_deg[0],
+            "figures": track.figures, "pictures": track.pictures,
         }
         for track in tracks
     ]  # fmt: skip

@@ -53,7 +53,7 @@ function dotOver(place, radius, color) {
   pen.fill();
   pen.stroke();
 }
-const link = (visibility) => (visibility >= 0.5 ? ["#2f9e44", []] : ["#e03131", [6, 5]]);
+const link = (visibility) => (!Number.isFinite(visibility) ? ["#868e96", [2, 4]] : visibility >= 0.5 ? ["#2f9e44", []] : ["#e03131", [6, 5]]);
 const drawBoth = (line, dot) => paths.forEach((path, number) => {
   const here = number === state.path, own = ofPath(number);
   if (path.person) line(personOf(number), PERSON, here ? 3.5 : 1.5);
