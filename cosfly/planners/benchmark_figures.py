@@ -1,6 +1,6 @@
-"""The figures of a benchmark, by matplotlib (extra `ompl`): axes as radar, bars and projections; deltas; flights in 3D.
+"""The figures of a benchmark, by matplotlib (extra `ompl`): axes as bars and projections; deltas; flights in 3D.
 
-Target-aware planners have a color each, generic ones are gray, as in the paper.
+Target-aware planners have a color each; generic ones are gray where all are drawn.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from cosfly.geometry import rotation_matrices
 from cosfly.planners.benchmark import PAPER, Benchmark, ScenarioRecord
-from cosfly.planners.compare import AXES, FIGURES, color_of
+from cosfly.planners.compare import AXES, FIGURES, color_of, draw_radar
 from cosfly.planners.contract import PLANNERS, title_of
 from cosfly.products.boxes import BoxMap
 from cosfly.products.walks import TARGET_HEIGHT_M
@@ -27,7 +27,8 @@ SIGNS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (
 
 def draw(found: Benchmark, records: list[ScenarioRecord], box_map: BoxMap) -> dict[str, bytes]:
     """Give the figures, name -> PNG; those of TA*+Smooth against MuCO only where both took part."""
-    pictures = {"axes_radar.png": _radar(found), "axes_bars.png": _bars(found), "axes_pairs.png": _pairs(found)}
+    primary = {p: row.scores for p, row in found.axes.items() if p not in PAPER or PAPER[p].axes_mean is not None}
+    pictures = {"axes_radar.png": draw_radar(primary), "axes_bars.png": _bars(found), "axes_pairs.png": _pairs(found)}
     if found.deltas:
         pictures |= {"deltas.png": _deltas(found), "flights_3d.png": _flights(found, records, box_map)}
     return pictures
@@ -47,26 +48,6 @@ def _png(figure: Any) -> bytes:
     file = io.BytesIO()
     figure.savefig(file, format="png", metadata={"Software": None})
     return file.getvalue()
-
-
-def _radar(found: Benchmark) -> bytes:
-    figure = _figure(9.0, 7.0)
-    axes = figure.add_subplot(projection="polar")
-    angles = np.linspace(0.0, 2.0 * np.pi, len(AXES) + 1)
-    primary = [p for p in found.axes if p not in PAPER or PAPER[p].axes_mean is not None]  # the paper's, and ours
-    for number, planner in enumerate(reversed(primary)):
-        row = found.axes[planner].scores
-        values, label = [row[axis] for axis in (*AXES, AXES[0])], f"{title_of(planner)}, mean {row['mean']:.3f}"
-        style = {"ls": "-", "lw": 2.5} if planner in PLANNERS else {"ls": ("--", ":", "-.")[number % 3], "lw": 1.2}
-        axes.plot(angles, values, color=_color(planner), label=label, **style)
-    axes.set_theta_offset(np.pi / 4.0)  # titles at the corners, where they have room
-    axes.set_xticks(angles[:-1], [axis.replace("_", " ") for axis in AXES])
-    axes.tick_params(pad=20)
-    axes.set_rlabel_position(45.0)
-    axes.set_ylim(0.0, 1.05)
-    axes.set_title("Four axes, higher is better")
-    figure.legend(loc="outside right upper", reverse=True, fontsize=9, handlelength=3.5)
-    return _png(figure)
 
 
 def _bars(found: Benchmark) -> bytes:

@@ -327,8 +327,12 @@ def timings(shared: list[Kept], planners: Sequence[str]) -> dict[str, dict[str, 
 
 
 # RGB: the paper's blue and orange, then others that differ in brightness too.
-PALETTE = ((30, 100, 210), (235, 120, 20), (20, 150, 90), (150, 60, 170), (120, 90, 60), (20, 170, 190))
+PALETTE = (
+    (30, 100, 210), (235, 120, 20), (20, 150, 90), (150, 60, 170), (120, 90, 60), (20, 170, 190), (200, 40, 60),
+    (110, 110, 110),
+)  # fmt: skip
 LEGEND_PX = 160  # of one planner
+MOST_FILLED = 4  # planners of a radar; of more one would see the last alone
 FAINT = (215, 215, 215)
 
 
@@ -438,9 +442,10 @@ def draw_radar(axes: dict[str, dict[str, float]]) -> bytes:
         draw_text(picture, name.replace("_", " "), x, y + 5, 0.6, align=align)
     for planner, scores in axes.items():
         shape = middle + radius_px * spokes * np.clip([[scores[name]] for name in names], 0.0, 1.0)
-        filled = picture.copy()
-        draw_area(filled, shape, color_of(planner))
-        picture[:] = (0.82 * picture + 0.18 * filled).astype(np.uint8)
+        if len(axes) <= MOST_FILLED:
+            filled = picture.copy()
+            draw_area(filled, shape, color_of(planner))
+            picture[:] = (0.82 * picture + 0.18 * filled).astype(np.uint8)
         draw_line(picture, shape, color_of(planner), 3, closed=True)
     for row, (planner, scores) in enumerate(axes.items()):
         words = ", ".join(f"{name.replace('_', ' ')} {scores[name]:.3f}" for name in names)

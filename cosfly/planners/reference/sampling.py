@@ -74,16 +74,11 @@ def sampled(task: Task, method: str, *, is_spline: bool = False) -> np.ndarray |
 
 
 def load_ompl() -> tuple[Any, Any, Any]:
-    """Import OMPL's three modules, silenced.
-
-    Raises:
-        EnvironmentMissing: it is not installed.
-    """
+    """Import OMPL's three modules, silenced; raises EnvironmentMissing where it is not installed."""
     try:
         from ompl import base, geometric, util
     except ImportError as error:
-        fix = 'pip install "cosfly[ompl]"'
-        raise EnvironmentMissing("OMPL is not installed", got=str(error), fix=fix) from None
+        raise EnvironmentMissing("OMPL is not installed", got=str(error), fix='pip install "cosfly[ompl]"') from None
     util.setLogLevel(util.LogLevel.LOG_NONE)
     return base, geometric, util
 
