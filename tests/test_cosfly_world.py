@@ -48,7 +48,7 @@ def test_a_prompt_gives_a_valid_world_with_each_named_object(row):
 
 
 def test_a_world_read_by_the_importer_is_the_one_that_was_laid_out(tmp_path):
-    cfg = WorldConfig(prompt=PROMPTS[0]["prompt"])
+    cfg = WorldConfig(prompt="a small village with a hospital, a church and a lawn")
     found, town = read_world(run(cfg, tmp_path / "w", seed=3)), build(plan_by_rules(cfg.prompt, 3)[0], cfg.name, 3)
     expected = town.boxes
     assert len(found) == len(expected) > 500

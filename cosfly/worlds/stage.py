@@ -115,11 +115,11 @@ def write_diversity(worlds: Sequence[Path], out: Path) -> dict[str, Any]:
 def _write_world(town: Town, out: Path, seed: int) -> None:
     """Write layout, placement, both merged, and the sizes of the assets that they use."""
     layout = road_nodes(town.settings, seed) + world_nodes(town.layout)
-    ids = [f"OBJ_{one.name.replace(' ', '_')}_{one.number}" for one in town.placed for _ in range(*one.rows)]
-    ids += ["way"] * (len(town.placement) - len(ids))
-    placed = world_nodes(
-        town.placement, ids, [OBJECTS[one.name].asset for one in town.placed for _ in range(*one.rows)]
-    )
+    ids, named = ["way"] * len(town.placement), list[str | None]([None]) * len(town.placement)
+    for one in town.placed:
+        for row in range(*one.rows):
+            ids[row], named[row] = f"OBJ_{one.name.replace(' ', '_')}_{one.number}", OBJECTS[one.name].asset
+    placed = world_nodes(town.placement, ids, named)
     write_json(out / "layout.json", {"nodes": layout}, indent=None)
     write_json(
         out / "placement.json",

@@ -6,7 +6,7 @@ Source: app:simworld:step1, the layout and the incremental placement layer.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -124,13 +124,13 @@ def _place_objects(town: Town, plan: WorldPlan) -> None:
             if place is None:
                 town.left_out.append((one.name, "no room" if not free.is_empty else "no water in the plan"))
                 continue
-            xy, yaw, scale = place
-            first = len(boxes)
+            outline, yaw, scale = place
+            xy, first = (outline.centroid.x, outline.centroid.y), len(boxes)
             _add_object(boxes, one, xy, yaw, scale)
-            taken.append(_outline(one, xy, yaw, scale))
-            if any(part[0] == "Buildings" for part in one.parts):
-                _add_path(boxes, taken[-1], pavements)
             town.placed.append(Placed(one.name, number, xy, yaw, scale, (first, len(boxes))))
+            taken.append(outline)
+            if any(part[0] == "Buildings" for part in one.parts):
+                _add_path(boxes, outline, pavements)
     town.placement = boxes.box_map()
     soft = of_kinds(town.layout, *SOFT)
     covered = shapely.intersects(outlines, shapely.union_all(taken).buffer(0.5)) if taken else np.zeros(len(soft), bool)
@@ -139,12 +139,9 @@ def _place_objects(town: Town, plan: WorldPlan) -> None:
 
 def _count_bridges(town: Town, one: Object, count: int) -> None:
     there = town.settings.num_blocks + 1 if town.settings.river_m else 0
-    there = min(there, town.settings.bridges or there)
-    for number in range(count):
-        if number < there:
-            town.placed.append(Placed(one.name, number, (0.0, 0.0), 0.0, 1.0, (0, 0)))
-        else:
-            town.left_out.append((one.name, "no street to carry it"))
+    there = min(count, town.settings.bridges or there, there)
+    town.placed += [Placed(one.name, number, (0.0, 0.0), 0.0, 1.0, (0, 0)) for number in range(there)]
+    town.left_out += [(one.name, "no street to carry it")] * (count - there)
 
 
 def _free_area(town: Town, one: Object) -> BaseGeometry:
@@ -157,8 +154,7 @@ def _free_area(town: Town, one: Object) -> BaseGeometry:
         far = -half + town.settings.verge_m - 0.5 if one.where == "quay" else -half
         return shapely.box(-half + 2, near, half - 2, far)
     if one.where == "water" and town.settings.river_m:
-        water = footprints(town.layout)[of_kinds(town.layout, "Water")]
-        return shapely.union_all(water)
+        return shapely.union_all(footprints(town.layout)[of_kinds(town.layout, "Water")])
     return shapely.Polygon()
 
 
@@ -174,20 +170,14 @@ def _open_blocks(town: Town) -> list[BaseGeometry]:
     return [block for block in blocks if not len(built.query(block, predicate="intersects"))]
 
 
-def _outline(one: Object, xy: tuple[float, float], yaw_deg: float, scale: float) -> BaseGeometry:
-    x, y = (side * scale / 2 for side in (one.size_m if yaw_deg % 180 == 0 else one.size_m[::-1]))
-    return shapely.box(xy[0] - x, xy[1] - y, xy[0] + x, xy[1] + y)
-
-
 def _place(
     one: Object, free: BaseGeometry, hard: np.ndarray, taken: list[BaseGeometry]
-) -> tuple[tuple[float, float], float, float] | None:
-    """Give the place nearest to the middle of the town where an object fits whole, and its yaw and scale there."""
+) -> tuple[BaseGeometry, float, float] | None:
+    """Give the outline, nearest to the middle of the town, in which an object fits whole, its yaw and its scale."""
     if free.is_empty:
         return None
     by_water = one.where != "open"
-    blocked = taken if by_water else [*hard, *taken]
-    tree = shapely.STRtree(blocked)
+    tree = shapely.STRtree(taken if by_water else [*hard, *taken])
     low_x, low_y, high_x, high_y = free.bounds
     anchor = (0.0, high_y if by_water else 0.0)
     x, y = np.meshgrid(np.arange(low_x, high_x, STEP_M), np.arange(low_y, high_y, STEP_M))
@@ -199,10 +189,9 @@ def _place(
         for yaw in (0.0,) if by_water else (0.0, 90.0):
             a, b = (side * scale / 2 for side in (one.size_m if yaw == 0 else one.size_m[::-1]))
             outlines = shapely.box(places[:, 0] - a, places[:, 1] - b, places[:, 0] + a, places[:, 1] + b)
-            fits = np.flatnonzero(shapely.contains_properly(free, outlines))
-            for row in fits:
-                if not len(tree.query(outlines[row], predicate="dwithin", distance=SPACE_M / 2)):
-                    return (float(places[row, 0]), float(places[row, 1])), yaw, scale
+            for outline in outlines[shapely.contains_properly(free, outlines)]:
+                if not len(tree.query(outline, predicate="dwithin", distance=SPACE_M / 2)):
+                    return outline, yaw, scale
     return None
 
 
@@ -229,8 +218,7 @@ def _add_path(boxes: BoxList, outline: BaseGeometry, pavements: BaseGeometry) ->
 
 def land_m2(town: Town) -> float:
     """The town's area without its river, m2."""
-    water = town.settings.river_m * town.settings.size_m
-    return town.settings.size_m**2 - water
+    return town.settings.size_m * (town.settings.size_m - town.settings.river_m)
 
 
 def _set_trees(town: Town, plan: WorldPlan, rng: np.random.Generator) -> None:
@@ -241,11 +229,10 @@ def _set_trees(town: Town, plan: WorldPlan, rng: np.random.Generator) -> None:
         before_door = shapely.dwithin(outlines[: len(town.layout)], shapely.union_all(ways), 0.8)
         town.layout = town.layout.select(np.flatnonzero(~(before_door & trees_of(town.layout))))
     hectares = land_m2(town) / 1e4
-    least, most = (math.ceil(plan.trees_per_ha[0] * hectares), math.floor(plan.trees_per_ha[1] * hectares))
     trees = np.flatnonzero(trees_of(town.layout))
     goal = round((0.65 * plan.trees_per_ha[0] + 0.35 * plan.trees_per_ha[1]) * hectares)
-    if len(trees) > most:
-        felled = rng.choice(trees, len(trees) - min(most, max(goal, least)), replace=False)
+    if len(trees) > plan.trees_per_ha[1] * hectares:
+        felled = rng.choice(trees, len(trees) - goal, replace=False)
         town.layout = town.layout.select(np.setdiff1d(np.arange(len(town.layout)), felled))
     elif len(trees) < goal:
         town.layout = town.layout.joined(_planted(town, goal - len(trees), rng))
@@ -261,22 +248,15 @@ def _planted(town: Town, count: int, rng: np.random.Generator) -> BoxMap:
     tree, weights = shapely.STRtree(blocked), shapely.area(lawns)
     if not len(lawns) or not weights.sum():
         return boxes.box_map()
-    places = _points_in(lawns, weights / weights.sum(), rng)
-    for _ in range(40 * count):
-        xy, crown = next(places), rng.uniform(3.0, 5.5)
+    bounds = shapely.bounds(lawns)
+    for row in rng.choice(len(lawns), 40 * count, p=weights / weights.sum()):
+        xy, crown = rng.uniform(bounds[row, :2], bounds[row, 2:]), rng.uniform(3.0, 5.5)
         own = shapely.box(*(xy - crown / 2), *(xy + crown / 2))
         if not len(tree.query(own, predicate="dwithin", distance=0.4)):
             boxes.add("Vegetation", xy, (crown, crown * rng.uniform(0.9, 1.1)), 0.0, rng.uniform(5.0, 11.0))
             if len(boxes) == count:
                 break
     return boxes.box_map()
-
-
-def _points_in(areas: np.ndarray, shares: np.ndarray, rng: np.random.Generator) -> Iterator[np.ndarray]:
-    bounds = shapely.bounds(areas)
-    while True:
-        row = bounds[rng.choice(len(areas), p=shares)]
-        yield rng.uniform(row[:2], row[2:])
 
 
 # --- SimWorld's nodes -------------------------------------------------------------------------------------------------
