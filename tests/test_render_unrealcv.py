@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import random
 import re
 import time
 from pathlib import Path
@@ -16,7 +18,7 @@ from test_renderers_contract import street
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.errors import ConfigError, EnvironmentMissing, InputError, RenderError
+from cosfly.errors import ConfigError, CosflyError, EnvironmentMissing, InputError, RenderError
 from cosfly.geometry import intrinsic_matrix, world_from_camera
 from cosfly.maps import unrealcv_export
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig
@@ -28,6 +30,7 @@ from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.render.unrealcv_backend import UnrealCvRenderConfig
 from cosfly.simulators.scene import clothes_of
+from cosfly.simulators.unrealcv.server import UnrealCvServer
 from cosfly.unreal.assets import id_of
 from cosfly.unreal.unrealcv_client import UnrealCvConfig, connect
 from cosfly.work.config import build
@@ -75,12 +78,14 @@ def test_a_tree_is_the_embedded_renderers_by_recursive_diff(tmp_path):
     reference = run(build(RenderConfig, FRAMES, "test"), *given, tmp_path / "gl", seed=5, workers=1)
     with serving(street(), tmp_path / "town", protocol="unrealcv") as port:
         tree = run(config(port, FRAMES), *given, tmp_path / "unrealcv", seed=5, workers=1)
-        time.sleep(3.0)  # a guard puts it in order when the worker is gone
-        connection = connect(UnrealCvConfig(port=port), port)
-        objects, pose, size = connection.ask("vget /objects", "vget /camera/0/pose", "vget /camera/0/size")
+        objects, until_s = "COSFLY", time.monotonic() + 60.0
+        while "COSFLY" in str(objects) and time.monotonic() < until_s:  # a guard takes them away when a worker is gone
+            time.sleep(1.0)
+            connection = connect(UnrealCvConfig(port=port), port)
+            objects, pose, size = connection.ask("vget /objects", "vget /camera/0/pose", "vget /camera/0/size")
+            connection.close()
         assert "COSFLY" not in str(objects), "nobody is left"
         assert (str(pose).split()[0], size) == ("0.000000", "640 480"), "the camera is where it was"
-        connection.close()
     # target.png shows what the person wears, which nobody knows of an engine's: CARLA's trees have none either.
     every = [
         {str(p.relative_to(root)) for p in root.rglob("*") if p.name != "target.png"} for root in (tree, reference)
@@ -160,8 +165,6 @@ def test_a_level_of_another_scale_is_found_before_a_frame_is_drawn():
 
 
 def test_a_camera_that_falls_is_found(monkeypatch):
-    from cosfly.simulators.unrealcv.server import UnrealCvServer
-
     done = UnrealCvServer._done
 
     def fallen(server, command: str) -> bytes:
@@ -182,6 +185,28 @@ def test_a_camera_that_falls_is_found(monkeypatch):
 
 
 # --- what goes wrong --------------------------------------------------------------------------------------------------
+
+
+GARBAGE = (
+    b"", b"error", b"nan nan nan", b"1e400 0 0 0 0 0", b"-1 -1 -1 -2 -2 -2", b"0 0 0 1e11 1e11 1e11", b"(R=999,G=1,B=1",
+    b"\x89PNG\r\n\x1a\n" + b"x" * 50, b"\x93NUMPY\x01\x00", b"\xff\xfe\x00", b"a\nb\nc", b"\x1b[31m", b"x" * 100_000,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2, 1.0])
+def test_garbage_in_place_of_answers_is_an_error_of_ours(share, monkeypatch):
+    given, rng, done = exported(), random.Random(1), UnrealCvServer._done
+    pose = world_from_camera(np.array([-1.0, -9.5, 5.5]), np.array([-32.5, 60.0, 0.0]))
+    monkeypatch.setattr(
+        UnrealCvServer,
+        "_done",
+        lambda server, text: rng.choice(GARBAGE) if rng.random() < share else done(server, text),
+    )
+    for _ in range(6):
+        with beside(street()) as port, contextlib.suppress(CosflyError):
+            unrealcv_export.load(UnrealCvMapConfig(port=port, timeout_s=2.0), 0)
+        with beside(street()) as port, contextlib.suppress(CosflyError):
+            opened(port, given, timeout_s=2.0, retries=1).render(pose, intrinsic_matrix(160, 90, 60.0), None)
 
 
 @pytest.mark.slow

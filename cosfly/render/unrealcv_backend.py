@@ -184,7 +184,8 @@ class UnrealCvRenderer:
         if gap_m <= SAME_BOX_M:
             return
         away, away_m = (np.linalg.norm(p - np.median(p, axis=0), axis=1) for p in (raw, middles_m))
-        scale = float(np.median(away[away_m > 0] / away_m[away_m > 0])) if (away_m > 0).any() else float("nan")
+        scale = float(np.median(away[away_m > 0] / away_m[away_m > 0])) if (away_m > 0).any() else 0.0
+        scale = scale or float("nan")  # all in one place
         high_m = float(np.median(raw[:, 2] / scale - middles_m[:, 2]))
         raise ConfigError(
             "the level is of another scale than the map: the camera would stand at ground level, or beside the town",
@@ -341,4 +342,4 @@ def _color_of(answer: str | bytes) -> int | None:
     """Read `(R=1,G=2,B=3,A=255)`."""
     found = re.match(r"\(R=(\d{1,3}),G=(\d{1,3}),B=(\d{1,3})", answer) if isinstance(answer, str) else None
     red, green, blue = map(int, found.groups()) if found else (0, 0, 0)
-    return (red << 16 | green << 8 | blue) or None
+    return (red << 16 | green << 8 | blue) or None if max(red, green, blue) < 256 else None

@@ -20,6 +20,7 @@ from typing import Any
 from pydantic import Field
 
 from cosfly.errors import ConfigError, EnvironmentMissing
+from cosfly.escaping import for_terminal
 from cosfly.work.config import Config, MayDiffer
 
 PROBE_S = 5.0  # for a server to accept a connection
@@ -123,7 +124,7 @@ def connect(cfg: UnrealCvConfig, port: int) -> UnrealCvConnection:
         expected = f"{'.'.join(map(str, LEAST_VERSION))} or newer"
         what, fix = "an UnrealCV server of another version", "run a newer build, as SimWorld ships"
         raise EnvironmentMissing(what, where=connection.endpoint, got=repr(version)[:80], expected=expected, fix=fix)
-    connection.version, connection.level = str(version).strip(), "" if is_refusal(level) else str(level).strip()
+    connection.version, connection.level = found[0], "" if is_refusal(level) else for_terminal(str(level).strip())
     if cfg.level in (None, connection.level):
         return connection
     return _opened(cfg, port, connection)
