@@ -31,7 +31,7 @@ def world(
     count: Annotated[int, Option(min=1, max=1000, help="So many worlds, each of a seed of its own.")] = 1,
     against: Annotated[
         list[Path] | None,
-        Option(help="A SimWorld world to compare buildings with, its Bbox.json beside it; repeat it."),
+        Option(help="A SimWorld world to compare buildings with (sizes: maps.simworld.sizes); repeat it."),
     ] = None,
     run: Annotated[
         bool, Option("--run", help="Go on: walks, flights, frames and all that `cosfly run` makes.")
@@ -43,8 +43,9 @@ def world(
     words = "-".join(re.findall(r"[a-z0-9]+", prompt.lower())[:5]) or "world"
     out = out or Path("worlds") / f"{words[:40]}-{time.strftime('%Y%m%d-%H%M%S')}"
     folders = [out] if count == 1 else [out / f"world_{number:03}" for number in range(count)]
+    other_cities = {"against": against or (), "sizes": job.cfg.maps.simworld.sizes}
     products = [
-        stage.run(job.cfg.world, folder, seed=job.cfg.seed + number, resume=job.resume, against=against or ())
+        stage.run(job.cfg.world, folder, seed=job.cfg.seed + number, resume=job.resume, **other_cities)
         for number, folder in enumerate(folders)
     ]
     for product in products:

@@ -15,7 +15,6 @@ import numpy as np
 import yaml
 
 import cosfly
-from cosfly.errors import InputError
 from cosfly.look.topview import TopView, draw_map, png_bytes
 from cosfly.maps.simworld import PLACEHOLDER_CM, SimWorldConfig
 from cosfly.maps.stage import MapsConfig, load_map
@@ -40,13 +39,20 @@ CREDITS = "cosfly; sizes of assets by SimWorld, maitrix-org and contributors"
 
 
 def run(
-    cfg: WorldConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same", against: Sequence[Path] = ()
+    cfg: WorldConfig,
+    out: Path,
+    *,
+    seed: int = 0,
+    resume: Resume = "if-same",
+    against: Sequence[Path] = (),
+    sizes: Sequence[Path] = (),
 ) -> Path:
     """Reads a prompt; writes trace.json, plan.json, layout.json, placement.json, combined_world.json with Bbox.json,
     checks.json, map.png, and loop.yaml: settings for `cosfly run` on it.
 
     Args:
-        against: SimWorld worlds, each with its Bbox.json beside it, whose buildings the world's are compared with.
+        against: SimWorld worlds whose buildings the world's are compared with.
+        sizes: their size tables; none: Bbox.json beside each.
     Raises:
         InputError: the prompt cannot be planned. TeacherError: the language model gives no plan.
     """
@@ -67,7 +73,7 @@ def run(
     town = build(plan, cfg.name, seed)
     _write_world(town, out, seed)
     checks = check_world(town, plan)
-    compared = {str(path): compare(town.boxes, read_world(path)) for path in against}
+    compared = {str(path): compare(town.boxes, read_world(path, sizes)) for path in against}
     write_json(out / "checks.json", {**CHECKS_FORMAT.header, "checks": checks, "compared": compared})
     view = TopView.around(np.stack(town.boxes.bounds()), 1000)
     write_bytes(out / "map.png", png_bytes(draw_map(town.boxes, view)))
@@ -95,12 +101,9 @@ def run(
     return product
 
 
-def read_world(path: Path) -> BoxMap:
-    """Read a SimWorld world as our importer does."""
-    sizes = [found for name in ("Bbox.json", "../Bbox_total.json") if (found := path.parent / name).is_file()]
-    if not sizes:
-        raise InputError("no asset size table beside a world", where=path, expected="Bbox.json, as SimWorld's")
-    cfg = SimWorldConfig(world=path, sizes=sizes[:1], stand_m=0.0)
+def read_world(path: Path, sizes: Sequence[Path] = ()) -> BoxMap:
+    """Read a SimWorld world as our importer does, with its size tables, or Bbox.json beside it."""
+    cfg = SimWorldConfig(world=path, sizes=[*sizes], stand_m=0.0)
     return load_map(MapsConfig(source="simworld", simworld=cfg))
 
 
