@@ -17,7 +17,7 @@ from cosfly.work.stage_folder import read_manifest
 from cosfly.worlds.checks import check_world, compare, unlikeness
 from cosfly.worlds.objects import OBJECTS, assets
 from cosfly.worlds.plan import PLAN_FORMAT, NamedObject, WorldPlan
-from cosfly.worlds.rules import check_prompt, plan_by_rules
+from cosfly.worlds.rules import WORDS, check_prompt, plan_by_rules
 from cosfly.worlds.settings import WorldConfig
 from cosfly.worlds.stage import read_world, run
 from cosfly.worlds.town import Town, build, footprints, of_kinds
@@ -75,6 +75,14 @@ def test_the_same_prompt_and_seed_give_the_same_bytes_and_another_seed_another_w
     assert one.read_bytes() == two.read_bytes() != other.read_bytes()
     assert unlikeness([read_world(one), read_world(two)]) == [0.0]
     assert unlikeness([read_world(one), read_world(other)])[0] > 0.2
+
+
+def test_every_word_of_the_table_gives_a_plan():
+    changing = [word for group in WORDS["groups"].values() for one in group.values() for word in one["words"].split()]
+    for settlement in (word for one in WORDS["settlements"].values() for word in one["words"].split()):
+        for word in ("", *changing, *WORDS["open"], *(f"{word}s" for word in WORDS["open"]), *WORDS["water"]):
+            plan = by_rules(f"a {word.replace('-trees', ' trees')} {settlement}, with a {word}, lawns and squares")
+            assert plan.plazas + plan.greens < plan.blocks_along**2
 
 
 def test_a_plan_alone_decides_the_world():

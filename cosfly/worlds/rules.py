@@ -5,6 +5,7 @@ Source: stands in for the language model of app:simworld:step1 where no endpoint
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -75,7 +76,9 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
         plan["heights_m"], plan["high_center"] = (plan["heights_m"][0], max(plan["heights_m"][1], 48.0)), True
     if re.search(r"\b(?:towers|high-rises|skyscrapers) in the (?:cent|middle)", text):
         plan["high_center"], plan["heights_m"] = True, (min(plan["heights_m"][0], 8.0), plan["heights_m"][1])
-    plan["blocks_along"] = int(min(9, max(2, round(plan["blocks_along"]))))
+    least = math.ceil(math.sqrt(2 * (plan["plazas"] + plan["greens"])))  # half of the blocks are built up
+    plan["blocks_along"] = int(min(9, max(2, least, round(plan["blocks_along"]))))
+    plan["gap_m"] = max(0.5, plan["gap_m"])
     plan |= {"objects": [one.model_dump() for one in objects], "not_in_table": _unknown(rest)}
     trace["not_in_table"] = plan["not_in_table"]
     return WorldPlan.model_validate(plan), trace
