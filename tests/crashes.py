@@ -210,7 +210,7 @@ class _Forking:
 # --- what stands in a folder ------------------------------------------------------------------------------------------
 
 TIMES = re.compile(
-    rb'"(seconds\w*|peak_memory_mb|planning_ms\w*|times_ms|mean_ms|max_ms|latency_s|time|at|speed)": ?'
+    rb'"(seconds\w*|peak_memory_mb|planning_ms\w*|times_ms|(mean|p50|p95|max)_ms|latency_s|time|at|speed)": ?'
     rb'(\{[^}]*\}|"[^"]*"|[\d.]+)'
 )
 

@@ -154,10 +154,13 @@ def test_a_damaged_record_is_named(made, tmp_path):
         read_scenarios(path)
 
 
-def test_the_command_shows_all_tables(inputs, tmp_path):
+def test_the_command_shows_the_axes_and_writes_all_tables(inputs, tmp_path):
     words = ["plan", "benchmark", *map(str, inputs), "--out", str(tmp_path / "out"), "--scenarios", "1"]
     result = CliRunner().invoke(app, [*words, *(f"--planner={name}" for name in ("track_astar", "muco"))])
     assert result.exit_code == 0, result.output
+    assert "TA* + Smooth" in result.output
+    assert "0.782" in result.output
+    page = (tmp_path / "out/benchmark.md").read_text()
     for title in ("Four axes", "less MuCO", "against MuCO", "Weighted score", "Feasibility", "Groups"):
-        assert title in result.output
+        assert title in page
     assert CliRunner().invoke(app, [*words, "--planner", "musco", "--planner", "prm"]).exit_code == 1
