@@ -63,7 +63,13 @@ class MapCanvas {
   path(points, closed = false) {
     const context = this.context;
     context.beginPath();
-    for (let i = 0; i < points.length; i += 1) { const [px, py] = this.at(points[i]); if (i) context.lineTo(px, py); else context.moveTo(px, py); }
+    let last = [NaN, NaN];
+    for (let i = 0; i < points.length; i += 1) {
+      const [px, py] = this.at(points[i]);
+      if (Math.abs(px - last[0]) + Math.abs(py - last[1]) < 0.7 && i < points.length - 1) continue;  // nobody sees it
+      if (i) context.lineTo(px, py); else context.moveTo(px, py);
+      last = [px, py];
+    }
     if (closed) context.closePath();
   }
   line(points, color, width = 2, dashes = [], closed = false) {
