@@ -203,7 +203,7 @@ class Places:
                     if functions
                     else values
                 )
-            except (TypeError, ValueError, AttributeError) as error:
+            except (TypeError, ValueError, AttributeError, ArithmeticError) as error:
                 raise InputError("not what a stage writes", where=f"{name}: {keys}", got=str(error)) from None
         return found
 
