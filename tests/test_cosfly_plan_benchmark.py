@@ -9,7 +9,7 @@ from specimens_planning import WORLDS, walk_along
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.errors import InputError
+from cosfly.errors import EnvironmentMissing, InputError
 from cosfly.planners import benchmark
 from cosfly.planners.benchmark import CRITERIA, PAPER, WEIGHTS, BenchmarkConfig, read_benchmark, read_scenarios
 from cosfly.planners.contract import ALL_PLANNERS
@@ -131,12 +131,16 @@ def test_the_same_bytes_again_and_with_two_workers(inputs, made, tmp_path):
 
 
 def test_without_ompl_a_line_names_the_extra_and_the_others_fly(inputs, tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "ompl" else find(name, *rest))
     cfg = BenchmarkConfig(planners=("prm", "theta_star", "rrt_star"), scenarios=1)
     found = read_benchmark(benchmark.run(cfg, *inputs, tmp_path / "out"))
     assert list(found.means) == ["theta_star"]
+    assert (tmp_path / "out/axes_radar.png").exists()
+    with pytest.raises(EnvironmentMissing, match="OMPL is not installed"):
+        benchmark.run(BenchmarkConfig(planners=("prm", "rrt_star")), *inputs, tmp_path / "none")
     assert [r.message for r in caplog.records if "OMPL" in r.message] == [
-        'OMPL is not installed, so prm, rrt_star are left out: pip install "cosfly[ompl]"'
+        'OMPL is not installed; left out: prm, rrt_star; pip install "cosfly[ompl]"'
     ]
 
 

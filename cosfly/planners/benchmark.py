@@ -22,7 +22,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, Field
 
-from cosfly.errors import InputError
+from cosfly.errors import EnvironmentMissing, InputError
 from cosfly.planners import compare
 from cosfly.planners.compare import AXES, FIGURES, INTERVAL_PERCENT, NUM_RESAMPLES, CompareConfig, TextTable
 from cosfly.planners.contract import ALL_PLANNERS, title_of
@@ -58,6 +58,7 @@ CRITERIA = {
 WEIGHTS = {"visibility": 0.35, "collision": 0.30, "clearance": 0.35}  # the paper's, see above
 EQUAL_WEIGHTS = {"visibility": 2 / 7} | dict.fromkeys([*CRITERIA][1:], 1 / 7)  # of seven: blocked sight is visibility
 RANDOM_WEIGHTS = 1000
+INSTALL = 'pip install "cosfly[ompl]"'
 
 
 class PaperRow(NamedTuple):
@@ -186,14 +187,16 @@ def _without_missing(cfg: BenchmarkConfig) -> BenchmarkConfig:
     sampling = [name for name in cfg.planners if ALL_PLANNERS[name].startswith("cosfly.planners.reference.sampling")]
     if not sampling or importlib.util.find_spec("ompl") is not None:
         return cfg
-    log.warning('OMPL is not installed, so %s are left out: pip install "cosfly[ompl]"', ", ".join(sampling))
+    if len(sampling) == len(cfg.planners):
+        raise EnvironmentMissing("OMPL is not installed", expected="a planner that goes without", fix=INSTALL)
+    log.warning("OMPL is not installed; left out: %s; %s", ", ".join(sampling), INSTALL)
     return cfg.model_copy(update={"planners": tuple(name for name in cfg.planners if name not in sampling)})
 
 
 def _pictures(found: Benchmark, records: list[ScenarioRecord], box_map: BoxMap) -> dict[str, bytes]:
     """Draw the figures; none, with one line that says so, where matplotlib is not installed."""
     if importlib.util.find_spec("matplotlib") is None:
-        log.warning('matplotlib is not installed, so there are no figures: pip install "cosfly[ompl]"')
+        log.warning("matplotlib is not installed; there are no figures; %s", INSTALL)
         return {}
     from cosfly.planners.benchmark_figures import draw
 

@@ -27,8 +27,10 @@ SIGNS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (
 
 def draw(found: Benchmark, records: list[ScenarioRecord], box_map: BoxMap) -> dict[str, bytes]:
     """Give the figures, name -> PNG; those of TA*+Smooth against MuCO only where both took part."""
-    primary = {p: row.scores for p, row in found.axes.items() if p not in PAPER or PAPER[p].axes_mean is not None}
-    pictures = {"axes_radar.png": draw_radar(primary), "axes_bars.png": _bars(found), "axes_pairs.png": _pairs(found)}
+    scores = {p: row.scores for p, row in found.axes.items()}
+    primary = {p: row for p, row in scores.items() if p not in PAPER or PAPER[p].axes_mean is not None}
+    pictures = {"axes_radar.png": draw_radar(primary or scores)}  # the paper's seven and ours, where there are any
+    pictures |= {"axes_bars.png": _bars(found), "axes_pairs.png": _pairs(found)}
     if found.deltas:
         pictures |= {"deltas.png": _deltas(found), "flights_3d.png": _flights(found, records, box_map)}
     return pictures
