@@ -76,8 +76,8 @@ def test_a_served_town_comes_back_as_it_is(tmp_path):
     assert [one["id"] for one in sidecar["objects"]] == exported.ids.tolist()
     assert all(id_of(one["name"]) == one["id"] and kind_of(one["class"]) == one["type"] for one in sidecar["objects"])
     page = (tmp_path / "out/boxes.html").read_text()
-    assert page.count("<polygon") == len(town)
-    assert "<script" not in page
+    assert town.name in page
+    assert 'id="space"' in page
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
     assert {"boxes_meta.json", "boxes.html"} <= {one["path"] for one in manifest["outputs"]}
 

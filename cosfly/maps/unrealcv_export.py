@@ -13,20 +13,18 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import Field
 
 from cosfly.errors import InputError
-from cosfly.look.page import page
 from cosfly.maps.simworld import read_sizes
 from cosfly.products.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_box_map
-from cosfly.products.kinds import KIND_COLORS, KIND_NAMES, KINDS
+from cosfly.products.kinds import KIND_NAMES, KINDS
 from cosfly.unreal.assets import asset_of, id_of, is_nothing, kind_of
 from cosfly.unreal.conventions import CM_PER_M, world_pose
 from cosfly.unreal.unrealcv_client import UnrealCvConfig, UnrealCvConnection, connect
-from cosfly.work.store import write_bytes, write_json
+from cosfly.work.store import write_json
 
 log = logging.getLogger(__name__)
 
@@ -36,10 +34,7 @@ LEAST_M = 0.01  # bounds of an object that has none
 CUBE_M = 1.0
 SKEWED = 0.2  # cosine of twice a yaw, below which bounds do not tell the sides of what is turned
 SIDECAR, VIEWER = "boxes_meta.json", "boxes.html"
-STYLE = (
-    "svg{width:100%;height:80vh;background:var(--ground)}polygon{fill-opacity:.6;stroke:#0008;stroke-width:.1}"
-    "polygon:hover{fill-opacity:1;stroke:var(--ink);stroke-width:.4}label{margin-right:14px}"
-)
+MOST_PAGE_MB = 200.0
 
 
 class UnrealCvMapConfig(UnrealCvConfig):
@@ -198,7 +193,9 @@ def _unturned(half_m: np.ndarray, rotation_deg: tuple[float, ...]) -> tuple[np.n
 
 
 def write_beside(box_map: BoxMap, out: Path) -> list[Path]:
-    """Write what is known of each box's object, and the page to look at it; gives both paths."""
+    """Write what is known of each box's object, and the page to look at the map; gives both paths."""
+    from cosfly.look import scene_page  # it reads flights and frames too, which `maps` has no use for
+
     assert isinstance(box_map, LevelMap)
     header = box_map.header
     objects = [
@@ -212,28 +209,4 @@ def write_beside(box_map: BoxMap, out: Path) -> list[Path]:
         "dropped_objects": header.dropped_objects, "objects": objects,
     }  # fmt: skip
     write_json(out / SIDECAR, sidecar, indent=None)
-    write_bytes(out / VIEWER, _viewer(box_map, objects).encode())
-    return [out / SIDECAR, out / VIEWER]
-
-
-def _viewer(box_map: LevelMap, objects: list[dict[str, Any]]) -> str:
-    """A page with the map from above, north up: a shape for each box, to point at and to hide by category."""
-    low, high = box_map.bounds()
-    order = np.argsort(box_map.maxs[:, 2], kind="stable").tolist()
-    shapes = []
-    for k in order:
-        yaw = np.radians(box_map.rotations_deg[k, 1])
-        (x, y, _), (a, b, c) = box_map.centers[k], box_map.half_extents[k]
-        ahead, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
-        corners = [np.array([x, y]) + i * a * ahead + j * b * left for i, j in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
-        points = " ".join(f"{px - low[0]:.2f},{high[1] - py:.2f}" for px, py in corners)
-        shapes.append({**objects[k], "points": points, "size": f"{2 * a:.1f} x {2 * b:.1f} x {2 * c:.1f} m"})
-    style = STYLE + "".join(
-        f"#{name}:not(:checked)~svg .{name}{{display:none}}.{name}{{fill:{color};background:{color}}}"
-        for name, color in KIND_COLORS.items()
-    )
-    box = f"-1 -1 {high[0] - low[0] + 2:.2f} {high[1] - low[1] + 2:.2f}"
-    return page(
-        "cosfly/maps/boxes.html", title=box_map.name, style=style, box=box,
-        shapes=shapes, counts=box_map.counts(), header=box_map.header, total=len(box_map),
-    )  # fmt: skip
+    return [out / SIDECAR, scene_page.run(out / "boxes_3d.json", out / VIEWER, max_mb=MOST_PAGE_MB)]
