@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import invoke
+from pydantic import ValidationError
 from teacher_server import TeacherServer
 
 from cosfly.errors import CosflyError, InputError, TeacherError
@@ -80,9 +81,35 @@ def test_the_same_prompt_and_seed_give_the_same_bytes_and_another_seed_another_w
 def test_every_word_of_the_table_gives_a_plan():
     changing = [word for group in WORDS["groups"].values() for one in group.values() for word in one["words"].split()]
     for settlement in (word for one in WORDS["settlements"].values() for word in one["words"].split()):
-        for word in ("", *changing, *WORDS["open"], *(f"{word}s" for word in WORDS["open"]), *WORDS["water"]):
-            plan = by_rules(f"a {word.replace('-trees', ' trees')} {settlement}, with a {word}, lawns and squares")
+        for seed, word in enumerate(
+            ("", *changing, *WORDS["open"], *(f"{word}s" for word in WORDS["open"]), *WORDS["water"])
+        ):
+            plan, _ = plan_by_rules(
+                f"a {word.replace('-trees', ' trees')} {settlement}, with a {word}, lawns and squares", seed
+            )
             assert plan.plazas + plan.greens < plan.blocks_along**2
+
+
+def test_any_plan_that_can_be_gives_a_world_and_says_what_it_lacks():
+    rng = np.random.default_rng(0)
+    for _ in range(25):
+        low, span = rng.uniform(3, 200), rng.uniform(0, 100)
+        values = {
+            "blocks_along": int(rng.integers(2, 5)), "block_m": rng.uniform(36, 120), "street_m": rng.uniform(12, 40),
+            "avenue_m": rng.uniform(12, 60), "unevenness": rng.uniform(0, 0.3), "gap_m": rng.uniform(0.5, 40),
+            "setback_m": rng.uniform(0, 15), "heights_m": (low, low + span), "trees_per_ha": (0.0, rng.uniform(0, 200)),
+            "footprint_m": (6.0, rng.uniform(6, 120)), "river_m": rng.choice([0.0, 30.0]), "bridges": int(rng.integers(4)),
+            "shore_m": rng.choice([0.0, 60.0]), "lanes": bool(rng.integers(2)), "plazas": int(rng.integers(2)),
+            "objects": [{"name": str(name), "count": 2} for name in rng.choice(list(OBJECTS), 5, replace=False)],
+        }  # fmt: skip
+        try:
+            plan = WorldPlan.model_validate(values)
+        except ValidationError:
+            continue
+        town = build(plan, "W", 0)
+        assert len(town.placed) + len(town.left_out) == 10
+        checks = {one["check"]: one["is_met"] for one in check_world(town, plan)}
+        assert checks["overlapping buildings"]
 
 
 def test_a_plan_alone_decides_the_world():

@@ -9,7 +9,7 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from cosfly.maps.synthetic import SyntheticConfig
+from cosfly.maps.synthetic import MIN_BLOCK_M, SyntheticConfig
 from cosfly.maps.town_blocks import LotsConfig
 from cosfly.reading.documents import FileFormat
 from cosfly.worlds.objects import OBJECTS, Object, assets
@@ -67,6 +67,10 @@ class WorldPlan(BaseModel):
                 raise ValueError(f"{name} is from {low:g} to {high:g}, not a range within {least:g} to {most:g}")
         if self.plazas + self.greens >= self.blocks_along**2:
             raise ValueError(f"{self.plazas} plazas and {self.greens} greens leave no block of {self.blocks_along**2}")
+        narrowest_m = self.block_m * (1.0 - self.unevenness) / (1.0 + self.unevenness)
+        if narrowest_m < MIN_BLOCK_M + 1.0 or self.setback_m > narrowest_m / 5:
+            what = f"blocks as narrow as {narrowest_m:.1f} m, less than {MIN_BLOCK_M + 1.0:g} m or five times setback_m"
+            raise ValueError(f"{what}: raise block_m, or lower unevenness or setback_m")
         return self
 
 
