@@ -56,18 +56,18 @@ def world(
             f"not shared of two worlds' built-up ground: {found['mean_unlike']:.0%}, least {found['least_unlike']:.0%}"
         )
     if run:
-        for folder in folders:
-            _go_on(job, folder)
+        for number, folder in enumerate(folders):
+            _go_on(job, folder, job.cfg.seed + number)
 
 
-def _go_on(job: Job, folder: Path) -> None:
+def _go_on(job: Job, folder: Path, seed: int) -> None:
     """Do the rest of the loop: a first region is proposed from the simplified map, then all stages follow."""
     from cosfly.app import pipeline
     from cosfly.cli.run import _closing_table
     from cosfly.pedestrians.roi_editor import run_propose
     from cosfly.worlds.stage import LOOP_FILE
 
-    given = {"seed": job.cfg.seed, "workers": job.cfg.workers}
+    given = {"seed": seed, "workers": job.cfg.workers}
     cfg, out = options.resolve(folder / LOOP_FILE, None, given), folder / "run"
     for first in pipeline.stages(cfg, out)[:2]:
         first.work()
