@@ -80,6 +80,10 @@ SMALL = {
     "render": _set("render.width_px=160", "render.height_px=90"),
     "study weather": _set("render.width_px=160", "render.height_px=90"),
     "study zoom": _set("render.width_px=160", "render.height_px=90"),
+    "run work/village/loop.yaml": _set(
+        *("pedestrians.num_paths=1", "pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25"),
+        *("render.width_px=160", "render.height_px=90", "render.fovs_deg=[60]"),
+    ),
     "run quickstart --out runs/five": _set("pedestrians.num_paths=2"),
     "run runs/five --set": _set("pedestrians.num_paths=3"),
     "bench": ["--workers", "2"],
