@@ -96,6 +96,8 @@ from cosfly.work.journal import Journal
 from cosfly.work.stage_events import EventLog, read_events
 from cosfly.work.stage_folder import StageFolder, read_failures, read_manifest
 from cosfly.work.store import CHECKSUMS, read_checksums, write_checksums, write_json, write_model
+from cosfly.worlds.plan import NamedObject, WorldPlan
+from cosfly.worlds.planner import plan_of
 from distill.evaluation import stage as evaluate
 from distill.evaluation.measure import read_report
 from distill.evaluation.scores import read_scores
@@ -169,6 +171,7 @@ FRAME = "frames_playback/frame_00006"
 TREE = "render/Town01/trajectory_1776047127"
 TEXTS = {
     "answer.json": json.dumps(ANSWER),
+    "plan.json": json.dumps(WorldPlan(objects=[NamedObject(name="church")]).model_dump(mode="json")),
     "answer.txt": "<think>The {\"draft\": 1}</think>\nHere it is:\n"
     f"```json\n{json.dumps(ANSWER, indent=1)}\n``` // done",
     "answer_zh.txt": "｛“critical_components”：“行人位于前方12.4米”，“reasoning_trace”：“因此直线跟踪”，"
@@ -509,6 +512,10 @@ def _answer(root: Path, name: str, language: Any = "en") -> None:
     more, finish_reason = ("claims",) if len(text) % 2 else (), "length" if len(text) % 3 == 0 else None
     parsed = parse_answer(text, shipped_actions(), language, more, finish_reason)
     assert (parsed.coc is None) == (parsed.reason is not None)
+
+
+def _plan(root: Path) -> None:
+    plan_of(_bytes(root / "plan.json").decode("utf-8", "replace"), "stop", "plan.json")
 
 
 def _prose(root: Path, name: str, language: Any = "en") -> None:
@@ -956,6 +963,7 @@ READERS: dict[str, Reader] = {
     "answer": Reader(("answer.json",), lambda root, _: _answer(root, "answer.json")),
     "answer with thoughts": Reader(("answer.txt",), lambda root, _: _answer(root, "answer.txt")),
     "answer in Chinese": Reader(("answer_zh.txt",), lambda root, _: _answer(root, "answer_zh.txt", "zh")),
+    "plan of a world": Reader(("plan.json",), lambda root, _: _plan(root)),
     "prose": Reader(("prose.txt",), lambda root, _: _prose(root, "prose.txt")),
     "prose in Chinese": Reader(("prose_zh.txt",), lambda root, _: _prose(root, "prose_zh.txt", "zh")),
     "slots": Reader(("slots.txt",), lambda root, _: _slots(root)),

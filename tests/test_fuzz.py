@@ -63,9 +63,10 @@ def test_every_file_that_is_documented_is_read_by_one_of_them_or_by_nobody():
 
 
 # The same format as one that is fuzzed, under another name.
-ALIKE = ["debug.png", "roi_polygon.json", "step2_simplified.json", "test.parquet"]
+ALIKE = ["combined_world.json", "debug.png", "loop.yaml", "roi_polygon.json", "step2_simplified.json", "test.parquet"]
 # Written, and read by no command.
 FOR_PEOPLE = [
+    "checks.json", "diversity.json", "layout.json", "placement.json", "trace.json",
     "axes_bars.png", "axes_pairs.png", "axes_radar.png", "boxes_meta.json", "deltas.png", "flights_3d.png",
     "bench.json", "caption_report.json", "comparison.json", "compare_overlay.png", "compare_radar.png",
     "compare_series.png", "compare_strategies.json",

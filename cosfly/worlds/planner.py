@@ -51,14 +51,22 @@ def plan_by_model(
         "planner": "model", "url": url, "model": model, "seed": seed, "messages": messages, "answer": reply.text,
         "finish_reason": reply.finish_reason, "usage": reply.usage.model_dump() if reply.usage else None,
     }  # fmt: skip
-    found = find_object(reply.text, WorldPlan.model_fields.keys(), reply.finish_reason)
-    where, fix = f"{url}: plan", "try another --seed, prompt or model, or leave out --planner: the rules need no model"
+    return plan_of(reply.text, reply.finish_reason, f"{url}: plan"), trace
+
+
+def plan_of(text: str, finish_reason: str | None, where: str) -> WorldPlan:
+    """Read the plan out of a model's answer; raises TeacherError where there is none, InputError for one that cannot
+    be."""
+    found = find_object(text, WorldPlan.model_fields.keys(), finish_reason)
     if found.value is None:
-        got = f"{found.reason}: {' '.join(reply.text.split())[:80]!r}"
         raise TeacherError(
-            "the planner's answer holds no plan", where=where, got=got, expected="a JSON object", fix=fix
+            "the planner's answer holds no plan",
+            where=where,
+            got=f"{found.reason}: {' '.join(text.split())[:80]!r}",
+            expected="a JSON object",
+            fix="try another --seed, prompt or model, or leave out --planner: the rules need no model",
         )
-    return validated(WorldPlan, found.value, where), trace
+    return validated(WorldPlan, found.value, where)
 
 
 async def _ask(
