@@ -423,6 +423,12 @@ def test_perturbed_frames_keep_their_promises(sampling):
     people, _ = signed_distances(index, after.poses.targets_m[moved])
     assert people.min() >= 0.3
     assert np.abs(after.rotation_offsets_deg).max() <= cfg.max_view_deg + 1e-9
+    rolled = perturbed(PerturbationConfig(sampling=sampling, max_roll_deg=4.0))
+    np.testing.assert_array_equal(rolled.rotation_offsets_deg[:, :2], after.rotation_offsets_deg[:, :2])
+    np.testing.assert_array_equal(rolled.poses.rotations_deg[:, 2], rolled.rotation_offsets_deg[:, 2])
+    assert not after.rotation_offsets_deg[:, 2].any()
+    assert 3.5 < np.abs(rolled.rotation_offsets_deg[:, 2]).max() <= 4.0
+    assert (rolled.rotation_offsets_deg[~turned] == 0).all()
     reach = (
         np.linalg.norm(after.drone_offsets_m, axis=1)
         if sampling == "spherical"

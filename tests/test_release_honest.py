@@ -79,7 +79,7 @@ NARROW, WIDE = ["render.fovs_deg=[30]"], ["render.fovs_deg=[110]"]
 ZOOM = ["render.fovs_deg=[30, 60, 90]", "render.zoom.mode=dynamic", "render.zoom.part_s=5", "render.zoom.ramp_s=2"]
 FAR = [
     "render.perturbation.pedestrian_radius_m=6", "render.perturbation.drone_radius_m=6",
-    "render.perturbation.max_view_deg=20",
+    "render.perturbation.max_view_deg=20", "render.perturbation.max_roll_deg=8",
     "render.perturbation.view_radius_m=6",
 ]  # fmt: skip
 TEACHER = "caption.teacher=TEACHER"

@@ -16,24 +16,27 @@ PERTURBED = "aug_001"  # the variant of the perturbed track
 @dataclass(frozen=True)
 class ShiftDraw:
     """One frame's draws. events: (2,) of position and rotation, below their probability; person_m, drone_m, view_m:
-    (3,)."""
+    (3,); roll: share of the largest, -1 to 1."""
 
     events: np.ndarray
     person_m: np.ndarray
     drone_m: np.ndarray
     view_m: np.ndarray
+    roll: float
 
 
 def shift_draws(
     rng: np.random.Generator, *, person_radius_m: float, drone_radius_m: float, view_radius_m: float, is_cubic: bool
 ) -> Iterator[ShiftDraw]:
     """Yield the draws of one frame after the other, without end; each takes the same number of the generator's."""
+    of_roll = rng.spawn(1)[0]  # the paper's track has none, and draws the same with and without
     for _ in repeat(None):
         yield ShiftDraw(
             rng.random(2),
             _offset(rng, person_radius_m, 2, is_cubic),
             _offset(rng, drone_radius_m, 3, is_cubic),
             _offset(rng, view_radius_m, 3, is_cubic),
+            of_roll.uniform(-1.0, 1.0),
         )
 
 

@@ -1,9 +1,9 @@
 """The perturbed track (app:dual_track): small random shifts of person, drone and view, frame by frame, with a way back.
 
 Each frame draws two independent events. *Position*: the person is shifted on the ground and the drone in space.
-*Rotation*: the camera looks at a point beside the person, at most theta_max off per axis. A shift that puts person or
-drone too near an obstacle, the person out of the picture or, once it is drawn, out of sight, is not made, and the frame
-says so.
+*Rotation*: the camera looks at a point beside the person, at most theta_max off per axis, and may roll. A shift that
+puts person or drone too near an obstacle, the person out of the picture or, once it is drawn, out of sight, is not
+made, and the frame says so.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from cosfly.geometry import look_at, project, rotation_matrices, world_from_came
 from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import Camera
 from cosfly.products.kinds import GROUND_KINDS
-from cosfly.products.shift_draws import shift_draws
+from cosfly.products.shift_draws import ShiftDraw, shift_draws
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.render.contract import plane_z_m
 from cosfly.render.person import NOBODY, Cast
@@ -48,6 +48,9 @@ class PerturbationConfig(Config):
     view_radius_m: float = Field(2.0, ge=0, description="how far beside the person the camera may look, m")
     max_view_deg: float = Field(
         5.0, ge=0, le=45, description="largest turn of the view, for yaw and for pitch (theta_max), degrees"
+    )
+    max_roll_deg: float = Field(
+        0.0, ge=0, le=45, description="largest roll of a turned view, degrees; the paper's track has none"
     )
     sampling: Literal["cubic", "spherical"] = Field(
         "spherical", description="offsets evenly in a cube or in a ball of the radius"
@@ -177,7 +180,7 @@ def perturb(
             position = _shift(result, planned, i, draw.person_m, draw.drone_m, cameras[i], surroundings, cfg, others)
         if draw.events[1] < cfg.rotation_probability:
             for each in (unshifted, result):
-                _turn(each, i, draw.view_m, cameras[i], cfg)
+                _turn(each, i, draw, cameras[i], cfg)
         if position != APPLIED:
             result.drop_shift(i, position)
     return result
@@ -215,11 +218,11 @@ def _shift(
     return APPLIED
 
 
-def _turn(result: PerturbedTrack, i: int, view_offset: np.ndarray, camera: Camera, cfg: PerturbationConfig) -> None:
+def _turn(result: PerturbedTrack, i: int, draw: ShiftDraw, camera: Camera, cfg: PerturbationConfig) -> None:
     """Apply one frame's rotation event to whatever pose the frame has, or note why not."""
     drone, target = result.poses.positions_m[i], result.poses.targets_m[i]
-    turn = wrap_deg(_aim_deg(drone, target + view_offset) - _aim_deg(drone, target))
-    turn = np.array([*np.clip(turn, -cfg.max_view_deg, cfg.max_view_deg), 0.0])
+    turn = wrap_deg(_aim_deg(drone, target + draw.view_m) - _aim_deg(drone, target))
+    turn = np.array([*np.clip(turn, -cfg.max_view_deg, cfg.max_view_deg), cfg.max_roll_deg * draw.roll])
     rotation = result.poses.rotations_deg[i] + turn
     rotation[1] = wrap_deg(rotation[1])
     if abs(rotation[0]) >= 90.0 or not in_frame(target, drone, rotation, camera, cfg.frame_margin):

@@ -130,5 +130,6 @@ def _odd_in_frame(
         eye, target = flight.pose[i, :3], flight.target_m[i]
         turn = wrap_deg(np.degrees(np.subtract(look_at(eye, target + draw.view_m), look_at(eye, target))))
         turn = np.clip(turn, -told["max_view_deg"], told["max_view_deg"])
-        if not np.abs(offset[3:5] - turn).max() <= EXACT_DEG:
-            yield "drone_offset", f"turned by {offset[3:5].round(3).tolist()} degrees", f"{turn.round(3).tolist()}"
+        turn = np.append(turn, told.get("max_roll_deg", 0.0) * draw.roll)
+        if not np.abs(offset[3:] - turn).max() <= EXACT_DEG:
+            yield "drone_offset", f"turned by {offset[3:].round(3).tolist()} degrees", f"{turn.round(3).tolist()}"

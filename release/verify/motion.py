@@ -129,7 +129,7 @@ def _check_perturbation(flight: FlightRows, settings: dict[str, Any], findings: 
     is_told, moved, turned = ~np.isnan(shift), (shift > 0) | (person > 0), turn > 0
     drone_m = settings.get("drone_radius_m", 3.0) / 3.0 * DRONE_SHIFT_M
     person_m = settings.get("pedestrian_radius_m", 2.0) * np.sqrt(2.0) + 0.5
-    view_deg = settings.get("max_view_deg", TURN_DEG)
+    view_deg = max(settings.get("max_view_deg", TURN_DEG), settings.get("max_roll_deg", 0.0))
 
     for column, size, most in (
         ("drone_offset", shift, drone_m), ("target_offset", person, person_m), ("drone_offset", turn, view_deg),
