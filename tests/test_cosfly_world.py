@@ -272,6 +272,21 @@ def test_several_worlds_are_unlike(tmp_path):
     assert found["least_unlike"] > 0.2
 
 
+@pytest.mark.slow
+def test_worlds_go_on_to_releases_with_the_settings_that_are_told(tmp_path):
+    small = ("pedestrians.num_paths=1", "render.width_px=160", "render.height_px=90", "render.frame_stride=8")
+    told = [word for setting in small for word in ("--set", setting)]
+    result = invoke("world", ["a small village", *told], "--count 2 --run --seed 5 --out", [tmp_path / "many"])
+    assert result.exit_code == 0, result.output
+    for number in range(2):
+        run_folder = tmp_path / f"many/world_{number:03}/run"
+        assert read_json(run_folder / "roi_polygon.json", what="region")["points_world"]
+        assert read_manifest(run_folder / "render").counts.kept == 2
+        assert (run_folder / "release/dataset/README.md").is_file()
+        assert (run_folder / "preview.gif").is_file()
+        assert f"seed: {5 + number}\n" in (run_folder / "run.yaml").read_text()
+
+
 @pytest.mark.skipif(not SIMWORLD.is_dir(), reason="the shared data are not here")
 def test_distributions_are_compared_with_a_city_of_simworld():
     city = read_world(SIMWORLD / "simworld-progen/progen_world.json")

@@ -78,9 +78,11 @@ STAGE = ("town", "seed", "workers", "verify", "resume", "repair")  # of a stage 
 
 @dataclass(frozen=True)
 class Job:
-    """What the common options of a command say: the settings as they are resolved, and how to work."""
+    """What the common options of a command say: the settings as they are resolved, and how to work. overrides: --set,
+    as it was told."""
 
     cfg: RunConfig
+    overrides: Sequence[str] = ()
     resume: Resume = "if-same"
     verify: bool = False
     repair: bool = False
@@ -171,7 +173,8 @@ def takes(*names: str, flights: str | None = None) -> Callable[[Callable[..., No
             extra = {one.path: one.value_of(given[name]) for name, one in chosen.items()}
             manner = {name: given[name] for name in ("resume", "verify", "repair") if name in given}
             cfg = resolve(given["config"], given.get("overrides"), extra)
-            job = Job(_town_of(cfg, given["town"]) if "town" in shared else cfg, **manner)
+            town = _town_of(cfg, given["town"]) if "town" in shared else cfg
+            job = Job(town, given.get("overrides") or (), **manner)
             function(job, **{name: _opened(job.cfg, given[name]) for name in taken})
 
         parameters = [

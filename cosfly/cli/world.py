@@ -34,7 +34,7 @@ def world(
         Option(help="A SimWorld world to compare buildings with (sizes: maps.simworld.sizes); repeat it."),
     ] = None,
     run: Annotated[
-        bool, Option("--run", help="Go on: walks, flights, frames and all that `cosfly run` makes.")
+        bool, Option("--run", help="Go on: walks, flights, frames and all that `cosfly run` makes, with --set.")
     ] = False,
 ) -> None:
     """Text to world: a town that a prompt describes, as SimWorld's combined_world.json."""
@@ -67,12 +67,12 @@ def _go_on(job: Job, folder: Path, seed: int) -> None:
     from cosfly.pedestrians.roi_editor import run_propose
     from cosfly.worlds.stage import LOOP_FILE
 
-    given = {"seed": seed, "workers": job.cfg.workers}
-    cfg, out = options.resolve(folder / LOOP_FILE, None, given), folder / "run"
+    told, given = list(job.overrides), {"seed": seed, "workers": job.cfg.workers}
+    cfg, out = options.resolve(folder / LOOP_FILE, told, given), folder / "run"
     for first in pipeline.stages(cfg, out)[:2]:
         first.work()
     roi = out / "roi_polygon.json"
     if not roi.exists():
         run_propose(out / "simplify/step2_simplified.json", cfg.pedestrians, roi)
-    cfg = options.resolve(folder / LOOP_FILE, None, given | {"roi": roi})
+    cfg = options.resolve(folder / LOOP_FILE, told, given | {"roi": roi})
     _closing_table(pipeline.run(cfg, out), out)
