@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +10,15 @@ import pytest
 from commands import invoke
 from pydantic import ValidationError
 from teacher_server import TeacherServer
+from test_renderers_contract import circling
 
 from cosfly.errors import CosflyError, InputError, TeacherError
+from cosfly.geometry import rotation_matrices
 from cosfly.maps.boxlist import BoxList
 from cosfly.products.kinds import KINDS
 from cosfly.reading.documents import read_json, read_model
 from cosfly.work.stage_folder import read_manifest
-from cosfly.worlds.checks import check_world, compare, unlikeness
+from cosfly.worlds.checks import check_world, compare, unlikeness, ways_apart
 from cosfly.worlds.objects import OBJECTS, assets
 from cosfly.worlds.plan import PLAN_FORMAT, NamedObject, WorldPlan
 from cosfly.worlds.rules import WORDS, check_prompt, plan_by_rules
@@ -259,6 +262,19 @@ def test_a_budget_that_is_spent_asks_nothing(tmp_path):
     assert planned_by.bodies == []
 
 
+def test_ways_are_apart_by_their_shape_alone():
+    bent = [circling(40), circling(60)]
+    turn = rotation_matrices(np.radians([[0.0, 70.0, 0.0]]))[0]
+    moved = [
+        replace(one, targets_m=one.targets_m @ turn.T + 9.0, positions_m=one.positions_m @ turn.T + 9.0) for one in bent
+    ]
+    higher = [replace(one, positions_m=one.positions_m + np.array([0.0, 0.0, 8.0])) for one in bent]
+    same, up, up_again = ways_apart([bent, moved, higher])
+    assert same < 1e-6
+    assert up == pytest.approx(4.0, abs=0.01)
+    assert up_again == pytest.approx(up, abs=0.01)
+
+
 # --- the command ------------------------------------------------------------------------------------------------------
 
 
@@ -278,6 +294,7 @@ def test_worlds_go_on_to_releases_with_the_settings_that_are_told(tmp_path):
     told = [word for setting in small for word in ("--set", setting)]
     result = invoke("world", ["a small village", *told], "--count 2 --run --seed 5 --out", [tmp_path / "many"])
     assert result.exit_code == 0, result.output
+    assert read_json(tmp_path / "many/diversity.json", what="diversity")["ways_apart_m"][0] > 1.0
     for number in range(2):
         run_folder = tmp_path / f"many/world_{number:03}/run"
         assert read_json(run_folder / "roi_polygon.json", what="region")["points_world"]

@@ -58,6 +58,10 @@ def world(
     if run:
         for number, folder in enumerate(folders):
             _go_on(job, folder, job.cfg.seed + number)
+        if count > 1:
+            found = stage.write_diversity(products, out, [folder / "run/plan/drone_trace.json" for folder in folders])
+            if apart_m := found.get("ways_apart_m"):
+                typer.echo(f"walks and flights of two worlds are {min(apart_m):.1f} m or more apart, on average")
 
 
 def _go_on(job: Job, folder: Path, seed: int) -> None:

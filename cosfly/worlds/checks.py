@@ -12,6 +12,8 @@ import shapely
 
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import GROUND_KINDS
+from cosfly.products.motion import in_axes_of
+from cosfly.products.traces import DroneTrace
 from cosfly.worlds.plan import WorldPlan
 from cosfly.worlds.town import Town, footprints, land_m2, of_kinds, trees_of
 
@@ -22,6 +24,7 @@ AT_THE_DOOR_M = 2.0  # from a building to the pavement it is reached by
 WALK_M = 100.0  # the longest walk that must find room: app:simworld:step4 samples 50 to 100 m
 OVERLAP_M = 0.05
 GRID_M = 4.0  # of the pictures of buildings that are compared between worlds
+WAY_POINTS = 50
 
 
 class Buildings(NamedTuple):
@@ -160,3 +163,21 @@ def unlikeness(worlds: Sequence[BoxMap]) -> list[float]:
     low, shape = np.array([-half, -half]), np.full(2, int(2 * half / GRID_M) + 1)
     built = [_drawn(buildings_of(world).polygons, low, shape, GRID_M) > 0 for world in worlds]
     return [round(1.0 - float((a & b).sum() / max(1, (a | b).sum())), 3) for a, b in combinations(built, 2)]
+
+
+def ways_apart(worlds: Sequence[Sequence[DroneTrace]]) -> list[float]:
+    """Give for every pair of worlds how far a walk and its flight are from the nearest of the other world, mean, m.
+
+    They are laid over each other with one start and one direction from start to end, WAY_POINTS at even times.
+    """
+    shapes = [np.stack([_laid_out(trace) for trace in traces]) for traces in worlds]
+    gaps_m = (np.linalg.norm(a[:, None] - b[None], axis=-1).mean(axis=-1) for a, b in combinations(shapes, 2))
+    return [round(float((gap.min(axis=0).mean() + gap.min(axis=1).mean()) / 2), 2) for gap in gaps_m]
+
+
+def _laid_out(trace: DroneTrace) -> np.ndarray:
+    """Walk and flight from the walk's start, x towards its end, (2 * WAY_POINTS, 3) m."""
+    rows = np.linspace(0, len(trace.time_s) - 1, WAY_POINTS).round().astype(int)
+    away_m = np.concatenate([trace.targets_m[rows], trace.positions_m[rows]]) - trace.targets_m[0]
+    end_m = trace.targets_m[-1] - trace.targets_m[0]
+    return in_axes_of(float(np.degrees(np.arctan2(end_m[1], end_m[0]))), away_m)

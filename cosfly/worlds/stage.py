@@ -19,11 +19,12 @@ from cosfly.look.topview import TopView, draw_map, png_bytes
 from cosfly.maps.simworld import PLACEHOLDER_CM, SimWorldConfig
 from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.products.boxes import OUR_LICENCE, BoxMap
+from cosfly.products.traces import read_traces
 from cosfly.reading.documents import FileFormat
 from cosfly.work.config import read_yaml, shipped
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import write_bytes, write_json, write_model
-from cosfly.worlds.checks import check_world, compare, unlikeness
+from cosfly.worlds.checks import check_world, compare, unlikeness, ways_apart
 from cosfly.worlds.objects import OBJECTS, assets
 from cosfly.worlds.plan import PLAN_FORMAT
 from cosfly.worlds.planner import plan_by_model
@@ -107,10 +108,14 @@ def read_world(path: Path, sizes: Sequence[Path] = ()) -> BoxMap:
     return load_map(MapsConfig(source="simworld", simworld=cfg))
 
 
-def write_diversity(worlds: Sequence[Path], out: Path) -> dict[str, Any]:
-    """Write `diversity.json`: how unlike the built-up ground of every two worlds is."""
+def write_diversity(worlds: Sequence[Path], out: Path, traces: Sequence[Path] = ()) -> dict[str, Any]:
+    """Write `diversity.json`: how unlike the built-up ground of every two worlds is, and their flights where there are
+    some."""
     pairs = unlikeness([read_world(path) for path in worlds])
-    found = {"worlds": len(worlds), "least_unlike": min(pairs), "mean_unlike": round(float(np.mean(pairs)), 3)}
+    found: dict[str, Any] = {"worlds": len(worlds), "least_unlike": min(pairs)}
+    found["mean_unlike"] = round(float(np.mean(pairs)), 3)
+    if flights := [some for path in traces if (some := read_traces(path))]:
+        found["ways_apart_m"] = ways_apart(flights)
     write_json(out / "diversity.json", {**FileFormat("cosfly.world_diversity", "1.0").header, **found, "pairs": pairs})
     return found
 
