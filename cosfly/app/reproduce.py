@@ -374,9 +374,10 @@ def work(cfg: RunConfig, run: Path, places: Places, done: Sequence[str]) -> dict
         rows = [benchmark.row_of(events, manifests["render"], workers, counts_frames=True)]
         if any((root / "bench.json").is_file() for root in places.roots):
             rows = read_model(places.file("bench.json"), benchmark.Bench, benchmark.FORMAT).rows
+        first = rows[0].per_s or None  # nothing where its events count no frames
         found["rendering"] = {
             f"{one.workers} workers": [
-                one.seconds, one.attempted, one.successful, one.per_s, one.per_s / rows[0].per_s, one.cores_used,
+                one.seconds, one.attempted, one.successful, one.per_s, first and one.per_s / first, one.cores_used,
                 one.peak_memory_mib, one.restarts, one.failed, one.gpu_percent, one.gpu_gib,
             ]
             for one in rows
