@@ -121,6 +121,22 @@ def test_a_plan_alone_decides_the_world():
     assert {one.name for one in one.placed} == {"fountain"}
 
 
+def test_what_a_prompt_says_there_is_none_of_is_not_there():
+    for prompt in ("a village with a well and no fountain or church", "a village without any fountain, with a well"):
+        assert [one.name for one in by_rules(prompt).objects] == ["well"]
+    plan, trace = plan_by_rules("a tiny ski resort, no high-rise towers, no cars and without trees", 0)
+    assert (trace["settlement"], trace["without"]) == ("resort", "high-rise towers cars ")
+    assert plan.parked_share == 0.0 < by_rules("a tiny ski resort").parked_share
+    assert plan.trees_per_ha == (0.0, 0.0)
+    assert [one.name for one in by_rules("a village, no fountain but a well").objects] == ["well"]
+
+
+@pytest.mark.parametrize("prompt", ["asdf qwer zxcv", "一个带喷泉的小村庄", "42"])
+def test_a_prompt_of_which_nothing_can_be_read_is_refused_in_words(prompt):
+    with pytest.raises(InputError, match=r"nothing that the rules can read.*expected English.*--planner URL"):
+        by_rules(prompt)
+
+
 def test_what_no_table_has_is_said_and_counted(tmp_path):
     out = tmp_path / "w"
     run(WorldConfig(prompt="a small town with a fountain, a dragon and three volcanoes"), out)

@@ -23,6 +23,8 @@ _STOPS = re.compile(
     r"\b(?:and|or|with|of|on|in|at|by|along|around|round|near|beside|between|to|from|for|over|through|without|under|is|are|has|have"
     r"|it|there|where|that|which|them|stands?|surrounded|lined)\b|[,.;:()]"
 )  # fmt: skip
+_PHRASE = rf"(?:(?!{_STOPS.pattern}|\b(?:but|no)\b).)+"
+_WITHOUT = re.compile(rf"\b(?:no|without(?: any)?)\s+({_PHRASE}(?:\b(?:or|nor)\b{_PHRASE})*)")  # "no fountain or well"
 SEVERAL = 4  # of a plural without a number
 MOST_CHARACTERS = 2000
 
@@ -52,11 +54,12 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
     """
     text = prompt.lower().replace("’", "'")
     text = re.sub(
-        r"\b(no|few|many|hardly any|lots of) (trees|vegetation|greenery)",
-        lambda m: f"{m[1]}-trees".replace(" ", "-"),
+        r"\b(no|without(?: any)?|few|many|hardly any|lots of) (trees|vegetation|greenery)",
+        lambda m: "no-trees" if m[1].startswith("without") else f"{m[1]}-trees".replace(" ", "-"),
         text,
     )
     text = re.sub(r"\bgarden city\b", "garden-city", text)
+    without, text = " ".join(_WITHOUT.findall(text)), _WITHOUT.sub(" , ", text)
     objects, rest = _objects(text)
     words = re.findall(r"[a-z][a-z'-]*", rest)
     kind = next((name for name, one in WORDS["settlements"].items() if set(one["words"].split()) & set(words)), "town")
@@ -72,6 +75,9 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
         plan[name] = _times(plan[name], factor * rng_for(seed, "world", name).uniform(0.92, 1.08))
     plan |= _heights(prompt.lower(), plan)
     plan |= _open_and_water(words, objects, plan)
+    if without:
+        trace["without"] = without
+        plan["parked_share"] *= not re.search(r"\b(?:cars?|vehicles?|traffic)\b", without)
     if "tower" in " ".join(words) and kind not in ("downtown", "high-rise city") and "heights_m" in values:
         plan["heights_m"], plan["high_center"] = (plan["heights_m"][0], max(plan["heights_m"][1], 48.0)), True
     if re.search(r"\b(?:towers|high-rises|skyscrapers) in the (?:cent|middle)", text):
@@ -81,6 +87,14 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
     plan["gap_m"] = max(0.5, plan["gap_m"])
     plan |= {"objects": [one.model_dump() for one in objects], "not_in_table": _unknown(rest)}
     trace["not_in_table"] = plan["not_in_table"]
+    if not (objects or plan["not_in_table"] or without or set(words) & _known()):
+        raise InputError(
+            "nothing that the rules can read",
+            where="PROMPT",
+            got=repr(prompt[:60]),
+            expected="English, as in 'a small village with a church'",
+            fix="say a kind of place, or ask a language model with --planner URL",
+        )
     return WorldPlan.model_validate(plan), trace
 
 
@@ -174,12 +188,17 @@ def _open_and_water(words: list[str], objects: list[NamedObject], plan: dict[str
     return changes
 
 
-def _unknown(rest: str) -> list[str]:
-    """Give what the text names and no table has: the last word of a phrase that begins with an article or a number."""
+def _known() -> set[str]:
+    """Give all words of the tables but the objects'."""
     known = {*WORDS["ordinary"], *WORDS["open"], *WORDS["water"], *WORDS["sized"]}
     for table in (WORDS["settlements"], *WORDS["groups"].values()):
         known |= {word for one in table.values() for word in one["words"].split()}
-    found = []
+    return known
+
+
+def _unknown(rest: str) -> list[str]:
+    """Give what the text names and no table has: the last word of a phrase that begins with an article or a number."""
+    known, found = _known(), []
     for chunk in _STOPS.split(rest):
         words = re.findall(r"[a-z0-9][a-z0-9'-]*", chunk)
         if len(words) < 2 or not (words[0] in ARTICLES or words[0] in NUMBERS or words[0].isdigit()):
