@@ -137,6 +137,19 @@ def test_a_prompt_of_which_nothing_can_be_read_is_refused_in_words(prompt):
         by_rules(prompt)
 
 
+def test_what_is_refused_leaves_the_folder_to_the_next_try(tmp_path):
+    out, broken = tmp_path / "w", tmp_path / "other.json"
+    broken.write_text('{"nodes": [')
+    for prompt, against in (
+        ("a tiny large village", ()),
+        ("a tiny village", (broken,)),
+        ("a tiny village", (tmp_path,)),
+    ):
+        with pytest.raises(InputError):
+            run(WorldConfig(prompt=prompt), out, against=against)
+    run(WorldConfig(prompt="a tiny village"), out)
+
+
 def test_what_no_table_has_is_said_and_counted(tmp_path):
     out = tmp_path / "w"
     run(WorldConfig(prompt="a small town with a fountain, a dragon and three volcanoes"), out)

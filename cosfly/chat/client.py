@@ -333,7 +333,7 @@ class ChatClient:
         except (TimeoutError, httpx.RequestError) as error:
             is_late = isinstance(error, TimeoutError | httpx.TimeoutException)
             why = f"no answer within {self.cfg.timeout_s:g} s" if is_late else f"{type(error).__name__} {error}"
-            fix = "start the server or check --teacher"
+            fix = "start the server or check its address"
             raise self.error("cannot reach the teacher", got=self.clean(why), fix=fix) from None
         if response.status in (401, 403):
             self.stop_if_fatal(self.refusal(response))

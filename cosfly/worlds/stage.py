@@ -59,6 +59,7 @@ def run(
     """
     prompt = check_prompt(cfg.prompt)
     others = {f"against_{number}": path for number, path in enumerate(against)}
+    real = {str(path): read_world(path, sizes) for path in against}  # a broken one before the folder is bound to it
     stage = StageFolder.open(out, "world", config=cfg, inputs=others, seed=seed, resume=resume)
     product = out / WORLD_FILE
     if stage.is_complete:
@@ -74,7 +75,7 @@ def run(
     town = build(plan, cfg.name, seed)
     _write_world(town, out, seed)
     checks = check_world(town, plan)
-    compared = {str(path): compare(town.boxes, read_world(path, sizes)) for path in against}
+    compared = {path: compare(town.boxes, boxes) for path, boxes in real.items()}
     write_json(out / "checks.json", {**CHECKS_FORMAT.header, "checks": checks, "compared": compared})
     view = TopView.around(np.stack(town.boxes.bounds()), 1000)
     write_bytes(out / "map.png", png_bytes(draw_map(town.boxes, view)))
