@@ -150,6 +150,16 @@ def test_what_is_refused_leaves_the_folder_to_the_next_try(tmp_path):
     run(WorldConfig(prompt="a tiny village"), out)
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_towers_of_a_campus_are_higher_than_its_halls(seed):
+    plans = [plan_by_rules(f"a campus {more}", seed)[0] for more in ("with towers", "")]
+    highest = [
+        max(one["got"] for one in check_world(build(plan, "W", seed), plan) if one["check"].startswith("highest"))
+        for plan in plans
+    ]
+    assert highest[0] > 35.0 > 23.0 > highest[1]
+
+
 def test_what_no_table_has_is_said_and_counted(tmp_path):
     out = tmp_path / "w"
     run(WorldConfig(prompt="a small town with a fountain, a dragon and three volcanoes"), out)

@@ -79,7 +79,7 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
         trace["without"] = without
         plan["parked_share"] *= not re.search(r"\b(?:cars?|vehicles?|traffic)\b", without)
     if "tower" in " ".join(words) and kind not in ("downtown", "high-rise city") and "heights_m" in values:
-        plan["heights_m"], plan["high_center"] = (plan["heights_m"][0], max(plan["heights_m"][1], 48.0)), True
+        plan["heights_m"] = (plan["heights_m"][0], max(plan["heights_m"][1], 48.0))
     if re.search(r"\b(?:towers|high-rises|skyscrapers) in the (?:cent|middle)", text):
         plan["high_center"], plan["heights_m"] = True, (min(plan["heights_m"][0], 8.0), plan["heights_m"][1])
     least = math.ceil(math.sqrt(2 * (plan["plazas"] + plan["greens"])))  # half of the blocks are built up
