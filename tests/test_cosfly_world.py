@@ -160,6 +160,12 @@ def test_towers_of_a_campus_are_higher_than_its_halls(seed):
     assert highest[0] > 35.0 > 23.0 > highest[1]
 
 
+def test_words_that_change_nothing_are_told():
+    read = {prompt: plan_by_rules(prompt, 0)[1]["not_read"] for prompt in (
+        "a tiny ski resort: chalets and a fountain, with three dragons", "a large village with many trees and a river")}  # fmt: skip
+    assert list(read.values()) == [["chalets", "ski"], []]
+
+
 def test_what_no_table_has_is_said_and_counted(tmp_path):
     out = tmp_path / "w"
     run(WorldConfig(prompt="a small town with a fountain, a dragon and three volcanoes"), out)

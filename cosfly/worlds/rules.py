@@ -87,6 +87,11 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
     plan["gap_m"] = max(0.5, plan["gap_m"])
     plan |= {"objects": [one.model_dump() for one in objects], "not_in_table": _unknown(rest)}
     trace["not_in_table"] = plan["not_in_table"]
+    spoken = re.findall(r"[a-z][a-z'-]+", " ".join(_STOPS.split(rest)))
+    left = " ".join(plan["not_in_table"]).split()
+    trace["not_read"] = sorted(
+        {w for w in spoken if not {w, w.removesuffix("s")} & {*_known(), *ARTICLES, *NUMBERS, *left, "but"}}
+    )
     if not (objects or plan["not_in_table"] or without or set(words) & _known()):
         raise InputError(
             "nothing that the rules can read",

@@ -71,6 +71,8 @@ def run(
     else:
         plan, trace = plan_by_rules(prompt, seed)
     write_json(out / "trace.json", {"prompt": prompt, **trace})
+    if trace.get("not_read"):
+        log.info("words that changed nothing: %s", ", ".join(trace["not_read"]))
     write_model(out / "plan.json", plan, PLAN_FORMAT)
     town = build(plan, cfg.name, seed)
     _write_world(town, out, seed)
