@@ -2,6 +2,7 @@
 (() => {
 const { file, ...about } = pageData();
 const parts = [...document.querySelectorAll(".choice")], last = {};  // verdict: the last reason given for it
+if (!parts.length) return;
 let here = -1;
 const tell = (text) => { byId("state").textContent = text; };
 const chosenOf = (part) => part.querySelector("input[type=radio]:checked");

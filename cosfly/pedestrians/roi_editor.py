@@ -140,14 +140,15 @@ def run_propose(map_: Path, cfg: PedestriansConfig, out: Path) -> str:
         NoPathError: nobody can walk on it.
     """
     if out.exists():
-        what, fix = "there is a region already", "name another file, or remove this one"
-        raise InputError(what, where=out, fix=fix)
+        what = "a folder, not a file" if out.is_dir() else "there is a region already"
+        raise InputError(what, where=out, fix="name another file" + ("" if out.is_dir() else ", or remove this one"))
     box_map = _read_map(map_)
     roi = propose(walkable_ground(box_map, cfg, where=map_), box_map.name)
     ground = walkable_ground(box_map, cfg, roi, where=map_, roi_where=out)
     write_roi(out, roi)
-    num_holes = sum(len(polygon.holes) for polygon in roi.rings())
-    return f"{len(roi.rings())} polygons with {num_holes} holes, {ground.counts['cells_used']:,} walkable cells"
+    rings = roi.rings()
+    num_holes = sum(len(polygon.holes) for polygon in rings)
+    return f"polygons: {len(rings)}, holes: {num_holes}, walkable cells: {ground.counts['cells_used']:,}"
 
 
 def _read_map(path: Path) -> BoxMap:
