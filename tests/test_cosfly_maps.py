@@ -175,6 +175,8 @@ def write_world(folder: Path, *nodes: dict, sizes: dict | None = None) -> SimWor
 def test_a_world_without_a_size_table_says_which_setting_names_one(tmp_path: Path):
     cfg = write_world(tmp_path, node("BP_Tree1_C", 0, 0))
     (tmp_path / "Bbox.json").unlink()
+    with pytest.raises(InputError, match="a folder, not a world"):
+        SimWorldConfig(world=tmp_path).inputs()
     with pytest.raises(InputError, match=r"Bbox\.json: there is no asset size table.*--set maps\.simworld\.sizes=FILE"):
         simworld(cfg)
 

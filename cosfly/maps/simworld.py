@@ -73,6 +73,8 @@ class SimWorldConfig(Config):
         if self.world is None:
             fix = "--set maps.simworld.world=FILE"
             raise ConfigError("no file is given", where="maps.simworld.world", expected="a path", fix=fix)
+        if self.world.is_dir():  # its size table would be looked for beside the folder
+            raise InputError("a folder, not a world", where=self.world, expected="a world file of SimWorld, JSON")
         for number, path in enumerate(self.size_tables()):
             if not path.is_file():
                 raise InputError(
