@@ -8,16 +8,28 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
+import pynvml
 import pytest
 from toy_workers import make_broken_worker, make_counting_worker, make_talking_worker, make_worker, stage_in
 
 from cosfly.errors import EnvironmentMissing
+from cosfly.work import stage_events
 from cosfly.work.journal import Journal
 from cosfly.work.runner import Item, Watch, run_items
-from cosfly.work.stage_events import EVENTS, LOSSES, PROBES_OF_ONE_PACE, EventLog, HowFar, progress_of, read_events
+from cosfly.work.stage_events import (
+    EVENTS,
+    LOSSES,
+    PROBES_OF_ONE_PACE,
+    EventLog,
+    HowFar,
+    gpu_use,
+    progress_of,
+    read_events,
+)
 from cosfly.work.stage_folder import Failed
 from cosfly.work.worker_pool import limit_s
 
@@ -222,6 +234,58 @@ def test_probes_tell_how_far_the_stage_is_and_their_pace_how_long_it_will_take(t
     assert far == (120, 428, "steps")
     assert left_s == pytest.approx((events[-1].at_s - events[-2].at_s) / 20 * 308)
     assert progress_of([]) is None
+
+
+def test_what_the_driver_says_of_processes_is_told_by_worker(monkeypatch):
+    """A driver with two devices, one of which does not tell of processes; the names and the structures are NVIDIA's."""
+    devices = {0: (40, 3), 1: (20, 1)}  # load in per cent, GiB in use
+    answers: dict[str, Callable] = {
+        "nvmlInit": lambda: None,
+        "nvmlDeviceGetCount": lambda: len(devices),
+        "nvmlDeviceGetHandleByIndex": lambda index: index,
+        "nvmlDeviceGetUtilizationRates": lambda device: SimpleNamespace(gpu=devices[device][0]),
+        "nvmlDeviceGetMemoryInfo": lambda device: SimpleNamespace(used=devices[device][1] << 30),
+    }
+    both = [SimpleNamespace(pid=71, usedGpuMemory=700 << 20), SimpleNamespace(pid=99, usedGpuMemory=1 << 30)]
+
+    def of_processes(found):
+        def answer(device, *since_us):
+            if device:
+                raise pynvml.NVMLError(pynvml.NVML_ERROR_NO_PERMISSION)
+            return found
+
+        return answer
+
+    answers["nvmlDeviceGetGraphicsRunningProcesses"] = of_processes(
+        [*both, SimpleNamespace(pid=72, usedGpuMemory=None)]
+    )
+    answers["nvmlDeviceGetComputeRunningProcesses"] = of_processes(both)
+    sample = pynvml.c_nvmlProcessUtilizationSample_t
+    samples = [sample(pid=71, timeStamp=2, smUtil=30), sample(pid=71, timeStamp=1, smUtil=90), sample(pid=99, smUtil=5)]
+    answers["nvmlDeviceGetProcessUtilization"] = of_processes(samples)
+    for name, answer in answers.items():
+        monkeypatch.setattr(pynvml, name, answer)
+    stage_events._nvml.cache_clear()
+    try:
+        of_devices = {"gpu_percent": 30.0, "gpu_mib": 4096.0}
+        by_worker = {"worker_gpu_percent": {0: 30.0}, "worker_gpu_mib": {0: 700.0}}
+        assert gpu_use({0: 71, 1: 72}) == of_devices | by_worker
+        assert gpu_use({0: 5}) == of_devices | {"worker_gpu_percent": {}, "worker_gpu_mib": {}}  # ids of a container
+    finally:
+        stage_events._nvml.cache_clear()
+
+
+def test_without_a_driver_there_are_no_figures_of_a_gpu(monkeypatch):
+    def absent(name: str):
+        raise OSError(f"{name}: cannot open shared object file")
+
+    monkeypatch.setattr(pynvml, "nvmlLib", None)
+    monkeypatch.setattr(pynvml, "CDLL", absent)
+    stage_events._nvml.cache_clear()
+    try:
+        assert gpu_use({0: os.getpid()}) == {}
+    finally:
+        stage_events._nvml.cache_clear()
 
 
 def test_a_week_of_probes_stays_small(tmp_path):

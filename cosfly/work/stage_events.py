@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -18,6 +17,7 @@ from cosfly.work.journal import Journal
 EVENTS = "events.jsonl"
 PROBES_OF_ONE_PACE = 500  # after so many the pace is halved: a week of work makes a few thousand lines
 MEBIBYTE = 2**20
+GPU_SAMPLE_S = 2.0  # of the driver's samples of what each process computes, the last so many seconds
 Loss = Literal["heartbeat_lost", "timed_out", "worker_died"]
 LOSSES: dict[str, str] = {  # events of a worker that is of no use any more
     "heartbeat_lost": "its worker stood still",
@@ -52,8 +52,8 @@ class Event(BaseModel):
     """A line of `events.jsonl`. at_s: seconds since 1970. worker: its place, 0 and up; a restarted one keeps it.
 
     Of a probe: rss_mib by worker (the most since the probe before), cores in use by all workers, free disk space, mean
-    load and memory in use of all NVIDIA devices of the machine where it has some, and how far the stage is: `done` of
-    `total`, of steps, as frames, or of items.
+    load and memory in use of all NVIDIA devices of the machine where it has some, their part by worker where the driver
+    tells whose it is, and how far the stage is: `done` of `total`, of steps, as frames, or of items.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -73,6 +73,8 @@ class Event(BaseModel):
     disk_free_mib: float | None = None
     gpu_percent: float | None = None
     gpu_mib: float | None = None
+    worker_gpu_percent: dict[int, float] | None = None
+    worker_gpu_mib: dict[int, float] | None = None
     done: int | None = None
     total: int | None = None
     unit: Literal["steps", "items"] | None = None
@@ -111,7 +113,7 @@ class EventLog:
         elapsed_s = time.monotonic() - self._probed_s
         cores = round(self._used_s / elapsed_s, 2) if elapsed_s else 0.0
         free = shutil.disk_usage(self._folder).free / MEBIBYTE
-        far = (self._how_far()._asdict() if self._how_far else {}) | gpu_use()
+        far = (self._how_far()._asdict() if self._how_far else {}) | gpu_use(pids)
         self.tell("probe", rss_mib=self._peaks_mib, cores_used=cores, disk_free_mib=round(free, 1), **far)
         self._peaks_mib, self._used_s, self._probed_s = {}, 0.0, time.monotonic()
         if self._num_probes == self._pace * PROBES_OF_ONE_PACE:
@@ -157,32 +159,62 @@ def cpu_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK") if fields else 0.0  # utime, stime: proc(5)
 
 
-def gpu_use() -> dict[str, float]:
-    """Give what the driver says of the machine's NVIDIA devices: `gpu_percent`, their mean load, and `gpu_mib`, their
-    memory in use together; nothing where there is none."""
-    library = _nvml()
-    count, loads, used_mib = ctypes.c_uint(), [], 0.0
-    if library is None or library.nvmlDeviceGetCount_v2(ctypes.byref(count)):
+def gpu_use(pids: Mapping[int, int]) -> dict[str, Any]:
+    """Give what the driver says of the machine's NVIDIA devices: `gpu_percent`, their mean load, `gpu_mib`, their
+    memory in use together, and both by worker (place -> process id); nothing where there is none.
+
+    The driver knows processes by the ids of the host, or tells of none, so a container with ids of its own hides which
+    worker uses what: its `worker_gpu_mib` and `worker_gpu_percent` are then empty, the figures of the devices are not.
+    """
+    nvml, loads, used_mib = _nvml(), list[float](), 0.0
+    if nvml is None:
         return {}
-    for index in range(count.value):
-        device, rates, memory = ctypes.c_void_p(), (ctypes.c_uint * 2)(), (ctypes.c_ulonglong * 3)()
-        if library.nvmlDeviceGetHandleByIndex_v2(index, ctypes.byref(device)):
+    places = {pid: place for place, pid in pids.items()}
+    mib, percent = dict[int, float](), dict[int, float]()
+    since_us = int(1e6 * (time.time() - GPU_SAMPLE_S))
+    for index in range(_asked(nvml.nvmlDeviceGetCount) or 0):
+        if (device := _asked(nvml.nvmlDeviceGetHandleByIndex, index)) is None:
             continue
-        if not library.nvmlDeviceGetUtilizationRates(device, rates):  # of the device, of its memory's bus
-            loads.append(rates[0])
-        if not library.nvmlDeviceGetMemoryInfo(device, memory):  # total, free, used
-            used_mib += memory[2] / MEBIBYTE
-    return {"gpu_percent": round(sum(loads) / len(loads), 1), "gpu_mib": round(used_mib, 1)} if loads else {}
+        if rates := _asked(nvml.nvmlDeviceGetUtilizationRates, device):
+            loads.append(rates.gpu)
+        if memory := _asked(nvml.nvmlDeviceGetMemoryInfo, device):
+            used_mib += memory.used / MEBIBYTE
+        held = dict[int, int | None]()  # a process that draws and computes is in both lists, with all it holds
+        for lister in (nvml.nvmlDeviceGetGraphicsRunningProcesses, nvml.nvmlDeviceGetComputeRunningProcesses):
+            held |= {one.pid: one.usedGpuMemory for one in _asked(lister, device) or ()}
+        for pid, used in held.items():
+            if used is not None and (place := places.get(pid)) is not None:
+                mib[place] = round(mib.get(place, 0.0) + used / MEBIBYTE, 1)
+        samples = _asked(nvml.nvmlDeviceGetProcessUtilization, device, since_us) or ()
+        for pid, load in {one.pid: one.smUtil for one in sorted(samples, key=lambda one: one.timeStamp)}.items():
+            if (place := places.get(pid)) is not None:
+                percent[place] = percent.get(place, 0.0) + load
+    if not loads:
+        return {}
+    of_devices = {"gpu_percent": round(sum(loads) / len(loads), 1), "gpu_mib": round(used_mib, 1)}
+    return of_devices | {"worker_gpu_percent": percent, "worker_gpu_mib": mib}
 
 
 @lru_cache(maxsize=1)
-def _nvml() -> ctypes.CDLL | None:
-    """Load the library of the NVIDIA driver; None where there is none, or no device."""
+def _nvml() -> Any:
+    """Give the library of the NVIDIA driver; None where there is none, or no device."""
+    import pynvml
+
     try:
-        library = ctypes.CDLL("libnvidia-ml.so.1")
-    except OSError:
+        pynvml.nvmlInit()
+    except pynvml.NVMLError:
         return None
-    return None if library.nvmlInit_v2() else library
+    return pynvml
+
+
+def _asked(call: Callable[..., Any], *arguments: Any) -> Any:
+    """Ask the driver; None where it does not tell: an old one, a virtual device, a right that is not ours."""
+    import pynvml
+
+    try:
+        return call(*arguments)
+    except (pynvml.NVMLError, pynvml.NVMLLibraryMismatchError):
+        return None
 
 
 def _stat(pid: int) -> list[bytes]:
