@@ -173,7 +173,7 @@ def render_flight(
             visibility.append(seen.visibility)
             told = {} if seen.others is None else {"others": seen.others.people_of(poses.targets_m[i], people)}
             company.append(told)
-            pending.append(pool.submit(_write_frame, folder, frame, _annotation(script, i, seen), writing, script))
+            pending.append(pool.submit(_write_frame, folder, frame, annotation(script, i, seen), writing, script))
             advance()
             while len(pending) >= FRAMES_IN_FLIGHT:
                 take(pending.pop(0))
@@ -272,7 +272,7 @@ def _write_frame(
 # --- annotations ------------------------------------------------------------------------------------------------------
 
 
-def _annotation(script: FlightScript, i: int, seen: TargetSight) -> FrameMeta:
+def annotation(script: FlightScript, i: int, seen: TargetSight) -> FrameMeta:
     perturbed, view = script.perturbed, seen.view
     return FrameMeta(
         index=i,

@@ -1,0 +1,211 @@
+"""One flight in closed loop: a command moves the drone, and what it then sees is drawn. No student, no file.
+
+The drone is a point with inertia: it reaches a commanded velocity as fast as its acceleration allows, turns and tilts
+its camera likewise. That is a stabilised multicopter as its autopilot presents it, without wind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cosfly.closed_loop.settings import DroneConfig
+from cosfly.geometry import step_s, wrap_deg
+from cosfly.products.boxes import BoxMap
+from cosfly.products.frames import TargetMeta
+from cosfly.products.others import Other
+from cosfly.products.places import town_folder
+from cosfly.products.pursuits import Ended
+from cosfly.products.traces import DroneTrace
+from cosfly.products.walks import TARGET_HEIGHT_M
+from cosfly.products.weather import WeatherParams
+from cosfly.render.camera import contrast_of, legibility
+from cosfly.render.contract import PERSON_ID, Frame
+from cosfly.render.flight import annotation, draw_frame
+from cosfly.render.perturbation import PerturbedTrack, Poses, Surroundings
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import renderer_of, script_flight
+from cosfly.render.weather import read_pools, weather_of
+from cosfly.space.flight_metrics import CLEARANCE_CAP_M
+from cosfly.space.kernels import swept_distances
+
+RATE_HZ = 20.0  # of the autopilot, which follows a command
+LEAVES_M = 100.0  # beyond the map's bounds
+AREA_M, AREA_STEP_M = 420.0, 100.0  # lit at once, and how far apart the middles of such areas are
+
+
+class World:
+    """A map to fly in: what draws it, and what can be hit. One a process, used from one thread."""
+
+    def __init__(
+        self, cfg: RenderConfig, boxes: BoxMap, simplified: BoxMap, *, seed: int = 0, num_others: int = 0
+    ) -> None:
+        """
+        Args:
+            boxes: that are drawn. simplified: that are flown among. num_others: as the renderer takes it.
+        """
+        given = {"first_timestamp": cfg.first_timestamp or 0, "weather_seed": max(cfg.weather_seed, 0) or seed}
+        self.cfg, self.seed = cfg.model_copy(update=given), seed
+        self.renderer, self.pools = renderer_of(cfg, boxes, seed, num_others), read_pools(cfg)
+        self.surroundings, self.ground = Surroundings(simplified), simplified.ground
+        self.town, self.bounds_m = town_folder(cfg.town or boxes.name), boxes.bounds()
+        self._lit: object = None
+
+    def light(self, targets_m: np.ndarray, weather: WeatherParams | None) -> None:
+        """Have the renderer ready for a walk. Its area is one of a grid, so that neighbours share it and that none
+        looks otherwise for those that are flown beside it."""
+        middle = np.round(targets_m.mean(axis=0) / AREA_STEP_M) * AREA_STEP_M
+        wanted = (*middle[:2].tolist(), None if weather is None else weather.model_dump_json())
+        if wanted != self._lit:
+            low, high = self.bounds_m
+            half = np.array([AREA_M / 2.0] * 2)
+            self.renderer.prepare(np.append(middle[:2] - half, low[2]), np.append(middle[:2] + half, high[2]), weather)
+            self._lit = wanted
+
+    def has_left(self, position_m: np.ndarray) -> bool:
+        """Tell whether a drone is far out of the map."""
+        low, high = self.bounds_m
+        outside = np.maximum(low - position_m, position_m - high)[:2]
+        return bool((outside > LEAVES_M).any())
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One frame of a flight. position_m, rotation_deg (pitch, yaw, roll), velocity_mps: (3,) world. target: as
+    `meta.json` has it; target_m: its hip, (3,). clearance_m: the least since the frame before."""
+
+    index: int
+    time_s: float
+    position_m: np.ndarray
+    rotation_deg: np.ndarray
+    velocity_mps: np.ndarray
+    target_m: np.ndarray
+    target: TargetMeta
+    company: dict[str, float | None]  # of other people, as `OthersMeta.people_of`; empty where nobody else moves
+    frame: Frame
+    clearance_m: float
+    height_m: float  # over the ground under the target
+
+    @property
+    def distance_m(self) -> float:
+        """From the drone to the target, over ground."""
+        return float(np.hypot(*(self.position_m - self.target_m)[:2]))
+
+
+class ClosedLoopFlight:
+    """One flight after one walk. `reset` gives the frames of the plan with which it begins, `step` flies a command for
+    one time step of the walk and gives what is seen then; `ended` tells how it ended, None while it goes on."""
+
+    def __init__(
+        self,
+        world: World,
+        planned: DroneTrace,
+        *,
+        number: int = 0,
+        num_lead: int = 5,
+        drone: DroneConfig = DroneConfig(),
+        lost_s: float = 0.0,
+        others: Sequence[Other] = (),
+    ) -> None:
+        """
+        Args:
+            planned: a plan for the walk: its first frames are flown, of the others the person's way is taken. number:
+                of the walk, for its weather. num_lead: frames of the plan, 2 or more. lost_s: ends after so long
+                without sight; 0: never.
+        """
+        if not 2 <= num_lead < len(planned.time_s):
+            raise ValueError(f"num_lead must be 2 to {len(planned.time_s) - 1}, not {num_lead}")
+        self.world, self.planned, self.drone = world, planned, drone
+        self.num_lead, self.lost_s, self.dt_s = num_lead, lost_s, step_s(planned.time_s)
+        weather = weather_of(world.cfg, world.pools, number)
+        plain = replace(planned, segments=(), mission=None)  # parts and orders are the plan's, not this flight's
+        self._script = script_flight(
+            plain, number, "clean", world.town, world.surroundings, world.cfg, world.seed, others, weather
+        )
+        self._begin()
+
+    def _begin(self) -> None:
+        planned, last = self.planned, self.num_lead - 1
+        flown = Poses(planned.positions_m, planned.rotations_deg, planned.targets_m, planned.clearances_m)
+        self._script = replace(self._script, perturbed=PerturbedTrack.nothing(flown))  # which copies it
+        self.poses = self._script.perturbed.poses  # written as it is flown; what lies ahead is still the plan
+        self.index, self._unseen_s = last, 0.0
+        self.ended: Ended | None = None
+        self.velocity_mps = (flown.positions_m[last] - flown.positions_m[last - 1]) / self.dt_s
+        turned_deg = wrap_deg(flown.rotations_deg[last, 1] - flown.rotations_deg[last - 1, 1])
+        self.yaw_rate_degps = float(turned_deg) / self.dt_s
+
+    def reset(self) -> tuple[Moment, ...]:
+        """Begin, anew where it was flown; gives the frames of the plan, of which the last is the present one."""
+        self._begin()
+        steps = np.diff(self.poses.positions_m[: self.num_lead], axis=0) / self.dt_s
+        velocities = [steps[0], *steps]
+        return tuple(self._drawn(i, velocities[i], float(self.poses.clearances_m[i])) for i in range(self.num_lead))
+
+    def step(self, command: np.ndarray) -> Moment:
+        """Fly a command, (5,) as ACTION in the level axes of the present frame, until the next frame.
+
+        Raises:
+            ValueError: the command cannot be flown (`DroneConfig.problem_of`), or the flight has ended.
+        """
+        if self.ended is not None or (problem := self.drone.problem_of(command)):
+            raise ValueError(f"the flight has ended: {self.ended}" if self.ended else problem)
+        places, yaw_deg, pitch_deg = self._way(np.asarray(command, dtype=np.float64))
+        i = self.index + 1
+        gaps, _, _ = swept_distances(self.world.surroundings.obstacles, places, CLEARANCE_CAP_M)
+        over_ground = places[:, 2] - self.world.ground.height_at(places)
+        gaps = np.minimum(gaps[:-1], np.minimum(over_ground[:-1], over_ground[1:]))  # of each part of the way
+        hits = np.flatnonzero(gaps < self.drone.radius_m)
+        end = int(hits[0]) if len(hits) else len(places) - 1  # it stops before the part that touches
+        clearance_m = min(float(gaps[: end + 1].min()), self._script.others.distance_m(i, places[end]))
+        self.index = i
+        self.poses.positions_m[i], self.poses.rotations_deg[i] = places[end], [pitch_deg, yaw_deg, 0.0]
+        self.poses.clearances_m[i - 1 : i + 1] = clearance_m
+        moment = self._drawn(i, self.velocity_mps.copy(), clearance_m)
+        self._unseen_s = 0.0 if moment.target.visible else self._unseen_s + self.dt_s
+        if clearance_m < self.drone.radius_m:
+            self.ended = "crashed"
+        elif self.world.has_left(places[-1]):
+            self.ended = "left"
+        elif i == len(self.planned.time_s) - 1:
+            self.ended = "finished"
+        elif self.lost_s and self._unseen_s >= self.lost_s:
+            self.ended = "lost"
+        return moment
+
+    def _way(self, command: np.ndarray) -> tuple[np.ndarray, float, float]:
+        """Give the places on the way of one step, (k + 1, 3), and yaw and pitch at its end, degrees."""
+        place, (pitch_deg, yaw_deg, _) = self.poses.positions_m[self.index], self.poses.rotations_deg[self.index]
+        num, drone = max(1, round(self.dt_s * RATE_HZ)), self.drone
+        part_s, yaw_rad = self.dt_s / num, np.radians(yaw_deg)
+        cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+        wanted = np.array([command[0] * cos - command[1] * sin, command[0] * sin + command[1] * cos, command[2]])
+        places = [place]
+        for _ in range(num):
+            change = wanted - self.velocity_mps
+            size = float(np.linalg.norm(change))
+            self.velocity_mps = self.velocity_mps + change * min(1.0, drone.accel_max_mps2 * part_s / max(size, 1e-9))
+            places.append(places[-1] + self.velocity_mps * part_s)
+            most = drone.yaw_accel_max_degps2 * part_s
+            self.yaw_rate_degps += float(np.clip(command[3] - self.yaw_rate_degps, -most, most))
+            yaw_deg += self.yaw_rate_degps * part_s
+            tilt = drone.gimbal_rate_max_degps * part_s
+            pitch_deg += float(np.clip(command[4] - pitch_deg, -tilt, tilt))
+        return np.array(places), float(wrap_deg(yaw_deg)), float(pitch_deg)
+
+    def _drawn(self, i: int, velocity_mps: np.ndarray, clearance_m: float) -> Moment:
+        script, poses = self._script, self.poses
+        self.world.light(poses.targets_m, None if script.weather is None else script.weather.params)
+        frame, seen = draw_frame(self.world.renderer, script, i, poses, self.world.cfg.visible_threshold)
+        target = annotation(script, i, seen).target
+        target = target.model_copy(update=legibility(target, contrast_of(frame.rgb, frame.ids == PERSON_ID)))
+        position_m, target_m = poses.positions_m[i].copy(), poses.targets_m[i].copy()
+        people = script.others.people(script.clothes.looks) if self.world.renderer.dresses else None
+        company = {} if seen.others is None else seen.others.people_of(target_m, people)
+        height_m = float(position_m[2] - (target_m[2] - TARGET_HEIGHT_M))
+        return Moment(
+            i, float(script.time_s[i]), position_m, poses.rotations_deg[i].copy(), velocity_mps,
+            target_m, target, company, frame, clearance_m, height_m,
+        )  # fmt: skip
