@@ -5,7 +5,7 @@ import pytest
 from specimens_planning import CANYON, town_of, walk_along
 
 from cosfly.closed_loop.settings import DroneConfig
-from cosfly.closed_loop.stepper import ClosedLoopFlight, World
+from cosfly.closed_loop.stepper import ClosedLoopFlight, Airspace
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_flight
 from cosfly.render.settings import RenderConfig
@@ -15,17 +15,17 @@ PITCH_DEG = -44.0
 
 
 @pytest.fixture(scope="module")
-def world():
+def airspace():
     town = town_of(*CANYON)
-    world = World(RenderConfig(**LOOK), town, town, seed=1)
-    yield world
-    world.renderer.close()
+    airspace = Airspace(RenderConfig(**LOOK), town, town, seed=1)
+    yield airspace
+    airspace.renderer.close()
 
 
 @pytest.fixture(scope="module")
-def planned(world):
+def planned(airspace):
     walk = walk_along("path_00000", [(0, 0), (100, 0)])
-    return plan_flight(walk, world.surroundings.obstacles, PlanConfig(), 1)
+    return plan_flight(walk, airspace.surroundings.obstacles, PlanConfig(), 1)
 
 
 def flown(flight: ClosedLoopFlight, *commands) -> list:
@@ -36,12 +36,12 @@ def flown(flight: ClosedLoopFlight, *commands) -> list:
     return moments
 
 
-def test_the_same_commands_give_the_same_flight_and_the_same_pictures_whatever_was_flown_beside_it(world, planned):
+def test_the_same_commands_give_the_same_flight_and_the_same_pictures_whatever_was_flown_beside_it(airspace, planned):
     commands = [(1.2, 0.3, 0.1, 4.0), (2.0, 0, 0, -8.0), (0, 0, 0, 0)]
-    first = flown(ClosedLoopFlight(world, planned), *commands)
-    other = ClosedLoopFlight(world, planned)
+    first = flown(ClosedLoopFlight(airspace, planned), *commands)
+    other = ClosedLoopFlight(airspace, planned)
     again = []
-    for moment in flown(ClosedLoopFlight(world, planned), *commands):
+    for moment in flown(ClosedLoopFlight(airspace, planned), *commands):
         again.append(moment)
         other.reset()
     for one, two in zip(first, again, strict=True):
@@ -51,16 +51,16 @@ def test_the_same_commands_give_the_same_flight_and_the_same_pictures_whatever_w
         assert one.target == two.target
 
 
-def test_it_begins_with_the_plan_and_the_person_in_view(world, planned):
-    lead = ClosedLoopFlight(world, planned).reset()
+def test_it_begins_with_the_plan_and_the_person_in_view(airspace, planned):
+    lead = ClosedLoopFlight(airspace, planned).reset()
     assert [m.index for m in lead] == [0, 1, 2, 3, 4]
     assert np.array_equal(lead[-1].position_m, planned.positions_m[4])
     assert all(m.target.in_view and m.target.visible and m.target.num_pixels > 0 for m in lead)
 
 
-def test_a_held_command_is_reached_as_fast_as_the_drone_can_and_no_faster(world, planned):
+def test_a_held_command_is_reached_as_fast_as_the_drone_can_and_no_faster(airspace, planned):
     drone = DroneConfig(accel_max_mps2=2.0, yaw_accel_max_degps2=20.0)
-    flight = ClosedLoopFlight(world, planned, drone=drone)
+    flight = ClosedLoopFlight(airspace, planned, drone=drone)
     moments = flown(flight, *[(0.0, 0.0, 1.0, 20.0)] * 6)[4:]
     velocities = np.array([m.velocity_mps for m in moments])
     assert np.linalg.norm(np.diff(velocities, axis=0), axis=1).max() <= 2.0 * flight.dt_s + 1e-9
@@ -70,16 +70,16 @@ def test_a_held_command_is_reached_as_fast_as_the_drone_can_and_no_faster(world,
     assert moments[-1].position_m[2] - moments[-2].position_m[2] == pytest.approx(0.5)
 
 
-def test_velocities_are_in_the_axes_of_the_drone(world, planned):
-    flight = ClosedLoopFlight(world, planned)
+def test_velocities_are_in_the_axes_of_the_drone(airspace, planned):
+    flight = ClosedLoopFlight(airspace, planned)
     moments = flown(flight, *[(0.0, 1.0, 0.0, 0.0)] * 4)
     yaw = np.radians(moments[-1].rotation_deg[1])
     assert moments[-1].velocity_mps == pytest.approx([-np.sin(yaw), np.cos(yaw), 0.0], abs=1e-6)
 
 
-def test_who_flies_into_the_ground_or_a_house_has_crashed_before_it_and_flies_no_more(world, planned):
+def test_who_flies_into_the_ground_or_a_house_has_crashed_before_it_and_flies_no_more(airspace, planned):
     for command in ((0, 0, -4.0, 0), (0, 8.0, -2.0, 0)):
-        flight = ClosedLoopFlight(world, planned)
+        flight = ClosedLoopFlight(airspace, planned)
         last = flown(flight, *[command] * 40)[-1]
         assert flight.ended == "crashed"
         assert last.clearance_m < flight.drone.radius_m
@@ -89,16 +89,16 @@ def test_who_flies_into_the_ground_or_a_house_has_crashed_before_it_and_flies_no
             flight.step(np.zeros(5))
 
 
-def test_who_leaves_the_person_is_lost_and_who_leaves_the_map_has_left(world, planned):
-    flight = ClosedLoopFlight(world, planned, lost_s=2.0)
+def test_who_leaves_the_person_is_lost_and_who_leaves_the_map_has_left(airspace, planned):
+    flight = ClosedLoopFlight(airspace, planned, lost_s=2.0)
     flown(flight, *[(0, 0, 0, 60.0)] * 3, *[(0, 0, 0, 0.0)] * 20)
     assert flight.ended == "lost"
-    small = ClosedLoopFlight(world, planned)
-    small.world.bounds_m, kept = (np.full(3, 0.0), np.full(3, 1.0)), small.world.bounds_m
+    small = ClosedLoopFlight(airspace, planned)
+    small.airspace.bounds_m, kept = (np.full(3, 0.0), np.full(3, 1.0)), small.airspace.bounds_m
     try:
         flown(small, *[(-10.0, 0, 4.0, 0)] * 40)
     finally:
-        small.world.bounds_m = kept
+        small.airspace.bounds_m = kept
     assert small.ended == "left"
 
 
@@ -112,8 +112,8 @@ def test_who_leaves_the_person_is_lost_and_who_leaves_the_map_has_left(world, pl
         ((0, 0, 0, 0, 45), "gimbal_pitch_deg"),
     ],
 )
-def test_a_command_beyond_the_bounds_is_none(world, planned, command, words):
-    flight = ClosedLoopFlight(world, planned)
+def test_a_command_beyond_the_bounds_is_none(airspace, planned, command, words):
+    flight = ClosedLoopFlight(airspace, planned)
     assert words in flight.drone.problem_of(np.array(command, dtype=float))
     with pytest.raises(ValueError, match=words):
         flight.step(np.array(command, dtype=float))

@@ -36,7 +36,7 @@ LEAVES_M = 100.0  # beyond the map's bounds
 AREA_M, AREA_STEP_M = 420.0, 100.0  # lit at once, and how far apart the middles of such areas are
 
 
-class World:
+class Airspace:
     """A map to fly in: what draws it, and what can be hit. One a process, used from one thread."""
 
     def __init__(
@@ -100,7 +100,7 @@ class ClosedLoopFlight:
 
     def __init__(
         self,
-        world: World,
+        airspace: Airspace,
         planned: DroneTrace,
         *,
         number: int = 0,
@@ -117,12 +117,12 @@ class ClosedLoopFlight:
         """
         if not 2 <= num_lead < len(planned.time_s):
             raise ValueError(f"num_lead must be 2 to {len(planned.time_s) - 1}, not {num_lead}")
-        self.world, self.planned, self.drone = world, planned, drone
+        self.airspace, self.planned, self.drone = airspace, planned, drone
         self.num_lead, self.lost_s, self.dt_s = num_lead, lost_s, step_s(planned.time_s)
-        weather = weather_of(world.cfg, world.pools, number)
+        weather = weather_of(airspace.cfg, airspace.pools, number)
         plain = replace(planned, segments=(), mission=None)  # parts and orders are the plan's, not this flight's
         self._script = script_flight(
-            plain, number, "clean", world.town, world.surroundings, world.cfg, world.seed, others, weather
+            plain, number, "clean", airspace.town, airspace.surroundings, airspace.cfg, airspace.seed, others, weather
         )
         self._begin()
 
@@ -154,8 +154,8 @@ class ClosedLoopFlight:
             raise ValueError(f"the flight has ended: {self.ended}" if self.ended else problem)
         places, yaw_deg, pitch_deg = self._way(np.asarray(command, dtype=np.float64))
         i = self.index + 1
-        gaps, _, _ = swept_distances(self.world.surroundings.obstacles, places, CLEARANCE_CAP_M)
-        over_ground = places[:, 2] - self.world.ground.height_at(places)
+        gaps, _, _ = swept_distances(self.airspace.surroundings.obstacles, places, CLEARANCE_CAP_M)
+        over_ground = places[:, 2] - self.airspace.ground.height_at(places)
         gaps = np.minimum(gaps[:-1], np.minimum(over_ground[:-1], over_ground[1:]))  # of each part of the way
         hits = np.flatnonzero(gaps < self.drone.radius_m)
         end = int(hits[0]) if len(hits) else len(places) - 1  # it stops before the part that touches
@@ -167,7 +167,7 @@ class ClosedLoopFlight:
         self._unseen_s = 0.0 if moment.target.visible else self._unseen_s + self.dt_s
         if clearance_m < self.drone.radius_m:
             self.ended = "crashed"
-        elif self.world.has_left(places[-1]):
+        elif self.airspace.has_left(places[-1]):
             self.ended = "left"
         elif i == len(self.planned.time_s) - 1:
             self.ended = "finished"
@@ -197,12 +197,12 @@ class ClosedLoopFlight:
 
     def _drawn(self, i: int, velocity_mps: np.ndarray, clearance_m: float) -> Moment:
         script, poses = self._script, self.poses
-        self.world.light(poses.targets_m, None if script.weather is None else script.weather.params)
-        frame, seen = draw_frame(self.world.renderer, script, i, poses, self.world.cfg.visible_threshold)
+        self.airspace.light(poses.targets_m, None if script.weather is None else script.weather.params)
+        frame, seen = draw_frame(self.airspace.renderer, script, i, poses, self.airspace.cfg.visible_threshold)
         target = annotation(script, i, seen).target
         target = target.model_copy(update=legibility(target, contrast_of(frame.rgb, frame.ids == PERSON_ID)))
         position_m, target_m = poses.positions_m[i].copy(), poses.targets_m[i].copy()
-        people = script.others.people(script.clothes.looks) if self.world.renderer.dresses else None
+        people = script.others.people(script.clothes.looks) if self.airspace.renderer.dresses else None
         company = {} if seen.others is None else seen.others.people_of(target_m, people)
         height_m = float(position_m[2] - (target_m[2] - TARGET_HEIGHT_M))
         return Moment(
