@@ -5,7 +5,7 @@ import pytest
 from specimens_planning import CANYON, town_of, walk_along
 
 from cosfly.closed_loop.settings import DroneConfig
-from cosfly.closed_loop.stepper import ClosedLoopFlight, Airspace
+from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_flight
 from cosfly.render.settings import RenderConfig
