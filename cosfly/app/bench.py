@@ -8,18 +8,20 @@ import shutil
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import BaseModel
 
 from caption.teachers.teacher import EMBEDDED
-from cosfly.app.pipeline import stages
-from cosfly.app.settings import RunConfig
 from cosfly.errors import ConfigError, ResumeError
 from cosfly.reading.documents import FileFormat
 from cosfly.work.stage_events import EVENTS, LOSSES, Event, read_events
 from cosfly.work.stage_folder import Manifest, read_manifest
 from cosfly.work.store import write_bytes, write_model
+
+if TYPE_CHECKING:
+    from cosfly.app.settings import RunConfig
 
 log = logging.getLogger(__name__)
 
@@ -102,6 +104,8 @@ def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterab
 
 def _measured(cfg: RunConfig, run_folder: Path, folder: Path, stage: str, workers: int) -> BenchRun:
     """Run the stage once; gives its figures."""
+    from cosfly.app.pipeline import stages
+
     log.info("bench: %s with %d worker%s", stage, workers, "s" if workers > 1 else "")
     cfg = cfg.model_copy(update={"workers": workers})
     next(s for s in stages(cfg, run_folder, into=folder) if s.name == stage).work()

@@ -6,6 +6,7 @@ frames.
     python tests/benchmarks/bench_render.py disk --against ../older        # another checkout in turns, and its pictures
     python tests/benchmarks/bench_render.py tiles                          # the SimWorld city 12 x 12
     python tests/benchmarks/bench_render.py memory --frames 5000
+    python tests/benchmarks/bench_render.py workers                        # 1, 2, 4, 6: the paper's tab:render_scaling
 
 1280x720, all files, the synthetic town and the SimWorld city, flights of the default planner; `disk` at 90 degrees, one
 flight a process. On a machine with a GPU the same commands use it (the device is printed).
@@ -29,6 +30,7 @@ import cv2
 import numpy as np
 import scenes
 
+from cosfly.app.bench import row_of
 from cosfly.geometry import intrinsic_matrix, world_from_camera
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_flight
@@ -36,6 +38,7 @@ from cosfly.products import frames
 from cosfly.products.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.products.traces import DroneTrace, read_traces, write_traces
 from cosfly.render import flight
+from cosfly.render import stage as render_stage
 from cosfly.render.contract import Renderer
 from cosfly.render.flight import MARGIN_M, Writing, render_flight
 from cosfly.render.person import choose_clothes, gait_of
@@ -43,9 +46,13 @@ from cosfly.render.perturbation import Surroundings
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, script_flight
 from cosfly.space.kernels import obstacle_index
+from cosfly.work.stage_events import read_events
+from cosfly.work.stage_folder import read_manifest
 
 SIZE = (1280, 720)
+PAPER = {1: (1.07, 46.3, 7.5), 2: (1.43, 58.6, 10.6), 4: (2.55, 86.8, 24.3), 6: (2.68, 91.6, 34.0)}  # frames/s, %, GiB
 FOVS_DEG = (60.0, 90.0)
+NUM_FLIGHTS = 6  # of `workers`, each on two tracks: twelve items, which 1, 2, 4 and 6 workers share evenly
 FILES = ("boxes_3d.json", "drone_trace.json")
 REPOSITORY = Path(__file__).resolve().parents[2]
 WORKER = """
@@ -277,11 +284,36 @@ def memory(num_frames: int) -> list[list[Any]]:
     return [[count, mib, 100.0 * (mib / rows[1][1] - 1.0)] for count, mib in rows]
 
 
+# --- the stage with more and more workers -----------------------------------------------------------------------------
+
+
+def workers_table(folder: Path, counts: list[int], num_points: int) -> list[list[Any]]:
+    """Run the stage on the same flights, both tracks, 1280x720, once for each count of workers. Figures of a GPU are
+    those of its events; of a machine without one they are missing."""
+    traces = read_traces(folder / FILES[1])
+    simplified = folder / "step2_simplified.json"
+    write_boxes(simplified, scenes.simplified(read_boxes(folder / FILES[0])))
+    stride = max(1, round(np.mean([len(trace.time_s) for trace in traces]) / num_points))
+    cfg = RenderConfig(width_px=SIZE[0], height_px=SIZE[1], fovs_deg=(90.0,), frame_stride=stride)
+    rows: list[list[Any]] = []
+    for count in counts:
+        with tempfile.TemporaryDirectory(dir=folder) as out:
+            render_stage.run(cfg, folder / FILES[0], simplified, folder / FILES[1], Path(out), workers=count)
+            row = row_of(read_events(Path(out)), read_manifest(Path(out)), count, counts_frames=True)
+        speed_up = row.per_s / rows[0][3] if rows else 1.0
+        held = "hidden" if row.gpu_gib and row.worker_gpu_mib is None else row.worker_gpu_mib
+        gpu = [row.gpu_percent, row.gpu_gib, held, row.worker_gpu_percent]
+        use = [row.cores_used, row.peak_memory_mib / count, *("-" if one is None else one for one in gpu)]
+        rows.append([count, row.seconds, row.successful, row.per_s, speed_up, *use, *PAPER.get(count, ("", "", ""))])
+        print(rows[-1], flush=True)
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("parts", "disk", "tiles", "memory"))
-    parser.add_argument("--frames", type=int, help="frames of a measurement; of `disk`, points of each flight")
-    parser.add_argument("--workers", type=int, nargs="+", default=[2])
+    parser.add_argument("what", choices=("parts", "disk", "tiles", "memory", "workers"))
+    parser.add_argument("--frames", type=int, help="frames of a measurement; of `disk` and `workers`, of each flight")
+    parser.add_argument("--workers", type=int, nargs="+")
     parser.add_argument("--against", type=Path, help="another checkout, for `disk`")
     given = parser.parse_args()
     scenes.one_thread_and_machine()
@@ -293,6 +325,18 @@ def main() -> None:
     if given.what == "memory":
         scenes.print_table("Memory", ["frames", "MiB", "% over the second row"], memory(given.frames or 5000))
         return
+    if given.what == "workers":
+        counts = given.workers or [*PAPER]
+        with tempfile.TemporaryDirectory() as root:
+            folder = make_inputs(Path(root), NUM_FLIGHTS)["town"]
+            renderer: Any = open_renderer("gl", read_boxes(folder / FILES[0]), *SIZE)
+            title = f"The render stage, {2 * NUM_FLIGHTS} flights of two tracks, {renderer.device}"
+            renderer.close()
+            names = ["workers", "s", "frames", "frames/s", "speed-up", "cores", "MiB a worker", "GPU %", "GPU GiB"]
+            names += ["GPU MiB a worker", "GPU % a worker", "paper: frames/s", "GPU %", "GPU GiB"]
+            scenes.print_table(title, names, workers_table(folder, counts, given.frames or 94))
+        return
+    given.workers = given.workers or [2]
     with tempfile.TemporaryDirectory() as root:
         folders = make_inputs(Path(root), max(given.workers))
         if given.what == "parts":
