@@ -306,7 +306,7 @@ def test_what_the_container_and_ci_install_is_pinned_and_is_what_the_project_nee
     def names(requirements: list[str]) -> set[str]:
         return {re.split(r"[\[<>=!~]", line)[0].lower().replace("_", "-") for line in requirements} - {"cosfly"}
 
-    text = text_of("docs/container/requirements.txt")
+    text = text_of("docs/deploy/requirements.txt")
     hashed = re.findall(r"^([a-z0-9-]+)==\S+((?: \\\n    --hash=sha256:[0-9a-f]{64})+)$", text, re.MULTILINE)
     assert len(hashed) == len(re.findall("^[a-z0-9]", text, re.MULTILINE)), "a line without a hash"
     setup = tomllib.loads(text_of("pyproject.toml"))
@@ -323,7 +323,7 @@ def test_what_the_container_and_ci_install_is_pinned_and_is_what_the_project_nee
 
 
 def test_the_container_has_the_libraries_of_the_makefile_its_files_and_a_user():
-    recipe, ignored = text_of("docs/container/Containerfile"), text_of(".dockerignore").splitlines()
+    recipe, ignored = text_of("docs/deploy/Containerfile"), text_of(".dockerignore").splitlines()
     packages = re.search("^GL_PACKAGES := (.*)$", text_of("Makefile"), re.MULTILINE)
     assert packages is not None
     assert packages[1] in recipe

@@ -1,0 +1,80 @@
+"""The SLURM script: what `sbatch` and cosfly's own parser make of it. The container is in test_architecture.py."""
+
+import os
+import re
+import shlex
+import subprocess
+from pathlib import Path
+
+import pytest
+import typer
+
+from cosfly.cli import app
+
+SCRIPT = Path(__file__).parents[1] / "docs/deploy/slurm.sh"
+SBATCH = {  # options of sbatch (its manual page), and what may follow
+    "job-name": r"[\w-]+", "nodes": r"\d+(-\d+)?", "ntasks-per-node": r"\d+", "cpus-per-task": r"\d+",
+    "gpus-per-node": r"([a-z]\w*:)?\d+", "mem": r"\d+[KMGT]?", "time": r"(\d+-)?\d+(:\d\d){0,2}", 
+    "output": r"[\w%./-]+", "open-mode": "append|truncate", "requeue": "",
+}  # fmt: skip
+TOOLS = {
+    "srun": 'while [[ $1 == --* ]]; do shift; done; exec "$@"',
+    "scontrol": "printf 'n1\\nn2\\n'",
+    "ray": '[[ $1 != status ]] || printf " 1 node_a\\n 1 node_b\\n"',
+    "sleep": ":",
+}
+
+
+def test_directives_are_options_of_sbatch_and_stand_before_any_command():
+    head, _, commands = SCRIPT.read_text().partition("set -euo pipefail")
+    found = dict(re.findall(r"^#SBATCH --([a-z-]+)=?(.*)$", head, re.MULTILINE))
+    assert len(found) == head.count("\n#SBATCH") >= 8
+    assert "#SBATCH" not in commands  # sbatch reads none after the first command
+    assert {name: value for name, value in found.items() if not re.fullmatch(SBATCH[name], value)} == {}
+
+
+def commands_of(tmp_path: Path, arguments: list[str], job: dict[str, str]) -> list[list[str]]:
+    """Run the script with commands that only say themselves; gives those of cosfly."""
+    for name, text in TOOLS.items():
+        (tmp_path / name).write_text(f"#!/bin/bash\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "COSFLY": "echo cosfly"} | job
+    found = subprocess.run(["bash", SCRIPT, *arguments], env=environment, capture_output=True, text=True, check=True)
+    return [shlex.split(line)[1:] for line in found.stdout.splitlines() if line.startswith("cosfly ")]
+
+
+def parsed(words: list[str]) -> str:
+    """Give them to the command's parser, which refuses an option that there is not; gives the command's name."""
+    group = typer.main.get_command(app)
+    command = group.commands[words[0]]  # type: ignore[attr-defined]
+    command.make_context(words[0], words[1:])
+    return words[0]
+
+
+RUN = ["diverse", "shared/run"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "job", "commands"),
+    [
+        (RUN, {"SLURM_JOB_NUM_NODES": "1", "SLURM_CPUS_PER_TASK": "16"}, ["run"]),
+        (
+            [*RUN, "grid", "park"],
+            {"SLURM_ARRAY_TASK_ID": "1", "SLURM_CPUS_PER_TASK": "16"},
+            ["maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption"],
+        ),
+    ],
+)
+def test_every_command_of_the_script_is_one_that_cosfly_takes(tmp_path, arguments, job, commands):
+    found = commands_of(tmp_path, arguments, job)
+    assert [parsed(words) for words in found] == commands
+    if len(found) > 1:
+        assert all(words[1:5] == ["--config", "diverse", "--town", "park"] for words in found)
+        assert all(words[words.index("--out") + 1] == f"shared/run/park/{words[0]}" for words in found)
+
+
+def test_a_task_without_a_town_ends_with_a_line(tmp_path):
+    job = {"SLURM_ARRAY_TASK_ID": "2"}
+    with pytest.raises(subprocess.CalledProcessError) as raised:
+        commands_of(tmp_path, [*RUN, "grid", "park"], job)
+    assert "no town of this number" in raised.value.stderr
