@@ -149,14 +149,14 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
-    assert {f"{page.stem}.html" for page in (ROOT / "docs").glob("*.md")} <= {
-        p.name for p in (tmp_path / "site").iterdir()
+    assert {f"{page.stem}.html" for page in (ROOT / "docs").rglob("*.md")} <= {
+        p.name for p in (tmp_path / "site").rglob("*.html")
     }
 
 
 def test_every_page_stands_in_the_site_s_list():
     listed = set(re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text(encoding="utf-8")))
-    assert listed == {page.name for page in (ROOT / "docs").glob("*.md")}
+    assert listed == {page.name for page in (ROOT / "docs").rglob("*.md")}
 
 
 HEADING = re.compile(r"^## (\d+\.\d+\.\d+) \((unreleased|\d{4}-\d\d-\d\d)\)$", re.MULTILINE)
