@@ -226,6 +226,10 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "render": [  # so narrow a view that the target is made out, and its picture written
         "render {three} --out {out} --set render.width_px=64 --set render.height_px=36 --set render.fovs_deg=[12]"
     ],
+    "fly": [
+        "fly --map {maps} --simplified {simple} --paths {walks} --out {out} {tiny} --set fly.most_decisions=4 "
+        "--set render.tracks=[clean]"
+    ],
     "study weather": ["study weather --map {maps} --traces {traces} --out {out} {tiny}"],
     "study zoom": ["study zoom {three} --out {out} --every 10"],
     "render sample": ["render sample --data {tree} --map {maps} --out {out}/sample.png"],

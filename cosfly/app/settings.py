@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import Field, model_validator
 
 from caption.schema import CaptionConfig
+from cosfly.closed_loop.settings import FlyConfig
 from cosfly.errors import ConfigError
 from cosfly.inspection.settings import InspectConfig
 from cosfly.maps.stage import MapsConfig
@@ -85,6 +86,7 @@ class RunConfig(Config):
     inspect: InspectConfig = Field(default_factory=InspectConfig, description="step 6")
     caption: CaptionConfig = Field(default_factory=CaptionConfig, description="step 7")
     release: ReleaseConfig = Field(default_factory=ReleaseConfig, description="the published data set")
+    fly: FlyConfig = Field(default_factory=FlyConfig, description="a student flies; not part of `cosfly run`")
     world: WorldConfig = Field(default_factory=WorldConfig, description="text to world; not part of `cosfly run`")
     distill: DistillConfig = Field(default_factory=DistillConfig, description="students; not part of `cosfly run`")
 

@@ -18,6 +18,7 @@ import typer
 from cosfly import __version__
 from cosfly.cli.caption import app as caption_app
 from cosfly.cli.distill import app as distill_app
+from cosfly.cli.fly import app as fly_app
 from cosfly.cli.release import app as release_app
 from cosfly.cli.release import export_app
 from cosfly.cli.run import app as run_app
@@ -58,7 +59,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (run_app, stages_app, world_app):
+for group in (run_app, stages_app, world_app, fly_app):
     app.add_typer(group)  # without a name: its commands stand at the top
 for name, named_group in (
     ("caption", caption_app),

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
-from pydantic import Field
+from pathlib import Path
+from typing import Any, Self
 
+import numpy as np
+from pydantic import Field, model_validator
+
+from cosfly.errors import nearest
 from cosfly.products.motion import ACTION
 from cosfly.work.config import Config
 
@@ -39,3 +43,59 @@ class DroneConfig(Config):
         if (speed_mps := float(np.hypot(*command[:2]))) > self.speed_max_mps:
             return f"a speed of {speed_mps:g} m/s over ground is more than {self.speed_max_mps:g}"
         return None
+
+
+FLOORS = ("track_straight", "random")
+ENGINES = ("rules", "endpoint", "vllm", "transformers", *FLOORS, "planner")
+KINDS = "there are rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR, track_straight, random and planner"
+
+
+class FlyConfig(Config):
+    """`cosfly fly`: who flies, and how."""
+
+    student: str = Field(
+        "rules",
+        description="who decides: rules, a URL, vllm:MODEL_DIR or transformers:MODEL_DIR; the floors track_straight "
+        "and random; the ceiling planner, which flies its plan",
+    )
+    as_student: Path | None = Field(
+        None, description="what `distill train` or `merge` wrote: a model behind a URL is asked as it was taught"
+    )
+    adapter: Path | None = Field(None, description="adapter of transformers:MODEL_DIR, as `distill train` wrote it")
+    controller: Path | None = Field(
+        None, description="file of yours in the place of the table that says what each decision is flown as"
+    )
+    drone: DroneConfig = Field(DroneConfig(), description="what the drone can do")
+    answer_limit_s: float = Field(
+        60.0, gt=0, description="a decision that takes longer is late: the drone hovers; simulated time stands still"
+    )
+    lost_s: float = Field(30.0, ge=0, description="a flight ends after so long without sight of the person; 0: never")
+    most_decisions: int = Field(0, ge=0, description="a flight ends after so many decisions; 0: with its walk")
+    side_by_side: int = Field(
+        16, ge=1, le=1024, description="flights that a worker flies at once: their frames are one batch to a student"
+    )
+    tree: bool = Field(True, description="draw the playback tree of what was flown")
+
+    @property
+    def engine(self) -> str:
+        """The kind of who decides."""
+        kind = self.student.partition(":")[0]
+        return "endpoint" if kind in ("http", "https") else kind
+
+    @property
+    def asks_model(self) -> bool:
+        """Whether an engine decides: one process flies all, so that there is one engine and one batch."""
+        return self.student not in ("rules", "planner", *FLOORS)
+
+    @model_validator(mode="after")
+    def _is_known(self) -> Self:
+        if self.engine not in ENGINES:
+            raise ValueError(f"there is no student {self.student!r}{nearest(self.student, ENGINES)}; {KINDS}")
+        if self.adapter is not None and self.engine != "transformers":
+            raise ValueError(f"an adapter is read by transformers:MODEL_DIR alone, got student {self.student!r}")
+        return self
+
+    def recorded(self) -> dict[str, Any]:
+        """Where a student is asked does not decide what it says; a table of one's own counts by its content."""
+        own = {name: "own" if getattr(self, name) else None for name in ("controller", "as_student", "adapter")}
+        return super().recorded() | {"student": self.engine} | own

@@ -14,7 +14,7 @@ import numpy as np
 from cosfly.closed_loop.settings import DroneConfig
 from cosfly.geometry import step_s, wrap_deg
 from cosfly.products.boxes import BoxMap
-from cosfly.products.frames import TargetMeta
+from cosfly.products.frames import Camera, TargetMeta
 from cosfly.products.others import Other
 from cosfly.products.places import town_folder
 from cosfly.products.pursuits import Ended
@@ -33,7 +33,7 @@ from cosfly.space.kernels import swept_distances
 
 RATE_HZ = 20.0  # of the autopilot, which follows a command
 LEAVES_M = 100.0  # beyond the map's bounds
-AREA_M, AREA_STEP_M = 420.0, 100.0  # lit at once, and how far apart the middles of such areas are
+AREA_M, AREA_STEP_M = 420.0, 200.0  # lit at once, and how far apart the middles of such areas are
 
 
 class Airspace:
@@ -53,15 +53,20 @@ class Airspace:
         self.town, self.bounds_m = town_folder(cfg.town or boxes.name), boxes.bounds()
         self._lit: object = None
 
+    @staticmethod
+    def area_of(targets_m: np.ndarray) -> tuple[float, float]:
+        """Give the middle of the area that a walk is lit with, of a grid: neighbours share it, and none looks otherwise
+        for those that are flown beside it."""
+        x, y = np.round(targets_m.mean(axis=0)[:2] / AREA_STEP_M) * AREA_STEP_M + 0.0
+        return float(x), float(y)
+
     def light(self, targets_m: np.ndarray, weather: WeatherParams | None) -> None:
-        """Have the renderer ready for a walk. Its area is one of a grid, so that neighbours share it and that none
-        looks otherwise for those that are flown beside it."""
-        middle = np.round(targets_m.mean(axis=0) / AREA_STEP_M) * AREA_STEP_M
-        wanted = (*middle[:2].tolist(), None if weather is None else weather.model_dump_json())
+        """Have the renderer ready for a walk."""
+        middle = np.array(self.area_of(targets_m))
+        wanted = (*middle, None if weather is None else weather.model_dump_json())
         if wanted != self._lit:
-            low, high = self.bounds_m
-            half = np.array([AREA_M / 2.0] * 2)
-            self.renderer.prepare(np.append(middle[:2] - half, low[2]), np.append(middle[:2] + half, high[2]), weather)
+            (low, high), half = self.bounds_m, AREA_M / 2.0
+            self.renderer.prepare(np.append(middle - half, low[2]), np.append(middle + half, high[2]), weather)
             self._lit = wanted
 
     def has_left(self, position_m: np.ndarray) -> bool:
@@ -125,6 +130,16 @@ class ClosedLoopFlight:
             plain, number, "clean", airspace.town, airspace.surroundings, airspace.cfg, airspace.seed, others, weather
         )
         self._begin()
+
+    @property
+    def place(self) -> tuple[str, str, str]:
+        """Town, trajectory and track, as a playback tree names them."""
+        return self._script.town, self._script.trajectory, self._script.variant
+
+    @property
+    def camera(self) -> Camera:
+        """The first frame's."""
+        return self._script.cameras[0]
 
     def _begin(self) -> None:
         planned, last = self.planned, self.num_lead - 1

@@ -199,7 +199,7 @@ def run(
     all_traces = read_traces(traces)
     _check_ids(all_traces, traces)
     passed = _passed(stage, all_traces, cfg.path_index)
-    ids_record = _ids_record(box_map, num_others_of(_companies(others, all_traces)))
+    ids_record = _ids_record(box_map, num_others_of(companies_of(others, all_traces)))
     if num_shared := ids_record["num_shared"]:
         log.warning("render: %d boxes share the instance id %d: ids have 16 bits", num_shared, SHARED_ID)
     town, first_timestamp = _names(stage, cfg, box_map.name, traces, others, seed)
@@ -273,7 +273,7 @@ class _RenderedFlight(BaseModel):
     weather_seed: int | None = None
 
 
-def _companies(others: Path | None, traces: list[DroneTrace]) -> dict[str, Company]:
+def companies_of(others: Path | None, traces: list[DroneTrace]) -> dict[str, Company]:
     """Read the others of every flight, by the walk's id; nobody without a file.
 
     Raises:
@@ -369,7 +369,7 @@ def make_worker(
         # Several processes share the cores already: one rasteriser thread each. Only read when the driver loads.
         os.environ.setdefault("LP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // num_processes)))
     surroundings, all_traces = Surroundings(read_boxes(simplified)), read_traces(traces)
-    companies = _companies(others, all_traces)
+    companies = companies_of(others, all_traces)
     num_others = num_others_of(companies)
     drawn = read_boxes(boxes)
     renderer = renderer_of(cfg, drawn, seed, num_others)

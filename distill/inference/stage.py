@@ -192,7 +192,7 @@ async def _answering(
 ) -> AsyncIterator[AsyncGenerator[SampleOutcome, None]]:
     """Start who answers; gives what becomes of the samples, in their order."""
     if cfg.engine == "transformers":
-        with _local(cfg, inputs, book) as local:
+        with local_answers(cfg, inputs, book) as local:
             yield local.answers(inputs.samples, advance)
         return
     engine = _make_engine(cfg, inputs)
@@ -204,7 +204,7 @@ async def _answering(
         yield asking.answers(inputs.samples, advance)
 
 
-def _local(cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> LocalAnswers:
+def local_answers(cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> LocalAnswers:
     model = Path(inputs.model)
     max_pixels = cfg.max_pixels or inputs.taught_pixels or most_pixels(inputs.samples)
     student = load_student(model, device=cfg.device, max_pixels=max_pixels, adapter=inputs.adapter)

@@ -1,0 +1,101 @@
+"""From a decision to a command, by a table with one row for each action (controller.yaml).
+
+Knows what a drone knows of itself: its pose, the place it took off from and its height there; never the person's place.
+The camera keeps its aim: the place ahead, at a hip's height, that it looked at when the flight began.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from cosfly.closed_loop.settings import DroneConfig
+from cosfly.closed_loop.stepper import Moment
+from cosfly.errors import ConfigError
+from cosfly.geometry import look_at, wrap_deg
+from cosfly.products.motion import in_axes_of
+from cosfly.products.walks import TARGET_HEIGHT_M
+from cosfly.reading.documents import FileFormat
+from cosfly.work.config import Config, build, read_yaml
+
+CONTROLLER_FILE = Path(__file__).with_name("controller.yaml")
+CONTROLLER_FORMAT = FileFormat("cosfly.controller", "1.0", "controller")
+AIM_MOST_M = 100.0  # a camera that looks at the horizon has no place ahead
+
+
+class Control(Config):
+    """One row; what the words mean stands at the top of the file."""
+
+    ahead_mps: float = Field(0.0, ge=-20, le=20, description="velocity ahead")
+    left_mps: float = Field(0.0, ge=-20, le=20, description="velocity to the left")
+    up_mps: float = Field(0.0, ge=-20, le=20, description="velocity upwards")
+    with_pace: bool = Field(False, description="the pace is added to ahead_mps")
+    pace_step_mps: float = Field(0.0, ge=-20, le=20, description="change of the pace, for good")
+    stops: bool = Field(False, description="the pace becomes 0")
+    yaw_rate_degps: float = Field(0.0, ge=-180, le=180, description="turn, positive to the left")
+    turn: Literal["rate", "orbit", "search", "home"] = Field("rate", description="what the drone turns by")
+    source: str = Field(min_length=1, description="where the figures are from")
+
+
+class ControlTable(Config):
+    """The whole file."""
+
+    schema_: str = Field(alias="schema", pattern=f"^{CONTROLLER_FORMAT.schema}$", description="which file it is")
+    schema_version: str = Field(pattern=f"^{re.escape(CONTROLLER_FORMAT.version)}$", description="version of this form")
+    actions: dict[str, Control] = Field(min_length=1, description="token -> what it is flown as")
+
+
+def read_controls(path: Path, tokens: tuple[str, ...]) -> dict[str, Control]:
+    """Read a table that has a row for each token.
+
+    Raises:
+        ConfigError: it is missing or malformed, or lacks an action.
+    """
+    found = build(ControlTable, read_yaml(path), path).actions
+    if lacking := [token for token in tokens if token not in found]:
+        raise ConfigError("a decision that nothing is flown as", where=path, got=", ".join(lacking), fix="add its row")
+    return found
+
+
+class Controller:
+    """The controller of one flight."""
+
+    def __init__(self, controls: dict[str, Control], drone: DroneConfig, start: Moment) -> None:
+        self.controls, self.drone = controls, drone
+        self._home, self._height_m = start.position_m, start.height_m - TARGET_HEIGHT_M
+        down = np.tan(np.radians(max(-start.rotation_deg[0], 0.1)))
+        self.aim_m = float(min(max(self._height_m, 1.0) / down, AIM_MOST_M))
+        self.pace_mps = max(0.0, float(in_axes_of(start.rotation_deg[1], start.velocity_mps)[0]))
+        self._side = 1.0
+
+    def command(self, action: str | None, now: Moment) -> np.ndarray:
+        """Give what is flown, (5,) as ACTION; None, where no decision came, hovers and keeps the pace in mind."""
+        row = self.controls[action] if action is not None else Control(source="hovers")
+        self.pace_mps = 0.0 if row.stops else max(0.0, self.pace_mps + row.pace_step_mps)
+        self.pace_mps = min(self.pace_mps, self.drone.speed_max_mps)
+        ahead, yaw_rate = row.ahead_mps + self.pace_mps * row.with_pace, row.yaw_rate_degps
+        left, yaw_deg = row.left_mps, now.rotation_deg[1]
+        if row.turn == "orbit":
+            yaw_rate = -float(np.degrees(left / self.aim_m))
+        elif row.turn == "search":
+            yaw_rate *= self._side
+        elif row.turn == "home":
+            way = self._home - now.position_m
+            away_m = float(np.hypot(*way[:2]))
+            ahead, left, _ = in_axes_of(yaw_deg, way * min(row.ahead_mps / max(away_m, 1e-9), 1.0))
+            _, bearing = look_at(now.position_m, self._home)
+            off_deg = float(wrap_deg(np.degrees(bearing) - yaw_deg)) if away_m > 1.0 else 0.0
+            yaw_rate = float(np.clip(off_deg, -row.yaw_rate_degps, row.yaw_rate_degps))
+        if row.turn == "rate" and yaw_rate:
+            self._side = float(np.sign(yaw_rate))
+        over_aim_m = self._height_m + now.position_m[2] - self._home[2]
+        pitch_deg = -float(np.degrees(np.arctan2(over_aim_m, self.aim_m)))
+        low, high = self.drone.bounds
+        command = np.clip([ahead, left, row.up_mps, yaw_rate, pitch_deg], low, high)
+        speed_mps = float(np.hypot(*command[:2]))
+        command[:2] *= min(1.0, self.drone.speed_max_mps / max(speed_mps, 1e-9))
+        return command

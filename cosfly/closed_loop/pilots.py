@@ -1,0 +1,262 @@
+"""Who decides in closed loop: students that are asked as in captions, the rules, two floors and a ceiling.
+
+All get the last frames of several flights and give a decision for each. What goes wrong with one is its student's
+failure: it is told as its answer, and the flight goes on.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import shutil
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from caption.run.own_files import vocabulary_of
+from caption.schema import CaptionConfig, ObservedWindow, observed_frames
+from caption.teachers.prompts import Question, make_question
+from caption.teachers.students import as_taught
+from caption.teachers.teacher import AskingTeacher, first_budget, open_teacher
+from caption.writing.contract import Draft, more_fields
+from cosfly.chat.answers import Answer as BookAnswer
+from cosfly.chat.answers import AnswerBook
+from cosfly.chat.contract import NoAnswer
+from cosfly.chat.student_chat import TAUGHT
+from cosfly.closed_loop.settings import FLOORS, FlyConfig
+from cosfly.closed_loop.stepper import ClosedLoopFlight, Moment
+from cosfly.errors import CosflyError
+from cosfly.geometry import wrap_deg
+from cosfly.products.actions import ActionSet
+from cosfly.products.answer_text import parse_answer
+from cosfly.products.frames import COMPANY, FILE_NAMES, depth_file, frame_name, instance_bytes, rgb_bytes
+from cosfly.products.motion import in_axes_of
+from cosfly.products.places import sample_id
+from cosfly.products.pursuits import MOST_WORDS, Answer
+from cosfly.work.chance import rng_for
+from distill.inference.stage import InferConfig, Inputs, local_answers
+from distill.schema import Sample
+
+NO_SET = "decision_not_in_closed_set"  # of answers that can be read and decide nothing that there is
+FILES = frozenset({*FILE_NAMES.values()})
+
+
+@dataclass(frozen=True)
+class PilotAnswer:
+    """What a student answered. command: of one that commands, (5,) as ACTION."""
+
+    answer: Answer
+    action: str | None = None
+    words: str | None = None
+    answer_s: float | None = None
+    command: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """A flight up to now: its last frames, oldest first."""
+
+    episode: str
+    flight: ClosedLoopFlight
+    moments: Sequence[Moment]
+
+
+class Pilot(Protocol):
+    """name: in records. has_engine: one process must do with it. `decide` gives a decision for each flight."""
+
+    name: str
+
+    def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]: ...
+
+
+def open_pilot(cfg: FlyConfig, caption: CaptionConfig, infer: InferConfig, seed: int, answers: Path) -> Pilot:
+    """Open who the settings name. answers: a folder, where those of a model are kept.
+
+    Raises:
+        ConfigError, InputError, TeacherError, EnvironmentMissing: it cannot be used.
+    """
+    actions = vocabulary_of(caption).actions
+    if cfg.student == "planner":
+        return Ceiling()
+    if cfg.student in FLOORS:
+        return Floor(cfg.student, actions, seed)
+    if cfg.student.startswith("transformers:"):
+        return LocalPilot(cfg, caption, infer, seed, answers)
+    return AskedPilot(cfg, caption, seed, answers)
+
+
+class Floor:
+    """Decides without looking: always the same, or by chance."""
+
+    def __init__(self, name: str, actions: ActionSet, seed: int) -> None:
+        self.name, self._tokens, self._seed = name, actions.tokens, seed
+
+    def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
+        if self.name != "random":
+            return [PilotAnswer("ok", self.name)] * len(outlooks)
+        items = (f"{outlook.episode}/{outlook.moments[-1].index}" for outlook in outlooks)
+        return [PilotAnswer("ok", str(rng_for(self._seed, "fly", item).choice(self._tokens))) for item in items]
+
+
+class Ceiling:
+    """Flies the plan, which knew the whole walk: from wherever it is to the plan's next pose."""
+
+    name = "planner"
+
+    def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
+        return [PilotAnswer("ok", command=self._to_next(one.flight, one.moments[-1])) for one in outlooks]
+
+    @staticmethod
+    def _to_next(flight: ClosedLoopFlight, now: Moment) -> np.ndarray:
+        planned, i = flight.planned, now.index + 1
+        velocity = in_axes_of(now.rotation_deg[1], planned.positions_m[i] - now.position_m) / flight.dt_s
+        velocity *= min(1.0, flight.drone.speed_max_mps / max(float(np.hypot(*velocity[:2])), 1e-9))
+        turn_degps = float(wrap_deg(planned.rotations_deg[i, 1] - now.rotation_deg[1])) / flight.dt_s
+        return np.clip([*velocity, turn_degps, planned.rotations_deg[i, 0]], *flight.drone.bounds)
+
+
+class AskedPilot:
+    """Is asked as a teacher is (caption/teachers): the rules, a model behind an endpoint or in vLLM; one that was
+    taught (`caption.student.folder`) with the prompts and pictures that it was taught with. All flights at once."""
+
+    def __init__(self, cfg: FlyConfig, caption: CaptionConfig, seed: int, answers: Path) -> None:
+        kind, _, place = cfg.student.partition(":")
+        folder = cfg.as_student or (Path(place) if kind == "vllm" and (Path(place) / TAUGHT).is_file() else None)
+        caption = _with_folder(caption, folder) if folder is not None else caption
+        self.vocabulary = vocabulary_of(caption)
+        teacher = caption.model_copy(update={"teacher": "rules" if kind == "transformers" else cfg.student})
+        self.cfg, self.seed, self.limit_s = as_taught(teacher, self.vocabulary), seed, cfg.answer_limit_s
+        self._book, self._runner = AnswerBook(answers), asyncio.Runner()
+        self._scratch: tempfile.TemporaryDirectory | None = None
+        self._open()
+
+    def _open(self) -> None:
+        opened = open_teacher(self.cfg, self._book, self.seed, first_budget(self.cfg, self._book.totals))
+        self._teacher = self._runner.run(opened.__aenter__())
+        self.name = self._teacher.record.model
+        self._is_rules = not isinstance(self._teacher, AskingTeacher)
+        if not self._is_rules:
+            self._scratch = tempfile.TemporaryDirectory(prefix="cosfly-fly-")
+
+    def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
+        return self._runner.run(self._decide(outlooks))
+
+    async def _decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
+        return await asyncio.gather(*(self._ask(self._question(outlook)) for outlook in outlooks))
+
+    async def _ask(self, question: Question) -> PilotAnswer:
+        begun_s = time.monotonic()
+        try:
+            reply = await asyncio.wait_for(self._teacher.ask(question), self.limit_s)
+        except TimeoutError:
+            return PilotAnswer("late", answer_s=time.monotonic() - begun_s)
+        except (NoAnswer, CosflyError) as error:
+            if isinstance(error, CosflyError) and error.fatal:
+                raise
+            return PilotAnswer("none", words=str(error)[:MOST_WORDS])
+        is_timed = not (self._is_rules or reply.is_kept)  # rules take no time, and records are the same each time
+        answer_s = time.monotonic() - begun_s if is_timed else None
+        return self._read(reply.text, question, answer_s, reply.finish_reason)
+
+    def _read(self, text: str, question: Question, answer_s: float | None, finish_reason: str | None) -> PilotAnswer:
+        """Make a decision of an answer: its words are the reasons with their slots filled, or the text as it came."""
+        more = {} if self.cfg.student.folder is not None else more_fields(question.way)
+        parsed = parse_answer(
+            text, self.vocabulary.actions, more=tuple(more), finish_reason=finish_reason, optional=question.way.optional
+        )
+        if parsed.coc is None:
+            return PilotAnswer(
+                "invalid" if parsed.reason == NO_SET else "unreadable", None, text[:MOST_WORDS], answer_s
+            )
+        draft = question.way.read(parsed, question.facts)
+        coc = draft.coc if isinstance(draft, Draft) else parsed.coc
+        words = f"{coc.critical_components} {coc.reasoning_trace}"[:MOST_WORDS]
+        return PilotAnswer("ok", parsed.coc.flight_decision, words, answer_s)
+
+    def _question(self, outlook: Outlook) -> Question:
+        window = self._window(outlook)
+        return make_question(window, self.cfg.image, self.cfg.writing, self.vocabulary)
+
+    def _window(self, outlook: Outlook) -> ObservedWindow:
+        flight, moments = outlook.flight, outlook.moments[-self.cfg.window.num_frames :]
+        targets = [moment.target for moment in moments]
+        company = [[moment.company.get(COMPANY[k]) for k in (0, 1, 4)] for moment in moments]
+        frames = observed_frames(
+            np.array([moment.time_s for moment in moments]),
+            np.array([moment.position_m for moment in moments]),
+            np.array([moment.rotation_deg for moment in moments]),
+            np.array([moment.target_m for moment in moments]),
+            np.array([target.image_uv or [math.nan] * 2 for target in targets]),
+            np.array([target.mask_bbox_2d or [math.nan] * 4 for target in targets]),
+            *(np.array([getattr(target, name) for target in targets]) for name in ("in_view", "visible", "visibility")),
+            np.array([bool(target.legible) for target in targets]),
+            *np.array(company, dtype=np.float64).T,
+        )
+        folders = [self._folder(flight, moment) for moment in moments]
+        place, indices = flight.place, tuple(moment.index for moment in moments)
+        name = sample_id(f"{place[1]}_{place[2]}", indices[-1])
+        height_px, width_px, _ = moments[-1].frame.rgb.shape
+        files = (FILES,) * len(folders)
+        return ObservedWindow(name, *place, indices, width_px, height_px, frames, tuple(folders), files)
+
+    def _folder(self, flight: ClosedLoopFlight, moment: Moment) -> Path:
+        """Give the folder of a frame, written for whoever looks at pictures; those that nobody asks for any more go."""
+        if self._scratch is None:
+            return Path()
+        above = Path(self._scratch.name, *flight.place)
+        folder, frame = above / frame_name(moment.index), moment.frame
+        if not folder.is_dir():
+            shutil.rmtree(above / frame_name(max(moment.index - self.cfg.window.num_frames, 0)), ignore_errors=True)
+            folder.mkdir(parents=True)
+            (folder / FILE_NAMES["rgb"]).write_bytes(rgb_bytes(frame.rgb))
+            (folder / FILE_NAMES["instance"]).write_bytes(instance_bytes(frame.kinds, frame.ids))
+            name, data = depth_file(frame.depth, "png")
+            (folder / name).write_bytes(data)
+        return folder
+
+
+def _with_folder(caption: CaptionConfig, folder: Path) -> CaptionConfig:
+    return caption.model_copy(update={"student": caption.student.model_copy(update={"folder": folder})})
+
+
+class LocalPilot(AskedPilot):
+    """A student in this process (distill/inference), all flights as one batch."""
+
+    def __init__(self, cfg: FlyConfig, caption: CaptionConfig, infer: InferConfig, seed: int, answers: Path) -> None:
+        self._infer, self._model, self._adapter = infer, Path(cfg.student.partition(":")[2]), cfg.adapter
+        super().__init__(cfg, _with_folder(caption, cfg.adapter or self._model), seed, answers)
+
+    def _open(self) -> None:
+        self._scratch = tempfile.TemporaryDirectory(prefix="cosfly-fly-")
+        inputs = Inputs((), {"": Path(self._scratch.name)}, self._model, self._adapter, self.vocabulary.actions)
+        self._local, self.name = local_answers(self._infer, inputs, self._book), inputs.name
+
+    async def _decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
+        begun_s = time.monotonic()
+        questions = [self._question(outlook) for outlook in outlooks]
+        found = [one async for one in self._local.answers(map(self._sample, questions), lambda count, told="": None)]
+        answer_s = time.monotonic() - begun_s  # all have waited for the batch
+        if answer_s > self.limit_s:
+            return [PilotAnswer("late", answer_s=answer_s)] * len(found)
+        return [
+            self._read(one.found.text, question, answer_s if one.is_new else None, one.found.finish_reason)
+            if isinstance(one.found, BookAnswer)
+            else PilotAnswer("none", words=one.found.message[:MOST_WORDS])
+            for one, question in zip(found, questions, strict=True)
+        ]
+
+    @staticmethod
+    def _sample(question: Question) -> Sample:
+        window, pictures = question.window, question.pictures
+        return Sample(
+            sample_id=window.sample_id, window_id=window.sample_id, run="", town=window.town,
+            trajectory=window.trajectory, variant=window.variant, walk="", window=window.indices, language="en",
+            views=pictures.views, picture_px=pictures.size_px, depth_range_m=pictures.depth_range_m,
+            prompt=question.asked["en"], answer="", decision="", label=None, contradicted=None, proved=None,
+            repair=None, weight=1.0,
+        )  # fmt: skip

@@ -1,0 +1,125 @@
+"""cosfly/closed_loop/controller.py: what a decision is flown as, held against the rules that decisions are judged by."""
+
+import numpy as np
+import pytest
+from specimens_planning import town_of, walk_along
+
+from caption.schema import FutureMotion, LabelConfig
+from caption.truth.actions import Motion, measure, table_of
+from cosfly.closed_loop.controller import CONTROLLER_FILE, Controller, read_controls
+from cosfly.closed_loop.settings import DroneConfig
+from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight
+from cosfly.errors import ConfigError
+from cosfly.planners.contract import PlanConfig
+from cosfly.planners.stage import plan_flight
+from cosfly.products.actions import shipped_actions
+from cosfly.products.motion import ACTION
+from cosfly.render.settings import RenderConfig
+
+TOKENS = shipped_actions().tokens
+LABELS = table_of(shipped_actions(), LabelConfig())
+CONTROLS = read_controls(CONTROLLER_FILE, TOKENS)
+HORIZON = 5  # decisions, 2.5 s, as labels look ahead
+
+
+@pytest.fixture(scope="module")
+def begin():
+    """Gives a flight behind a walker in the open, and its controller."""
+    town = town_of()
+    airspace = Airspace(RenderConfig(width_px=320, height_px=180, fovs_deg=(90.0,)), town, town)
+    walk = walk_along("path_00000", [(0, 0), (60, 0)])
+    plan = plan_flight(walk, airspace.surroundings.obstacles, PlanConfig(), 0)
+
+    def start(num_lead=40):
+        flight = ClosedLoopFlight(airspace, plan, num_lead=num_lead)
+        moment = flight.reset()[-1]
+        return flight, Controller(CONTROLS, DroneConfig(), moment), moment
+
+    yield start
+    airspace.renderer.close()
+
+
+def flown(begin, *tokens) -> tuple[list, Motion, Controller]:
+    flight, controller, moment = begin()
+    before_mps = float(np.linalg.norm(moment.velocity_mps))
+    moments = [moment]
+    for token in tokens:
+        moments.append(flight.step(controller.command(token, moments[-1])))
+    future = FutureMotion(
+        tuple(m.index for m in moments[1:]),
+        *(np.array([getattr(m, name) for m in moments]) for name in ("time_s", "position_m")),
+        np.array([m.rotation_deg[1] for m in moments]),
+        np.array([m.target_m for m in moments]),
+        np.array([m.target.visible for m in moments]),
+        before_mps,
+    )
+    return moments, measure(future), controller
+
+
+@pytest.mark.parametrize("token", [t for t in TOKENS if t != "search_to_reacquire_target"])
+def test_a_decision_that_is_flown_for_its_horizon_shows_what_its_own_rule_asks_for(begin, token):
+    _, motion, _ = flown(begin, *[token] * HORIZON)
+    if token in ("break_off", "return_to_home"):  # orders of a mission; who leaves without one leaves the person
+        assert motion.approach_m <= -LabelConfig().approach_m
+        return
+    shown, _ = LABELS.shown[token]
+    assert shown(motion) >= 1.0, (token, shown(motion), motion)
+
+
+@pytest.mark.parametrize(
+    "token",
+    ["yaw_left_to_follow", "yaw_right_to_follow", "ascend", "descend", "strafe_left", "strafe_right", "hover",
+     "track_straight"],
+)  # fmt: skip
+def test_what_is_flown_is_what_the_label_would_have_been(begin, token):
+    _, motion, _ = flown(begin, *[token] * HORIZON)
+    assert LABELS.label_of(motion) == token
+
+
+def test_a_search_stands_and_turns_to_the_side_of_the_last_turn(begin):
+    for token, side in (("yaw_left_to_follow", 1), ("yaw_right_to_follow", -1)):
+        moments, _, _ = flown(begin, token, *["search_to_reacquire_target"] * HORIZON)
+        turned_deg = (moments[-1].rotation_deg[1] - moments[1].rotation_deg[1] + 180) % 360 - 180
+        assert side * turned_deg > 30
+        assert np.linalg.norm(moments[-1].velocity_mps) < 1e-6
+
+
+def test_the_pace_is_kept_through_a_turn_and_a_missing_answer_and_ends_with_a_hover(begin):
+    moments, _, controller = flown(begin, "yaw_left_to_follow", None, "track_straight", "track_straight")
+    pace = controller.pace_mps
+    assert np.linalg.norm(moments[-1].velocity_mps) == pytest.approx(pace)
+    assert np.linalg.norm(moments[2].velocity_mps) < pace
+    assert flown(begin, "hover", "track_straight")[2].pace_mps == 0.0
+    assert flown(begin, *["slow_down"] * 20)[2].pace_mps == 0.0  # it flies no way back
+
+
+def test_the_camera_keeps_its_aim_while_the_drone_climbs(begin):
+    moments, _, controller = flown(begin, *["ascend"] * HORIZON)
+    for moment in moments[2:]:
+        over_hip_m = moment.position_m[2] - 0.9
+        aimed_deg = -np.degrees(np.arctan2(over_hip_m - 0.75, controller.aim_m))  # a step behind: 1.5 m/s for 0.5 s
+        assert moment.rotation_deg[0] == pytest.approx(aimed_deg, abs=0.6)
+
+
+def test_it_flies_home_and_stays_there(begin):
+    moments, _, _ = flown(begin, *["move_forward"] * 4, *["return_to_home"] * 12)
+    home = moments[0].position_m
+    assert np.linalg.norm((moments[4].position_m - home)[:2]) > 2
+    assert np.linalg.norm((moments[-1].position_m - home)[:2]) < 1
+
+
+def test_every_command_can_be_flown(begin):
+    _, controller, moment = begin()
+    for token in TOKENS * 3:
+        assert DroneConfig().problem_of(controller.command(token, moment)) is None
+        assert len(controller.command(token, moment)) == len(ACTION)
+
+
+def test_a_table_without_a_row_or_with_a_wrong_word_is_refused_by_name(tmp_path):
+    path, text = tmp_path / "own.yaml", CONTROLLER_FILE.read_text()
+    path.write_text(text.replace("  hover:", "  hovering:"))
+    with pytest.raises(ConfigError, match="hover"):
+        read_controls(path, TOKENS)
+    path.write_text(text.replace("turn: orbit", "turn: spin"))
+    with pytest.raises(ConfigError, match="turn"):
+        read_controls(path, TOKENS)
