@@ -242,6 +242,27 @@ def test_what_a_kill_left_of_a_file_or_folder_goes_when_it_is_written_again(tmp_
         shutil.rmtree(tmp_path / "f")
 
 
+def test_what_a_kill_left_is_found_without_a_look_at_every_frame(tmp_path, monkeypatch):
+    """A million flights have a folder for each of their hundred frames; the workers' losses are cleared away at the end
+    of the stage, and when it is taken up again."""
+    whole, scanned, scandir = tmp_path / "Town/trajectory_1/ORI", [], os.scandir
+    for frame in range(20):
+        (whole / f"frames/{frame}").mkdir(parents=True)
+    (whole / store.CHECKSUMS).write_text("")
+    left = [tmp_path / "Town/trajectory_1/.aug_001.7.partial/frames/0", tmp_path / "Town/trajectory_2/.ORI.7.partial"]
+    for folder in left:
+        folder.mkdir(parents=True)
+        (folder / "rgb.png").write_text("half")
+    (tmp_path / ".town_map.json.7.partial").write_text("half")
+    (tmp_path / "Town/.away.7.partial").symlink_to(tmp_path)
+    monkeypatch.setattr(os, "scandir", lambda path: scanned.append(str(path)) or scandir(path))
+    store.remove_partials(tmp_path)
+    monkeypatch.undo()
+    assert not list(tmp_path.rglob("*.partial"))
+    assert len(list(whole.rglob("*"))) == 22
+    assert not [path for path in scanned if f"{whole}/" in path]
+
+
 def test_a_lock_leads_nowhere_else(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "private").write_text("mine")

@@ -166,9 +166,13 @@ def refuse_links(folder: Path) -> None:
 
 
 def remove_partials(folder: Path) -> None:
-    """Remove what a kill left under temporary names."""
-    for path in sorted(folder.rglob(".*.partial"), reverse=True):
-        _remove(path)
+    """Remove what a kill left under temporary names. A folder with checksums appeared whole, so what is below it is not
+    looked at: a flight has a folder for each frame."""
+    for place, folders, files in os.walk(folder):
+        partials = {name for name in (*folders, *files) if name.startswith(".") and name.endswith(".partial")}
+        for name in partials:
+            _remove(Path(place, name))
+        folders[:] = [] if CHECKSUMS in files else [name for name in folders if name not in partials]
 
 
 LONGEST_NAME = 255  # bytes of one part of a path, on every common file system
