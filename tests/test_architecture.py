@@ -159,6 +159,7 @@ READING = {
     *("imdecode", "decompress", "ParquetFile", "read_table", "read_metadata", "load_file", "genfromtxt", "loadtxt"),
 }
 ALLOWED_TO_READ = {
+    ("cosfly.work.ray_engine", "loads"),  # what a worker says, as `multiprocessing` reads it from a pipe
     ("cosfly.work.folder_lock", "open"),  # a lock, opened to be written
     ("cosfly.work.stage_events", "read_bytes"),  # /proc, whose files have no size
     ("cosfly.products.png", "decompress"),  # of a picture, up to the size that its header gives

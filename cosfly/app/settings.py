@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -21,6 +21,7 @@ from cosfly.render.settings import RenderConfig
 from cosfly.simplify.passes import SimplifyConfig
 from cosfly.work.chance import rng_for
 from cosfly.work.config import Config, build
+from cosfly.work.ray_engine import ALL_ROOM, RayConfig
 from cosfly.work.worker_pool import Watch
 from cosfly.worlds.settings import WorldConfig
 from distill.evaluation.compare import ReportConfig
@@ -54,7 +55,15 @@ class RunConfig(Config):
         "run", pattern=r"^[\w-][\w. -]*$", description="name of the run; `cosfly run` writes to runs/<name>"
     )
     seed: int = Field(0, description="every random choice derives from it, the stage and the item; 0 is a seed")
-    workers: int = Field(0, ge=0, description="worker processes; 0 takes one per core")
+    workers: int = Field(
+        0,
+        ge=0,
+        description="worker processes; 0 takes one per core, of a Ray cluster as many as its nodes have room for",
+    )
+    engine: Literal["local", "ray"] = Field(
+        "local", description="where the workers of stages are: processes of this machine, or on the nodes of `ray`"
+    )
+    ray: RayConfig = Field(default_factory=RayConfig, description="the cluster of engine ray")
     item_limit_s: float | None = Field(
         None,
         ge=0,
@@ -93,6 +102,12 @@ class RunConfig(Config):
     def opened(self, path: Path) -> Path:
         """Give a path that a command was given as one whose links are followed, if they are."""
         return LinkedPath(path) if self.follow_links else path
+
+    @model_validator(mode="after")
+    def _address_is_used(self) -> RunConfig:
+        if self.ray.address and self.engine != "ray":
+            raise ValueError(f"ray.address is {self.ray.address}, but engine is {self.engine}: --engine ray")
+        return self
 
     @model_validator(mode="after")
     def _towns_can_be(self) -> RunConfig:
@@ -147,5 +162,7 @@ def _merged(group: Config, settings: dict[str, Any], changes: dict[str, Any]) ->
 
 
 def manner_of_work(cfg: RunConfig) -> dict[str, Any]:
-    """Give the arguments that all stages with items take: processes, and when one counts as stalled."""
-    return {"workers": cfg.workers or len(os.sched_getaffinity(0)), "watch": Watch(item_limit_s=cfg.item_limit_s)}
+    """Give the arguments that all stages with items take: how many workers, where, and when one counts as stalled."""
+    cluster = cfg.ray if cfg.engine == "ray" else None
+    workers = cfg.workers or (len(os.sched_getaffinity(0)) if cluster is None else ALL_ROOM)
+    return {"workers": workers, "watch": Watch(cluster, cfg.item_limit_s)}

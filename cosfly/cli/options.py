@@ -52,6 +52,8 @@ TRACKS_HELP = "Only flights of this track."
 RESUME_HELP = "A folder that holds work: refuse it, or continue if settings and inputs are the same."
 VERIFY_HELP = "First compare every file of the stages that are read with its sha256."
 REPAIR_HELP = "First set aside, as FILE.aside, what is broken in the folder's journals."
+ENGINE_HELP = "Where the workers are: processes of this machine, or on the nodes of a Ray cluster."
+ADDRESS_HELP = "Head node of --engine ray, or auto; none: $RAY_ADDRESS, or a cluster of this machine."
 SHARED: dict[str, tuple[Any, Any, Any]] = {  # name -> type, option and default, in the order of the help
     "flights": (list[str] | None, Option(metavar="GLOB", help=GLOB_HELP), None),
     "tracks": (Track | None, Option(show_default="both", help=TRACKS_HELP), None),
@@ -68,12 +70,20 @@ SHARED: dict[str, tuple[Any, Any, Any]] = {  # name -> type, option and default,
     ),
     "seed": (int | None, Option(help="Seed; every random choice derives from it."), None),
     "workers": (int | None, Option(help="Worker processes; 0 takes one per core."), None),
+    "engine": (Literal["local", "ray"] | None, Option(show_default="local", help=ENGINE_HELP), None),
+    "address": (str | None, Option(metavar="HOST:PORT", help=ADDRESS_HELP), None),
     "verify": (bool, Option("--verify", help=VERIFY_HELP), False),
     "resume": (Literal["never", "if-same"], Option(help=RESUME_HELP), "if-same"),
     "repair": (bool, Option("--repair", help=REPAIR_HELP), False),
 }
-SET_BY = {"flights": Sets("match"), "tracks": Sets("tracks", TRACKS), "seed": Sets("seed"), "workers": Sets("workers")}
-STAGE = ("town", "seed", "workers", "verify", "resume", "repair")  # of a stage that does items by workers
+SET_BY = {
+    "flights": Sets("match"),
+    "tracks": Sets("tracks", TRACKS),
+    "address": Sets("ray.address"),
+    **{name: Sets(name) for name in ("seed", "workers", "engine")},
+}
+WORKERS = ("workers", "engine", "address")
+STAGE = ("town", "seed", *WORKERS, "verify", "resume", "repair")  # of a stage that does items by workers
 
 
 @dataclass(frozen=True)

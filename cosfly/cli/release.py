@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import Job, Sets, takes
+from cosfly.cli.options import WORKERS, Job, Sets, takes
 
 app = typer.Typer(no_args_is_help=True, help="Package captions and frames as a data set that opens with one line.")
 ReleaseFolder = Annotated[Path, Argument(help="Release folder, or a run with one.")]
@@ -17,7 +17,7 @@ LevelBefore = Annotated[Literal["structure", "rows", "pixels"], Option(help="How
 
 
 @app.command("build")
-@takes("workers", "verify", "resume", "repair")
+@takes(*WORKERS, "verify", "resume", "repair")
 def release_build(
     job: Job,
     out: Annotated[Path, Option(help="Release folder.")],
@@ -65,7 +65,7 @@ def release_build(
 
 
 @app.command("verify")
-@takes("workers")
+@takes(*WORKERS)
 def release_verify(
     job: Job,
     folder: Annotated[
@@ -111,7 +111,7 @@ def release_verify(
 
 
 @app.command("sign")
-@takes("workers")
+@takes(*WORKERS)
 def release_sign(
     job: Job,
     folder: ReleaseFolder,
@@ -197,7 +197,7 @@ def release_viewer(
 
 
 @app.command("export")
-@takes("workers", "verify", "resume", "repair")
+@takes(*WORKERS, "verify", "resume", "repair")
 def release_export(
     job: Job,
     folder: ReleaseFolder,
@@ -219,7 +219,7 @@ def release_export(
 
 
 @app.command("get")
-@takes("workers", "resume")
+@takes(*WORKERS, "resume")
 def release_get(
     job: Job,
     source: Annotated[
@@ -255,7 +255,7 @@ def release_get(
 
 
 @app.command("push")
-@takes("workers")
+@takes(*WORKERS)
 def release_push(
     job: Job,
     folder: ReleaseFolder,
@@ -266,6 +266,7 @@ def release_push(
 ) -> None:
     """Send a release to a hub that speaks the Hugging Face protocol; verified first, and a dry run without --yes."""
     from caption.run.released import read_released
+    from cosfly.app.settings import manner_of_work
     from cosfly.work.console import answer_console
     from release.transfer import push
 
@@ -276,7 +277,7 @@ def release_push(
     options.tell_table(answer_console, (), rows, title=title)
     for name in parcel.stays:
         answer_console.print(f"stays here, as it is not of the release: {name}", soft_wrap=True)
-    report = push.verified(parcel, level, workers=job.manner["workers"], reader=read_released)
+    report = push.verified(parcel, level, reader=read_released, **manner_of_work(job.cfg))
     typer.echo(str(report))
     if yes:
         typer.echo(push.push(parcel, repo, private=not public))

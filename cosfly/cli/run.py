@@ -10,7 +10,7 @@ import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import Job, takes
+from cosfly.cli.options import WORKERS, Job, takes
 
 if TYPE_CHECKING:
     from cosfly.app.pipeline import StageResult
@@ -23,7 +23,7 @@ PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)}
 
 
 @app.command()
-@takes("seed", "workers", "verify", "resume", "repair")
+@takes("seed", *WORKERS, "verify", "resume", "repair")
 def run(
     job: Job,
     config: Annotated[Path, Argument(help=CONFIG)],
@@ -168,7 +168,7 @@ def list_runs(root: Annotated[Path, Argument(metavar="[DIR]", help="Where runs a
 
 
 @app.command()
-@takes()
+@takes("engine", "address")
 def bench(
     job: Job,
     config: Annotated[Path, Argument(metavar="RUN", help="Folder of a run that is finished up to the stage.")],
@@ -192,7 +192,7 @@ def bench(
 
 
 @app.command()
-@takes("workers", "resume")
+@takes(*WORKERS, "resume")
 def reproduce(
     job: Job,
     config: Annotated[Path, Argument(metavar="[RUN]", help="A run folder; of several towns, that of one.")] = Path(),

@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import STAGE, Job, Sets, takes
+from cosfly.cli.options import STAGE, WORKERS, Job, Sets, takes
 
 app = typer.Typer()
 
@@ -381,7 +381,7 @@ app.add_typer(inspect_app, name="inspect")
 
 
 @inspect_app.callback()
-@takes("town", "workers", "verify", "resume", "repair", flights="inspect.flights")
+@takes("town", *WORKERS, "verify", "resume", "repair", flights="inspect.flights")
 def inspect(
     job: Job,
     out: options.Out,

@@ -5,19 +5,19 @@ from __future__ import annotations
 import re
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import Job, Sets, takes
+from cosfly.cli.options import WORKERS, Job, Sets, takes
 
 app = typer.Typer()
 
 
 @app.command()
-@takes("seed", "workers", "resume")
+@takes("seed", *WORKERS, "resume")
 def world(
     job: Job,
     prompt: Annotated[str, Argument(help="What the world shall be, in plain English."), Sets("world.prompt")],
@@ -71,7 +71,9 @@ def _go_on(job: Job, folder: Path, seed: int) -> None:
     from cosfly.pedestrians.roi_editor import run_propose
     from cosfly.worlds.stage import LOOP_FILE
 
-    told, given = list(job.overrides), {"seed": seed, "workers": job.cfg.workers}
+    told = list(job.overrides)
+    where: dict[str, Any] = {"workers": job.cfg.workers, "engine": job.cfg.engine, "ray.address": job.cfg.ray.address}
+    given = where | {"seed": seed}
     cfg, out = options.resolve(folder / LOOP_FILE, told, given), folder / "run"
     for first in pipeline.stages(cfg, out)[:2]:
         first.work()

@@ -2,7 +2,7 @@
 
 `run_items` is the whole interface. A stage hands it items (an id and a payload that pickles) and `make_worker`, a
 module-level function that is called once in each worker process with `worker_args` and returns the function that does
-one item. Load maps and open GL contexts in it. The same signature fits an actor pool on other machines.
+one item. Load maps and open GL contexts in it. `watch` says where: in processes of this machine, or of a Ray cluster.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from functools import partial
 from cosfly.errors import CosflyError, EnvironmentMissing
 from cosfly.work.console import progress_bar
 from cosfly.work.items import Item, Outcome, Work, advance, attempt, counted_steps
+from cosfly.work.ray_engine import ALL_ROOM, Cluster
 from cosfly.work.stage_events import EventLog, HowFar
 from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Kept, StageFolder, Tally, write_failures
 from cosfly.work.store import remove_partials
-from cosfly.work.worker_pool import Watch, WorkerPool
+from cosfly.work.worker_pool import LocalPost, StartPost, Watch, WorkerPool
 
 __all__ = ["Item", "ItemOutcomes", "Outcome", "Watch", "Work", "advance", "run_items"]
 
@@ -60,7 +61,7 @@ def run_items(
     Args:
         make_worker: module-level function; `make_worker(*worker_args)` returns the work function, once in each process.
         workers: processes; 0 works in this process, where nothing can end an item that hangs.
-        watch: when a worker counts as stalled.
+        watch: where workers work, and when one counts as stalled.
     Returns:
         Records and tally, in the order of `items` whatever the order of work.
     """
@@ -133,8 +134,12 @@ def _in_this_process(
 def _in_processes(
     stage: StageFolder, items: Sequence[Item], start: _Start, workers: int, watch: Watch, progress: _Progress
 ) -> Generator[ItemRecord, None, None]:
+    start_post: StartPost = LocalPost
+    if watch.ray is not None:
+        cluster = Cluster(watch.ray, stage.path)
+        start_post, workers = cluster.start_post, cluster.room if workers == ALL_ROOM else workers
     events = EventLog(stage.path, progress.how_far)
-    pool = WorkerPool(*start, min(workers, len(items)), watch, events, progress.move)
+    pool = WorkerPool(*start, min(workers, len(items)), watch, events, progress.move, start_post)
     try:
         yield from pool.outcomes(items)
     except CosflyError:

@@ -49,7 +49,8 @@ class HowFar(NamedTuple):
 
 
 class Event(BaseModel):
-    """A line of `events.jsonl`. at_s: seconds since 1970. worker: its place, 0 and up; a restarted one keeps it.
+    """A line of `events.jsonl`. at_s: seconds since 1970. worker: its place, 0 and up; a restarted one keeps it. node:
+    the name of the machine where it works, of a cluster's.
 
     Of a probe: rss_mib by worker (the most since the probe before), cores in use by all workers, free disk space, mean
     load and memory in use of all NVIDIA devices of the machine where it has some, their part by worker where the driver
@@ -62,6 +63,7 @@ class Event(BaseModel):
     event: Kind
     workers: int | None = None
     worker: int | None = None
+    node: str | None = None
     pid: int | None = None
     item: str | None = None
     status: str | None = None
@@ -86,6 +88,18 @@ class Event(BaseModel):
         return HowFar(self.done, self.total, self.unit)
 
 
+class Vitals(NamedTuple):
+    """What the system of its machine says of a worker process. pid: None on another machine."""
+
+    cpu_s: float
+    rss_mib: float
+    pid: int | None = None
+
+    @classmethod
+    def of(cls, pid: int) -> Vitals:
+        return cls(cpu_seconds(pid), rss_mib(pid), pid)
+
+
 class EventLog:
     """Adds to a stage's `events.jsonl`. A kill costs the line in hand. how_far: asked at each probe that is written."""
 
@@ -93,26 +107,27 @@ class EventLog:
         self._journal, self._folder, self._how_far = Journal(folder / EVENTS), folder, how_far
         self._num_probes, self._pace, self._probed_s = 0, 1, time.monotonic()
         self._peaks_mib: dict[int, float] = {}
-        self._cpu_s: dict[int, float] = {}  # by pid, at the probe before
+        self._cpu_s: dict[int, float] = {}  # by worker, at the probe before
         self._used_s = 0.0  # by all workers since the last line
 
     def tell(self, event: Kind, **fields: object) -> None:
         line = Event.model_validate({"at_s": round(time.time(), 3), "event": event, **fields})
         self._journal.append(line.model_dump(exclude_none=True), sync=False)
 
-    def probe(self, pids: Mapping[int, int]) -> None:
-        """Look at memory and time of the workers (place -> process id) and at the disk; not every look is written."""
-        for worker, pid in pids.items():
-            self._peaks_mib[worker] = max(self._peaks_mib.get(worker, 0.0), rss_mib(pid))
-            cpu_s = cpu_seconds(pid)
-            self._used_s += max(0.0, cpu_s - self._cpu_s.get(pid, 0.0))
-            self._cpu_s[pid] = cpu_s
+    def probe(self, workers: Mapping[int, Vitals]) -> None:
+        """Look at memory and time of the workers (by place) and at the disk; not every look is written."""
+        for worker, (cpu_s, mib, _) in workers.items():
+            self._peaks_mib[worker] = max(self._peaks_mib.get(worker, 0.0), mib)
+            before_s = self._cpu_s.get(worker, 0.0)
+            self._used_s += cpu_s - before_s if cpu_s >= before_s else cpu_s  # of one that replaces another
+            self._cpu_s[worker] = cpu_s
         self._num_probes += 1
         if self._num_probes % self._pace:
             return
         elapsed_s = time.monotonic() - self._probed_s
         cores = round(self._used_s / elapsed_s, 2) if elapsed_s else 0.0
         free = shutil.disk_usage(self._folder).free / MEBIBYTE
+        pids = {worker: seen.pid for worker, seen in workers.items() if seen.pid is not None}
         far = (self._how_far()._asdict() if self._how_far else {}) | gpu_use(pids)
         self.tell("probe", rss_mib=self._peaks_mib, cores_used=cores, disk_free_mib=round(free, 1), **far)
         self._peaks_mib, self._used_s, self._probed_s = {}, 0.0, time.monotonic()

@@ -1,7 +1,8 @@
 """Worker processes that are watched: one that dies, stalls or takes for ever is replaced, and its item tried again.
 
 All that can block on a worker (sending it an item, reading from it) happens in a thread of its own, so that nothing a
-worker does or leaves undone holds up the stage. `worker` is the other end of the pipe.
+worker does or leaves undone holds up the stage. Where a process runs and how it is reached is its `Post`: here one of
+this machine, at the other end of a pipe (`worker`); in `ray_engine` one on a node of a cluster.
 """
 
 from __future__ import annotations
@@ -16,15 +17,18 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
-from typing import Any
+from typing import TYPE_CHECKING, Protocol
 
-from cosfly.errors import EnvironmentMissing
+from cosfly.errors import CosflyError, EnvironmentMissing
 from cosfly.work.items import Item, Work
-from cosfly.work.stage_events import LOSSES, EventLog, Loss, cpu_seconds
+from cosfly.work.stage_events import LOSSES, EventLog, Loss, Vitals
 from cosfly.work.stage_folder import Failed, ItemRecord
 from cosfly.work.worker import Abort, Manner, Message, Sign, Start, signals_held_back, work_through
+
+if TYPE_CHECKING:
+    from cosfly.work.ray_engine import RayConfig
 
 log = logging.getLogger(__name__)
 
@@ -35,13 +39,16 @@ PATIENCE_S = 5.0  # for a worker that has no more to do to end by itself
 
 @dataclass(frozen=True)
 class Watch:
-    """When a worker counts as stalled, and what is done then; the times are those of the paper (sec:dataset_watchdog).
+    """Where workers work, when one counts as stalled, and what is done then; the times are those of the paper
+    (sec:dataset_watchdog).
 
+    ray: the cluster; None: this machine.
     item_limit_s: how long an item may go without getting on (no step of it is told of); 0: for ever; None: ten minutes
     or 20 times what items take, whichever is more, and with each new attempt twice as long, as for the start of a
     worker.
     """
 
+    ray: RayConfig | None = None
     item_limit_s: float | None = None
     heartbeat_s: float = 2.0
     check_s: float = 5.0
@@ -68,6 +75,61 @@ def limit_s(watch: Watch, seconds: Collection[float], attempt: int, has_begun: b
     return max(LEAST_LIMIT_S, TYPICAL_ITEMS * typical_s, watch.item_limit_s or 0.0) * 2**attempt
 
 
+class Post(Protocol):
+    """A worker's process, wherever it is: `work_through` at the other end.
+
+    pid: None until it has started. node: its machine's name, of a cluster's.
+    """
+
+    pid: int | None
+    node: str | None
+
+    def send(self, what: Start | Item | None) -> None:
+        """Give it its Start, then items one by one, at last None; may wait for as long as it likes."""
+
+    def receive(self) -> Message:
+        """Wait for what it says next. Raises EOFError or OSError when it is gone."""
+
+    def look(self) -> Vitals | None:
+        """Give what its system says of it, at once; None: it is gone."""
+
+    def kill(self, patience_s: float) -> None:
+        """End it: by itself, if it has been given None and can within the time. It is gone, or out of reach, then."""
+
+
+StartPost = Callable[[Manner], Post]
+
+
+class LocalPost:
+    """A process of this machine, which it starts."""
+
+    node: str | None = None
+
+    def __init__(self, manner: Manner) -> None:
+        context = multiprocessing.get_context("spawn")  # fork would copy GL and thread-pool state
+        self.connection, there = context.Pipe()
+        self._process = context.Process(target=work_through, args=(there, manner), daemon=True)
+        with signals_held_back():
+            self._process.start()
+        there.close()
+        self.pid: int | None = self._process.pid
+
+    def send(self, what: Start | Item | None) -> None:
+        self.connection.send(what)
+
+    def receive(self) -> Message:
+        return self.connection.recv()
+
+    def look(self) -> Vitals | None:
+        return Vitals.of(self._process.pid or 0) if self._process.is_alive() else None
+
+    def kill(self, patience_s: float) -> None:
+        if patience_s:
+            self._process.join(patience_s)
+        self._process.kill()
+        self._process.join()
+
+
 @dataclass(frozen=True)
 class _Attempt:
     item: Item
@@ -79,8 +141,9 @@ class _Worker:
     """One process, and what is known of it."""
 
     place: int
-    process: Any
-    inbox: queue.SimpleQueue[Item | None]
+    post: Post
+    inbox: queue.SimpleQueue[Item | None] = field(default_factory=queue.SimpleQueue)
+    is_known: bool = False  # to the log of events
     attempt: _Attempt | None = None
     num_steps: int = 0
     has_begun: bool = False  # the item; before that, a new worker reads maps and compiles
@@ -106,10 +169,13 @@ class WorkerPool:
     watch: Watch
     events: EventLog
     on_steps: Callable[[str, int], None]
+    start_post: StartPost = LocalPost
     num_lost: int = 0
     _num_done: int = 0
     _seconds: deque[float] = field(default_factory=lambda: deque(maxlen=ITEMS_REMEMBERED))
-    _waiting: deque[_Attempt] = field(default_factory=deque)
+    _fresh: deque[Item] = field(default_factory=deque)
+    _again: deque[_Attempt] = field(default_factory=deque)
+    _alone: deque[_Attempt] = field(default_factory=deque)  # last attempts
     _workers: dict[int, _Worker] = field(default_factory=dict)
     _lost: set[int] = field(default_factory=set)  # places that wait for a new worker
     _messages: queue.SimpleQueue[tuple[_Worker, Message | None]] = field(default_factory=queue.SimpleQueue)
@@ -121,16 +187,18 @@ class WorkerPool:
             CosflyError: a fatal one of a worker; or EnvironmentMissing: workers die or stall all the time.
         """
         self.events.tell("began", workers=self.num_workers)
-        self._waiting.extend(_Attempt(item) for item in items)
+        self._fresh.extend(items)
         next_check_s, next_probe_s = time.monotonic() + self.watch.check_s, time.monotonic()
         try:
-            while self._waiting or self._busy():
+            while self._fresh or self._again or self._alone or self._busy():
                 self._hand_out()
                 for worker, message in self._told(min(next_check_s, next_probe_s)):
                     yield from self._hear(worker, message)
                 if (now_s := time.monotonic()) >= next_probe_s:
                     next_probe_s = now_s + self.watch.probe_s
-                    self.events.probe({w.place: w.process.pid for w in self._workers.values()})
+                    self.events.probe(
+                        {w.place: seen for w in self._workers.values() if w.post.pid and (seen := w.post.look())}
+                    )
                 if now_s >= next_check_s:
                     next_check_s = now_s + self.watch.check_s
                     yield from self._check()
@@ -148,38 +216,43 @@ class WorkerPool:
     def _hand_out(self) -> None:
         """Give every free worker an item, and start those that are missing."""
         for place in range(self.num_workers):
-            worker = self._workers.get(place)
-            if (worker is None or worker.attempt is None) and (attempt := self._next_attempt(place)) is not None:
-                worker = self._workers.get(place) or self._start(place)
+            worker = self._workers.get(place) or (self._start(place) if self._is_short() else None)
+            if worker is None or worker.attempt is not None or worker.post.pid is None:
+                continue
+            if not worker.is_known:
+                worker.is_known = True
+                self.events.tell("restarted" if place in self._lost else "worker_started", **self._about(worker))
+                self._lost.discard(place)
+            if (attempt := self._next_attempt(place)) is not None:
                 worker.give(attempt)
+
+    def _is_short(self) -> bool:
+        """Tell whether there is more to do now than workers without an item, those that still start among them."""
+        num_idle = len(self._workers) - len(self._busy())
+        return num_idle < (len(self._fresh) + len(self._again) or int(bool(self._alone) and not self._busy()))
 
     def _next_attempt(self, place: int) -> _Attempt | None:
         """Take what is to be done next, at a place. A last attempt is made alone: there may not be the memory for
         two."""
-        for k, attempt in enumerate(self._waiting):
-            if attempt.number < self.watch.retries or attempt.number == 0:
-                del self._waiting[k]
-                return attempt
-        if self._waiting and not self._busy():
+        if self._fresh:
+            return _Attempt(self._fresh.popleft())
+        if self._again:
+            return self._again.popleft()
+        if self._alone and not self._busy():
             for worker in [worker for worker in self._workers.values() if worker.place != place]:
                 self._stop(worker, PATIENCE_S)
-            return self._waiting.popleft()
+            return self._alone.popleft()
         return None
 
     def _start(self, place: int) -> _Worker:
-        context = multiprocessing.get_context("spawn")  # fork would copy GL and thread-pool state
-        here, there = context.Pipe()
         manner = Manner(os.getpid(), self.watch.heartbeat_s, logging.getLogger().level, place)
-        process = context.Process(target=work_through, args=(there, manner), daemon=True)
-        with signals_held_back():
-            process.start()
-        there.close()
-        worker = self._workers[place] = _Worker(place, process, queue.SimpleQueue())
+        worker = self._workers[place] = _Worker(place, self.start_post(manner))
         start = Start(self.make_worker, self.worker_args)
-        threading.Thread(target=_attend, args=(worker, start, here, self._messages), daemon=True).start()
-        self.events.tell("restarted" if place in self._lost else "worker_started", worker=place, pid=process.pid)
-        self._lost.discard(place)
+        threading.Thread(target=_attend, args=(worker, start, self._messages), daemon=True).start()
         return worker
+
+    def _about(self, worker: _Worker) -> dict[str, object]:
+        return {"worker": worker.place, "node": worker.post.node, "pid": worker.post.pid}
 
     # --- hearing what comes of it -------------------------------------------------------------------------------------
 
@@ -195,7 +268,10 @@ class WorkerPool:
         if message is None:
             yield from self._lose(worker, "worker_died")
         elif isinstance(message, Abort):
-            raise message.error
+            error, node = message.error, worker.post.node
+            if node is not None and isinstance(error, CosflyError):
+                error.where = f"node {node}" if error.where is None else f"node {node}: {error.where}"
+            raise error
         elif isinstance(message, logging.LogRecord):
             logging.getLogger(message.name).handle(message)
         elif isinstance(message, Sign):
@@ -223,12 +299,13 @@ class WorkerPool:
         """
         for worker in self._busy():
             assert worker.attempt is not None
-            cpu_s = cpu_seconds(worker.process.pid)
+            seen = worker.post.look()
+            cpu_s = worker.cpu_s if seen is None else seen.cpu_s
             lives = worker.has_told or cpu_s != worker.cpu_s
             worker.failed_checks = 0 if lives else worker.failed_checks + 1
             worker.has_told, worker.cpu_s = False, cpu_s
             worker.quiet_s += self.watch.check_s
-            if not worker.process.is_alive():
+            if seen is None:
                 yield from self._lose(worker, "worker_died")
             elif worker.failed_checks >= self.watch.failed_checks:
                 yield from self._lose(worker, "heartbeat_lost")
@@ -242,25 +319,26 @@ class WorkerPool:
         self._stop(worker, 0.0)
         self._lost.add(worker.place)
         attempt, self.num_lost = worker.attempt, self.num_lost + 1
-        if attempt is None:  # it had nothing in hand
-            self.events.tell(loss, worker=worker.place, pid=worker.process.pid)
-            return
-        item = attempt.item
-        seconds = round(time.monotonic() - worker.begun_s, 3) if worker.has_begun else 0.0
-        about = {"worker": worker.place, "item": item.item_id, "seconds": seconds, "steps": worker.num_steps}
-        self.events.tell(loss, pid=worker.process.pid, **about)
-        self.on_steps(item.item_id, 0)
+        item, about = None if attempt is None else attempt.item, self._about(worker)
+        if item is not None:
+            seconds = round(time.monotonic() - worker.begun_s, 3) if worker.has_begun else 0.0
+            about |= {"item": item.item_id, "seconds": seconds, "steps": worker.num_steps}
+            self.on_steps(item.item_id, 0)
+        self.events.tell(loss, **about)
         if self.num_lost > self.watch.restarts + self._num_done:
             raise EnvironmentMissing(
                 "workers die or stall all the time",
-                where=item.item_id,
+                where=None if item is None else item.item_id,
                 got=f"{self.num_lost} lost, {self._num_done} items done; the last: {LOSSES[loss]}",
                 fix="see events.jsonl; free some memory, use fewer --workers or raise item_limit_s, then run the same "
                 "command again: finished items are kept",
             )
+        if attempt is None or item is None:  # it had nothing in hand
+            return
         if attempt.number < self.watch.retries:
             log.warning("%s: %s; it is tried again", item.item_id, LOSSES[loss])
-            self._waiting.append(_Attempt(item, attempt.number + 1))
+            is_last = attempt.number + 1 == self.watch.retries
+            (self._alone if is_last else self._again).append(_Attempt(item, attempt.number + 1))
             self.events.tell("retried", item=item.item_id, attempt=attempt.number + 1)
             return
         self.events.tell("given_up", item=item.item_id)
@@ -271,33 +349,30 @@ class WorkerPool:
         """End a worker: by itself, if it can within the time given."""
         del self._workers[worker.place]
         worker.inbox.put(None)
-        if patience_s:
-            worker.process.join(patience_s)
-        worker.process.kill()
-        worker.process.join()
+        worker.post.kill(patience_s)
 
     def _end(self, patience_s: float) -> None:
-        for worker in self._workers.values():
-            worker.inbox.put(None)  # all at once
-        for worker in list(self._workers.values()):
-            self._stop(worker, patience_s)
+        if workers := list(self._workers.values()):
+            with ThreadPoolExecutor(len(workers)) as at_once:
+                list(at_once.map(lambda worker: self._stop(worker, patience_s), workers))
 
 
-def _attend(worker: _Worker, start: Start, connection: Connection, messages: queue.SimpleQueue) -> None:
+def _attend(worker: _Worker, start: Start, messages: queue.SimpleQueue) -> None:
     """Carry items to a worker and what it says to the pool, until either wants no more; None in `messages`: it is
     gone."""
+    post = worker.post
     try:
-        with connection:
-            connection.send(start)
-            while (item := worker.inbox.get()) is not None:
-                connection.send(item)
-                while True:
-                    message = connection.recv()
-                    worker.has_told = True
-                    messages.put((worker, message))
-                    if isinstance(message, Abort | ItemRecord):
-                        break
-            connection.send(None)
+        post.send(start)
+        messages.put((worker, Sign(None, 0)))  # it may be given an item
+        while (item := worker.inbox.get()) is not None:
+            post.send(item)
+            while True:
+                message = post.receive()
+                worker.has_told = True
+                messages.put((worker, message))
+                if isinstance(message, Abort | ItemRecord):
+                    break
+        post.send(None)
     except (EOFError, OSError):
         messages.put((worker, None))
     except Exception as error:  # an item that does not pickle, a message that does not unpickle

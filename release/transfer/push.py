@@ -15,6 +15,7 @@ from pathlib import Path
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, TeacherError, VerifyError
 from cosfly.products.shown_captions import CaptionReader
 from cosfly.work.store import CHECKSUMS, read_checksums
+from cosfly.work.worker_pool import Watch
 from release.export.source import SHARD_NAME, open_release
 from release.sign import SIGNATURE, is_signed
 from release.transfer.remote import without_secrets
@@ -86,13 +87,13 @@ def pack(folder: Path) -> Parcel:
     return Parcel(folder, files, digests, sorted(set(found) - set(names)))
 
 
-def verified(parcel: Parcel, level: Level, *, workers: int, reader: CaptionReader) -> Verified:
+def verified(parcel: Parcel, level: Level, *, reader: CaptionReader, workers: int, watch: Watch) -> Verified:
     """Verify what would go.
 
     Raises:
         VerifyError: it is not what it says.
     """
-    report = verify(parcel.folder, level=level, workers=workers, reader=reader)
+    report = verify(parcel.folder, level=level, workers=workers, watch=watch, reader=reader)
     if not report.is_ok:
         raise VerifyError(
             "this release does not verify, and does not go out", where=parcel.folder, got=str(report)[:1000],

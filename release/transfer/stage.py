@@ -403,7 +403,7 @@ def run(
         else:
             part = _part_of(record, choice, published_address(remote.shown))
             write_records(folder, part_record(record, part, flights, plan.modalities, named, taken, folder))
-        report = verify(folder, level="rows", workers=workers)
+        report = verify(folder, level="rows", workers=workers, watch=watch)
         if not report.is_ok and findings == "refuse":
             raise _not_kept(report, remote.shown)
     outputs = [dataset / name for name in ("README.md", RECORD, CHECKSUMS)]

@@ -1,0 +1,299 @@
+"""Stages on a Ray cluster: an actor is the post of a worker process, on whichever node Ray has room for it.
+
+Ray finds the node, carries bytes and tells of nodes that are lost. When a worker counts as stalled, what is tried again
+and what is told of it is `worker_pool`'s, as for the processes of one machine. Files do not travel: the nodes share the
+folder of the stage and its inputs. Items are handed out one at a time, and no frame passes through Ray.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import pickle
+import re
+import signal
+import socket
+import sys
+from collections import deque
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+import cosfly
+from cosfly.errors import EnvironmentMissing
+from cosfly.reading.files import sha256_file
+from cosfly.work.config import Config
+from cosfly.work.items import Item
+from cosfly.work.stage_events import Vitals
+from cosfly.work.worker import Manner, Message, Start
+
+log = logging.getLogger(__name__)
+
+ALL_ROOM = 2**31  # as many workers as the cluster has room for when a stage begins
+STORE_BYTES = 80_000_000  # of a cluster of this machine: what Ray asks for at least; nothing of ours is kept in it
+ANSWER_S = 5.0  # within which a head node or an actor answers
+WAITING_S = 30.0  # after so long it is told that there is no room
+
+
+class RayConfig(Config):
+    """Where a Ray cluster is, and what a worker takes of it."""
+
+    address: str = Field(
+        "", pattern=r"^(auto|[^/\s]+:\d+)?$",
+        description="the head node's host:port, or auto for that of this machine; empty: $RAY_ADDRESS, and without it "
+        "a cluster of this machine alone, which ends with the command",
+    )  # fmt: skip
+    worker_cpus: float = Field(1.0, gt=0, description="CPUs that a worker takes of its node")
+    worker_gpus: float = Field(
+        0.0, ge=0, description="GPUs that a worker takes: 0.25 lets four share one; 0: where CPUs are free"
+    )
+
+
+class Cluster:
+    """A cluster, and a stage's folder that its nodes share."""
+
+    def __init__(self, cfg: RayConfig, folder: Path) -> None:
+        self._cfg, self._folder, self._ray = cfg, folder, connected(cfg)
+        self._record = sha256_file(folder / "stage.json")
+        if not self.room:
+            nodes = [node["Resources"] for node in self._alive()]
+            got = ", ".join(f"{node.get('CPU', 0):g} CPUs and {node.get('GPU', 0):g} GPUs" for node in nodes)
+            fix = "lower ray.worker_cpus or ray.worker_gpus, or add a node that has as many"
+            raise EnvironmentMissing(
+                "no node has room for a worker", got=f"nodes of {got}", expected=self.needs, fix=fix
+            )
+
+    @property
+    def needs(self) -> str:
+        """What a worker takes, in words."""
+        gpus = f" and {self._cfg.worker_gpus:g} GPUs" if self._cfg.worker_gpus else ""
+        return f"{self._cfg.worker_cpus:g} CPUs{gpus}"
+
+    @cached_property
+    def room(self) -> int:
+        """How many workers the nodes have room for, if nobody else is there."""
+        shares = {"CPU": self._cfg.worker_cpus, "GPU": self._cfg.worker_gpus}
+        taken = [(name, share) for name, share in shares.items() if share]
+        return sum(
+            min(int(node["Resources"].get(name, 0.0) / share + 1e-6) for name, share in taken) for node in self._alive()
+        )
+
+    def _alive(self) -> list[dict[str, Any]]:
+        return [node for node in self._ray.nodes() if node["Alive"]]
+
+    def start_post(self, manner: Manner) -> RayPost:
+        """Ask for a worker somewhere."""
+        takes = {"num_cpus": self._cfg.worker_cpus, "num_gpus": self._cfg.worker_gpus, "max_restarts": 0}
+        host = self._actor.options(**takes).remote(manner.heartbeat_s)
+        how: dict[str, Any] = {
+            "folder": str(self._folder),
+            "record": self._record,
+            "cwd": os.getcwd(),
+            "path": sys.path,
+        }
+        how["version"] = cosfly.__version__
+        return RayPost(self._ray, host, manner, how, self.needs)
+
+    @cached_property
+    def _actor(self) -> Any:
+        return self._ray.remote(_host())
+
+
+class RayPost:
+    """The way to a worker process on a node."""
+
+    def __init__(self, ray: Any, host: Any, manner: Manner, how: dict[str, Any], needs: str) -> None:
+        self.pid: int | None = None
+        self.node: str | None = None
+        self._ray, self._host, self._manner, self._needs = ray, host, manner, needs
+        self._begun = host.begin.remote(**how, log_level=manner.log_level, place=manner.place)
+        self._said: Any = None
+        self._heard = deque[bytes]()
+        self._vitals: Vitals | None = Vitals(0.0, 0.0)
+
+    def send(self, what: Start | Item | None) -> None:
+        data = pickle.dumps(what)
+        with self._gone_as_eof():
+            if self.pid is None:
+                self._settle()
+            self._said = self._host.talk.remote(data)
+
+    def _settle(self) -> None:
+        """Wait until it has a node and has started there; raises EnvironmentMissing where the node will not do."""
+        while not self._ray.wait([self._begun], timeout=WAITING_S)[0]:
+            if self._manner.place == 0:
+                log.warning("worker 0 waits for a node with %s free; `ray status` tells who has them", self._needs)
+        node, pid, problem = self._ray.get(self._begun)
+        if problem:
+            raise EnvironmentMissing(where=f"node {node}", **problem)
+        self.node, self.pid = node, pid
+
+    def receive(self) -> Message:
+        while not self._heard:
+            if self._vitals is None:
+                raise EOFError
+            with self._gone_as_eof():
+                said, self._said = self._said or self._host.talk.remote(None), None
+                heard, vitals = self._ray.get(said)
+            self._heard.extend(heard)
+            self._vitals = None if vitals is None else Vitals(*vitals)
+        return pickle.loads(self._heard.popleft())
+
+    def look(self) -> Vitals | None:
+        return self._vitals  # the last that came: those of a node that is lost change no more
+
+    def kill(self, patience_s: float) -> None:
+        if self.pid is not None:
+            # By its host, so that it is known to be gone. A node that is lost does not answer.
+            with contextlib.suppress(self._ray.exceptions.RayError):
+                self._ray.get(self._host.end.remote(patience_s), timeout=ANSWER_S + patience_s)
+        self._ray.kill(self._host)
+
+    @contextlib.contextmanager
+    def _gone_as_eof(self) -> Iterator[None]:
+        errors = self._ray.exceptions
+        try:
+            yield
+        except (errors.RayActorError, errors.WorkerCrashedError, errors.ObjectLostError) as error:
+            log.debug("worker %d: %s", self._manner.place, error)
+            raise EOFError from None
+
+
+def _host() -> type:
+    """Make the class of the actors. Within a function: so Ray carries its code along, and not only its name, and it
+    can speak on a node that has another cosfly, or none."""
+
+    class Host:
+        """Starts a worker on its node, and passes on what it is told and says. One call at a time."""
+
+        def __init__(self, heartbeat_s: float) -> None:
+            import queue
+
+            self.heartbeat_s = heartbeat_s
+            self.inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+        def begin(
+            self, folder: str, record: str, cwd: str, path: list[str], version: str, log_level: int, place: int
+        ) -> tuple:
+            """Give the node's name, the worker's process id, and what is wrong with the node."""
+            import os
+            import socket
+            import sys
+            import threading
+            from pathlib import Path
+
+            import ray
+
+            node, python = socket.gethostname(), f"Python {sys.executable}"
+            try:
+                import cosfly
+            except ImportError as error:
+                fix = f"install cosfly {version} there, or start the node with the Python that has it"
+                return node, None, {"what": "cosfly is not there", "got": f"{error} ({python})", "fix": fix}
+            if cosfly.__version__ != version:
+                fix = "install the same on every node, then start Ray there again"
+                got = f"{cosfly.__version__} ({python})"
+                return node, None, {"what": "another cosfly", "got": got, "expected": version, "fix": fix}
+            from cosfly.reading.files import sha256_file
+            from cosfly.work.worker import Manner
+            from cosfly.work.worker_pool import LocalPost
+
+            try:
+                os.chdir(cwd)
+                is_same = sha256_file(Path(folder) / "stage.json") == record
+            except (OSError, cosfly.errors.InputError):
+                is_same = False
+            if not is_same:
+                got = f"no {Path(cwd) / folder}, or another folder of that name"
+                fix = "have run folder and inputs on storage that all nodes share, at the same path"
+                return node, None, {"what": "the stage's folder is not there", "got": got, "fix": fix}
+            if devices := ray.get_gpu_ids():
+                os.environ.setdefault("GLCONTEXT_DEVICE_INDEX", str(devices[0]))  # of EGL, which counts NVIDIA's first
+            sys.path.extend(place for place in path if place not in sys.path)  # a spawned process takes it over
+            vars(sys.modules["__main__"]).pop("__file__", None)  # Ray's own, which a spawned process would run again
+            self.post = LocalPost(Manner(os.getpid(), self.heartbeat_s, log_level, place))
+            threading.Thread(target=self._send, daemon=True).start()
+            return node, self.post.pid, None
+
+        def _send(self) -> None:
+            try:
+                while True:
+                    self.post.connection.send_bytes(self.inbox.get())
+            except OSError:
+                pass  # the worker is gone; `talk` tells
+
+        def talk(self, data: bytes | None) -> tuple:
+            """Pass something on; give what the worker has said since, and how it is: None if it is gone."""
+            if data is not None:
+                self.inbox.put(data)
+            heard: list[bytes] = []
+            try:
+                while self.post.connection.poll(0.0 if heard else self.heartbeat_s):
+                    heard.append(self.post.connection.recv_bytes())
+            except (EOFError, OSError):
+                return heard, None
+            vitals = self.post.look()
+            return heard, None if vitals is None and not heard else tuple(vitals or (0.0, 0.0))[:2]
+
+        def end(self, patience_s: float) -> None:
+            """End the worker; it is gone then."""
+            self.post.kill(patience_s)
+
+    return Host
+
+
+# --- the way in -------------------------------------------------------------------------------------------------------
+
+
+def connected(cfg: RayConfig) -> Any:
+    """Connect this process to the cluster, if it is not; gives the module `ray`.
+
+    Raises:
+        EnvironmentMissing: Ray is not installed, no cluster answers, or it has another Python or Ray.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # it would tell its makers
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # nor hide GPUs from who shares none
+    try:
+        import ray
+    except ImportError:
+        fix = "pip install 'cosfly[ray]', on every node"
+        raise EnvironmentMissing("the package ray is missing", where="--engine ray", fix=fix) from None
+    if ray.is_initialized():
+        return ray
+    address = cfg.address or os.environ.get("RAY_ADDRESS") or "local"
+    own: dict[str, Any] = {"object_store_memory": STORE_BYTES, "include_dashboard": False} if address == "local" else {}
+    _knock(address)
+    ends_it = signal.getsignal(signal.SIGTERM)
+    try:
+        ray.init(address, **own, log_to_driver=False, logging_level=logging.ERROR, namespace="cosfly")
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        raise _refused(address, error) from None
+    finally:
+        with contextlib.suppress(ValueError):  # not the main thread, where Ray leaves it alone
+            signal.signal(signal.SIGTERM, ends_it)
+    return ray
+
+
+def _knock(address: str) -> None:
+    """See that somebody is at a host and port: Ray itself would try for minutes."""
+    host, colon, port = address.rpartition(":")
+    if not colon:
+        return
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), ANSWER_S).close()
+    except (OSError, ValueError, OverflowError) as error:
+        raise _refused(address, error) from None
+
+
+def _refused(address: str, error: Exception) -> EnvironmentMissing:
+    versions = re.findall(r"(?:Ray|Python): (\S+)", str(error))
+    if len(versions) == 4:
+        theirs, ours = (f"Ray {ray} on Python {python}" for ray, python in (versions[:2], versions[2:]))
+        fix = "have the same on every node and here"
+        return EnvironmentMissing("a cluster of other versions", where=address, got=theirs, expected=ours, fix=fix)
+    fix = "start one there (ray start --head), or leave out --address for a cluster of this machine"
+    return EnvironmentMissing("no Ray cluster answers", where=address, got=str(error), fix=fix)
