@@ -67,7 +67,7 @@ def anchors_of(page: Path) -> set[str]:
 
 def test_links_and_pictures_exist():
     num_anchors = 0
-    for page in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]:
+    for page in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]:
         for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", page.read_text(encoding="utf-8")):
             if "://" in target:
                 continue
@@ -85,7 +85,7 @@ def test_ci_runs_a_command_of_the_readme():
 
 # --- the documents and the disk ---------------------------------------------------------------------------------------
 
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FOLDERS = ("cosfly", "caption", "distill", "release", "configs", "tests")
 CODE = "\n".join(p.read_text(encoding="utf-8") for f in FOLDERS[:4] for p in sorted((ROOT / f).rglob("*.py")))
 

@@ -11,7 +11,7 @@ import typer
 from cosfly.cli import app, options_first
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 TOWNS = [f"runs/learning/{name}" for name in ("grid", "old_town", "city_a", "city_b")]
 VARIABLES = {
     "trees": " ".join(f"--data {town}/render" for town in TOWNS),
