@@ -20,6 +20,7 @@ from cosfly.errors import ConfigError, InputError
 from cosfly.products.actions import shipped_actions
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import write_captions
+from cosfly.products.figures import draw_walks
 from cosfly.products.flights import find_flights
 from cosfly.products.predictions import Prediction, read_predictions
 from cosfly.space.blind import LEAST_WINDOWS
@@ -46,7 +47,6 @@ from distill.evaluation.scores import (
     ScoredAnswer,
     Scores,
     differences_of,
-    draw_walks,
     figures_of,
     macro_f1,
     read_scores,

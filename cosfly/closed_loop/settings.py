@@ -75,6 +75,9 @@ class FlyConfig(Config):
         16, ge=1, le=1024, description="flights that a worker flies at once: their frames are one batch to a student"
     )
     tree: bool = Field(True, description="draw the playback tree of what was flown")
+    trained_on: tuple[str, ...] | None = Field(
+        None, description="towns that the student was trained on: the score marks their flights; null: not known"
+    )
 
     @property
     def engine(self) -> str:

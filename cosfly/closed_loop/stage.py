@@ -19,6 +19,7 @@ import numpy as np
 from caption.run.own_files import vocabulary_of
 from caption.schema import CaptionConfig
 from cosfly.closed_loop.controller import CONTROLLER_FILE, Control, Controller, read_controls
+from cosfly.closed_loop.measures import score_pursuits
 from cosfly.closed_loop.pilots import Outlook, PilotAnswer, open_pilot
 from cosfly.closed_loop.settings import FlyConfig
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, Moment
@@ -27,6 +28,7 @@ from cosfly.geometry import headings_of, step_s
 from cosfly.planners import stage as planning
 from cosfly.planners.contract import PlanConfig
 from cosfly.products.boxes import read_boxes
+from cosfly.products.flight_scores import SCORE, SCORE_FORMAT
 from cosfly.products.motion import PlannedMotion
 from cosfly.products.others import Company
 from cosfly.products.pursuits import Pursuit, PursuitFrame, WalkStyle, pursuit_file, read_pursuit, write_pursuit
@@ -39,6 +41,7 @@ from cosfly.space.kernels import BoxIndex, obstacle_index, visibility
 from cosfly.work.config import Config
 from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.work.stage_folder import Kept, Resume, StageFolder, Tally
+from cosfly.work.store import write_model
 from distill.inference.stage import InferConfig
 
 log = logging.getLogger(__name__)
@@ -109,8 +112,8 @@ def run(
     others: Path | None = None,
 ) -> Path:
     """Reads a map as it is drawn and as it is flown in, walks and, where others move, `others.json`; writes `plan/`,
-    with whose first frames each flight begins, `pursuits/`, the flown `drone_trace.json` and, if it is asked for, the
-    playback tree `render/`. Gives the folder.
+    with whose first frames each flight begins, `pursuits/`, the flown `drone_trace.json`, `score.json` and, if it is
+    asked for, the playback tree `render/`. Gives the folder.
 
     Raises:
         ConfigError: settings that cannot be flown. InputError: a file is not what it must be. NothingKept: no walk has
@@ -175,6 +178,10 @@ def _fly_all(stage: StageFolder, cfg: FlightsConfig, inputs: Inputs, seed: int, 
     dropped = Counter(trace.drop_reason or "too_short" for trace in left_out)
     lost = Counter({"flights": len(numbers) - len(flown)} if len(flown) < len(numbers) else {})
     tally = Tally(input=len(traces), kept=len(flown), dropped=dropped, failed=lost)
+    if files:
+        score = score_pursuits(map(read_pursuit, files), trained_on=cfg.fly.trained_on, seed=seed)
+        write_model(stage.path / SCORE, score, SCORE_FORMAT)
+        files.append(stage.path / SCORE)
     stage.finish([stage.path / TRACES, *files], tally, flown=dict(sorted(facts.items())))
     log.info(
         "fly: %s: the person in view in %.1f %%, seen in %.1f %% of %d frames; %s; %.1f decisions/s",

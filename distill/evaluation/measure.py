@@ -14,6 +14,7 @@ from cosfly.chat.answers import Answer, read_line
 from cosfly.errors import InputError
 from cosfly.products.actions import RecordedActions, shipped_actions
 from cosfly.products.captions import FIELDS, Coc, Language, SentenceState, read_captions
+from cosfly.products.figures import Figure, draw_walks
 from cosfly.products.predictions import FAILED, Prediction
 from cosfly.products.splits import Split
 from cosfly.reading.documents import FileFormat, read_model, read_object, validated
@@ -24,7 +25,7 @@ from cosfly.work.provenance import MANIFEST_FORMAT
 from cosfly.work.stage_folder import read_manifest
 from distill.evaluation.bertscore import Metric, score_beside_floors
 from distill.evaluation.floors import WRITTEN, Floors, coc_of
-from distill.evaluation.scores import UNPARSED, Figure, ScoredAnswer, Scores, draw_walks, figures_of, score_answers
+from distill.evaluation.scores import UNPARSED, ScoredAnswer, Scores, figures_of, score_answers
 from distill.schema import Sample
 
 

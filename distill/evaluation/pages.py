@@ -10,9 +10,10 @@ from cosfly.escaping import for_markdown
 from cosfly.look.page import page
 from cosfly.products.actions import ActionSet
 from cosfly.products.captions import FIELDS
+from cosfly.products.figures import Figure
 from cosfly.reading.files import read_text
 from distill.evaluation.measure import STUDENT, UNPARSED_NAME, Evaluation, FigureSet, Measurement
-from distill.evaluation.scores import FIGURES, Figure
+from distill.evaluation.scores import FIGURES
 
 STYLE = "\n" + read_text(Path(__file__).with_name("pages.css"))
 COLORS = ("#2b6cb0", "#c05621", "#2f855a", "#6b46c1", "#b83280", "#4a5568")

@@ -4,8 +4,7 @@ A sample that got no answer (`answered` false: a picture could not be read, a se
 answer that does not parse is one: it decides nothing, and its texts score 0.
 
 Windows of a flight overlap, flights of a walk resemble each other and languages share windows, so samples are no
-independent draws. Whole walks are drawn instead, with replacement (Efron and Tibshirani 1993, sec. 8; the cluster
-bootstrap): the interval of a figure is the percentiles of what it becomes on such draws.
+independent draws: intervals are by bootstrap over whole walks (cosfly/products/figures.py).
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ from pydantic import BaseModel, ConfigDict
 from cosfly.errors import InputError
 from cosfly.products.actions import ActionSet, not_in_set
 from cosfly.products.captions import Coc, SentenceState, Verdict, verdict_on
+from cosfly.products.figures import Figure, draw_walks, figure_of_draws, interval_of
 from cosfly.products.predictions import FAILED, Prediction
 from cosfly.reading.tables import arrow_errors, row_groups
 from cosfly.work.store import atomic_file, dump_json, sha256_bytes
@@ -253,17 +253,6 @@ LESS_IS_BETTER = ("hard_conflict", "contradicted", "unread")
 NEITHER = ("soft_conflict", "abstain", "drawn_ahead", "tokens")  # more of it is neither better nor worse
 
 
-class Figure(BaseModel):
-    """A figure over `count` samples with its interval; all None where nothing is known."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    value: float | None
-    low: float | None
-    high: float | None
-    count: int
-
-
 @dataclass(frozen=True)
 class _Sums:
     """Of each walk the sums over its samples: numerators, denominators (walks, figures).
@@ -352,11 +341,6 @@ def _values(sums: _Sums, draws: np.ndarray) -> dict[str, np.ndarray]:
     return found | {f"decision/{token}": recall[:, number] for number, token in enumerate(sums.tokens)}
 
 
-def draw_walks(num_walks: int, resamples: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw as many walks as there are, with replacement, `resamples` times: (resamples, walks) counts."""
-    return rng.multinomial(num_walks, np.full(num_walks, 1.0 / num_walks), size=resamples).astype(float)
-
-
 def figures_of(scores: Scores, draws: np.ndarray, *, confidence: float) -> tuple[dict[str, Figure], dict[str, Figure]]:
     """Give all figures, and the accuracy of each decision that references have; draws: of the walks (`draw_walks`)."""
     names, walk = np.unique(scores.walk.astype(str), return_inverse=True)
@@ -367,25 +351,11 @@ def figures_of(scores: Scores, draws: np.ndarray, *, confidence: float) -> tuple
     references = sums.confusion.sum(axis=(0, 2))
     counts |= {"macro_f1": references.sum(), **{f"decision/{a}": references[i] for i, a in enumerate(sums.tokens)}}
     found = {
-        name: _figure(float(v[0]), drawn[name], int(counts[name]), len(names), confidence) for name, v in whole.items()
+        name: figure_of_draws(float(v[0]), drawn[name], int(counts[name]), len(names), confidence)
+        for name, v in whole.items()
     }
     decisions = {token: found[f"decision/{token}"] for i, token in enumerate(sums.tokens) if references[i]}
     return {name: found[name] for name in FIGURES}, decisions
-
-
-def _figure(value: float, drawn: np.ndarray, count: int, num_walks: int, confidence: float) -> Figure:
-    if count == 0 or np.isnan(value):
-        return Figure(value=None, low=None, high=None, count=count)
-    low, high = _interval(drawn, confidence) if num_walks > 1 else (None, None)  # one walk tells nothing of others
-    return Figure(value=value, low=low, high=high, count=count)
-
-
-def _interval(drawn: np.ndarray, confidence: float) -> tuple[float | None, float | None]:
-    drawn = drawn[~np.isnan(drawn)]  # draws in which nothing of the kind occurs
-    if not len(drawn):
-        return None, None
-    low, high = np.quantile(drawn, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return float(low), float(high)
 
 
 class Difference(BaseModel):
@@ -430,6 +400,6 @@ def _difference(value: float, drawn: np.ndarray, num_walks: int, confidence: flo
     drawn = drawn[~np.isnan(drawn)]
     if num_walks < 2 or not len(drawn):
         return Difference(value=float(value), low=None, high=None, p=None)
-    low, high = _interval(drawn, confidence)
+    low, high = interval_of(drawn, confidence)
     beyond = min((drawn <= 0).mean(), (drawn >= 0).mean())
     return Difference(value=float(value), low=low, high=high, p=float(min(1.0, max(2 * beyond, 1 / len(drawn)))))

@@ -1,0 +1,117 @@
+"""Figures of closed-loop flights: small records that can be counted by hand, and sums that add up."""
+
+import numpy as np
+import pytest
+from test_products_pursuits import frame, pursuit
+
+from cosfly.closed_loop.measures import MEASURES, measure, score_flights, score_pursuits
+from cosfly.errors import InputError
+from cosfly.products.flight_scores import SCORE, SCORE_FORMAT, Score, read_score
+from cosfly.work.store import write_model
+
+
+def flight(seen="", *, walk="path_0", ended="finished", num_walk_frames=None, **columns):
+    """A flight whose frames after the first decision show the person ("1") or not ("0")."""
+    frames = [frame(0.0, "lead"), frame(0.5, **{"answer": "ok"} | {k: v[0] for k, v in columns.items()})]
+    for i, one in enumerate(seen, 1):
+        more = {k: v[i] for k, v in columns.items() if i < len(v)}
+        answer = "end" if i == len(seen) else more.pop("answer", "ok")
+        if answer == "end":
+            more.pop("action", None), more.pop("answer", None)
+        frames.append(frame(0.5 + 0.5 * i, answer, visible=one == "1", **more))
+    num = num_walk_frames or len(seen)
+    return pursuit(frames=tuple(frames), walk=walk, episode=walk, ended=ended, num_walk_frames=num)
+
+
+def of(one):
+    return {name: a / b if b else None for name, (a, b) in measure(one).sums.items()}
+
+
+def test_a_flight_that_is_counted_by_hand():
+    found = of(flight("1100001101", num_walk_frames=20, ended="left"))  # one loss of 4 frames, one blink
+    assert found["in_view"] == 5 / 20
+    assert (found["tracked_frames"], found["lost"], found["reacquired"], found["reacquire_s"]) == (5, 1, 1, 2.0)
+    assert found["kept_s"] == 1.0
+    assert (found["success"], found["left"], found["crashed"]) == (0, 1, 0)
+
+
+@pytest.mark.parametrize(
+    ("seen", "more", "success"),
+    [
+        ("1111", {}, 1),
+        ("1000", {}, 1),  # hidden for 1.5 s: not lost yet
+        ("10000", {}, 0),  # lost at the end
+        ("10000001", {}, 1),  # lost and found again
+        ("1111", {"ended": "crashed"}, 0),
+        ("1111", {"distance_m": [20.0, 20.0, 20.0, 20.0, 41.0]}, 0),  # too far at the end
+        ("1111", {"distance_m": [20.0, 60.0, 20.0, 20.0, 20.0]}, 1),
+    ],
+)
+def test_success_is_what_stands_in_the_module(seen, more, success):
+    assert of(flight(seen, **more))["success"] == success
+
+
+def test_decisions_near_misses_and_failures_are_counted():
+    answers, actions = ["ok", "late", "ok", "ok", "ok"], ["hover", None, "yaw_left", "yaw_left", "hover"]
+    one = flight("11111", answer=answers, action=actions, clearance_m=[9.0, 2.0, 2.4, 9.0, 1.0], answer_s=[1.0, 3.0])
+    found = of(one)
+    assert found["no_decision"] == 1 / 5
+    assert found["changes_pmin"] == pytest.approx(2 / (5 * 0.5 / 60), rel=1e-3)
+    assert found["near_misses_pmin"] == pytest.approx(2 / (5 * 0.5 / 60), rel=1e-3)
+    assert found["decision_s"] == 2.0
+    assert sum(measure(one).answers.values()) == len(one.decisions)
+    crash = of(one.model_copy(update={"ended": "crashed"}))
+    assert crash["near_misses_pmin"] == pytest.approx(1 / (5 * 0.5 / 60), rel=1e-3)  # the last one was no miss
+
+
+def test_even_motion_has_no_jerk_and_a_turn_across_north_none_of_yaw():
+    poses = [(float(i), 0, 20, -43, (170 + 5 * i + 180) % 360 - 180, 0) for i in range(9)]
+    frames = tuple(frame(0.5 * i, "end" if i == 8 else "ok", pose=pose) for i, pose in enumerate(poses))
+    found = of(pursuit(frames=frames, num_walk_frames=8))
+    assert found["jerk_rms_mps3"] == pytest.approx(0, abs=1e-6)
+    assert found["yaw_jerk_rms_degps3"] == pytest.approx(0, abs=1e-6)
+    poses[4] = (5.0, *poses[4][1:])  # one pose is 1 m ahead: third differences 1, -3, 3, -1 of six
+    frames = tuple(frame(0.5 * i, "end" if i == 8 else "ok", pose=pose) for i, pose in enumerate(poses))
+    jerk = of(pursuit(frames=frames, num_walk_frames=8))["jerk_rms_mps3"]
+    assert jerk == pytest.approx(np.sqrt(20 / 6) / 0.5**3, rel=1e-3)
+
+
+def test_a_score_adds_up_is_read_as_written_and_marks_towns_that_were_trained_on(tmp_path):
+    flights = [flight("11" * (k + 1), walk=f"path_{k}") for k in range(4)] + [flight("10000", walk="path_9")]
+    score = score_pursuits(flights, trained_on=["Town_8"])
+    assert score.figures["success"].value == 4 / 5
+    assert score.figures["in_view"].value == (2 + 4 + 6 + 8 + 1) / (2 + 4 + 6 + 8 + 5)
+    assert score.figures["success"].low <= 4 / 5 <= score.figures["success"].high
+    for kind, groups in score.by.items():
+        assert sum(figures["success"].count for figures in groups.values()) == len(flights), kind
+    assert list(score.by["training"]) == ["never trained on"]
+    assert list(score_pursuits(flights, trained_on=["Town_7"]).by["training"]) == ["trained on"]
+    assert set(score.figures) == set(MEASURES)
+    write_model(tmp_path / SCORE, score, SCORE_FORMAT)
+    assert read_score(tmp_path) == score
+
+
+def test_walks_are_drawn_and_not_flights():
+    """Nine flights of one walk tell no more than one: the interval is as wide as of two walks."""
+    one, other = flight("1111", walk="a"), flight("10000", walk="b")
+    scored = [measure(one)] + [measure(other).model_copy(update={"episode": f"b{k}"}) for k in range(9)]
+    found = score_flights(scored, "s", "rules", "0" * 64).figures["success"]
+    assert (found.low, found.high, found.value, found.count) == (0.0, 1.0, 0.1, 10)
+
+
+def test_flights_of_two_students_or_an_episode_twice_are_refused():
+    one = flight("11")
+    with pytest.raises(InputError, match="one student"):
+        score_pursuits([one, one.model_copy(update={"student": "other", "episode": "b"})])
+    with pytest.raises(InputError, match="no flight"):
+        score_pursuits([])
+    with pytest.raises(ValueError, match="twice"):
+        score_pursuits([one, one])
+    assert Score.model_fields["flights"].is_required()
+
+
+def test_what_no_student_decides_names_the_episodes():
+    one, other = flight("1111"), flight("1000")
+    a, b = score_pursuits([one]), score_pursuits([other.model_copy(update={"student": "other"})])
+    assert a.episodes_sha256 == b.episodes_sha256
+    assert a.episodes_sha256 != score_pursuits([one.model_copy(update={"map_sha256": "cd" * 32})]).episodes_sha256
