@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 
 from cosfly.chat.budget import BudgetConfig
 from cosfly.chat.client import EndpointConfig
-from cosfly.chat.protocol import check_url
+from cosfly.chat.protocol import check_url, split_urls
 from cosfly.chat.student_chat import MAX_ANSWER_TOKENS
 from cosfly.chat.vllm_engine import VllmConfig
 from cosfly.look.frame_views import DEPTH_RANGE_M, Layout, View
@@ -315,7 +315,8 @@ class CaptionConfig(Config):
 
     teacher: str = Field(
         "rules",
-        description="`rules` (embedded, no model), the URL of an OpenAI-compatible endpoint, `vllm:MODEL_DIR`, "
+        description="`rules` (embedded, no model), the URL of an OpenAI-compatible endpoint, or several of one model "
+        "with commas between, `vllm:MODEL_DIR`, "
         "`file:PATH`, captions of somebody else, one a line, or `student:PATH`, what `distill infer` wrote",
     )
     writing: Writing = Field(
@@ -379,9 +380,9 @@ class CaptionConfig(Config):
     def _known_teacher(self) -> Self:
         if self.teacher_kind == "endpoint":
             try:
-                check_url(self.teacher)
+                split_urls(self.teacher)
             except ValueError as error:
-                kinds = "`rules`, a URL, vllm:MODEL_DIR, file:PATH or student:PATH"
+                kinds = "`rules`, URLs, vllm:MODEL_DIR, file:PATH or student:PATH"
                 raise ValueError(f"teacher must be {kinds}; {error}") from None
         return self
 
@@ -406,8 +407,9 @@ class CaptionConfig(Config):
     @property
     def most_in_flight(self) -> int:
         """Requests that the teacher takes at once."""
-        asked = {"endpoint": self.endpoint.concurrency, "vllm": self.vllm.batch}
-        return asked.get(self.teacher_kind, 1)
+        if self.teacher_kind == "endpoint":
+            return self.endpoint.concurrency * len(split_urls(self.teacher))
+        return self.vllm.batch if self.teacher_kind == "vllm" else 1
 
     @property
     def num_images(self) -> int:

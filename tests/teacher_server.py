@@ -90,6 +90,7 @@ class TeacherServer:
         respond: Callable[[dict], tuple[int, dict] | Sent | Wild | None] | None = None,
         model_facts: dict | None = None,
         list_models: Callable[[], Sent | Wild | None] | None = None,
+        port: int = 0,
     ) -> None:
         """
         Args:
@@ -106,7 +107,7 @@ class TeacherServer:
         self.most_at_once = 0
         self.active = 0
         self._lock = threading.Lock()
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(self))
+        self._server = ThreadingHTTPServer(("127.0.0.1", port), _handler(self))
         self._server.daemon_threads = True
         self._thread = threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
 

@@ -27,8 +27,9 @@ from caption.teachers.prompts import make_question
 from caption.teachers.teacher import AskingTeacher, first_budget
 from cosfly.chat import client
 from cosfly.chat.answers import AnswerBook
-from cosfly.chat.client import ChatClient, EndpointConfig
+from cosfly.chat.client import EndpointConfig
 from cosfly.chat.contract import NoAnswer, Reply, started
+from cosfly.chat.servers import ChatClient
 from cosfly.errors import ResumeError, TeacherError
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree

@@ -26,8 +26,9 @@ from caption.schema import CaptionConfig
 from caption.teachers import teacher
 from caption.teachers.teacher import make_engine
 from cosfly.chat.answers import AnswerBook, KeptAnswers
-from cosfly.chat.client import ChatClient, EndpointConfig
+from cosfly.chat.client import EndpointConfig
 from cosfly.chat.contract import NoAnswer, Reply, Request, started
+from cosfly.chat.servers import ChatClient
 from cosfly.chat.vllm_engine import VllmEngine
 from cosfly.errors import ConfigError, EnvironmentMissing, TeacherError
 from cosfly.products.actions import shipped_actions

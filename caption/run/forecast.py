@@ -129,7 +129,7 @@ def _scaled(
     which = ("low", "expected", "high")
     cost = Estimate(*(cfg.budget.cost(getattr(prompt, name), getattr(completion, name)) for name in which))
     per_window = estimate(seconds).scaled(num_windows)
-    in_flight = (cfg.endpoint if cfg.teacher_kind == "endpoint" else cfg.reader).concurrency
+    in_flight = cfg.most_in_flight if cfg.teacher_kind == "endpoint" else cfg.reader.concurrency
     # At best every slot works as fast as in the trial; at worst the server is no faster than it was with the trial's
     # windows.
     time_s = Estimate(

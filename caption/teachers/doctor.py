@@ -10,7 +10,7 @@ import asyncio
 import base64
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,10 +34,19 @@ from caption.truth.gold import read_gold
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import WAYS, more_fields, way_of
 from cosfly.chat.answers import KeptAnswers
-from cosfly.chat.client import ChatClient
+from cosfly.chat.client import ChatServer
 from cosfly.chat.contract import Request
-from cosfly.chat.protocol import ERROR_INSTEAD, THOUGHT_FIELDS, final_text, read_body, request_body, response_format
+from cosfly.chat.protocol import (
+    ERROR_INSTEAD,
+    THOUGHT_FIELDS,
+    final_text,
+    read_body,
+    request_body,
+    response_format,
+    split_urls,
+)
 from cosfly.chat.refusals import MEANINGS, Refusal
+from cosfly.chat.servers import ChatClient
 from cosfly.chat.wire import Response
 from cosfly.errors import TeacherError
 from cosfly.look.frame_views import VIEW_FILES
@@ -69,9 +78,26 @@ def examine_endpoint(
     """Try an endpoint. It is usable if no finding is `unusable`.
 
     Args:
+        url: an address, or several with commas between: each is tried, and then whether all serve one model.
         ways: of writing that are tried. as_reader: none is, it reads prose of others and sees no picture.
     """
-    return asyncio.run(_Examination(url, cfg, vocabulary, ways, as_reader).run())
+    try:
+        urls = split_urls(url)
+    except ValueError as error:
+        raise TeacherError(str(error)) from None
+    if len(urls) == 1:
+        return asyncio.run(_Examination(url, cfg, vocabulary, ways, as_reader).run())
+    found = [(one, asyncio.run(_Examination(one, cfg, vocabulary, ways, as_reader).run())) for one in urls]
+    findings = [replace(finding, name=f"{one}: {finding.name}") for one, findings in found for finding in findings]
+    models = {
+        one: next(finding.detail for finding in findings if finding.state == "ok")
+        for one, findings in found
+        if findings[0].state == "ok"
+    }
+    if len(set(models.values())) > 1:
+        listed = ", ".join(f"{one}: {model}" for one, model in models.items())
+        findings.append(Finding("one model", "unusable", f"they serve different ones: {listed}; leave some out"))
+    return findings
 
 
 # --- what one request gave --------------------------------------------------------------------------------------------
@@ -131,7 +157,7 @@ class Probe:
         return count if type(count) is int else None
 
 
-def read_probe(response: Response, request: Request, client: ChatClient, seconds: float) -> Probe:
+def read_probe(response: Response, request: Request, client: ChatServer, seconds: float) -> Probe:
     """Read a response; `seconds`: what it took."""
     found = client.read(response, request, is_structured=False)
     if isinstance(found, Refusal):
@@ -157,7 +183,8 @@ class _Examination:
     ) -> None:
         self.cfg, self.vocabulary, self.ways, self.as_reader = cfg, vocabulary, ways, as_reader
         self.takes_schema = cfg.endpoint.json_schema
-        self.client = ChatClient(url, cfg.endpoint)
+        self.engine = ChatClient(url, cfg.endpoint)
+        [self.client] = self.engine.servers
         self.findings: list[Finding] = []
         self.tokens_per_image: int | None = None
         self.num_images = cfg.num_images
@@ -166,7 +193,7 @@ class _Examination:
 
     async def run(self) -> list[Finding]:
         try:
-            await self.client.start()
+            await self.engine.start()
         except TeacherError as error:
             return [Finding("model", "unusable", str(error))]
         else:
@@ -179,7 +206,7 @@ class _Examination:
                 elif await self._image() and await self._many_images() and await self._largest_prompt():
                     await self._writing()
         finally:
-            await self.client.close()
+            await self.engine.close()
         return self.findings
 
     def _add(self, name: str, state: State, detail: str) -> None:
@@ -376,7 +403,7 @@ class _Examination:
     async def _reading(self) -> None:
         """Find whether it reads true captions into claims."""
         gold = [caption.model_copy(update={"errors": ()}) for caption in read_gold() if caption.claims][:READ_CAPTIONS]
-        model = AskedModel(KeptAnswers(self.client, None), self.cfg.reader, 0)
+        model = AskedModel(KeptAnswers(self.engine, None), self.cfg.reader, 0)
         check = await measure_reader(Reader([model], self.vocabulary), gold)
         is_good = not check.num_unreadable and not check.num_flagged and check.num_claims >= check.num_sentences
         self._add(

@@ -32,9 +32,9 @@ from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft, more_fields, way_of
 from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget
-from cosfly.chat.client import ChatClient
 from cosfly.chat.contract import Engine, NoAnswer, Reply, Request, Troubles
 from cosfly.chat.protocol import BYTES_PER_TOKEN, PIXELS_PER_TOKEN
+from cosfly.chat.servers import ChatClient
 from cosfly.chat.vllm_engine import VllmEngine
 from cosfly.errors import TeacherError
 from cosfly.look.frame_views import Pictures

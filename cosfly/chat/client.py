@@ -1,22 +1,19 @@
-"""Engine `endpoint`: the HTTP client of a chat-completions server. It retries what may pass and names what cannot.
+"""One chat-completions server: what is sent to it, and what its answers mean. `servers` asks it, and others beside it.
 
 The key comes from the environment variable COSFLY_API_KEY and goes into the request header only.
 """
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import os
-import random
-import time
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import httpx
 from pydantic import Field
 
-from cosfly.chat.contract import NoAnswer, Reply, Request, Troubles
+from cosfly.chat.contract import NoAnswer, Reply, Request
 from cosfly.chat.protocol import (
     ERROR_INSTEAD,
     base_url,
@@ -50,7 +47,7 @@ class EndpointConfig(Config):
     top_p: float = Field(0.95, gt=0, le=1, description="nucleus sampling")
     max_tokens: int = Field(1024, ge=64, description="longest answer, tokens")
     concurrency: MayDiffer[int] = Field(
-        16, ge=1, le=4096, description="most requests in flight; fewer while the server says it is busy"
+        16, ge=1, le=4096, description="most requests in flight at each server; fewer while it says it is busy"
     )
     timeout_s: MayDiffer[float] = Field(
         120.0, gt=0, description="limit of one request, from its first byte to its last"
@@ -88,7 +85,7 @@ class EndpointConfig(Config):
 
 
 @dataclass(frozen=True)
-class _Failure:
+class Failure:
     """A try that may go better next time; wait_s: as the server says, None: as the settings do."""
 
     cause: str
@@ -97,12 +94,11 @@ class _Failure:
 
 
 @dataclass
-class _Ask:
+class Ask:
     """A request and what its tries have shown. suspect: the refusal that its schema may be the cause of."""
 
     request: Request
     body: dict[str, Any]
-    deadline_s: float = float("inf")
     suspect: Refusal | None = None
     is_structured: bool = False
 
@@ -111,12 +107,14 @@ class _Ask:
         return self.body | ({"response_format": response_format(self.request.schema)} if self.is_structured else {})
 
 
-class ChatClient:
-    """Sends requests to one server."""
+class Unreachable(TeacherError):
+    """Nobody answers at an address."""
 
-    kind: Literal["endpoint"] = "endpoint"
 
-    def __init__(self, url: str, cfg: EndpointConfig, troubles: Troubles | None = None) -> None:
+class ChatServer:
+    """Sends requests to one server, each once."""
+
+    def __init__(self, url: str, cfg: EndpointConfig) -> None:
         """
         Raises:
             TeacherError: it is no URL that can be asked, or holds a secret.
@@ -128,7 +126,6 @@ class ChatClient:
         self.url = self.where = base_url(url)
         self.cfg, self.model = cfg, ""
         self.throttle = Throttle(cfg.concurrency)
-        self.troubles = troubles or Troubles()
         self.model_entry: dict[str, Any] = {}  # what the server's list says about the model
         self._is_schema_refused = not cfg.json_schema
         self._num_doubts = 0  # refusals in a row that went away without the schema
@@ -137,7 +134,6 @@ class ChatClient:
         self._key = os.environ.get(KEY_VARIABLE, "")
         most_bytes = int(cfg.max_reply_mb * 1e6)
         self._connections = Connections(self._key, timeout_s=cfg.timeout_s, most_bytes=most_bytes)
-        self._jitter = random.Random()  # times of retries only: no product depends on it
 
     async def close(self) -> None:
         """Close all connections; none may be in use."""
@@ -153,75 +149,47 @@ class ChatClient:
         """
         return await self._connections.exchange(f"{self.url}/chat/completions", encode_body(payload))
 
-    async def answer(self, request: Request) -> Reply:
-        """Send a request until it is answered.
+    def ask_of(self, request: Request) -> Ask:
+        """Give a request as it is sent to this server."""
+        return Ask(request, request_body(self.model, request, with_ids=self.cfg.image_uuid))
 
+    async def attempt(self, ask: Ask, given_s: float) -> Reply | Failure:
+        """Send a request once; where its schema may be what the server refuses, at once again without it.
+
+        Args:
+            given_s: when it was let through, by the throttle's clock.
         Raises:
-            NoAnswer: not within the tries and the time that the settings allow, or the server refuses it.
-            TeacherError: no request will get an answer.
+            NoAnswer: the server refuses this request. TeacherError: it would refuse any.
         """
-        ask = _Ask(request, request_body(self.model, request, with_ids=self.cfg.image_uuid))
-        found = _Failure("no_answer", "")
-        for attempt in range(self.cfg.max_tries):
-            answered = await self._try(ask)
-            if isinstance(answered, Reply):
-                self.throttle.succeeded()
-                self.troubles.answered()
-                log.debug("%s: answered at try %d", self.where, attempt + 1)
-                return answered
-            found = answered
-            is_last = attempt + 1 == self.cfg.max_tries
-            pause_s = self._wait_s(attempt) if found.wait_s is None else found.wait_s
-            is_late = not is_last and time.monotonic() + pause_s >= ask.deadline_s
-            if self.troubles.failed(found.detail):
-                what = "given up" if is_last or is_late else "trying again"
-                log.warning("%s: %s; %s, failed tries so far: %d", self.where, found.detail, what, self.troubles.num)
-            if is_late:
-                words = f"no answer within {self.cfg.total_timeout_s:g} s; the last: {found.detail}"
-                raise NoAnswer("total_timeout", words)
-            if not is_last:
-                await asyncio.sleep(pause_s)
-        raise NoAnswer(found.cause, found.detail)
-
-    async def _try(self, ask: _Ask) -> Reply | _Failure:
-        found = await self._send_in_turn(ask)
+        try:
+            # Another answer may have told meanwhile.
+            ask.is_structured = not (self._is_schema_refused or ask.suspect)
+            response = await self.send(ask.payload)
+            found = self.read(response, ask.request, is_structured=ask.is_structured)
+            if ask.is_structured and isinstance(found, Refusal) and found.may_be_schema:
+                ask.suspect, ask.is_structured = found, False
+                response = await self.send(ask.payload)
+                found = self.read(response, ask.request, is_structured=False)
+        except (TimeoutError, httpx.TimeoutException):
+            self.throttle.failed()
+            return Failure("timeout", f"no answer within {self.cfg.timeout_s:g} s")
+        except httpx.RequestError as error:  # also a body that is not compressed as it claims
+            self.throttle.failed()
+            return Failure("connection", self.clean(f"{type(error).__name__} {error}"))
+        if isinstance(found, str):
+            return Failure("bad_reply", found)
         if isinstance(found, Refusal):
-            raise NoAnswer(found.code, found.said, fix=found.meaning.fix, is_final=True)
-        if isinstance(found, _Failure):
-            return found
+            return self._refused(found, ask, given_s, response.retry_after_s)
+        self.throttle.succeeded()
         self._judge_schema(ask)
         self._warn_of_oddities(found)
         return self._with_full_context(found, ask.request)
 
-    async def _send_in_turn(self, ask: _Ask) -> Reply | Refusal | _Failure:
-        """Send a request once; where its schema may be what the server refuses, at once again without it."""
-        given_s = 0.0
-        try:
-            async with self.throttle.slot() as given_s:
-                ask.deadline_s = min(ask.deadline_s, time.monotonic() + self.cfg.total_timeout_s)
-                # Another answer may have told meanwhile.
-                ask.is_structured = not (self._is_schema_refused or ask.suspect)
-                response = await self.send(ask.payload)
-                found = self.read(response, ask.request, is_structured=ask.is_structured)
-                if ask.is_structured and isinstance(found, Refusal) and found.may_be_schema:
-                    ask.suspect, ask.is_structured = found, False
-                    response = await self.send(ask.payload)
-                    found = self.read(response, ask.request, is_structured=False)
-        except (TimeoutError, httpx.TimeoutException):
-            self.throttle.failed()
-            return _Failure("timeout", f"no answer within {self.cfg.timeout_s:g} s")
-        except httpx.RequestError as error:  # also a body that is not compressed as it claims
-            self.throttle.failed()
-            return _Failure("connection", self.clean(f"{type(error).__name__} {error}"))
-        if isinstance(found, str):
-            return _Failure("bad_reply", found)
-        return found if isinstance(found, Reply) else self._refused(found, ask, given_s, response.retry_after_s)
-
-    def _refused(self, refusal: Refusal, ask: _Ask, given_s: float, wait_s: float | None = None) -> Refusal | _Failure:
+    def _refused(self, refusal: Refusal, ask: Ask, given_s: float, wait_s: float | None = None) -> Failure:
         """Tell what a refusal means; wait_s: as the server says.
 
         Raises:
-            TeacherError: no request will be answered.
+            NoAnswer: this request will not be answered. TeacherError: none will.
         """
         status = refusal.status
         if refusal.meaning.ends_run:
@@ -235,13 +203,13 @@ class ChatClient:
                 self.throttle.failed()
             poisoned = f" ({POISONED})" if status == 500 and self._was_too_long and ask.request.digests else ""
             asked = f" (asks to wait {wait_s:.0f} s)" if is_long else ""
-            return _Failure(f"http_{status}", refusal.said + asked + poisoned, wait_s)
+            return Failure(f"http_{status}", refusal.said + asked + poisoned, wait_s)
         if refusal.kind != "content":
             self.stop_if_fatal(refusal)
         self._was_too_long |= refusal.kind == "too_long"
-        return refusal
+        raise NoAnswer(refusal.code, refusal.said, fix=refusal.meaning.fix, is_final=True)
 
-    def _judge_schema(self, ask: _Ask) -> None:
+    def _judge_schema(self, ask: Ask) -> None:
         """Learn from an answer whether the schema is what was refused: only a request that is answered without it
         tells.
 
@@ -282,10 +250,6 @@ class ChatClient:
             self._warned.add(oddity)
             log.warning("%s: %s", self.where, words)
 
-    def _wait_s(self, attempt: int) -> float:
-        longest = min(self.cfg.max_backoff_s, self.cfg.backoff_s * 2.0**attempt)
-        return self._jitter.uniform(0.5, 1.0) * longest
-
     @property
     def context(self) -> int | None:
         """Tokens that prompt and answer may have together, where the server's list of models says so."""
@@ -294,14 +258,17 @@ class ChatClient:
 
     # --- errors ---
 
-    async def start(self) -> None:
-        """Ask which models there are and find ours among them.
+    async def start(self, wanted: str | None = None) -> None:
+        """Ask which models there are and find ours among them: `wanted`, else that of the settings.
 
         Raises:
-            TeacherError: unreachable, refuses the key, does not speak the protocol, or lacks the model.
+            Unreachable: nobody answers, or not yet again.
+            TeacherError: it refuses the key, does not speak the protocol, or lacks the model.
         """
-        wanted, entries = self.cfg.model, await self.models()
+        wanted, entries = wanted or self.cfg.model, await self.models()
         if isinstance(entries, Refusal):
+            if self.model_entry and entries.may_pass:
+                raise Unreachable("lists no models now", where=self.where, got=entries.said)
             if wanted:
                 self.model = wanted  # some hosts list no models; the first request will tell
                 return
@@ -326,7 +293,7 @@ class ChatClient:
         """Ask which models there are; gives what is said in place of a list.
 
         Raises:
-            TeacherError: unreachable, or refuses the key.
+            Unreachable: nobody answers. TeacherError: it refuses the key.
         """
         try:
             response = await self._connections.exchange(f"{self.url}/models")
@@ -334,7 +301,7 @@ class ChatClient:
             is_late = isinstance(error, TimeoutError | httpx.TimeoutException)
             why = f"no answer within {self.cfg.timeout_s:g} s" if is_late else f"{type(error).__name__} {error}"
             fix = "start the server or check its address"
-            raise self.error("cannot reach the teacher", got=self.clean(why), fix=fix) from None
+            raise Unreachable("cannot reach the teacher", where=self.where, got=self.clean(why), fix=fix) from None
         if response.status in (401, 403):
             self.stop_if_fatal(self.refusal(response))
         entries = None if response.is_cut else read_models(response)

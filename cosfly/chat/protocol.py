@@ -56,6 +56,20 @@ def check_url(url: str) -> None:
         raise ValueError(f"the port must be from 1 to 65535{shown}")
 
 
+def split_urls(urls: str) -> list[str]:
+    """Give the addresses of servers that stand with commas between.
+
+    Raises:
+        ValueError: one is none that can be asked (check_url), or stands there twice.
+    """
+    found = [url.strip() for url in urls.split(",")]
+    for number, url in enumerate(found):
+        check_url(url)
+        if base_url(url) in map(base_url, found[:number]):
+            raise ValueError(f"a server stands in the list twice, got {url!r}")
+    return found
+
+
 def base_url(url: str) -> str:
     """Give the API root of whatever form of URL a user has: host, host/v1, or the whole chat-completions path."""
     root = url.rstrip("/").removesuffix("/chat/completions").rstrip("/")

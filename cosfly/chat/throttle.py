@@ -8,10 +8,8 @@ Retry-After holds all requests back, not only the one that was told.
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 
 FIRST_LIMIT = 8
 RAMP_PER_ANSWER = 2.0  # triples the limit per round
@@ -19,7 +17,7 @@ RAMP_S = 1.5  # doubles it: 256 in flight after 7.5 s, when a model that thinks 
 
 
 class Throttle:
-    """Hands out slots for requests. All methods run on one event loop."""
+    """Counts the requests in flight at one server. All methods run on one event loop."""
 
     def __init__(self, ceiling: int, clock: Callable[[], float] = time.monotonic) -> None:
         self.ceiling = ceiling
@@ -30,37 +28,35 @@ class Throttle:
         self._last_decrease_s = float("-inf")
         self._is_ramping = True
         self._grows_at_s = float("inf")  # from the first request on
-        self._changed = asyncio.Condition()
 
-    @contextlib.asynccontextmanager
-    async def slot(self) -> AsyncIterator[float]:
-        """Wait for a slot and hold it; yields the time at which it was given."""
-        async with self._changed:
-            if self._grows_at_s == float("inf"):
-                self._grows_at_s = self._clock() + RAMP_S
-            while self.num_active >= int(self.limit):
-                await self._wait()
-            self.num_active += 1
-        try:
-            while (wait_s := self._held_until_s - self._clock()) > 0:
-                await asyncio.sleep(wait_s)
-            yield self._clock()
-        finally:
-            async with self._changed:
-                self.num_active -= 1
-                self._changed.notify(max(int(self.limit) - self.num_active, 0))
+    @property
+    def load(self) -> float:
+        """The share of its limit that is in flight."""
+        return self.num_active / self.limit
 
-    async def _wait(self) -> None:
-        """Wait until a slot may be free: one was given back, or the limit has grown."""
-        if not self._is_ramping:
-            await self._changed.wait()
-            return
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(max(0.0, self._grows_at_s - self._clock())):
-                await self._changed.wait()
-        if self._is_ramping and self._clock() >= self._grows_at_s:
+    def restart(self) -> None:
+        """Begin anew, and with one: the server was away."""
+        self.limit, self._is_ramping, self._grows_at_s, self._held_until_s = 1.0, True, float("inf"), 0.0
+
+    def has_room(self) -> bool:
+        """Tell whether one more may be in flight; where that is asked and it is time, the limit grows."""
+        now_s = self._clock()
+        if self._grows_at_s == float("inf"):
+            self._grows_at_s = now_s + RAMP_S
+        if now_s < self._held_until_s:
+            return False
+        if self.num_active >= int(self.limit) and self._is_ramping and now_s >= self._grows_at_s:
             self.limit = min(float(self.ceiling), 2.0 * self.limit)
-            self._grows_at_s = self._clock() + RAMP_S
+            self._grows_at_s = now_s + RAMP_S
+        return self.num_active < int(self.limit)
+
+    def room_in_s(self) -> float:
+        """Give the time after which there may be room though nothing was answered, s; infinite: never."""
+        now_s = self._clock()
+        if now_s < self._held_until_s:
+            return self._held_until_s - now_s
+        is_growing = self._is_ramping and self.limit < self.ceiling
+        return max(0.0, self._grows_at_s - now_s) if is_growing else float("inf")
 
     def failed(self) -> None:
         """Note a request that failed in another way than for load: no more of them for now."""

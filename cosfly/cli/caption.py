@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 
 app = options.stage_group("Step 7: Chain-of-Cause captions in English and Chinese.")
 
-TEACHER = "rules, an OpenAI-compatible endpoint's URL, vllm:MODEL_DIR, file:PATH, or student:PATH of `distill infer`."
+TEACHER = (
+    "rules, an OpenAI-compatible endpoint's URL or several with commas between, vllm:MODEL_DIR, file:PATH, or "
+    "student:PATH of `distill infer`."
+)
 READERS = (
     "URL of an endpoint that reads prose into claims; give it twice for two models, else one is asked in two orders."
 )
@@ -99,7 +102,7 @@ def _tell_forecast(job: Job, tree: Path, target: Path) -> None:
 @takes()
 def caption_doctor(
     job: Job,
-    url: Annotated[str, Argument(help="URL of an OpenAI-compatible endpoint.")],
+    url: Annotated[str, Argument(help="URL of an OpenAI-compatible endpoint, or several with commas between.")],
     model: Model = None,
     as_reader: Annotated[
         bool, Option("--as-reader", help="Try how it reads prose of others, for --reader; it needs no pictures.")

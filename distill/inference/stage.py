@@ -14,9 +14,9 @@ from typing import Any, Literal
 from pydantic import Field
 
 from cosfly.chat.answers import Answer, AnswerBook, KeptAnswers
-from cosfly.chat.client import ChatClient
 from cosfly.chat.contract import Engine, NoAnswer, Request, started
-from cosfly.chat.protocol import answer_key, base_url
+from cosfly.chat.protocol import answer_key, split_urls
+from cosfly.chat.servers import ChatClient, server_names
 from cosfly.chat.student_chat import TAUGHT, StudentEndpointConfig, picture_to_send, read_taught, student_request
 from cosfly.chat.vllm_engine import VllmConfig, VllmEngine
 from cosfly.errors import ConfigError, InputError, TeacherError
@@ -162,7 +162,7 @@ class InferConfig(Config):
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a run reads. model: a folder, or the URL of a server."""
+    """What a run reads. model: a folder, or the URL of a server, or of several with commas between."""
 
     samples: Sequence[Sample]
     trees: Mapping[str, Path]
@@ -196,7 +196,8 @@ async def _answering(
             yield local.answers(inputs.samples, advance)
         return
     engine = _make_engine(cfg, inputs)
-    in_flight = cfg.vllm.batch if cfg.engine == "vllm" else cfg.endpoint.concurrency
+    is_server = cfg.engine == "endpoint"
+    in_flight = cfg.endpoint.concurrency * len(split_urls(str(inputs.model))) if is_server else cfg.vllm.batch
     async with started(engine):
         max_pixels = cfg.max_pixels or (inputs.taught_pixels if cfg.engine == "vllm" else 0)
         how: Any = {"max_pixels": max_pixels, "in_flight": in_flight}
@@ -235,7 +236,7 @@ def _identified(cfg: InferConfig, url: str, out: Path) -> tuple[InferConfig, str
     Returns:
         The settings, and a digest of the server's address, which itself stays out of records.
     """
-    server = sha256_bytes(base_url(url).encode())[:16]
+    server = sha256_bytes(server_names(url).encode())[:16]
     if (out / "manifest.json").exists():
         facts = read_manifest(out).facts
         name = str(facts.get("model"))
