@@ -58,6 +58,7 @@ RUN = ["diverse", "shared/run"]
     ("arguments", "job", "commands"),
     [
         (RUN, {"SLURM_JOB_NUM_NODES": "1", "SLURM_CPUS_PER_TASK": "16"}, ["run"]),
+        (RUN, {"SLURM_JOB_NUM_NODES": "2", "SLURM_JOB_NODELIST": "n[1-2]", "SLURM_JOB_ID": "77"}, ["run"]),
         (
             [*RUN, "grid", "park"],
             {"SLURM_ARRAY_TASK_ID": "1", "SLURM_CPUS_PER_TASK": "16"},
@@ -68,6 +69,7 @@ RUN = ["diverse", "shared/run"]
 def test_every_command_of_the_script_is_one_that_cosfly_takes(tmp_path, arguments, job, commands):
     found = commands_of(tmp_path, arguments, job)
     assert [parsed(words) for words in found] == commands
+    assert ("ray" in found[0]) == ("SLURM_JOB_NODELIST" in job)
     if len(found) > 1:
         assert all(words[1:5] == ["--config", "diverse", "--town", "park"] for words in found)
         assert all(words[words.index("--out") + 1] == f"shared/run/park/{words[0]}" for words in found)

@@ -16,7 +16,7 @@ import tempfile
 import timeit
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,7 @@ from cosfly.work.journal import Journal
 from cosfly.work.runner import Item, Outcome, Work, run_items
 from cosfly.work.stage_events import read_events
 from cosfly.work.stage_folder import StageFolder
-from cosfly.work.worker_pool import Watch, WorkerPool, _Attempt, _Worker
+from cosfly.work.worker_pool import Watch
 
 STAGES = ("plan", "render", "inspect", "caption", "release")
 OPS = {"render": 5.1, "inspect": 9.5, "caption": 2.2, "release": 3.2}  # opens and mkdirs of a frame, counted by strace
@@ -36,6 +36,9 @@ NODE_USD_H = 2.5 + 16 * 0.04  # stated: such a GPU, and its cores
 TEACHER_USD_H, WINDOWS_S = 3.5, 3.7  # stated; measured: vLLM on one H200, 15 pictures a request, a JSON schema
 STORAGE_OPS_S, STORAGE_S = 20_000.0, 1e-3  # stated: what a parallel file system serves, and what one operation takes
 NODE_LOSSES_H, WORKER_LOSSES_H = 1 / 6300, 1e-3  # 419 in 54 days of 2,048 nodes (Llama 3, 2024); stated
+RAY_S = (
+    8e-4  # of the driver, measured: an item on a Ray cluster of two workers that do nothing; a heartbeat is a call too
+)
 BEAT_S, NEVER = Watch().heartbeat_s, float("inf")
 PAPER = {"A": (16, 2, 94.7, 814), "B": (12, 1, 91.5, 497), "C": (18, 2, 85.0, 1178), "D": (1, 1, 86.5, 175)}
 PILOT = {1: 1.07, 2: 1.43, 4: 2.55, 6: 2.68}  # frames/s of one GPU by workers (tab:render_scaling); no more beyond
@@ -51,7 +54,7 @@ class Cluster:
     workers: int = NODE_WORKERS  # on each
     start_s: float = 0.0  # a worker reads maps and compiles
     hand_out_s: float = 0.0  # the driver, an item: its message, its line in the journal on the disk
-    beat_s: float = 0.0  # the driver, a heartbeat of one worker among so many
+    beat_s: float = 0.0  # the driver, a heartbeat
     finish_s: float = 0.0  # the driver, an item, when the stage ends
     worker_losses_h: float = 0.0
     node_losses_h: float = 0.0
@@ -185,7 +188,7 @@ def nothing() -> Work:
 
 def driver() -> dict[str, float]:
     """Measure the driver on this machine, s, least of three: a line in a journal on the disk; an item from hand to hand
-    with all that is written of it; what a heartbeat costs for each worker that there is."""
+    with all that is written of it."""
 
     def least_s(work: Callable[[], object], count: int, of: int = 1) -> float:
         return min(timeit.repeat(work, number=count, repeat=3)) / count / of
@@ -198,10 +201,7 @@ def driver() -> dict[str, float]:
 
         found = {"journal": least_s(lambda: journal.append({"id": "path_00000/ORI", "seconds": 1.0}), 500)}
         found["item"] = least_s(stage, 1, 2000)
-    pool = WorkerPool(nothing, (), 10000, Watch(), None, lambda *_: None)  # type: ignore[arg-type]
-    bare = dict.fromkeys(one.name for one in fields(_Worker) if one.default is one.default_factory is MISSING)
-    pool._workers |= {k: _Worker(**bare | {"place": k, "attempt": _Attempt(Item("i"))}) for k in range(10000)}
-    return found | {"heartbeat a worker": least_s(pool._hand_out, 20, 10000)}
+        return found
 
 
 # --- what is simulated ------------------------------------------------------------------------------------------------
@@ -272,14 +272,14 @@ def row_of(name: str, on: Cluster, found: dict[str, Result]) -> list:
     return [name, on.nodes, hours, on.nodes * hours, usd, lost, given_up, f"{what}: {100 * share:.0f} %"]
 
 
-def asked(profile: Profile, costs: dict[str, float], rng: np.random.Generator) -> dict[str, list[float]]:
+def asked(profile: Profile, rng: np.random.Generator) -> dict[str, list[float]]:
     """What more and more nodes would ask of what is there once, over what it can, in runs that nothing holds up."""
     mean, found = float(np.mean(profile.frames)), list[dict[str, float]]()
     for nodes in (1, 4, 10, 40, 100, 400, 1000):
         results, workers = whole_run(profile, Cluster(nodes), 100 * nodes, rng), nodes * NODE_WORKERS
         flights_s = {stage: 100 * nodes / one.seconds for stage, one in results.items()}
-        shares = {f"{stage}: journal and hand-out": flights_s[stage] * costs["item"] for stage in ("plan", "render")}
-        shares["heartbeats"] = workers / BEAT_S * workers * costs["heartbeat a worker"]
+        shares = {f"{stage}: journal and hand-out": flights_s[stage] * RAY_S for stage in ("plan", "render")}
+        shares["heartbeats"] = workers / BEAT_S * RAY_S
         shares |= {f"{s}: storage": flights_s[s] * mean * OPS[s] / STORAGE_OPS_S for s in ("render", "inspect")}
         shares["one teacher that keeps up with render"] = flights_s["render"] * mean / WINDOWS_S
         found.append({"nodes": nodes} | shares)
@@ -318,16 +318,18 @@ def main() -> None:
     names = ["machine", "workers", "GPUs", "h", "trajectories", "simulated", "off"]
     scenes.print_table("The paper's four nodes", names, paper_rows(rng))
 
-    free, rows = Cluster(1, hand_out_s=costs["item"], finish_s=2 * STORAGE_S), []  # two files of a flight are hashed
+    # At the end of render two files of each flight are hashed.
+    free, rows = Cluster(1, hand_out_s=RAY_S, beat_s=RAY_S, finish_s=2 * STORAGE_S), list[list]()
     losses = {"worker_losses_h": WORKER_LOSSES_H, "node_losses_h": NODE_LOSSES_H}
     for nodes in (4, 100, 1000):
         on = replace(free, nodes=nodes, **losses)
         rows.append(row_of("one run, storage without limit", on, whole_run(profile, on, given.flights, rng)))
-        on = replace(on, ops_s=STORAGE_OPS_S, beat_s=nodes * NODE_WORKERS * costs["heartbeat a worker"])
+        on = replace(on, ops_s=STORAGE_OPS_S)
         rows.append(row_of("one run", on, whole_run(profile, on, given.flights, rng)))
         on = replace(on, teachers=max(1, nodes // 4))
         rows.append(row_of(f"one run, {on.teachers} teachers", on, whole_run(profile, on, given.flights, rng)))
-        rows.append(row_of("runs of 200 flights, a node each", on, many_runs(profile, on, given.flights, rng)))
+        alone = Cluster(nodes, hand_out_s=costs["item"], **losses)
+        rows.append(row_of("runs of 200 flights, a node each", alone, many_runs(profile, alone, given.flights, rng)))
     names = ["", "nodes", "h", "node hours", "USD", "lost", "given up", "busiest of what is there once"]
     scenes.print_table(f"{given.flights:,} flights", names, rows)
 
@@ -337,7 +339,7 @@ def main() -> None:
         rows.append([spread, times, *row_of("", on, whole_run(profile, on, few, rng, spread))[1:-1]])
     names = ["spread, times", "losses, times", "nodes", "h", "node hours", "USD", "lost", "given up"]
     scenes.print_table(f"{few:,} flights, storage without limit", names, rows)
-    told = asked(profile, costs, rng)
+    told = asked(profile, rng)
     scenes.print_table("Asked / can be done, one run", [*told], [list(row) for row in zip(*told.values(), strict=True)])
     if given.figure:
         draw(told, given.figure)
