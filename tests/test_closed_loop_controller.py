@@ -1,5 +1,7 @@
 """cosfly/closed_loop/controller.py: what a decision is flown as, held against the rules that decisions are judged by."""
 
+from collections import deque
+
 import numpy as np
 import pytest
 from specimens_planning import town_of, walk_along
@@ -7,7 +9,9 @@ from specimens_planning import town_of, walk_along
 from caption.schema import FutureMotion, LabelConfig
 from caption.truth.actions import Motion, measure, table_of
 from cosfly.closed_loop.controller import CONTROLLER_FILE, Controller, read_controls
+from cosfly.closed_loop.pilots import PilotAnswer
 from cosfly.closed_loop.settings import DroneConfig
+from cosfly.closed_loop.stage import _OpenFlight
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight
 from cosfly.errors import ConfigError
 from cosfly.planners.contract import PlanConfig
@@ -113,6 +117,16 @@ def test_every_command_can_be_flown(begin):
     for token in TOKENS * 3:
         assert DroneConfig().problem_of(controller.command(token, moment)) is None
         assert len(controller.command(token, moment)) == len(ACTION)
+
+
+@pytest.mark.parametrize("command", [(99.0, 0, 0, 0, 0), (0, 0, 0, float("nan"), 0), (0, 0)])
+def test_a_command_that_cannot_be_flown_is_the_students_failure_and_the_drone_hovers(begin, command):
+    flight, controller, moment = begin()
+    under_way = _OpenFlight("path_00000", flight, controller, deque([moment]))
+    under_way.step(PilotAnswer("ok", command=np.array(command)))
+    [frame] = under_way.frames
+    assert (frame["answer"], frame["action"], frame["command"][:4]) == ("invalid", None, (0, 0, 0, 0))
+    assert under_way.moments[-1].index == moment.index + 1
 
 
 def test_a_table_without_a_row_or_with_a_wrong_word_is_refused_by_name(tmp_path):

@@ -66,6 +66,13 @@ class FlyConfig(Config):
         None, description="file of yours in the place of the table that says what each decision is flown as"
     )
     drone: DroneConfig = Field(DroneConfig(), description="what the drone can do")
+    lead_frames: int = Field(
+        21,
+        ge=5,
+        le=1000,
+        description="frames of the plan with which a flight begins, the present one included: 10 s, after which who "
+        "walks has walked off and the drone has its pace",
+    )
     answer_limit_s: float = Field(
         60.0, gt=0, description="a decision that takes longer is late: the drone hovers; simulated time stands still"
     )

@@ -46,7 +46,7 @@ from distill.inference.stage import InferConfig
 
 log = logging.getLogger(__name__)
 
-NUM_LEAD = 5  # frames of a window: what a student is shown first is the plan's
+MOST_FRAMES = 32  # of a window (caption.window.num_frames)
 PLAN, TRACES, TREE, ANSWERS = "plan", "drone_trace.json", "render", "answers"
 HALF_SEEN = 0.5  # of the five rays
 
@@ -151,12 +151,14 @@ Inputs = tuple[Path, Path, Path, Path | None]
 
 def _fly_all(stage: StageFolder, cfg: FlightsConfig, inputs: Inputs, seed: int, workers: int, watch: Watch) -> None:
     traces = read_traces(inputs[2])
-    numbers = [n for n, trace in enumerate(traces) if trace.drop_reason is None and len(trace.time_s) > NUM_LEAD]
+    numbers = [
+        n for n, trace in enumerate(traces) if trace.drop_reason is None and len(trace.time_s) > cfg.fly.lead_frames
+    ]
     lit = {n: Airspace.area_of(traces[n].targets_m) for n in numbers}
     num = 1 if cfg.fly.asks_model else workers
     ordered, most = sorted(numbers, key=lambda n: (lit[n], n)), min(cfg.fly.side_by_side, -(-len(numbers) // num))
     flocks = [ordered[k : k + most] for k in range(0, len(ordered), most)] if numbers else []
-    steps = [sum(len(_cut(traces[n], cfg.fly.most_decisions).time_s) - NUM_LEAD for n in flock) for flock in flocks]
+    steps = [sum(len(_cut(traces[n], cfg.fly).time_s) - cfg.fly.lead_frames for n in flock) for flock in flocks]
     items = [Item(f"{traces[f[0]].path_id} and {len(f) - 1}", f, steps[k]) for k, f in enumerate(flocks)]
     begun_s = time.monotonic()
     done = run_items(stage, items, make_worker, (cfg, *inputs, stage.path, seed, num), workers=num, watch=watch)
@@ -213,7 +215,7 @@ def make_worker(
         for n in item.payload:
             if not pursuit_file(out, traces[n].path_id).exists():  # else of before a kill
                 company = companies.get(traces[n].path_id)
-                flights.append(_begun(cfg.fly, space, _cut(traces[n], cfg.fly.most_decisions), n, controls, company))
+                flights.append(_begun(cfg.fly, space, _cut(traces[n], cfg.fly), n, controls, company))
         while flights:
             outlooks = [Outlook(one.episode, one.flight, tuple(one.moments)) for one in flights]
             for one, decision in zip(flights, student.decide(outlooks), strict=True):
@@ -227,9 +229,9 @@ def make_worker(
     return work
 
 
-def _cut(trace: DroneTrace, most: int) -> DroneTrace:
-    """Give a plan up to so many decisions; 0: all of it."""
-    end = NUM_LEAD + most if most else len(trace.time_s)
+def _cut(trace: DroneTrace, cfg: FlyConfig) -> DroneTrace:
+    """Give a plan as far as it is flown."""
+    end = cfg.lead_frames + cfg.most_decisions if cfg.most_decisions else len(trace.time_s)
     return replace(trace, **{name: getattr(trace, name)[:end] for name in (*ARRAYS, "clearances_m")})
 
 
@@ -243,10 +245,10 @@ def _begun(
 ) -> _OpenFlight:
     others = () if company is None else company.others
     flight = ClosedLoopFlight(
-        space, plan, number=number, num_lead=NUM_LEAD, drone=cfg.drone, lost_s=cfg.lost_s, others=others
+        space, plan, number=number, num_lead=cfg.lead_frames, drone=cfg.drone, lost_s=cfg.lost_s, others=others
     )
     lead = flight.reset()
-    begun = _OpenFlight(plan.path_id, flight, Controller(controls, cfg.drone, lead[-1]), deque(lead, NUM_LEAD))
+    begun = _OpenFlight(plan.path_id, flight, Controller(controls, cfg.drone, lead[-1]), deque(lead, MOST_FRAMES))
     poses = np.hstack([plan.positions_m, plan.rotations_deg])
     between = np.empty((len(poses), 0, 6))
     flown = PlannedMotion(plan.time_s, poses, between, plan.rotations_deg[:, 1], plan.positions_m).action
@@ -257,21 +259,22 @@ def _begun(
 
 def _record(one: _OpenFlight, about: dict) -> Pursuit:
     flight, plan = one.flight, one.flight.planned
+    obstacles = flight.airspace.surroundings.obstacles
     gaps = np.round(flight.poses.clearances_m, 4).tolist()
     frames = [PursuitFrame(**frame, clearance_m=gap) for frame, gap in zip(one.frames, gaps, strict=False)]
     return Pursuit(
-        **about, episode=one.episode, walk=plan.path_id, style=style_of(plan, flight.airspace.surroundings.obstacles),
+        **about, episode=one.episode, walk=plan.path_id, style=style_of(plan, flight.num_lead - 1, obstacles),
         dt_s=flight.dt_s, camera_px=(flight.camera.width_px, flight.camera.height_px), fov_deg=flight.camera.fov_deg,
         drone_radius_m=flight.drone.radius_m, ended=flight.ended, num_walk_frames=len(plan.time_s) - flight.num_lead,
         frames=tuple(frames),
     )  # fmt: skip
 
 
-def style_of(plan: DroneTrace, obstacles: BoxIndex) -> WalkStyle:
-    """Tell how hard a walk is to follow; of its plan only the first pose counts."""
+def style_of(plan: DroneTrace, start: int, obstacles: BoxIndex) -> WalkStyle:
+    """Tell how hard a walk is to follow; of its plan only the pose counts at which the student takes over."""
     headings = headings_of(plan.targets_m, plan.time_s)
     turn_rad = np.abs(np.diff(np.unwrap(headings))).sum()
-    away = plan.positions_m[NUM_LEAD - 1] - plan.targets_m[NUM_LEAD - 1]
+    away = plan.positions_m[start] - plan.targets_m[start]
     back = np.stack([np.cos(headings), np.sin(headings)], axis=1) * -np.hypot(*away[:2])
     seen = visibility(obstacles, plan.targets_m + np.column_stack([back, np.full(len(back), away[2])]), plan.targets_m)
     turn_degps = float(np.degrees(turn_rad) / (plan.time_s[-1] - plan.time_s[0]))

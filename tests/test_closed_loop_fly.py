@@ -1,0 +1,226 @@
+"""`cosfly fly`: students after walkers; what it writes, whatever a student answers, and after a kill."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import invoke
+from specimens_distill import prepared
+from teacher_server import TeacherServer
+
+from caption.run.stage import run as caption_tree
+from caption.schema import CaptionConfig
+from cosfly.chat.student_chat import write_taught
+from cosfly.closed_loop.stage import PLAN
+from cosfly.products.actions import shipped_actions
+from cosfly.products.captions import read_captions
+from cosfly.products.flights import find_flights
+from cosfly.products.playback import read_flight
+from cosfly.products.pursuits import PURSUITS, Pursuit, read_pursuit
+from cosfly.products.traces import read_traces
+from distill.prepare.stage import PrepareConfig, make_sample
+from distill.schema import Sample, open_split
+from distill.student.random_student import make_tiny_student
+from distill.training.stage import taught_by
+from release.verify.verify import verify
+from specimens import make_playback_tree
+
+TINY = (
+    "--set maps.synthetic.size_m=110 --set maps.synthetic.num_blocks=1 --set pedestrians.num_paths=3 "
+    "--set pedestrians.min_distance_m=25 --set pedestrians.max_distance_m=35 --set render.width_px=160 "
+    "--set render.height_px=90 --set render.fovs_deg=[70] --seed 4"
+)
+LONG = "--set fly.tree=false --set fly.most_decisions=30"
+SHORT = "--workers 1 --set fly.most_decisions=6 --set fly.tree=false"
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("town")
+    for words in (
+        f"maps {TINY} --out {root}/maps",
+        f"simplify {TINY.replace('--seed 4', '')} --map {root}/maps/boxes_3d.json --out {root}/simplify",
+        f"pedestrians {TINY} --workers 1 --map {root}/simplify/step2_simplified.json --out {root}/pedestrians",
+    ):
+        done = invoke(words)
+        assert done.exit_code == 0, done.output
+    return root
+
+
+def fly(town: Path, out: Path, more: str) -> dict[str, Pursuit]:
+    done = attempt(town, out, more)
+    assert done.exit_code == 0, (done.output, done.exception)
+    return {path.stem: read_pursuit(path) for path in sorted((out / PURSUITS).glob("*.json"))}
+
+
+def attempt(town: Path, out: Path, more: str):
+    given = f"--map {town}/maps/boxes_3d.json --simplified {town}/simplify/step2_simplified.json"
+    return invoke(f"fly {TINY} {given} --paths {town}/pedestrians/path.json --out {out} {more}")
+
+
+# --- what is flown ----------------------------------------------------------------------------------------------------
+
+
+def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(town, tmp_path):
+    flown = fly(town, tmp_path, "--workers 2 --set fly.most_decisions=12 --student rules")
+    assert len(flown) == 3
+    for pursuit in flown.values():
+        assert (pursuit.engine, pursuit.num_lead, len(pursuit.decisions)) == ("rules", 20, 12)
+        assert all(frame.answer == "ok" and frame.words and frame.action for frame in pursuit.decisions)
+    simple, traces = f"{town}/simplify/step2_simplified.json", f"{tmp_path}/drone_trace.json"
+    for words in (
+        f"inspect {TINY} --workers 1 --map {simple} --traces {traces} --data {tmp_path}/render --out {tmp_path}/inspect",
+        f"caption {TINY} --workers 1 --data {tmp_path}/render --out {tmp_path}/caption",
+        f"release build {TINY} --workers 1 --data {tmp_path}/render --captions {tmp_path}/caption/captions.jsonl "
+        f"--inspect {tmp_path}/inspect/inspect.json --out {tmp_path}/release --set release.licence=cc-by-4.0",
+    ):
+        done = invoke(words if words.startswith("caption") else words.replace("--seed 4", ""))
+        assert done.exit_code == 0, (words, done.output, done.exception)
+    assert verify(tmp_path / "release/dataset").is_ok
+    captions = list(read_captions(tmp_path / "caption/captions.jsonl"))
+    assert captions
+    decided = {}  # the rule teacher says of the tree what it said while it flew
+    for folder in find_flights(tmp_path / "render"):
+        flight = read_flight(folder)
+        assert flight.source["algorithm"].startswith("flown by rules")
+        pursuit = flown[flight.source["scenario_id"]]
+        assert np.allclose(flight.positions_m, [frame.pose[:3] for frame in pursuit.frames], atol=1e-3)
+        assert list(flight.target_visible) == [frame.visible for frame in pursuit.frames]
+        decided |= {f"{flight.flight_id}_frame_{i:05d}": frame.action for i, frame in enumerate(pursuit.frames)}
+    asked = [caption for caption in captions if decided[caption.sample_id] is not None and caption.repair is None]
+    assert asked
+    same = [caption.en.flight_decision == decided[caption.sample_id] for caption in asked if caption.en]
+    assert np.mean(same) == 1.0
+
+
+def test_the_ceiling_sees_more_than_chance_and_all_is_the_same_however_many_fly_at_once(town, tmp_path):
+    seen = {}
+    for student, alone in (("planner", False), ("random", True)):
+        flown = fly(town, tmp_path / student, f"--student {student} {LONG} --workers 1")
+        seen[student] = np.mean([sum(f.in_view for f in p.flown) / p.num_walk_frames for p in flown.values()])
+        if alone:
+            one = f"--student {student} {LONG} --workers 2 --set fly.side_by_side=1"
+            assert fly(town, tmp_path / f"{student}_alone", one) == flown
+    assert seen["planner"] >= 0.95
+    assert seen["random"] < seen["planner"]
+
+
+def test_after_a_kill_only_what_was_in_flight_is_flown_again(town, tmp_path):
+    flown = fly(town, tmp_path, f"{SHORT} --student random")
+    product = {path: path.read_bytes() for path in (tmp_path / PURSUITS).glob("*.json")}
+    first, *others = sorted(product)
+    for path in (tmp_path / "manifest.json", tmp_path / "items.jsonl", first):
+        path.unlink()
+    before = {path: path.stat().st_mtime_ns for path in others}
+    assert fly(town, tmp_path, f"{SHORT} --student random") == flown
+    assert {path: path.read_bytes() for path in product} == product
+    assert {path: path.stat().st_mtime_ns for path in others} == before
+
+
+def test_each_flight_begins_as_its_plan_does(town, tmp_path):
+    flown = fly(town, tmp_path, f"{SHORT} --student track_straight")
+    for trace in read_traces(tmp_path / PLAN / "drone_trace.json"):
+        pursuit = flown[trace.path_id]
+        lead = [frame.pose[:3] for frame in pursuit.frames[: pursuit.num_lead + 1]]
+        assert np.allclose(lead, trace.positions_m[: pursuit.num_lead + 1], atol=1e-3)
+        assert pursuit.decisions[0].in_view
+
+
+# --- answers that are none --------------------------------------------------------------------------------------------
+
+ONE = "--set caption.endpoint.max_tries=1 --set fly.side_by_side=3"
+
+
+@pytest.mark.parametrize(
+    ("fault", "answer"),
+    [("wrong_decision", "invalid"), ("wrong_shape", "unreadable"), ("empty_choices", "none")],
+)
+def test_what_a_model_answers_wrong_is_its_own_failure_and_the_flight_goes_on(town, tmp_path, fault, answer):
+    with TeacherServer(lambda number, body: fault) as server:
+        flown = fly(town, tmp_path, f"{SHORT} {ONE} --student {server.url}")
+    for pursuit in flown.values():
+        assert {frame.answer for frame in pursuit.decisions} == {answer}
+        assert len(pursuit.decisions) == 6
+        assert all(frame.command[:4] == (0, 0, 0, 0) and frame.action is None for frame in pursuit.decisions)
+        assert all(frame.words for frame in pursuit.decisions)
+        assert pursuit.engine == "endpoint"
+
+
+def test_who_answers_too_late_hovers(town, tmp_path):
+    with TeacherServer(delay_s=1.0) as server:
+        limit = "--set fly.answer_limit_s=0.2 --set fly.most_decisions=2"
+        flown = fly(town, tmp_path, f"{SHORT} {ONE} {limit} --student {server.url}")
+    assert {frame.answer for pursuit in flown.values() for frame in pursuit.decisions} == {"late"}
+
+
+def test_a_model_is_asked_about_all_flights_at_once_and_nothing_twice(town, tmp_path):
+    with TeacherServer(delay_s=0.2) as server:
+        flown = fly(town, tmp_path, f"{SHORT} {ONE} --student {server.url}")
+        assert server.most_at_once == 3
+        assert len(server.bodies) == 3 * 6
+        first = server.bodies[0]
+        assert json.loads(first)["messages"][1]["content"][1]["type"] == "image_url"
+        for path in (tmp_path / "manifest.json", tmp_path / "items.jsonl", *(tmp_path / PURSUITS).glob("*.json")):
+            path.unlink()
+        again = fly(town, tmp_path, f"{SHORT} {ONE} --student {server.url}")
+        assert len(server.bodies) == 3 * 6
+    for one, two in zip(flown.values(), again.values(), strict=True):
+        assert [f.command for f in one.frames] == [f.command for f in two.frames]
+        assert all(f.answer == "ok" and f.answer_s > 0 for f in one.decisions)
+
+
+@pytest.fixture(scope="module")
+def student(tmp_path_factory) -> Path:
+    """A tiny student that was taught with the prompts of today, the pictures in colour."""
+    root = tmp_path_factory.mktemp("student")
+    tree = make_playback_tree(root / "tree", num_flights=3, num_points=11, width_px=160, height_px=90)
+    captions = caption_tree(CaptionConfig(), tree, root / "captions")
+    prepared(tree, captions, root / "set", modalities=("rgb",))
+    make_tiny_student(root / "model")
+    write_taught(root / "model", taught_by(open_split(root / "set", "train"), 64 * 64))
+    return root / "model"
+
+
+def test_a_student_in_this_process_answers_all_flights_as_one_batch(town, tmp_path, student):
+    few = "--set distill.infer.max_new_tokens=4 --set distill.infer.device=cpu --set fly.most_decisions=2"
+    flown = fly(town, tmp_path, f"{SHORT} {few} --student transformers:{student}")
+    for pursuit in flown.values():
+        assert pursuit.engine == "transformers"
+        assert {frame.answer for frame in pursuit.decisions} == {"unreadable"}  # of four tokens
+        assert all(frame.words is not None and frame.answer_s > 0 for frame in pursuit.decisions)
+
+
+def test_a_student_is_asked_with_the_very_prompts_that_it_was_taught_with(town, tmp_path, student):
+    with TeacherServer() as server:
+        more = f"--workers 1 --set fly.most_decisions=8 --student {server.url} --as-student {student}"
+        flown = fly(town, tmp_path, more)
+        bodies = [json.loads(body) for body in server.bodies]
+    assert {frame.answer for pursuit in flown.values() for frame in pursuit.decisions} == {"ok"}
+    asked = {(body["messages"][0]["content"], body["messages"][1]["content"][-1]["text"]) for body in bodies}
+    assert len(asked) == 24
+    assert {len([c for c in body["messages"][1]["content"] if c["type"] == "image_url"]) for body in bodies} == {5}
+    # As a training set that is made of what was flown has them.
+    captions = caption_tree(CaptionConfig(), tmp_path / "render", tmp_path / "captions")
+    every: tuple = ("CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN")
+    cfg = PrepareConfig(modalities=("rgb",), contradicted="keep", verdicts=every)
+    samples = [make_sample(caption, "en", cfg, shipped_actions()) for caption in read_captions(captions)]
+    taught = {(one.prompt.system, one.prompt.user) for one in samples if isinstance(one, Sample)}
+    assert len(taught & asked) == 12  # of each flight the first four: the others have no future there, and no caption
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ("--student ruels", "did you mean"),
+        ("--student rules --adapter x", "transformers"),
+        ("--set fly.controller=nowhere.yaml", "nowhere.yaml"),
+        ("--set render.effects.noise=2", "render.effects"),
+        ("--student http://127.0.0.1:9/v1", "cannot reach"),
+    ],
+)
+def test_what_cannot_be_flown_is_told_in_one_line(town, tmp_path, more, words):
+    done = attempt(town, tmp_path / "out", f"{SHORT} {more}")
+    assert done.exit_code != 0
+    said = str(done.exception) if done.exception is not None else done.output
+    assert words in said, said
