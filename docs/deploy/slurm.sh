@@ -45,6 +45,8 @@ on_ray() {
     mapfile -t nodes < <(scontrol show hostnames "$SLURM_JOB_NODELIST")
     head=$(srun --nodes=1 --ntasks=1 --nodelist="${nodes[0]}" hostname --all-ip-addresses)
     address=${head%% *}:$((20000 + SLURM_JOB_ID % 10000))
+    # Ray asks for a token on any address but 127.0.0.1: one, which srun hands to every node with the environment.
+    RAY_AUTH_TOKEN=$("${ray[@]}" get-auth-token --generate) && export RAY_AUTH_MODE=token RAY_AUTH_TOKEN
     trap 'kill $(jobs -p) 2>/dev/null || true; wait' EXIT
     local start=("${ray[@]}" start --block --disable-usage-stats "--num-cpus=$workers" "--num-gpus=${SLURM_GPUS_ON_NODE:-0}")
     srun --nodes=1 --ntasks=1 --nodelist="${nodes[0]}" "${start[@]}" --head --node-ip-address="${address%:*}" --port="${address#*:}" &

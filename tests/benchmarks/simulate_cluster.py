@@ -289,12 +289,12 @@ def asked(profile: Profile, rng: np.random.Generator) -> dict[str, list[float]]:
 def draw(told: dict[str, list[float]], path: Path) -> None:
     from matplotlib.figure import Figure
 
-    axes = (figure := Figure((8, 4.5), layout="constrained")).subplots()
+    axes = (figure := Figure((10, 4.5), layout="constrained")).subplots()
     for name, marker in zip([*told][1:], "osv^D*", strict=True):
         axes.loglog(told["nodes"], told[name], marker=marker, markersize=5, label=name)
     axes.axhline(1.0, color="black", linewidth=1, linestyle="--")
     axes.set(xlabel=f"nodes of {NODE_WORKERS} workers, one run", ylabel="asked / can be done")
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
 
