@@ -50,6 +50,7 @@ def test_losses_cost_time_and_no_item():
     assert hopeless.given_up > 45
 
 
+@pytest.mark.slow
 def test_all_tables_of_a_small_run(tmp_path, monkeypatch, capsys):
     frames = (90, 110, 100, 120)
     for stage in simulation.STAGES:
