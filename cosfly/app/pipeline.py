@@ -81,20 +81,24 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path 
         stage("render", tree, cosfly.render.stage.run, boxes, simplified, traces, others=others, seed=seed, **working),
         stage("inspect", inspected, cosfly.inspection.stage.run, simplified, traces, tree, **working),
         stage("caption", captions, caption.run.stage.run, tree, seed=seed, **working),
-        _release(cfg, whole, into or out, resume),
+        joint_release(cfg, whole, into or out, resume),
     ]
 
 
-def _release(cfg: RunConfig, sources: list[Source], out: Path, resume: Resume) -> Stage:
+def joint_release(cfg: RunConfig, sources: list[Source], out: Path, resume: Resume) -> Stage:
+    """Give the stage that releases runs together."""
     work = partial(
         release.package.stage.run, cfg.release, sources, out / "release", resume=resume, **manner_of_work(cfg)
     )
     return Stage("release", out / "release/dataset", work)
 
 
-def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageResult]:
+def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "release") -> list[StageResult]:
     """Make a data set: reads what the configuration names, writes one folder per stage below `out`; of several towns
     one run folder for each, and `release`.
+
+    Args:
+        until: the last stage that is done.
 
     Every stage is complete or resumable at any moment; running again continues. Ends with `contact_sheet.png`,
     `preview.gif` and `summary.json` in the run folder, in that of each town where there are several.
@@ -104,20 +108,25 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same") -> list[StageR
     towns = check(cfg)
     left = _TimeLeft(cfg, out)
     if not towns:
-        return _run_town(cfg, out, stages(cfg, out, resume=resume), left)
+        return _run_town(cfg, out, _up_to(until, stages(cfg, out, resume=resume)), left)
     for name in (*towns, "release"):
         refuse_link(out / name)
     with _run_folder(cfg, out):
         results = []
         for number, (name, town) in enumerate(towns.items(), 1):
             log.info("town %d of %d: %s", number, len(towns), name)
-            own = stages(town, out / name, resume=resume)[:-1]  # the release is made of all
+            own = _up_to(until, stages(town, out / name, resume=resume)[:-1])  # the release is made of all
             made = _run_town(town, out / name, own, left)
             results += [replace(one, stage=replace(one.stage, name=f"{name}/{one.stage.name}")) for one in made]
-        joint = _release(cfg, [Source.of_run(out / name) for name in towns], out, resume)
-        results.append(_do(joint, out, "all towns", left))
+        if until == "release":
+            joint = joint_release(cfg, [Source.of_run(out / name) for name in towns], out, resume)
+            results.append(_do(joint, out, "all towns", left))
         _save_summary(results, out)
     return results
+
+
+def _up_to(name: str, todo: list[Stage]) -> list[Stage]:
+    return todo[: next((k for k, stage in enumerate(todo, 1) if stage.name == name), len(todo))]
 
 
 @contextlib.contextmanager
@@ -224,7 +233,8 @@ def _run_town(cfg: RunConfig, out: Path, todo: list[Stage], left: _TimeLeft) -> 
     with _run_folder(cfg, out):
         results = [_do(stage, out, f"{number}/{len(todo)}", left) for number, stage in enumerate(todo, 1)]
         tree = out / "render"
-        if not _is_summed_up(results, out) or not (out / "preview.gif").exists():
+        has_frames = (tree / "manifest.json").exists()
+        if has_frames and not (_is_summed_up(results, out) and (out / "preview.gif").exists()):
             contact_sheet(tree, out / "contact_sheet.png")
             preview_gif(tree, out / "preview.gif")
         _save_summary(results, out)

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
 from cosfly.cli.options import WORKERS, Job, takes
+from cosfly.errors import InputError
 
 if TYPE_CHECKING:
+    from cosfly.app.estimate import StageEstimate
     from cosfly.app.pipeline import StageResult
     from cosfly.app.runs import StageLook
     from cosfly.app.settings import RunConfig
 
 app = typer.Typer()
 CONFIG = "YAML file, one that ships (quickstart, diverse, learning, simworld, delft), or a run folder, to continue."
+Until = Literal["maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release"]
 PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)}
 
 
@@ -31,6 +34,7 @@ def run(
     dry_run: Annotated[
         bool, Option("--dry-run", help="Say what it would take (time, disk, tokens by stage) and write nothing.")
     ] = False,
+    until: Annotated[Until, Option(help="The last stage that is done.")] = "release",
 ) -> None:
     """Make a data set from a configuration: all stages in order. Run it again to continue."""
     from cosfly.app import pipeline
@@ -45,9 +49,62 @@ def run(
         pipeline.check_with_files(job.cfg)
         return _tell_estimate(job.cfg, out)
     job.begin(out, *sorted(path.parent for depth in ("*", "*/*") for path in out.glob(f"{depth}/manifest.json")))
-    results = pipeline.run(job.cfg, out, resume=job.resume)
+    results = pipeline.run(job.cfg, out, resume=job.resume, until=until)
     _closing_table(results, out)
     job.check_failures({r.stage.name: r.manifest.counts for r in results}, out)
+
+
+@app.command()
+def campaign(
+    file: Annotated[Path, Argument(help="YAML file with maps, configurations and seeds; or the folder, to continue.")],
+    out: Annotated[
+        Path | None, Option(show_default="campaigns/<name>", help="Folder of the campaign, with one for each run.")
+    ] = None,
+    overrides: Annotated[
+        list[str] | None, Option("--set", "-s", metavar="A.B=C", help="Override a setting of the campaign; repeat it.")
+    ] = None,
+    resume: Annotated[Literal["never", "if-same"], Option(help=options.RESUME_HELP)] = "if-same",
+    dry_run: Annotated[
+        bool, Option("--dry-run", help="Name the runs, say what is left of each, and write nothing.")
+    ] = False,
+) -> None:
+    """Many runs (maps x configurations x seeds) as one job with one release. Run it again to continue."""
+    from caption.run.progress import duration
+    from cosfly.app import campaign as campaigns
+    from cosfly.app import estimate
+    from cosfly.work.console import answer_console, console
+
+    cfg, runs, out = campaigns.load_campaign(file, overrides or [], out)
+    if dry_run:
+        told, rows = [], []
+        for one in runs:
+            left = [r for r in estimate.estimate(one.cfg, one.folder, estimate.rates_near(one.folder)) if not r.is_done]
+            rows += left[:-1]  # its release is that of all
+            stages = ", ".join(row.name for row in left[:-1])
+            told.append((one.name, stages or "-", estimate.time_left(left[:-1]), estimate.in_words(_disk(left[:-1]))))
+        title = f"What {out} would take, one run after the other; nothing is written"
+        options.tell_table(answer_console, ("run", "to do", "time", "disk"), told, title=title, left=("to do", "time"))
+        unknown = "" if all(row.seconds is not None for row in rows) else ", and what teachers take"
+        seconds = sum(row.seconds or 0.0 for row in rows)
+        free = estimate.in_words(estimate.free_bytes(out))
+        line = f"in all about {duration(seconds)}{unknown}; {estimate.in_words(_disk(rows))} of disk, {free} are free"
+        return answer_console.print(line, soft_wrap=True)
+    released = campaigns.run(cfg, runs, out, resume=resume)
+    rows_now = campaigns.table(runs, out)
+    options.tell_table(console, campaigns.HEAD, rows_now, title=f"What was made in {out}", left=("state", "at hand"))
+    typer.echo(out / campaigns.REPORT)
+    if released is None:
+        failed = ", ".join(row[0] for row in rows_now if row[1] != "done")
+        what, fix = (
+            "some runs failed; the others are done",
+            "mend what the table names, then run the same command again",
+        )
+        raise InputError(what, where=out, got=failed, fix=f"{fix}; or leave them out (leave_out)")
+    typer.echo(out / "release/dataset")
+
+
+def _disk(rows: list[StageEstimate]) -> float:
+    return sum(row.bytes for row in rows)
 
 
 def _is_begun(config: Path, cfg: RunConfig) -> bool:

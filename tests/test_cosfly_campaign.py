@@ -1,0 +1,178 @@
+"""Many runs as one job: what a campaign's file means, one that fails among others, and kills in the middle."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from cosfly.app.campaign import Run, load_campaign, tallies
+from cosfly.cli import app
+from cosfly.errors import ConfigError
+from cosfly.reading.documents import read_json
+from cosfly.work.journal import Journal
+from cosfly.work.stage_events import read_events
+
+SMALL = {
+    "pedestrians": {"num_paths": 1, "min_distance_m": 12, "max_distance_m": 20},
+    "render": {"width_px": 160, "height_px": 90, "fovs_deg": [60], "tracks": ["clean"]},
+    "caption": {"window": {"stride": 4}},
+    "workers": 1,
+}
+
+
+def campaign_file(folder: Path, **settings) -> Path:
+    path = folder / "campaign.yaml"
+    path.write_text(yaml.safe_dump({"name": "few", "configs": {"small": SMALL}} | settings, sort_keys=False))
+    return path
+
+
+def names(path: Path) -> list[str]:
+    return [run.name for run in load_campaign(path, [], path.parent / "out")[1]]
+
+
+def test_a_campaign_is_of_every_map_configuration_and_seed_but_what_is_left_out(tmp_path):
+    maps = {"one": {"source": "synthetic"}, "two": {"source": "synthetic"}}
+    path = campaign_file(tmp_path, maps=maps, configs={"small": SMALL, "large": {"base": "quickstart"}}, seeds=[3, 4])
+    assert names(path) == [f"{m}-{c}-{s}" for m in ("one", "two") for c in ("small", "large") for s in (3, 4)]
+    runs = {run.name: run.cfg for run in load_campaign(path, ["leave_out=['*-large-*', two-small-4]"], None)[1]}
+    assert list(runs) == ["one-small-3", "one-small-4", "two-small-3"]
+    assert runs["one-small-3"].maps.synthetic.name == "one"
+    assert len({cfg.seed for cfg in runs.values()}) == 3, "no two maps share a seed"
+    assert runs["one-small-3"].pedestrians.num_paths == 1
+    assert names(campaign_file(tmp_path, seeds=[7])) == ["small-7"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"config": {}}, ["config: unknown setting", "did you mean 'configs'"]),
+        ({"configs": {"a": {"base": "quickstrat"}}}, ["no such configuration", "quickstrat"]),
+        ({"configs": {"a": {"render": {"width": 3}}, "b": {"plan": {"planer": "x"}}}}, ["a-0", "b-0", "2 to mend"]),
+        ({"configs": {"../a": SMALL}}, ["configs"]),
+        ({"leave_out": ["*"]}, ["every run is left out"]),
+        ({"maps": {"m": {"source": "boxes", "boxes": {"path": "no.csv", "licence": "mit"}}}}, ["no such file", "no.csv"]),
+        ({"maps": {"m": {"source": "synthetic"}}, "configs": {"a": {"towns": {"t": {}}}}}, ["towns have maps of their own"]),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_a_campaign_is_told_before_anything_is_done(tmp_path, settings, words):
+    out = tmp_path / "out"
+    done = CliRunner().invoke(app, ["campaign", str(campaign_file(tmp_path, **settings)), "--out", str(out)])
+    assert isinstance(done.exception, ConfigError)
+    for word in words:
+        assert word in str(done.exception)
+    assert not out.exists()
+
+
+def start(path: Path, out: Path) -> subprocess.Popen:
+    words = [sys.executable, "-m", "cosfly", "campaign", str(path), "--out", str(out)]
+    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True)
+
+
+def finish(path: Path, out: Path) -> tuple[int, str]:
+    process = start(path, out)
+    text, _ = process.communicate(timeout=500)
+    return process.returncode, text
+
+
+def digests(out: Path, run: str) -> dict[str, str]:
+    """Product -> sha256 of all stages of a run."""
+    return {
+        f"{stage.parent.name}/{entry['path']}": entry["sha256"]
+        for stage in sorted((out / run).glob("*/manifest.json"))
+        for entry in read_json(stage)["outputs"]
+    }
+
+
+@pytest.mark.slow
+def test_a_run_that_fails_stops_no_other_and_is_told(tmp_path):
+    bad = SMALL | {"pedestrians": SMALL["pedestrians"] | {"min_distance_m": 1900, "max_distance_m": 2000}}
+    path, out = campaign_file(tmp_path, configs={"bad": bad, "small": SMALL}), tmp_path / "out"
+    code, text = finish(path, out)
+    assert code == 1
+    assert "bad-0: failed: " in text
+    assert "small-0: done" in text
+    assert "some runs failed; the others are done" in text
+    assert not (out / "release").exists()
+    assert "failed" in (out / "report.html").read_text()
+    # Left out, the others are released, and what stands there is told and left alone.
+    path.write_text(path.read_text() + "leave_out: [bad-*]\n")
+    code, text = finish(path, out)
+    assert code == 0
+    assert "1 of 1 runs are done" in text
+    assert "not of this campaign, left as they are: bad-0" in text
+    assert (out / "release/dataset/release.json").is_file()
+    assert (out / "bad-0").is_dir()
+
+
+@pytest.mark.slow
+def test_six_runs_killed_at_three_moments_end_as_if_undisturbed_and_nothing_is_done_twice(tmp_path):
+    maps = {"one": {"source": "synthetic"}, "two": {"source": "synthetic"}}
+    path = campaign_file(tmp_path, maps=maps, seeds=[1, 2, 3], at_once=2)
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    code, text = finish(path, whole)
+    assert code == 0, text
+    runs = names(path)
+    moments = [
+        lambda: (out / runs[0] / "render/stage.json").exists(),
+        lambda: (out / runs[2] / "pedestrians/manifest.json").exists(),
+        lambda: (out / "release/stage.json").exists(),
+    ]
+    for reached in moments:
+        process = start(path, out)
+        while not reached():
+            assert process.poll() is None, process.stdout.read()
+            time.sleep(0.02)
+        process.kill()  # alone: what it started must end by itself
+        process.wait()
+        ours = [p for p in Path("/proc").glob("[0-9]*/cmdline") if str(out).encode() in _read(p)]
+        until_s = time.monotonic() + 10
+        while ours and time.monotonic() < until_s:
+            ours = [p for p in ours if str(out).encode() in _read(p)]
+            time.sleep(0.05)
+        assert not ours, "a run outlived its campaign"
+    code, text = finish(path, out)
+    assert code == 0, text
+    _, all_runs, _ = load_campaign(path, [], out)
+    for run in all_runs:
+        assert digests(out, run.name) == digests(whole, run.name)
+        for _, folder in run.stages():
+            kept = Counter(line["id"] for line in Journal(folder / "items.jsonl").read())
+            done = Counter(event.item for event in read_events(folder) if event.event == "item_done")
+            assert set(kept.values()) <= {1}, folder
+            assert set(done.values()) <= {1}, folder
+    assert digests(out, ".") == digests(whole, "."), "the release"
+    assert (
+        tallies(all_runs)["caption"].kept
+        == tallies([Run(r.name, r.cfg, whole / r.name) for r in all_runs])["caption"].kept
+    )
+    again, told = finish(path, out)
+    assert again == 0
+    assert "6 of 6 runs are done" in told
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError:
+        return b""
+
+
+def test_ctrl_c_ends_the_runs_too(tmp_path):
+    path, out = campaign_file(tmp_path, seeds=[1, 2]), tmp_path / "out"
+    process = start(path, out)
+    while not (out / "small-1/run.yaml").exists():
+        assert process.poll() is None, process.stdout.read()
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGTERM)
+    text, _ = process.communicate(timeout=60)
+    assert process.returncode == 143
+    assert "finished work is kept" in text
+    assert not (out / "small-2").exists()
+    assert not [p for p in Path("/proc").glob("[0-9]*/cmdline") if str(out).encode() in _read(p)]
