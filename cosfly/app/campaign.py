@@ -32,6 +32,7 @@ from cosfly.errors import ConfigError, CosflyError
 from cosfly.look.frame_views import thumbnail
 from cosfly.look.page import page
 from cosfly.products.captions import read_captions
+from cosfly.reading.files import read_span
 from cosfly.work.chance import rng_for
 from cosfly.work.config import Config, apply_overrides, build, read_yaml, shipped
 from cosfly.work.console import console
@@ -255,9 +256,9 @@ def error_of(out: Path, name: str) -> str | None:
     path = out / LOGS / f"{name}.log"
     if not path.is_file():
         return None
-    with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - LONGEST_TAIL))
-        lines = file.read().decode(errors="replace").splitlines()
+    size = path.stat().st_size
+    tail = min(size, LONGEST_TAIL)
+    lines = read_span(path, size - tail, tail, what="log").decode(errors="replace").splitlines()
     return next((line.removeprefix("error: ") for line in reversed(lines) if line.startswith("error: ")), None)
 
 
