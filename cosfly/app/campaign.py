@@ -29,9 +29,10 @@ from cosfly.app.estimate import other_settings
 from cosfly.app.runs import STAGES, find
 from cosfly.app.settings import RunConfig
 from cosfly.errors import ConfigError, CosflyError
-from cosfly.look.frame_views import thumbnail
+from cosfly.look.frame_views import small_jpeg
 from cosfly.look.page import page
 from cosfly.products.captions import read_captions
+from cosfly.reading.arrays import read_picture
 from cosfly.reading.files import read_span
 from cosfly.work.chance import rng_for
 from cosfly.work.config import Config, apply_overrides, build, read_yaml, shipped
@@ -281,7 +282,9 @@ def table(runs: list[Run], out: Path, at_work: Collection[str] = ()) -> list[tup
         elif (out / LOGS / f"{one.name}.log").exists():
             state = "failed"
         if state == "failed":
-            what = error_of(out, one.name) or "see its log"
+            others = other_settings(one.cfg, one.folder)
+            made = f"made with other settings: {', '.join(others[:3])}" if others else "see its log"
+            what = error_of(out, one.name) or made
         kept = (sum(m.counts.kept for name, m in complete.items() if name.endswith(of)) for of in ("render", "caption"))
         seconds = sum(manifest.seconds for manifest in complete.values())
         stages = f"{len(complete)} of {len(one.stages())}"
@@ -336,7 +339,8 @@ def write_report(cfg: CampaignConfig, runs: list[Run], out: Path) -> Path:
             if (captions := one.folder / town / "caption/captions.jsonl").is_file():
                 labels.update(caption.label for caption in read_captions(captions) if caption.label)
             if (sheet := one.folder / town / "contact_sheet.png").is_file():
-                pictures.append((f"{one.name} {town}".strip(), thumbnail(sheet, SHEET_PX)))
+                rgb = read_picture(sheet)[..., ::-1]
+                pictures.append((f"{one.name} {town}".strip(), small_jpeg(rgb, min(SHEET_PX, rgb.shape[1]))))
     rows, sums = table(runs, out), tallies(runs)
     text = page(
         "cosfly/app/campaign.html", title=cfg.name, head=HEAD, rows=rows, tallies=sums, pictures=pictures,
