@@ -103,6 +103,10 @@ def _students(place: Place) -> Path:
     return make_place(place.root / "students")
 
 
+def _flown(place: Place) -> Path:
+    return place.do("fly", place.root / "flown")
+
+
 def _trained(place: Place) -> Path:
     return place.do("distill train", place.root / "trained")
 
@@ -166,7 +170,7 @@ def _simulator(protocol: str, place: Place) -> int:
 
 INPUTS: dict[str, Callable[[Place], object]] = {
     "base": _base, "students": _students, "trained": _trained, "inferred": _inferred, "evaluated": _evaluated,
-    "walk": _walk, "teacher": _teacher, "judge": _judge, "served": _served, "key": _key,
+    "flown": _flown, "walk": _walk, "teacher": _teacher, "judge": _judge, "served": _served, "key": _key,
     "carla": partial(_simulator, "carla"), "unrealcv": partial(_simulator, "unrealcv"),
 }  # fmt: skip
 
@@ -230,6 +234,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
         "fly --map {maps} --simplified {simple} --paths {walks} --out {out} {tiny} --set fly.most_decisions=4 "
         "--set render.tracks=[clean]"
     ],
+    "leaderboard": ["leaderboard {flown} --out {out}"],
     "study weather": ["study weather --map {maps} --traces {traces} --out {out} {tiny}"],
     "study zoom": ["study zoom {three} --out {out} --every 10"],
     "render sample": ["render sample --data {tree} --map {maps} --out {out}/sample.png"],
