@@ -13,9 +13,10 @@ import argparse
 import heapq
 import json
 import tempfile
+import time
 import timeit
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ import scenes
 
 from cosfly.work.config import Config
 from cosfly.work.journal import Journal
+from cosfly.work.ray_engine import RayConfig
 from cosfly.work.runner import Item, Outcome, Work, run_items
 from cosfly.work.stage_events import read_events
 from cosfly.work.stage_folder import StageFolder
@@ -36,9 +38,7 @@ NODE_USD_H = 2.5 + 16 * 0.04  # stated: such a GPU, and its cores
 TEACHER_USD_H, WINDOWS_S = 3.5, 3.7  # stated; measured: vLLM on one H200, 15 pictures a request, a JSON schema
 STORAGE_OPS_S, STORAGE_S = 20_000.0, 1e-3  # stated: what a parallel file system serves, and what one operation takes
 NODE_LOSSES_H, WORKER_LOSSES_H = 1 / 6300, 1e-3  # 419 in 54 days of 2,048 nodes (Llama 3, 2024); stated
-RAY_S = (
-    8e-4  # of the driver, measured: an item on a Ray cluster of two workers that do nothing; a heartbeat is a call too
-)
+RAY_S = 8e-4  # an item's of the driver, measured with --ray; a heartbeat is such a call too
 BEAT_S, NEVER = Watch().heartbeat_s, float("inf")
 PAPER = {"A": (16, 2, 94.7, 814), "B": (12, 1, 91.5, 497), "C": (18, 2, 85.0, 1178), "D": (1, 1, 86.5, 175)}
 PILOT = {1: 1.07, 2: 1.43, 4: 2.55, 6: 2.68}  # frames/s of one GPU by workers (tab:render_scaling); no more beyond
@@ -186,22 +186,22 @@ def nothing() -> Work:
     return lambda item: Outcome({"folder": item.item_id, "num_frames": 100})
 
 
-def driver() -> dict[str, float]:
-    """Measure the driver on this machine, s, least of three: a line in a journal on the disk; an item from hand to hand
-    with all that is written of it."""
-
-    def least_s(work: Callable[[], object], count: int, of: int = 1) -> float:
-        return min(timeit.repeat(work, number=count, repeat=3)) / count / of
+def driver(engines: dict[str, Watch]) -> dict[str, float]:
+    """Measure what an item takes of the driver's processor, by engine, and a line of a journal until it is on the disk,
+    s."""
+    import simulate_cluster  # by its name: workers on Ray know no __main__
 
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as root, Journal(Path(root) / "items.jsonl") as journal:
 
-        def stage() -> None:
+        def used_s(count: int, watch: Watch) -> float:
             folder = StageFolder.open(Path(tempfile.mkdtemp(dir=root)), "demo", config=Config(), inputs={}, seed=0)
-            run_items(folder, [Item(f"i{k}") for k in range(2000)], nothing, workers=2)
+            items, begun_s = [Item(f"i{k}") for k in range(count)], time.process_time()
+            run_items(folder, items, simulate_cluster.nothing, workers=2, watch=watch)
+            return time.process_time() - begun_s
 
-        found = {"journal": least_s(lambda: journal.append({"id": "path_00000/ORI", "seconds": 1.0}), 500)}
-        found["item"] = least_s(stage, 1, 2000)
-        return found
+        found = {name: (used_s(2200, watch) - used_s(200, watch)) / 2000 for name, watch in engines.items()}
+        lines_s = timeit.repeat(lambda: journal.append({"id": "path_00000/ORI"}), number=500, repeat=3)
+        return found | {"journal": min(lines_s) / 500}
 
 
 # --- what is simulated ------------------------------------------------------------------------------------------------
@@ -303,10 +303,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path, nargs="+", help="of one town: the first is fitted, others are predicted")
     parser.add_argument("--flights", type=int, default=1_000_000)
+    parser.add_argument("--ray", action="store_true", help="also measure the driver of a Ray cluster of this machine")
     parser.add_argument("--figure", type=Path)
     given = parser.parse_args()
     scenes.one_thread_and_machine()
-    rng, profile, costs = np.random.default_rng(0), Profile.of(given.runs[0]), driver()
+    engines = {"item": Watch()} | ({"item on Ray": Watch(ray=RayConfig())} if given.ray else {})
+    rng, profile, costs = np.random.default_rng(0), Profile.of(given.runs[0]), driver(engines)
     paces = {name: f"{np.mean(each):.4f} +- {np.std(each):.4f}" for name, each in profile.seconds.items()}
     print(f"a frame (plan: a flight), s: {json.dumps(paces)}; driver, s: {json.dumps(costs)}")
     items_s = rng.lognormal(0.0, 0.5, 200_000)
@@ -328,7 +330,7 @@ def main() -> None:
         rows.append(row_of("one run", on, whole_run(profile, on, given.flights, rng)))
         on = replace(on, teachers=max(1, nodes // 4))
         rows.append(row_of(f"one run, {on.teachers} teachers", on, whole_run(profile, on, given.flights, rng)))
-        alone = Cluster(nodes, hand_out_s=costs["item"], **losses)
+        alone = Cluster(nodes, hand_out_s=costs["item"] + costs["journal"], **losses)
         rows.append(row_of("runs of 200 flights, a node each", alone, many_runs(profile, alone, given.flights, rng)))
     names = ["", "nodes", "h", "node hours", "USD", "lost", "given up", "busiest of what is there once"]
     scenes.print_table(f"{given.flights:,} flights", names, rows)
