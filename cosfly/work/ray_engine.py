@@ -36,6 +36,11 @@ log = logging.getLogger(__name__)
 ALL_ROOM = 2**31  # as many workers as the cluster has room for when a stage begins
 STORE_BYTES = 80_000_000  # of a cluster of this machine: what Ray asks for at least; nothing of ours is kept in it
 ANSWER_S = 5.0  # within which a head node or an actor answers
+ENVIRONMENT = {
+    "RAY_USAGE_STATS_ENABLED": "0",  # it would tell its makers
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # it would hide the GPUs from workers that ask for no share
+}
+HTTP2 = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))  # how gRPC begins: RFC 9113, 3.4
 WAITING_S = 30.0  # after so long it is told that there is no room
 
 
@@ -255,10 +260,11 @@ def connected(cfg: RayConfig) -> Any:
     Raises:
         EnvironmentMissing: Ray is not installed, no cluster answers, or it has another Python or Ray.
     """
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # it would tell its makers
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # nor hide GPUs from who shares none
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
     try:
         import ray
+        from ray._private import worker as speaker
     except ImportError:
         fix = "pip install 'cosfly[ray]', on every node"
         raise EnvironmentMissing("the package ray is missing", where="--engine ray", fix=fix) from None
@@ -273,18 +279,23 @@ def connected(cfg: RayConfig) -> Any:
     except (ConnectionError, RuntimeError, ValueError) as error:
         raise _refused(address, error) from None
     finally:
+        # What it tells of nodes that are lost it would write on the standard output.
+        speaker.print_to_stdstream = lambda data, **_: log.debug("ray: %s", " ".join(data["lines"]))
         with contextlib.suppress(ValueError):  # not the main thread, where Ray leaves it alone
             signal.signal(signal.SIGTERM, ends_it)
     return ray
 
 
 def _knock(address: str) -> None:
-    """See that somebody is at a host and port: Ray itself would try for minutes."""
+    """See that somebody who speaks gRPC is at a host and port: Ray itself would try for a quarter of an hour."""
     host, colon, port = address.rpartition(":")
     if not colon:
         return
     try:
-        socket.create_connection((host.strip("[]"), int(port)), ANSWER_S).close()
+        with socket.create_connection((host.strip("[]"), int(port)), ANSWER_S) as there:
+            there.sendall(HTTP2)
+            if there.recv(4)[3:] != HTTP2[-6:-5]:
+                raise OSError("something else answers there")
     except (OSError, ValueError, OverflowError) as error:
         raise _refused(address, error) from None
 
