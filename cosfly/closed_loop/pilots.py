@@ -67,9 +67,10 @@ class Outlook:
 
 
 class Pilot(Protocol):
-    """name: in records. has_engine: one process must do with it. `decide` gives a decision for each flight."""
+    """name: in records. num_frames: that it is shown, at most. `decide` gives a decision for each flight."""
 
     name: str
+    num_frames: int
 
     def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]: ...
 
@@ -93,6 +94,8 @@ def open_pilot(cfg: FlyConfig, caption: CaptionConfig, infer: InferConfig, seed:
 class Floor:
     """Decides without looking: always the same, or by chance."""
 
+    num_frames = 1
+
     def __init__(self, name: str, actions: ActionSet, seed: int) -> None:
         self.name, self._tokens, self._seed = name, actions.tokens, seed
 
@@ -106,7 +109,7 @@ class Floor:
 class Ceiling:
     """Flies the plan, which knew the whole walk: from wherever it is to the plan's next pose."""
 
-    name = "planner"
+    name, num_frames = "planner", 1
 
     def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
         return [PilotAnswer("ok", command=self._to_next(one.flight, one.moments[-1])) for one in outlooks]
@@ -131,6 +134,7 @@ class AskedPilot:
         self.vocabulary = vocabulary_of(caption)
         teacher = caption.model_copy(update={"teacher": "rules" if kind == "transformers" else cfg.student})
         self.cfg, self.seed, self.limit_s = as_taught(teacher, self.vocabulary), seed, cfg.answer_limit_s
+        self.num_frames = self.cfg.window.num_frames
         self._book, self._runner = AnswerBook(answers), asyncio.Runner()
         self._scratch: tempfile.TemporaryDirectory | None = None
         self._open()
@@ -183,7 +187,7 @@ class AskedPilot:
         return make_question(window, self.cfg.image, self.cfg.writing, self.vocabulary)
 
     def _window(self, outlook: Outlook) -> ObservedWindow:
-        flight, moments = outlook.flight, outlook.moments[-self.cfg.window.num_frames :]
+        flight, moments = outlook.flight, outlook.moments
         targets = [moment.target for moment in moments]
         company = [[moment.company.get(COMPANY[k]) for k in (0, 1, 4)] for moment in moments]
         frames = observed_frames(

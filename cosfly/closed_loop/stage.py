@@ -30,7 +30,6 @@ from cosfly.planners.contract import PlanConfig
 from cosfly.products.boxes import read_boxes
 from cosfly.products.flight_scores import SCORE, SCORE_FORMAT
 from cosfly.products.motion import PlannedMotion
-from cosfly.products.others import Company
 from cosfly.products.pursuits import Pursuit, PursuitFrame, WalkStyle, pursuit_file, read_pursuit, write_pursuit
 from cosfly.products.traces import ARRAYS, DroneTrace, read_traces, write_traces
 from cosfly.reading.files import sha256_file
@@ -46,7 +45,6 @@ from distill.inference.stage import InferConfig
 
 log = logging.getLogger(__name__)
 
-MOST_FRAMES = 32  # of a window (caption.window.num_frames)
 PLAN, TRACES, TREE, ANSWERS = "plan", "drone_trace.json", "render", "answers"
 HALF_SEEN = 0.5  # of the five rays
 
@@ -210,12 +208,16 @@ def make_worker(
         "seed": seed, "controller_sha256": None if cfg.fly.engine == "planner" else sha256_file(table),
     }  # fmt: skip
 
+    bounds: dict[str, Any] = {"num_lead": cfg.fly.lead_frames, "drone": cfg.fly.drone, "lost_s": cfg.fly.lost_s}
+
     def work(item: Item) -> Outcome:
         flights = list[_OpenFlight]()
         for n in item.payload:
             if not pursuit_file(out, traces[n].path_id).exists():  # else of before a kill
-                company = companies.get(traces[n].path_id)
-                flights.append(_begun(cfg.fly, space, _cut(traces[n], cfg.fly), n, controls, company))
+                company, plan = companies.get(traces[n].path_id), _cut(traces[n], cfg.fly)
+                others = () if company is None else company.others
+                flight = ClosedLoopFlight(space, plan, number=n, **bounds, others=others)
+                flights.append(_begun(flight, controls, student.num_frames))
         while flights:
             outlooks = [Outlook(one.episode, one.flight, tuple(one.moments)) for one in flights]
             for one, decision in zip(flights, student.decide(outlooks), strict=True):
@@ -235,20 +237,10 @@ def _cut(trace: DroneTrace, cfg: FlyConfig) -> DroneTrace:
     return replace(trace, **{name: getattr(trace, name)[:end] for name in (*ARRAYS, "clearances_m")})
 
 
-def _begun(
-    cfg: FlyConfig,
-    space: Airspace,
-    plan: DroneTrace,
-    number: int,
-    controls: dict[str, Control],
-    company: Company | None,
-) -> _OpenFlight:
-    others = () if company is None else company.others
-    flight = ClosedLoopFlight(
-        space, plan, number=number, num_lead=cfg.lead_frames, drone=cfg.drone, lost_s=cfg.lost_s, others=others
-    )
+def _begun(flight: ClosedLoopFlight, controls: dict[str, Control], num_frames: int) -> _OpenFlight:
+    plan = flight.planned
     lead = flight.reset()
-    begun = _OpenFlight(plan.path_id, flight, Controller(controls, cfg.drone, lead[-1]), deque(lead, MOST_FRAMES))
+    begun = _OpenFlight(plan.path_id, flight, Controller(controls, flight.drone, lead[-1]), deque(lead, num_frames))
     poses = np.hstack([plan.positions_m, plan.rotations_deg])
     between = np.empty((len(poses), 0, 6))
     flown = PlannedMotion(plan.time_s, poses, between, plan.rotations_deg[:, 1], plan.positions_m).action

@@ -1,0 +1,62 @@
+"""How many decisions a second the closed loop takes: 64 flights of 200 decisions with the rule teacher.
+
+    python tests/benchmarks/bench_flying.py                     a town of our own, two workers, 640x360
+    python tests/benchmarks/bench_flying.py --flights 8 --decisions 50 --rounds 3
+
+Planning is done first and not counted; starting workers, maps, drawing and deciding are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+from pathlib import Path
+
+from caption.schema import CaptionConfig
+from cosfly import load_map
+from cosfly.closed_loop import stage
+from cosfly.closed_loop.settings import FlyConfig
+from cosfly.pedestrians import stage as pedestrians
+from cosfly.pedestrians.walkable import PedestriansConfig
+from cosfly.planners.contract import PlanConfig
+from cosfly.products.boxes import write_boxes
+from cosfly.render.settings import RenderConfig
+from cosfly.simplify.passes import SimplifyConfig, simplify
+from cosfly.work.stage_folder import read_manifest
+from distill.inference.stage import InferConfig
+
+SEED = 64
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--flights", type=int, default=64)
+    parser.add_argument("--decisions", type=int, default=200)
+    parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=2)
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        root = Path(name)
+        box_map = load_map(seed=SEED)
+        write_boxes(root / "boxes_3d.json", box_map)
+        write_boxes(root / "step2_simplified.json", simplify(box_map, SimplifyConfig()).box_map)
+        walks = PedestriansConfig(num_paths=asked.flights, min_distance_m=140, max_distance_m=220, ground="paved")
+        how = {"seed": SEED, "workers": asked.workers}
+        paths = pedestrians.run(walks, root / "step2_simplified.json", root / "walks", **how)
+        fly = FlyConfig(most_decisions=asked.decisions, lost_s=0, tree=False)
+        render = RenderConfig(width_px=640, height_px=360, fovs_deg=(60.0, 90.0))
+        cfg = stage.FlightsConfig(
+            fly=fly, plan=PlanConfig(), render=render, caption=CaptionConfig(), infer=InferConfig()
+        )
+        for number in range(asked.rounds):
+            load, out = os.getloadavg()[0], root / str(number)
+            stage.run(cfg, root / "boxes_3d.json", root / "step2_simplified.json", paths, out, **how)
+            seconds = read_manifest(out).seconds - read_manifest(out / stage.PLAN).seconds
+            decisions = read_manifest(out).facts["flown"]["decisions"]
+            print(f"{read_manifest(out).counts.kept} flights, {decisions} decisions in {seconds:.0f} s, "
+                  f"{decisions / seconds:.1f} a second; load before {load:.1f}")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
