@@ -93,7 +93,7 @@ def test_every_command_that_writes_is_in_the_sweep():
     with. A campaign's runs are processes of their own: test_cosfly_campaign.py kills it."""
     told = {
         "list", "show", "doctor", "config check", "config show", "config schema", "release verify", "caption doctor",
-        "caption judge-check", "caption reader-check", "sim serve", "roi edit",
+        "caption judge-check", "caption reader-check", "sim serve", "teacher serve", "roi edit",
     }  # fmt: skip
     root, names = get_command(app), set[str]()
     for name, found in root.commands.items():

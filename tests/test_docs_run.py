@@ -48,6 +48,9 @@ FIRST, LAST = ("first-runs.md", "commands.md"), ("rendering.md",)
 QUICKSTART = "run quickstart --out runs/quickstart"  # what `make quickstart` does, beside installing
 # What no machine of the tests can do, or another test does: words of the command, and why.
 NOT_HERE = {
+    "http://node1:8000": "servers of several machines; tests/test_teacher_servers.py has several on this one",
+    "teacher serve ": "starts `vllm serve`; tests/test_teacher_serve.py runs it over a server of the tests",
+    "serve:MODEL": "starts `vllm serve` for the run; the same",
     "vllm serve ": "a server of real weights, on an accelerator; the teacher's server of the tests stands in for it",
     "torchrun --nproc-per-node 8": "eight accelerators; the command runs here in one process, and in two in "
     "tests/test_distill_train_ranks.py",

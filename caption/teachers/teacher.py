@@ -35,6 +35,7 @@ from cosfly.chat.budget import Budget
 from cosfly.chat.contract import Engine, NoAnswer, Reply, Request, Troubles
 from cosfly.chat.protocol import BYTES_PER_TOKEN, PIXELS_PER_TOKEN
 from cosfly.chat.servers import ChatClient
+from cosfly.chat.supervisor import ServedClient
 from cosfly.chat.vllm_engine import VllmEngine
 from cosfly.errors import TeacherError
 from cosfly.look.frame_views import Pictures
@@ -295,6 +296,8 @@ def make_engine(cfg: CaptionConfig, troubles: Troubles | None = None) -> Engine:
     Raises:
         InputError: it is not a model folder.
     """
+    if cfg.served_model is not None:
+        return ServedClient(cfg.served_model, cfg.serve, cfg.num_images, cfg.endpoint, troubles)
     if cfg.teacher_kind == "endpoint":
         return ChatClient(cfg.teacher, cfg.endpoint, troubles)
     folder = Path(cfg.teacher.removeprefix("vllm:"))

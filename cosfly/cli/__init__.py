@@ -25,6 +25,7 @@ from cosfly.cli.run import app as run_app
 from cosfly.cli.sim import app as sim_app
 from cosfly.cli.stages import app as stages_app
 from cosfly.cli.studies import app as studies_app
+from cosfly.cli.teacher import app as teacher_app
 from cosfly.cli.world import app as world_app
 from cosfly.errors import CosflyError, plain
 
@@ -68,6 +69,7 @@ for name, named_group in (
     ("release", release_app),
     ("sim", sim_app),
     ("study", studies_app),
+    ("teacher", teacher_app),
 ):
     app.add_typer(named_group, name=name)
 

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 app = options.stage_group("Step 7: Chain-of-Cause captions in English and Chinese.")
 
 TEACHER = (
-    "rules, an OpenAI-compatible endpoint's URL or several with commas between, vllm:MODEL_DIR, file:PATH, or "
-    "student:PATH of `distill infer`."
+    "rules, an OpenAI-compatible endpoint's URL or several with commas between, vllm:MODEL_DIR, serve:MODEL "
+    "(servers for this run), file:PATH, or student:PATH of `distill infer`."
 )
 READERS = (
     "URL of an endpoint that reads prose into claims; give it twice for two models, else one is asked in two orders."
@@ -80,7 +80,8 @@ def caption(
     target = out or tree.resolve().parent / "caption"
     job.begin(target, tree)
     is_student = cfg.student.folder is not None  # it knows one question, and no other is tried
-    if check and cfg.teacher_kind == "endpoint" and not is_student and not (target / "answers").exists():
+    is_there = cfg.teacher_kind == "endpoint" and cfg.served_model is None
+    if check and is_there and not is_student and not (target / "answers").exists():
         _examine_endpoint(cfg.teacher, cfg, [cfg.writing])
     if check and not (target / "readings").exists():
         for url in cfg.reader.urls:

@@ -8,9 +8,7 @@ that put the camera back. Where the input ends, so has the process that wrote it
 from __future__ import annotations
 
 import json
-import os
 import shlex
-import signal
 import socket
 import subprocess
 import sys
@@ -18,6 +16,8 @@ import time
 from typing import Any
 
 from cosfly.errors import EnvironmentMissing
+from cosfly.work.server_process import end_server, start_server
+from cosfly.work.worker import adopt_orphans
 
 PATIENCE_S = 20.0  # for a server that is to be left in order
 
@@ -93,10 +93,11 @@ def _put_back_unrealcv(host: str, port: int, commands: list[str]) -> None:
 
 
 def main(engine: str, host: str, port: str, command: str) -> None:
-    server = subprocess.Popen(shlex.split(command), start_new_session=True) if command else None
+    adopt_orphans()
+    server = start_server(shlex.split(command)) if command else None
     lines = [json.loads(line) for line in sys.stdin]
     if server is not None:
-        os.killpg(server.pid, signal.SIGKILL)
+        end_server(server, 0.0)
     elif lines:
         try:
             if engine == "carla":

@@ -170,7 +170,7 @@ def lost_steps(folder: Path) -> int:
 
 def cpu_seconds(pid: int) -> float:
     """Give the processor time of a process and all its threads; 0 where the system does not tell, or it is gone."""
-    fields = _stat(pid)
+    fields = process_stat(pid)
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK") if fields else 0.0  # utime, stime: proc(5)
 
 
@@ -210,6 +210,12 @@ def gpu_use(pids: Mapping[int, int]) -> dict[str, Any]:
     return of_devices | {"worker_gpu_percent": percent, "worker_gpu_mib": mib}
 
 
+def num_gpus() -> int:
+    """Give how many NVIDIA devices the driver here tells of."""
+    nvml = _nvml()
+    return 0 if nvml is None else _asked(nvml.nvmlDeviceGetCount) or 0
+
+
 @lru_cache(maxsize=1)
 def _nvml() -> Any:
     """Give the library of the NVIDIA driver; None where there is none, or no device."""
@@ -232,7 +238,7 @@ def _asked(call: Callable[..., Any], *arguments: Any) -> Any:
         return None
 
 
-def _stat(pid: int) -> list[bytes]:
+def process_stat(pid: int) -> list[bytes]:
     """Read what /proc tells of a process, from its state on; empty where there is nothing."""
     try:
         return Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()

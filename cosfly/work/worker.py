@@ -27,7 +27,7 @@ from cosfly.work.items import Item, Work, attempt, counted_steps, take_place
 from cosfly.work.stage_folder import ItemRecord
 
 LEFT_TO_THE_PARENT = frozenset({signal.SIGINT, signal.SIGTERM})  # it ends its workers, and alone speaks of it
-PR_SET_PDEATHSIG = 1  # prctl(2)
+PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # prctl(2)
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # mallopt(3) of glibc
 GREATEST_KEPT_BYTES = 32 << 20  # an array, the most that glibc takes
 MOST_KEPT_BYTES = 64 << 20  # together
@@ -135,6 +135,12 @@ def end_with_parent(parent_pid: int) -> None:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent_pid:  # it died before we asked
             os._exit(1)
+
+
+def adopt_orphans() -> None:
+    """Become the parent of what the processes below this one leave behind, so that it can be found; on Linux."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1)
 
 
 class _Voice(logging.handlers.QueueHandler):

@@ -1,0 +1,248 @@
+"""Starts servers of a model, waits until they answer, starts those anew that end, and ends them: `cosfly teacher
+serve`, `--teacher serve:MODEL`. What serves is a command, vLLM's unless the settings name another.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import logging
+import os
+import re
+import shutil
+import socket
+import tempfile
+import threading
+import time
+from pathlib import Path
+from string import Template
+from typing import Literal
+
+from pydantic import Field
+
+from cosfly.chat.client import EndpointConfig
+from cosfly.chat.contract import NoAnswer, Reply, Request, Troubles
+from cosfly.chat.servers import ChatClient
+from cosfly.errors import ConfigError, EnvironmentMissing, TeacherError
+from cosfly.reading.files import read_span
+from cosfly.work.config import Config
+from cosfly.work.server_process import ServerProcess
+from cosfly.work.stage_events import num_gpus
+
+log = logging.getLogger(__name__)
+
+VLLM = (
+    "vllm", "serve", "$model", "--served-model-name", "$name", "--host", "$host", "--port", "$port",
+    "--tensor-parallel-size", "$gpus",
+    # Without the 0, room is kept for a video; without a backend's name, white space cannot be forbidden.
+    "--limit-mm-per-prompt", '{"image": $images, "video": 0}',
+    "--structured-outputs-config", '{"backend": "xgrammar", "disable_any_whitespace": true}',
+)  # fmt: skip
+LOOK_S, ANSWER_S, FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 5.0, 1.0, 60.0
+READ_BYTES, MOST_SAID = 200_000, 300  # of a server's log; characters of one of its lines
+CAUSES = {
+    "its accelerator's memory is full": r"out of memory|no available memory|free memory on device",
+    "it finds no accelerator": r"no cuda gpus|failed to infer device type|no cuda-capable|libcuda|nvml",
+    "its port is taken": r"address already in use",
+    "it does not know an argument": r"unrecognized arguments|invalid choice",
+    "it has no such model": r"repo id|repositorynotfound|is not a local folder|no such file or directory",
+}
+
+
+class ServeConfig(Config):
+    """Servers of a teacher that cosfly starts."""
+
+    command: tuple[str, ...] = Field(
+        VLLM, min_length=1, description="what is run; $model $name $host $port $gpus $images are filled in"
+    )
+    arguments: tuple[str, ...] = Field((), description="further arguments of the command")
+    replicas: int = Field(1, ge=1, le=256, description="servers, each on accelerators of its own, at ports in a row")
+    gpus: int = Field(1, ge=1, description="accelerators of one server, which share the model")
+    host: str = Field("127.0.0.1", description="address they listen at; 0.0.0.0: all of this machine's")
+    port: int = Field(8000, ge=1, le=65535, description="port of the first")
+    ready_s: float = Field(900.0, gt=0, description="limit of the time until a server answers, s")
+    restarts: int = Field(5, ge=0, description="times that a server which ended is started anew")
+
+
+class _Replica:
+    """One server: how it is started, and what becomes of it."""
+
+    def __init__(self, number: int, model: str, cfg: ServeConfig, num_images: int, folder: Path) -> None:
+        self.port, self.log_file, self.cfg = cfg.port + number, folder / f"server_{number}.log", cfg
+        self.host = "127.0.0.1" if cfg.host == "0.0.0.0" else cfg.host
+        shown = socket.gethostname() if cfg.host == "0.0.0.0" else cfg.host
+        self.url = f"http://{shown}:{self.port}/v1"
+        name = Path(model).resolve().name if Path(model).is_dir() else model
+        filled = {"model": model, "name": name, "host": cfg.host, "port": self.port}
+        filled |= {"gpus": cfg.gpus, "images": num_images}
+        self.words = [Template(word).safe_substitute(filled) for word in (*cfg.command, *cfg.arguments)]
+        self.environment = {"VLLM_NO_USAGE_STATS": "1", **os.environ, **_devices(number, cfg)}
+        self.is_ready, self.failure = False, ""
+
+    def serve(self, stop: threading.Event) -> None:
+        """Keep a server running until it is told to stop, or it was started anew too often; `failure` says why."""
+        for number in range(self.cfg.restarts + 1):
+            if number:
+                pause_s = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0 ** (number - 1))
+                log.warning(
+                    "%s: %s; started anew in %g s, %d of %d", self.url, self.failure, pause_s, number, self.cfg.restarts
+                )
+                stop.wait(pause_s)
+            cause = self._serve_once(stop)
+            if stop.is_set():
+                return
+            was_ready, self.is_ready, self.failure = self.is_ready or number > 0, False, cause
+            if not was_ready:  # it never worked here, so it will not
+                return
+        log.error("%s: %s; given up after %d starts", self.url, self.failure, self.cfg.restarts + 1)
+
+    def _serve_once(self, stop: threading.Event) -> str:
+        """Run a server until it ends or is told to; gives why it ended."""
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((self.cfg.host, self.port))
+            except OSError as error:
+                return f"port {self.port} cannot be had ({error.strerror}); choose another with --port"
+        begin = self.log_file.stat().st_size if self.log_file.exists() else 0
+        until_s = time.monotonic() + self.cfg.ready_s
+        process = ServerProcess(self.words, self.log_file, self.environment)
+        try:
+            while not stop.wait(LOOK_S):
+                if (code := process.poll()) is not None:
+                    how = f"ended by signal {-code}" if code < 0 else f"ended with status {code}"
+                    return f"{how}{self._why(begin)}"
+                if not self.is_ready and self._answers():
+                    self.is_ready = True
+                    log.info("%s: ready", self.url)
+                elif not self.is_ready and time.monotonic() > until_s:
+                    return f"not ready within {self.cfg.ready_s:g} s (caption.serve.ready_s){self._why(begin)}"
+            return ""
+        finally:
+            process.end()
+
+    def _answers(self) -> bool:
+        connection = http.client.HTTPConnection(self.host, self.port, timeout=ANSWER_S)
+        try:
+            connection.request("GET", "/v1/models")
+            return connection.getresponse().status < 500
+        except (OSError, http.client.HTTPException):
+            return False
+        finally:
+            connection.close()
+
+    def _why(self, begin: int) -> str:
+        """Give what its log says since it was started: a cause that is known, and the line that tells it, or its first
+        error and its last line."""
+        size = self.log_file.stat().st_size
+        begin = max(begin, size - READ_BYTES)
+        said = read_span(self.log_file, begin, size - begin).decode("utf-8", "replace")
+        text = re.sub(r"\x1b\[[\d;]*m", "", said)
+        lines = [" ".join(line.split())[:MOST_SAID] for line in text.splitlines() if line.strip()]
+        for cause, signs in CAUSES.items():
+            if found := next((line for line in lines if re.search(signs, line, re.IGNORECASE)), None):
+                return f": {cause}: {found!r} (log: {self.log_file})"
+        told = [next((line for line in lines if re.search(r"\w(Error|Exception):", line)), ""), *lines[-1:]]
+        return f": its log ends {' ... '.join(dict.fromkeys(filter(None, told)))!r} ({self.log_file})"
+
+
+def _devices(number: int, cfg: ServeConfig) -> dict[str, str]:
+    """Give the variable that shows a server its accelerators; none where this machine has none.
+
+    Raises:
+        ConfigError: there are too few.
+    """
+    given = os.environ.get("CUDA_VISIBLE_DEVICES")
+    devices = given.split(",") if given else [str(index) for index in range(num_gpus())]
+    if not devices:
+        return {}
+    if len(devices) < cfg.replicas * cfg.gpus:
+        got, expected = f"{len(devices)} accelerators", f"{cfg.replicas} x {cfg.gpus} (replicas x gpus)"
+        raise ConfigError("too few accelerators for the servers", where="caption.serve", got=got, expected=expected)
+    return {"CUDA_VISIBLE_DEVICES": ",".join(devices[number * cfg.gpus : (number + 1) * cfg.gpus])}
+
+
+class TeacherServers:
+    """All servers of a model, each watched by a thread. Use as a context manager: inside, all answer."""
+
+    def __init__(self, model: str, cfg: ServeConfig, num_images: int) -> None:
+        """
+        Args:
+            num_images: most pictures of one request.
+        Raises:
+            EnvironmentMissing: the command is not installed. ConfigError: too few accelerators.
+        """
+        if shutil.which(cfg.command[0]) is None:
+            fix = 'pip install "cosfly[vllm]" where the servers run' if cfg.command == VLLM else "caption.serve.command"
+            raise EnvironmentMissing("the command of the servers is not installed", got=cfg.command[0], fix=fix)
+        self.folder = Path(tempfile.mkdtemp(prefix="cosfly-teacher-"))
+        self.replicas = [_Replica(number, model, cfg, num_images, self.folder) for number in range(cfg.replicas)]
+        self.urls = ",".join(replica.url for replica in self.replicas)
+        self.stop = threading.Event()
+        self._threads = [threading.Thread(target=one.serve, args=(self.stop,), daemon=True) for one in self.replicas]
+
+    def __enter__(self) -> TeacherServers:
+        log.info("starting %s; log: %s", self.urls, self.folder)
+        for thread in self._threads:
+            thread.start()
+        try:
+            while not (self.stop.is_set() or all(one.is_ready for one in self.replicas)):
+                self.check(some_failed=True)
+                time.sleep(LOOK_S)
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def check(self, *, some_failed: bool = False) -> None:
+        """
+        Raises:
+            TeacherError: all servers, or some, have ended for good.
+        """
+        ended = [one for one, thread in zip(self.replicas, self._threads, strict=True) if not thread.is_alive()]
+        if (ended and some_failed) or len(ended) == len(self.replicas):
+            fix, one = "mend that, then run the same command again", ended[0]
+            raise TeacherError("a server of the teacher does not run", where=one.url, got=one.failure, fix=fix)
+
+    def __exit__(self, *exc: object) -> None:
+        """End all servers. The log stays where one of them failed."""
+        self.stop.set()
+        for thread in self._threads:
+            if thread.ident is not None:
+                thread.join()
+        if not any(one.failure for one in self.replicas):
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+
+class ServedClient:
+    """Engine `endpoint` over servers that are started with it and end with it: `--teacher serve:MODEL`."""
+
+    kind: Literal["endpoint"] = "endpoint"
+
+    def __init__(
+        self, model: str, serve: ServeConfig, num_images: int, cfg: EndpointConfig, troubles: Troubles | None
+    ) -> None:
+        self.model, self.where = "", f"serve:{model}"
+        self._servers = TeacherServers(model, serve, num_images)
+        self._client = ChatClient(self._servers.urls, cfg, troubles)
+
+    async def start(self) -> None:
+        """Start the servers; raises as `TeacherServers` and `ChatClient.start`."""
+        await asyncio.to_thread(self._servers.__enter__)
+        await self._client.start()
+        self.model = self._client.model
+
+    async def answer(self, request: Request) -> Reply:
+        """Answer as `ChatClient` does; servers that are being started anew are waited for."""
+        while True:
+            try:
+                return await self._client.answer(request)
+            except NoAnswer as error:
+                self._servers.check()
+                if error.is_final or any(one.is_ready for one in self._servers.replicas):
+                    raise
+            await asyncio.sleep(LOOK_S)
+
+    async def close(self) -> None:
+        await self._client.close()
+        await asyncio.to_thread(self._servers.__exit__)
