@@ -232,7 +232,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     ],
     "fly": [
         "fly --map {maps} --simplified {simple} --paths {walks} --out {out} {tiny} --set fly.most_decisions=4 "
-        "--set render.tracks=[clean]"
+        "--set fly.lead_frames=5 --set render.tracks=[clean]"
     ],
     "leaderboard": ["leaderboard {flown} --out {out}"],
     "study weather": ["study weather --map {maps} --traces {traces} --out {out} {tiny}"],

@@ -18,6 +18,7 @@ from safetensors.numpy import save_file
 from specimens_captions import VOCABULARY, WAY
 from specimens_distill import make_captions
 from specimens_planning import walk_along
+from test_products_pursuits import pursuit
 
 from caption.run import stage as caption_stage
 from caption.run.asking import read_quarantine
@@ -44,6 +45,7 @@ from cosfly.chat.refusals import kind_of
 from cosfly.chat.student_chat import TAUGHT, read_taught, write_taught
 from cosfly.chat.wire import Response, retry_after_s
 from cosfly.cli.options import resolve
+from cosfly.closed_loop.controller import CONTROLLER_FILE, read_controls
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.review import read_filled
 from cosfly.inspection.settings import InspectConfig
@@ -77,6 +79,7 @@ from cosfly.products.others import BUILDS, Company, Other, read_others, write_ot
 from cosfly.products.playback import TARGET_FILE, read_flight
 from cosfly.products.png import parse_png
 from cosfly.products.predictions import read_predictions
+from cosfly.products.pursuits import read_pursuit, write_pursuit
 from cosfly.products.roi import read_roi
 from cosfly.products.town import IDS_FILE, IDS_FORMAT, read_instance_ids, read_town_map, write_town_map
 from cosfly.products.traces import DroneTrace, read_traces, write_traces
@@ -211,6 +214,8 @@ def make_specimens(root: Path) -> Path:
         "boxes": [[1, 1], [7, 7]],
     }
     write_json(tree / "Town01" / IDS_FILE, {**IDS_FORMAT.header, **ids})
+    write_pursuit(root / "pursuit.json", pursuit())
+    shutil.copy(CONTROLLER_FILE, root / "controller.yaml")
     pack_depth(root / TREE / "aug_001")
     shutil.copy(root / TREE / "ORI" / FRAME / "rgb.png", root / TREE / "ORI" / TARGET_FILE)
     for folder in find_flights(tree):
@@ -742,6 +747,8 @@ READERS: dict[str, Reader] = {
     "walks": _one("path.json", read_paths),
     "others": _one("others.json", read_others),
     "traces": _one("drone_trace.json", read_traces),
+    "pursuit": _one("pursuit.json", read_pursuit),
+    "controller": _one("controller.yaml", lambda path: read_controls(path, shipped_actions().tokens)),
     "city model": _one("city.json", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
     "city model, lines": _one("city.jsonl", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
     "city model, packed": _one("city.json.gz", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),

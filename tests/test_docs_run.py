@@ -81,6 +81,7 @@ SMALL = {
     "maps": _set("maps.synthetic.size_m=150", "maps.synthetic.num_blocks=1"),
     "pedestrians": _set("pedestrians.min_distance_m=15", "pedestrians.max_distance_m=25"),
     "render": _set("render.width_px=160", "render.height_px=90"),
+    "fly": _set("render.width_px=160", "render.height_px=90", "fly.most_decisions=5"),
     "study weather": _set("render.width_px=160", "render.height_px=90"),
     "study zoom": _set("render.width_px=160", "render.height_px=90"),
     "run work/village/loop.yaml": _set(

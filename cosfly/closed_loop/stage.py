@@ -152,10 +152,15 @@ def _fly_all(stage: StageFolder, cfg: FlightsConfig, inputs: Inputs, seed: int, 
     numbers = [
         n for n, trace in enumerate(traces) if trace.drop_reason is None and len(trace.time_s) > cfg.fly.lead_frames
     ]
+    left_out = [trace for n, trace in enumerate(traces) if n not in numbers]
+    dropped = Counter(trace.drop_reason or "too_short" for trace in left_out)
+    if not numbers:
+        expected = f"a plan of more than fly.lead_frames={cfg.fly.lead_frames} frames that is not dropped"
+        raise stage.nothing_kept(Tally(input=len(traces), dropped=dropped), expected=expected)
     lit = {n: Airspace.area_of(traces[n].targets_m) for n in numbers}
     num = 1 if cfg.fly.asks_model else workers
     ordered, most = sorted(numbers, key=lambda n: (lit[n], n)), min(cfg.fly.side_by_side, -(-len(numbers) // num))
-    flocks = [ordered[k : k + most] for k in range(0, len(ordered), most)] if numbers else []
+    flocks = [ordered[k : k + most] for k in range(0, len(ordered), most)]
     steps = [sum(len(_cut(traces[n], cfg.fly).time_s) - cfg.fly.lead_frames for n in flock) for flock in flocks]
     items = [Item(f"{traces[f[0]].path_id} and {len(f) - 1}", f, steps[k]) for k, f in enumerate(flocks)]
     begun_s = time.monotonic()
@@ -173,15 +178,14 @@ def _fly_all(stage: StageFolder, cfg: FlightsConfig, inputs: Inputs, seed: int, 
         facts.update({pursuit.ended: 1, "frames": pursuit.num_walk_frames, "decisions": len(pursuit.decisions)})
         facts["in_view"] += sum(frame.in_view for frame in pursuit.flown)
         facts["seen"] += sum(frame.visible for frame in pursuit.flown)
-    write_traces(stage.path / TRACES, written, {"student": cfg.fly.student, "seed": seed})
-    left_out = [trace for n, trace in enumerate(traces) if n not in lit]
-    dropped = Counter(trace.drop_reason or "too_short" for trace in left_out)
     lost = Counter({"flights": len(numbers) - len(flown)} if len(flown) < len(numbers) else {})
     tally = Tally(input=len(traces), kept=len(flown), dropped=dropped, failed=lost)
-    if files:
-        score = score_pursuits(map(read_pursuit, files), trained_on=cfg.fly.trained_on, seed=seed)
-        write_model(stage.path / SCORE, score, SCORE_FORMAT)
-        files.append(stage.path / SCORE)
+    if not files:
+        raise stage.nothing_kept(tally)
+    write_traces(stage.path / TRACES, written, {"student": cfg.fly.student, "seed": seed})
+    score = score_pursuits(map(read_pursuit, files), trained_on=cfg.fly.trained_on, seed=seed)
+    write_model(stage.path / SCORE, score, SCORE_FORMAT)
+    files.append(stage.path / SCORE)
     stage.finish([stage.path / TRACES, *files], tally, flown=dict(sorted(facts.items())))
     log.info(
         "fly: %s: the person in view in %.1f %%, seen in %.1f %% of %d frames; %s; %.1f decisions/s",
