@@ -57,6 +57,10 @@ def test_a_campaign_is_of_every_map_configuration_and_seed_but_what_is_left_out(
         ({"configs": {"a": {"render": {"width": 3}}, "b": {"plan": {"planer": "x"}}}}, ["a-0", "b-0", "2 to mend"]),
         ({"configs": {"../a": SMALL}}, ["configs"]),
         ({"leave_out": ["*"]}, ["every run is left out"]),
+        ({"leave_out": ["smal-0"]}, ["leave_out: no run is called 'smal-0'", "did you mean 'small-0'"]),
+        ({"seeds": [1, 2, 1]}, ["seeds: a seed is listed twice"]),
+        ({"configs": {"a": SMALL | {"release": {"licence": "mit"}}}}, ["configs.a.release", "have one release"]),
+        ({"configs": {"a": SMALL | {"render": {"modalities": ["rgb"]}}}}, ["pictures that nobody draws", "no depth"]),
         ({"maps": {"m": {"source": "boxes", "boxes": {"path": "no.csv", "licence": "mit"}}}}, ["no such file", "no.csv"]),
         ({"maps": {"m": {"source": "synthetic"}}, "configs": {"a": {"towns": {"t": {}}}}}, ["towns have maps of their own"]),
     ],
@@ -68,6 +72,36 @@ def test_what_is_wrong_with_a_campaign_is_told_before_anything_is_done(tmp_path,
     for word in words:
         assert word in str(done.exception)
     assert not out.exists()
+
+
+def test_a_mistake_of_all_runs_is_told_once(tmp_path):
+    path = campaign_file(tmp_path, configs={"a": {"plan": {"planer": "x"}}}, seeds=[0, 1, 2])
+    with pytest.raises(ConfigError) as caught:
+        load_campaign(path, [], None)
+    assert str(caught.value).count("planer") == 1
+    assert "to mend" not in str(caught.value)
+
+
+def test_the_release_of_the_campaign_is_what_its_runs_are_asked_for(tmp_path):
+    """Its licence stands for maps of which nobody knows one, its pictures are those that a run must draw."""
+    (tmp_path / "town.csv").write_text("type,x,y,height,length,width\nBuildings,1,1,4,4,4\n")
+    maps = {"mine": {"source": "boxes", "boxes": {"path": str(tmp_path / "town.csv")}}}
+    configs = {"a": SMALL | {"render": {"modalities": ["rgb"]}}}
+    release = {"licence": "mit", "modalities": ["rgb"]}
+    cfg, (one,), _ = load_campaign(campaign_file(tmp_path, maps=maps, configs=configs, release=release), [], None)
+    assert (one.cfg.release.licence, one.cfg.release.modalities) == ("mit", ("rgb",))
+    assert cfg.release.split_by == "town", "no map is in two splits"
+
+
+def test_the_dry_run_tells_of_the_release_too(tmp_path):
+    path = campaign_file(tmp_path, seeds=[1, 2])
+    told = CliRunner().invoke(app, ["campaign", str(path), "--out", str(tmp_path / "out"), "--dry-run"]).output
+    assert [line.split()[1] for line in told.splitlines() if " MB " in line and "│" in line] == [
+        "small-1",
+        "small-2",
+        "release",
+    ]
+    assert not (tmp_path / "out").exists()
 
 
 def start(path: Path, out: Path) -> subprocess.Popen:
@@ -109,6 +143,34 @@ def test_a_run_that_fails_stops_no_other_and_is_told(tmp_path):
     assert "not of this campaign, left as they are: bad-0" in text
     assert (out / "release/dataset/release.json").is_file()
     assert (out / "bad-0").is_dir()
+
+
+@pytest.mark.slow
+def test_towns_of_several_seeds_are_released_and_what_is_finished_refuses_other_settings_and_maps(tmp_path):
+    """Towns of one name stand in the runs of both seeds."""
+    csv = tmp_path / "town.csv"
+    csv.write_text("type,x,y,z,height,length,width\nRoads,0,0,-0.1,0.2,90,90\nBuildings,30,30,5,10,8,8\n")
+    mine = {"maps": {"source": "boxes", "boxes": {"path": str(csv), "licence": "mit"}}}
+    config = SMALL | {"towns": {"mine": mine, "grid": {}}}
+    settings = {"configs": {"both": config}, "seeds": [1, 2], "at_once": 2}
+    release = {"licence": "mit", "split_by": "walk"}
+    path, out = campaign_file(tmp_path, **settings, release=release), tmp_path / "out"
+    code, text = finish(path, out)
+    assert code == 0, text
+    record = read_json(out / "release/dataset/release.json")
+    assert record["history"]["flights"]["released"] >= 2
+    assert load_campaign(out, [], None)[0].release.split_by == "walk", "the folder goes on as the file said"
+    before = {name: digests(out, f"{name}/{town}") for name in ("both-1", "both-2") for town in ("mine", "grid")}
+    # Another setting of a stage, then another map under the same name: each run refuses it, and keeps what it has.
+    slower = config | {"pedestrians": SMALL["pedestrians"] | {"cruise_speed_mps": 0.9}}
+    code, text = finish(campaign_file(tmp_path, **settings | {"configs": {"both": slower}}, release=release), out)
+    assert code == 1
+    assert text.count("cruise_speed_mps") >= 2, text
+    csv.write_text(csv.read_text() + "Buildings,-30,30,5,10,8,8\n")
+    code, text = finish(campaign_file(tmp_path, **settings, release=release), out)
+    assert code == 1
+    assert "0 of 2 runs are done" in text
+    assert {name: digests(out, f"{name}/{town}") for name in before for town in ("mine", "grid")} == before
 
 
 @pytest.mark.slow

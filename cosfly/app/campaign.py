@@ -15,20 +15,20 @@ import time
 from collections import Counter
 from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import yaml
-from pydantic import Field, StringConstraints
+from pydantic import Field, StringConstraints, field_validator
 
 from cosfly.app import pipeline
 from cosfly.app.estimate import other_settings
 from cosfly.app.runs import STAGES, find
 from cosfly.app.settings import RunConfig
-from cosfly.errors import ConfigError, CosflyError
+from cosfly.errors import ConfigError, CosflyError, nearest
 from cosfly.look.frame_views import small_jpeg
 from cosfly.look.page import page
 from cosfly.products.captions import read_captions
@@ -38,9 +38,10 @@ from cosfly.work.chance import rng_for
 from cosfly.work.config import Config, apply_overrides, build, read_yaml, shipped
 from cosfly.work.console import console
 from cosfly.work.folder_lock import hold_folder
+from cosfly.work.provenance import checked_inputs, read_stage_record
 from cosfly.work.stage_events import progress_of, read_events
 from cosfly.work.stage_folder import Manifest, Resume, Tally, read_manifest
-from cosfly.work.store import write_bytes
+from cosfly.work.store import storage_errors, write_bytes
 from cosfly.work.worker import end_with_parent
 from release.package.config import ReleaseConfig
 from release.package.sources import Source, choose_licence
@@ -73,7 +74,22 @@ class CampaignConfig(Config):
     leave_out: tuple[str, ...] = Field((), description="runs that are not made: their names, * for any part")
     at_once: int = Field(1, ge=1, description="runs at work at the same time, which share the worker processes")
     workers: int = Field(0, ge=0, description="worker processes of all runs together; 0 takes one per core")
-    release: ReleaseConfig = Field(default_factory=ReleaseConfig, description="the release of all runs")
+    release: ReleaseConfig = Field(
+        default_factory=lambda: ReleaseConfig(split_by="town"),
+        description="the release of all runs, in place of their own; split_by is town unless it is set",
+    )
+
+    @field_validator("release", mode="before")
+    @classmethod
+    def _no_map_in_two_splits(cls, given: Any) -> Any:
+        return {"split_by": "town"} | given if isinstance(given, dict) else given
+
+    @field_validator("seeds")
+    @classmethod
+    def _distinct(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
+        if len(set(seeds)) != len(seeds):
+            raise ValueError("a seed is listed twice")
+        return seeds
 
 
 @dataclass(frozen=True)
@@ -97,10 +113,28 @@ class Run:
 
     def is_done(self) -> bool:
         """Tell whether all stages are complete with these very settings, and what failed is accepted."""
-        if self.num_complete() < len(self.stages()) or other_settings(self.cfg, self.folder):
+        if self.num_complete() < len(self.stages()) or self.other_settings() or not self._has_the_same_maps():
             return False
         failed = sum(read_manifest(folder).counts.failed.total() for _, folder in self.stages())
         return failed <= self.cfg.max_failed
+
+    def other_settings(self) -> list[str]:
+        """Name the settings that its stages were made with otherwise; those of the release are none of them."""
+        return [name for name in other_settings(self.cfg, self.folder) if not name.startswith("release.")]
+
+    def _has_the_same_maps(self) -> bool:
+        """Tell whether the files of its maps are those that it was made of; what cannot be read its stage tells of."""
+        try:
+            for place, town in [(name, self.cfg.of_town(name)) for name in self.cfg.towns] or [("", self.cfg)]:
+                made_of = read_stage_record(self.folder / place / "maps").inputs
+                now = checked_inputs(getattr(town.maps, town.maps.source).inputs())
+                if {name: one.sha256 for name, one in made_of.items()} != {
+                    name: one.sha256 for name, one in now.items()
+                }:
+                    return False
+        except CosflyError:
+            return False
+        return True
 
 
 def load_campaign(path: Path, overrides: list[str], out: Path | None) -> tuple[CampaignConfig, list[Run], Path]:
@@ -115,34 +149,34 @@ def load_campaign(path: Path, overrides: list[str], out: Path | None) -> tuple[C
         out, path = out or path, path / FILE
     cfg = build(CampaignConfig, apply_overrides(read_yaml(path), overrides), path)
     out = out or Path("campaigns") / cfg.name
-    runs, problems = [], list[str]()
-    for name, place, config, seed in _combinations(cfg):
+    runs, problems = [], dict[str, str]()  # a mistake of all runs is one: its words -> the first run with it
+    every = list(_combinations(cfg))
+    chosen = [one for one in every if not any(fnmatchcase(one[0], pattern) for pattern in cfg.leave_out)]
+    names = [name for name, *_ in every]
+    for pattern in cfg.leave_out:
+        if not any(fnmatchcase(name, pattern) for name in names):
+            problems[f"no run is called {pattern!r}{nearest(pattern, names)}"] = "leave_out"
+    if not chosen:
+        raise ConfigError("every run is left out", where=f"{path}: leave_out", got=", ".join(cfg.leave_out))
+    for name, place, config, seed in chosen:
         try:
             runs.append(Run(name, _settings(cfg, name, place, config, seed), out / name))
+            pipeline.check_with_files(runs[-1].cfg)
         except CosflyError as error:
-            problems.append(f"{name}: {error}")
-    if not runs and not problems:
-        raise ConfigError("every run is left out", where=f"{path}: leave_out", got=", ".join(cfg.leave_out))
-    for one in runs:
-        try:
-            pipeline.check_with_files(one.cfg)
-        except CosflyError as error:
-            problems.append(f"{one.name}: {error}")
+            problems.setdefault(str(error), name)
     if problems:
-        raise ConfigError.of_all(problems, where=path)
+        raise ConfigError.of_all([f"{name}: {words}" for words, name in problems.items()], where=path)
     maps = [(town.name, town.maps.licence) for one in runs for town in one.towns()]
     choose_licence(cfg.release.licence, maps)
     return cfg, runs, out
 
 
 def _combinations(cfg: CampaignConfig) -> Iterator[tuple[str, str | None, str, int]]:
-    """Yield name, map, configuration and seed of each run that is not left out."""
+    """Yield name, map, configuration and seed of each run, also of those that are left out."""
     for place in cfg.maps or [None]:
         for config in cfg.configs:
             for seed in cfg.seeds:
-                name = "-".join([*([place] if place else []), config, str(seed)])
-                if not any(fnmatchcase(name, pattern) for pattern in cfg.leave_out):
-                    yield name, place, config, seed
+                yield "-".join([*([place] if place else []), config, str(seed)]), place, config, seed
 
 
 def _settings(cfg: CampaignConfig, name: str, place: str | None, config: str, seed: int) -> RunConfig:
@@ -150,7 +184,11 @@ def _settings(cfg: CampaignConfig, name: str, place: str | None, config: str, se
     base = changes.pop("base", None)
     where = f"configs.{config}"
     data = {} if base is None else read_yaml(_file_of(base, f"{where}.base"))
-    data = _merged(data, changes) | {"name": name, "seed": seed}
+    if "release" in changes:
+        fix = "set it in `release` of the campaign"
+        raise ConfigError("the runs of a campaign have one release", where=f"{where}.release", fix=fix)
+    # With the release's settings a run is asked before its first stage what the release will ask after all.
+    data = _merged(data, changes) | {"name": name, "seed": seed, "release": cfg.release.model_dump(mode="json")}
     if place is not None:
         if "towns" in data:
             raise ConfigError("towns have maps of their own", where=where, fix="leave out `maps`, or the towns")
@@ -191,30 +229,37 @@ def run(cfg: CampaignConfig, runs: list[Run], out: Path, *, resume: Resume = "if
     """
     stood = (out / FILE).exists()
     with hold_folder(out, nothing=() if stood else (FILE,)):
-        settings = yaml.safe_dump(cfg.model_dump(mode="json", exclude_defaults=True), sort_keys=False)
+        settings = yaml.safe_dump(cfg.model_dump(mode="json", exclude_unset=True), sort_keys=False)
         write_bytes(out / FILE, settings.encode())
         _tell_left_behind(runs, out)
-        todo = [one for one in runs if not one.is_done()]
-        log.info("%s: %d of %d runs are done", cfg.name, len(runs) - len(todo), len(runs))
+        done = {one.name for one in runs if one.is_done()}
+        todo = [one for one in runs if one.name not in done]
+        log.info("%s: %d of %d runs are done", cfg.name, len(done), len(runs))
         cores = cfg.workers or len(os.sched_getaffinity(0))
         at_work: dict[str, subprocess.Popen] = {}
-        work = partial(_do, out, max(1, cores // min(cfg.at_once, len(todo) or 1)), resume, at_work)
-        with _shown(runs, out, at_work), ThreadPoolExecutor(cfg.at_once) as threads:
+        work = partial(_do, out, max(1, cores // min(cfg.at_once, len(todo) or 1)), resume, at_work, done)
+        with _shown(runs, out, at_work, done), ThreadPoolExecutor(cfg.at_once) as threads:
             try:
-                done = list(threads.map(work, todo))
+                list(threads.map(work, todo))
             except BaseException:
                 threads.shutdown(wait=False, cancel_futures=True)
                 for process in list(at_work.values()):
                     process.terminate()
                 raise
-        failed = [one.name for one, is_done in zip(todo, done, strict=True) if not is_done]
+        failed = [one.name for one in todo if one.name not in done]
         try:
             if failed:
                 log.error("%s: no release is made: %d runs failed: %s", cfg.name, len(failed), ", ".join(failed))
                 return None
             joint = RunConfig(name=cfg.name, workers=cfg.workers, release=cfg.release)
-            parts = [one.folder / town for one in runs for town in one.cfg.towns or [""]]
-            pipeline.joint_release(joint, [Source.of_run(part) for part in parts], out, resume).work()
+            sources = [
+                replace(
+                    Source.of_run(one.folder / town), run=f"{one.name}_{town}".rstrip("_")
+                )  # towns of seeds: one name
+                for one in runs
+                for town in one.cfg.towns or [""]
+            ]
+            pipeline.joint_release(joint, sources, out, resume).work()
             return read_manifest(out / "release")
         finally:
             write_report(cfg, runs, out)
@@ -228,16 +273,20 @@ def _tell_left_behind(runs: list[Run], out: Path) -> None:
         log.warning("%s: not of this campaign, left as they are: %s", out, ", ".join(left))
 
 
-def _do(out: Path, workers: int, resume: Resume, at_work: dict[str, subprocess.Popen], one: Run) -> bool:
-    """Do one run in a process of its own, which ends with this one; tells whether it came to its end."""
+def _do(
+    out: Path, workers: int, resume: Resume, at_work: dict[str, subprocess.Popen], done: set[str], one: Run
+) -> None:
+    """Do one run in a process of its own, which ends with this one; `done` has its name if it came to its end."""
     settings, told = out / SETTINGS / f"{one.name}.yaml", out / LOGS / f"{one.name}.log"
     write_bytes(settings, yaml.safe_dump(one.cfg.model_dump(mode="json"), sort_keys=False, allow_unicode=True).encode())
-    told.parent.mkdir(exist_ok=True)
+    with storage_errors(told):
+        told.parent.mkdir(exist_ok=True)
+        log_file = told.open("wb")
     words = ["run", str(settings), "--out", str(one.folder), "--until", OF_A_RUN[-1]]
     words += ["--workers", str(one.cfg.workers or workers), "--resume", resume]
     begun_s = time.monotonic()
     log.info("%s: begun", one.name)
-    with told.open("wb") as log_file:
+    with log_file:
         at_work[one.name] = process = subprocess.Popen(
             [sys.executable, "-m", "cosfly", *words],
             stdin=subprocess.DEVNULL, stdout=log_file, stderr=subprocess.STDOUT,
@@ -246,10 +295,10 @@ def _do(out: Path, workers: int, resume: Resume, at_work: dict[str, subprocess.P
         code = process.wait()
     del at_work[one.name]
     if code == 0 and one.is_done():
+        done.add(one.name)
         log.info("%s: done, %.0f s", one.name, time.monotonic() - begun_s)
-        return True
-    log.error("%s: failed: %s", one.name, error_of(out, one.name) or f"exit code {code}; see {told}")
-    return False
+    else:
+        log.error("%s: failed: %s", one.name, error_of(out, one.name) or f"exit code {code}; see {told}")
 
 
 def error_of(out: Path, name: str) -> str | None:
@@ -266,23 +315,29 @@ def error_of(out: Path, name: str) -> str | None:
 # --- how far it is ----------------------------------------------------------------------------------------------------
 
 
-def table(runs: list[Run], out: Path, at_work: Collection[str] = ()) -> list[tuple[str, ...]]:
-    """Tell of each run how far it is: name, state, stages complete, what is at hand, flights and captions, seconds."""
+def table(
+    runs: list[Run], out: Path, at_work: Collection[str] = (), done: Collection[str] = ()
+) -> list[tuple[str, ...]]:
+    """Tell of each run how far it is: name, state, stages complete, what is at hand, flights and captions, seconds.
+
+    Args:
+        done: names of runs that are known to be done: to see it takes a tenth of a second each.
+    """
     rows = []
     for one in runs:
         complete = {name: read_manifest(folder) for name, folder in one.stages() if (folder / "manifest.json").exists()}
         begun = [(name, folder) for name, folder in one.stages() if name not in complete]
         state, what = "to do", ""
         if not begun:
-            state = "done" if one.is_done() else "failed"
+            state = "done" if one.name in done or one.is_done() else "failed"
         elif one.name in at_work:
             (name, folder), state = begun[0], "at work"
             far = progress_of(read_events(folder))
             what = f"{name}, {far[0].done:,} of {far[0].total:,} {far[0].unit}" if far else name
         elif (out / LOGS / f"{one.name}.log").exists():
-            state = "failed"
+            state = "failed" if error_of(out, one.name) else "broken off"
         if state == "failed":
-            others = other_settings(one.cfg, one.folder)
+            others = one.other_settings()
             made = f"made with other settings: {', '.join(others[:3])}" if others else "see its log"
             what = error_of(out, one.name) or made
         kept = (sum(m.counts.kept for name, m in complete.items() if name.endswith(of)) for of in ("render", "caption"))
@@ -296,7 +351,7 @@ HEAD = ("run", "state", "stages", "at hand", "flights", "captions", "seconds")
 
 
 @contextlib.contextmanager
-def _shown(runs: list[Run], out: Path, at_work: Collection[str]) -> Iterator[None]:
+def _shown(runs: list[Run], out: Path, at_work: Collection[str], done: Collection[str]) -> Iterator[None]:
     """Show the table on a terminal while runs are at work."""
     if not console.is_terminal:
         yield
@@ -306,8 +361,9 @@ def _shown(runs: list[Run], out: Path, at_work: Collection[str]) -> Iterator[Non
 
     def drawn() -> Table:
         shown = Table(*HEAD, box=None)
-        for row in table(runs, out, at_work):
-            shown.add_row(*row)
+        with contextlib.suppress(CosflyError):  # a stage that begins again has just taken its manifest away
+            for row in table(runs, out, at_work, done):
+                shown.add_row(*row)
         return shown
 
     with Live(get_renderable=drawn, console=console, refresh_per_second=0.5, transient=True):

@@ -78,10 +78,15 @@ def campaign(
     if dry_run:
         told, rows = [], []
         for one in runs:
-            left = [r for r in estimate.estimate(one.cfg, one.folder, estimate.rates_near(one.folder)) if not r.is_done]
-            rows += left[:-1]  # its release is that of all
-            stages = ", ".join(row.name for row in left[:-1])
-            told.append((one.name, stages or "-", estimate.time_left(left[:-1]), estimate.in_words(_disk(left[:-1]))))
+            every = estimate.estimate(one.cfg, one.folder, estimate.rates_near(one.folder))
+            rows += every
+            left = [row for row in every if not row.is_done and row.name != "release"]
+            stages = ", ".join(row.name for row in left)
+            told.append((one.name, stages or "-", estimate.time_left(left), estimate.in_words(_disk(left))))
+        if (out / "release/manifest.json").exists() and not any(row[1] != "-" for row in told):
+            rows = []
+        elif joint := [row for row in rows if row.name == "release"]:  # is of the frames of all runs
+            told.append(("release", "release", estimate.time_left(joint), estimate.in_words(_disk(joint))))
         title = f"What {out} would take, one run after the other; nothing is written"
         options.tell_table(answer_console, ("run", "to do", "time", "disk"), told, title=title, left=("to do", "time"))
         unknown = "" if all(row.seconds is not None for row in rows) else ", and what teachers take"
