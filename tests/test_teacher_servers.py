@@ -93,6 +93,13 @@ def test_a_server_that_always_fails_costs_no_window(fault, tree, tmp_path, caplo
     assert any("left out" in record.message and bad.url in record.message for record in caplog.records)
 
 
+def test_a_server_that_never_answers_costs_no_window(tree, tmp_path, caplog):
+    with deciding() as good, deciding(delay_s=20.0) as silent:
+        run(asking(silent.url, good.url, endpoint={"timeout_s": 4.0}), tree, tmp_path / "out")
+    assert all(caption.status == "accepted" for caption in read_captions(tmp_path / "out" / "captions.jsonl"))
+    assert f"{silent.url}: no answer within 4 s" in caplog.text
+
+
 def test_a_run_goes_on_with_another_list_of_servers(tmp_path):
     tree = make_playback_tree(tmp_path / "tree", 1, 30, with_augmented=False)
     with deciding() as one, deciding() as two, deciding() as three:

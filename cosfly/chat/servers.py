@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 from cosfly.chat.client import Ask, ChatServer, EndpointConfig, Failure, Unreachable
 from cosfly.chat.contract import NoAnswer, Reply, Request, Troubles
-from cosfly.chat.protocol import base_url, split_urls
+from cosfly.chat.protocol import split_urls
 from cosfly.errors import TeacherError
 
 log = logging.getLogger(__name__)
@@ -106,17 +106,20 @@ class ChatClient:
             TeacherError: no request will get an answer.
         """
         asks: dict[_Place, Ask] = {}  # of the servers that were tried
-        found, deadline_s = Failure("no_answer", ""), float("inf")
-        for attempt in range(self.cfg.max_tries):
+        attempt, deadline_s = 0, float("inf")
+        while True:
             async with self._slot(asks) as server:
                 given_s = time.monotonic()
                 deadline_s = min(deadline_s, given_s + self.cfg.total_timeout_s)
-                answered = await self._attempt(server, asks.setdefault(server, server.ask_of(request)), given_s)
-            if isinstance(answered, Reply):
+                found = await self._attempt(server, asks.setdefault(server, server.ask_of(request)), given_s)
+            if isinstance(found, Reply):
                 log.debug("%s: answered at try %d", server.where, attempt + 1)
-                return answered
-            found, is_last = answered, attempt + 1 == self.cfg.max_tries
-            pause_s = self._pause_s(server, attempt, found)
+                return found
+            is_moving = any(not one.trouble and one not in asks for one in self.servers)
+            attempt += not is_moving  # to ask each server once is one try
+            is_last = attempt >= self.cfg.max_tries
+            pause_s = self._backoff_s(attempt - 1) if found.wait_s is None else found.wait_s
+            pause_s = 0.0 if is_moving else pause_s
             is_late = not is_last and time.monotonic() + pause_s >= deadline_s
             if self.troubles.failed(found.detail):
                 what = "given up" if is_last or is_late else "trying again"
@@ -124,9 +127,9 @@ class ChatClient:
             if is_late:
                 words = f"no answer within {self.cfg.total_timeout_s:g} s; the last: {found.detail}"
                 raise NoAnswer("total_timeout", words)
-            if not is_last:
-                await asyncio.sleep(pause_s)
-        raise NoAnswer(found.cause, found.detail)
+            if is_last:
+                raise NoAnswer(found.cause, found.detail)
+            await asyncio.sleep(pause_s)
 
     async def _attempt(self, server: _Place, ask: Ask, given_s: float) -> Reply | Failure:
         """Send a request to a server once, and note what that says of the server."""
@@ -148,12 +151,6 @@ class ChatClient:
             if server.num_failed >= (1 if server.num_outs else OUT_AFTER):
                 self._leave_out(server, found.detail)
         return found
-
-    def _pause_s(self, server: _Place, attempt: int, found: Failure) -> float:
-        """Give the wait before the next try, s: none where another server can be asked."""
-        if self._others(server):
-            return 0.0
-        return self._backoff_s(attempt) if found.wait_s is None else found.wait_s
 
     def _backoff_s(self, attempt: int) -> float:
         longest = min(self.cfg.max_backoff_s, self.cfg.backoff_s * 2.0 ** min(attempt, 60))
@@ -183,10 +180,6 @@ class ChatClient:
         asked = [server for server in asked if server not in tried] or asked
         with_room = [server for server in asked if server.throttle.has_room()]
         return min(with_room, key=lambda server: server.throttle.load, default=None)
-
-    def _others(self, server: _Place) -> bool:
-        """Tell whether another server than this one is asked."""
-        return any(not other.trouble for other in self.servers if other is not server)
 
     def _leave_out(self, server: _Place, why: str) -> None:
         if server.trouble or len(self.servers) == 1:
@@ -224,8 +217,3 @@ class ChatClient:
         server.trouble, server.returning, server.is_refusing = "", None, False
         server.throttle.restart()
         log.warning("%s: is asked again", server.where)
-
-
-def server_names(urls: str) -> str:
-    """Give what tells one list of servers from another: their addresses in order."""
-    return ",".join(sorted(base_url(url) for url in split_urls(urls)))

@@ -102,8 +102,8 @@ class _Replica:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 probe.bind((self.cfg.host, self.port))
-            except OSError as error:
-                return f"port {self.port} cannot be had ({error.strerror}); choose another with --port"
+            except (OSError, OverflowError) as error:
+                return f"port {self.port} cannot be had ({error}); choose another with --port"
         begin = self.log_file.stat().st_size if self.log_file.exists() else 0
         until_s = time.monotonic() + self.cfg.ready_s
         process = ServerProcess(self.words, self.log_file, self.environment)

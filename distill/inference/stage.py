@@ -16,7 +16,7 @@ from pydantic import Field
 from cosfly.chat.answers import Answer, AnswerBook, KeptAnswers
 from cosfly.chat.contract import Engine, NoAnswer, Request, started
 from cosfly.chat.protocol import answer_key, split_urls
-from cosfly.chat.servers import ChatClient, server_names
+from cosfly.chat.servers import ChatClient
 from cosfly.chat.student_chat import TAUGHT, StudentEndpointConfig, picture_to_send, read_taught, student_request
 from cosfly.chat.vllm_engine import VllmConfig, VllmEngine
 from cosfly.errors import ConfigError, InputError, TeacherError
@@ -234,9 +234,10 @@ def _identified(cfg: InferConfig, url: str, out: Path) -> tuple[InferConfig, str
     A folder that is complete is not asked for again, so its server need not run.
 
     Returns:
-        The settings, and a digest of the server's address, which itself stays out of records.
+        The settings, and a digest of the servers' addresses, which itself stays out of records.
     """
-    server = sha256_bytes(server_names(url).encode())[:16]
+    client = ChatClient(url, cfg.sampling)
+    server = sha256_bytes(",".join(sorted(client.where.split(","))).encode())[:16]
     if (out / "manifest.json").exists():
         facts = read_manifest(out).facts
         name = str(facts.get("model"))
@@ -244,7 +245,7 @@ def _identified(cfg: InferConfig, url: str, out: Path) -> tuple[InferConfig, str
             return cfg.model_copy(update={"endpoint": cfg.endpoint.model_copy(update={"model": name})}), server
 
     async def ask() -> str:
-        async with started(client := ChatClient(url, cfg.sampling)):
+        async with started(client):
             return client.model
 
     return cfg.model_copy(update={"endpoint": cfg.endpoint.model_copy(update={"model": asyncio.run(ask())})}), server
