@@ -276,7 +276,7 @@ def connected(cfg: RayConfig) -> Any:
     ends_it = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(address, **own, log_to_driver=False, logging_level=logging.ERROR, namespace="cosfly")
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
         raise _refused(address, error) from None
     finally:
         # What it tells of nodes that are lost it would write on the standard output.

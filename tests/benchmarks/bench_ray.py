@@ -1,0 +1,176 @@
+"""Two workers on a Ray cluster beside two processes of the local engine; memory of the driver; nodes and workers lost.
+
+    python tests/benchmarks/bench_ray.py render --rounds 2        # pairs A B A B of one render stage
+    python tests/benchmarks/bench_ray.py memory                   # 1,000, 10,000, 100,000 items that do nothing
+    python tests/benchmarks/bench_ray.py losses --kills 20        # SIGKILL to workers and one node, 2,000 frames
+
+The cluster is one of several processes on this machine. Writes below the folder of --work only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import logging
+import multiprocessing
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from crashes import contents, differences
+from test_cosfly_ray import Nodes
+from toy_workers import make_talking_worker, stage_in
+
+from cosfly.app import pipeline
+from cosfly.app.settings import RunConfig
+from cosfly.work.config import load
+from cosfly.work.ray_engine import RayConfig, connected
+from cosfly.work.runner import Item, Watch, run_items
+from cosfly.work.stage_events import LOSSES, Event, read_events, rss_mib
+from cosfly.work.stage_folder import read_manifest
+
+WORKERS = 2
+TOWN = ("pedestrians.num_paths=7", "render.width_px=320", "render.height_px=180", "release.licence=cc-by-4.0")
+
+
+@contextlib.contextmanager
+def cluster(num_nodes: int = WORKERS) -> Iterator[tuple[Nodes, list, RayConfig]]:
+    """A head without CPUs and nodes of one."""
+    begun_s, nodes = time.monotonic(), Nodes()
+    added, cfg = [nodes.add() for _ in range(num_nodes)], RayConfig(address=nodes.address)
+    connected(cfg)
+    print(f"cluster of {num_nodes} nodes, and this process connected: {time.monotonic() - begun_s:.1f} s")
+    try:
+        yield nodes, added, cfg
+    finally:
+        nodes.end()
+
+
+def stages(out: Path, cfg: RayConfig | None) -> dict[str, pipeline.Stage]:
+    on = [] if cfg is None else ["engine=ray", f"ray.address={cfg.address}"]
+    run = load(RunConfig, None, [*TOWN, f"workers={WORKERS}", *on])
+    return {stage.name: stage for stage in pipeline.stages(run, out)}
+
+
+def begin(work: Path) -> Path:
+    """Make a run up to its flights, which every measurement then copies."""
+    for name in ("maps", "simplify", "pedestrians", "plan"):
+        stages(work / "base/run", None)[name].work()
+    return work / "base/run"
+
+
+def render(base: Path, place: Path, cfg: RayConfig | None) -> list[Event]:
+    """Render the flights of a run in a copy, in the folder `run` of a place."""
+    shutil.copytree(base, place / "run")
+    before = Path.cwd()
+    os.chdir(place)  # so that paths in records are the same
+    try:
+        stages(Path("run"), cfg)["render"].work()
+    finally:
+        os.chdir(before)
+    return read_events(place / "run/render")
+
+
+def spans(events: list[Event]) -> tuple[float, float, int]:
+    """Give the seconds until the first item has begun, those of all work after it, and the frames."""
+    done = [event for event in events if event.event == "item_done"]
+    first_s = min(event.at_s - (event.seconds or 0.0) for event in done)
+    return first_s - events[0].at_s, done[-1].at_s - first_s, sum(event.steps or 0 for event in done)
+
+
+def measure_render(work: Path, rounds: int) -> None:
+    base, rates = begin(work), {"local": list[float](), "ray": list[float]()}
+    with cluster() as (_, _, cfg):
+        for number in range(rounds):
+            for name, engine in (("local", None), ("ray", cfg)):
+                start_s, work_s, frames = spans(render(base, work / f"{name}{number}", engine))
+                rates[name].append(frames / work_s)
+                pace, load = f"{frames} frames in {work_s:.1f} s, {frames / work_s:.1f}/s", os.getloadavg()[0]
+                print(f"{name}: start {start_s:.1f} s, then {pace}; load {load:.0f}", flush=True)
+    told = differences(contents(work / "ray0"), contents(work / "local0"))
+    ratios = [f"{ray / local:.2f}" for local, ray in zip(*rates.values(), strict=True)]
+    print(f"ray / local, by rounds: {', '.join(ratios)}; differences: {told}")
+
+
+def do_nothing(folder: Path, engine: RayConfig | None, count: int) -> None:
+    """Do items that do nothing, as a command does; tell the memory of this process."""
+    logging.getLogger().setLevel(logging.ERROR)
+    folder.mkdir(parents=True)
+    items = [Item(str(k)) for k in range(count)]
+    if engine is not None:
+        connected(engine)
+    before_mib, begun_s = rss_mib(os.getpid()), time.monotonic()
+    run_items(stage_in(folder), items, make_talking_worker, workers=WORKERS, watch=Watch(engine))
+    pace = count / (time.monotonic() - begun_s)
+    name, after_mib = "local" if engine is None else "ray", rss_mib(os.getpid())
+    print(f"{name}, {count:,} items: driver {before_mib:.0f} MiB before, {after_mib:.0f} after; {pace:.0f} items/s")
+
+
+def measure_memory(work: Path, counts: Iterable[int]) -> None:
+    spawn = multiprocessing.get_context("spawn")
+    with cluster() as (_, _, cfg):
+        for count in counts:
+            for engine in (None, cfg):
+                process = spawn.Process(target=do_nothing, args=(work / f"{count}{engine is None}", engine, count))
+                process.start()
+                process.join()
+
+
+def measure_losses(work: Path, kills: int) -> None:
+    base = begin(work)
+    render(base, work / "undisturbed", None)
+    with cluster(3) as (nodes, added, cfg):
+        killed = [0]
+
+        def disturb() -> None:
+            folder, chance = work / "disturbed/run/render", random.Random(0)
+            while killed[0] < kills:
+                time.sleep(chance.uniform(1.0, 3.0))
+                alive = {e.worker: e.pid for e in read_events(folder) if e.event in ("worker_started", "restarted")}
+                with contextlib.suppress(ProcessLookupError):
+                    if alive and (pid := chance.choice(sorted(alive.values()))):
+                        os.kill(pid, signal.SIGKILL)
+                        killed[0] += 1
+                if killed[0] == kills // 2 and added:
+                    nodes.kill(added.pop())
+
+        threading.Thread(target=disturb, daemon=True).start()
+        events = render(base, work / "disturbed", cfg)
+        kinds = (*LOSSES, "restarted", "retried", "given_up")
+        counts = {kind: sum(event.event == kind for event in events) for kind in kinds}
+        frames = read_manifest(work / "disturbed/run/render").facts["num_frames"]
+        told = differences(contents(work / "disturbed"), contents(work / "undisturbed"))
+        lost = f"{killed[0]} workers and {3 - len(added)} node killed"
+        print(f"{frames} frames, {lost}: {counts}; differences: {told}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("render", "memory", "losses"))
+    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--counts", type=int, nargs="+", default=(1_000, 10_000, 100_000), help="of items")
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--work", type=Path, help="new folder; without: one that goes again")
+    given = parser.parse_args()
+    logging.getLogger().setLevel(logging.ERROR)
+    with tempfile.TemporaryDirectory() as place:
+        work = (given.work or Path(place)).absolute()
+        todo: dict[str, Callable[[], None]] = {
+            "render": lambda: measure_render(work, given.rounds),
+            "memory": lambda: measure_memory(work, given.counts),
+            "losses": lambda: measure_losses(work, given.kills),
+        }
+        todo[given.what]()
+
+
+if __name__ == "__main__":
+    main()
