@@ -2,6 +2,9 @@
 
 Prints its address when all of it is there, answers every GET so many seconds late, writes a line of JSON for each
 request, and ends with its input. Runs in an environment of its own (tests/owners.py).
+
+A key that is called `wrong` is refused. A file LOG.faults plants more, anew for each request: `deny METHOD` and
+`cut METHOD` refuse, or break off, what changes or reads an object. LOG.all has the method and path of every request.
 """
 
 import json
@@ -20,8 +23,24 @@ answer = DomainDispatcherApplication(create_backend_app)
 logging.getLogger("werkzeug").setLevel(logging.ERROR)
 
 
+def refused(start, code):
+    start("403 Forbidden", [("Content-Type", "application/xml")])
+    return [f"<Error><Code>{code}</Code><Message>no</Message></Error>".encode()]
+
+
 def told(environ, start):
     method = environ["REQUEST_METHOD"]
+    with log.with_suffix(".all").open("a") as file:
+        file.write(f"{method} {environ['PATH_INFO']}\n")
+    faults = log.with_suffix(".faults")
+    planted = faults.read_text() if faults.exists() else ""
+    if "Credential=wrong/" in environ.get("HTTP_AUTHORIZATION", ""):
+        return refused(start, "InvalidAccessKeyId")
+    if planted == f"deny {method}":
+        return refused(start, "AccessDenied")
+    if planted == f"cut {method}":
+        environ["werkzeug.socket"].shutdown(2)
+        return refused(start, "Cut")
     if method == "GET":
         with log.open("a") as file:
             file.write(json.dumps([environ["PATH_INFO"], environ.get("HTTP_RANGE")]) + "\n")

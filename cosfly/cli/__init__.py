@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,6 +20,7 @@ from cosfly import __version__
 from cosfly.cli.caption import app as caption_app
 from cosfly.cli.distill import app as distill_app
 from cosfly.cli.fly import app as fly_app
+from cosfly.cli.located import default_cache, located
 from cosfly.cli.release import app as release_app
 from cosfly.cli.release import export_app
 from cosfly.cli.run import app as run_app
@@ -32,7 +34,10 @@ from cosfly.errors import CosflyError, plain
 # The exit codes of Ctrl-C, which Typer makes of a KeyboardInterrupt without a word, and of SIGTERM.
 ENDED = {130: "interrupted", 143: "terminated"}
 
+CACHE_HELP = "Where work on s3://... and the like is done, and kept; on Ray a folder that all nodes see."
 FLAGS = ("-v", "--verbose", "-q", "--quiet")  # of all commands; no command has others of these names
+
+VALUES = ("--log-file", "--cache")  # the same, with a value each
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +47,8 @@ class _Root(typer.core.TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         try:
-            return super().invoke(ctx)
+            with ExitStack() as self._held:
+                return super().invoke(ctx)
         except typer.BadParameter as error:
             from pydantic import ValidationError
 
@@ -51,6 +57,14 @@ class _Root(typer.core.TyperGroup):
                 got = "" if detail["type"] == "value_error" else f", got {detail['input']!r}"
                 error.message = f"{plain(error.message)}{got}"
             raise
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name, command, self._words = found = super().resolve_command(ctx, args)
+        return found
+
+    def locate(self, name: str, cache: Path) -> None:
+        """Put working folders in place of the addresses among the words of a command, which are yet to be read."""
+        self._words[:] = located([name, *self._words], cache, self._held)[1:]
 
 
 app = typer.Typer(
@@ -76,11 +90,16 @@ for name, named_group in (
 
 @app.callback(invoke_without_command=True)
 def _root(
+    context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Tell what is done, item by item.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Tell warnings and errors only.")] = False,
     log_file: Annotated[
         Path | None, typer.Option("--log-file", help="Also append all that -v tells to this file, with times.")
+    ] = None,
+    cache: Annotated[
+        Path | None,
+        typer.Option("--cache", envvar="COSFLY_CACHE", show_default="~/.cache/cosfly/locations", help=CACHE_HELP),
     ] = None,
 ) -> None:
     if version:
@@ -90,6 +109,8 @@ def _root(
 
     set_up_logging(logging.DEBUG if verbose else logging.WARNING if quiet else logging.INFO, log_file)
     log.debug("cosfly %s, Python %s, in %s", __version__, sys.version.split()[0], Path.cwd())
+    if context.invoked_subcommand is not None and isinstance(context.command, _Root):
+        context.command.locate(context.invoked_subcommand, cache or default_cache())
 
 
 def options_first(words: Sequence[str]) -> list[str]:
@@ -99,7 +120,7 @@ def options_first(words: Sequence[str]) -> list[str]:
     number = 0
     while number < end:
         word = others[number]
-        count = 2 if word == "--log-file" else 1 if word in FLAGS or word.startswith("--log-file=") else 0
+        count = 2 if word in VALUES else 1 if word in FLAGS or word.partition("=")[0] in VALUES else 0
         count = min(count, end - number)
         ours += others[number : number + count]
         del others[number : number + count]

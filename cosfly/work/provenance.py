@@ -23,6 +23,7 @@ from cosfly.reading.documents import FileFormat, read_json, read_model, read_obj
 from cosfly.reading.files import files_named, sha256_file
 from cosfly.work.console import progress_bar
 from cosfly.work.journal import Journal
+from cosfly.work.locations import name_of
 from cosfly.work.store import CHECKSUMS, checksum_lines, dump_json, inside, read_checksums, sha256_bytes
 
 log = logging.getLogger(__name__)
@@ -154,7 +155,7 @@ def checked_inputs(inputs: Mapping[str, Path], audited: Collection[str] = ()) ->
         _check_name(path)
         if name not in audited:
             _check_finished(path)
-    found = {name: StageInput(path=str(path), sha256=fingerprint(path)) for name, path in sorted(inputs.items())}
+    found = {name: StageInput(path=name_of(path), sha256=fingerprint(path)) for name, path in sorted(inputs.items())}
     for name, path in inputs.items():
         _check_belongs(name, path, inputs, found)
     return found

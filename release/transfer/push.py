@@ -14,11 +14,11 @@ from pathlib import Path
 
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, TeacherError, VerifyError
 from cosfly.products.shown_captions import CaptionReader
+from cosfly.work.locations import without_secrets
 from cosfly.work.store import CHECKSUMS, read_checksums
 from cosfly.work.worker_pool import Watch
 from release.export.source import SHARD_NAME, open_release
 from release.sign import SIGNATURE, is_signed
-from release.transfer.remote import without_secrets
 from release.verify.findings import Verified
 from release.verify.verify import Level, verify
 

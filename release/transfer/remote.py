@@ -12,7 +12,6 @@ import asyncio
 import io
 import ipaddress
 import os
-import re
 import socket
 import time
 from abc import abstractmethod
@@ -23,6 +22,7 @@ from urllib.parse import SplitResult, urljoin, urlsplit, urlunsplit
 from cosfly.errors import EnvironmentMissing, InputError
 from cosfly.escaping import published_name
 from cosfly.reading.files import open_file
+from cosfly.work.locations import CHAIN, opened, without_secrets
 from cosfly.work.runner import advance
 from cosfly.work.store import inside
 from release.record import release_folder
@@ -37,7 +37,6 @@ TIMEOUT_S = 90.0  # of one answer, from its first byte to its last, however stea
 REDIRECTS, MOST_REDIRECTS = (301, 302, 303, 307, 308), 5
 MOST_DIGITS = 15  # of a size
 LOCAL = ("file", "local")  # schemes of files of this machine
-CHAIN = re.compile(r"::(?![^\[]*\])")  # between the links of a chain, not within [::1]
 
 
 class Remote(Protocol):
@@ -69,22 +68,6 @@ def open_remote(address: str) -> Remote:
     if not os.path.isdir(folder):  # of any text; a path's own raises
         raise InputError("there is no such folder", where=folder, expected="a release folder, or an address")
     return FolderRemote(folder)
-
-
-def without_secrets(address: str) -> str:
-    """Give an address without user, password, query and fragment; of a chain (`zip://x::https://...`) each link."""
-    return "::".join(_plain(link) for link in CHAIN.split(address))
-
-
-def _plain(link: str) -> str:
-    if "://" not in link:  # a folder, or what is left of an address that is none
-        return re.split("[?#]", link, maxsplit=1)[0].rpartition("@")[2]
-    try:
-        parts = urlsplit(link)
-        host = parts.netloc.rpartition("@")[2]
-    except ValueError:
-        return f"{link.partition('://')[0]}://..."
-    return urlunsplit((parts.scheme, host, parts.path, "", ""))
 
 
 def published_address(shown: str) -> str:
@@ -294,18 +277,7 @@ class FsspecRemote:
 
     def _system(self) -> tuple[Any, str]:
         if self._opened is None:
-            try:
-                from fsspec.core import url_to_fs
-            except ImportError:
-                raise EnvironmentMissing(
-                    "fsspec is not installed", where=self.shown, fix="pip install 'cosfly[remote]'"
-                ) from None
-            try:
-                system, root = url_to_fs(self._address)
-            except Exception as error:  # each file system has its own
-                got = type(error).__name__
-                raise InputError("no such address", where=self.shown, got=got, expected="what fsspec opens") from None
-            self._opened = system, str(root).rstrip("/")
+            self._opened = opened(self._address)
         return self._opened
 
 

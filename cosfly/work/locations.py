@@ -1,0 +1,438 @@
+"""Folders that lie where fsspec reaches (s3://, gs://, sftp://, memory:// ...), worked on in a folder of this machine.
+
+An input is fetched into a cache; what is here does not travel again. An output is a folder of the cache that is copied
+out while a stage works: files first, then journals as they were before those files were listed, then manifests as they
+were then. So what a journal out there names is there, and a manifest, the only commit, comes last. Of the other side
+only this is asked: a file that was put can be listed, with its size.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import hashlib
+import logging
+import os
+import re
+import shutil
+import socket
+import threading
+import time
+import uuid
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar, cast
+from urllib.parse import urlsplit, urlunsplit
+
+from pydantic import BaseModel
+
+from cosfly.errors import CosflyError, EnvironmentMissing, InputError, ResumeError, StorageError
+from cosfly.work.folder_lock import LOCK, hold_folder
+from cosfly.work.store import CHECKSUMS, DISK_FULL, inside, storage_errors, write_bytes
+
+log = logging.getLogger(__name__)
+
+CHAIN = re.compile(r"::(?![^\[]*\])")  # between the links of a chain, not within [::1]
+HAS_NO_FOLDERS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "memory"}
+MD5 = re.compile("[0-9a-f]{32}")
+TRIES, FIRST_WAIT_S = 3, 1.0  # what broke is asked again after 1 and 2 s; libraries try on their own before
+BATCH = 128  # files of one call, which go side by side where the library can
+COPY_EVERY_S, MOST_SHARE = 10.0, 0.2  # a copy begins so often, and takes so much of the time at most
+BEAT_S, STALE_S, SETTLE_S = 20.0, 120.0, 0.5  # of the mark that says who writes
+MANIFEST = "manifest.json"
+
+T = TypeVar("T")
+
+
+def without_secrets(address: str) -> str:
+    """Give an address without user, password, query and fragment; of a chain (`zip://x::https://...`) each link."""
+    return "::".join(_plain(link) for link in CHAIN.split(address))
+
+
+def _plain(link: str) -> str:
+    if "://" not in link:  # a folder, or what is left of an address that is none
+        return re.split("[?#]", link, maxsplit=1)[0].rpartition("@")[2]
+    try:
+        parts = urlsplit(link)
+        host = parts.netloc.rpartition("@")[2]
+    except ValueError:
+        return f"{link.partition('://')[0]}://..."
+    return urlunsplit((parts.scheme, host, parts.path, "", ""))
+
+
+def opened(address: str) -> tuple[Any, str]:
+    """Give the file system of an address, and the path in it.
+
+    Raises:
+        InputError: fsspec knows no such address. EnvironmentMissing: a package is not installed; says which.
+    """
+    shown = without_secrets(address)
+    try:
+        from fsspec.core import url_to_fs
+        from fsspec.registry import known_implementations
+    except ImportError:
+        fix = "pip install 'cosfly[remote]'"
+        raise EnvironmentMissing("fsspec is not installed", where=shown, fix=fix) from None
+    try:
+        system, root = url_to_fs(address)
+    except ImportError:
+        told = known_implementations.get(address.partition("://")[0], {}).get("err", "")  # 'Install s3fs to access S3'
+        fix = re.sub(r".*nstall ([\w.-]+) to .*", r"pip install \1", told)
+        raise EnvironmentMissing("what opens such addresses is not installed", where=shown, fix=fix) from None
+    except Exception as error:  # each file system has its own; their words may hold the address
+        got, expected = type(error).__name__, "what fsspec opens"
+        raise InputError("no such address", where=shown, got=got, expected=expected) from None
+    return system, str(root).rstrip("/")
+
+
+_shown: dict[Path, str] = {}  # working folder -> address, of this process
+
+
+def name_of(path: Path) -> str:
+    """Give the name by which a record calls a path: what lies at a location its address, anything else itself."""
+    for place in (path.absolute(), *path.absolute().parents):
+        if place in _shown:
+            return "/".join([_shown[place], *path.absolute().relative_to(place).parts])
+    return str(path)
+
+
+class _Copy(NamedTuple):
+    """A file that is the same on both sides. tag: what the other side calls its content, mostly the MD5."""
+
+    size: int
+    changed_ns: int
+    tag: str = ""
+
+    @classmethod
+    def of(cls, path: Path, tag: str = "") -> _Copy:
+        found = path.stat()
+        return cls(found.st_size, found.st_mtime_ns, tag)
+
+    def is_at(self, there: tuple[int, str] | None) -> bool:
+        return there == (self.size, self.tag)
+
+
+class _State(BaseModel):
+    """What is known of a working folder. id: of the mark under which it was made or fetched."""
+
+    id: str = ""
+    files: dict[str, _Copy] = {}
+
+
+class _Writer(BaseModel):
+    """The mark beside a folder: who writes to it, or did last."""
+
+    id: str
+    host: str
+    pid: int
+    seen_s: float
+    at_work: bool
+
+
+class WorkingFolder:
+    """A place at a location and its counterpart here, `local`; names are relative to the folders above the two."""
+
+    def __init__(self, address: str, cache: Path, *, is_written: bool) -> None:
+        self.shown, scheme = without_secrets(address).rstrip("/"), address.partition("://")[0].lower()
+        if CHAIN.search(address) or scheme in ("http", "https"):
+            what, fix = "commands work at no such address", "`cosfly release get` fetches a release from there"
+            raise InputError(what, where=self.shown, expected="one as s3://BUCKET/FOLDER", fix=fix)
+        self._system, root = opened(address)
+        self._above, _, name = root.rpartition("/")
+        if not self._above.strip("/") or "@" in root.split("/")[0]:
+            what, expected = "not a place to work at", f"{scheme}://BUCKET/FOLDER, without a key"
+            raise InputError(what, where=self.shown, expected=expected)
+        self._has_folders = scheme not in HAS_NO_FOLDERS
+        told = [self._system.storage_options.get(key) for key in ("host", "port", "endpoint_url", "client_kwargs")]
+        told += [os.environ.get(key) for key in ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL")]
+        server = f"{scheme}-{hashlib.sha256(repr(told).encode()).hexdigest()[:8]}"
+        self._base = cache / ("written" if is_written else "read") / server / self._above.strip("/")
+        self.local = inside(self._base, name)
+        self._notes = cache / "notes" / hashlib.sha256(str(self.local).encode()).hexdigest()[:24]
+        self._lock = hold_folder(self._notes)
+        self._mark = f"{self._above}/.{name}.writer.json"
+        self._state, self._lost = _State(), cast(CosflyError | None, None)
+        if self.local.exists():
+            with contextlib.suppress(OSError, ValueError):
+                self._state = _State.model_validate_json((self._notes / "state.json").read_bytes())
+        self.num_sent = self.bytes_sent = 0
+        _shown[self.local.absolute()] = self.shown
+
+    def fetch(self, *, is_input: bool = True) -> None:
+        """Make `local` what is there, of a file with its stage's records beside it; only what is new travels.
+
+        Raises:
+            InputError: nothing is there, or a name cannot be. StorageError: it cannot be read.
+        """
+        there = self._listed(self.local.name)
+        if is_input and not there:
+            raise InputError("there is nothing", where=self.shown, fix="check the address, and the bucket's name")
+        if is_input and self.local.name in there:
+            for name in ("stage.json", MANIFEST, CHECKSUMS):
+                there |= self._listed(name)
+        wanted = []
+        for name, found in there.items():
+            path, known = inside(self._base, name), self._state.files.get(name)
+            if known is None or not path.is_file() or _Copy.of(path)[:2] != known[:2] or not known.is_at(found):
+                wanted.append(name)
+        for begin in range(0, len(wanted), BATCH):
+            batch = {name: inside(self._base, name) for name in wanted[begin : begin + BATCH]}
+            paths = [f"{self._above}/{name}" for name in batch], [str(path) for path in batch.values()]
+            for path in batch.values():
+                with storage_errors(path):
+                    path.parent.mkdir(parents=True, exist_ok=True)
+            self._asked("cannot read", partial(self._system.get, *paths))
+            for name, path in batch.items():
+                self._state.files[name] = got = _Copy.of(path, there[name][1])
+                if not got.is_at(there[name]):
+                    raise StorageError("a file came with another size", where=f"{self.shown}: {name}", got=got.size)
+        for name in self._here().keys() - there.keys():
+            inside(self._base, name).unlink()
+        self._save()
+        log.info("%s: %d files fetched, %d were here", self.shown, len(wanted), len(there) - len(wanted))
+
+    def _listed(self, name: str) -> dict[str, tuple[int, str]]:
+        """List the file of a name, or those below it: name -> size and tag."""
+        top = f"{self._above}/{name}"
+
+        def ask() -> dict[str, Any]:
+            self._system.invalidate_cache()
+            try:
+                found = self._system.find(top, detail=True)
+                return found if all(found.values()) else {top: self._system.info(top)}
+            except FileNotFoundError:
+                return {}
+
+        listed = {}
+        for full, info in self._asked("cannot list", ask).items():
+            if info["type"] != "file" or full.endswith("/") or _is_passing(full):
+                continue  # folders, links, and objects that stand for folders
+            if os.path.normpath(full) != full or not f"{full}/".startswith(f"{top}/"):
+                raise InputError("a name that leads elsewhere", where=self.shown, got=full, fix="remove it there")
+            tag = info.get("ETag") or info.get("mtime") or info.get("created") or ""
+            listed[full.removeprefix(f"{self._above}/")] = (info["size"], str(tag).strip('"'))
+        return listed
+
+    def take(self) -> None:
+        """Become the one who writes there, and make `local` what is there, unless it is what is there and more.
+
+        Raises:
+            ResumeError: another machine is at work there. StorageError: it cannot be written to.
+        """
+        found, is_ours = self._writer(), False
+        if found is not None:
+            is_ours, age_s = found.id == self._state.id, time.time() - found.seen_s
+            got = f"process {found.pid} on {found.host}, {age_s:.0f} s ago"
+            if found.at_work and not is_ours and age_s < STALE_S:
+                fix = f"wait for it, or {STALE_S:.0f} s if it was killed; or choose another --out"
+                raise ResumeError("another machine is at work there", where=self.shown, got=got, fix=fix)
+            if found.at_work and not is_ours:
+                log.warning("%s: taken over; no sign of life of %s", self.shown, got)
+        writer = self._state.id if is_ours else uuid.uuid4().hex
+        self._tell(writer)
+        time.sleep(SETTLE_S)
+        self._check_writer(writer)
+        if is_ours:  # nobody else wrote since: what is not there as it was sent goes anew, what is only there goes
+            there = self._listed(self.local.name)
+            known = {name: one for name, one in self._state.files.items() if one.is_at(there.get(name))}
+            self._state.files = {name: _Copy(-1, 0) for name in there} | known
+            return
+        if unsent := self._changed(self._here()):
+            aside = self._notes / f"aside-{time.time_ns()}"
+            self.local.rename(aside)
+            log.warning("%s went on elsewhere: %d files that were not sent are in %s", self.shown, len(unsent), aside)
+        self._state = _State() if unsent else self._state
+        self.fetch(is_input=False)
+        self._state.id = writer
+        self._save()
+
+    def _writer(self) -> _Writer | None:
+        def ask() -> bytes:
+            try:
+                return self._system.cat_file(self._mark)
+            except FileNotFoundError:
+                return b""
+
+        with contextlib.suppress(ValueError):
+            return _Writer.model_validate_json(self._asked("cannot read", ask))
+        return None
+
+    def _check_writer(self, writer: str) -> None:
+        found = self._writer()
+        if found is not None and found.id != writer:
+            got, fix = f"process {found.pid} on {found.host}", f"what was made here is in {self.local}"
+            self._lost = ResumeError("another machine took over", where=self.shown, got=got, fix=fix)
+        if self._lost is not None:
+            raise self._lost
+
+    def _tell(self, writer: str, *, at_work: bool = True) -> None:
+        mark = _Writer(id=writer, host=socket.gethostname(), pid=os.getpid(), seen_s=time.time(), at_work=at_work)
+        self._make_folders([self._mark])
+        self._asked("cannot write", lambda: self._system.pipe_file(self._mark, mark.model_dump_json().encode()))
+
+    @contextlib.contextmanager
+    def at_work(self) -> Iterator[None]:
+        """Copy out what is finished while the block runs, and all of it at its end, also where that is an error."""
+        ended, is_done = threading.Event(), False
+        thread = threading.Thread(target=self._copy_until, args=(ended,), daemon=True)
+        thread.start()
+        try:
+            yield
+            is_done = True
+        finally:
+            ended.set()
+            thread.join()
+            try:
+                self._finish()
+            except CosflyError as error:
+                if is_done:
+                    raise
+                log.warning("%s", error)
+
+    def _copy_until(self, ended: threading.Event) -> None:
+        wait_s, beaten_s, told = COPY_EVERY_S, time.monotonic(), ""
+        while not ended.wait(wait_s) and self._lost is None:
+            began_s = time.monotonic()
+            try:
+                if began_s - beaten_s >= BEAT_S:
+                    self._check_writer(self._state.id)
+                    self._tell(self._state.id)
+                    beaten_s = began_s
+                self.copy_out()
+            except CosflyError as error:
+                if str(error) != told:
+                    told = str(error)
+                    log.warning("%s; the work goes on, and is copied when that can be done", told)
+            except OSError as error:  # a file that went while it was looked at
+                log.debug("%s: the next copy takes it: %s", self.shown, error)
+            wait_s = min(BEAT_S, max(COPY_EVERY_S, (time.monotonic() - began_s) / MOST_SHARE))
+
+    def _finish(self) -> None:
+        """Copy what is left, then compare both sides: sizes, and MD5s where the other side tells these."""
+        self._check_writer(self._state.id)
+        self.copy_out()
+        there = self._listed(self.local.name)
+        wrong = [name for name, one in self._state.files.items() if not self._arrived(name, one, there.get(name))]
+        self._state.files = {n: c._replace(tag=there[n][1]) for n, c in self._state.files.items() if n not in wrong}
+        self._save()
+        if wrong:
+            fix = f"run the same command again; all of it is in {self.local}"
+            raise StorageError("not there as it was sent", where=self.shown, got=", ".join(wrong)[:200], fix=fix)
+        self._tell(self._state.id, at_work=False)
+        log.info("%s: %d files sent, %.1f MB; compared", self.shown, self.num_sent, self.bytes_sent / 1e6)
+
+    def _arrived(self, name: str, sent: _Copy, there: tuple[int, str] | None) -> bool:
+        """Tell whether a file is there as it was sent; by its bytes where a tag is no MD5 but looks like one."""
+        if there is None or there[0] != sent.size or there[1] == sent.tag or not MD5.fullmatch(there[1]):
+            return there is not None and there[0] == sent.size
+        data = self._asked("cannot read", partial(self._system.cat_file, f"{self._above}/{name}"))
+        return hashlib.md5(data, usedforsecurity=False).hexdigest() == sent.tag
+
+    def copy_out(self) -> None:
+        """Send what has changed. Journals and manifests are taken first and go last."""
+        before, late = self._here(), dict[str, Path]()
+        for name in before:
+            if _is_late(name) and (name.endswith(f"/{MANIFEST}") or name in self._changed(before)):
+                late[name] = self._notes / "late" / str(len(late))
+                with storage_errors(self._notes):
+                    late[name].parent.mkdir(parents=True, exist_ok=True)
+                    shutil.copy2(inside(self._base, name), late[name])
+        here = self._here()
+        files = {name: inside(self._base, name) for name in self._changed(here) if not _is_late(name)}
+        gone = self._state.files.keys() - here.keys() - before.keys()
+        journals = {name: path for name, path in late.items() if not name.endswith(f"/{MANIFEST}")}
+        touched = {str(place) for name in (*files, *journals, *gone) for place in Path(name).parents}
+        untrue = {f"{place}/{MANIFEST}" for place in touched} | {name for name in gone if _is_late(name)}
+        self._remove(untrue & self._state.files.keys())
+        self._send(files)
+        self._send(journals)
+        self._remove(gone & self._state.files.keys())
+        self._send({name: path for name, path in late.items() if name not in journals})
+        self._save()
+
+    def _here(self) -> dict[str, _Copy]:
+        """List the files here, as `_listed` does; a file goes with those of its stem."""
+        found = self.local.rglob("*") if self.local.is_dir() else self._base.glob(f"{glob.escape(self.local.stem)}.*")
+        here = {}
+        for path in found:
+            name = path.relative_to(self._base).as_posix()
+            with contextlib.suppress(FileNotFoundError):
+                if not path.is_symlink() and path.is_file() and not any(map(_is_passing, Path(name).parts)):
+                    here[name] = _Copy.of(path)
+        return here
+
+    def _changed(self, here: Mapping[str, _Copy]) -> Collection[str]:
+        known = self._state.files
+        return {name: None for name, one in here.items() if name not in known or known[name][:2] != one[:2]}.keys()
+
+    def _send(self, files: Mapping[str, Path]) -> None:
+        """Send what has changed: name -> the file with its bytes."""
+        names = sorted(name for name, path in files.items() if path.is_file())
+        names = [
+            name
+            for name in names
+            if (known := self._state.files.get(name)) is None or known[:2] != _Copy.of(files[name])[:2]
+        ]
+        for begin in range(0, len(names), BATCH):
+            batch = names[begin : begin + BATCH]
+            copies = {name: _Copy.of(files[name], _md5(files[name])) for name in batch}
+            paths = [str(files[name]) for name in batch], [f"{self._above}/{name}" for name in batch]
+            self._make_folders(paths[1])
+            self._asked("cannot write", partial(self._system.put, *paths))
+            self._state.files |= copies
+            self.num_sent += len(batch)
+            self.bytes_sent += sum(one.size for one in copies.values())
+
+    def _make_folders(self, paths: Collection[str]) -> None:
+        for folder in sorted({path.rpartition("/")[0] for path in paths} if self._has_folders else ()):
+            self._asked("cannot write", partial(self._system.makedirs, folder, exist_ok=True))
+
+    def _remove(self, names: Collection[str]) -> None:
+        def remove() -> None:
+            with contextlib.suppress(FileNotFoundError):
+                self._system.rm([f"{self._above}/{name}" for name in names])
+
+        if names:
+            self._asked("cannot remove", remove)
+        for name in names:
+            del self._state.files[name]
+
+    def _save(self) -> None:
+        write_bytes(self._notes / "state.json", self._state.model_dump_json().encode())
+
+    def _asked(self, what: str, ask: Callable[[], T]) -> T:
+        """Ask, again where that broke; tell of it in our words, as those of libraries may hold a key."""
+        for attempt in range(TRIES):
+            time.sleep(FIRST_WAIT_S * 2 ** (attempt - 1) if attempt else 0.0)
+            try:
+                return ask()
+            except Exception as error:  # every file system has its own
+                why, is_full = error, getattr(error, "errno", 0) in DISK_FULL
+                if is_full or isinstance(error, (PermissionError, FileNotFoundError)):
+                    break
+        code = getattr(why.__cause__ or why, "response", {}).get("Error", {}).get("Code")  # as S3 calls it
+        fix = f"run the same command again; finished work stays, in {self.local}"
+        if isinstance(why, PermissionError) or "Credentials" in type(why).__name__:
+            fix = f"check the key (of S3: AWS_ACCESS_KEY_ID, ~/.aws/credentials) and what it may do, then {fix}"
+        elif isinstance(why, FileNotFoundError):
+            fix = f"check that there is such a bucket or folder, then {fix}"
+        elif is_full:
+            what, fix = "the disk of this machine is full", f"free some space, or choose another --cache, then {fix}"
+        raise StorageError(what, where=self.shown, got=str(code or type(why).__name__)[:60], fix=fix) from None
+
+
+def _is_late(name: str) -> bool:
+    """Tell whether a file says what else there is."""
+    return name.endswith((".jsonl", f"/{MANIFEST}"))
+
+
+def _is_passing(name: str) -> bool:
+    """Tell whether a name is one of a moment: a lock, a temporary name, the mark of a writer."""
+    name = name.rpartition("/")[2]
+    return name == LOCK or (name.startswith(".") and name.endswith((".partial", ".writer.json")))
+
+
+def _md5(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, lambda: hashlib.md5(usedforsecurity=False)).hexdigest()
