@@ -23,9 +23,9 @@ answer = DomainDispatcherApplication(create_backend_app)
 logging.getLogger("werkzeug").setLevel(logging.ERROR)
 
 
-def refused(start, code):
+def refused(method, start, code):
     start("403 Forbidden", [("Content-Type", "application/xml")])
-    return [f"<Error><Code>{code}</Code><Message>no</Message></Error>".encode()]
+    return [] if method == "HEAD" else [f"<Error><Code>{code}</Code><Message>no</Message></Error>".encode()]
 
 
 def told(environ, start):
@@ -35,12 +35,12 @@ def told(environ, start):
     faults = log.with_suffix(".faults")
     planted = faults.read_text() if faults.exists() else ""
     if "Credential=wrong/" in environ.get("HTTP_AUTHORIZATION", ""):
-        return refused(start, "InvalidAccessKeyId")
+        return refused(method, start, "InvalidAccessKeyId")
     if planted == f"deny {method}":
-        return refused(start, "AccessDenied")
+        return refused(method, start, "AccessDenied")
     if planted == f"cut {method}":
         environ["werkzeug.socket"].shutdown(2)
-        return refused(start, "Cut")
+        return refused(method, start, "Cut")
     if method == "GET":
         with log.open("a") as file:
             file.write(json.dumps([environ["PATH_INFO"], environ.get("HTTP_RANGE")]) + "\n")

@@ -63,6 +63,7 @@ NOT_HERE = {
     "python docs/window_card.py": "a page for the browser of the next line",
     "chromium --headless": "a browser; tests/browser.py drives one for the pages that run a script",
     "roi edit work/": "it serves until it is stopped; tests/test_cosfly_roi_editor.py draws on its page",
+    "s3://bucket/": "a bucket is needed; tests/test_cosfly_locations.py works on one of a server of its own",
     "hf://datasets/": "a hub is asked; tests/test_release_get.py reads the same through fsspec from elsewhere",
     "--repo OWNER/NAME --yes": "a hub is written to; tests/test_release_push.py sends to one of its own",
     "render.carla.server_command=": "CARLA itself; tests/test_render_carla.py starts a server of ours by that setting",

@@ -59,7 +59,7 @@ class _Root(typer.core.TyperGroup):
             raise
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        name, command, self._words = found = super().resolve_command(ctx, args)
+        _, _, self._words = found = super().resolve_command(ctx, args)
         return found
 
     def locate(self, name: str, cache: Path) -> None:

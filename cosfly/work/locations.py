@@ -28,6 +28,7 @@ from urllib.parse import urlsplit, urlunsplit
 from pydantic import BaseModel
 
 from cosfly.errors import CosflyError, EnvironmentMissing, InputError, ResumeError, StorageError
+from cosfly.reading.files import open_file, read_bytes
 from cosfly.work.folder_lock import LOCK, hold_folder
 from cosfly.work.store import CHECKSUMS, DISK_FULL, inside, storage_errors, write_bytes
 
@@ -154,8 +155,8 @@ class WorkingFolder:
         self._mark = f"{self._above}/.{name}.writer.json"
         self._state, self._lost = _State(), cast(CosflyError | None, None)
         if self.local.exists():
-            with contextlib.suppress(OSError, ValueError):
-                self._state = _State.model_validate_json((self._notes / "state.json").read_bytes())
+            with contextlib.suppress(InputError, ValueError):
+                self._state = _State.model_validate_json(read_bytes(self._notes / "state.json"))
         self.num_sent = self.bytes_sent = 0
         _shown[self.local.absolute()] = self.shown
 
@@ -190,6 +191,9 @@ class WorkingFolder:
         for name in self._here().keys() - there.keys():
             inside(self._base, name).unlink()
         self._save()
+        begun = {name.removesuffix("stage.json") for name in there if f"/{name}".endswith("/stage.json")}
+        if is_input and (open_ones := sorted(name for name in begun if f"{name}{MANIFEST}" not in there)):
+            log.warning("%s: not finished, as there is no %s: %s", self.shown, MANIFEST, ", ".join(open_ones)[:200])
         log.info("%s: %d files fetched, %d were here", self.shown, len(wanted), len(there) - len(wanted))
 
     def _listed(self, name: str) -> dict[str, tuple[int, str]]:
@@ -411,7 +415,8 @@ class WorkingFolder:
                 why, is_full = error, getattr(error, "errno", 0) in DISK_FULL
                 if is_full or isinstance(error, (PermissionError, FileNotFoundError)):
                     break
-        code = getattr(why.__cause__ or why, "response", {}).get("Error", {}).get("Code")  # as S3 calls it
+        told = getattr(why.__cause__ or why, "response", None)  # of S3: with a code
+        code = told.get("Error", {}).get("Code") if isinstance(told, dict) else None
         fix = f"run the same command again; finished work stays, in {self.local}"
         if isinstance(why, PermissionError) or "Credentials" in type(why).__name__:
             fix = f"check the key (of S3: AWS_ACCESS_KEY_ID, ~/.aws/credentials) and what it may do, then {fix}"
@@ -434,5 +439,5 @@ def _is_passing(name: str) -> bool:
 
 
 def _md5(path: Path) -> str:
-    with open(path, "rb") as file:
+    with open_file(path) as file:
         return hashlib.file_digest(file, lambda: hashlib.md5(usedforsecurity=False)).hexdigest()
