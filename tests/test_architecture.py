@@ -18,7 +18,7 @@ STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")
 # From the ground up: a room may import what stands before it, and itself; stages do not import each other, nor do
 # siblings.
 ROOMS = ("root", "reading", "work", "products", "space", "look", "chat", "unreal", "stages", "siblings", "app", "cli")
-ASSEMBLY = ("app", "closed_loop", "simulators", "studies", "worlds")  # what may know all stages and siblings
+ASSEMBLY = ("app", "closed_loop", "envs", "simulators", "studies", "worlds")  # what may know all stages and siblings
 HEAVY = {
     *("torch", "transformers", "peft", "accelerate", "bert_score", "datasets"),
     *("vllm", "pyrender", "trimesh", "carla", "ray"),

@@ -11,7 +11,7 @@ from caption.truth.actions import Motion, measure, table_of
 from cosfly.closed_loop.controller import CONTROLLER_FILE, Controller, read_controls
 from cosfly.closed_loop.pilots import PilotAnswer
 from cosfly.closed_loop.settings import DroneConfig
-from cosfly.closed_loop.stage import _OpenFlight
+from cosfly.closed_loop.stage import OpenFlight
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight
 from cosfly.errors import ConfigError
 from cosfly.planners.contract import PlanConfig
@@ -122,7 +122,7 @@ def test_every_command_can_be_flown(begin):
 @pytest.mark.parametrize("command", [(99.0, 0, 0, 0, 0), (0, 0, 0, float("nan"), 0), (0, 0)])
 def test_a_command_that_cannot_be_flown_is_the_students_failure_and_the_drone_hovers(begin, command):
     flight, controller, moment = begin()
-    under_way = _OpenFlight("path_00000", flight, controller, deque([moment]))
+    under_way = OpenFlight("path_00000", flight, controller, deque([moment]))
     under_way.step(PilotAnswer("ok", command=np.array(command)))
     [frame] = under_way.frames
     assert (frame["answer"], frame["action"], frame["command"][:4]) == ("invalid", None, (0, 0, 0, 0))

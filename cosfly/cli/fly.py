@@ -20,9 +20,15 @@ STUDENT = "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR; floors: track_s
 @takes(*STAGE)
 def fly(
     job: Job,
-    map_: Annotated[Path, Option("--map", help="Boxes that are drawn: boxes_3d.json.")],
-    paths: Annotated[Path, Option(help="Walks: path.json.")],
     out: options.Out,
+    map_: Annotated[Path | None, Option("--map", help="Boxes that are drawn: boxes_3d.json.")] = None,
+    paths: Annotated[Path | None, Option(help="Walks: path.json.")] = None,
+    env: Annotated[
+        str | None, Option(help="A benchmark's list of episodes in place of map and walks: cosfly/Follow-v0.")
+    ] = None,
+    policy: Annotated[
+        str | None, Option(metavar="MODULE:CLASS", help="Of yours, with --env: runs its code; in place of --student.")
+    ] = None,
     student: Annotated[str | None, Option(show_default="rules", help=STUDENT), Sets("fly.student")] = None,
     as_student: Annotated[
         Path | None,
@@ -42,6 +48,17 @@ def fly(
     run = stage.FlightsConfig(
         fly=cfg.fly, plan=cfg.plan, render=cfg.render, caption=cfg.caption, infer=cfg.distill.infer
     )
+    if env is not None:
+        if map_ or paths or simplified or others or (policy and student):
+            raise typer.BadParameter("--env has its own maps and walks, and either --policy or --student flies")
+        from cosfly.envs import listed
+
+        job.begin(out)
+        listing = listed.ListConfig(flights=run, env=env, policy=policy)
+        job.finish(listed.run(listing, out, seed=cfg.seed, **job.manner), out)
+        return
+    if map_ is None or paths is None or policy:
+        raise typer.BadParameter("--map and --paths are needed, or --env, which --policy needs too")
     job.begin(out, map_, simplified, paths, others)
     job.finish(stage.run(run, map_, simplified or map_, paths, out, seed=cfg.seed, others=others, **job.manner), out)
 

@@ -20,7 +20,7 @@ from caption.run.own_files import vocabulary_of
 from caption.schema import CaptionConfig
 from cosfly.closed_loop.controller import CONTROLLER_FILE, Control, Controller, read_controls
 from cosfly.closed_loop.measures import score_pursuits
-from cosfly.closed_loop.pilots import Outlook, PilotAnswer, open_pilot
+from cosfly.closed_loop.pilots import Outlook, Pilot, PilotAnswer, open_pilot
 from cosfly.closed_loop.settings import FlyConfig
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, Moment
 from cosfly.errors import ConfigError
@@ -60,7 +60,7 @@ class FlightsConfig(Config):
 
 
 @dataclass
-class _OpenFlight:
+class OpenFlight:
     """A flight under way: the moments that its student may look at, and all frames' records, but for clearances."""
 
     episode: str
@@ -215,24 +215,29 @@ def make_worker(
     bounds: dict[str, Any] = {"num_lead": cfg.fly.lead_frames, "drone": cfg.fly.drone, "lost_s": cfg.fly.lost_s}
 
     def work(item: Item) -> Outcome:
-        flights = list[_OpenFlight]()
+        flights = list[OpenFlight]()
         for n in item.payload:
             if not pursuit_file(out, traces[n].path_id).exists():  # else of before a kill
                 company, plan = companies.get(traces[n].path_id), _cut(traces[n], cfg.fly)
                 others = () if company is None else company.others
                 flight = ClosedLoopFlight(space, plan, number=n, **bounds, others=others)
-                flights.append(_begun(flight, controls, student.num_frames))
-        while flights:
-            outlooks = [Outlook(one.episode, one.flight, tuple(one.moments)) for one in flights]
-            for one, decision in zip(flights, student.decide(outlooks), strict=True):
-                one.step(decision)
-                advance()
-            for one in [one for one in flights if one.flight.ended is not None]:
-                write_pursuit(pursuit_file(out, one.episode), _record(one, about))
-                flights.remove(one)
+                flights.append(begin_flight(flight, controls, student.num_frames, plan.path_id))
+        fly_side_by_side(flights, student, out, about)
         return Outcome({"flights": [traces[n].path_id for n in item.payload]})
 
     return work
+
+
+def fly_side_by_side(flights: list[OpenFlight], student: Pilot, out: Path, about: dict[str, Any]) -> None:
+    """Fly flights to their ends, and write the record of each as it ends. about: what their records say alike."""
+    while flights:
+        outlooks = [Outlook(one.episode, one.flight, tuple(one.moments)) for one in flights]
+        for one, decision in zip(flights, student.decide(outlooks), strict=True):
+            one.step(decision)
+            advance()
+        for one in [one for one in flights if one.flight.ended is not None]:
+            write_pursuit(pursuit_file(out, one.episode), _record(one, about))
+            flights.remove(one)
 
 
 def _cut(trace: DroneTrace, cfg: FlyConfig) -> DroneTrace:
@@ -241,10 +246,11 @@ def _cut(trace: DroneTrace, cfg: FlyConfig) -> DroneTrace:
     return replace(trace, **{name: getattr(trace, name)[:end] for name in (*ARRAYS, "clearances_m")})
 
 
-def _begun(flight: ClosedLoopFlight, controls: dict[str, Control], num_frames: int) -> _OpenFlight:
+def begin_flight(flight: ClosedLoopFlight, controls: dict[str, Control], num_frames: int, episode: str) -> OpenFlight:
+    """Begin an episode with what nobody is asked about."""
     plan = flight.planned
     lead = flight.reset()
-    begun = _OpenFlight(plan.path_id, flight, Controller(controls, flight.drone, lead[-1]), deque(lead, num_frames))
+    begun = OpenFlight(episode, flight, Controller(controls, flight.drone, lead[-1]), deque(lead, num_frames))
     poses = np.hstack([plan.positions_m, plan.rotations_deg])
     between = np.empty((len(poses), 0, 6))
     flown = PlannedMotion(plan.time_s, poses, between, plan.rotations_deg[:, 1], plan.positions_m).action
@@ -253,7 +259,7 @@ def _begun(flight: ClosedLoopFlight, controls: dict[str, Control], num_frames: i
     return begun
 
 
-def _record(one: _OpenFlight, about: dict) -> Pursuit:
+def _record(one: OpenFlight, about: dict) -> Pursuit:
     flight, plan = one.flight, one.flight.planned
     obstacles = flight.airspace.surroundings.obstacles
     gaps = np.round(flight.poses.clearances_m, 4).tolist()

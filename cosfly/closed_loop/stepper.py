@@ -16,6 +16,7 @@ from cosfly.geometry import step_s, wrap_deg
 from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import Camera, TargetMeta
 from cosfly.products.others import Other
+from cosfly.products.people import Appearance
 from cosfly.products.places import town_folder
 from cosfly.products.pursuits import Ended
 from cosfly.products.traces import DroneTrace
@@ -140,6 +141,11 @@ class ClosedLoopFlight:
     def camera(self) -> Camera:
         """The first frame's."""
         return self._script.cameras[0]
+
+    @property
+    def looks(self) -> Appearance:
+        """What the target wears."""
+        return self._script.clothes.looks
 
     def _begin(self) -> None:
         planned, last = self.planned, self.num_lead - 1

@@ -1,0 +1,19 @@
+"""Gymnasium environments in which a policy follows a person: `import cosfly.envs`, then `gymnasium.make(ENV)`.
+
+They draw, move and judge as `cosfly fly` does, and need neither a GPU nor a simulator.
+"""
+
+from __future__ import annotations
+
+from cosfly.envs.episodes import TASKS
+from cosfly.errors import EnvironmentMissing
+
+try:
+    import gymnasium
+except ImportError as error:
+    fix = 'pip install "cosfly[envs]"'
+    raise EnvironmentMissing("Gymnasium is not installed", got=str(error), fix=fix) from None
+
+for _name in TASKS:
+    if _name not in gymnasium.registry:
+        gymnasium.register(_name, entry_point="cosfly.envs.follow:FollowEnv", kwargs={"task": _name})

@@ -1,0 +1,207 @@
+"""Episodes of the benchmark: in which town, after which walk, from where; all made in the process, no file is left.
+
+A town is a preset and a seed. Those of HELD_OUT are for tests alone: no configuration of ours and no training episode
+has one of these seeds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, Moment
+from cosfly.errors import InputError, NoPathError, nearest
+from cosfly.maps.synthetic import PRESETS, SyntheticConfig, load
+from cosfly.pedestrians.lanes import Lane, lanes_of
+from cosfly.pedestrians.others import company_of
+from cosfly.pedestrians.stage import make_walk
+from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, walkable_ground
+from cosfly.planners.contract import PlanConfig
+from cosfly.planners.reacquire import first_loss, screens_of
+from cosfly.planners.stage import plan_flight
+from cosfly.planners.styles import REACQUIRE
+from cosfly.products.boxes import BoxMap
+from cosfly.products.goals import SLOTS, words_of
+from cosfly.products.others import Other
+from cosfly.products.traces import ARRAYS, DroneTrace
+from cosfly.products.walks import walk_id
+from cosfly.reading.documents import FileFormat, read_model
+from cosfly.render.settings import RenderConfig
+from cosfly.simplify.passes import SimplifyConfig, simplify
+from cosfly.space.kernels import BoxIndex, obstacle_index
+from cosfly.work.chance import rng_for
+from cosfly.work.store import dump_json, sha256_bytes
+
+EPISODES_FILE = Path(__file__).with_name("episodes.json")
+EPISODES_FORMAT = FileFormat("cosfly.episodes", "1.0", "episodes")
+SIZE_PX, FOV_DEG = (640, 360), 60.0  # of the camera of the lists
+NUM_DECISIONS = 80  # 40 s
+LEAD_FRAMES = 21  # of the plan, as `fly.lead_frames`
+AFTER_LOSS = 3  # frames without sight before a policy takes over
+TURNED_DEG = (60.0, 300.0)  # by which a drone looks away that begins so
+TRIES = 40  # walks, until one can be an episode
+PACE = {"walk": 0.4, "stop_and_look": 0.2, "hurry": 0.1, "fits_and_starts": 0.2, "turn_back": 0.1}
+_ALONE = PedestriansConfig(ground="paved", road_cost=20, pace=PACE, hurry_speed_mps=2.0)
+
+# Environment -> who walks about.
+TASKS = {
+    "cosfly/Follow-v0": _ALONE,
+    "cosfly/Distracted-v0": _ALONE.model_copy(update={"others": 8, "look_alikes": 3, "traffic": 2}),
+    "cosfly/Reacquire-v0": _ALONE,
+}
+REACQUIRES = "cosfly/Reacquire-v0"
+
+
+class BenchmarkTown(BaseModel):
+    """A town by name and seed."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str
+    preset: str
+    seed: int
+
+
+HELD_OUT = {
+    f"HeldOut_{preset}": BenchmarkTown(name=f"HeldOut_{preset}", preset=preset, seed=90_001 + k)
+    for k, preset in enumerate(("grid", "old_town", "towers", "park", "river"))
+}
+TRAINING = tuple(
+    BenchmarkTown(name=f"Training_{preset}_{seed}", preset=preset, seed=seed)
+    for preset in PRESETS if preset not in ("small_town", "town10") for seed in range(7_001, 7_009)
+)  # fmt: skip
+
+
+class EpisodeLists(BaseModel):
+    """The file of lists: environment -> list -> episodes, each a town and the number of its walk."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    lists: dict[str, dict[str, tuple[tuple[str, int], ...]]]
+
+
+def read_list(name: str) -> tuple[str, tuple[tuple[str, int], ...], str]:
+    """Give environment, episodes and digest of a list, `cosfly/Follow-v0/test`, or of an environment's `test`.
+
+    Raises:
+        InputError: there is no such environment or list.
+    """
+    env, _, listed = name.partition("-v0")
+    env, listed = f"{env}-v0", listed.strip("/") or "test"
+    known = read_model(EPISODES_FILE, EpisodeLists, EPISODES_FORMAT).lists
+    if env not in known:
+        what = f"there is no such environment{nearest(name, known)}"
+        raise InputError(what, where="--env", got=name, expected=", ".join(known))
+    if listed not in known[env]:
+        what = "there is no such list of episodes"
+        raise InputError(what, where=f"--env {env}", got=listed, expected=", ".join(known[env]))
+    episodes = known[env][listed]
+    told = [env, [[HELD_OUT[town].model_dump(), number] for town, number in episodes], SIZE_PX, FOV_DEG, NUM_DECISIONS]
+    return env, episodes, sha256_bytes(dump_json(told).encode())
+
+
+def episode_id(town: str, number: int) -> str:
+    return f"{town}_{walk_id(number)}"
+
+
+@dataclass(frozen=True)
+class BenchmarkWorld:
+    """A town, made: as it is drawn, as it is flown in, where people walk and cars drive."""
+
+    town: BenchmarkTown
+    boxes: BoxMap
+    simplified: BoxMap
+    ground: WalkableGround
+    lanes: list[Lane]
+    obstacles: BoxIndex
+    screens: BoxIndex
+
+    @property
+    def sha256(self) -> str:
+        """Digest of its boxes."""
+        parts = (self.boxes.centers, self.boxes.half_extents, self.boxes.rotations_deg, self.boxes.kinds)
+        return sha256_bytes(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
+
+    def airspace(self, task: str, size_px: tuple[int, int] = SIZE_PX) -> Airspace:
+        """Open a renderer for a task."""
+        num_others = TASKS[task].others + TASKS[task].traffic
+        return Airspace(render_config(size_px), self.boxes, self.simplified, seed=self.town.seed, num_others=num_others)
+
+
+def render_config(size_px: tuple[int, int] = SIZE_PX) -> RenderConfig:
+    return RenderConfig(width_px=size_px[0], height_px=size_px[1], fovs_deg=(FOV_DEG,))
+
+
+@lru_cache(maxsize=16)
+def world_of(town: BenchmarkTown) -> BenchmarkWorld:
+    """Make a town; the last ones are kept."""
+    boxes = load(SyntheticConfig(name=town.name, preset=town.preset), town.seed)
+    flown = simplify(boxes, SimplifyConfig()).box_map
+    ground = walkable_ground(flown, _ALONE, where=town.name)
+    return BenchmarkWorld(town, boxes, flown, ground, lanes_of(flown), obstacle_index(flown), screens_of(flown))
+
+
+@dataclass(frozen=True)
+class BenchmarkEpisode:
+    """What is to be flown: a plan, whose first num_lead frames are flown before a policy takes over, and who else is
+    there."""
+
+    task: str
+    world: BenchmarkWorld
+    number: int
+    plan: DroneTrace
+    num_lead: int
+    others: tuple[Other, ...]
+
+    @property
+    def name(self) -> str:
+        return episode_id(self.world.town.name, self.number)
+
+    def begins_well(self, now: Moment) -> bool:
+        """Tell whether the first frame is as the task has it: the person is in sight, or is to be found again."""
+        return now.target.visible != (self.task == REACQUIRES)
+
+    def flight(self, airspace: Airspace) -> ClosedLoopFlight:
+        """Open it."""
+        return ClosedLoopFlight(airspace, self.plan, number=self.number, num_lead=self.num_lead, others=self.others)
+
+    def goal(self, flight: ClosedLoopFlight) -> str:
+        """Say whom to follow: all that the person wears, which a look-alike does but for one thing."""
+        return words_of(("figure", *SLOTS), flight.looks)["en"]
+
+
+def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisode | None:
+    """Make an episode of a walk of a town; None where the walk, or its plan, cannot be one."""
+    cfg, town, name = TASKS[task], world.town, walk_id(number)
+    planning = PlanConfig(styles={REACQUIRE: 1.0}) if task == REACQUIRES else PlanConfig()
+    try:
+        walk = make_walk(name, world.ground, cfg, rng_for(town.seed, "pedestrians", name)).walk
+        plan = plan_flight(walk, world.obstacles, planning, town.seed, world.screens)
+    except NoPathError:
+        return None
+    num_lead, turned_deg = LEAD_FRAMES, 0.0
+    if task == REACQUIRES:
+        dt_s = float(plan.time_s[1])
+        lost = None if plan.instead_of else first_loss(plan.visibility, dt_s, AFTER_LOSS * dt_s)
+        if lost is not None and lost + AFTER_LOSS > LEAD_FRAMES // 2:
+            num_lead = lost + AFTER_LOSS
+        else:
+            turned_deg = float(rng_for(town.seed, "reacquire", name).uniform(*TURNED_DEG))
+    if plan.drop_reason is not None or len(plan.time_s) < num_lead + NUM_DECISIONS:
+        return None
+    end = num_lead + NUM_DECISIONS
+    plan = replace(plan, **{field: getattr(plan, field)[:end] for field in (*ARRAYS, "clearances_m")})
+    if turned_deg:
+        rotations = plan.rotations_deg.copy()
+        rotations[:num_lead, 1] += turned_deg
+        plan = replace(plan, rotations_deg=rotations)
+    others = tuple[Other, ...]()
+    if cfg.has_others:
+        rng = rng_for(town.seed, "pedestrians", f"{name}/others")
+        there = company_of(walk, world.ground, world.lanes, cfg, rng).others
+        others = tuple(replace(o, positions_m=o.positions_m[:end], headings_rad=o.headings_rad[:end]) for o in there)
+    return BenchmarkEpisode(task, world, number, plan, num_lead, others)

@@ -1,0 +1,182 @@
+"""The environment: after a person who walks through a town. Observations hold what a real drone has, and no more."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from cosfly.closed_loop.controller import CONTROLLER_FILE, Controller, read_controls
+from cosfly.closed_loop.settings import DroneConfig
+from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, Moment
+from cosfly.envs.episodes import (
+    HELD_OUT,
+    SIZE_PX,
+    TRAINING,
+    TRIES,
+    BenchmarkEpisode,
+    episode_of,
+    read_list,
+    world_of,
+)
+from cosfly.errors import ConfigError, InputError
+from cosfly.geometry import wrap_deg
+from cosfly.products.actions import shipped_actions
+from cosfly.products.motion import in_axes_of
+from cosfly.render.contract import FAR_M
+
+STATE = ("forward_mps", "left_mps", "up_mps", "height_m", "yaw_deg", "gimbal_pitch_deg", "time_s")
+STATE_LOW = np.array([-40, -40, -40, -100, -180, -90, 0], dtype=np.float32)
+STATE_HIGH = np.array([40, 40, 40, 1000, 180, 90, 3600], dtype=np.float32)
+GOAL_CHARACTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ -,"
+# Of the distance between drone and person: all of the reward up to the first, none beyond the second.
+FULL_REWARD_M, NO_REWARD_M = 35.0, 70.0
+CRASH_REWARD = -10.0
+
+
+def observe(flight: ClosedLoopFlight, now: Moment, goal: str, *, depth: bool = False) -> dict[str, Any]:
+    """Give what a policy sees: rgb (h, w, 3) uint8, state (7,) float32 as STATE, goal, and depth (h, w) float32 m."""
+    ground_m = float(flight.airspace.ground.height_at(now.position_m[None])[0])
+    pitch_deg, yaw_deg, _ = now.rotation_deg
+    height_m, velocity = float(now.position_m[2]) - ground_m, in_axes_of(float(yaw_deg), now.velocity_mps)
+    state = np.array([*velocity, height_m, wrap_deg(yaw_deg), pitch_deg, now.time_s], dtype=np.float32)
+    seen = {"rgb": now.frame.rgb, "state": np.clip(state, STATE_LOW, STATE_HIGH), "goal": goal}
+    return seen | {"depth": now.frame.depth} if depth else seen
+
+
+def reward_of(now: Moment, ended: str | None) -> float:
+    """Give what a step is worth: 1 where the frame shows the person from up to FULL_REWARD_M, falling to 0 at
+    NO_REWARD_M; 0 where it does not; a crash CRASH_REWARD. No step but a crash costs anything, so an end never pays."""
+    if ended == "crashed":
+        return CRASH_REWARD
+    away_m = float(np.linalg.norm(now.position_m - now.target_m))
+    return float(np.clip((NO_REWARD_M - away_m) / (NO_REWARD_M - FULL_REWARD_M), 0.0, 1.0)) * now.target.visible
+
+
+class FollowEnv(gymnasium.Env):
+    """One drone, one person, one time step of 0.5 s a step.
+
+    action: of `decisions` the number of one of the seventeen in the order of actions.yaml; of `velocities` (5,) as
+    ACTION, in the level axes of the drone; ground speeds beyond the drone's greatest are scaled down to it.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 2}  # noqa: RUF012
+
+    def __init__(
+        self,
+        task: str,
+        *,
+        actions: str = "decisions",
+        episodes: str = "train",
+        depth: bool = False,
+        size_px: tuple[int, int] = SIZE_PX,
+        render_mode: str | None = None,
+    ) -> None:
+        """
+        Args:
+            actions: decisions or velocities. episodes: train draws a town and a walk, else the name of a list, of which
+                reset takes options["episode"], or draws. size_px: width and height of the pictures.
+        Raises:
+            ConfigError, InputError: there is no such kind of action, or no such list.
+        """
+        if actions not in ("decisions", "velocities"):
+            raise ConfigError("no such actions", where=task, got=actions, expected="decisions or velocities")
+        self.task, self.size_px, self.has_depth, self.render_mode = task, (size_px[0], size_px[1]), depth, render_mode
+        self.listed = None if episodes == "train" else read_list(f"{task}/{episodes}")[1]
+        self.drone, self.tokens = DroneConfig(), shipped_actions().tokens
+        self._controls = read_controls(CONTROLLER_FILE, self.tokens)
+        low, high = (bound.astype(np.float32) for bound in self.drone.bounds)
+        self.action_space = spaces.Discrete(len(self.tokens)) if actions == "decisions" else spaces.Box(low, high)
+        width_px, height_px = self.size_px
+        seen: dict[str, spaces.Space] = {
+            "rgb": spaces.Box(0, 255, (height_px, width_px, 3), np.uint8),
+            "state": spaces.Box(STATE_LOW, STATE_HIGH),
+            "goal": spaces.Text(200, charset=GOAL_CHARACTERS),
+        }
+        if depth:
+            seen["depth"] = spaces.Box(0.0, FAR_M, (height_px, width_px), np.float32)
+        self.observation_space = spaces.Dict(seen)
+        self._space: Airspace | None = None
+        self._episode: BenchmarkEpisode | None = None
+        self._flight: ClosedLoopFlight | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
+        """Begin an episode: of the list the one of options["episode"], counted from 0; else one that is drawn."""
+        super().reset(seed=seed)
+        wanted = (options or {}).get("episode")
+        if self.listed is not None:
+            k = int(self.np_random.integers(len(self.listed))) if wanted is None else wanted
+            if not isinstance(k, int) or not 0 <= k < len(self.listed):
+                expected = f"0 to {len(self.listed) - 1}"
+                raise InputError("no such episode", where=self.task, got=repr(k)[:40], expected=expected)
+            town, number = self.listed[k]
+            if not self._begin(episode_of(self.task, world_of(HELD_OUT[town]), number)):
+                raise InputError("an episode that cannot be flown", where=f"{self.task}: {town}", got=str(number))
+        else:
+            world = world_of(TRAINING[int(self.np_random.integers(len(TRAINING)))])
+            numbers = self.np_random.integers(100_000, size=TRIES).tolist()
+            if not any(self._begin(episode_of(self.task, world, number)) for number in numbers):
+                raise InputError("no walk of a town can be an episode", where=self.task, got=world.town.name)
+        assert self._flight is not None
+        return observe(self._flight, self._now, self._goal, depth=self.has_depth), self._info()
+
+    def _begin(self, episode: BenchmarkEpisode | None) -> bool:
+        """Begin an episode; False where it cannot be one."""
+        if episode is None:
+            return False
+        if self._space is None or self._episode is None or self._episode.world is not episode.world:
+            self.close()
+            self._space = episode.world.airspace(self.task, self.size_px)
+        self._episode, self._flight = episode, episode.flight(self._space)
+        self._now = self._flight.reset()[-1]
+        self._goal, self._controller = episode.goal(self._flight), Controller(self._controls, self.drone, self._now)
+        return episode.begins_well(self._now)
+
+    def step(self, action: Any) -> tuple[dict, float, bool, bool, dict]:
+        """Fly an action for 0.5 s. terminated: crashed or out of the map; truncated: the episode's time is over.
+
+        Raises:
+            InputError: an action out of its bounds, or no episode is under way.
+        """
+        if self._flight is None or self._flight.ended is not None:
+            raise InputError("no episode is under way", where=self.task, fix="call reset first")
+        if not self.action_space.contains(action):
+            got, expected = repr(action)[:120], repr(self.action_space)
+            raise InputError("an action outside its bounds", where=self.task, got=got, expected=expected)
+        if isinstance(self.action_space, spaces.Discrete):
+            command = self._controller.command(self.tokens[int(action)], self._now)
+        else:
+            command = within_speed(np.asarray(action, dtype=np.float64), self.drone)
+        self._now = self._flight.step(command)
+        ended = self._flight.ended
+        seen = observe(self._flight, self._now, self._goal, depth=self.has_depth)
+        return seen, reward_of(self._now, ended), ended in ("crashed", "left"), ended == "finished", self._info()
+
+    def _info(self) -> dict[str, Any]:
+        """Measures of the present frame, which a policy is not to look at."""
+        now, target = self._now, self._now.target
+        return {
+            "episode": self._episode.name if self._episode else "",
+            "ended": (self._flight.ended if self._flight else None) or "",
+            "in_view": target.in_view, "visible": target.visible, "visibility": target.visibility,
+            "distance_m": now.distance_m, "height_m": now.height_m, "clearance_m": now.clearance_m,
+        }  # fmt: skip
+
+    def render(self) -> np.ndarray | None:
+        """Give the present frame, (h, w, 3) uint8."""
+        return self._now.frame.rgb.copy() if self.render_mode == "rgb_array" and self._flight else None
+
+    def close(self) -> None:
+        """Close the renderer."""
+        if self._space is not None:
+            self._space.renderer.close()
+        self._space = self._flight = None
+
+
+def within_speed(command: np.ndarray, drone: DroneConfig) -> np.ndarray:
+    """Scale a command's speed over ground, (5,) as ACTION, down to the drone's greatest."""
+    command = command.copy()
+    command[:2] *= min(1.0, drone.speed_max_mps / max(float(np.hypot(*command[:2])), 1e-9))
+    return command

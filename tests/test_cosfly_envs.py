@@ -1,0 +1,253 @@
+"""cosfly/envs: the environments as Gymnasium has them, episodes, rewards that no cheat earns, policies that fail."""
+
+import json
+import warnings
+from pathlib import Path
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+from commands import invoke
+from gymnasium.utils.env_checker import check_env
+
+import cosfly.envs
+from cosfly.envs.episodes import HELD_OUT, TASKS, TRAINING, read_list
+from cosfly.envs.follow import CRASH_REWARD, FULL_REWARD_M, NO_REWARD_M, reward_of
+from cosfly.envs.policy import MOST_LATE, Policy
+from cosfly.errors import InputError
+from cosfly.products.actions import shipped_actions
+from cosfly.products.pursuits import read_pursuit
+from cosfly.work.config import read_yaml
+
+FOLLOW, SMALL = "cosfly/Follow-v0", (160, 96)
+TOKENS = shipped_actions().tokens
+
+
+@pytest.fixture(scope="module")
+def follow():
+    env = gymnasium.make(FOLLOW, episodes="test", actions="velocities", size_px=SMALL, depth=True).unwrapped
+    yield env
+    env.close()
+
+
+def flown(env, seed, actions):
+    seen, _ = env.reset(seed=seed)
+    frames, rewards = [seen], []
+    for action in actions:
+        seen, reward, terminated, truncated, _ = env.step(action)
+        frames.append(seen)
+        rewards.append(reward)
+        if terminated or truncated:
+            break
+    return frames, rewards
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_an_environment_is_as_gymnasium_wants_it_without_a_warning(task):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gymnasium.make(task, size_px=SMALL).unwrapped)
+
+
+def test_velocities_are_in_units_which_is_all_that_the_checker_has_to_say(follow):
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        check_env(follow)
+    assert all("normalized" in str(one.message) for one in told)
+    assert follow.action_space.high.tolist() == [10, 10, 4, 60, 30]
+
+
+def test_equal_seeds_and_actions_give_equal_bytes_and_other_seeds_others(follow):
+    actions = [np.array([2.0, 0.5, 0.1, 5.0, -40.0], dtype=np.float32)] * 3
+    (first, _), (again, _), (other, _) = (flown(follow, seed, actions) for seed in (4, 4, 5))
+    for one, same in zip(first, again, strict=True):
+        assert all(np.array_equal(one[name], same[name]) for name in one)
+    assert not np.array_equal(first[-1]["rgb"], other[-1]["rgb"])
+
+
+def test_an_observation_has_what_a_drone_knows_and_no_more(follow):
+    [seen], _ = flown(follow, 0, [])
+    assert set(seen) == {"rgb", "depth", "state", "goal"}
+    assert follow.observation_space.contains(seen)
+    assert seen["goal"].startswith(("the man in", "the woman in"))
+
+
+def test_an_action_outside_its_bounds_and_a_step_after_the_end_are_refused_in_a_line(follow):
+    follow.reset(seed=0)
+    for action in (np.array([99, 0, 0, 0, 0], dtype=np.float32), 3, None):
+        with pytest.raises(InputError, match="outside its bounds"):
+            follow.step(action)
+    flown(follow, 0, [np.array([0, 0, -4, 0, -30], dtype=np.float32)] * 40)  # into the ground
+    with pytest.raises(InputError, match="reset"):
+        follow.step(np.zeros(5, dtype=np.float32))
+
+
+def test_the_corner_of_the_box_is_flown_at_the_greatest_speed(follow):
+    frames, _ = flown(follow, 0, [np.array([7.2, 7.2, 4, 0, -30], dtype=np.float32), follow.action_space.high] * 3)
+    assert np.hypot(*frames[-1]["state"][:2]) <= 10.01
+
+
+def test_a_crash_ends_an_episode_and_costs(follow):
+    _, rewards = flown(follow, 0, [np.array([0, 0, -4, 0, -30], dtype=np.float32)] * 40)
+    assert rewards[-1] == CRASH_REWARD
+    assert follow._info()["ended"] == "crashed"
+    assert len(rewards) < 40
+
+
+def test_cheats_do_not_pay(follow):
+    """Going high, staring and crashing early earn less than being behind the person for the whole episode."""
+    at = SimpleNamespace(position_m=np.array([0.0, 0, 20]), target_m=np.array([15.0, 0, 1]), target=SimpleNamespace())
+    for visible, ended, above_m, low, high in (
+        (True, None, 20.0, 1, 1), (False, None, 20.0, 0, 0), (True, None, 1 + NO_REWARD_M, 0, 0),
+        (True, None, 1 + FULL_REWARD_M + 10, 0.1, 0.9), (True, "crashed", 20.0, -10, -10),
+    ):  # fmt: skip
+        at.target.visible, at.position_m = visible, np.array([0.0, 0, above_m])
+        assert low <= reward_of(at, ended) <= high
+    up = [np.array([0, 0, 4, 0, -89], dtype=np.float32)] * 80
+    _, high_up = flown(follow, 0, up)
+    assert sum(high_up) < 25  # of 80
+    assert len(high_up) == 80
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_environments_are_stepped_as_vectors(mode):
+    envs = gymnasium.make_vec(FOLLOW, num_envs=2, vectorization_mode=mode, size_px=SMALL)
+    try:
+        seen, _ = envs.reset(seed=[1, 2])
+        seen, rewards, *_ = envs.step(np.array([0, 0]))
+        alone = gymnasium.make(FOLLOW, size_px=SMALL)
+        alone.reset(seed=2)
+        mine, reward, *_ = alone.step(0)
+        assert np.array_equal(seen["rgb"][1], mine["rgb"])
+        assert rewards[1] == reward
+        alone.close()
+    finally:
+        envs.close()
+
+
+def test_nobody_trains_on_held_out_towns():
+    held = {(town.preset, town.seed) for town in HELD_OUT.values()}
+    assert not held & {(town.preset, town.seed) for town in TRAINING}
+    configs = [read_yaml(path) for path in (Path(cosfly.envs.__file__).parents[2] / "configs").glob("*.yaml")]
+    assert len(configs) >= 4
+    seeds = {part.get("seed", 0) for one in configs for part in (one, *(one.get("towns") or {}).values())}
+    assert not seeds & {town.seed for town in HELD_OUT.values()}
+    assert not {*HELD_OUT} & {str(name) for one in configs for name in one.get("towns") or {}}
+
+
+def test_lists_are_fixed_and_their_digests_are_those_of_the_document():
+    text = (Path(cosfly.envs.__file__).parents[2] / "docs" / "closed-loop.md").read_text(encoding="utf-8")
+    for task in TASKS:
+        env, episodes, digest = read_list(f"{task}/test")
+        assert (env, len(episodes), len({*episodes})) == (task, 20, 20)
+        assert digest[:12] in text, f"{task}: {digest[:12]}"
+
+
+# --- policies ---------------------------------------------------------------------------------------------------------
+
+POLICIES = """
+import os, time
+import numpy as np
+
+class Fine:
+    answer = 0
+    def reset(self, goal, seed):
+        self.goal, self.count = goal, 0
+    def act(self, observation):
+        assert observation["goal"] == self.goal
+        self.count += 1
+        return self.answer
+class Token(Fine): answer = "hover"
+class Command(Fine): answer = np.array([1.0, 0, 0, 0, -30])
+class Word(Fine): answer = "fly!"
+class Beyond(Fine): answer = [99.0, 0, 0, 0, 0]
+class Seventeen(Fine): answer = 17
+class Nothing(Fine): answer = None
+class Object(Fine): answer = {"a": 1}
+class Raises(Fine):
+    def act(self, observation): raise RuntimeError("oops")
+class Dies(Fine):
+    def act(self, observation): os._exit(7)
+class Never(Fine):
+    def act(self, observation):
+        while True: pass
+class Slow(Fine):
+    def act(self, observation):
+        time.sleep(0.7 * (super().act(observation) + self.count == 1)); return 0
+class BadReset(Fine):
+    def reset(self, goal, seed): raise ValueError("no")
+class NoAct: pass
+"""
+
+
+@pytest.fixture
+def ask(follow, tmp_path, monkeypatch):
+    """Gives what a policy of that name answers, four times of one episode and once of the next."""
+    (tmp_path / "own.py").write_text(POLICIES)
+    monkeypatch.chdir(tmp_path)
+    follow.reset(seed=0)
+    outlook = SimpleNamespace(flight=follow._flight, moments=[follow._now])
+
+    def answers(name, limit_s=0.4):
+        policy = Policy(f"own:{name}", limit_s, 0, lambda episode: "the man")
+        try:
+            names = ["a", "a", "a", "a", "b"]
+            return [policy.decide([SimpleNamespace(**vars(outlook), episode=one)])[0] for one in names]
+        finally:
+            policy.close()
+
+    return answers
+
+
+@pytest.mark.parametrize(
+    ("name", "wanted"),
+    [
+        ("Fine", "ok"), ("Token", "ok"), ("Command", "ok"), ("Word", "invalid"), ("Beyond", "invalid"),
+        ("Seventeen", "invalid"), ("Nothing", "unreadable"), ("Object", "unreadable"), ("Raises", "none"),
+        ("Dies", "none"), ("Never", "late"), ("BadReset", "none"),
+    ],
+)  # fmt: skip
+def test_what_a_policy_does_is_told_as_its_answer(ask, name, wanted):
+    assert [one.answer for one in ask(name, 10.0 if wanted != "late" else 0.4)] == [wanted] * 5
+
+
+def test_what_was_answered_is_what_is_flown(ask):
+    assert ask("Fine", 10)[0].action == TOKENS[0]
+    assert ask("Token", 10)[0].action == "hover"
+    assert ask("Command", 10)[0].command.tolist() == [1, 0, 0, 0, -30]
+
+
+def test_a_slow_answer_is_late_once_and_the_next_ones_are_in_time(ask):
+    assert [one.answer for one in ask("Slow")][:4] == ["late", "ok", "ok", "ok"]
+    assert MOST_LATE > 1
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--env", "cosfly/Folow-v0", "--policy", "own:Fine"], "did you mean 'cosfly/Follow-v0'"),
+        (["--env", "cosfly/Follow-v0/tst", "--policy", "own:Fine"], "no such list"),
+        (["--env", FOLLOW, "--policy", "own:Missing"], "own:Missing"),
+        (["--env", FOLLOW, "--policy", "nowhere:Fine"], "No module named"),
+        (["--env", FOLLOW, "--policy", "own:NoAct"], "reset"),
+    ],
+)
+def test_bad_words_are_refused_in_a_line(tmp_path, monkeypatch, words, said):
+    (tmp_path / "own.py").write_text(POLICIES)
+    monkeypatch.chdir(tmp_path)
+    result = invoke("fly", *words, "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert said in str(result.exception or result.output)
+
+
+@pytest.mark.slow
+def test_a_whole_list_gives_records_and_a_score(tmp_path, monkeypatch):
+    (tmp_path / "own.py").write_text(POLICIES)
+    monkeypatch.chdir(tmp_path)
+    out = tmp_path / "out"
+    invoke("fly", "--env", FOLLOW, "--policy", "own:Word", "--out", out, "--workers", "2")
+    records = [read_pursuit(path) for path in sorted((out / "pursuits").glob("*.json"))]
+    assert len(records) == 20
+    assert {frame.answer for one in records for frame in one.decisions} == {"invalid"}
+    assert json.loads((out / "score.json").read_text())["list_sha256"] == read_list(FOLLOW)[2]
