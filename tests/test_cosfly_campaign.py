@@ -227,14 +227,15 @@ def _read(path: Path) -> bytes:
 
 
 def test_ctrl_c_ends_the_runs_too(tmp_path):
+    """As a terminal sends it: to all processes of its foreground."""
     path, out = campaign_file(tmp_path, seeds=[1, 2]), tmp_path / "out"
     process = start(path, out)
-    while not (out / "small-1/run.yaml").exists():
+    while not (out / "small-1/pedestrians/stage.json").exists():
         assert process.poll() is None, process.stdout.read()
         time.sleep(0.02)
-    os.kill(process.pid, signal.SIGTERM)
+    os.killpg(process.pid, signal.SIGINT)
     text, _ = process.communicate(timeout=60)
-    assert process.returncode == 143
+    assert process.returncode == 130
     assert "finished work is kept" in text
     assert not (out / "small-2").exists()
     assert not [p for p in Path("/proc").glob("[0-9]*/cmdline") if str(out).encode() in _read(p)]

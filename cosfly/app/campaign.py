@@ -53,6 +53,7 @@ OF_A_RUN = STAGES[:-1]  # the release is made of all
 NOT_A_RUN = ("release", LOGS, SETTINGS)
 LONGEST_TAIL = 65536  # of a log, in which the error of a run stands last
 SHEET_PX = 960
+PATIENCE_S = 20.0  # for a run that was told to end
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_]{1,40}$")]
 
 
@@ -243,8 +244,14 @@ def run(cfg: CampaignConfig, runs: list[Run], out: Path, *, resume: Resume = "if
                 list(threads.map(work, todo))
             except BaseException:
                 threads.shutdown(wait=False, cancel_futures=True)
-                for process in list(at_work.values()):
+                ending = list(at_work.values())
+                for process in ending:
                     process.terminate()
+                for process in ending:
+                    try:
+                        process.wait(PATIENCE_S)
+                    except subprocess.TimeoutExpired:
+                        process.kill()
                 raise
         failed = [one.name for one in todo if one.name not in done]
         try:
@@ -291,6 +298,7 @@ def _do(
             [sys.executable, "-m", "cosfly", *words],
             stdin=subprocess.DEVNULL, stdout=log_file, stderr=subprocess.STDOUT,
             preexec_fn=partial(end_with_parent, os.getpid()),
+            start_new_session=True,  # a terminal's Ctrl-C is for the campaign, which tells its runs, once
         )  # fmt: skip
         code = process.wait()
     del at_work[one.name]
