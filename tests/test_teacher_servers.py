@@ -17,6 +17,7 @@ from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.doctor import examine_endpoint
 from cosfly.chat.protocol import split_urls
+from cosfly.chat.throttle import Throttle
 from cosfly.errors import ConfigError, TeacherError
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
@@ -91,6 +92,17 @@ def test_a_server_that_always_fails_costs_no_window(fault, tree, tmp_path, caplo
     assert len(good.bodies) == 10
     assert 0 < len(bad.bodies) <= 12
     assert any("left out" in record.message and bad.url in record.message for record in caplog.records)
+
+
+def test_who_waits_for_a_server_sleeps_while_another_is_left_out(tmp_path, monkeypatch):
+    tree = make_playback_tree(tmp_path / "tree", 1, 20, with_augmented=False)  # 11 windows
+    looks, look = [], Throttle.has_room
+    monkeypatch.setattr(Throttle, "has_room", lambda self: looks.append(self) or look(self))
+    slow = {"concurrency": 9, "backoff_s": 60.0, "max_backoff_s": 60.0}  # one more than it begins with: it would grow
+    with deciding(delay_s=1.5) as good, deciding(fault=lambda number, body: "500") as bad:
+        run(asking(bad.url, good.url, endpoint=slow), tree, tmp_path / "out")
+    assert len(good.bodies) == 22
+    assert len(looks) < 500
 
 
 def test_a_server_that_never_answers_costs_no_window(tree, tmp_path, caplog):

@@ -162,24 +162,25 @@ class ChatClient:
     async def _slot(self, tried: dict[_Place, Any]) -> AsyncIterator[_Place]:
         """Wait for a server with room, one that was not tried where there is any, and hold a slot of it."""
         async with self._changed:
-            while (server := self._choose(tried)) is None:
-                soonest_s = min(server.throttle.room_in_s() for server in self.servers)
+            while not (with_room := [one for one in self._asked(tried) if one.throttle.has_room()]):
+                soonest_s = min(one.throttle.room_in_s() for one in self._asked(tried))
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(None if soonest_s == float("inf") else soonest_s):
                         await self._changed.wait()
+            server = min(with_room, key=lambda one: one.throttle.load)
             server.throttle.num_active += 1
         try:
             yield server
         finally:
             async with self._changed:
                 server.throttle.num_active -= 1
-                self._changed.notify(max(int(server.throttle.limit) - server.throttle.num_active, 0))
+                # Of several, who waits first may wait for another.
+                is_alone, room = len(self.servers) == 1, int(server.throttle.limit) - server.throttle.num_active
+                self._changed.notify(max(room, 0)) if is_alone else self._changed.notify_all()
 
-    def _choose(self, tried: dict[_Place, Any]) -> _Place | None:
+    def _asked(self, tried: dict[_Place, Any]) -> list[_Place]:
         asked = [server for server in self.servers if not server.trouble] or self.servers
-        asked = [server for server in asked if server not in tried] or asked
-        with_room = [server for server in asked if server.throttle.has_room()]
-        return min(with_room, key=lambda server: server.throttle.load, default=None)
+        return [server for server in asked if server not in tried] or asked
 
     def _leave_out(self, server: _Place, why: str) -> None:
         if server.trouble or len(self.servers) == 1:
