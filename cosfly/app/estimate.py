@@ -22,6 +22,7 @@ from cosfly.products.traces import read_traces
 from cosfly.products.walks import read_paths, walk_id
 from cosfly.render.weather import dark_flights
 from cosfly.work.config import load
+from cosfly.work.ray_engine import ALL_ROOM
 from cosfly.work.stage_folder import Failed, StageFolder, flattened
 
 UNITS = {
@@ -120,7 +121,8 @@ def _learn(rates: Rates, run: Path) -> None:
             continue
         units = counts[UNITS[stage.name]] * (_mpx(seen.cfg) if stage.name in BY_PIXELS else 1)
         seconds = max(stage.seconds, _seconds_of_items(run / stage.name, stage, workers))
-        rates.stages[stage.name] = Rate(seconds / units, stage.size_bytes / units, f"{run}, {workers} workers")
+        told = "all" if workers == ALL_ROOM else workers
+        rates.stages[stage.name] = Rate(seconds / units, stage.size_bytes / units, f"{run}, {told} workers")
         if stage.name == "caption" and seen.cfg.caption.teacher_kind != "rules":
             rates.tokens[seen.cfg.caption.teacher_kind] = _tokens_of(run / "caption/captions.jsonl")
     rates.frames_a_metre = sum(frames) / (len(seen.cfg.render.tracks) * num_walks * _straight_frames(seen.cfg))

@@ -152,11 +152,13 @@ class RayPost:
         return self._vitals  # the last that came: those of a node that is lost change no more
 
     def kill(self, patience_s: float) -> None:
+        unreachable = self._ray.exceptions.RayError
         if self.pid is not None:
             # By its host, so that it is known to be gone. A node that is lost does not answer.
-            with contextlib.suppress(self._ray.exceptions.RayError):
+            with contextlib.suppress(unreachable):
                 self._ray.get(self._host.end.remote(patience_s), timeout=ANSWER_S + patience_s)
-        self._ray.kill(self._host)
+        with contextlib.suppress(unreachable):
+            self._ray.kill(self._host)
 
     @contextlib.contextmanager
     def _gone_as_eof(self) -> Iterator[None]:
@@ -281,7 +283,7 @@ def connected(cfg: RayConfig) -> Any:
     finally:
         # What it tells of nodes that are lost it would write on the standard output.
         speaker.print_to_stdstream = lambda data, **_: log.debug("ray: %s", " ".join(data["lines"]))
-        with contextlib.suppress(ValueError):  # not the main thread, where Ray leaves it alone
+        with contextlib.suppress(ValueError, TypeError):  # not the main thread, where Ray leaves it alone
             signal.signal(signal.SIGTERM, ends_it)
     return ray
 
