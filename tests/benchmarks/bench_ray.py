@@ -26,8 +26,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from crashes import contents, differences
-from test_cosfly_ray import Nodes
+from crashes import differences
+from test_cosfly_ray import Nodes, products
 from toy_workers import make_talking_worker, stage_in
 
 from cosfly.app import pipeline
@@ -96,7 +96,7 @@ def measure_render(work: Path, rounds: int) -> None:
                 rates[name].append(frames / work_s)
                 pace, load = f"{frames} frames in {work_s:.1f} s, {frames / work_s:.1f}/s", os.getloadavg()[0]
                 print(f"{name}: start {start_s:.1f} s, then {pace}; load {load:.0f}", flush=True)
-    told = differences(contents(work / "ray0"), contents(work / "local0"))
+    told = differences(products(work / "ray0"), products(work / "local0"))
     ratios = [f"{ray / local:.2f}" for local, ray in zip(*rates.values(), strict=True)]
     print(f"ray / local, by rounds: {', '.join(ratios)}; differences: {told}")
 
@@ -148,7 +148,7 @@ def measure_losses(work: Path, kills: int) -> None:
         kinds = (*LOSSES, "restarted", "retried", "given_up")
         counts = {kind: sum(event.event == kind for event in events) for kind in kinds}
         frames = read_manifest(work / "disturbed/run/render").facts["num_frames"]
-        told = differences(contents(work / "disturbed"), contents(work / "undisturbed"))
+        told = differences(products(work / "disturbed"), products(work / "undisturbed"))
         lost = f"{killed[0]} workers and {3 - len(added)} node killed"
         print(f"{frames} frames, {lost}: {counts}; differences: {told}")
 
