@@ -146,6 +146,17 @@ def test_another_machine_is_refused_then_takes_over(memory, tmp_path, monkeypatc
     assert there(memory) == {"a.json": "1", "c.json": "3"}
 
 
+def test_a_sign_of_life_is_given_while_many_files_travel(memory, tmp_path, monkeypatch):
+    folder = taken(tmp_path)
+    put(folder, **{f"{number}_json": "1" for number in range(3)})
+    monkeypatch.setattr(locations, "BATCH", 1)
+    monkeypatch.setattr(locations, "BEAT_S", 0.0)
+    told, pipe = list[str](), memory.pipe_file
+    monkeypatch.setattr(memory, "pipe_file", lambda path, data: (told.append(path), pipe(path, data)))
+    folder.copy_out()
+    assert told == ["/bucket/.run.writer.json"] * 3
+
+
 def test_what_was_not_sent_when_a_folder_went_on_elsewhere_is_set_aside(memory, tmp_path, caplog):
     first = taken(tmp_path / "a")
     with first.at_work():

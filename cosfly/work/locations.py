@@ -158,6 +158,7 @@ class WorkingFolder:
             with contextlib.suppress(InputError, ValueError):
                 self._state = _State.model_validate_json(read_bytes(self._notes / "state.json"))
         self.num_sent = self.bytes_sent = 0
+        self._id, self._told_s = "", 0.0  # of our mark, once there is one; when it was written last
         _shown[self.local.absolute()] = self.shown
 
     def fetch(self, *, is_input: bool = True) -> None:
@@ -184,6 +185,7 @@ class WorkingFolder:
                 with storage_errors(path):
                     path.parent.mkdir(parents=True, exist_ok=True)
             self._asked("cannot read", partial(self._system.get, *paths))
+            self._beat()
             for name, path in batch.items():
                 self._state.files[name] = got = _Copy.of(path, there[name][1])
                 if not got.is_at(there[name]):
@@ -233,10 +235,10 @@ class WorkingFolder:
                 raise ResumeError("another machine is at work there", where=self.shown, got=got, fix=fix)
             if found.at_work and not is_ours:
                 log.warning("%s: taken over; no sign of life of %s", self.shown, got)
-        writer = self._state.id if is_ours else uuid.uuid4().hex
-        self._tell(writer)
+        self._id = self._state.id if is_ours else uuid.uuid4().hex
+        self._tell()
         time.sleep(SETTLE_S)
-        self._check_writer(writer)
+        self._check_writer()
         if is_ours:  # nobody else wrote since: what is not there as it was sent goes anew, what is only there goes
             there = self._listed(self.local.name)
             known = {name: one for name, one in self._state.files.items() if one.is_at(there.get(name))}
@@ -248,7 +250,7 @@ class WorkingFolder:
             log.warning("%s went on elsewhere: %d files that were not sent are in %s", self.shown, len(unsent), aside)
         self._state = _State() if unsent else self._state
         self.fetch(is_input=False)
-        self._state.id = writer
+        self._state.id = self._id
         self._save()
 
     def _writer(self) -> _Writer | None:
@@ -262,16 +264,23 @@ class WorkingFolder:
             return _Writer.model_validate_json(self._asked("cannot read", ask))
         return None
 
-    def _check_writer(self, writer: str) -> None:
+    def _check_writer(self) -> None:
         found = self._writer()
-        if found is not None and found.id != writer:
+        if found is not None and found.id != self._id:
             got, fix = f"process {found.pid} on {found.host}", f"what was made here is in {self.local}"
             self._lost = ResumeError("another machine took over", where=self.shown, got=got, fix=fix)
         if self._lost is not None:
             raise self._lost
 
-    def _tell(self, writer: str, *, at_work: bool = True) -> None:
-        mark = _Writer(id=writer, host=socket.gethostname(), pid=os.getpid(), seen_s=time.time(), at_work=at_work)
+    def _beat(self) -> None:
+        """Give a sign of life where one is due, also while many files travel."""
+        if self._id and time.monotonic() - self._told_s >= BEAT_S:
+            self._check_writer()
+            self._tell()
+
+    def _tell(self, *, at_work: bool = True) -> None:
+        self._told_s = time.monotonic()
+        mark = _Writer(id=self._id, host=socket.gethostname(), pid=os.getpid(), seen_s=time.time(), at_work=at_work)
         self._make_folders([self._mark])
         self._asked("cannot write", lambda: self._system.pipe_file(self._mark, mark.model_dump_json().encode()))
 
@@ -295,14 +304,13 @@ class WorkingFolder:
                 log.warning("%s", error)
 
     def _copy_until(self, ended: threading.Event) -> None:
-        wait_s, beaten_s, told = COPY_EVERY_S, time.monotonic(), ""
-        while not ended.wait(wait_s) and self._lost is None:
+        due_s, told = time.monotonic() + COPY_EVERY_S, ""
+        while not ended.wait(min(COPY_EVERY_S, BEAT_S)) and self._lost is None:
             began_s = time.monotonic()
             try:
-                if began_s - beaten_s >= BEAT_S:
-                    self._check_writer(self._state.id)
-                    self._tell(self._state.id)
-                    beaten_s = began_s
+                self._beat()
+                if began_s < due_s:
+                    continue
                 self.copy_out()
             except CosflyError as error:
                 if str(error) != told:
@@ -310,11 +318,11 @@ class WorkingFolder:
                     log.warning("%s; the work goes on, and is copied when that can be done", told)
             except OSError as error:  # a file that went while it was looked at
                 log.debug("%s: the next copy takes it: %s", self.shown, error)
-            wait_s = min(BEAT_S, max(COPY_EVERY_S, (time.monotonic() - began_s) / MOST_SHARE))
+            due_s = began_s + max(COPY_EVERY_S, (time.monotonic() - began_s) / MOST_SHARE)
 
     def _finish(self) -> None:
         """Copy what is left, then compare both sides: sizes, and MD5s where the other side tells these."""
-        self._check_writer(self._state.id)
+        self._check_writer()
         self.copy_out()
         there = self._listed(self.local.name)
         wrong = [name for name, one in self._state.files.items() if not self._arrived(name, one, there.get(name))]
@@ -323,7 +331,7 @@ class WorkingFolder:
         if wrong:
             fix = f"run the same command again; all of it is in {self.local}"
             raise StorageError("not there as it was sent", where=self.shown, got=", ".join(wrong)[:200], fix=fix)
-        self._tell(self._state.id, at_work=False)
+        self._tell(at_work=False)
         log.info("%s: %d files sent, %.1f MB; compared", self.shown, self.num_sent, self.bytes_sent / 1e6)
 
     def _arrived(self, name: str, sent: _Copy, there: tuple[int, str] | None) -> bool:
@@ -384,6 +392,7 @@ class WorkingFolder:
             paths = [str(files[name]) for name in batch], [f"{self._above}/{name}" for name in batch]
             self._make_folders(paths[1])
             self._asked("cannot write", partial(self._system.put, *paths))
+            self._beat()
             self._state.files |= copies
             self.num_sent += len(batch)
             self.bytes_sent += sum(one.size for one in copies.values())
