@@ -40,6 +40,9 @@ def fly(
         Path | None, Option(show_default="that of --map", help="Boxes that are flown in: step2_simplified.json.")
     ] = None,
     others: Annotated[Path | None, Option(help="Who else moves: others.json, beside path.json.")] = None,
+    relabel: Annotated[
+        Path | None, Option(help="Folder of `cosfly fly`: nobody flies, the planner goes on where that student erred.")
+    ] = None,
 ) -> None:
     """A student flies: its decisions move the drone, and what it then sees is drawn. Records of all, and their tree."""
     from cosfly.closed_loop import stage
@@ -48,6 +51,14 @@ def fly(
     run = stage.FlightsConfig(
         fly=cfg.fly, plan=cfg.plan, render=cfg.render, caption=cfg.caption, infer=cfg.distill.infer
     )
+    if relabel is not None:
+        if map_ is None or paths or env or policy or student:
+            raise typer.BadParameter("--relabel takes --map, and who flew where stands in its folder")
+        from cosfly.closed_loop.relabel import run as replan
+
+        job.begin(out, map_, simplified, relabel)
+        job.finish(replan(run, relabel, map_, simplified or map_, out, seed=cfg.seed, **job.manner), out)
+        return
     if env is not None:
         if map_ or paths or simplified or others or (policy and student):
             raise typer.BadParameter("--env has its own maps and walks, and either --policy or --student flies")

@@ -112,10 +112,11 @@ class Ceiling:
     name, num_frames = "planner", 1
 
     def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
-        return [PilotAnswer("ok", command=self._to_next(one.flight, one.moments[-1])) for one in outlooks]
+        return [PilotAnswer("ok", command=self.to_next(one.flight, one.moments[-1])) for one in outlooks]
 
     @staticmethod
-    def _to_next(flight: ClosedLoopFlight, now: Moment) -> np.ndarray:
+    def to_next(flight: ClosedLoopFlight, now: Moment) -> np.ndarray:
+        """Give the command that leads to the plan's next pose, or as near as the drone's bounds allow."""
         planned, i = flight.planned, now.index + 1
         velocity = in_axes_of(now.rotation_deg[1], planned.positions_m[i] - now.position_m) / flight.dt_s
         velocity *= min(1.0, flight.drone.speed_max_mps / max(float(np.hypot(*velocity[:2])), 1e-9))

@@ -12,6 +12,8 @@ from cosfly.errors import nearest
 from cosfly.products.motion import ACTION
 from cosfly.work.config import Config
 
+ROUNDING = 1e-9  # of a command that was made as fast as it may be
+
 
 class DroneConfig(Config):
     """What the drone can do; a command beyond its bounds is none."""
@@ -40,9 +42,17 @@ class DroneConfig(Config):
         if (outside := (command < low) | (command > high)).any():
             k = int(np.argmax(outside))
             return f"{ACTION[k]} {command[k]:g} is outside {low[k]:g} to {high[k]:g}"
-        if (speed_mps := float(np.hypot(*command[:2]))) > self.speed_max_mps:
+        if (speed_mps := float(np.hypot(*command[:2]))) > self.speed_max_mps * (1 + ROUNDING):
             return f"a speed of {speed_mps:g} m/s over ground is more than {self.speed_max_mps:g}"
         return None
+
+
+class RelabelConfig(Config):
+    """`cosfly fly --relabel`: which frames of a flown flight become training data."""
+
+    stride: int = Field(5, ge=1, description="frames from one that is looked at to the next")
+    future_frames: int = Field(10, ge=5, le=100, description="frames of the planner after the student's")
+    round: int = Field(1, ge=1, description="of DAgger; told in what is made")
 
 
 FLOORS = ("track_straight", "random")
@@ -85,6 +95,7 @@ class FlyConfig(Config):
     trained_on: tuple[str, ...] | None = Field(
         None, description="towns that the student was trained on: the score marks their flights; null: not known"
     )
+    relabel: RelabelConfig = Field(RelabelConfig(), description="`cosfly fly --relabel`: the planner where it erred")
 
     @property
     def engine(self) -> str:

@@ -291,9 +291,27 @@ def trace_of(pursuit: Pursuit, obstacles: BoxIndex) -> DroneTrace:
     targets_m = np.array([frame.target_m for frame in pursuit.frames])
     clearances_m = np.array([frame.clearance_m for frame in pursuit.frames])
     ground_m = np.array([frame.pose[2] - frame.height_m for frame in pursuit.frames])
+    return flown_trace(
+        pursuit.walk, f"flown by {pursuit.student}", time_s, poses, targets_m, clearances_m, ground_m, obstacles,
+        {"ended": pursuit.ended}, pursuit.style.pace,
+    )  # fmt: skip
+
+
+def flown_trace(
+    path_id: str,
+    planner: str,
+    time_s: np.ndarray,
+    poses: np.ndarray,
+    targets_m: np.ndarray,
+    clearances_m: np.ndarray,
+    ground_m: np.ndarray,
+    obstacles: BoxIndex,
+    solver: dict,
+    pace: str,
+) -> DroneTrace:
+    """Give a flight of n frames as step 4 gives a plan. poses: (n, 6); targets_m: (n, 3); others (n,)."""
     seen = visibility(obstacles, poses[:, :3], targets_m)
     metrics = flight_metrics(poses[:, :3], targets_m, seen, clearances_m, ground_m, step_s(time_s))
     return DroneTrace(
-        pursuit.walk, f"flown by {pursuit.student}", time_s, poses[:, :3], poses[:, 3:], targets_m, seen, clearances_m,
-        metrics, {"ended": pursuit.ended}, pace=pursuit.style.pace,
-    )  # fmt: skip
+        path_id, planner, time_s, poses[:, :3], poses[:, 3:], targets_m, seen, clearances_m, metrics, solver, pace=pace
+    )

@@ -1,0 +1,149 @@
+"""`cosfly fly --relabel`, DAgger's data (Ross, Gordon and Bagnell 2011): what the planner does from where a student's
+own mistakes led it.
+
+The planner knows the whole walk: from the pose that the student had reached the drone flies back to the plan as fast as
+it may (`pilots.Ceiling`). A window is kept where the student's decision is ruled out by that motion, or where it was
+about to lose the person. Each is a short flight: the student's observed frames, then the planner's.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from caption.run.own_files import vocabulary_of
+from caption.schema import FutureMotion
+from caption.truth.actions import measure, table_of
+from cosfly.closed_loop.measures import LOSS_S
+from cosfly.closed_loop.pilots import Ceiling
+from cosfly.closed_loop.stage import PLAN, TRACES, TREE, FlightsConfig, flown_trace
+from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight
+from cosfly.errors import InputError
+from cosfly.products.boxes import read_boxes
+from cosfly.products.flight_scores import read_score
+from cosfly.products.pursuits import Pursuit, pursuit_file, read_pursuit
+from cosfly.products.traces import ARRAYS, DroneTrace, read_traces, write_traces
+from cosfly.reading.files import sha256_file
+from cosfly.render import stage as rendering
+from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
+from cosfly.work.stage_folder import Kept, Resume, StageFolder
+
+
+def run(
+    cfg: FlightsConfig,
+    flown: Path,
+    boxes: Path,
+    simplified: Path,
+    out: Path,
+    *,
+    seed: int = 0,
+    workers: int = 1,
+    watch: Watch = Watch(),
+    resume: Resume = "if-same",
+) -> Path:
+    """Reads a folder of `cosfly fly` and its map; writes `drone_trace.json` and the playback tree `render/` of what the
+    planner does where the student erred. Gives the folder.
+
+    Raises:
+        InputError: a file is not what it must be, or the map is another one. NothingKept: the student erred nowhere.
+    """
+    inputs = {"flown": flown, "boxes": boxes, "simplified": simplified}
+    stage = StageFolder.open(out, "relabel", config=cfg, inputs=inputs, seed=seed, resume=resume, begun=(TREE,))
+    if not stage.is_complete:
+        items = []
+        for episode in sorted(flight.episode for flight in read_score(flown).flights):
+            pursuit = read_pursuit(pursuit_file(flown, episode))
+            if pursuit.map_sha256 != sha256_file(boxes):
+                raise InputError("another map than was flown in", where=boxes, expected=f"that of {flown}")
+            places = range(pursuit.num_lead, len(pursuit.frames) - 1, cfg.fly.relabel.stride)
+            items += [Item(f"{episode}_f{i:05d}", (episode, i)) for i in places]
+        done = run_items(stage, items, make_worker, (cfg, flown, boxes, simplified, seed), workers=workers, watch=watch)
+        kept = [record.result for record in done.records if isinstance(record, Kept)]
+        traces = [DroneTrace.from_json(result["trace"], "relabel") for result in kept]
+        write_traces(stage.path / TRACES, traces, {"round": cfg.fly.relabel.round, "seed": seed})
+        reasons = Counter(reason for result in kept for reason in result["reasons"])
+        stage.finish([stage.path / TRACES], done.tally, reasons=dict(sorted(reasons.items())))
+    drawn = cfg.render.model_copy(update={"tracks": ("clean",)})
+    how: dict[str, Any] = {"seed": seed, "workers": workers, "watch": watch, "resume": resume}
+    rendering.run(drawn, boxes, simplified, out / TRACES, out / TREE, **how)
+    return out
+
+
+def make_worker(cfg: FlightsConfig, flown: Path, boxes: Path, simplified: Path, seed: int) -> Work:
+    """Open a map in this process, and give the function that judges one window of a student's flight."""
+    plans = {plan.path_id: plan for plan in read_traces(flown / PLAN / TRACES)}
+    space = Airspace(cfg.render, read_boxes(boxes), read_boxes(simplified), seed=seed)
+    table, fly, num = table_of(vocabulary_of(cfg.caption).actions, cfg.caption.label), cfg.fly, cfg.caption.window
+
+    def work(item: Item) -> Outcome:
+        episode, i = item.payload
+        pursuit = read_pursuit(pursuit_file(flown, episode))
+        plan, begin, end = plans[pursuit.walk], i - num.num_frames + 1, i + fly.relabel.future_frames + 1
+        if begin < 0 or end > len(plan.time_s):
+            return Outcome(drop_reason="walk_ends")
+        if not any(frame.visible for frame in pursuit.frames[begin : i + 1]):
+            return Outcome(drop_reason="long_lost")  # no picture tells where the person is
+        flight = ClosedLoopFlight(
+            space, _joined(plan, pursuit, begin, i, end), num_lead=num.num_frames, drone=fly.drone
+        )
+        moments = [*flight.reset()]
+        while flight.ended is None:
+            moments.append(flight.step(Ceiling.to_next(flight, moments[-1])))
+            advance()
+        if flight.ended != "finished":
+            return Outcome(drop_reason="crashes")
+        after = moments[num.num_frames - 1 :][: num.future_frames + 1]
+        before_m = moments[num.num_frames - 1].position_m - moments[num.num_frames - 2].position_m
+        future = FutureMotion(
+            indices=tuple(moment.index for moment in after[1:]),
+            time_s=np.array([moment.time_s for moment in after]),
+            positions_m=np.array([moment.position_m for moment in after]),
+            yaw_deg=np.array([moment.rotation_deg[1] for moment in after]),
+            targets_m=np.array([moment.target_m for moment in after]),
+            visible=np.array([moment.target.visible for moment in after]),
+            speed_before_mps=float(np.linalg.norm(before_m)) / flight.dt_s,
+        )
+        motion = measure(future)
+        reasons = _reasons(pursuit, i, pursuit.frames[i].action, table.verdict_of, motion, table.label_of(motion))
+        if not reasons:
+            return Outcome(drop_reason="no_mistake")
+        solver = {"source": episode, "frame": i, "student": pursuit.student, "round": fly.relabel.round}
+        solver |= {"decision": pursuit.frames[i].action, "reasons": reasons}
+        trace = flown_trace(
+            item.item_id,
+            f"replanned from frame {i} of {pursuit.student}, round {fly.relabel.round}",
+            np.array([moment.time_s for moment in moments]),
+            np.hstack([flight.poses.positions_m, flight.poses.rotations_deg]),
+            flight.poses.targets_m,
+            flight.poses.clearances_m,
+            np.array([moment.position_m[2] - moment.height_m for moment in moments]),
+            space.surroundings.obstacles,
+            solver,
+            pursuit.style.pace,
+        )
+        return Outcome({"trace": trace.as_json(), "reasons": reasons})
+
+    return work
+
+
+def _joined(plan: DroneTrace, pursuit: Pursuit, begin: int, i: int, end: int) -> DroneTrace:
+    """Give the student's frames begin to i, and the plan's up to `end`, as a plan."""
+    cut: Any = {name: getattr(plan, name)[begin:end].copy() for name in (*ARRAYS, "clearances_m")}
+    poses = np.array([frame.pose for frame in pursuit.frames[begin : i + 1]])
+    cut["positions_m"][: len(poses)], cut["rotations_deg"][: len(poses)] = poses[:, :3], poses[:, 3:]
+    cut["clearances_m"][: len(poses)] = [frame.clearance_m for frame in pursuit.frames[begin : i + 1]]
+    return replace(plan, **cut)
+
+
+def _reasons(
+    pursuit: Pursuit, i: int, action: str | None, verdict_of: Any, motion: Any, label: str | None
+) -> list[str]:
+    """Say what was wrong at frame i, if anything."""
+    soon = pursuit.frames[i : i + round(LOSS_S / pursuit.dt_s) + 1]
+    found = ["nearly_lost"] if not all(frame.visible for frame in soon) else []
+    conflicts = action is not None and verdict_of(action, motion, label) == "HARD_CONFLICT"
+    return found + (["hard_conflict"] if conflicts else [])

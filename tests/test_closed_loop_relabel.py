@@ -1,0 +1,65 @@
+"""`cosfly fly --relabel`: frames of the student's own mistakes, then the planner; a tree that is captioned as any other."""
+
+import json
+
+import numpy as np
+import pytest
+from commands import invoke
+from test_closed_loop_fly import TINY, fly, town  # noqa: F401
+
+from cosfly.closed_loop.settings import DroneConfig
+from cosfly.errors import InputError
+from cosfly.products.captions import read_captions
+from cosfly.products.flights import find_flights
+from cosfly.products.playback import read_flight
+
+STUDENT, FRAMES = "--workers 1 --student track_straight --set fly.tree=false", 5
+
+
+def relabel(town, flown, out, more=""):  # noqa: F811
+    boxes = f"--map {town}/maps/boxes_3d.json --simplified {town}/simplify/step2_simplified.json"
+    return invoke(f"fly {TINY} {boxes} --relabel {flown} --workers 1 --out {out} --set fly.relabel.stride=8 {more}")
+
+
+def test_where_it_erred_the_planner_goes_on_and_what_is_made_is_captioned(town, tmp_path):  # noqa: F811
+    flown = fly(town, tmp_path / "flown", STUDENT)
+    done = relabel(town, tmp_path / "flown", tmp_path / "made", "--set fly.relabel.round=2")
+    assert done.exit_code == 0, (done.output, done.exception)
+    counts = json.loads((tmp_path / "made/manifest.json").read_text())["counts"]
+    looked_at = sum(len(range(0, len(pursuit.decisions), 8)) for pursuit in flown.values())
+    assert counts["input"] == looked_at
+    assert counts["kept"] + sum(counts["dropped"].values()) + sum(counts["failed"].values()) == looked_at
+    assert counts["kept"] >= 1
+    flights = [read_flight(folder) for folder in find_flights(tmp_path / "made/render")]
+    assert len(flights) == counts["kept"]
+    for flight in flights:
+        name, _, number = flight.source["scenario_id"].rpartition("_f")
+        i, pursuit = int(number), flown[name]
+        assert flight.source["algorithm"] == f"replanned from frame {i} of {pursuit.student}, round 2"
+        assert len(flight) == FRAMES + 10
+        own = [frame.pose[:3] for frame in pursuit.frames[i - FRAMES + 1 : i + 1]]
+        assert np.allclose(flight.positions_m[:FRAMES], own, atol=1e-3)  # what it saw; then the planner
+        assert np.linalg.norm(np.diff(flight.positions_m, axis=0), axis=1).max() <= 10 * 0.5 * 1.2
+    done = invoke(f"caption {TINY} --workers 1 --data {tmp_path}/made/render --out {tmp_path}/caption")
+    assert done.exit_code == 0, done.output
+    captions = list(read_captions(tmp_path / "caption/captions.jsonl"))
+    assert {max(caption.window) for caption in captions} >= {FRAMES - 1}
+    assert all(max(caption.window) < min(caption.future) for caption in captions)
+
+
+def test_another_map_than_was_flown_in_is_refused(town, tmp_path):  # noqa: F811
+    fly(town, tmp_path / "flown", f"{STUDENT} --set fly.most_decisions=4")
+    other = tmp_path / "other.json"
+    other.write_text((town / "maps/boxes_3d.json").read_text() + "\n")
+    done = invoke(f"fly {TINY} --map {other} --relabel {tmp_path}/flown --workers 1 --out {tmp_path}/made")
+    assert isinstance(done.exception, InputError)
+    assert "another map" in str(done.exception)
+
+
+@pytest.mark.parametrize("angle", np.linspace(0, 6, 13))
+def test_a_command_as_fast_as_may_be_can_be_flown(angle):
+    drone = DroneConfig()
+    command = np.array([*(drone.speed_max_mps * np.array([np.cos(angle), np.sin(angle)])), 0, 0, -40.0])
+    command[:2] *= 1 + 1e-15
+    assert drone.problem_of(np.clip(command, *drone.bounds)) is None
+    assert drone.problem_of(command * [1.001, 1.001, 1, 1, 1]) is not None
