@@ -8,7 +8,7 @@ from commands import invoke
 from test_closed_loop_fly import TINY, fly, town  # noqa: F401
 
 from cosfly.closed_loop.settings import DroneConfig
-from cosfly.errors import InputError
+from cosfly.errors import VerifyError
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight
@@ -52,8 +52,8 @@ def test_another_map_than_was_flown_in_is_refused(town, tmp_path):  # noqa: F811
     other = tmp_path / "other.json"
     other.write_text((town / "maps/boxes_3d.json").read_text() + "\n")
     done = invoke(f"fly {TINY} --map {other} --relabel {tmp_path}/flown --workers 1 --out {tmp_path}/made")
-    assert isinstance(done.exception, InputError)
-    assert "another map" in str(done.exception)
+    assert isinstance(done.exception, VerifyError)
+    assert "another input 'boxes'" in str(done.exception)
 
 
 @pytest.mark.parametrize("angle", np.linspace(0, 6, 13))
