@@ -162,6 +162,18 @@ def test_a_signal_ends_a_command_and_its_workers_in_one_line(tmp_path, until, nu
     assert text.splitlines() == [f"error: {word}; finished work is kept: run the same command again to continue"]
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+@pytest.mark.parametrize("gap_s", [0.0, 0.002, 0.01])
+def test_a_second_signal_that_breaks_off_the_ending_ends_the_workers_too(tmp_path, gap_s):
+    process = start_program(tmp_path, ("0.pid", "1.pid"), stderr=subprocess.DEVNULL)
+    pids = [int((tmp_path / name).read_text()) for name in ("0.pid", "1.pid")]
+    process.send_signal(signal.SIGINT)
+    time.sleep(gap_s)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(timeout=30) in (130, 143, -signal.SIGTERM)
+    wait_for(lambda: not any(map(is_running, pids)), 10.0)
+
+
 # --- telling how far it is --------------------------------------------------------------------------------------------
 
 

@@ -7,6 +7,7 @@ this machine, at the other end of a pipe (`worker`); in `ray_engine` one on a no
 
 from __future__ import annotations
 
+import atexit
 import logging
 import math
 import multiprocessing
@@ -112,6 +113,8 @@ class LocalPost:
         with signals_held_back():
             self._process.start()
         there.close()
+        # A second Ctrl-C may break off what ends it, and the SIGTERM that Python sends at the end it does not heed.
+        atexit.register(self._process.kill)
         self.pid: int | None = self._process.pid
 
     def send(self, what: Start | Item | None) -> None:
@@ -128,6 +131,7 @@ class LocalPost:
             self._process.join(patience_s)
         self._process.kill()
         self._process.join()
+        atexit.unregister(self._process.kill)
 
 
 @dataclass(frozen=True)
