@@ -358,13 +358,13 @@ def test_a_run_that_was_killed_goes_on_on_another_machine(s3):
     assert "taken over; no sign of life of process" in ended.stderr
     assert ended.returncode == 0, ended.stderr[-3000:]
     assert text(python, env, "flights/run/render/items.jsonl").startswith(journal)  # nothing was done again
-    ended = cosfly(python, env, folder / "c", "run", "quickstart", "--out", str(folder / "plain"), *sets)
+    ended = cosfly(python, env, folder / "c", "run", "quickstart", "--out", str(folder / "plain/run"), *sets)
     assert ended.returncode == 0, ended.stderr[-3000:]
     verify = ("release", "verify", "s3://flights/run/release/dataset")
     assert cosfly(python, env, folder / "c", *verify).returncode == 0
     (fetched,) = (folder / "b/written").glob("*/flights/run")
     for stage in STAGES:
-        made, plain = (products(run / stage) for run in (fetched, folder / "plain"))
+        made, plain = (products(run / stage) for run in (fetched, folder / "plain/run"))
         for one in (made, plain):
             one.pop("report.html", None)  # it names the folder that it stands in
         assert made == plain, stage
