@@ -20,7 +20,7 @@ from cosfly.cli.located import located
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, ResumeError, StorageError
 from cosfly.work import locations
 from cosfly.work.journal import Journal
-from cosfly.work.locations import WorkingFolder, name_of
+from cosfly.work.locations import WorkingFolder, name_of, path_of
 
 ROOT = Path(__file__).resolve().parents[1]
 RUN = "memory://bucket/run"
@@ -196,7 +196,9 @@ def test_inputs_travel_once_and_what_is_gone_there_goes_here(memory, tmp_path, c
     assert "1 files fetched, 1 were here" in caplog.text
     assert sorted(path.name for path in folder.local.rglob("*.json")) == ["b.json", "c.json"]
     assert name_of(folder.local / "d/b.json") == f"{RUN}/d/b.json"
+    assert path_of(f"{RUN}/d/b.json") == folder.local / "d/b.json"
     assert name_of(tmp_path) == str(tmp_path)
+    assert path_of(f"{RUN}2/a") == Path(f"{RUN}2/a")
 
 
 def test_a_file_comes_with_the_records_of_its_stage(memory, tmp_path):

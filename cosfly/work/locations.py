@@ -98,6 +98,14 @@ def name_of(path: Path) -> str:
     return str(path)
 
 
+def path_of(name: str) -> Path:
+    """Give the path that `name_of` gave a name, as far as this process works at that location."""
+    for place, shown in reversed(_shown.items()):
+        if f"{name}/".startswith(f"{shown}/"):
+            return place / name.removeprefix(shown).lstrip("/")
+    return Path(name)
+
+
 class _Copy(NamedTuple):
     """A file that is the same on both sides. tag: what the other side calls its content, mostly the MD5."""
 

@@ -23,7 +23,7 @@ from cosfly.reading.documents import FileFormat, read_json, read_model, read_obj
 from cosfly.reading.files import files_named, sha256_file
 from cosfly.work.console import progress_bar
 from cosfly.work.journal import Journal
-from cosfly.work.locations import name_of
+from cosfly.work.locations import name_of, path_of
 from cosfly.work.store import CHECKSUMS, checksum_lines, dump_json, inside, read_checksums, sha256_bytes
 
 log = logging.getLogger(__name__)
@@ -302,7 +302,7 @@ def stages_behind(products: Iterable[Path]) -> list[StageRecord]:
             return
         found.add(known)
         for entry in record.inputs.values():
-            before = Path(entry.path)
+            before = path_of(entry.path)
             if before.exists() and _record_of(before) is not None and fingerprint(before) == entry.sha256:
                 visit(before)
         ordered.append(record)
