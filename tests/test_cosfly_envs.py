@@ -12,7 +12,7 @@ from commands import invoke
 from gymnasium.utils.env_checker import check_env
 
 import cosfly.envs
-from cosfly.envs.episodes import HELD_OUT, TASKS, TRAINING, read_list
+from cosfly.envs.episodes import HELD_OUT, TASKS, TRAINING, episode_of, read_list, world_of
 from cosfly.envs.follow import CRASH_REWARD, FULL_REWARD_M, NO_REWARD_M, reward_of
 from cosfly.envs.policy import MOST_LATE, Policy
 from cosfly.errors import InputError
@@ -144,6 +144,13 @@ def test_lists_are_fixed_and_their_digests_are_those_of_the_document():
         env, episodes, digest = read_list(f"{task}/test")
         assert (env, len(episodes), len({*episodes})) == (task, 20, 20)
         assert digest[:12] in text, f"{task}: {digest[:12]}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_every_listed_episode_can_be_one(task):
+    for town, number in read_list(task)[1]:
+        assert episode_of(task, world_of(HELD_OUT[town]), number) is not None, f"{town} {number}"
 
 
 # --- policies ---------------------------------------------------------------------------------------------------------
