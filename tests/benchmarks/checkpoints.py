@@ -68,7 +68,6 @@ def main() -> None:
     numbers = [n for n, trace in enumerate(read_traces(plans)) if trace.drop_reason is None][: given.walks]
     checkpoints = {f"noise-{p:g}": (p, ()) for p in NOISE}
     checkpoints |= {"no-turns": (0.0, TURNS), "no-left": (0.0, TURNS[:1]), "no-speed": (0.0, ("speed_up", "slow_down"))}
-    checkpoints["no-descend"] = (0.0, ("descend_for_observation", "climb_to_avoid_occlusion"))
     windows = [c for c in read_captions(given.captions) if c.label and c.en] if given.captions else []
     for name, (noise, without) in checkpoints.items():
         told = [(c.label, replaced(c.en.flight_decision, c.sample_id, noise, without)) for c in windows]
