@@ -45,7 +45,8 @@ class Checkpoint:
     """A pilot whose decisions are replaced."""
 
     def __init__(self, pilot: Any, noise: float, without: tuple[str, ...]) -> None:
-        self.name, self._pilot, self._noise, self._without = pilot.name, pilot, noise, without
+        self.name, self.num_frames = pilot.name, pilot.num_frames
+        self._pilot, self._noise, self._without = pilot, noise, without
 
     def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
         answers = self._pilot.decide(outlooks)
