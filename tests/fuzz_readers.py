@@ -46,6 +46,7 @@ from cosfly.chat.student_chat import TAUGHT, read_taught, write_taught
 from cosfly.chat.wire import Response, retry_after_s
 from cosfly.cli.options import resolve
 from cosfly.closed_loop.controller import CONTROLLER_FILE, read_controls
+from cosfly.closed_loop.measures import score_pursuits
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.review import read_filled
 from cosfly.inspection.settings import InspectConfig
@@ -69,6 +70,7 @@ from cosfly.products.answer_text import Parsed, parse_answer
 from cosfly.products.backdrop import Backdrop, WorldFrame, write_backdrop
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.products.captions import Coc, read_captions
+from cosfly.products.flight_scores import SCORE, SCORE_FORMAT, read_score
 from cosfly.products.flights import find_flights, read_twin
 from cosfly.products.frames import DEPTH_PNG, read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.goals import Goal
@@ -215,6 +217,7 @@ def make_specimens(root: Path) -> Path:
     }
     write_json(tree / "Town01" / IDS_FILE, {**IDS_FORMAT.header, **ids})
     write_pursuit(root / "pursuit.json", pursuit())
+    write_model(root / SCORE, score_pursuits([pursuit()]), SCORE_FORMAT)
     shutil.copy(CONTROLLER_FILE, root / "controller.yaml")
     pack_depth(root / TREE / "aug_001")
     shutil.copy(root / TREE / "ORI" / FRAME / "rgb.png", root / TREE / "ORI" / TARGET_FILE)
@@ -748,6 +751,7 @@ READERS: dict[str, Reader] = {
     "others": _one("others.json", read_others),
     "traces": _one("drone_trace.json", read_traces),
     "pursuit": _one("pursuit.json", read_pursuit),
+    "score": Reader((SCORE,), lambda root, _: read_score(root)),
     "controller": _one("controller.yaml", lambda path: read_controls(path, shipped_actions().tokens)),
     "city model": _one("city.json", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
     "city model, lines": _one("city.jsonl", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),

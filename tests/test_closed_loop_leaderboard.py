@@ -1,6 +1,7 @@
 """The leaderboard: one table for one list of episodes, gains of rounds, correlation, and a page that escapes."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from test_closed_loop_measures import flight
 from cosfly.closed_loop.leaderboard import LEAST_CHECKPOINTS
 from cosfly.closed_loop.measures import score_pursuits
 from cosfly.errors import CosflyError
+from cosfly.escaping import LONGEST
 from cosfly.products.flight_scores import SCORE, SCORE_FORMAT
 from cosfly.products.pursuits import pursuit_file, write_pursuit
 from cosfly.work.store import write_model
@@ -43,6 +45,13 @@ def test_the_best_is_first_and_foreign_words_are_escaped(tmp_path):
     assert "<script>alert" not in page
     assert "&lt;script&gt;alert" in page
     assert page.count("<polyline") >= 2 * 2 + 3 * 3  # two curves of two students, three walks with both flights
+
+
+def test_lines_of_long_flights_are_drawn_whole(tmp_path):
+    _, page = board(tmp_path / "out", folder(tmp_path, "long", ["1" * 300] * 2))
+    lines = re.findall(r'<polyline points="([^"]*)"', page)
+    assert max(map(len, lines)) > LONGEST
+    assert all(re.fullmatch(r"[-0-9., ]+", line) for line in lines)
 
 
 def test_other_episodes_are_another_table_and_two_folders_of_one_student_are_put_together(tmp_path):

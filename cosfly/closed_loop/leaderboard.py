@@ -273,8 +273,10 @@ def _distance(pursuits: Sequence[Pursuit], longest: int) -> list[tuple[float, fl
 def _chart(title: str, lines: Mapping[str, Sequence[tuple[float, float]]]) -> dict[str, Any]:
     """Give lines on axes that begin at zero, 620 by 220 px."""
     most = np.array([point for line in lines.values() for point in line]).max(axis=0)
+    digits = 0 if most[1] >= 10 else 2
     ticks = [
-        (46 + 560 * i / 4, 206 - 190 * i / 4, f"{most[0] * i / 4:.0f}", f"{most[1] * i / 4:.2g}") for i in range(5)
+        (46 + 560 * i / 4, 206 - 190 * i / 4, f"{most[0] * i / 4:.0f}", f"{most[1] * i / 4:.{digits}f}")
+        for i in range(5)
     ]
     scaled = {n: [(46 + 560 * x / most[0], 206 - 190 * y / max(most[1], 1e-9)) for x, y in p] for n, p in lines.items()}
     return {"title": title, "ticks": ticks, "lines": {name: _points(line) for name, line in scaled.items()}}
