@@ -220,6 +220,8 @@ BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "public.pem": lambda root, target: _openssl("pkey", "-in", root / "key.pem", "-pubout", "-out", target),
     "runs/town1": copy_of("runs/diverse/grid"),
     "runs/town2": copy_of("runs/diverse/old_town"),
+    "work/flown0": copy_of("work/random"),
+    "work/flown1": copy_of("work/rules"),
     "work/unlabelled/render": copy_of("work/render"),
     "Qwen/Qwen3.5-2B": copy_of("work/student"),
     "models/Qwen3.5-2B": copy_of("work/student"),
