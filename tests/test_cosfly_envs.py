@@ -112,8 +112,8 @@ def test_cheats_do_not_pay(follow):
 
 @pytest.mark.parametrize("mode", ["sync", "async"])
 def test_environments_are_stepped_as_vectors(mode):
-    # Gymnasium reads texts in shared memory once, before there are any.
-    how = {"shared_memory": False} if mode == "async" else {}
+    # Gymnasium reads texts in shared memory once, before there are any; it forks, which GL and threads do not survive.
+    how = {"shared_memory": False, "context": "spawn"} if mode == "async" else {}
     envs = gymnasium.make_vec(FOLLOW, num_envs=2, vectorization_mode=mode, vector_kwargs=how, size_px=SMALL)
     try:
         seen, _ = envs.reset(seed=[1, 2])
