@@ -62,6 +62,8 @@ NOT_HERE = {
     "python tests/benchmarks/": "minutes each; what they measure stands beside them in the documents",
     "python docs/window_card.py": "a page for the browser of the next line",
     "chromium --headless": "a browser; tests/browser.py drives one for the pages that run a script",
+    "--env cosfly/": "1,600 frames each; tests/test_cosfly_envs.py flies a list and policies",
+    "--out work/round1": "two short flights are too few walks to split; tests/test_distill_dataset.py has more",
     "roi edit work/": "it serves until it is stopped; tests/test_cosfly_roi_editor.py draws on its page",
     "s3://bucket/": "a bucket is needed; tests/test_cosfly_locations.py works on one of a server of its own",
     "hf://datasets/": "a hub is asked; tests/test_release_get.py reads the same through fsspec from elsewhere",
