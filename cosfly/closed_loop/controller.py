@@ -94,8 +94,4 @@ class Controller:
             self._side = float(np.sign(yaw_rate))
         over_aim_m = self._height_m + now.position_m[2] - self._home[2]
         pitch_deg = -float(np.degrees(np.arctan2(over_aim_m, self.aim_m)))
-        low, high = self.drone.bounds
-        command = np.clip([ahead, left, row.up_mps, yaw_rate, pitch_deg], low, high)
-        speed_mps = float(np.hypot(*command[:2]))
-        command[:2] *= min(1.0, self.drone.speed_max_mps / max(speed_mps, 1e-9))
-        return command
+        return self.drone.within_speed(np.clip([ahead, left, row.up_mps, yaw_rate, pitch_deg], *self.drone.bounds))

@@ -46,6 +46,12 @@ class DroneConfig(Config):
             return f"a speed of {speed_mps:g} m/s over ground is more than {self.speed_max_mps:g}"
         return None
 
+    def within_speed(self, command: np.ndarray) -> np.ndarray:
+        """Scale a command's speed over ground, (5,) as ACTION, down to the greatest."""
+        command = command.copy()
+        command[:2] *= min(1.0, self.speed_max_mps / max(float(np.hypot(*command[:2])), 1e-9))
+        return command
+
 
 class RelabelConfig(Config):
     """`cosfly fly --relabel`: which frames of a flown flight become training data."""

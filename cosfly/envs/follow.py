@@ -148,7 +148,7 @@ class FollowEnv(gymnasium.Env):
         if isinstance(self.action_space, spaces.Discrete):
             command = self._controller.command(self.tokens[int(action)], self._now)
         else:
-            command = within_speed(np.asarray(action, dtype=np.float64), self.drone)
+            command = self.drone.within_speed(np.asarray(action, dtype=np.float64))
         self._now = self._flight.step(command)
         ended = self._flight.ended
         seen = observe(self._flight, self._now, self._goal, depth=self.has_depth)
@@ -173,10 +173,3 @@ class FollowEnv(gymnasium.Env):
         if self._space is not None:
             self._space.renderer.close()
         self._space = self._flight = None
-
-
-def within_speed(command: np.ndarray, drone: DroneConfig) -> np.ndarray:
-    """Scale a command's speed over ground, (5,) as ACTION, down to the drone's greatest."""
-    command = command.copy()
-    command[:2] *= min(1.0, drone.speed_max_mps / max(float(np.hypot(*command[:2])), 1e-9))
-    return command

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from cosfly.closed_loop.pilots import Outlook, PilotAnswer
-from cosfly.envs.follow import observe, within_speed
+from cosfly.envs.follow import observe
 from cosfly.errors import InputError
 from cosfly.products.actions import shipped_actions
 from cosfly.products.pursuits import MOST_WORDS
@@ -100,9 +100,10 @@ class Policy:
             if said in self._tokens:
                 return PilotAnswer("ok", said, answer_s=answer_s)
         elif isinstance(said, list):
-            command, (low, high) = np.array(said), outlook.flight.drone.bounds
+            command, drone = np.array(said), outlook.flight.drone
+            low, high = drone.bounds
             if command.shape == low.shape and (command >= low).all() and (command <= high).all():
-                return PilotAnswer("ok", answer_s=answer_s, command=within_speed(command, outlook.flight.drone))
+                return PilotAnswer("ok", answer_s=answer_s, command=drone.within_speed(command))
         return PilotAnswer("invalid", words=repr(said)[:MOST_WORDS], answer_s=answer_s)
 
     def _ask(self, *call: Any) -> tuple[Any, Any]:
