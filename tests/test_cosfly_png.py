@@ -6,6 +6,7 @@ from __future__ import annotations
 import io
 import struct
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -138,6 +139,19 @@ def test_floats_come_back_to_the_bit_and_any_library_finds_their_bytes(shape):
     assert floats_of(data, "x").tobytes() == values.tobytes(), "also what is no number"
     with Image.open(io.BytesIO(data)) as image:
         assert np.asarray(image).view("<f4")[..., 0].tobytes() == values.tobytes()
+
+
+def test_every_thread_packs_the_same_bytes():
+    """Whose stack lies elsewhere: of a thousand such pictures one differed."""
+    depths = np.random.default_rng(0).uniform(1.0, 900.0, 10_000).astype(np.float32)
+
+    def pack() -> list[bytes]:
+        return [floats_png(np.full((1, 60), depth)) for depth in depths]
+
+    with ThreadPoolExecutor(2) as pool:
+        others = [pool.submit(pack) for _ in range(2)]
+        found = pack()
+    assert all(other.result() == found for other in others)
 
 
 def test_a_picture_is_no_depth():
