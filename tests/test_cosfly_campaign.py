@@ -12,7 +12,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from cosfly.app.campaign import Run, load_campaign, tallies
+from cosfly.app.campaign import PATIENCE_S, Run, load_campaign, tallies
 from cosfly.cli import app
 from cosfly.errors import ConfigError
 from cosfly.reading.documents import read_json
@@ -204,11 +204,11 @@ def test_six_runs_killed_at_three_moments_end_as_if_undisturbed_and_nothing_is_d
     _, all_runs, _ = load_campaign(path, [], out)
     for run in all_runs:
         assert digests(out, run.name) == digests(whole, run.name)
-        for _, folder in run.stages():
-            kept = Counter(line["id"] for line in Journal(folder / "items.jsonl").read())
-            done = Counter(event.item for event in read_events(folder) if event.event == "item_done")
-            assert set(kept.values()) <= {1}, folder
-            assert set(done.values()) <= {1}, folder
+        for stage in run.look().stages:
+            kept = Counter(line["id"] for line in Journal(stage.folder / "items.jsonl").read())
+            done = Counter(event.item for event in read_events(stage.folder) if event.event == "item_done")
+            assert set(kept.values()) <= {1}, stage
+            assert set(done.values()) <= {1}, stage
     assert digests(out, ".") == digests(whole, "."), "the release"
     assert (
         tallies(all_runs)["caption"].kept
@@ -226,16 +226,24 @@ def _read(path: Path) -> bytes:
         return b""
 
 
-def test_ctrl_c_ends_the_runs_too(tmp_path):
-    """As a terminal sends it: to all processes of its foreground."""
+@pytest.mark.parametrize(
+    ("number", "begun", "code"),
+    [(signal.SIGINT, "small-1/pedestrians/stage.json", 130), (signal.SIGTERM, "logs/small-1.log", 143)],
+)
+def test_what_ends_a_campaign_ends_its_runs_too(tmp_path, number, begun, code):
+    """Ctrl-C as a terminal sends it: to all processes of its foreground. SIGTERM when a run has just been started and
+    has no handlers yet."""
     path, out = campaign_file(tmp_path, seeds=[1, 2]), tmp_path / "out"
     process = start(path, out)
-    while not (out / "small-1/pedestrians/stage.json").exists():
+    while not (out / begun).exists():
         assert process.poll() is None, process.stdout.read()
-        time.sleep(0.02)
-    os.killpg(process.pid, signal.SIGINT)
+        time.sleep(0.001)
+    os.killpg(process.pid, number)
+    begun_s = time.monotonic()
     text, _ = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == code
+    assert time.monotonic() - begun_s < PATIENCE_S, "the run heard it"
     assert "finished work is kept" in text
     assert not (out / "small-2").exists()
     assert not [p for p in Path("/proc").glob("[0-9]*/cmdline") if str(out).encode() in _read(p)]
+    assert all(one.look().stages[0].state == "to do" for one in load_campaign(out, [], None)[1][1:])

@@ -258,7 +258,7 @@ def _stage(name: str, count: int, cfg: RunConfig, out: Path, rates: Rates, stand
 
 def time_left(rows: list[StageEstimate]) -> str:
     """Give the time of all that is not done, in words; what nobody knows is named."""
-    unknown = [row.name for row in rows if row.seconds is None]
+    unknown = dict.fromkeys(row.name for row in rows if row.seconds is None)
     text = duration(sum(row.seconds or 0.0 for row in rows))
     return f"{text}, and {', '.join(unknown)}, whose time depends on its teacher" if unknown else text
 

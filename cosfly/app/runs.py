@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from caption.run.progress import duration
 from cosfly.app.settings import RunConfig
 from cosfly.app.settings_guide import Setting, changed
 from cosfly.errors import CosflyError, InputError
@@ -32,19 +33,37 @@ class StageLook:
     """One stage of a run.
 
     Attributes:
-        name: of a town's stage: `town/stage`.
+        name: of a town's stage: `town/stage`. folder: where it stands.
         state: whether it has ended, has begun, or has not.
         tally: what became of its items; of one that has begun, of those that are done.
         far, left_s: of one that works now, how far it is and how long it will still take; None where nobody knows.
     """
 
     name: str
+    folder: Path
     state: Literal["complete", "begun", "to do"]
-    tally: Tally | None
-    seconds: float | None
-    size_bytes: int
+    tally: Tally | None = None
+    seconds: float | None = None
     far: HowFar | None = None
     left_s: float | None = None
+
+    @property
+    def stage(self) -> str:
+        """Its name without that of a town."""
+        return self.name.rpartition("/")[2]
+
+    @property
+    def size_bytes(self) -> int:
+        """What it takes on the disk: looks at each of its files."""
+        return _size(self.folder)
+
+    def items_in_words(self) -> str:
+        """Say what became of its items; of one at work how far it is: `120 of 428 frames, about 3 min left`."""
+        if self.far is None:
+            return "" if self.tally is None else str(self.tally)
+        what = "frames" if self.far.unit == "steps" else "items"
+        left = "" if self.left_s is None else f", about {duration(self.left_s)} left"
+        return f"{self.far.done:,} of {self.far.total:,} {what}{left}"
 
 
 @dataclass(frozen=True)
@@ -66,28 +85,30 @@ class RunLook:
     def size_bytes(self) -> int:
         return sum(stage.size_bytes for stage in self.stages)
 
+    def tally(self, stage: str) -> Tally:
+        """Add up what became of a stage's items, in all towns."""
+        return sum((one.tally for one in self.stages if one.stage == stage and one.tally), Tally())
+
     def waiting(self) -> dict[Path, int]:
         """Give the folders of finished inspections that left flights to a person, and how many are still undecided.
 
         Raises:
             InputError: an inspection, or what was decided on it, cannot be read.
         """
-        done = [
-            self.path / stage.name
-            for stage in self.stages
-            if stage.name.split("/")[-1] == "inspect" and stage.state == "complete"
-        ]
+        done = [one.folder for one in self.stages if one.stage == "inspect" and one.state == "complete"]
         counts = {folder: len(undecided(folder / "inspect.json")) for folder in done}
         return {folder: count for folder, count in counts.items() if count}
 
 
-def look(run: Path) -> RunLook:
+def look(run: Path, cfg: RunConfig | None = None) -> RunLook:
     """Look at a run folder.
 
+    Args:
+        cfg: its settings, where they are known: then it need not be there yet.
     Raises:
         InputError: it is none. ConfigError: its `run.yaml` is not of this version.
     """
-    if not (run / "run.yaml").is_file():
+    if cfg is None and not (run / "run.yaml").is_file():
         raise InputError(
             "not a run folder",
             where=run,
@@ -95,7 +116,7 @@ def look(run: Path) -> RunLook:
             expected="a folder that `cosfly run` made",
             fix="cosfly list DIR finds them",
         )
-    cfg = load(RunConfig, run / "run.yaml")
+    cfg = cfg or load(RunConfig, run / "run.yaml")
     folders = [(f"{town}/{name}", run / town / name) for town in cfg.towns for name in STAGES[:-1]]
     folders = [*folders, ("release", run / "release")] if cfg.towns else [(name, run / name) for name in STAGES]
     found = [run / name for name in TO_LOOK_AT if (run / name).exists()]
@@ -121,12 +142,11 @@ def find(root: Path, *, depth: int = 2) -> Iterator[Path]:
 
 
 def _stage(name: str, folder: Path, is_at_work: bool) -> StageLook:
-    size = _size(folder)
     if (folder / "manifest.json").exists():
         manifest = read_manifest(folder)
-        return StageLook(name, "complete", manifest.counts, manifest.seconds, size)
+        return StageLook(name, folder, "complete", manifest.counts, manifest.seconds)
     if not (folder / "stage.json").exists():
-        return StageLook(name, "to do", None, None, size)
+        return StageLook(name, folder, "to do")
     tally = Tally()
     outcomes = {record.id: record for record in StageFolder(folder, name, False).items()}
     for record in outcomes.values():
@@ -138,7 +158,7 @@ def _stage(name: str, folder: Path, is_at_work: bool) -> StageLook:
         else:
             tally.kept += 1
     far = progress_of(read_events(folder)) if is_at_work else None
-    return StageLook(name, "begun", tally, None, size, *(far or ()))
+    return StageLook(name, folder, "begun", tally, None, *(far or ()))
 
 
 def _size(folder: Path) -> int:

@@ -141,7 +141,7 @@ class RunConfig(Config):
         seed = int(rng_for(self.seed, "run", name).integers(2**31))
         shared = self.model_dump(mode="json", exclude={"towns", "maps"}) | {"name": name, "seed": seed}
         others = {setting: value for setting, value in changes.items() if setting != "maps"}
-        return build(RunConfig, _merged(self, shared, others) | {"maps": maps}, f"towns.{name}")
+        return build(RunConfig, merged(self, shared, others) | {"maps": maps}, f"towns.{name}")
 
 
 def _mapping(value: Any, where: str) -> dict[str, Any]:
@@ -150,15 +150,15 @@ def _mapping(value: Any, where: str) -> dict[str, Any]:
     return value
 
 
-def _merged(group: Config, settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+def merged(group: Config, settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     """Give a group's settings with the changes in them; a mapping that is one value, as shares are, is replaced."""
-    merged = dict(settings)
+    result = dict(settings)
     for name, value in changes.items():
         within = getattr(group, name, None)
         if isinstance(within, Config) and isinstance(value, dict):
-            value = _merged(within, settings[name], value)
-        merged[name] = value
-    return merged
+            value = merged(within, settings[name], value)
+        result[name] = value
+    return result
 
 
 def manner_of_work(cfg: RunConfig) -> dict[str, Any]:

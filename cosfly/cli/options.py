@@ -227,12 +227,12 @@ def stage_group(text: str) -> typer.Typer:
 def resolve(config: Path | None, overrides: list[str] | None, given: Mapping[str, Any] = {}) -> RunConfig:
     """Resolve the settings: defaults, file, --set, then `given`: what options say of single settings."""
     from cosfly.app.settings import RunConfig
-    from cosfly.work.config import load
+    from cosfly.work.config import config_file, load
     from cosfly.work.store import dump_json
 
     # As YAML, which JSON is: a colon in a text is only a colon.
     extra = [f"{name}={dump_json(str(value) if isinstance(value, Path) else value)}" for name, value in given.items()]
-    return load(RunConfig, _config_path(config), [*(overrides or []), *extra])
+    return load(RunConfig, config_file(config), [*(overrides or []), *extra])
 
 
 def _town_of(cfg: RunConfig, name: str | None) -> RunConfig:
@@ -247,29 +247,6 @@ def _town_of(cfg: RunConfig, name: str | None) -> RunConfig:
         what, expected = f"there is no such town{nearest(name, cfg.towns)}", names or "a configuration with towns"
         raise ConfigError(what, where="--town", got=name, expected=expected)
     return cfg.of_town(name)
-
-
-def _config_path(config: Path | None) -> Path | None:
-    """A path, a run folder, or the bare name of a configuration that ships with cosfly."""
-    from cosfly.work.config import shipped
-
-    if config is None or config.is_file():
-        return config
-    if (config / "run.yaml").is_file():
-        return config / "run.yaml"
-    is_bare = config.suffix == "" and len(config.parts) == 1
-    if is_bare and (packaged := shipped(f"{config}.yaml")).exists():
-        return packaged  # whatever folder of this name stands here
-    names = sorted(path.stem for path in shipped(".").glob("*.yaml") if path.stem != "glossary")
-    expected = f"a YAML file, a run folder, or one that ships: {', '.join(names)}"
-    if config.is_dir():
-        fix = f"cosfly list {config} names the runs in it"
-        raise ConfigError(
-            "a folder, and not that of a run", where=config, got="no run.yaml", expected=expected, fix=fix
-        )
-    if is_bare:
-        raise ConfigError(f"no such configuration{nearest(str(config), names)}", where=config, expected=expected)
-    return config
 
 
 # --- on the terminal --------------------------------------------------------------------------------------------------

@@ -16,7 +16,6 @@ from cosfly.errors import InputError
 if TYPE_CHECKING:
     from cosfly.app.estimate import StageEstimate
     from cosfly.app.pipeline import StageResult
-    from cosfly.app.runs import StageLook
     from cosfly.app.settings import RunConfig
 
 app = typer.Typer()
@@ -69,47 +68,45 @@ def campaign(
     ] = False,
 ) -> None:
     """Many runs (maps x configurations x seeds) as one job with one release. Run it again to continue."""
-    from caption.run.progress import duration
     from cosfly.app import campaign as campaigns
     from cosfly.app import estimate
     from cosfly.work.console import answer_console, console
+    from release.stats.stats import shown
 
     cfg, runs, out = campaigns.load_campaign(file, overrides or [], out)
     if dry_run:
-        told, rows = [], []
+        left: dict[str, list[StageEstimate]] = {}
+        of_release: list[StageEstimate] = []
         for one in runs:
-            every = estimate.estimate(one.cfg, one.folder, estimate.rates_near(one.folder))
-            rows += every
-            left = [row for row in every if not row.is_done and row.name != "release"]
-            stages = ", ".join(row.name for row in left)
-            told.append((one.name, stages or "-", estimate.time_left(left), estimate.in_words(_disk(left))))
-        if (out / "release/manifest.json").exists() and not any(row[1] != "-" for row in told):
-            rows = []
-        elif joint := [row for row in rows if row.name == "release"]:  # is of the frames of all runs
-            told.append(("release", "release", estimate.time_left(joint), estimate.in_words(_disk(joint))))
+            rows = estimate.estimate(one.cfg, one.folder, estimate.rates_near(one.folder))
+            left[one.name] = [row for row in rows if not row.is_done and row.name != "release"]
+            of_release += [row for row in rows if row.name == "release"]
+        if any(left.values()) or not (out / "release/manifest.json").exists():
+            left["release"] = of_release
+        told = []
+        for name, rows in left.items():
+            stages = ", ".join(dict.fromkeys(row.name for row in rows))
+            told.append((name, stages or "-", estimate.time_left(rows), _disk(rows)))
         title = f"What {out} would take, one run after the other; nothing is written"
         options.tell_table(answer_console, ("run", "to do", "time", "disk"), told, title=title, left=("to do", "time"))
-        unknown = "" if all(row.seconds is not None for row in rows) else ", and what teachers take"
-        seconds = sum(row.seconds or 0.0 for row in rows)
+        rows = [row for of_one in left.values() for row in of_one]
         free = estimate.in_words(estimate.free_bytes(out))
-        line = f"in all about {duration(seconds)}{unknown}; {estimate.in_words(_disk(rows))} of disk, {free} are free"
+        line = f"in all about {estimate.time_left(rows)}; {_disk(rows)} of disk, {free} are free"
         return answer_console.print(line, soft_wrap=True)
-    released = campaigns.run(cfg, runs, out, resume=resume)
-    rows_now = campaigns.table(runs, out)
-    options.tell_table(console, campaigns.HEAD, rows_now, title=f"What was made in {out}", left=("state", "at hand"))
+    failed = campaigns.run(cfg, runs, out, resume=resume)
+    table = [[shown(cell) for cell in row] for row in campaigns.table(runs, failed)]
+    options.tell_table(console, campaigns.HEAD, table, title=f"What was made in {out}", left=("state", "at hand"))
     typer.echo(out / campaigns.REPORT)
-    if released is None:
-        failed = ", ".join(row[0] for row in rows_now if row[1] != "done")
-        what, fix = (
-            "some runs failed; the others are done",
-            "mend what the table names, then run the same command again",
-        )
-        raise InputError(what, where=out, got=failed, fix=f"{fix}; or leave them out (leave_out)")
+    if failed:
+        fix = "mend what the table names, then run the same command again; or leave them out (leave_out)"
+        raise InputError("some runs failed; the others are done", where=out, got=", ".join(failed), fix=fix)
     typer.echo(out / "release/dataset")
 
 
-def _disk(rows: list[StageEstimate]) -> float:
-    return sum(row.bytes for row in rows)
+def _disk(rows: list[StageEstimate]) -> str:
+    from cosfly.app.estimate import in_words
+
+    return in_words(sum(row.bytes for row in rows))
 
 
 def _is_begun(config: Path, cfg: RunConfig) -> bool:
@@ -176,7 +173,7 @@ def show(run: Annotated[Path, Argument(metavar="RUN", help="A run folder.")]) ->
     rows = []
     for one in seen.stages:
         seconds = "" if one.seconds is None else f"{one.seconds:.1f}"
-        rows.append((one.name, one.state, _items_of(one), seconds, size(one.size_bytes) if one.size_bytes else ""))
+        rows.append((one.name, one.state, one.items_in_words(), seconds, size(num) if (num := one.size_bytes) else ""))
     head = ("stage", "state", "items", "seconds", "on disk")
     options.tell_table(answer_console, head, rows, left=("state", "items"), **PLAIN)
     lines = ["settings that are not the defaults:"] if seen.differing else []
@@ -188,17 +185,6 @@ def show(run: Annotated[Path, Argument(metavar="RUN", help="A run folder.")]) ->
         lines.append(f"continue  cosfly run {os.path.relpath(run)}")
     for line in lines:
         answer_console.print(line, soft_wrap=True)
-
-
-def _items_of(stage: StageLook) -> str:
-    """Say what became of a stage's items; of one at work how far it is: `120 of 428 frames, about 3 min left`."""
-    from caption.run.progress import duration
-
-    if stage.far is None:
-        return "" if stage.tally is None else str(stage.tally)
-    what = "frames" if stage.far.unit == "steps" else "items"
-    left = "" if stage.left_s is None else f", about {duration(stage.left_s)} left"
-    return f"{stage.far.done:,} of {stage.far.total:,} {what}{left}"
 
 
 @app.command("list")
@@ -214,8 +200,7 @@ def list_runs(root: Annotated[Path, Argument(metavar="[DIR]", help="Where runs a
         if isinstance(seen, CosflyError):
             errors.append(seen)
             continue
-        tallies = [(stage.name, stage.tally) for stage in seen.stages if stage.tally]
-        kept = [sum(tally.kept for name, tally in tallies if name.endswith(of)) for of in ("render", "caption")]
+        kept = [seen.tally(of).kept for of in ("render", "caption")]
         source = f"{len(seen.cfg.towns)} towns" if seen.cfg.towns else seen.cfg.maps.source
         stages, state = f"{seen.num_complete} of {len(seen.stages)}", "at work" if seen.is_at_work else ""
         counts = (str(count or "") for count in kept)

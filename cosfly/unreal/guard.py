@@ -16,7 +16,7 @@ import time
 from typing import Any
 
 from cosfly.errors import EnvironmentMissing
-from cosfly.work.server_process import end_server, start_server
+from cosfly.work.server_process import end_server, start_process
 from cosfly.work.worker import adopt_orphans
 
 PATIENCE_S = 20.0  # for a server that is to be left in order
@@ -94,7 +94,7 @@ def _put_back_unrealcv(host: str, port: int, commands: list[str]) -> None:
 
 def main(engine: str, host: str, port: str, command: str) -> None:
     adopt_orphans()
-    server = start_server(shlex.split(command)) if command else None
+    server = start_process(shlex.split(command)) if command else None
     lines = [json.loads(line) for line in sys.stdin]
     if server is not None:
         end_server(server, 0.0)

@@ -184,3 +184,28 @@ def _group(model: Any, parents: Iterable[Any]) -> Any:
 def shipped(name: str) -> Path:
     """Give the path of a file that ships in `configs/`, wherever cosfly is installed."""
     return Path(str(importlib.resources.files("cosfly_configs") / name))
+
+
+def config_file(config: Path | None) -> Path | None:
+    """Give the file of a configuration: that of a path, of a run folder, or of the bare name of one that ships.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if config is None or config.is_file():
+        return config
+    if (config / "run.yaml").is_file():
+        return config / "run.yaml"
+    is_bare = config.suffix == "" and len(config.parts) == 1
+    if is_bare and (packaged := shipped(f"{config}.yaml")).exists():
+        return packaged  # whatever folder of this name stands here
+    names = sorted(path.stem for path in shipped(".").glob("*.yaml") if path.stem != "glossary")
+    expected = f"a YAML file, a run folder, or one that ships: {', '.join(names)}"
+    if config.is_dir():
+        fix = f"cosfly list {config} names the runs in it"
+        raise ConfigError(
+            "a folder, and not that of a run", where=config, got="no run.yaml", expected=expected, fix=fix
+        )
+    if is_bare:
+        raise ConfigError(f"no such configuration{nearest(str(config), names)}", where=config, expected=expected)
+    return config

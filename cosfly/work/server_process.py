@@ -17,9 +17,10 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import IO
 
 from cosfly.work.stage_events import process_stat
-from cosfly.work.worker import adopt_orphans, end_with_parent
+from cosfly.work.worker import LEFT_TO_THE_PARENT, adopt_orphans, end_with_parent, signals_held_back
 
 PATIENCE_S = 15.0  # for a server that is asked to end
 LOOK_S = 0.2
@@ -48,10 +49,19 @@ class ServerProcess:
         self._process.wait()
 
 
-def start_server(words: Sequence[str]) -> subprocess.Popen:
-    """Start a server that is killed with this process. In a session of its own: `end_server` ends that."""
-    ours = partial(end_with_parent, os.getpid())
-    return subprocess.Popen(words, stdin=subprocess.DEVNULL, start_new_session=True, preexec_fn=ours)
+def start_process(words: Sequence[str], log: IO[bytes] | None = None) -> subprocess.Popen:
+    """Start a process that is killed with this one, and writes to a log. In a session of its own: Ctrl-C is not for
+    it."""
+    with signals_held_back():
+        return subprocess.Popen(
+            words, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+            start_new_session=True, preexec_fn=partial(_begin, os.getpid()),
+        )  # fmt: skip
+
+
+def _begin(parent_pid: int) -> None:
+    end_with_parent(parent_pid)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, LEFT_TO_THE_PARENT)
 
 
 def end_server(server: subprocess.Popen, patience_s: float) -> None:
@@ -85,7 +95,7 @@ def _descendants() -> list[int]:
 def main(words: Sequence[str]) -> int:
     """Run a server until it ends, or the input does."""
     adopt_orphans()
-    server = start_server(words)
+    server = start_process(words)
     while server.poll() is None and not select.select([sys.stdin], [], [], LOOK_S)[0]:
         pass
     code = server.poll()

@@ -17,7 +17,6 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -71,8 +70,8 @@ class Start:
 
 @contextlib.contextmanager
 def signals_held_back() -> Iterator[None]:
-    """Hold back Ctrl-C and its like; a worker that starts here inherits that, or they would hit its imports."""
-    resource_tracker.ensure_running()  # the first worker would start this, and with it end the holding back
+    """Hold back Ctrl-C and its like while a process starts, which inherits that: what they raise is lost in hooks of a
+    fork, and would hit a worker's imports."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, LEFT_TO_THE_PARENT)
     try:
         yield

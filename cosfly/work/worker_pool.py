@@ -20,6 +20,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Protocol
 
 from cosfly.errors import CosflyError, EnvironmentMissing
@@ -110,6 +111,7 @@ class LocalPost:
         context = multiprocessing.get_context("spawn")  # fork would copy GL and thread-pool state
         self.connection, there = context.Pipe()
         self._process = context.Process(target=work_through, args=(there, manner), daemon=True)
+        resource_tracker.ensure_running()  # the first worker would start this, and with it end the holding back
         with signals_held_back():
             self._process.start()
         there.close()
