@@ -28,6 +28,7 @@ def main() -> None:
     parser.add_argument("--journal", type=Path)
     parser.add_argument("--delay", type=float, default=0.0)
     parser.add_argument("--die-after", type=int, default=0, help="answers; then the process ends, each time")
+    parser.add_argument("--hang-after", type=int, default=0, help="answers; then nobody is answered, and it lives")
     parser.add_argument("--status", type=int, default=0, help="of every answer, in place of one")
     parser.add_argument("--silent", action="store_true", help="never listen")
     parser.add_argument("--last-words", default="", help="say this and end with status 3")
@@ -43,6 +44,10 @@ def main() -> None:
         time.sleep(600)
     num_answers, lock = 0, threading.Lock()
 
+    def hang() -> None:
+        if args.hang_after and num_answers > args.hang_after:
+            time.sleep(600)
+
     def respond(body: dict) -> tuple[int, dict] | None:
         nonlocal num_answers
         if args.status:
@@ -51,6 +56,7 @@ def main() -> None:
             num_answers += 1
             if args.die_after and num_answers > args.die_after:
                 os._exit(9)
+        hang()
         if args.journal:
             digest = hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
             with args.journal.open("a") as file:
@@ -62,7 +68,7 @@ def main() -> None:
 
     decide = lambda body: "hover"  # noqa: E731
     with TeacherServer(
-        models=(args.name,), port=args.port, delay_s=args.delay, decision=decide, respond=respond
+        models=(args.name,), port=args.port, delay_s=args.delay, decision=decide, respond=respond, list_models=hang
     ) as server:
         print(f"{os.environ.get('CUDA_VISIBLE_DEVICES', 'all')} --port {args.port}", flush=True)
         time.sleep(600)

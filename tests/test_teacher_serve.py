@@ -27,7 +27,7 @@ from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
 
 COMMAND = (sys.executable, SERVER, "$name", "--port", "$port")
-PATIENT = {"max_tries": 6, "backoff_s": 0.1, "max_backoff_s": 0.5, "concurrency": 4}
+PATIENT = {"max_tries": 6, "timeout_s": 3.0, "backoff_s": 0.1, "max_backoff_s": 0.5, "concurrency": 4}
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="what a killed process leaves is found through /proc")
 
@@ -174,16 +174,21 @@ def served(cfg: ServeConfig) -> CaptionConfig:
     return settings("serve:test-teacher", endpoint=PATIENT, serve=cfg.model_dump())
 
 
-def test_servers_of_one_run_begin_and_end_with_it_and_one_that_dies_costs_nothing(monkeypatch, tmp_path):
+@pytest.mark.parametrize("fault", ["--die-after", "--hang-after"])
+def test_servers_of_one_run_begin_and_end_with_it_and_one_that_dies_or_hangs_costs_nothing(
+    monkeypatch, tmp_path, caplog, fault
+):
     monkeypatch.setattr("cosfly.chat.supervisor.FIRST_PAUSE_S", 0.1)
+    monkeypatch.setattr("cosfly.chat.supervisor.ANSWER_S", 1.0)
     tree = make_playback_tree(tmp_path / "tree", 1, 20, with_augmented=False)  # 11 windows
     journal, child = tmp_path / "journal", tmp_path / "child"
-    cfg = serving("--journal", journal, "--child", child, "--die-after", 15)
+    cfg = serving("--journal", journal, "--child", child, fault, 15, hung_s=2.0)
     run(served(cfg), tree, tmp_path / "out")
+    assert ("has not answered for" in caplog.text) == (fault == "--hang-after")
     assert {caption.status for caption in read_captions(tmp_path / "out" / "captions.jsonl")} == {"accepted"}
     keys = [record["key"] for record in kept_answers(tmp_path / "out")]
     assert len(keys) == len(set(keys)) == 22
-    assert len({pid for pid, _ in journaled(journal)}) == 2, "it died after fifteen answers"
+    assert len({pid for pid, _ in journaled(journal)}) == 2, "it is of no use after fifteen answers"
     assert not any(map(is_alive, pids_in(child)))
     asked = len(journaled(journal))
     run(served(cfg), tree, tmp_path / "out")  # complete: nothing is started

@@ -5,7 +5,6 @@ serve`, `--teacher serve:MODEL`. What serves is a command, vLLM's unless the set
 from __future__ import annotations
 
 import asyncio
-import http.client
 import logging
 import os
 import re
@@ -18,6 +17,7 @@ from pathlib import Path
 from string import Template
 from typing import Literal
 
+import httpx
 from pydantic import Field
 
 from cosfly.chat.client import EndpointConfig
@@ -26,7 +26,7 @@ from cosfly.chat.servers import ChatClient
 from cosfly.errors import ConfigError, EnvironmentMissing, TeacherError
 from cosfly.reading.files import read_span
 from cosfly.work.config import Config
-from cosfly.work.server_process import ServerProcess
+from cosfly.work.server_process import guarded
 from cosfly.work.stage_events import num_gpus
 
 log = logging.getLogger(__name__)
@@ -39,6 +39,7 @@ VLLM = (
     "--structured-outputs-config", '{"backend": "xgrammar", "disable_any_whitespace": true}',
 )  # fmt: skip
 LOOK_S, ANSWER_S, FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 5.0, 1.0, 60.0
+ASKED_BEFORE_HUNG = 10  # times that a server is asked whether it lives, before it counts as hung
 READ_BYTES, MOST_SAID = 200_000, 300  # of a server's log; characters of one of its lines
 CAUSES = {
     "its accelerator's memory is full": r"out of memory|no available memory|free memory on device",
@@ -61,6 +62,7 @@ class ServeConfig(Config):
     host: str = Field("127.0.0.1", description="address they listen at; 0.0.0.0: all of this machine's")
     port: int = Field(8000, ge=1, le=65535, description="port of the first")
     ready_s: float = Field(900.0, gt=0, description="limit of the time until a server answers, s")
+    hung_s: float = Field(120.0, gt=0, description="time without an answer after which a server that lives is ended, s")
     restarts: int = Field(5, ge=0, description="times that a server which ended is started anew")
 
 
@@ -84,52 +86,48 @@ class _Replica:
         for number in range(self.cfg.restarts + 1):
             if number:
                 pause_s = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0 ** (number - 1))
-                log.warning(
-                    "%s: %s; started anew in %g s, %d of %d", self.url, self.failure, pause_s, number, self.cfg.restarts
-                )
+                told = f"{self.failure}; started anew in {pause_s:g} s, {number} of {self.cfg.restarts}"
+                log.warning("%s: %s", self.url, told)
                 stop.wait(pause_s)
-            cause = self._serve_once(stop)
-            if stop.is_set():
-                return
-            was_ready, self.is_ready, self.failure = self.is_ready or number > 0, False, cause
-            if not was_ready:  # it never worked here, so it will not
+            self.failure = self._serve_once(stop) or self.failure
+            was_ready, self.is_ready = self.is_ready, False
+            if stop.is_set() or not (was_ready or number):  # one that never worked here will not
                 return
         log.error("%s: %s; given up after %d starts", self.url, self.failure, self.cfg.restarts + 1)
 
     def _serve_once(self, stop: threading.Event) -> str:
-        """Run a server until it ends or is told to; gives why it ended."""
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind((self.cfg.host, self.port))
-            except (OSError, OverflowError) as error:
-                return f"port {self.port} cannot be had ({error}); choose another with --port"
-        begin = self.log_file.stat().st_size if self.log_file.exists() else 0
-        until_s = time.monotonic() + self.cfg.ready_s
-        process = ServerProcess(self.words, self.log_file, self.environment)
+        """Run a server until it ends, hangs or is told to end; gives why it ended."""
         try:
+            socket.create_server((self.cfg.host, self.port)).close()
+        except (OSError, OverflowError) as error:
+            return f"port {self.port} cannot be had ({error}); choose another with --port"
+        begin = self.log_file.stat().st_size if self.log_file.exists() else 0
+        asked_s = answered_s = time.monotonic()
+        with guarded(self.words, self.log_file, self.environment) as process:
             while not stop.wait(LOOK_S):
                 if (code := process.poll()) is not None:
-                    how = f"ended by signal {-code}" if code < 0 else f"ended with status {code}"
+                    how = f"ended by signal {code - 128}" if code > 128 else f"ended with status {code}"
                     return f"{how}{self._why(begin)}"
-                if not self.is_ready and self._answers():
-                    self.is_ready = True
-                    log.info("%s: ready", self.url)
-                elif not self.is_ready and time.monotonic() > until_s:
+                if self.is_ready and time.monotonic() - asked_s < self.cfg.hung_s / ASKED_BEFORE_HUNG:
+                    continue
+                asked_s = time.monotonic()
+                silent_s = asked_s - answered_s
+                if self._answers():
+                    if not self.is_ready:
+                        log.info("%s: ready", self.url)
+                    self.is_ready, answered_s = True, asked_s
+                elif self.is_ready and silent_s > self.cfg.hung_s:
+                    return f"lives, and has not answered for {silent_s:.0f} s (caption.serve.hung_s){self._why(begin)}"
+                elif not self.is_ready and silent_s > self.cfg.ready_s:
                     return f"not ready within {self.cfg.ready_s:g} s (caption.serve.ready_s){self._why(begin)}"
-            return ""
-        finally:
-            process.end()
+        return ""
 
     def _answers(self) -> bool:
-        connection = http.client.HTTPConnection(self.host, self.port, timeout=ANSWER_S)
+        url = f"http://{self.host}:{self.port}/v1/models"
         try:
-            connection.request("GET", "/v1/models")
-            return connection.getresponse().status < 500
-        except (OSError, http.client.HTTPException):
+            return httpx.get(url, timeout=ANSWER_S, trust_env=False, verify=False).status_code < 500
+        except httpx.HTTPError:
             return False
-        finally:
-            connection.close()
 
     def _why(self, begin: int) -> str:
         """Give what its log says since it was started: a cause that is known, and the line that tells it, or its first

@@ -26,27 +26,17 @@ PATIENCE_S = 15.0  # for a server that is asked to end
 LOOK_S = 0.2
 
 
-class ServerProcess:
-    """The server, from the side of the process that wants it."""
+def guarded(words: Sequence[str], log_file: Path, environment: Mapping[str, str]) -> subprocess.Popen:
+    """Start a server behind a guard; where the guard's input is closed, as `with` does, both end.
 
-    def __init__(self, words: Sequence[str], log_file: Path, environment: Mapping[str, str]) -> None:
-        guard = [sys.executable, "-m", "cosfly.work.server_process", *words]
-        with log_file.open("ab") as log:
-            # A session of its own: Ctrl-C is not for it.
-            self._process = subprocess.Popen(
-                guard, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment, start_new_session=True
-            )
-
-    def poll(self) -> int | None:
-        """Give the status that the server ended with, -N by signal N; None: it runs."""
-        code = self._process.poll()
-        return 128 - code if code is not None and code > 128 else code
-
-    def end(self) -> None:
-        """End it, and wait for that."""
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait()
+    The guard ends with the server's status, with 128 + N where that was signal N.
+    """
+    guard = [sys.executable, "-m", "cosfly.work.server_process", *words]
+    with log_file.open("ab") as log:
+        # A session of its own: Ctrl-C is not for it.
+        return subprocess.Popen(
+            guard, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment, start_new_session=True
+        )
 
 
 def start_process(words: Sequence[str], log: IO[bytes] | None = None) -> subprocess.Popen:
