@@ -2,6 +2,7 @@
 
 import os
 import signal
+import tracemalloc
 from collections import Counter
 from itertools import islice, pairwise
 from pathlib import Path
@@ -13,7 +14,7 @@ from cosfly.errors import EnvironmentMissing, InputError, StorageError
 from cosfly.work.chance import BLOCK, draw_by_share, draw_to_quota, draws_for, rng_for
 from cosfly.work.config import Config
 from cosfly.work.runner import Item, Outcome, run_items
-from cosfly.work.stage_folder import StageFolder
+from cosfly.work.stage_folder import Failed, Kept, StageFolder
 from cosfly.work.store import dump_json
 
 
@@ -39,6 +40,10 @@ def make_worker(log: Path):
     return work
 
 
+def make_wordy_worker(num_bytes: int):
+    return lambda item: Outcome({"words": num_bytes * "x"})
+
+
 def _stage(path: Path) -> StageFolder:
     return StageFolder.open(path, "demo", config=Config(), inputs={}, seed=0)
 
@@ -62,6 +67,38 @@ def test_everything_is_counted(tmp_path):
     failures = (tmp_path / "s/failures.jsonl").read_text()
     assert "got x" in failures
     assert "KeyError" in failures
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_results_are_not_held(tmp_path, workers):
+    """A driver of a hundred thousand items has the memory for one."""
+    num, megabyte = 40, 1_000_000
+    tracemalloc.start()
+    items = [Item(f"i{k}", k) for k in range(num)]
+    finished = run_items(_stage(tmp_path / "s"), items, make_wordy_worker, (megabyte,), workers=workers)
+    assert [len(record.result["words"]) for record in finished.kept] == [megabyte] * num
+    assert [record.id for record in finished.records] == [item.item_id for item in items]
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak_bytes < 15 * megabyte
+
+
+def test_a_record_is_the_last_of_its_item_and_a_failure_undoes_nothing(tmp_path):
+    stage = _stage(tmp_path / "s")
+    with stage.journal as journal:
+        for record in (
+            Failed(id="i0", code="input", message="at first"), Kept(id="i0", result={"square": 4}),
+            Failed(id="i0", code="input", message="of somebody else"), Kept(id="another"),
+            Failed(id="i1", code="input", message="at first"),
+        ):  # fmt: skip
+            journal.append(record.model_dump())
+    finished = run_items(stage, _items(("keep", 9), ("fail", "x")), make_worker, (tmp_path / "log",))
+    kept, failed = finished.records
+    assert (kept.result, failed.message.partition(";")[2]) == ({"square": 4}, " got x")
+    assert (finished.tally.kept, finished.tally.failed) == (1, {"input": 1})
+    (tmp_path / "s/items.jsonl").write_text("damaged meanwhile\n")
+    with pytest.raises(InputError, match=r"damaged meanwhile.*same command again"):
+        list(finished.records)
 
 
 def test_worker_count_does_not_matter(tmp_path):

@@ -85,7 +85,7 @@ def test_workers_that_die_all_the_time_end_the_stage(tmp_path):
         work_on(tmp_path, kinds, workers=1, watch=Watch(restarts=1))
     assert [record.id for record in stage_in(tmp_path).items()] == ["i0"]
     # The machine is fit again.
-    assert len(work_on(tmp_path, ["nothing"] * 31, workers=1).kept) == 31
+    assert work_on(tmp_path, ["nothing"] * 31, workers=1).tally.kept == 31
 
 
 def test_a_bug_in_making_a_worker_is_told_in_its_words(tmp_path):

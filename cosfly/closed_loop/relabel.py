@@ -28,7 +28,7 @@ from cosfly.products.pursuits import Pursuit, pursuit_file, read_pursuit
 from cosfly.products.traces import ARRAYS, DroneTrace, read_traces, write_traces
 from cosfly.render import stage as rendering
 from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
-from cosfly.work.stage_folder import Kept, Resume, StageFolder
+from cosfly.work.stage_folder import Resume, StageFolder
 
 
 def run(
@@ -58,10 +58,11 @@ def run(
             places = range(pursuit.num_lead, len(pursuit.frames) - 1, cfg.fly.relabel.stride)
             items += [Item(f"{episode}_f{i:05d}", (episode, i)) for i in places]
         done = run_items(stage, items, make_worker, (cfg, flown, boxes, simplified, seed), workers=workers, watch=watch)
-        kept = [record.result for record in done.records if isinstance(record, Kept)]
-        traces = [DroneTrace.from_json(result["trace"], "relabel") for result in kept]
+        traces, reasons = [], Counter[str]()
+        for record in done.kept:
+            traces.append(DroneTrace.from_json(record.result["trace"], "relabel"))
+            reasons.update(record.result["reasons"])
         write_traces(stage.path / TRACES, traces, {"round": cfg.fly.relabel.round, "seed": seed})
-        reasons = Counter(reason for result in kept for reason in result["reasons"])
         stage.finish([stage.path / TRACES], done.tally, reasons=dict(sorted(reasons.items())))
     drawn = cfg.render.model_copy(update={"tracks": ("clean",)})
     how: dict[str, Any] = {"seed": seed, "workers": workers, "watch": watch, "resume": resume}

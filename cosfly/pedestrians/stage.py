@@ -337,7 +337,7 @@ def run(
     finished = run_items(
         stage, items, make_worker, (cfg, seed, lean, lanes), workers=workers, watch=watch, label="walks"
     )
-    if not finished.kept:
+    if not finished.tally.kept:
         raise stage.nothing_kept(finished.tally)
     results = [result_of(record, _WalkRecord) for record in finished.kept]
     paths = [Walk.from_json(result.path, f"{out}: items.jsonl") for result in results]

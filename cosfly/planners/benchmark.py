@@ -158,13 +158,10 @@ def run(
     walks = walks[: cfg.scenarios]
     items = [Item(w.path_id, (w, styles)) for w, styles in zip(walks, draw_styles_of(walks, cfg, seed), strict=True)]
     done = run_items(stage, items, compare.make_worker, (cfg, simplified_map, seed, True), workers=workers, watch=watch)
-    if not done.kept:
+    if not done.tally.kept:
         raise stage.nothing_kept(done.tally, expected="a walk that a planner flies")
-    flown = [result_of(record, compare.FlightsOfWalk) for record in done.kept]
-    lines = [
-        ScenarioRecord(id=record.id, flights=f.flights, infeasible=f.errors)
-        for record, f in zip(done.kept, flown, strict=True)
-    ]
+    flown = {record.id: result_of(record, compare.FlightsOfWalk) for record in done.kept}
+    lines = [ScenarioRecord(id=name, flights=f.flights, infeasible=f.errors) for name, f in flown.items()]
     write_bytes(raw, "".join(dump_json(line.model_dump()) + "\n" for line in lines).encode())
     header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.model_dump(mode="json")}
     summary = summarize(read_scenarios(raw), cfg.planners, rng_for(seed, "plan_benchmark", "intervals"))
@@ -177,7 +174,7 @@ def run(
     stage.finish(
         [product, raw, page, *(out / name for name in pictures)],
         done.tally,
-        timings=compare.timings(done.kept, cfg.planners),
+        timings=compare.timings(flown.values(), cfg.planners),
     )
     return product
 

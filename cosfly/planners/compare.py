@@ -10,7 +10,7 @@ Only walks that all of them fly are compared; the others are counted by the plan
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from cosfly.products.walks import Walk, read_paths
 from cosfly.reading.documents import FileFormat, read_object, validated
 from cosfly.work.chance import rng_for
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Kept, Resume, StageFolder, read_manifest, result_of
+from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Resume, StageFolder, read_manifest, result_of
 from cosfly.work.store import write_bytes, write_json
 
 FORMAT = FileFormat("cosfly.plan_compare", "2.1")
@@ -250,9 +250,9 @@ def run(
     check_ids(walks, paths)
     items = [Item(w.path_id, (w, styles)) for w, styles in zip(walks, draw_styles_of(walks, cfg, seed), strict=True)]
     finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers, watch=watch)
-    shared = finished.kept
-    if not shared:
+    if not finished.tally.kept:
         raise stage.nothing_kept(finished.tally, expected="a walk that all planners fly")
+    shared = {record.id: result_of(record, FlightsOfWalk) for record in finished.kept}
     flights = {name: _flights_of(name, shared, out) for name in cfg.planners}
     header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.model_dump(mode="json")}
     named = {name: ALL_PLANNERS[name] for name in flights}
@@ -267,7 +267,7 @@ def run(
         outputs.append(out / f"drone_trace_{name}.json")
         write_traces(outputs[-1], traces, {**header, "planner": name})
     by_id = {walk.path_id: walk for walk in walks}
-    flown: list[Walk] = [by_id[record.id] for record in shared]
+    flown: list[Walk] = [by_id[walk_id] for walk_id in shared]
     pictures = {
         "compare_overlay.png": draw_overlay(box_map, flown, flights),
         "compare_series.png": draw_series(flown, flights),
@@ -276,7 +276,7 @@ def run(
     for name, picture in pictures.items():
         outputs.append(out / name)
         write_bytes(outputs[-1], picture)
-    stage.finish(outputs, finished.tally, timings=timings(shared, cfg.planners))
+    stage.finish(outputs, finished.tally, timings=timings(shared.values(), cfg.planners))
     return product
 
 
@@ -288,16 +288,14 @@ class FlightsOfWalk(BaseModel):
     times_ms: dict[str, float]
 
 
-def _flights_of(planner: str, shared: list[Kept], out: Path) -> list[DroneTrace]:
+def _flights_of(planner: str, shared: dict[str, FlightsOfWalk], out: Path) -> list[DroneTrace]:
     return [
-        DroneTrace.from_json(
-            result_of(record, FlightsOfWalk).flights.get(planner) or {}, f"{out}/items.jsonl: {record.id}: {planner}"
-        )
-        for record in shared
+        DroneTrace.from_json(found.flights.get(planner) or {}, f"{out}/items.jsonl: {walk_id}: {planner}")
+        for walk_id, found in shared.items()
     ]
 
 
-def _left_out(records: list[ItemRecord]) -> list[dict[str, str]]:
+def _left_out(records: Iterable[ItemRecord]) -> list[dict[str, str]]:
     """Walks that are not compared, with the planners that failed and their reasons."""
     rows = []
     for record in records:
@@ -311,11 +309,11 @@ def _left_out(records: list[ItemRecord]) -> list[dict[str, str]]:
     return rows
 
 
-def timings(shared: list[Kept], planners: Sequence[str]) -> dict[str, dict[str, float]]:
+def timings(shared: Collection[FlightsOfWalk], planners: Sequence[str]) -> dict[str, dict[str, float]]:
     """Give planning times over the compared walks: they differ from run to run, so they stand in the manifest alone."""
     table = {}
     for name in planners:
-        times_ms = np.array([result_of(record, FlightsOfWalk).times_ms.get(name, 0.0) for record in shared])
+        times_ms = np.array([found.times_ms.get(name, 0.0) for found in shared])
         p50, p95 = np.percentile(times_ms, (50, 95))
         figures = {"mean_ms": times_ms.mean(), "p50_ms": p50, "p95_ms": p95, "max_ms": times_ms.max()}
         table[name] = {figure: round(float(value), 1) for figure, value in figures.items()}

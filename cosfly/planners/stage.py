@@ -25,7 +25,7 @@ from cosfly.products.walks import TARGET_HEIGHT_M, Walk, read_paths
 from cosfly.space.flight_metrics import CLEARANCE_CAP_M, CLEARANCE_TOLERANCE_M, flight_metrics
 from cosfly.work.chance import rng_for
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.work.stage_folder import Dropped, Failed, Kept, Resume, StageFolder
+from cosfly.work.stage_folder import Failed, Resume, StageFolder
 from cosfly.work.store import write_bytes
 
 if TYPE_CHECKING:
@@ -255,23 +255,26 @@ def run(
         log.warning("%s", remark)
     items = [Item(w.path_id, (w, styles)) for w, styles in zip(walks, draw_styles_of(walks, cfg, seed), strict=True)]
     finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers, watch=watch)
-    planned = [record for record in finished.records if not isinstance(record, Failed)]
-    if not planned:
+    traces, seconds = [], []
+    for record in finished.records:
+        if not isinstance(record, Failed):
+            traces.append(DroneTrace.from_json(record.result, f"{stage.path}/items.jsonl: {record.id}"))
+            seconds.append(record.seconds)
+    if not traces:
         raise stage.nothing_kept(finished.tally)
-    traces = [DroneTrace.from_json(record.result, f"{stage.path}/items.jsonl: {record.id}") for record in planned]
     header = {"map": box_map.name, "planner": cfg.planner, "seed": seed, "settings": cfg.recorded()}
     for trace in traces:
         if trace.not_held:
             log.warning("%s: style_not_held: %s", trace.path_id, trace.not_held)
     write_traces(product, traces, header)
     write_bytes(picture, draw_flights(box_map, walks, traces))
-    stage.finish([product, picture], finished.tally, **_facts(box_map, traces, planned))
+    stage.finish([product, picture], finished.tally, **_facts(box_map, traces, seconds))
     return product
 
 
-def _facts(box_map: BoxMap, traces: list[DroneTrace], records: list[Kept | Dropped]) -> dict:
+def _facts(box_map: BoxMap, traces: list[DroneTrace], seconds: list[float]) -> dict:
     """What the manifest says beyond the counts; planning times stand here and not in the product."""
-    times_ms = np.array([1000.0 * record.seconds for record in records])
+    times_ms = 1000.0 * np.array(seconds)
     names = ("five_ray_mean", "clearance_min_m", "altitude_mean_m", "target_distance_mean_m", "smoothness_score")
     return {
         "num_boxes": len(box_map),

@@ -181,14 +181,14 @@ def run(
     check_ids(walks, paths)
     items = [Item(w.path_id, (w, styles)) for w, styles in zip(walks, draw_styles_of(walks, cfg, seed), strict=True)]
     finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers, watch=watch)
-    if not finished.kept:
+    if not finished.tally.kept:
         raise stage.nothing_kept(finished.tally)
-    studied = [result_of(record, _Walk).flown for record in finished.kept]
-    flown = {name: [walk[name] for walk in studied] for name in cfg.variants}
+    studied = {record.id: result_of(record, _Walk).flown for record in finished.kept}
+    flown = {name: [walk[name] for walk in studied.values()] for name in cfg.variants}
     rows = summarize(flown, rng_for(seed, "plan_variants", "intervals"))
     scenarios = [
-        {"id": record.id, **{name: one.model_dump(exclude={"times_ms"}) for name, one in walk.items()}}
-        for record, walk in zip(finished.kept, studied, strict=True)
+        {"id": walk_id, **{name: one.model_dump(exclude={"times_ms"}) for name, one in walk.items()}}
+        for walk_id, walk in studied.items()
     ]
     header = {"seed": seed, "settings": cfg.model_dump(mode="json", exclude={"variants"})}
     weights = list(dict.fromkeys(name.partition(" x ")[0] for name in rows if " x " in name))

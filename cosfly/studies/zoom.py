@@ -284,7 +284,7 @@ def run(
     items = [Item(t.path_id, k, steps * len(range(0, len(t.time_s), cfg.every))) for k, t in passed]
     arguments = (cfg, boxes, simplified, traces, seed)
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label="study zoom: frames")
-    if not finished.kept:
+    if not finished.tally.kept:
         raise stage.nothing_kept(finished.tally, expected="a flight that can be drawn")
     studied = {record.id: result_of(record, Studied) for record in finished.kept}
     summary = summarize(studied, cfg, rng_for(seed, STAGE, "intervals"))

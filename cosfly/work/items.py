@@ -16,7 +16,7 @@ from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Kept
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Item:
     """One unit of work. `item_id` is unique within the stage and stable between runs.
 

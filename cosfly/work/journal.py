@@ -6,7 +6,7 @@ import contextlib
 import mmap
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from cosfly.errors import InputError, plain
 from cosfly.reading.documents import parse_json
-from cosfly.reading.files import open_file, read_lines
+from cosfly.reading.files import disk_errors, open_file, read_lines
 from cosfly.work.store import dump_json, refuse_link, sha256_bytes, storage_errors, write_bytes
 
 TAIL = 65_536  # bytes at the end in which `last` looks
@@ -29,12 +29,12 @@ class Journal:
     A line is on the disk before `append` returns, or with `sync=False` in the hands of the system, which a kill of this
     process does not reach; `sync` then waits for the disk. A line that a kill cut short, or that was damaged, is
     skipped by `read` and counted in `num_damaged`; what stood in it is done again. `is_cut_short`: the last of these
-    has no end, as a kill leaves it. `line_num` is the number of the line that was read last.
+    has no end, as a kill leaves it. `line_num`, `line_byte`: number and first byte of the line that was read last.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.num_damaged = self.line_num = 0
+        self.num_damaged = self.line_num = self.line_byte = 0
         self.is_cut_short = False
         self._file: Any = None
         self._lock = threading.Lock()
@@ -44,8 +44,10 @@ class Journal:
         self.num_damaged, self.is_cut_short = 0, False
         if not self.path.exists():
             return
+        end = 0
         for number, line in enumerate(read_lines(self.path, what="journal"), 1):
-            self.line_num, record = number, _record_of(line)
+            self.line_num, self.line_byte, record = number, end, _record_of(line)
+            end += len(line)
             if record is None:
                 self.num_damaged += 1
                 self.is_cut_short = not line.endswith(b"\n")
@@ -73,6 +75,20 @@ class Journal:
         fix = f"{fix} {self.path.name}{ASIDE}, and what stood in them is done again"
         return InputError("a line that cannot be used", where=where, got=got, fix=fix)
 
+    def read_at(self, line_bytes: Iterable[int]) -> Iterator[dict]:
+        """Yield the records of the lines that begin at these bytes; InputError where one is there no more."""
+        if not self.path.exists():
+            return
+        with open_file(self.path, what="journal") as file:
+            for line_byte in line_bytes:
+                with disk_errors(self.path, "journal"):
+                    file.seek(line_byte)
+                    record = _record_of(file.readline())
+                if record is None:
+                    fix = "run the same command again: what stood in it is done again"
+                    raise InputError("a line was damaged meanwhile", where=f"{self.path}: byte {line_byte}", fix=fix)
+                yield record
+
     def set_aside(self, is_usable: Callable[[dict], bool]) -> int:
         """Move lines that are damaged or cannot be used to the end of `<name>.aside`; gives their number."""
         kept, broken = list[bytes](), list[bytes]()
@@ -96,8 +112,8 @@ class Journal:
             tail = file.read()
         return _record_of(tail[tail.rfind(b"\n", 0, -1) + 1 :])
 
-    def append(self, record: dict, *, sync: bool = True) -> None:
-        """Add a record and, unless told otherwise, wait until it is on the disk."""
+    def append(self, record: dict, *, sync: bool = True) -> int:
+        """Add a record and, unless told otherwise, wait until it is on the disk; gives the byte where it begins."""
         body = dump_json(record).encode()
         line = sha256_bytes(body)[:16].encode() + b" " + body + b"\n"
         with self._lock, storage_errors(self.path):
@@ -105,10 +121,12 @@ class Journal:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
                 _cut_torn_line(self.path)
                 self._file = open(self.path, "ab")  # noqa: SIM115 (kept open, closed by close())
+            line_byte = self._file.tell()
             self._file.write(line)
             self._file.flush()
             if sync:
                 os.fsync(self._file.fileno())
+        return line_byte
 
     def sync(self) -> None:
         """Wait until all that was appended is on the disk."""

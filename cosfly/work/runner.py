@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections import Counter
-from collections.abc import Callable, Collection, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+
+import numpy as np
 
 from cosfly.errors import CosflyError, EnvironmentMissing
 from cosfly.work.console import progress_bar
 from cosfly.work.items import Item, Outcome, Work, advance, attempt, counted_steps
+from cosfly.work.journal import Journal
 from cosfly.work.ray_engine import ALL_ROOM, Cluster
 from cosfly.work.stage_events import EventLog, HowFar
-from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Kept, StageFolder, Tally, write_failures
+from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Kept, StageFolder, Tally, read_item, write_failures
 from cosfly.work.store import remove_partials
 from cosfly.work.worker_pool import LocalPost, StartPost, Watch, WorkerPool
 
@@ -30,14 +32,20 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ItemOutcomes:
-    """All outcomes of a stage, in the order of the items."""
+    """What became of all items of a stage. The records stay on the disk: each look through them, in the order of the
+    items, reads them again, one at a time."""
 
-    records: list[ItemRecord]
     tally: Tally
+    _journal: Journal
+    _line_bytes: np.ndarray  # (n,) int64, by item: where its record begins
 
     @property
-    def kept(self) -> list[Kept]:
-        return [record for record in self.records if isinstance(record, Kept)]
+    def records(self) -> Iterator[ItemRecord]:
+        return map(read_item, self._journal.read_at(self._line_bytes))
+
+    @property
+    def kept(self) -> Iterator[Kept]:
+        return (record for record in self.records if isinstance(record, Kept))
 
 
 def run_items(
@@ -65,37 +73,44 @@ def run_items(
     Returns:
         Records and tally, in the order of `items` whatever the order of work.
     """
-    ids = [item.item_id for item in items]
-    assert len(set(ids)) == len(ids), "item ids must be unique"
-    known = set(ids)
-    records: dict[str, ItemRecord] = {}
-    records |= {r.id: r for r in stage.items() if r.id in known and not isinstance(r, Failed)}
-    todo = [item for item in items if item.item_id not in records]
-    if records:
-        log.info("%s: %d of %d items were finished before", stage.stage, len(records), len(items))
-    progress = _Progress(items, records.keys())
+    line_bytes = _finished_before(stage, items)
+    indices = np.flatnonzero(line_bytes < 0)
+    todo = [item for item, line_byte in zip(items, line_bytes, strict=True) if line_byte < 0]
+    if num_finished := len(items) - len(todo):
+        log.info("%s: %d of %d items were finished before", stage.stage, num_finished, len(items))
+    progress = _Progress(items, todo)
     if workers and todo:
         outcomes = _in_processes(stage, todo, (make_worker, worker_args), workers, watch, progress)
     else:
         outcomes = _in_this_process(todo, (make_worker, worker_args), progress.move)
     # Closed at once, also while an error is on its way: no worker goes on behind it.
     with stage.journal as journal, progress.shown(label or stage.stage), contextlib.closing(outcomes):
-        for record in outcomes:
-            records[record.id] = record
-            journal.append(record.model_dump())
+        for todo_index, record in outcomes:
+            line_bytes[indices[todo_index]] = journal.append(record.model_dump())
             _tell(stage.stage, record)
-            progress.finish(record.id)
-    ordered = [records[item_id] for item_id in ids]
-    tally = _tally(stage, ordered)
+            progress.finish(todo[todo_index])
+    finished = ItemOutcomes(tally := Tally(input=len(items)), stage.journal, line_bytes)
+    write_failures(stage.path / "failures.jsonl", _counted(finished.records, tally))
     if "worker_died" in tally.failed:
         # That is the machine's doing, not the item's: it must not become a result. The stage stays open.
         raise EnvironmentMissing(
             "worker processes were killed, three times for the same item",
             where=stage.path,
-            got=f"{tally.failed['worker_died']} of {len(ordered)} items without an outcome",
+            got=f"{tally.failed['worker_died']} of {len(items)} items without an outcome",
             fix="free some memory or use fewer --workers, then run the same command again: finished items are kept",
         )
-    return ItemOutcomes(ordered, tally)
+    return finished
+
+
+def _finished_before(stage: StageFolder, items: Sequence[Item]) -> np.ndarray:
+    """Give of each item the byte from which the journal tells that it is finished, (n,) int64; -1 where it does not."""
+    indices = {item.item_id: index for index, item in enumerate(items)}
+    assert len(indices) == len(items), "item ids must be unique"
+    line_bytes, journal = np.full(len(items), -1), stage.journal
+    for record in journal.read_as(read_item):
+        if record.id in indices and not isinstance(record, Failed):
+            line_bytes[indices[record.id]] = journal.line_byte
+    return line_bytes
 
 
 def _tell(stage: str, record: ItemRecord) -> None:
@@ -107,33 +122,37 @@ def _tell(stage: str, record: ItemRecord) -> None:
         log.debug("%s: %s: %s%s, %.2f s", stage, record.id, record.status, reason, record.seconds)
 
 
-def _tally(stage: StageFolder, records: list[ItemRecord]) -> Tally:
-    failures = [record for record in records if isinstance(record, Failed)]
-    write_failures(stage.path / "failures.jsonl", failures)
-    dropped = Counter(record.reason for record in records if isinstance(record, Dropped))
-    kept = len(records) - dropped.total() - len(failures)
-    return Tally(input=len(records), kept=kept, dropped=dropped, failed=Counter(failure.code for failure in failures))
+def _counted(records: Iterable[ItemRecord], tally: Tally) -> Iterator[Failed]:
+    """Count records in a tally, and yield those that failed."""
+    for record in records:
+        if isinstance(record, Kept):
+            tally.kept += 1
+        elif isinstance(record, Dropped):
+            tally.dropped[record.reason] += 1
+        else:
+            tally.failed[record.code] += 1
+            yield record
 
 
 _Start = tuple[Callable[..., Work], tuple]  # make_worker, worker_args
 
 
 def _in_this_process(
-    items: Sequence[Item], start: _Start, on_steps: Callable[[str, int], None]
-) -> Generator[ItemRecord, None, None]:
+    items: Sequence[Item], start: _Start, on_steps: Callable[[Item, int], None]
+) -> Generator[tuple[int, ItemRecord], None, None]:
     if not items:
         return
     make_worker, worker_args = start
     work = make_worker(*worker_args)
-    for item in items:
-        with counted_steps(partial(on_steps, item.item_id)):
+    for index, item in enumerate(items):
+        with counted_steps(partial(on_steps, item)):
             record = attempt(work, item)
-        yield record
+        yield index, record
 
 
 def _in_processes(
     stage: StageFolder, items: Sequence[Item], start: _Start, workers: int, watch: Watch, progress: _Progress
-) -> Generator[ItemRecord, None, None]:
+) -> Generator[tuple[int, ItemRecord], None, None]:
     start_post: StartPost = LocalPost
     if watch.ray is not None:
         cluster = Cluster(watch.ray, stage.path)
@@ -154,29 +173,35 @@ def _in_processes(
 class _Progress:
     """How far a stage is: in steps, as frames, where every item says how many it has, else in items."""
 
-    def __init__(self, items: Sequence[Item], done: Collection[str]) -> None:
-        sizes = {item.item_id: item.num_steps for item in items}
-        self._in_steps = all(sizes.values())
-        self._sizes = {item_id: size or 1 if self._in_steps else 1 for item_id, size in sizes.items()}
-        self._at = {item_id: self._sizes[item_id] for item_id in done}
+    def __init__(self, items: Sequence[Item], todo: Sequence[Item]) -> None:
+        self._in_steps = all(item.num_steps for item in items)
+        self._total = sum(map(self._size, items))
+        self._done = self._total - sum(map(self._size, todo))
+        self._in_hand: dict[str, int] = {}  # of `done`, by item
         self._advance: Callable[[int], None] = lambda count: None
+
+    def _size(self, item: Item) -> int:
+        return item.num_steps or 1 if self._in_steps else 1
 
     @contextlib.contextmanager
     def shown(self, label: str) -> Iterator[None]:
-        with progress_bar(label, total=sum(self._sizes.values()), done=sum(self._at.values())) as self._advance:
+        with progress_bar(label, total=self._total, done=self._done) as self._advance:
             yield
 
     def how_far(self) -> HowFar:
-        return HowFar(sum(self._at.values()), sum(self._sizes.values()), "steps" if self._in_steps else "items")
+        return HowFar(self._done, self._total, "steps" if self._in_steps else "items")
 
-    def move(self, item_id: str, num_steps: int) -> None:
+    def move(self, item: Item, num_steps: int) -> None:
         """Note how many steps of an item are done; fewer than before where it is begun again."""
         if self._in_steps:
-            self._set(item_id, min(num_steps, self._sizes[item_id]))
+            self._set(item, min(num_steps, self._size(item)))
 
-    def finish(self, item_id: str) -> None:
-        self._set(item_id, self._sizes[item_id])
+    def finish(self, item: Item) -> None:
+        self._set(item, self._size(item))
+        del self._in_hand[item.item_id]
 
-    def _set(self, item_id: str, count: int) -> None:
-        self._advance(count - self._at.get(item_id, 0))
-        self._at[item_id] = count
+    def _set(self, item: Item, count: int) -> None:
+        gained = count - self._in_hand.get(item.item_id, 0)
+        self._in_hand[item.item_id] = count
+        self._done += gained
+        self._advance(gained)

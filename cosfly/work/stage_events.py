@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -138,15 +139,16 @@ class EventLog:
         self._journal.close()
 
 
-def read_events(folder: Path) -> list[Event]:
-    """Read the events of a stage folder in order; damaged lines and those of a later cosfly are left out."""
-    events = []
+def iterate_events(folder: Path) -> Iterator[Event]:
+    """Yield the events of a stage folder in order; damaged lines and those of a later cosfly are left out."""
     for line in Journal(folder / EVENTS).read():
-        try:
-            events.append(Event.model_validate(line))
-        except ValidationError:
-            continue
-    return events
+        with contextlib.suppress(ValidationError):
+            yield Event.model_validate(line)
+
+
+def read_events(folder: Path) -> list[Event]:
+    """Read all of them."""
+    return list(iterate_events(folder))
 
 
 def progress_of(events: Sequence[Event]) -> tuple[HowFar, float | None] | None:
@@ -162,7 +164,8 @@ def progress_of(events: Sequence[Event]) -> tuple[HowFar, float | None] | None:
 
 def lost_steps(folder: Path) -> int:
     """Count the steps, as frames, of items which then failed or were lost with their worker: they are in no product."""
-    return sum(event.steps or 0 for event in read_events(folder) if event.event in LOSSES or event.status == "failed")
+    events = iterate_events(folder)
+    return sum(event.steps or 0 for event in events if event.event in LOSSES or event.status == "failed")
 
 
 # --- what the system says of a process --------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Protocol
 
@@ -138,6 +138,7 @@ class LocalPost:
 
 @dataclass(frozen=True)
 class _Attempt:
+    item_index: int  # among all items
     item: Item
     number: int = 0
 
@@ -167,37 +168,38 @@ class _Worker:
 
 @dataclass
 class WorkerPool:
-    """Does items in `num_workers` processes. on_steps(item_id, n) hears how many steps of an item in hand are done."""
+    """Does items in `num_workers` processes. on_steps(item, n) hears how many steps of an item in hand are done."""
 
     make_worker: Callable[..., Work]
     worker_args: tuple
     num_workers: int
     watch: Watch
     events: EventLog
-    on_steps: Callable[[str, int], None]
+    on_steps: Callable[[Item, int], None]
     start_post: StartPost = LocalPost
     num_lost: int = 0
     _num_done: int = 0
     _seconds: deque[float] = field(default_factory=lambda: deque(maxlen=ITEMS_REMEMBERED))
-    _fresh: deque[Item] = field(default_factory=deque)
+    _fresh: Iterator[tuple[int, Item]] = field(default_factory=lambda: iter(()))  # with their indices
+    _num_fresh: int = 0
     _again: deque[_Attempt] = field(default_factory=deque)
     _alone: deque[_Attempt] = field(default_factory=deque)  # last attempts
     _workers: dict[int, _Worker] = field(default_factory=dict)
     _lost: set[int] = field(default_factory=set)  # places that wait for a new worker
     _messages: queue.SimpleQueue[tuple[_Worker, Message | None]] = field(default_factory=queue.SimpleQueue)
 
-    def outcomes(self, items: Sequence[Item]) -> Iterator[ItemRecord]:
-        """Yield the record of each item as it is done.
+    def outcomes(self, items: Sequence[Item]) -> Iterator[tuple[int, ItemRecord]]:
+        """Yield the index of each item, and its record, as it is done.
 
         Raises:
             CosflyError: a fatal one of a worker; or EnvironmentMissing: workers die or stall all the time.
         """
         self.events.tell("began", workers=self.num_workers)
-        self._fresh.extend(items)
+        self._fresh, self._num_fresh = enumerate(items), len(items)
         next_check_s, next_probe_s = time.monotonic() + self.watch.check_s, time.monotonic()
         places = everywhere = range(self.num_workers)
         try:
-            while self._fresh or self._again or self._alone or self._busy():
+            while self._num_fresh or self._again or self._alone or self._busy():
                 self._hand_out(places)
                 places = everywhere
                 for worker, message in self._told(min(next_check_s, next_probe_s)):
@@ -240,13 +242,14 @@ class WorkerPool:
     def _is_short(self) -> bool:
         """Tell whether there is more to do now than workers without an item, those that still start among them."""
         num_idle = len(self._workers) - len(self._busy())
-        return num_idle < (len(self._fresh) + len(self._again) or int(bool(self._alone) and not self._busy()))
+        return num_idle < (self._num_fresh + len(self._again) or int(bool(self._alone) and not self._busy()))
 
     def _next_attempt(self, place: int) -> _Attempt | None:
         """Take what is to be done next, at a place. A last attempt is made alone: there may not be the memory for
         two."""
-        if self._fresh:
-            return _Attempt(self._fresh.popleft())
+        if self._num_fresh:
+            self._num_fresh -= 1
+            return _Attempt(*next(self._fresh))
         if self._again:
             return self._again.popleft()
         if self._alone and not self._busy():
@@ -275,7 +278,7 @@ class WorkerPool:
             return []
         return [(worker, message)] if self._workers.get(worker.place) is worker else []
 
-    def _hear(self, worker: _Worker, message: Message | None) -> Iterator[ItemRecord]:
+    def _hear(self, worker: _Worker, message: Message | None) -> Iterator[tuple[int, ItemRecord]]:
         if message is None:
             yield from self._lose(worker, "worker_died")
         elif isinstance(message, Abort):
@@ -293,17 +296,17 @@ class WorkerPool:
                 worker.has_begun, worker.begun_s, worker.quiet_s = True, time.monotonic(), 0.0
             elif message.num_steps != worker.num_steps:
                 worker.num_steps, worker.quiet_s = message.num_steps, 0.0
-                self.on_steps(message.item_id, message.num_steps)
-        else:
+                self.on_steps(attempt.item, message.num_steps)
+        elif (attempt := worker.attempt) is not None:
             seconds = time.monotonic() - worker.begun_s
             self._seconds.append(seconds)
             self._num_done += 1
             worker.attempt = None
             about = {"status": message.status, "seconds": round(seconds, 3), "steps": worker.num_steps}
             self.events.tell("item_done", worker=worker.place, item=message.id, **about)
-            yield message
+            yield attempt.item_index, message
 
-    def _check(self) -> Iterator[ItemRecord]:
+    def _check(self) -> Iterator[tuple[int, ItemRecord]]:
         """Look for workers that neither tell that they live nor compute, and for items that do not get on.
 
         Time counts here by checks: while this process itself was stopped, nobody could tell us anything.
@@ -325,7 +328,7 @@ class WorkerPool:
 
     # --- losing a worker ----------------------------------------------------------------------------------------------
 
-    def _lose(self, worker: _Worker, loss: Loss) -> Iterator[ItemRecord]:
+    def _lose(self, worker: _Worker, loss: Loss) -> Iterator[tuple[int, ItemRecord]]:
         """End a worker that is of no use any more; its item is tried again, or has failed."""
         self._stop(worker, 0.0)
         self._lost.add(worker.place)
@@ -334,7 +337,7 @@ class WorkerPool:
         if item is not None:
             seconds = round(time.monotonic() - worker.begun_s, 3) if worker.has_begun else 0.0
             about |= {"item": item.item_id, "seconds": seconds, "steps": worker.num_steps}
-            self.on_steps(item.item_id, 0)
+            self.on_steps(item, 0)
         self.events.tell(loss, **about)
         if self.num_lost > self.watch.restarts + self._num_done:
             raise EnvironmentMissing(
@@ -349,12 +352,13 @@ class WorkerPool:
         if attempt.number < self.watch.retries:
             log.warning("%s: %s; it is tried again", item.item_id, LOSSES[loss])
             is_last = attempt.number + 1 == self.watch.retries
-            (self._alone if is_last else self._again).append(_Attempt(item, attempt.number + 1))
+            (self._alone if is_last else self._again).append(replace(attempt, number=attempt.number + 1))
             self.events.tell("retried", item=item.item_id, attempt=attempt.number + 1)
             return
         self.events.tell("given_up", item=item.item_id)
+        code = "worker_died" if loss == "worker_died" else "timed_out"
         message = f"{item.item_id}: {LOSSES[loss]}, {attempt.number + 1} times"
-        yield Failed(id=item.item_id, code="worker_died" if loss == "worker_died" else "timed_out", message=message)
+        yield attempt.item_index, Failed(id=item.item_id, code=code, message=message)
 
     def _stop(self, worker: _Worker, patience_s: float) -> None:
         """End a worker: by itself, if it can within the time given."""
