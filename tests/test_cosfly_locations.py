@@ -31,7 +31,6 @@ def memory(monkeypatch):
     system = pytest.importorskip("fsspec", reason="extra remote").filesystem("memory")
     system.store.clear()
     monkeypatch.setattr(locations, "SETTLE_S", 0.0)
-    monkeypatch.setattr(locations, "FIRST_WAIT_S", 0.0)
     return system
 
 

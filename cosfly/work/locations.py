@@ -28,7 +28,7 @@ from urllib.parse import urlsplit, urlunsplit
 from pydantic import BaseModel
 
 from cosfly.errors import CosflyError, EnvironmentMissing, InputError, ResumeError, StorageError
-from cosfly.reading.files import open_file, read_bytes
+from cosfly.reading.files import read_bytes
 from cosfly.work.folder_lock import LOCK, hold_folder
 from cosfly.work.store import CHECKSUMS, DISK_FULL, inside, storage_errors, write_bytes
 
@@ -36,8 +36,6 @@ log = logging.getLogger(__name__)
 
 CHAIN = re.compile(r"::(?![^\[]*\])")  # between the links of a chain, not within [::1]
 HAS_NO_FOLDERS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "memory"}
-MD5 = re.compile("[0-9a-f]{32}")
-TRIES, FIRST_WAIT_S = 3, 1.0  # what broke is asked again after 1 and 2 s; libraries try on their own before
 BATCH = 128  # files of one call, which go side by side where the library can
 COPY_EVERY_S, MOST_SHARE = 10.0, 0.2  # a copy begins so often, and takes so much of the time at most
 BEAT_S, STALE_S, SETTLE_S = 20.0, 120.0, 0.5  # of the mark that says who writes
@@ -107,7 +105,7 @@ def path_of(name: str) -> Path:
 
 
 class _Copy(NamedTuple):
-    """A file that is the same on both sides. tag: what the other side calls its content, mostly the MD5."""
+    """A file that is the same on both sides. tag: what the other side calls its content, once it was asked."""
 
     size: int
     changed_ns: int
@@ -117,9 +115,6 @@ class _Copy(NamedTuple):
     def of(cls, path: Path, tag: str = "") -> _Copy:
         found = path.stat()
         return cls(found.st_size, found.st_mtime_ns, tag)
-
-    def is_at(self, there: tuple[int, str] | None) -> bool:
-        return there == (self.size, self.tag)
 
 
 class _State(BaseModel):
@@ -165,7 +160,7 @@ class WorkingFolder:
         if self.local.exists():
             with contextlib.suppress(InputError, ValueError):
                 self._state = _State.model_validate_json(read_bytes(self._notes / "state.json"))
-        self.num_sent = self.bytes_sent = 0
+        self.num_sent = 0
         self._id, self._told_s = "", 0.0  # of our mark, once there is one; when it was written last
         _shown[self.local.absolute()] = self.shown
 
@@ -181,11 +176,10 @@ class WorkingFolder:
         if is_input and self.local.name in there:
             for name in ("stage.json", MANIFEST, CHECKSUMS):
                 there |= self._listed(name)
-        wanted = []
-        for name, found in there.items():
-            path, known = inside(self._base, name), self._state.files.get(name)
-            if known is None or not path.is_file() or _Copy.of(path)[:2] != known[:2] or not known.is_at(found):
-                wanted.append(name)
+        here = self._here()
+        known = {name: (copy.size, copy.tag) for name, copy in self._state.files.items()}
+        changed = {name for name, found in there.items() if name not in here or known.get(name) != found}
+        wanted = sorted(changed | self._changed(here).keys() & there.keys())
         for begin in range(0, len(wanted), BATCH):
             batch = {name: inside(self._base, name) for name in wanted[begin : begin + BATCH]}
             paths = [f"{self._above}/{name}" for name in batch], [str(path) for path in batch.values()]
@@ -196,10 +190,10 @@ class WorkingFolder:
             self._beat()
             for name, path in batch.items():
                 self._state.files[name] = got = _Copy.of(path, there[name][1])
-                if not got.is_at(there[name]):
+                if got.size != there[name][0]:
                     raise StorageError("a file came with another size", where=f"{self.shown}: {name}", got=got.size)
-        for name in self._here().keys() - there.keys():
-            inside(self._base, name).unlink()
+        for name in here.keys() - there.keys():
+            here[name].unlink()
         self._save()
         begun = {name.removesuffix("stage.json") for name in there if f"/{name}".endswith("/stage.json")}
         if is_input and (open_ones := sorted(name for name in begun if f"{name}{MANIFEST}" not in there)):
@@ -248,9 +242,9 @@ class WorkingFolder:
         time.sleep(SETTLE_S)
         self._check_writer()
         if is_ours:  # nobody else wrote since: what is not there as it was sent goes anew, what is only there goes
-            there = self._listed(self.local.name)
-            known = {name: one for name, one in self._state.files.items() if one.is_at(there.get(name))}
-            self._state.files = {name: _Copy(-1, 0) for name in there} | known
+            known, there = self._state.files, self._listed(self.local.name)
+            same = {name for name, (size, _) in there.items() if name in known and known[name].size == size}
+            self._state.files = {name: known[name] if name in same else _Copy(-1, 0) for name in there}
             return
         if unsent := self._changed(self._here()):
             aside = self._notes / f"aside-{time.time_ns()}"
@@ -329,87 +323,82 @@ class WorkingFolder:
             due_s = began_s + max(COPY_EVERY_S, (time.monotonic() - began_s) / MOST_SHARE)
 
     def _finish(self) -> None:
-        """Copy what is left, then compare both sides: sizes, and MD5s where the other side tells these."""
+        """Copy what is left, then compare the sizes of both sides; what came whole is the libraries' to see."""
         self._check_writer()
         self.copy_out()
-        there = self._listed(self.local.name)
-        wrong = [name for name, one in self._state.files.items() if not self._arrived(name, one, there.get(name))]
-        self._state.files = {n: c._replace(tag=there[n][1]) for n, c in self._state.files.items() if n not in wrong}
+        sent, there = self._state.files, self._listed(self.local.name)
+        whole = {name for name, (size, _) in there.items() if name in sent and sent[name].size == size}
+        self._state.files = {name: sent[name]._replace(tag=there[name][1]) for name in whole}
         self._save()
-        if wrong:
+        if wrong := ", ".join(sorted(sent.keys() - whole)):
             fix = f"run the same command again; all of it is in {self.local}"
-            raise StorageError("not there as it was sent", where=self.shown, got=", ".join(wrong)[:200], fix=fix)
+            raise StorageError("not there as it was sent", where=self.shown, got=wrong[:200], fix=fix)
         self._tell(at_work=False)
-        log.info("%s: %d files sent, %.1f MB; compared", self.shown, self.num_sent, self.bytes_sent / 1e6)
-
-    def _arrived(self, name: str, sent: _Copy, there: tuple[int, str] | None) -> bool:
-        """Tell whether a file is there as it was sent; by its bytes where a tag is no MD5 but looks like one."""
-        if there is None or there[0] != sent.size or there[1] == sent.tag or not MD5.fullmatch(there[1]):
-            return there is not None and there[0] == sent.size
-        data = self._asked("cannot read", partial(self._system.cat_file, f"{self._above}/{name}"))
-        return hashlib.md5(data, usedforsecurity=False).hexdigest() == sent.tag
+        log.info("%s: %d files sent, and compared", self.shown, self.num_sent)
 
     def copy_out(self) -> None:
         """Send what has changed. Journals and manifests are taken first and go last."""
-        before, late = self._here(), dict[str, Path]()
-        for name in before:
-            if _is_late(name) and (name.endswith(f"/{MANIFEST}") or name in self._changed(before)):
-                late[name] = self._notes / "late" / str(len(late))
-                with storage_errors(self._notes):
-                    late[name].parent.mkdir(parents=True, exist_ok=True)
-                    shutil.copy2(inside(self._base, name), late[name])
+        begun = self._here()
+        manifests = {name: path for name, path in begun.items() if name.endswith(f"/{MANIFEST}")}
+        journals = self._changed({name: path for name, path in begun.items() if name.endswith(".jsonl")})
+        late = self._set_aside(journals | manifests)
         here = self._here()
-        files = {name: inside(self._base, name) for name in self._changed(here) if not _is_late(name)}
-        gone = self._state.files.keys() - here.keys() - before.keys()
-        journals = {name: path for name, path in late.items() if not name.endswith(f"/{MANIFEST}")}
+        files = self._changed({name: path for name, path in here.items() if not _is_late(name)})
+        gone = self._state.files.keys() - here.keys() - late.keys()
         touched = {str(place) for name in (*files, *journals, *gone) for place in Path(name).parents}
-        untrue = {f"{place}/{MANIFEST}" for place in touched} | {name for name in gone if _is_late(name)}
-        self._remove(untrue & self._state.files.keys())
+        self._remove({f"{place}/{MANIFEST}" for place in touched} | {name for name in gone if _is_late(name)})
         self._send(files)
-        self._send(journals)
-        self._remove(gone & self._state.files.keys())
-        self._send({name: path for name, path in late.items() if name not in journals})
+        self._send({name: late[name] for name in journals})
+        self._remove(gone)
+        self._send(self._changed({name: late[name] for name in manifests}))
         self._save()
 
-    def _here(self) -> dict[str, _Copy]:
+    def _set_aside(self, files: Mapping[str, Path]) -> dict[str, Path]:
+        """Copy files as they are now, times too."""
+        copies = {name: self._notes / "late" / str(number) for number, name in enumerate(files)}
+        with storage_errors(self._notes):
+            (self._notes / "late").mkdir(exist_ok=True)
+            for name, copy in copies.items():
+                shutil.copy2(files[name], copy)
+        return copies
+
+    def _here(self) -> dict[str, Path]:
         """List the files here, as `_listed` does; a file goes with those of its stem."""
         found = self.local.rglob("*") if self.local.is_dir() else self._base.glob(f"{glob.escape(self.local.stem)}.*")
-        here = {}
-        for path in found:
-            name = path.relative_to(self._base).as_posix()
-            with contextlib.suppress(FileNotFoundError):
-                if not path.is_symlink() and path.is_file() and not any(map(_is_passing, Path(name).parts)):
-                    here[name] = _Copy.of(path)
-        return here
+        here = {path.relative_to(self._base).as_posix(): path for path in found if not path.is_symlink()}
+        return {
+            name: path for name, path in here.items() if path.is_file() and not any(map(_is_passing, Path(name).parts))
+        }
 
-    def _changed(self, here: Mapping[str, _Copy]) -> Collection[str]:
-        known = self._state.files
-        return {name: None for name, one in here.items() if name not in known or known[name][:2] != one[:2]}.keys()
+    def _changed(self, files: Mapping[str, Path]) -> dict[str, Path]:
+        """Give those that are not there as they are here."""
+        known, changed = self._state.files, dict[str, Path]()
+        for name, path in files.items():
+            with contextlib.suppress(FileNotFoundError):
+                if name not in known or known[name][:2] != _Copy.of(path)[:2]:
+                    changed[name] = path
+        return changed
 
     def _send(self, files: Mapping[str, Path]) -> None:
-        """Send what has changed: name -> the file with its bytes."""
+        """Send files: name -> the file with its bytes."""
         names = sorted(name for name, path in files.items() if path.is_file())
-        names = [
-            name
-            for name in names
-            if (known := self._state.files.get(name)) is None or known[:2] != _Copy.of(files[name])[:2]
-        ]
         for begin in range(0, len(names), BATCH):
             batch = names[begin : begin + BATCH]
-            copies = {name: _Copy.of(files[name], _md5(files[name])) for name in batch}
+            copies = {name: _Copy.of(files[name]) for name in batch}
             paths = [str(files[name]) for name in batch], [f"{self._above}/{name}" for name in batch]
             self._make_folders(paths[1])
             self._asked("cannot write", partial(self._system.put, *paths))
             self._beat()
             self._state.files |= copies
             self.num_sent += len(batch)
-            self.bytes_sent += sum(one.size for one in copies.values())
 
     def _make_folders(self, paths: Collection[str]) -> None:
         for folder in sorted({path.rpartition("/")[0] for path in paths} if self._has_folders else ()):
             self._asked("cannot write", partial(self._system.makedirs, folder, exist_ok=True))
 
     def _remove(self, names: Collection[str]) -> None:
+        names = self._state.files.keys() & names
+
         def remove() -> None:
             with contextlib.suppress(FileNotFoundError):
                 self._system.rm([f"{self._above}/{name}" for name in names])
@@ -423,15 +412,11 @@ class WorkingFolder:
         write_bytes(self._notes / "state.json", self._state.model_dump_json().encode())
 
     def _asked(self, what: str, ask: Callable[[], T]) -> T:
-        """Ask, again where that broke; tell of it in our words, as those of libraries may hold a key."""
-        for attempt in range(TRIES):
-            time.sleep(FIRST_WAIT_S * 2 ** (attempt - 1) if attempt else 0.0)
-            try:
-                return ask()
-            except Exception as error:  # every file system has its own
-                why, is_full = error, getattr(error, "errno", 0) in DISK_FULL
-                if is_full or isinstance(error, (PermissionError, FileNotFoundError)):
-                    break
+        """Ask, and tell in our words of what breaks: those of libraries may hold a key. They try again themselves."""
+        try:
+            return ask()
+        except Exception as error:  # every file system has its own
+            why = error
         told = getattr(why.__cause__ or why, "response", None)  # of S3: with a code
         code = told.get("Error", {}).get("Code") if isinstance(told, dict) else None
         fix = f"run the same command again; finished work stays, in {self.local}"
@@ -439,7 +424,7 @@ class WorkingFolder:
             fix = f"check the key (of S3: AWS_ACCESS_KEY_ID, ~/.aws/credentials) and what it may do, then {fix}"
         elif isinstance(why, FileNotFoundError):
             fix = f"check that there is such a bucket or folder, then {fix}"
-        elif is_full:
+        elif getattr(why, "errno", 0) in DISK_FULL:
             what, fix = "the disk of this machine is full", f"free some space, or choose another --cache, then {fix}"
         raise StorageError(what, where=self.shown, got=str(code or type(why).__name__)[:60], fix=fix) from None
 
@@ -453,8 +438,3 @@ def _is_passing(name: str) -> bool:
     """Tell whether a name is one of a moment: a lock, a temporary name, the mark of a writer."""
     name = name.rpartition("/")[2]
     return name == LOCK or (name.startswith(".") and name.endswith((".partial", ".writer.json")))
-
-
-def _md5(path: Path) -> str:
-    with open_file(path) as file:
-        return hashlib.file_digest(file, lambda: hashlib.md5(usedforsecurity=False)).hexdigest()

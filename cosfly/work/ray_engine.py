@@ -13,7 +13,6 @@ import os
 import pickle
 import re
 import signal
-import socket
 import sys
 from collections import deque
 from collections.abc import Iterator
@@ -40,7 +39,6 @@ ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",  # it would tell its makers
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # it would hide the GPUs from workers that ask for no share
 }
-HTTP2 = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))  # how gRPC begins: RFC 9113, 3.4
 WAITING_S = 30.0  # after so long it is told that there is no room
 
 
@@ -93,15 +91,9 @@ class Cluster:
     def start_post(self, manner: Manner) -> RayPost:
         """Ask for a worker somewhere."""
         takes = {"num_cpus": self._cfg.worker_cpus, "num_gpus": self._cfg.worker_gpus, "max_restarts": 0}
-        host = self._actor.options(**takes).remote(manner.heartbeat_s)
-        how: dict[str, Any] = {
-            "folder": str(self._folder),
-            "record": self._record,
-            "cwd": os.getcwd(),
-            "path": sys.path,
-        }
-        how["version"] = cosfly.__version__
-        return RayPost(self._ray, host, manner, how, self.needs)
+        host = self._actor.options(**takes).remote(manner.heartbeat_s, manner.log_level, manner.place)
+        begun = host.begin.remote(str(self._folder), self._record, os.getcwd(), sys.path, cosfly.__version__)
+        return RayPost(self._ray, host, begun, manner.place, self.needs)
 
     @cached_property
     def _actor(self) -> Any:
@@ -111,11 +103,10 @@ class Cluster:
 class RayPost:
     """The way to a worker process on a node."""
 
-    def __init__(self, ray: Any, host: Any, manner: Manner, how: dict[str, Any], needs: str) -> None:
+    def __init__(self, ray: Any, host: Any, begun: Any, place: int, needs: str) -> None:
         self.pid: int | None = None
         self.node: str | None = None
-        self._ray, self._host, self._manner, self._needs = ray, host, manner, needs
-        self._begun = host.begin.remote(**how, log_level=manner.log_level, place=manner.place)
+        self._ray, self._host, self._begun, self._place, self._needs = ray, host, begun, place, needs
         self._said: Any = None
         self._heard = deque[bytes]()
         self._vitals: Vitals | None = Vitals(0.0, 0.0)
@@ -130,7 +121,7 @@ class RayPost:
     def _settle(self) -> None:
         """Wait until it has a node and has started there; raises EnvironmentMissing where the node will not do."""
         while not self._ray.wait([self._begun], timeout=WAITING_S)[0]:
-            if self._manner.place == 0:
+            if self._place == 0:
                 log.warning("worker 0 waits for a node with %s free; `ray status` tells who has them", self._needs)
         node, pid, problem = self._ray.get(self._begun)
         if problem:
@@ -166,7 +157,7 @@ class RayPost:
         try:
             yield
         except (errors.RayActorError, errors.WorkerCrashedError, errors.ObjectLostError) as error:
-            log.debug("worker %d: %s", self._manner.place, error)
+            log.debug("worker %d: %s", self._place, error)
             raise EOFError from None
 
 
@@ -177,15 +168,13 @@ def _host() -> type:
     class Host:
         """Starts a worker on its node, and passes on what it is told and says. One call at a time."""
 
-        def __init__(self, heartbeat_s: float) -> None:
+        def __init__(self, heartbeat_s: float, log_level: int, place: int) -> None:
             import queue
 
-            self.heartbeat_s = heartbeat_s
+            self.heartbeat_s, self.log_level, self.place = heartbeat_s, log_level, place
             self.inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 
-        def begin(
-            self, folder: str, record: str, cwd: str, path: list[str], version: str, log_level: int, place: int
-        ) -> tuple:
+        def begin(self, folder: str, record: str, cwd: str, path: list[str], version: str) -> tuple:
             """Give the node's name, the worker's process id, and what is wrong with the node."""
             import os
             import socket
@@ -222,7 +211,7 @@ def _host() -> type:
                 os.environ.setdefault("GLCONTEXT_DEVICE_INDEX", str(devices[0]))  # of EGL, which counts NVIDIA's first
             sys.path.extend(place for place in path if place not in sys.path)  # a spawned process takes it over
             vars(sys.modules["__main__"]).pop("__file__", None)  # Ray's own, which a spawned process would run again
-            self.post = LocalPost(Manner(os.getpid(), self.heartbeat_s, log_level, place))
+            self.post = LocalPost(Manner(os.getpid(), self.heartbeat_s, self.log_level, self.place))
             threading.Thread(target=self._send, daemon=True).start()
             return node, self.post.pid, None
 
@@ -290,19 +279,21 @@ def connected(cfg: RayConfig) -> Any:
 
 def _knock(address: str) -> None:
     """See that somebody who speaks gRPC is at a host and port: Ray itself would try for a quarter of an hour."""
-    host, colon, port = address.rpartition(":")
-    if not colon:
+    import grpc
+    from ray._private.gcs_utils import create_gcs_channel
+
+    if ":" not in address:
         return
+    channel = create_gcs_channel(address)
     try:
-        with socket.create_connection((host.strip("[]"), int(port)), ANSWER_S) as there:
-            there.sendall(HTTP2)
-            if there.recv(4)[3:] != HTTP2[-6:-5]:
-                raise OSError("something else answers there")
-    except (OSError, ValueError, OverflowError) as error:
-        raise _refused(address, error) from None
+        grpc.channel_ready_future(channel).result(ANSWER_S)
+    except grpc.FutureTimeoutError:
+        raise _refused(address, f"nobody who speaks gRPC within {ANSWER_S:g} s") from None
+    finally:
+        channel.close()
 
 
-def _refused(address: str, error: Exception) -> EnvironmentMissing:
+def _refused(address: str, error: Exception | str) -> EnvironmentMissing:
     versions = re.findall(r"(?:Ray|Python): (\S+)", str(error))
     if len(versions) == 4:
         theirs, ours = (f"Ray {ray} on Python {python}" for ray, python in (versions[:2], versions[2:]))
