@@ -16,9 +16,11 @@ import pytest
 from test_pipeline_tiny import STAGES, TINY, products
 from test_release_get_servers import served_by_s3
 
+from cosfly.app.settings import RunConfig
 from cosfly.cli.located import located
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, ResumeError, StorageError
 from cosfly.work import locations
+from cosfly.work.config import load
 from cosfly.work.journal import Journal
 from cosfly.work.locations import WorkingFolder, name_of, path_of
 
@@ -252,6 +254,18 @@ def test_words_that_are_no_addresses_stay(memory, tmp_path):
         assert located(words, tmp_path, held) == [*words[:4], "/tmp/x", *words[5:]]
         get = ["release", "get", "hf://datasets/a/b", "--out", "out"]
         assert located(get, tmp_path, held) == get
+
+
+def test_an_address_among_the_settings_is_refused_in_one_line(tmp_path):
+    (tmp_path / "a.yaml").write_text(
+        "maps: {source: boxes, boxes: {path: s3://bucket/town.csv}}\nroi: s3://bucket/roi.json"
+    )
+    with pytest.raises(ConfigError, match=r"roi: an address.*copy it.*maps\.boxes\.path: an address") as error:
+        load(RunConfig, tmp_path / "a.yaml")
+    assert "\n" not in str(error.value)
+    with pytest.raises(ConfigError, match=r"fly\.controller: an address"):
+        load(RunConfig, None, ["fly.controller=s3://bucket/controller.yaml"])
+    assert load(RunConfig, None, ["roi=a:b/roi.json"]).roi == Path("a:b/roi.json")
 
 
 def test_a_full_disk_here_is_told_as_that(memory, tmp_path):
