@@ -93,14 +93,12 @@ def test_the_release_of_the_campaign_is_what_its_runs_are_asked_for(tmp_path):
     assert cfg.release.split_by == "town", "no map is in two splits"
 
 
-def test_the_dry_run_tells_of_the_release_too(tmp_path):
+def test_the_dry_run_tells_what_is_left(tmp_path):
     path = campaign_file(tmp_path, seeds=[1, 2])
     told = CliRunner().invoke(app, ["campaign", str(path), "--out", str(tmp_path / "out"), "--dry-run"]).output
-    assert [line.split()[1] for line in told.splitlines() if " MB " in line and "│" in line] == [
-        "small-1",
-        "small-2",
-        "release",
-    ]
+    rows = [line.split("│") for line in told.splitlines() if "│" in line]
+    assert [[cell.strip() for cell in row[1:4]] for row in rows] == [[f"small-{k}", "to do", "0 of 7"] for k in (1, 2)]
+    assert "what is left takes about" in told
     assert not (tmp_path / "out").exists()
 
 

@@ -30,7 +30,7 @@ from cosfly.errors import ConfigError, CosflyError, nearest
 from cosfly.look.frame_views import small_jpeg
 from cosfly.look.page import page
 from cosfly.reading.arrays import read_picture
-from cosfly.reading.files import read_span
+from cosfly.reading.files import read_tail
 from cosfly.work.config import Config, apply_overrides, build, config_file, load, read_yaml
 from cosfly.work.console import Advance, progress_bar
 from cosfly.work.folder_lock import hold_folder
@@ -48,7 +48,6 @@ log = logging.getLogger(__name__)
 FILE, REPORT, LOGS, SETTINGS = "campaign.yaml", "report.html", "logs", "settings"
 NOT_A_RUN = ("release", LOGS, SETTINGS)
 HEAD = ("run", "state", "stages", "at hand", "flights", "captions", "seconds")
-LONGEST_TAIL = 65536  # of a log, in which the error of a run stands last
 SHEET_PX = 960
 LOOK_S = 0.5
 PATIENCE_S = 20.0  # for a run that was told to end
@@ -262,10 +261,8 @@ def _start(one: Run, out: Path, workers: int, resume: Resume) -> subprocess.Pope
 
 def _error_in(log_file: Path) -> str | None:
     """Give what a log says last of an error; None where it says nothing."""
-    size = log_file.stat().st_size
-    tail = min(size, LONGEST_TAIL)
-    lines = read_span(log_file, size - tail, tail, what="log").decode(errors="replace").splitlines()
-    return next((line.removeprefix("error: ") for line in reversed(lines) if line.startswith("error: ")), None)
+    errors = [line for line in read_tail(log_file).splitlines() if line.startswith("error: ")]
+    return errors[-1].removeprefix("error: ") if errors else None
 
 
 # --- how far it is ----------------------------------------------------------------------------------------------------

@@ -269,14 +269,18 @@ def free_bytes(out: Path) -> int:
     return shutil.disk_usage(place).free
 
 
+def space(rows: list[StageEstimate], out: Path) -> str:
+    """Give the disk space of all that is not done, and what is free, in words."""
+    return f"{in_words(sum(row.bytes for row in rows))} of disk, {in_words(free_bytes(out))} are free"
+
+
 def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
     """Say what the figures rest on, what they come to in all, and what stands in the way of the run."""
     lines = []
     for basis in dict.fromkeys(row.basis for row in rows):
         names = dict.fromkeys(row.stage for row in rows if row.basis == basis)
         lines.append(f"figures of {', '.join(names)}: {basis}")
-    needed, free = sum(row.bytes for row in rows), free_bytes(out)
-    lines.append(f"in all about {time_left(rows)}; {in_words(needed)} of disk, {in_words(free)} are free")
+    lines.append(f"in all about {time_left(rows)}; {space(rows, out)}")
     lines += caveats(cfg)
     if any(row.tokens is None for row in rows):
         lines.append(f"tokens are {UNKNOWN_TOKENS}")
@@ -289,7 +293,7 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
             f"{out} was made with other settings ({listed}): its finished stages refuse them, "
             "and only a greater pedestrians.num_paths goes on there; choose another --out"
         )
-    if needed > free:
+    if sum(row.bytes for row in rows) > free_bytes(out):
         lines.append("there is not enough space for it: choose another --out, or fewer walks or pixels")
     return lines
 

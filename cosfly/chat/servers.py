@@ -13,7 +13,6 @@ import contextlib
 import logging
 import random
 import time
-from collections import Counter
 from collections.abc import AsyncIterator
 from typing import Any, Literal
 
@@ -29,16 +28,12 @@ TOO_MANY = "http_429"  # a server that says so works
 
 
 class _Place(ChatServer):
-    """A server in its list: whether it is asked, and what it did."""
+    """A server in its list, and whether it is asked."""
 
     num_failed = num_outs = 0  # in a row; since it last answered
     is_refusing = False  # whatever it is asked
     trouble = ""  # why it is left out; "": it is not
     returning: asyncio.Task | None = None
-
-    def __init__(self, url: str, cfg: EndpointConfig) -> None:
-        super().__init__(url, cfg)
-        self.done: Counter[str] = Counter()  # answers, tokens, times left out
 
 
 class ChatClient:
@@ -94,9 +89,6 @@ class ChatClient:
         await asyncio.gather(*tasks, return_exceptions=True)
         for server in self.servers:
             await server.close()
-            if len(self.servers) > 1:
-                done = ", ".join(f"{count:,} {name}" for name, count in server.done.items())
-                log.info("%s: %s", server.where, done or "nothing asked")
 
     async def answer(self, request: Request) -> Reply:
         """Send a request until it is answered.
@@ -145,7 +137,6 @@ class ChatClient:
             self.troubles.answered()
             self._bring_in(server)
             server.num_failed = server.num_outs = 0
-            server.done.update(answers=1, tokens=found.usage.total if found.usage else 0)
         elif found.cause != TOO_MANY:
             server.num_failed += 1
             if server.num_failed >= (1 if server.num_outs else OUT_AFTER):
@@ -185,7 +176,7 @@ class ChatClient:
     def _leave_out(self, server: _Place, why: str) -> None:
         if server.trouble or len(self.servers) == 1:
             return
-        server.trouble, server.done["times left out"] = why or "no answer", server.done["times left out"] + 1
+        server.trouble = why or "no answer"
         server.returning = asyncio.create_task(self._await_return(server))
         log.warning("%s: left out: %s", server.where, why)
         if all(one.trouble for one in self.servers):

@@ -15,7 +15,6 @@ import threading
 import time
 from pathlib import Path
 from string import Template
-from typing import Literal
 
 import httpx
 from pydantic import Field
@@ -24,7 +23,7 @@ from cosfly.chat.client import EndpointConfig
 from cosfly.chat.contract import NoAnswer, Reply, Request, Troubles
 from cosfly.chat.servers import ChatClient
 from cosfly.errors import ConfigError, EnvironmentMissing, TeacherError
-from cosfly.reading.files import read_span
+from cosfly.reading.files import read_tail
 from cosfly.work.config import Config
 from cosfly.work.server_process import guarded
 from cosfly.work.stage_events import num_gpus
@@ -40,7 +39,7 @@ VLLM = (
 )  # fmt: skip
 LOOK_S, ANSWER_S, FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 5.0, 1.0, 60.0
 ASKED_BEFORE_HUNG = 10  # times that a server is asked whether it lives, before it counts as hung
-READ_BYTES, MOST_SAID = 200_000, 300  # of a server's log; characters of one of its lines
+MOST_SAID = 300  # characters of a line of a server's log
 CAUSES = {
     "its accelerator's memory is full": r"out of memory|no available memory|free memory on device",
     "it finds no accelerator": r"no cuda gpus|failed to infer device type|no cuda-capable|libcuda|nvml",
@@ -132,10 +131,7 @@ class _Replica:
     def _why(self, begin: int) -> str:
         """Give what its log says since it was started: a cause that is known, and the line that tells it, or its first
         error and its last line."""
-        size = self.log_file.stat().st_size
-        begin = max(begin, size - READ_BYTES)
-        said = read_span(self.log_file, begin, size - begin).decode("utf-8", "replace")
-        text = re.sub(r"\x1b\[[\d;]*m", "", said)
+        text = re.sub(r"\x1b\[[\d;]*m", "", read_tail(self.log_file, begin))
         lines = [" ".join(line.split())[:MOST_SAID] for line in text.splitlines() if line.strip()]
         for cause, signs in CAUSES.items():
             if found := next((line for line in lines if re.search(signs, line, re.IGNORECASE)), None):
@@ -212,35 +208,32 @@ class TeacherServers:
             shutil.rmtree(self.folder, ignore_errors=True)
 
 
-class ServedClient:
+class ServedClient(ChatClient):
     """Engine `endpoint` over servers that are started with it and end with it: `--teacher serve:MODEL`."""
-
-    kind: Literal["endpoint"] = "endpoint"
 
     def __init__(
         self, model: str, serve: ServeConfig, num_images: int, cfg: EndpointConfig, troubles: Troubles | None
     ) -> None:
-        self.model, self.where = "", f"serve:{model}"
-        self._servers = TeacherServers(model, serve, num_images)
-        self._client = ChatClient(self._servers.urls, cfg, troubles)
+        self._supervised = TeacherServers(model, serve, num_images)
+        super().__init__(self._supervised.urls, cfg, troubles)
+        self.where = f"serve:{model}"
 
     async def start(self) -> None:
         """Start the servers; raises as `TeacherServers` and `ChatClient.start`."""
-        await asyncio.to_thread(self._servers.__enter__)
-        await self._client.start()
-        self.model = self._client.model
+        await asyncio.to_thread(self._supervised.__enter__)
+        await super().start()
 
     async def answer(self, request: Request) -> Reply:
         """Answer as `ChatClient` does; servers that are being started anew are waited for."""
         while True:
             try:
-                return await self._client.answer(request)
+                return await super().answer(request)
             except NoAnswer as error:
-                self._servers.check()
-                if error.is_final or any(one.is_ready for one in self._servers.replicas):
+                self._supervised.check()
+                if error.is_final or any(one.is_ready for one in self._supervised.replicas):
                     raise
             await asyncio.sleep(LOOK_S)
 
     async def close(self) -> None:
-        await self._client.close()
-        await asyncio.to_thread(self._servers.__exit__)
+        await super().close()
+        await asyncio.to_thread(self._supervised.__exit__)

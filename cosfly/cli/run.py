@@ -14,7 +14,6 @@ from cosfly.cli.options import WORKERS, Job, takes
 from cosfly.errors import InputError
 
 if TYPE_CHECKING:
-    from cosfly.app.estimate import StageEstimate
     from cosfly.app.pipeline import StageResult
     from cosfly.app.settings import RunConfig
 
@@ -74,39 +73,22 @@ def campaign(
     from release.stats.stats import shown
 
     cfg, runs, out = campaigns.load_campaign(file, overrides or [], out)
-    if dry_run:
-        left: dict[str, list[StageEstimate]] = {}
-        of_release: list[StageEstimate] = []
-        for one in runs:
-            rows = estimate.estimate(one.cfg, one.folder, estimate.rates_near(one.folder))
-            left[one.name] = [row for row in rows if not row.is_done and row.name != "release"]
-            of_release += [row for row in rows if row.name == "release"]
-        if any(left.values()) or not (out / "release/manifest.json").exists():
-            left["release"] = of_release
-        told = []
-        for name, rows in left.items():
-            stages = ", ".join(dict.fromkeys(row.name for row in rows))
-            told.append((name, stages or "-", estimate.time_left(rows), _disk(rows)))
-        title = f"What {out} would take, one run after the other; nothing is written"
-        options.tell_table(answer_console, ("run", "to do", "time", "disk"), told, title=title, left=("to do", "time"))
-        rows = [row for of_one in left.values() for row in of_one]
-        free = estimate.in_words(estimate.free_bytes(out))
-        line = f"in all about {estimate.time_left(rows)}; {_disk(rows)} of disk, {free} are free"
-        return answer_console.print(line, soft_wrap=True)
-    failed = campaigns.run(cfg, runs, out, resume=resume)
+    failed = {} if dry_run else campaigns.run(cfg, runs, out, resume=resume)
     table = [[shown(cell) for cell in row] for row in campaigns.table(runs, failed)]
-    options.tell_table(console, campaigns.HEAD, table, title=f"What was made in {out}", left=("state", "at hand"))
+    title = f"What {'stands' if dry_run else 'was made'} in {out}"
+    where = answer_console if dry_run else console
+    options.tell_table(where, campaigns.HEAD, table, title=title, left=("state", "at hand"))
+    if dry_run:
+        every = [row for one in runs for row in estimate.estimate(one.cfg, one.folder, estimate.rates_near(one.folder))]
+        is_released = (out / "release/manifest.json").exists()
+        left = [row for row in every if not (row.is_done or (row.stage == "release" and is_released))]
+        line = f"what is left takes about {estimate.time_left(left)}; {estimate.space(left, out)}"
+        return answer_console.print(line, soft_wrap=True)
     typer.echo(out / campaigns.REPORT)
     if failed:
         fix = "mend what the table names, then run the same command again; or leave them out (leave_out)"
         raise InputError("some runs failed; the others are done", where=out, got=", ".join(failed), fix=fix)
     typer.echo(out / "release/dataset")
-
-
-def _disk(rows: list[StageEstimate]) -> str:
-    from cosfly.app.estimate import in_words
-
-    return in_words(sum(row.bytes for row in rows))
 
 
 def _is_begun(config: Path, cfg: RunConfig) -> bool:
