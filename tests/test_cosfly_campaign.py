@@ -12,7 +12,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from cosfly.app.campaign import PATIENCE_S, Run, load_campaign, tallies
+from cosfly.app.campaign import PATIENCE_S, Run, load_campaign, share_of, tallies
 from cosfly.cli import app
 from cosfly.errors import ConfigError
 from cosfly.reading.documents import read_json
@@ -100,6 +100,21 @@ def test_the_dry_run_tells_what_is_left(tmp_path):
     assert [[cell.strip() for cell in row[1:4]] for row in rows] == [[f"small-{k}", "to do", "0 of 7"] for k in (1, 2)]
     assert "what is left takes about" in told
     assert not (tmp_path / "out").exists()
+
+
+def test_runs_at_the_same_time_share_the_workers(tmp_path, monkeypatch):
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: range(8))
+    config = {name: value for name, value in SMALL.items() if name != "workers"}
+    path = campaign_file(tmp_path, configs={"here": config, "there": config | {"engine": "ray"}}, at_once=3)
+
+    def shares(*overrides: str, num_runs: int = 9) -> list[int]:
+        cfg, runs, _ = load_campaign(path, list(overrides), None)
+        return [share_of(cfg, run, num_runs) for run in runs]
+
+    assert shares() == [2, 0]
+    assert shares(num_runs=2) == [4, 0]
+    assert shares("workers=40") == [13, 13]
+    assert shares("workers=1") == [1, 1]
 
 
 def start(path: Path, out: Path) -> subprocess.Popen:

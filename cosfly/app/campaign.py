@@ -71,7 +71,11 @@ class CampaignConfig(Config):
     seeds: tuple[int, ...] = Field((0,), min_length=1, description="seeds, each a run of every map and configuration")
     leave_out: tuple[str, ...] = Field((), description="runs that are not made: their names, * for any part")
     at_once: int = Field(1, ge=1, description="runs at work at the same time, which share the worker processes")
-    workers: int = Field(0, ge=0, description="worker processes of all runs together; 0 takes one per core")
+    workers: int = Field(
+        0,
+        ge=0,
+        description="worker processes of all runs together; 0 takes one per core, on Ray all there is room for",
+    )
     release: ReleaseConfig = Field(
         default_factory=lambda: ReleaseConfig(split_by="town"),
         description="the release of all runs, in place of their own; split_by is town unless it is set",
@@ -218,20 +222,20 @@ def run(cfg: CampaignConfig, runs: list[Run], out: Path, *, resume: Resume = "if
 
 def _do(cfg: CampaignConfig, todo: list[Run], out: Path, resume: Resume, advance: Advance) -> dict[str, str]:
     """Do runs, each in a process of its own that ends with this one; gives what went wrong, by their names."""
-    cores = cfg.workers or len(os.sched_getaffinity(0))
-    workers = max(1, cores // min(cfg.at_once, len(todo) or 1))
     waiting, at_work, failed = todo[::-1], list[tuple[Run, subprocess.Popen]](), dict[str, str]()
     try:
         while waiting or at_work:
             while waiting and len(at_work) < cfg.at_once:
                 one = waiting.pop()
                 log.info("%s: begun", one.name)
+                workers = one.cfg.workers or share_of(cfg, one, len(todo))
                 at_work.append((one, _start(one, out, workers, resume)))
             time.sleep(LOOK_S)
             for one, process in [pair for pair in at_work if pair[1].poll() is not None]:
                 at_work.remove((one, process))
-                if process.returncode:
-                    failed[one.name] = _error_in(out / LOGS / f"{one.name}.log") or f"exit code {process.returncode}"
+                if code := process.returncode:
+                    told = out / LOGS / f"{one.name}.log"
+                    failed[one.name] = _error_in(told) or f"exit code {code}, see {told}"
                     log.error("%s: failed: %s", one.name, failed[one.name])
                 else:
                     log.info("%s: done", one.name)
@@ -247,11 +251,18 @@ def _do(cfg: CampaignConfig, todo: list[Run], out: Path, resume: Resume, advance
     return failed
 
 
+def share_of(cfg: CampaignConfig, one: Run, num_runs: int) -> int:
+    """Give the workers of one run of those that share them; 0: as many as a cluster has room for."""
+    here = 0 if one.cfg.engine == "ray" else len(os.sched_getaffinity(0))
+    most = cfg.workers or here
+    return most and max(1, most // min(cfg.at_once, num_runs))
+
+
 def _start(one: Run, out: Path, workers: int, resume: Resume) -> subprocess.Popen:
     settings, told = out / SETTINGS / f"{one.name}.yaml", out / LOGS / f"{one.name}.log"
     write_bytes(settings, yaml.safe_dump(one.cfg.model_dump(mode="json"), sort_keys=False, allow_unicode=True).encode())
     words = ["run", str(settings), "--out", str(one.folder), "--until", STAGES[-2]]
-    words += ["--workers", str(one.cfg.workers or workers), "--resume", resume]
+    words += ["--workers", str(workers), "--resume", resume]
     with storage_errors(told):
         told.parent.mkdir(exist_ok=True)
         log_file = told.open("wb")

@@ -1,12 +1,15 @@
-"""What it costs to copy a run to S3 and back, beside a copy on this disk; requests by kind. A server of the tests.
+"""What it costs to copy a run to S3 and back, beside a copy on this disk; requests by kind. Without RUN: what it costs
+to make a run there, beside the same on this disk, in pairs. A server of the tests.
 
-python tests/benchmarks/bench_locations.py RUN
+python tests/benchmarks/bench_locations.py [RUN]
 """
 
 import os
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -46,14 +49,38 @@ for number in range(2):
 """
 
 
+SMALL = ("render.width_px=320", "render.height_px=180")
+PAIRS = 3
+
+
+def make_runs(python: Path, env: Mapping[str, str], folder: Path) -> None:
+    """Make a run on this disk and at S3, in turns."""
+    (folder / "packages").mkdir()  # as an installation has them
+    (folder / "packages/cosfly_configs").symlink_to(ROOT / "configs")
+    kernels = os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))  # compiled once on a machine
+    env = {**env, "XDG_CACHE_HOME": kernels, "PYTHONPATH": f"{ROOT}:{folder / 'packages'}"}
+    words = [str(python), "-m", "cosfly", "-q", "--cache", str(folder / "cache"), "run", "quickstart"]
+    words += [word for one in SMALL for word in ("--set", one)]
+    for number in range(PAIRS):
+        for place in (str(folder / f"run{number}"), f"s3://flights/run{number}"):
+            load, began_s = os.getloadavg()[0], time.monotonic()
+            subprocess.run([*words, "--out", place], env=env, cwd=ROOT, check=True, capture_output=True)
+            print(f"{place}: {time.monotonic() - began_s:.1f} s, load before {load:.1f}", flush=True)
+    files = [path for path in (folder / "run0").rglob("*") if path.is_file()]
+    frames = sum(path.stem == "rgb" for path in files)
+    print(f"{frames} frames, {len(files)} files, {sum(path.stat().st_size for path in files) / 1e6:.0f} MB")
+
+
 def main() -> None:
-    run = Path(sys.argv[1]).resolve()
-    frames, files = (sum(path.is_file() for path in run.rglob(name)) for name in ("rgb.*", "*"))
-    print(f"{frames} frames, {files} files, load {os.getloadavg()[0]:.1f}")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "empty").mkdir()
         with served_by_s3(folder / "empty", folder / "log", 0.0) as (python, env):
+            if len(sys.argv) == 1:
+                return make_runs(python, env, folder)
+            run = Path(sys.argv[1]).resolve()
+            frames, files = (sum(path.is_file() for path in run.rglob(name)) for name in ("rgb.*", "*"))
+            print(f"{frames} frames, {files} files, load {os.getloadavg()[0]:.1f}")
             subprocess.run([str(python), "-c", MEASURE, str(run), name], env=env, check=True)
 
 
