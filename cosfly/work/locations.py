@@ -69,15 +69,13 @@ def opened(address: str) -> tuple[Any, str]:
     shown = without_secrets(address)
     try:
         from fsspec.core import url_to_fs
-        from fsspec.registry import known_implementations
     except ImportError:
         fix = "pip install 'cosfly[remote]'"
         raise EnvironmentMissing("fsspec is not installed", where=shown, fix=fix) from None
     try:
         system, root = url_to_fs(address)
-    except ImportError:
-        told = known_implementations.get(address.partition("://")[0], {}).get("err", "")  # 'Install s3fs to access S3'
-        fix = re.sub(r".*nstall ([\w.-]+) to .*", r"pip install \1", told)
+    except ImportError as error:
+        fix = re.sub(r".*nstall ([\w.-]+) to .*", r"pip install \1", str(error))  # 'Install s3fs to access S3'
         raise EnvironmentMissing("what opens such addresses is not installed", where=shown, fix=fix) from None
     except Exception as error:  # each file system has its own; their words may hold the address
         got, expected = type(error).__name__, "what fsspec opens"

@@ -172,7 +172,7 @@ def _host() -> type:
             import queue
 
             self.heartbeat_s, self.log_level, self.place = heartbeat_s, log_level, place
-            self.inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+            self.inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()  # a worker that still imports reads nothing
 
         def begin(self, folder: str, record: str, cwd: str, path: list[str], version: str) -> tuple:
             """Give the node's name, the worker's process id, and what is wrong with the node."""
