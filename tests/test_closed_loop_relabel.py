@@ -8,7 +8,7 @@ from commands import invoke
 from test_closed_loop_fly import TINY, fly, town  # noqa: F401
 
 from cosfly.closed_loop.settings import DroneConfig
-from cosfly.errors import VerifyError
+from cosfly.errors import ConfigError, VerifyError
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight
@@ -54,6 +54,13 @@ def test_another_map_than_was_flown_in_is_refused(town, tmp_path):  # noqa: F811
     done = invoke(f"fly {TINY} --map {other} --relabel {tmp_path}/flown --workers 1 --out {tmp_path}/made")
     assert isinstance(done.exception, VerifyError)
     assert "another input 'boxes'" in str(done.exception)
+
+
+def test_another_planner_than_foresight_is_refused(town, tmp_path):  # noqa: F811
+    fly(town, tmp_path / "flown", f"{STUDENT} --set fly.most_decisions=4")
+    done = relabel(town, tmp_path / "flown", tmp_path / "made", "--set plan.planner=muco")
+    assert isinstance(done.exception, ConfigError)
+    assert "foresight alone" in str(done.exception)
 
 
 @pytest.mark.parametrize("angle", np.linspace(0, 6, 13))

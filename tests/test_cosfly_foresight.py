@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from specimens_planning import scenario_of, town_of, walk_along
+from specimens_planning import WORLDS, scenario_of, town_of, walk_along
 
+from cosfly.errors import NoPathError
 from cosfly.planners import foresight, smoothing
 from cosfly.planners.contract import PlanConfig, load_planner
-from cosfly.planners.stage import make_scenario, plan_flight
+from cosfly.planners.stage import make_scenario, plan_flight, plan_on
 from cosfly.space import flight_metrics, kernels
 from cosfly.work.chance import rng_for
 
@@ -244,3 +245,35 @@ def test_a_wished_bearing_counts_for_more_than_a_short_way(subtests):
             off = np.arctan2(away[:, 1], away[:, 0]) - (wish.heading_rad + bearing_rad)
             assert np.abs(np.angle(np.exp(1j * off))).mean() < np.radians(8)
             assert np.abs(np.linalg.norm(away, axis=1) - wish.distance_m).mean() < 3.0
+
+
+# --- from where a drone is --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("place_m", "velocity_mps"),
+    [((-20, 0, 20), (1.2, 0, 0)), ((45, 3, 24), (-6, 0, 2)), ((-60, 0, 30), (-9, 0, 0)), ((5, 2, 12), (0, 0, -2))],
+)
+def test_a_flight_is_planned_on_from_a_place_and_a_velocity(place_m, velocity_mps):
+    box_map, corners = WORLDS["canyon"]
+    walk, obstacles = walk_along("canyon", corners), kernels.obstacle_index(box_map)
+    targets = walk.positions_m + np.array([0, 0, 0.9])
+    flown = np.array(place_m) + np.arange(-9, 1)[:, None] * 0.5 * np.array(velocity_mps, dtype=float)
+    points = plan_on("canyon", targets, 0.5, flown, obstacles, CFG)
+    np.testing.assert_array_equal(points[: len(flown)], flown)
+    ahead, dt_s = points[len(flown) - 3 :], 0.5
+    assert np.linalg.norm(np.diff(ahead[2:], axis=0), axis=1).max() <= CFG.speed_max_mps * dt_s + 1e-3
+    assert np.linalg.norm(np.diff(ahead, n=2, axis=0), axis=1).max() <= CFG.accel_max_mps2 * dt_s**2 + 1e-3
+    assert kernels.swept_distances(obstacles, ahead[2:], 20.0)[0].min() >= CFG.relaxed_safety_m - 0.02
+    assert ahead[-1, 2] >= CFG.altitude_min_m - 1e-6
+    late = slice(len(flown) + 40, None)  # 20 s later it is where a flight of this style is, and sees the walker
+    assert np.linalg.norm((points - targets)[late], axis=1).max() < 40
+    assert kernels.visibility(obstacles, points, targets)[late].mean() > 0.95
+
+
+def test_no_flight_is_planned_on_from_within_the_safety_distance():
+    box_map, corners = WORLDS["canyon"]
+    walk, obstacles = walk_along("canyon", corners), kernels.obstacle_index(box_map)
+    flown = np.array([[-20.0, 7.0, 20.0]] * 5)  # a metre from a house
+    with pytest.raises(NoPathError, match="no free places"):
+        plan_on("canyon", walk.positions_m + np.array([0, 0, 0.9]), 0.5, flown, obstacles, CFG)

@@ -119,9 +119,9 @@ class Ceiling:
         """Give the command that leads to the plan's next pose, or as near as the drone's bounds allow."""
         planned, i = flight.planned, now.index + 1
         velocity = in_axes_of(now.rotation_deg[1], planned.positions_m[i] - now.position_m) / flight.dt_s
-        velocity *= min(1.0, flight.drone.speed_max_mps / max(float(np.hypot(*velocity[:2])), 1e-9))
         turn_degps = float(wrap_deg(planned.rotations_deg[i, 1] - now.rotation_deg[1])) / flight.dt_s
-        return np.clip([*velocity, turn_degps, planned.rotations_deg[i, 0]], *flight.drone.bounds)
+        command = flight.drone.within_speed(np.array([*velocity, turn_degps, planned.rotations_deg[i, 0]]))
+        return np.clip(command, *flight.drone.bounds)
 
 
 class AskedPilot:

@@ -1,14 +1,16 @@
 """`cosfly fly --relabel`, DAgger's data (Ross, Gordon and Bagnell 2011): what the planner does from where a student's
 own mistakes led it.
 
-The planner knows the whole walk: from the pose that the student had reached the drone flies back to the plan as fast as
-it may (`pilots.Ceiling`). A window is kept where the student's decision is ruled out by that motion, or where it was
-about to lose the person. Each is a short flight: the student's observed frames, then the planner's.
+The planner knows the whole walk: it plans anew from the pose and the velocity that the student had reached, and
+that plan is flown as the ceiling flies (`pilots.Ceiling`). A window is kept where the student's decision is ruled out
+by that motion, or where it was about to lose the person. Each is a short flight: the student's observed frames, then
+the planner's.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,11 +24,17 @@ from cosfly.closed_loop.measures import LOSS_S
 from cosfly.closed_loop.pilots import Ceiling
 from cosfly.closed_loop.stage import PLAN, TRACES, TREE, FlightsConfig, flown_trace
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight
+from cosfly.errors import ConfigError, NoPathError
+from cosfly.geometry import look_at, step_s
+from cosfly.planners.contract import PlanConfig
+from cosfly.planners.stage import plan_on
 from cosfly.products.boxes import read_boxes
 from cosfly.products.flight_scores import read_score
-from cosfly.products.pursuits import Pursuit, pursuit_file, read_pursuit
+from cosfly.products.pursuits import Pursuit, PursuitFrame, pursuit_file, read_pursuit
 from cosfly.products.traces import ARRAYS, DroneTrace, read_traces, write_traces
 from cosfly.render import stage as rendering
+from cosfly.space.flight_metrics import CLEARANCE_CAP_M
+from cosfly.space.kernels import signed_distances, swept_distances
 from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.work.stage_folder import Resume, StageFolder
 
@@ -47,9 +55,14 @@ def run(
     planner does where the student erred. Gives the folder.
 
     Raises:
-        InputError: a file is not what it must be. NothingKept: the student erred nowhere.
+        InputError: a file is not what it must be. ConfigError: another planner than foresight. NothingKept: the
+            student erred nowhere.
     """
     inputs = {"flown": flown, "boxes": boxes, "simplified": simplified}
+    planners = {plan.planner for plan in read_traces(flown / PLAN / TRACES)} | {cfg.plan.planner}
+    if planners != {"foresight"}:
+        what, where = "foresight alone plans on from where a drone is", f"plan.planner, and {flown / PLAN}"
+        raise ConfigError(what, where=where, got=", ".join(sorted(planners)), fix="fly with plan.planner=foresight")
     stage = StageFolder.open(out, "relabel", config=cfg, inputs=inputs, seed=seed, resume=resume, begun=(TREE,))
     if not stage.is_complete:
         items = []
@@ -82,11 +95,18 @@ def make_worker(cfg: FlightsConfig, flown: Path, boxes: Path, simplified: Path, 
         plan, begin, end = plans[pursuit.walk], i - num.num_frames + 1, i + fly.relabel.future_frames + 1
         if begin < 0 or end > len(plan.time_s):
             return Outcome(drop_reason="walk_ends")
-        if not any(frame.visible for frame in pursuit.frames[begin : i + 1]):
+        own = pursuit.frames[: i + 1]
+        if not any(frame.visible for frame in own[begin:]):
             return Outcome(drop_reason="long_lost")  # no picture tells where the person is
-        flight = ClosedLoopFlight(
-            space, _joined(plan, pursuit, begin, i, end), num_lead=num.num_frames, drone=fly.drone
-        )
+        here_m = np.array([own[-1].pose[:3]])
+        if signed_distances(space.surroundings.obstacles, here_m)[0][0] < cfg.plan.relaxed_safety_m:
+            return Outcome(drop_reason="too_near")  # no plan begins there
+        try:
+            planned = _planned_on(plan, own, space, cfg.plan)
+        except NoPathError:
+            return Outcome(drop_reason="no_path")
+        cut: Any = {name: getattr(planned, name)[begin:end] for name in (*ARRAYS, "clearances_m")}
+        flight = ClosedLoopFlight(space, replace(planned, **cut), num_lead=num.num_frames, drone=fly.drone)
         moments = [*flight.reset()]
         while flight.ended is None:
             moments.append(flight.step(Ceiling.to_next(flight, moments[-1])))
@@ -127,13 +147,16 @@ def make_worker(cfg: FlightsConfig, flown: Path, boxes: Path, simplified: Path, 
     return work
 
 
-def _joined(plan: DroneTrace, pursuit: Pursuit, begin: int, i: int, end: int) -> DroneTrace:
-    """Give the student's frames begin to i, and the plan's up to `end`, as a plan."""
-    cut: Any = {name: getattr(plan, name)[begin:end].copy() for name in (*ARRAYS, "clearances_m")}
-    poses = np.array([frame.pose for frame in pursuit.frames[begin : i + 1]])
-    cut["positions_m"][: len(poses)], cut["rotations_deg"][: len(poses)] = poses[:, :3], poses[:, 3:]
-    cut["clearances_m"][: len(poses)] = [frame.clearance_m for frame in pursuit.frames[begin : i + 1]]
-    return replace(plan, **cut)
+def _planned_on(plan: DroneTrace, flown: Sequence[PursuitFrame], space: Airspace, cfg: PlanConfig) -> DroneTrace:
+    """Give a plan for the walk that begins with what a student has flown; raises as `plan_on`."""
+    poses, obstacles = np.array([frame.pose for frame in flown]), space.surroundings.obstacles
+    positions_m = plan_on(plan.path_id, plan.targets_m, step_s(plan.time_s), poses[:, :3], obstacles, cfg)
+    pitch_rad, yaw_rad = look_at(positions_m, plan.targets_m)
+    rotations_deg = np.degrees(np.stack([pitch_rad, yaw_rad, 0.0 * yaw_rad], axis=1))
+    rotations_deg[: len(poses)] = poses[:, 3:]
+    clearances_m = swept_distances(obstacles, positions_m, CLEARANCE_CAP_M)[0]
+    clearances_m[: len(poses)] = [frame.clearance_m for frame in flown]
+    return replace(plan, positions_m=positions_m, rotations_deg=rotations_deg, clearances_m=clearances_m)
 
 
 def _reasons(

@@ -315,7 +315,8 @@ class Scenario:
     """What a planner gets to know; n >= 2 waypoints, dt_s apart.
 
     targets_m: (n, 3) hip points. ground_m: (n,) height of the ground below each. wish: what the flight should be at
-    each.
+    each. flown_m: (k, 3), where the drone was at the first k waypoints, of a flight that goes on from there; k is 0, or
+    3 and more, and only foresight plans on.
     """
 
     path_id: str
@@ -323,16 +324,27 @@ class Scenario:
     ground_m: np.ndarray
     wish: Wish
     dt_s: float = DT_S
+    flown_m: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+
+    @property
+    def start(self) -> int:
+        """The waypoint from which on is planned."""
+        return max(len(self.flown_m) - 1, 0)
+
+    def as_flown(self, points_m: np.ndarray) -> np.ndarray:
+        """Give a flight, (n, 3), with what is flown already as its begin."""
+        return np.vstack([self.flown_m, points_m[len(self.flown_m) :]])
 
     def key_frames(self, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Give every stride-th frame and the last, and the least, preferred and greatest z at each, all (m,).
+        """Give every stride-th frame from the start on and the last, and the least, preferred and greatest z at each,
+        all (m,).
 
         Between key frames a flight is straight while the ground may rise and fall: a key frame keeps the bounds of all
         frames around it.
         """
         from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-        frames = np.unique(np.append(np.arange(0, len(self.targets_m), stride), len(self.targets_m) - 1))
+        frames = np.unique(np.append(np.arange(self.start, len(self.targets_m), stride), len(self.targets_m) - 1))
         least, preferred = (
             maximum_filter1d(self.ground_m + altitudes_m, 2 * stride + 1, mode="nearest")[frames]
             for altitudes_m in (self.wish.altitude_min_m, self.wish.altitude_m)
@@ -343,7 +355,7 @@ class Scenario:
     def between(self, frames: np.ndarray, places: np.ndarray) -> np.ndarray:
         """Give the flight that is straight between places at key frames, (m, 3): (n, 3)."""
         every = np.arange(len(self.targets_m))
-        return np.stack([np.interp(every, frames, places[:, axis]) for axis in range(3)], axis=1)
+        return self.as_flown(np.stack([np.interp(every, frames, places[:, axis]) for axis in range(3)], axis=1))
 
     def no_way(self, what: str, floor_m: float) -> NoPathError:
         """Give the error of a planner that finds nothing. floor_m: distance to boxes that it keeps at least."""

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 # How fast the wish goes from one part to the next, relative to the walker; within the drone's 10 m/s.
 APART_MPS, ROUND_MPS, CLIMB_MPS = 4.0, 6.5, 3.5
+OVERSHOOT_M = 3.0  # of a drone that climbs or sinks as fast as it may, until it has turned round
 # Least and greatest speed of a distance and of a height that change all through a part.
 EVEN_APART_MPS, EVEN_CLIMB_MPS = (0.8, 2.0), (1.0, 2.2)
 ROUNDING_S = 1.0  # standard deviation of the smoothing of corners
@@ -80,6 +81,24 @@ def places_of(course: np.ndarray, targets_m: np.ndarray, ground_m: np.ndarray) -
     """Give the places of a course as it is drawn, jumps and all, (n, 3)."""
     away = course[:, 1:2] * np.column_stack([np.cos(course[:, 0]), np.sin(course[:, 0])])
     return np.column_stack([targets_m[:, :2] + away, ground_m + course[:, 2]])
+
+
+def going_on(scenario: Scenario, cfg: PlanConfig) -> Wish:
+    """Give the wish of a flight that is to come from where the drone is (`flown_m`) to where the scenario wishes it,
+    as from one style to the next; altitudes that it comes from are no breach."""
+    paper, num_flown = scenario.wish, len(scenario.flown_m)
+    away = scenario.flown_m[-1] - scenario.targets_m[num_flown - 1]
+    altitude_m = scenario.flown_m[-1, 2] - scenario.ground_m[num_flown - 1]
+    course = np.column_stack([paper.heading_rad + paper.bearing_rad, paper.ground_distance_m, paper.altitude_m])
+    course[:num_flown] = [np.arctan2(away[1], away[0]), np.hypot(*away[:2]), altitude_m]
+    since_s = np.maximum(np.arange(len(course)) - scenario.start, 0) * scenario.dt_s
+    room_m = OVERSHOOT_M - CLIMB_MPS / 2.0 * since_s
+    return replace(
+        without_jumps(course, scenario, cfg),
+        altitude_min_m=np.minimum(paper.altitude_min_m, altitude_m - room_m),
+        altitude_max_m=np.maximum(paper.altitude_max_m, altitude_m + room_m),
+        any_bearing=paper.any_bearing,
+    )
 
 
 def _best_course(

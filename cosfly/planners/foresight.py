@@ -97,6 +97,8 @@ def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
     turned, high = (ANY_BEARING_COST, ANY_BEARING_HIGH_COST) if wish.any_bearing else (BEARING_COST, HIGH_COST)
     aside = np.where(off > 0, FAR_COST, NEAR_COST) * off**2 + high * (STEP_UP_M * rings[:, 1] / distances_m) ** 2
     costs = aside[:, :, None] + turned * np.minimum(turns, 2.0 * np.pi - turns) ** 2
+    if len(scenario.flown_m):  # all places of the first key frame are the one where the drone is
+        places_m[0], costs[0] = scenario.flown_m[-1], 0.0
     max_turn = MAX_TURN_CLIMBING if climbing else MAX_TURN
     return Lattice(frames, places_m, costs, _links(rings), float(radii_m.max()), max_turn)
 
@@ -124,6 +126,7 @@ def _links(rings: np.ndarray) -> np.ndarray:
 WAY_COST = 0.02  # of a metre, where "the walker hidden for one key frame" = 1
 NEIGHBOUR_SHARE = 0.3  # of what is seen a key frame before and after: places that see only just do not last
 SPEED_SHARE = 0.9  # of the limit: smoothing must be able to catch up
+SPEED_SHARE_ON = 0.6  # from where a drone is, which may first have to brake and turn round
 REACH_M = 12.0  # a box farther away than this is not asked after: two places this free have nothing between them
 
 
@@ -148,13 +151,17 @@ def search_flight(
     own = (1.0 - 2.0 * NEIGHBOUR_SHARE) * hidden + NEIGHBOUR_SHARE * (before + after)
     own[~scenario.wish.keeps_sight[frames]] = 0.0
     own += lattice.costs.reshape(own.shape)
-    longest_m = SPEED_SHARE * cfg.speed_max_mps * scenario.dt_s * np.diff(frames, prepend=0)
+    longest_m = _speed_share(scenario) * cfg.speed_max_mps * scenario.dt_s * np.diff(frames, prepend=frames[0])
     chosen = _cheapest(
         places, own, gaps, longest_m, aloft, clearance_m, lattice.links, num_azimuths, lattice.max_turn, WAY_COST
     )
     if chosen[0] < 0:
         return None
     return scenario.between(frames, places[np.arange(len(frames)), chosen])
+
+
+def _speed_share(scenario: Scenario) -> float:
+    return SPEED_SHARE_ON if len(scenario.flown_m) else SPEED_SHARE
 
 
 def boxes_aloft(obstacles: BoxIndex, targets_m: np.ndarray, lattice: Lattice) -> BoxIndex:
@@ -269,10 +276,11 @@ def raw_flight(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> tupl
     Raises:
         NoPathError: no places lead along this walk.
     """
-    wished, step_m = scenario.wish.places_m(scenario.targets_m, scenario.ground_m), cfg.speed_max_mps * scenario.dt_s
+    wished = scenario.as_flown(scenario.wish.places_m(scenario.targets_m, scenario.ground_m))
+    ahead, step_m = slice(scenario.start, None), cfg.speed_max_mps * scenario.dt_s
     safety_m, relaxed_m = cfg.safety_distance_m, cfg.relaxed_safety_m
-    sees_all = bool((~scenario.wish.keeps_sight | (visibility(obstacles, wished, scenario.targets_m) == 1.0)).all())
-    if sees_all and not unsafe(wished, obstacles, safety_m, SPEED_SHARE * step_m).any():
+    seen = ~scenario.wish.keeps_sight | (visibility(obstacles, wished, scenario.targets_m) == 1.0)
+    if seen[ahead].all() and not unsafe(wished[ahead], obstacles, safety_m, _speed_share(scenario) * step_m).any():
         return wished, "wished", safety_m
     for climbing, clearance_m in ((False, safety_m), (True, safety_m), (True, relaxed_m)):
         found = search_flight(scenario, make_lattice(scenario, climbing=climbing), obstacles, cfg, clearance_m)

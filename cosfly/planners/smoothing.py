@@ -31,6 +31,8 @@ MENDS_MAX = 120  # rounds for a flight that breaks limits: between two boxes the
 SIGHT_LOSS = 0.01  # of a waypoint that is no loss: the five rays count in fifths
 ASTRAY_SHARE = 0.3  # of the wished distance: farther from the raw flight is not the flight that was searched
 PULL_STAYS = 1e6  # of a flight that is right: within a centimetre
+PULL_FLOWN = 1e9  # of what is flown already
+SETTLES = 4  # times as long as the drone takes to change to the raw flight's velocity
 AWAY_M = 0.05  # beyond what is asked for, so that rounds end
 ROUNDING_M = 1e-9
 
@@ -46,18 +48,19 @@ def smooth_flight(
         (n, 3), and facts: visibility of the raw flight, rounds, whether a smooth flight was found.
     """
     wish, dt_s = scenario.wish, scenario.dt_s
-    low, high = (scenario.ground_m + bound for bound in (wish.altitude_min_m, wish.altitude_max_m))
+    ahead, settled = slice(scenario.start, None), 0
+    if len(scenario.flown_m):  # braked, and on its way: before it can neither follow the raw flight nor see as much
+        change_m = np.linalg.norm(np.diff(raw[scenario.start - 1 : scenario.start + 2], n=2, axis=0))
+        settled = scenario.start + SETTLES * int(np.ceil(change_m / (cfg.accel_max_mps2 * dt_s**2)))
     seen_raw, astray_m = visibility(obstacles, raw, scenario.targets_m), ASTRAY_SHARE * wish.distance_m
     band, pulls = smoothness_band(len(raw), dt_s), first_pulls(raw, scenario)
     for tried in range(1, ROUNDS_MAX + 1):
-        system = band.copy()
-        system[0] += pulls
-        points = solveh_banded(system, pulls[:, None] * raw, lower=True)
-        points[:, 2] = np.clip(points[:, 2], low, high)
-        blocked = unsafe(points, obstacles, clearance_m, cfg.speed_max_mps * dt_s)
+        points, blocked = _drawn_to(raw, pulls, band, scenario), np.zeros(len(raw), dtype=bool)
+        blocked[ahead] = unsafe(points[ahead], obstacles, clearance_m, cfg.speed_max_mps * dt_s)
         lost = np.maximum(seen_raw - visibility(obstacles, points, scenario.targets_m), 0.0) * wish.keeps_sight
         lost = np.maximum(lost, np.linalg.norm(points - raw, axis=1) > astray_m)
         lost[(lost < SIGHT_LOSS) | (pulls >= PULL_FOR_SIGHT_MAX)] = 0.0
+        lost[:settled] = 0.0
         is_smooth = not blocked.any()
         if is_smooth and (tried >= ROUNDS or not lost.any()):
             break
@@ -73,13 +76,13 @@ def within_limits(points: np.ndarray, scenario: Scenario, obstacles: BoxIndex, c
     Raises:
         NoPathError: none was found near it.
     """
-    low, high = (scenario.ground_m + bound for bound in (scenario.wish.altitude_min_m, scenario.wish.altitude_max_m))
     goal, pulls, band = points.copy(), np.full(len(points), PULL_STAYS), smoothness_band(len(points), scenario.dt_s)
     least_m = cfg.relaxed_safety_m - CLEARANCE_TOLERANCE_M
     for _ in range(MENDS_MAX):
         written = np.round(points, 4)
-        hurried = hurries(written, cfg, scenario.dt_s)
+        hurried = hurries(written, cfg, scenario.dt_s, len(scenario.flown_m))
         gaps_m, shares, boxes = swept_distances(obstacles, written, cfg.relaxed_safety_m + AWAY_M)
+        gaps_m[: scenario.start] = np.inf
         if not (hurried.any() or (gaps_m < least_m).any()):
             return points
         near = np.flatnonzero((gaps_m < cfg.relaxed_safety_m + AWAY_M) & (boxes >= 0))
@@ -89,18 +92,28 @@ def within_limits(points: np.ndarray, scenario: Scenario, obstacles: BoxIndex, c
         for ends in (near, after):
             np.add.at(goal, ends, away)
         pulls = pulls / PULL_RISE ** _spread(hurried, SPREAD_S / scenario.dt_s)
-        system = band.copy()
-        system[0] += pulls
-        points = solveh_banded(system, pulls[:, None] * goal, lower=True)
-        points[:, 2] = np.clip(points[:, 2], low, high)
+        points = _drawn_to(goal, pulls, band, scenario)
     raise scenario.no_way("no flight within the limits of speed and acceleration", cfg.relaxed_safety_m)
 
 
-def hurries(points: np.ndarray, cfg: PlanConfig, dt_s: float) -> np.ndarray:
-    """Tell which waypoints (n, 3) are at an end of a step too fast or of a change of speed too great, (n,) bool."""
+def _drawn_to(goal: np.ndarray, pulls: np.ndarray, band: np.ndarray, scenario: Scenario) -> np.ndarray:
+    """Give the smooth flight, (n, 3), that is drawn to a goal, (n, 3), with pulls (n,), within the wished altitudes."""
+    system, goal = band.copy(), scenario.as_flown(goal)
+    low, high = (scenario.ground_m + bound for bound in (scenario.wish.altitude_min_m, scenario.wish.altitude_max_m))
+    pulls = np.where(np.arange(len(pulls)) < len(scenario.flown_m), PULL_FLOWN, pulls)
+    system[0] += pulls
+    points = solveh_banded(system, pulls[:, None] * goal, lower=True)
+    points[:, 2] = np.clip(points[:, 2], low, high)
+    return scenario.as_flown(points)
+
+
+def hurries(points: np.ndarray, cfg: PlanConfig, dt_s: float, num_flown: int = 0) -> np.ndarray:
+    """Tell which waypoints (n, 3) are at an end of a step too fast or of a change of speed too great, (n,) bool. Those
+    among the first `num_flown` are past."""
     found = np.zeros(len(points), dtype=bool)
     for order, most in ((1, cfg.speed_max_mps), (2, cfg.accel_max_mps2)):
         over = np.linalg.norm(np.diff(points, n=order, axis=0), axis=1) > most * dt_s**order + 1e-9
+        over[: max(num_flown - order, 0)] = False
         for k in range(order + 1):
             found[k : k + len(over)] |= over
     return found

@@ -123,6 +123,27 @@ def plan_flight(
     return replace(follows, instead_of=f"{intent.styles}: {reason}", not_held=not_held)
 
 
+def plan_on(
+    path_id: str, targets_m: np.ndarray, dt_s: float, flown_m: np.ndarray, obstacles: BoxIndex, cfg: PlanConfig
+) -> np.ndarray:
+    """Plan a flight of the style `follow` on from where a drone is, with foresight.
+
+    Args:
+        targets_m: (n, 3) hip points of the whole walk. flown_m: (k, 3), 3 <= k < n, where the drone was at the first.
+    Returns:
+        (n, 3), which begins with `flown_m`; from there on it keeps all limits of the settings.
+    Raises:
+        NoPathError: nothing was found.
+    """
+    from cosfly.planners.courses import follow, going_on
+    from cosfly.planners.foresight import plan
+
+    ground_m = targets_m[:, 2] - TARGET_HEIGHT_M
+    scenario = Scenario(path_id, targets_m, ground_m, follow(targets_m, cfg, dt_s), dt_s, flown_m)
+    scenario = replace(scenario, wish=going_on(scenario, cfg))
+    return plan(scenario, obstacles, cfg, rng_for(0, "plan", path_id)).positions_m
+
+
 def style_rng(walk: Walk, seed: int, attempt: int = 0) -> np.random.Generator:
     """Give the generator of how a flight's styles are flown, by the walk's begin too."""
     x_m, y_m = np.round(walk.positions_m[0, :2], 2) + 0.0
