@@ -7,11 +7,14 @@ differ by one level of colour in 0.5 % of the pixels, and by 5 mm of depth away 
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import functools
 import hashlib
 import multiprocessing
+import os
 import sys
+import weakref
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -416,6 +419,38 @@ def test_another_process_gives_the_same_picture_and_closing_a_renderer_leaves_ot
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         there = pool.apply(_digest_in_process, (renderer_name,))
     assert here == there, "see the tolerance at the top: on one machine and driver it is zero"
+
+
+def _resident_mib() -> float:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def _growth_mib(name: str) -> float:
+    """Of renderers that are dropped, not closed; the first ones load and compile what stays."""
+    resident_mib = []
+    for _ in range(8):
+        _digest(open_renderer(name, street(), *SIZE))
+        resident_mib.append(_resident_mib())
+    return resident_mib[-1] - resident_mib[1]
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="asks Linux for the memory in use")
+def test_a_renderer_that_is_dropped_gives_its_memory_back(renderer_name):
+    opened(renderer_name, street()).close()
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert pool.apply(_growth_mib, (renderer_name,)) < 200.0, "six more, of 80 MiB and more each"
+
+
+def test_a_renderer_may_be_dropped_on_another_thread_in_the_midst_of_a_frame(monkeypatch):
+    kept = opened("gl", street())
+    here = _digest(kept)
+    with concurrent.futures.ThreadPoolExecutor(1) as thread:
+        dropped = [thread.submit(opened, "gl", street()).result()]
+    gone, read = weakref.ref(dropped[0]), kept._read
+    monkeypatch.setattr(kept, "_read", lambda: dropped.clear() or read())
+    assert _digest(kept) == here
+    assert gone() is None
+    kept.close()
 
 
 def _digest(renderer) -> str:
