@@ -2,6 +2,7 @@
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 from commands import invoke
@@ -45,6 +46,36 @@ def test_where_it_erred_the_planner_goes_on_and_what_is_made_is_captioned(town, 
     captions = list(read_captions(tmp_path / "caption/captions.jsonl"))
     assert {max(caption.window) for caption in captions} >= {FRAMES - 1}
     assert all(max(caption.window) < min(caption.future) for caption in captions)
+
+
+def test_redrawn_frames_show_what_the_student_saw(town, tmp_path):  # noqa: F811
+    weather = "--set render.weather_mode=random_per_path --set render.fovs_deg=[40,70]"
+    fly(town, tmp_path / "flown", f"--workers 1 --student track_straight --set fly.most_decisions=20 {weather}")
+    done = relabel(town, tmp_path / "flown", tmp_path / "made", weather)
+    assert done.exit_code == 0, (done.output, done.exception)
+    whole = {
+        flight.source["scenario_id"]: flight for flight in map(read_flight, find_flights(tmp_path / "flown/render"))
+    }
+    flights = [read_flight(folder) for folder in find_flights(tmp_path / "made/render")]
+    assert len(flights) >= 2
+    for flight in flights:
+        name, _, number = flight.source["scenario_id"].rpartition("_f")
+        assert (flight.goal, flight.raw["weather"]) == (whole[name].goal, whole[name].raw["weather"])
+        for k in range(FRAMES):
+            a, b = (one.frame_folder(i) for one, i in ((flight, k), (whole[name], int(number) - FRAMES + 1 + k)))
+            for name_of_file in ("depth_float32.png", "instance.png"):
+                assert (a / name_of_file).read_bytes() == (b / name_of_file).read_bytes()
+            pictures = [cv2.imread(str(folder / "rgb.png")).astype(int) for folder in (a, b)]
+            assert (
+                np.abs(pictures[0] - pictures[1]).mean() < 2.0
+            )  # shadows of a tree are as fine as its flight is short
+
+
+def test_other_pictures_than_the_student_saw_are_refused(town, tmp_path):  # noqa: F811
+    fly(town, tmp_path / "flown", f"{STUDENT} --set fly.most_decisions=4")
+    done = relabel(town, tmp_path / "flown", tmp_path / "made", "--set render.fovs_deg=[60]")
+    assert isinstance(done.exception, ConfigError)
+    assert "render.fovs_deg was [70.0], is [60.0]" in str(done.exception)
 
 
 def test_another_map_than_was_flown_in_is_refused(town, tmp_path):  # noqa: F811

@@ -57,7 +57,7 @@ def fly(
         from cosfly.closed_loop.relabel import run as replan
 
         job.begin(out, map_, simplified, relabel)
-        job.finish(replan(run, relabel, map_, simplified or map_, out, seed=cfg.seed, **job.manner), out)
+        job.finish(replan(run, relabel, map_, simplified or map_, out, **job.manner), out)
         return
     if env is not None:
         if map_ or paths or simplified or others or (policy and student):

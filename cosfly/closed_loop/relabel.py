@@ -23,20 +23,21 @@ from caption.truth.actions import measure, table_of
 from cosfly.closed_loop.measures import LOSS_S
 from cosfly.closed_loop.pilots import Ceiling
 from cosfly.closed_loop.stage import PLAN, TRACES, TREE, FlightsConfig, flown_trace
-from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight
-from cosfly.errors import ConfigError, NoPathError
+from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, as_drawn
+from cosfly.errors import ConfigError, InputError, NoPathError
 from cosfly.geometry import look_at, step_s
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_on
 from cosfly.products.boxes import read_boxes
 from cosfly.products.flight_scores import read_score
 from cosfly.products.pursuits import Pursuit, PursuitFrame, pursuit_file, read_pursuit
-from cosfly.products.traces import ARRAYS, DroneTrace, read_traces, write_traces
+from cosfly.products.traces import ARRAYS, DroneTrace, Excerpt, read_traces, write_traces
 from cosfly.render import stage as rendering
 from cosfly.space.flight_metrics import CLEARANCE_CAP_M
 from cosfly.space.kernels import signed_distances, swept_distances
+from cosfly.work.provenance import read_stage_record
 from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
-from cosfly.work.stage_folder import Resume, StageFolder
+from cosfly.work.stage_folder import Resume, StageFolder, flattened
 
 
 def run(
@@ -46,7 +47,6 @@ def run(
     simplified: Path,
     out: Path,
     *,
-    seed: int = 0,
     workers: int = 1,
     watch: Watch = Watch(),
     resume: Resume = "if-same",
@@ -55,10 +55,11 @@ def run(
     planner does where the student erred. Gives the folder.
 
     Raises:
-        InputError: a file is not what it must be. ConfigError: another planner than foresight. NothingKept: the
-            student erred nowhere.
+        InputError: a file is not what it must be. ConfigError: another planner than foresight, or pictures that
+            are not what the student saw. NothingKept: the student erred nowhere.
     """
     inputs = {"flown": flown, "boxes": boxes, "simplified": simplified}
+    seed = _seed_of(flown, cfg)
     planners = {plan.planner for plan in read_traces(flown / PLAN / TRACES)} | {cfg.plan.planner}
     if planners != {"foresight"}:
         what, where = "foresight alone plans on from where a drone is", f"plan.planner, and {flown / PLAN}"
@@ -77,22 +78,36 @@ def run(
             reasons.update(record.result["reasons"])
         write_traces(stage.path / TRACES, traces, {"round": cfg.fly.relabel.round, "seed": seed})
         stage.finish([stage.path / TRACES], done.tally, reasons=dict(sorted(reasons.items())))
-    drawn = cfg.render.model_copy(update={"tracks": ("clean",)})
     how: dict[str, Any] = {"seed": seed, "workers": workers, "watch": watch, "resume": resume}
-    rendering.run(drawn, boxes, simplified, out / TRACES, out / TREE, **how)
+    rendering.run(as_drawn(cfg.render, seed), boxes, simplified, out / TRACES, out / TREE, **how)
     return out
+
+
+def _seed_of(flown: Path, cfg: FlightsConfig) -> int:
+    """Give the seed of a flown folder, by which clothes and weather were drawn; see that the pictures are the same."""
+    begun, fix = read_stage_record(flown), "give the settings that it was flown with"
+    if begun.stage != "fly":
+        what, expected = "not a folder of flights after a map's walks", "what `cosfly fly --map --paths` wrote"
+        raise InputError(what, where=flown, got=f"stage {begun.stage}", expected=expected)
+    if "others" in begun.inputs:
+        raise InputError("flown among others, whom --relabel does not draw", where=flown, fix="fly without --others")
+    was, now = (flattened(part, "render") for part in (begun.config["render"], cfg.recorded()["render"]))
+    if changed := [f"{key} was {was.get(key)!r}, is {value!r}" for key, value in now.items() if was.get(key) != value]:
+        raise ConfigError("pictures that the student did not see", where=flown, got="; ".join(changed), fix=fix)
+    return begun.seed
 
 
 def make_worker(cfg: FlightsConfig, flown: Path, boxes: Path, simplified: Path, seed: int) -> Work:
     """Open a map in this process, and give the function that judges one window of a student's flight."""
-    plans = {plan.path_id: plan for plan in read_traces(flown / PLAN / TRACES)}
+    plans = {plan.path_id: (n, plan) for n, plan in enumerate(read_traces(flown / PLAN / TRACES))}
     space = Airspace(cfg.render, read_boxes(boxes), read_boxes(simplified), seed=seed)
     table, fly, num = table_of(vocabulary_of(cfg.caption).actions, cfg.caption.label), cfg.fly, cfg.caption.window
 
     def work(item: Item) -> Outcome:
         episode, i = item.payload
         pursuit = read_pursuit(pursuit_file(flown, episode))
-        plan, begin, end = plans[pursuit.walk], i - num.num_frames + 1, i + fly.relabel.future_frames + 1
+        number, plan = plans[pursuit.walk]
+        begin, end = i - num.num_frames + 1, i + fly.relabel.future_frames + 1
         if begin < 0 or end > len(plan.time_s):
             return Outcome(drop_reason="walk_ends")
         own = pursuit.frames[: i + 1]
@@ -106,7 +121,9 @@ def make_worker(cfg: FlightsConfig, flown: Path, boxes: Path, simplified: Path, 
         except NoPathError:
             return Outcome(drop_reason="no_path")
         cut: Any = {name: getattr(planned, name)[begin:end] for name in (*ARRAYS, "clearances_m")}
-        flight = ClosedLoopFlight(space, replace(planned, **cut), num_lead=num.num_frames, drone=fly.drone)
+        part_of = Excerpt(plan.path_id, number, plan.targets_m[: begin + 1])
+        planned = replace(planned, **cut, part_of=part_of)
+        flight = ClosedLoopFlight(space, planned, number=number, num_lead=num.num_frames, drone=fly.drone)
         moments = [*flight.reset()]
         while flight.ended is None:
             moments.append(flight.step(Ceiling.to_next(flight, moments[-1])))
@@ -142,7 +159,7 @@ def make_worker(cfg: FlightsConfig, flown: Path, boxes: Path, simplified: Path, 
             solver,
             pursuit.style.pace,
         )
-        return Outcome({"trace": trace.as_json(), "reasons": reasons})
+        return Outcome({"trace": replace(trace, part_of=part_of).as_json(), "reasons": reasons})
 
     return work
 

@@ -22,7 +22,7 @@ from cosfly.closed_loop.controller import CONTROLLER_FILE, Control, Controller, 
 from cosfly.closed_loop.measures import score_pursuits
 from cosfly.closed_loop.pilots import Outlook, Pilot, PilotAnswer, open_pilot
 from cosfly.closed_loop.settings import FlyConfig
-from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, Moment
+from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, Moment, as_drawn
 from cosfly.errors import ConfigError
 from cosfly.geometry import headings_of, step_s
 from cosfly.planners import stage as planning
@@ -139,8 +139,7 @@ def run(
         plans = planning.run(cfg.plan, simplified, paths, out / PLAN, **how)
         _fly_all(stage, cfg, (boxes, simplified, plans, others), seed, workers, watch)
     if cfg.fly.tree:
-        drawn = cfg.render.model_copy(update={"tracks": ("clean",)})
-        rendering.run(drawn, boxes, simplified, out / TRACES, out / TREE, others=others, **how)
+        rendering.run(as_drawn(cfg.render, seed), boxes, simplified, out / TRACES, out / TREE, others=others, **how)
     return out
 
 

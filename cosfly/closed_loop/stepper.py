@@ -37,6 +37,13 @@ LEAVES_M = 100.0  # beyond the map's bounds
 AREA_M, AREA_STEP_M = 420.0, 200.0  # lit at once, and how far apart the middles of such areas are
 
 
+def as_drawn(cfg: RenderConfig, seed: int) -> RenderConfig:
+    """Give the settings of what a student sees, and of its tree: no weather is drawn that is not the seed's."""
+    return cfg.model_copy(
+        update={"tracks": ("clean",), "weather_seed": cfg.weather_seed if cfg.weather_seed >= 0 else seed}
+    )
+
+
 class Airspace:
     """A map to fly in: what draws it, and what can be hit. One a process, used from one thread."""
 
@@ -47,8 +54,7 @@ class Airspace:
         Args:
             boxes: that are drawn. simplified: that are flown among. num_others: as the renderer takes it.
         """
-        given = {"first_timestamp": cfg.first_timestamp or 0, "weather_seed": max(cfg.weather_seed, 0) or seed}
-        self.cfg, self.seed = cfg.model_copy(update=given), seed
+        self.cfg, self.seed = as_drawn(cfg, seed).model_copy(update={"first_timestamp": cfg.first_timestamp or 0}), seed
         self.renderer, self.pools = renderer_of(cfg, boxes, seed, num_others), read_pools(cfg)
         self.surroundings, self.ground = Surroundings(simplified), simplified.ground
         self.town, self.bounds_m = town_folder(cfg.town or boxes.name), boxes.bounds()

@@ -316,7 +316,7 @@ class Scenario:
 
     targets_m: (n, 3) hip points. ground_m: (n,) height of the ground below each. wish: what the flight should be at
     each. flown_m: (k, 3), where the drone was at the first k waypoints, of a flight that goes on from there; k is 0, or
-    3 and more, and only foresight plans on.
+    3 and more, and only foresight plans on. turns_round: such a drone is first to brake and turn round.
     """
 
     path_id: str
@@ -325,6 +325,7 @@ class Scenario:
     wish: Wish
     dt_s: float = DT_S
     flown_m: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+    turns_round: bool = False
 
     @property
     def start(self) -> int:

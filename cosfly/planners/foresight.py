@@ -126,7 +126,7 @@ def _links(rings: np.ndarray) -> np.ndarray:
 WAY_COST = 0.02  # of a metre, where "the walker hidden for one key frame" = 1
 NEIGHBOUR_SHARE = 0.3  # of what is seen a key frame before and after: places that see only just do not last
 SPEED_SHARE = 0.9  # of the limit: smoothing must be able to catch up
-SPEED_SHARE_ON = 0.6  # from where a drone is, which may first have to brake and turn round
+SPEED_SHARE_TURNING = 0.6  # of a drone that first has to brake and turn round
 REACH_M = 12.0  # a box farther away than this is not asked after: two places this free have nothing between them
 
 
@@ -161,7 +161,7 @@ def search_flight(
 
 
 def _speed_share(scenario: Scenario) -> float:
-    return SPEED_SHARE_ON if len(scenario.flown_m) else SPEED_SHARE
+    return SPEED_SHARE_TURNING if scenario.turns_round else SPEED_SHARE
 
 
 def boxes_aloft(obstacles: BoxIndex, targets_m: np.ndarray, lattice: Lattice) -> BoxIndex:

@@ -49,7 +49,7 @@ def smooth_flight(
     """
     wish, dt_s = scenario.wish, scenario.dt_s
     ahead, settled = slice(scenario.start, None), 0
-    if len(scenario.flown_m):  # braked, and on its way: before it can neither follow the raw flight nor see as much
+    if scenario.turns_round:  # and is on its way: before it can neither follow the raw flight nor see as much
         change_m = np.linalg.norm(np.diff(raw[scenario.start - 1 : scenario.start + 2], n=2, axis=0))
         settled = scenario.start + SETTLES * int(np.ceil(change_m / (cfg.accel_max_mps2 * dt_s**2)))
     seen_raw, astray_m = visibility(obstacles, raw, scenario.targets_m), ASTRAY_SHARE * wish.distance_m

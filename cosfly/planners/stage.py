@@ -141,7 +141,11 @@ def plan_on(
     ground_m = targets_m[:, 2] - TARGET_HEIGHT_M
     scenario = Scenario(path_id, targets_m, ground_m, follow(targets_m, cfg, dt_s), dt_s, flown_m)
     scenario = replace(scenario, wish=going_on(scenario, cfg))
-    return plan(scenario, obstacles, cfg, rng_for(0, "plan", path_id)).positions_m
+    try:
+        return plan(scenario, obstacles, cfg, rng_for(0, "plan", path_id)).positions_m
+    except NoPathError:
+        turning = replace(scenario, turns_round=True)
+        return plan(turning, obstacles, cfg, rng_for(0, "plan", path_id)).positions_m
 
 
 def style_rng(walk: Walk, seed: int, attempt: int = 0) -> np.random.Generator:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.products.columns import column, read_items, rounded, step_field, text_id, write_items
+from cosfly.products.columns import column, matrix, read_items, rounded, step_field, text_id, write_items
 from cosfly.products.segments import Mission, Segment, flown_as_json, read_mission, read_segments
 from cosfly.products.walks import PLAIN_PACE, pace_field, pace_of
 from cosfly.reading.documents import FileFormat
@@ -17,6 +17,29 @@ from cosfly.reading.documents import FileFormat
 TRACE_FORMAT = FileFormat("cosfly.drone_trace", "1.0", "drone traces")
 ARRAYS = ("time_s", "positions_m", "rotations_deg", "targets_m", "visibility")
 MORE = ("metrics", "solver", "drop_reason", "instead_of", "not_held")  # fields of a flight that are taken as they are
+MOST_FLIGHTS = 1_000_000  # of a run that an excerpt is of
+
+
+@dataclass(frozen=True)
+class Excerpt:
+    """Of a flight that is a part of another, the whole one, with whose clothes, stride and weather it is drawn. number:
+    among those of its run; before_m: (m, 3), the tracked points up to the first of the part, m >= 1."""
+
+    path_id: str
+    number: int
+    before_m: np.ndarray
+
+    def as_json(self) -> dict:
+        return {"id": self.path_id, "number": self.number, "before": [rounded(p, 4) for p in self.before_m]}
+
+    @classmethod
+    def from_json(cls, record: Any, where: str) -> Excerpt | None:
+        if record is None:
+            return None
+        if not isinstance(record, dict) or record.get("number") not in range(MOST_FLIGHTS):
+            expected = f"id, a number below {MOST_FLIGHTS} and before"
+            raise InputError("not a part of a flight", where=where, expected=expected)
+        return cls(text_id(record, where), int(record["number"]), matrix(record, "before", 3, where))
 
 
 @dataclass(frozen=True)
@@ -30,7 +53,7 @@ class DroneTrace:
     order that ended the pursuit. instead_of: the style that it should have had and the map did not hold, and why;
     not_held: what was asked and what was flown. On the way home and in a search the camera looks elsewhere.
     drop_reason: why the planner-stage prefilter (sec:step6) rejects the flight, None if it passes; only those are
-    rendered. pace: of the walk.
+    rendered. pace: of the walk. part_of: what it is an excerpt of.
     """
 
     path_id: str
@@ -49,6 +72,11 @@ class DroneTrace:
     instead_of: str | None = None
     not_held: str | None = None
     pace: str = PLAIN_PACE
+    part_of: Excerpt | None = None
+
+    def drawn_as(self, number: int) -> Excerpt:
+        """Give what decides how it looks, of the flight of that number."""
+        return self.part_of or Excerpt(self.path_id, number, self.targets_m[:1])
 
     def every(self, stride: int) -> DroneTrace:
         """Give the flight at every so many of its points; clearances are the least until the next of them."""
@@ -84,6 +112,7 @@ class DroneTrace:
             "drop_reason": self.drop_reason,
             **flown_as_json(self.segments, self.mission),
             **{name: said for name in ("instead_of", "not_held") if (said := getattr(self, name))},
+            **({} if self.part_of is None else {"part_of": self.part_of.as_json()}),
             "metrics": self.metrics,
             "solver": self.solver,
             "t": rounded(self.time_s, 4),
@@ -110,6 +139,7 @@ class DroneTrace:
         mission = read_mission(record.get("mission"), len(time_s), f"{where}.mission")
         more: dict[str, Any] = {name: record[name] for name in MORE if name in record}
         more |= {"segments": segments, "mission": mission, "pace": pace_of(record, where)}
+        more["part_of"] = Excerpt.from_json(record.get("part_of"), f"{where}.part_of")
         name, flown = str(record.get("planner", "")), (groups["drone"][:, :3], groups["drone"][:, 3:], groups["target"])
         return cls(text_id(record, where), name, time_s, *flown, visibility, clearances_m, **more)
 

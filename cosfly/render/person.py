@@ -34,6 +34,10 @@ class Gait:
     phases_rad: np.ndarray
     swings: np.ndarray
 
+    def since(self, first: int) -> Gait:
+        """The same from a frame on."""
+        return Gait(self.headings_rad[first:], self.phases_rad[first:], self.swings[first:])
+
     def posed(self, i: int, hip_m: np.ndarray, clothes: Clothes) -> PosedPerson:
         """The person of frame i, at a hip point, (3,) world."""
         return PosedPerson(

@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from cosfly.errors import ConfigError, InputError
+from cosfly.geometry import step_s
 from cosfly.look.overlay import Overlay
 from cosfly.products.boxes import BoxMap, check_ground, read_boxes
 from cosfly.products.frames import Look
@@ -114,13 +115,17 @@ def script_flight(
     """
     assert cfg.first_timestamp is not None, "`run` settles it"
     trace = planned.every(cfg.frame_stride)
-    shared = rng_for(seed, "render", trace.path_id)
+    looks = planned.drawn_as(number)
+    before_m, step = looks.before_m[:-1], step_s(planned.time_s)
+    before_s = trace.time_s[0] - step * np.arange(len(before_m), 0, -1)
+    walked = gait_of(np.vstack([before_m, trace.targets_m]), np.concatenate([before_s, trace.time_s]))
+    shared = rng_for(seed, "render", looks.path_id)
     fov_deg = float(cfg.fovs_deg[int(shared.integers(len(cfg.fovs_deg)))])
     clothes = choose_clothes(shared)
     drawn_others = [other.every(cfg.frame_stride) for other in others]
-    others_rng = rng_for(seed, "render", f"{trace.path_id}/others")
+    others_rng = rng_for(seed, "render", f"{looks.path_id}/others")
     cast = cast_of(drawn_others, trace.time_s, clothes.looks, others_rng)
-    lens_rng = rng_for(seed, "render", f"{trace.path_id}/zoom")
+    lens_rng = rng_for(seed, "render", f"{looks.path_id}/zoom")
     size_px = cfg.width_px, cfg.height_px
     cameras = cameras_of(size_px, fov_deg, cfg.fovs_deg, cfg.zoom, trace.time_s, trace.segments, lens_rng)
     poses = Poses(trace.positions_m, trace.rotations_deg, trace.targets_m, trace.clearances_m)
@@ -136,7 +141,7 @@ def script_flight(
         cameras=cameras,
         time_s=trace.time_s,
         perturbed=perturbed,
-        gait=gait_of(trace.targets_m, trace.time_s),
+        gait=walked.since(len(before_m)),
         clothes=clothes,
         others=cast,
         look=cfg.look if weather is None else None,
@@ -205,7 +210,9 @@ def run(
     town, first_timestamp = _names(stage, cfg, box_map.name, traces, others, seed)
     cfg = cfg.model_copy(update={"first_timestamp": first_timestamp, "weather_seed": _weather_seed(stage, cfg)})
     apart_m = {number: np.linalg.norm(trace.positions_m - trace.targets_m, axis=1) for number, trace in passed}
-    if hidden := [t.path_id for n, t in passed if fog_hides(weather_of(cfg, pools, n), float(apart_m[n].min()))]:
+    if hidden := [
+        t.path_id for n, t in passed if fog_hides(weather_of(cfg, pools, t.drawn_as(n).number), float(apart_m[n].min()))
+    ]:
         log.warning("render: fog hides the person from end to end of %s: fly nearer, or in other weather", hidden)
     items = [_item(number, trace.every(cfg.frame_stride), track) for number, trace in passed for track in cfg.tracks]
     arguments = (cfg, boxes, simplified, traces, others, out, town, seed, min(workers, len(items)))
@@ -385,7 +392,7 @@ def make_worker(
             check_outside_rim(trace, drawn)
         company = companies.get(trace.path_id)
         others = () if company is None else company.others
-        weather = weather_of(cfg, pools, number)
+        weather = weather_of(cfg, pools, trace.drawn_as(number).number)
         script = script_flight(trace, number, track, town, surroundings, cfg, seed, others, weather)
         folder = out / town / script.trajectory / script.variant
         with atomic_folder(folder) as unfinished:
