@@ -56,11 +56,11 @@ class Place:
             self._made[name] = str(INPUTS[name](self))
         return self._made[name]
 
-    def do(self, name: str, out: Path) -> Path:
+    def do(self, name: str, out: Path, more: str = "") -> Path:
         """Do the first command of a name."""
         first = COMMANDS[name][0]
         assert isinstance(first, str)
-        words = words_of(first, self, out)
+        words = words_of(f"{first} {more}", self, out)
         ended = run(lambda: command(words), out)
         assert ended.code == 0, ended.said
         return out
@@ -105,6 +105,10 @@ def _students(place: Place) -> Path:
 
 def _flown(place: Place) -> Path:
     return place.do("fly", place.root / "flown")
+
+
+def _erred(place: Place) -> Path:
+    return place.do("fly", place.root / "erred", "--student random")
 
 
 def _trained(place: Place) -> Path:
@@ -170,8 +174,8 @@ def _simulator(protocol: str, place: Place) -> int:
 
 INPUTS: dict[str, Callable[[Place], object]] = {
     "base": _base, "students": _students, "trained": _trained, "inferred": _inferred, "evaluated": _evaluated,
-    "flown": _flown, "walk": _walk, "teacher": _teacher, "judge": _judge, "served": _served, "key": _key,
-    "carla": partial(_simulator, "carla"), "unrealcv": partial(_simulator, "unrealcv"),
+    "erred": _erred, "flown": _flown, "walk": _walk, "teacher": _teacher, "judge": _judge, "served": _served,
+    "key": _key, "carla": partial(_simulator, "carla"), "unrealcv": partial(_simulator, "unrealcv"),
 }  # fmt: skip
 
 TRAINING = (
@@ -233,6 +237,10 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "fly": [
         "fly --map {maps} --simplified {simple} --paths {walks} --out {out} {tiny} --set fly.most_decisions=4 "
         "--set fly.lead_frames=5 --set render.tracks=[clean]"
+    ],
+    "fly, relabelled": [
+        "fly --map {maps} --simplified {simple} --relabel {erred} --out {out} {tiny} --set render.tracks=[clean] "
+        "--set fly.relabel.stride=1 --set fly.relabel.future_frames=5"
     ],
     "leaderboard": ["leaderboard {flown} --out {out}"],
     "study weather": ["study weather --map {maps} --traces {traces} --out {out} {tiny}"],
