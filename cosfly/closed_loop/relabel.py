@@ -87,8 +87,7 @@ def _seed_of(flown: Path, cfg: FlightsConfig) -> int:
     """Give the seed of a flown folder, by which clothes and weather were drawn; see that the pictures are the same."""
     begun, fix = read_stage_record(flown), "give the settings that it was flown with"
     if begun.stage != "fly":
-        what, expected = "not a folder of flights after a map's walks", "what `cosfly fly --map --paths` wrote"
-        raise InputError(what, where=flown, got=f"stage {begun.stage}", expected=expected)
+        raise InputError("not what `cosfly fly --map --paths` wrote", where=flown, got=f"stage {begun.stage}")
     if "others" in begun.inputs:
         raise InputError("flown among others, whom --relabel does not draw", where=flown, fix="fly without --others")
     was, now = (flattened(part, "render") for part in (begun.config["render"], cfg.recorded()["render"]))

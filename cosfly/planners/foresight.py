@@ -126,7 +126,6 @@ def _links(rings: np.ndarray) -> np.ndarray:
 WAY_COST = 0.02  # of a metre, where "the walker hidden for one key frame" = 1
 NEIGHBOUR_SHARE = 0.3  # of what is seen a key frame before and after: places that see only just do not last
 SPEED_SHARE = 0.9  # of the limit: smoothing must be able to catch up
-SPEED_SHARE_TURNING = 0.6  # of a drone that first has to brake and turn round
 REACH_M = 12.0  # a box farther away than this is not asked after: two places this free have nothing between them
 
 
@@ -151,17 +150,13 @@ def search_flight(
     own = (1.0 - 2.0 * NEIGHBOUR_SHARE) * hidden + NEIGHBOUR_SHARE * (before + after)
     own[~scenario.wish.keeps_sight[frames]] = 0.0
     own += lattice.costs.reshape(own.shape)
-    longest_m = _speed_share(scenario) * cfg.speed_max_mps * scenario.dt_s * np.diff(frames, prepend=frames[0])
+    longest_m = SPEED_SHARE * cfg.speed_max_mps * scenario.dt_s * np.diff(frames, prepend=frames[0])
     chosen = _cheapest(
         places, own, gaps, longest_m, aloft, clearance_m, lattice.links, num_azimuths, lattice.max_turn, WAY_COST
     )
     if chosen[0] < 0:
         return None
     return scenario.between(frames, places[np.arange(len(frames)), chosen])
-
-
-def _speed_share(scenario: Scenario) -> float:
-    return SPEED_SHARE_TURNING if scenario.turns_round else SPEED_SHARE
 
 
 def boxes_aloft(obstacles: BoxIndex, targets_m: np.ndarray, lattice: Lattice) -> BoxIndex:
@@ -280,7 +275,7 @@ def raw_flight(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> tupl
     ahead, step_m = slice(scenario.start, None), cfg.speed_max_mps * scenario.dt_s
     safety_m, relaxed_m = cfg.safety_distance_m, cfg.relaxed_safety_m
     seen = ~scenario.wish.keeps_sight | (visibility(obstacles, wished, scenario.targets_m) == 1.0)
-    if seen[ahead].all() and not unsafe(wished[ahead], obstacles, safety_m, _speed_share(scenario) * step_m).any():
+    if seen[ahead].all() and not unsafe(wished[ahead], obstacles, safety_m, SPEED_SHARE * step_m).any():
         return wished, "wished", safety_m
     for climbing, clearance_m in ((False, safety_m), (True, safety_m), (True, relaxed_m)):
         found = search_flight(scenario, make_lattice(scenario, climbing=climbing), obstacles, cfg, clearance_m)
