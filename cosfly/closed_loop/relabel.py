@@ -4,7 +4,7 @@ own mistakes led it.
 The planner knows the whole walk: it plans anew from the pose and the velocity that the student had reached, and
 that plan is flown as the ceiling flies (`pilots.Ceiling`). A window is kept where the student's decision is ruled out
 by that motion, or where it was about to lose the person. Each is a short flight: the student's observed frames, then
-the planner's.
+the planner's, with the teacher's captions.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from caption.run import stage as captioning
 from caption.run.own_files import vocabulary_of
 from caption.schema import FutureMotion
 from caption.truth.actions import measure, table_of
@@ -39,6 +40,8 @@ from cosfly.work.provenance import read_stage_record
 from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.work.stage_folder import Resume, StageFolder, flattened
 
+CAPTIONS = "caption"
+
 
 def run(
     cfg: FlightsConfig,
@@ -51,8 +54,8 @@ def run(
     watch: Watch = Watch(),
     resume: Resume = "if-same",
 ) -> Path:
-    """Reads a folder of `cosfly fly` and its map; writes `drone_trace.json` and the playback tree `render/` of what the
-    planner does where the student erred. Gives the folder.
+    """Reads a folder of `cosfly fly` and its map; writes `drone_trace.json`, the playback tree `render/` of what the
+    planner does where the student erred, and the teacher's `caption/` of it. Gives the folder.
 
     Raises:
         InputError: a file is not what it must be. ConfigError: another planner than foresight, or pictures that
@@ -64,7 +67,9 @@ def run(
     if planners != {"foresight"}:
         what, where = "foresight alone plans on from where a drone is", f"plan.planner, and {flown / PLAN}"
         raise ConfigError(what, where=where, got=", ".join(sorted(planners)), fix="fly with plan.planner=foresight")
-    stage = StageFolder.open(out, "relabel", config=cfg, inputs=inputs, seed=seed, resume=resume, begun=(TREE,))
+    stage = StageFolder.open(
+        out, "relabel", config=cfg, inputs=inputs, seed=seed, resume=resume, begun=(TREE, CAPTIONS)
+    )
     if not stage.is_complete:
         items = []
         for episode in sorted(flight.episode for flight in read_score(flown).flights):
@@ -80,6 +85,7 @@ def run(
         stage.finish([stage.path / TRACES], done.tally, reasons=dict(sorted(reasons.items())))
     how: dict[str, Any] = {"seed": seed, "workers": workers, "watch": watch, "resume": resume}
     rendering.run(as_drawn(cfg.render, seed), boxes, simplified, out / TRACES, out / TREE, **how)
+    captioning.run(cfg.caption, out / TREE, out / CAPTIONS, **how)
     return out
 
 
