@@ -7,7 +7,6 @@ table says how well it foretells closed-loop success.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,6 +18,8 @@ from cosfly.closed_loop.measures import (
     MEASURES,
     RESAMPLES,
     SHARES,
+    draws_of,
+    figures_of,
     ratios,
     score_flights,
     walk_sums,
@@ -27,22 +28,24 @@ from cosfly.closed_loop.settings import FLOORS
 from cosfly.errors import InputError
 from cosfly.look.frame_views import thumbnail
 from cosfly.look.page import page
-from cosfly.products.figures import Figure, draw_walks, figure_of_draws, interval_of
-from cosfly.products.flight_scores import FlightScore, Score, read_score
+from cosfly.look.topview import TopView
+from cosfly.products.figures import Figure, figure_of_draws
+from cosfly.products.flight_scores import Score, read_score
 from cosfly.products.flights import find_flights
-from cosfly.products.playback import Flight, read_flight
-from cosfly.products.pursuits import Pursuit, PursuitFrame, pursuit_file, read_pursuit
+from cosfly.products.playback import read_flight
+from cosfly.products.pursuits import Pursuit, pursuit_file, read_pursuit
 from cosfly.reading.documents import FileFormat
 from cosfly.work.chance import rng_for
 from cosfly.work.config import Config
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import sha256_bytes, write_bytes, write_model
 from distill.evaluation.measure import STUDENT, read_report
-from distill.evaluation.pages import COLORS, STYLE, bars
+from distill.evaluation.pages import COLORS, STYLE, Chart, bars, color_of, shown_as
 
 LEAST_CHECKPOINTS = 8  # of fewer nothing is claimed: by chance alone 1 of 12 orders of 4 is one or its reverse
 HEADLINE = ("success", "in_view", "tracked_frames", "kept_s", "lost", "crashed")
-MOST_MAPS, STRIP_FRAMES, STRIP_PX = 6, 8, 200
+FORETOLD = ("success", "in_view")
+MOST_MAPS, MAP_PX, STRIP_FRAMES, STRIP_PX = 6, 320, 8, 200
 BOARD_FORMAT = FileFormat("cosfly.leaderboard", "1.0", "leaderboard")
 
 
@@ -69,11 +72,10 @@ class Standing(_Strict):
 
 
 class Correlation(_Strict):
-    """How the order by open-loop accuracy agrees with that by a closed-loop figure, over `checkpoints`; intervals by
+    """How the order by open-loop accuracy agrees with that by a closed-loop figure, over checkpoints; intervals by
     bootstrap over checkpoints and walks. All None where they are too few, or all alike."""
 
     figure: str
-    checkpoints: int
     spearman: Figure
     kendall: Figure
 
@@ -92,12 +94,7 @@ class Leaderboard(_Strict):
     tables: tuple[StudentTable, ...]
 
 
-@dataclass
-class _Flown:
-    """Folders of one student."""
-
-    folders: list[Path] = field(default_factory=list)
-    scores: list[Score] = field(default_factory=list)
+Flown = dict[Path, Score]  # the folders of one student
 
 
 def run(
@@ -107,18 +104,18 @@ def run(
     is given.
 
     Raises:
-        InputError: two folders of one name hold the same episodes, or nobody is called as an accuracy says.
+        InputError: two folders of one name hold the same episode, or nobody is called as an accuracy says.
     """
     inputs = {f"{number}/{name}": folder for number, (name, folder) in enumerate(folders)}
-    flown: dict[str, _Flown] = {}
+    flown: dict[str, Flown] = {}
     for name, folder in folders:
         score = read_score(folder)
-        one = flown.setdefault(name or score.student, _Flown())
-        if score.episodes_sha256 in {other.episodes_sha256 for other in one.scores}:
-            fix, got = "name them: NAME=DIR", f"{name or score.student}: {folder}"
-            raise InputError("two folders of one name hold the same episodes", got=got, fix=fix)
-        one.folders.append(folder)
-        one.scores.append(score)
+        own = flown.setdefault(name or score.student, {})
+        known = {(flight.town, flight.episode) for other in own.values() for flight in other.flights}
+        if twice := [flight for flight in score.flights if (flight.town, flight.episode) in known]:
+            what, got = "two folders of one name hold the same episode", f"{twice[0].town}, {twice[0].episode}"
+            raise InputError(what, where=f"{name or score.student}: {folder}", got=got, fix="name them: NAME=DIR")
+        own[folder] = score
     if unknown := sorted(cfg.open_loop.keys() - flown.keys()):
         raise InputError("nobody is called so", where="--open-loop", got=unknown[0], expected=", ".join(flown))
     stage = StageFolder.open(out, "leaderboard", config=cfg, inputs=inputs, seed=seed, resume=resume)
@@ -126,7 +123,7 @@ def run(
     if not stage.is_complete:
         board = Leaderboard(tables=tuple(tables_of(flown, cfg, seed)))
         write_model(record, board, BOARD_FORMAT)
-        write_bytes(path, page_of(board, {name: one.folders for name, one in flown.items()}).encode())
+        write_bytes(path, page_of(board, flown).encode())
         stage.finish([record, path], Tally(input=len(folders), kept=len(folders)))
     return path
 
@@ -139,17 +136,18 @@ def open_loop_of(folder: Path) -> float:
     return figure.value
 
 
-def tables_of(flown: Mapping[str, _Flown], cfg: LeaderboardConfig, seed: int) -> list[StudentTable]:
+def tables_of(flown: Mapping[str, Flown], cfg: LeaderboardConfig, seed: int) -> list[StudentTable]:
     """Put those that were to fly the same into one table each, the best first, or rounds in their order."""
     groups: dict[tuple[str, ...], list[Standing]] = {}
-    for name, one in flown.items():
-        flights: list[FlightScore] = [flight for score in one.scores for flight in score.flights]
-        digests, first = tuple(sorted(score.episodes_sha256 for score in one.scores)), one.scores[0]
+    for name, own in flown.items():
+        scores = list(own.values())
+        digests, first = tuple(sorted(score.episodes_sha256 for score in scores)), scores[0]
         role: Any = "floor" if first.engine in FLOORS else "ceiling" if first.engine == "planner" else "student"
-        towns = [score.trained_on for score in one.scores]
+        towns = [score.trained_on for score in scores]
         together = score_flights(
-            flights, first.student, first.engine, sha256_bytes(" ".join(digests).encode()), seed=seed,
-            list_sha256=first.list_sha256 if len(one.scores) == 1 else None,
+            [flight for score in scores for flight in score.flights], first.student, first.engine,
+            sha256_bytes(" ".join(digests).encode()), seed=seed,
+            list_sha256=first.list_sha256 if len(scores) == 1 else None,
             trained_on=None if None in towns else sorted({town for known in towns for town in known or ()}),
         )  # fmt: skip
         group = groups.setdefault(digests, [])
@@ -167,15 +165,9 @@ def tables_of(flown: Mapping[str, _Flown], cfg: LeaderboardConfig, seed: int) ->
 
 def gains(before: Score, after: Score, seed: int) -> dict[str, Figure]:
     """Give by how much figures changed from one to another who flew the same walks."""
-    names = list(MEASURES)
-    (walks, one), (_, other) = (walk_sums(score.flights, names) for score in (before, after))
-    draws = draw_walks(len(walks), RESAMPLES, rng_for(seed, "leaderboard", "gains"))
-    whole = ratios(np.ones((1, len(walks))), other)[0] - ratios(np.ones((1, len(walks))), one)[0]
-    drawn = ratios(draws, other) - ratios(draws, one)
-    return {
-        name: figure_of_draws(float(whole[k]), drawn[:, k], len(walks), len(walks), CONFIDENCE)
-        for k, name in enumerate(names)
-    }
+    (walks, one), (_, other) = (walk_sums(score.flights, list(MEASURES)) for score in (before, after))
+    draws = draws_of(len(walks), rng_for(seed, "leaderboard", "gains"))
+    return figures_of(ratios(draws, other) - ratios(draws, one), [len(walks)] * len(MEASURES), len(walks))
 
 
 def correlations(group: Sequence[Standing], seed: int) -> list[Correlation]:
@@ -185,28 +177,25 @@ def correlations(group: Sequence[Standing], seed: int) -> list[Correlation]:
     known = [one for one in group if one.open_loop is not None]
     if not known:
         return []
-    told, found, names = np.array([one.open_loop for one in known]), [], ("success", "in_view")
-    sums = np.array([walk_sums(one.score.flights, names)[1] for one in known])  # (students, walks, figures, 2)
-    rng, num = rng_for(seed, "leaderboard", "correlation"), len(known)
-    draws = draw_walks(sums.shape[1], RESAMPLES, rng)
-    drawn = np.array([ratios(draws, own) for own in sums])  # (students, draws, figures)
-    whole = np.array([ratios(np.ones((1, sums.shape[1])), own)[0] for own in sums])
-    chosen = rng.integers(num, size=(RESAMPLES, num))
-    for k, name in enumerate(names):
-        figures = []
-        for statistic in (spearmanr, kendalltau):
+    told, num = np.array([one.open_loop for one in known]), len(known)
+    sums = [walk_sums(one.score.flights, FORETOLD)[1] for one in known]
+    rng = rng_for(seed, "leaderboard", "correlation")
+    draws = draws_of(len(sums[0]), rng)
+    found = np.array([ratios(draws, own) for own in sums])  # (students, draws, figures)
+    chosen = np.vstack([np.arange(num), rng.integers(num, size=(RESAMPLES, num))])
 
-            def of(x: np.ndarray, y: np.ndarray, statistic: Any = statistic) -> float:
-                is_told = num >= LEAST_CHECKPOINTS and len(set(x)) > 1 and len(set(y)) > 1
-                return float(statistic(x, y).statistic) if is_told else np.nan
+    def figure(statistic: Any, k: int) -> Figure:
+        values = np.full(len(chosen), np.nan)
+        for draw, c in enumerate(chosen if num >= LEAST_CHECKPOINTS else ()):
+            x, y = told[c], found[c, draw, k]
+            if len(set(x)) > 1 and len(set(y)) > 1:
+                values[draw] = statistic(x, y).statistic
+        return figure_of_draws(float(values[0]), values[1:], num, num, CONFIDENCE)
 
-            value = of(told, whole[:, k])
-            again = [np.nan if np.isnan(value) else of(told[c], drawn[c, d, k]) for d, c in enumerate(chosen)]
-            low, high = interval_of(np.array(again), CONFIDENCE)
-            is_none = bool(np.isnan(value))
-            figures.append(Figure(value=None if is_none else value, low=low, high=high, count=num))
-        found.append(Correlation(figure=name, checkpoints=num, spearman=figures[0], kendall=figures[1]))
-    return found
+    return [
+        Correlation(figure=name, spearman=figure(spearmanr, k), kendall=figure(kendalltau, k))
+        for k, name in enumerate(FORETOLD)
+    ]
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------
@@ -214,124 +203,123 @@ def correlations(group: Sequence[Standing], seed: int) -> list[Correlation]:
 
 def shown(name: str, figure: Figure, *, signed: bool = False) -> str:
     """Give a figure with its interval in words."""
-    if figure.value is None:
-        return "–"
-    form = ("{:+.1%}" if signed else "{:.1%}") if name in SHARES else "{:+.2f}" if signed else "{:.2f}"
-    ends = "" if figure.low is None else f" ({form.format(figure.low)} to {form.format(figure.high)})"
-    return form.format(figure.value) + ends
+    sign, digits = "+" if signed else "", ".1%" if name in SHARES else ".2f"
+    return shown_as(f"{{:{sign}{digits}}}", figure)
 
 
-def page_of(board: Leaderboard, folders: Mapping[str, Sequence[Path]]) -> str:
-    """Give the page. folders: of each student, for its flights; one that has none is shown by its figures alone."""
+Pursuits = dict[tuple[str, str], tuple[Pursuit, Path]]  # by town and episode, and the folder of each
+
+
+def page_of(board: Leaderboard, flown: Mapping[str, Flown]) -> str:
+    """Give the page; a student whose folders have no flights any more is shown by its figures alone."""
     drawn = []
     for table in board.tables:
-        names = [one.name for one in table.standings]
-        pursuits = {name: _pursuits(folders[name]) for name in names}
-        bar = {
-            words: {one.name: one.score.figures[measure] for one in table.standings}
+        standings = table.standings
+        own = {one.name: _pursuits(flown[one.name]) for one in standings}
+        groups = {
+            words: {one.name: one.score.figures[measure] for one in standings}
             for measure, words in (("success", "success"), ("in_view", "person seen"))
         }
-        longest = max((len(p.flown) for own in pursuits.values() for p in own), default=0)
-        curves = [
-            ("Share of flights that show the person, by time, s", {n: _seen(p, longest) for n, p in pursuits.items()}),
-            ("Median distance over ground, m, by time, s", {n: _distance(p, longest) for n, p in pursuits.items()}),
-        ]
-        drawn.append({
-            "table": table, "bars": bars(bar), "curves": [_chart(title, own) for title, own in curves if longest],
-            "maps": _maps(pursuits), "strips": [_strips(one, folders[one.name]) for one in table.standings],
-        })  # fmt: skip
+        charts = [("Success, and frames that show the person", bars(groups))]
+        if any(own.values()):
+            over_time = [_over_time([pursuit for pursuit, _ in one.values()]) for one in own.values()]
+            titles = "Share of flights that show the person, by time, s", "Median distance over ground, m, by time, s"
+            lines = [dict(zip(own, curves, strict=True)) for curves in zip(*over_time, strict=True)]
+            charts += [(title, _curves(line)) for title, line in zip(titles, lines, strict=True)]
+        strips = [strip for one in standings for strip in _strips(one, own[one.name])]
+        drawn.append({"table": table, "charts": charts, "maps": _maps(own), "strips": strips})
     return page(
         "cosfly/closed_loop/leaderboard.html", title="Closed loop", style=STYLE, tables=drawn, measures=MEASURES,
-        headline=HEADLINE, shown=shown, colors=COLORS, least=LEAST_CHECKPOINTS,
+        headline=HEADLINE, shown=shown, colors=COLORS, least=LEAST_CHECKPOINTS, width_px=STRIP_PX,
     )  # fmt: skip
 
 
-def _pursuits(folders: Sequence[Path]) -> list[Pursuit]:
-    scores = [(folder, read_score(folder)) for folder in folders]
-    paths = [pursuit_file(folder, flight.episode) for folder, score in scores for flight in score.flights]
-    return [read_pursuit(path) for path in paths if path.is_file()]
+def _pursuits(own: Flown) -> Pursuits:
+    flights = [(folder, flight) for folder, score in own.items() for flight in score.flights]
+    paths = [(folder, flight, pursuit_file(folder, flight.episode)) for folder, flight in flights]
+    return {(one.town, one.episode): (read_pursuit(path), folder) for folder, one, path in paths if path.is_file()}
 
 
-def _seen(pursuits: Sequence[Pursuit], longest: int) -> list[tuple[float, float]]:
-    """Of walks that go on so long the share whose frame shows the person."""
-    points = []
-    for k in range(longest):
-        on = [p for p in pursuits if p.num_walk_frames > k]
-        if on:
-            points.append(((k + 1) * on[0].dt_s, sum(k < len(p.flown) and p.flown[k].visible for p in on) / len(on)))
-    return points
+Curve = list[tuple[float, float]]
 
 
-def _distance(pursuits: Sequence[Pursuit], longest: int) -> list[tuple[float, float]]:
-    points = []
-    for k in range(longest):
-        if on := [p for p in pursuits if len(p.flown) > k]:
-            points.append(((k + 1) * on[0].dt_s, float(np.median([p.flown[k].distance_m for p in on]))))
-    return points
+def _over_time(pursuits: Sequence[Pursuit]) -> tuple[Curve, Curve]:
+    """Give, of walks that go on so long, the share whose frame shows the person, and of those that are still flown the
+    median distance."""
+    seen, distances, flown = [], [], [(one.num_walk_frames, one.flown) for one in pursuits]
+    for k in range(max((num for num, _ in flown), default=0)):
+        time_s, frames = (k + 1) * pursuits[0].dt_s, [frames[k] for _, frames in flown if k < len(frames)]
+        seen.append((time_s, sum(frame.visible for frame in frames) / sum(num > k for num, _ in flown)))
+        if frames:
+            distances.append((time_s, float(np.median([frame.distance_m for frame in frames]))))
+    return seen, distances
 
 
-def _chart(title: str, lines: Mapping[str, Sequence[tuple[float, float]]]) -> dict[str, Any]:
-    """Give lines on axes that begin at zero, 620 by 220 px."""
-    most = np.array([point for line in lines.values() for point in line]).max(axis=0)
-    digits = 0 if most[1] >= 10 else 2
-    ticks = [
-        (46 + 560 * i / 4, 206 - 190 * i / 4, f"{most[0] * i / 4:.0f}", f"{most[1] * i / 4:.{digits}f}")
-        for i in range(5)
+def _curves(lines: Mapping[str, Curve]) -> Chart:
+    """Give lines on axes that begin at zero, 620 by 226 px; names -> line."""
+    most = np.maximum(np.max([point for line in lines.values() for point in line], axis=0), 1e-9)
+    low, size = np.array([46.0, 206.0]), np.array([560.0, -190.0])
+    axes, texts, digits = [], [], 0 if most[1] >= 10 else 2
+    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+        (x, y), (time_s, value) = (low + share * size).tolist(), share * most
+        axes.append({"x1": 46, "x2": 606, "y1": y, "y2": y, "kind": "axis"})
+        texts.append({"x": 40, "y": y + 4, "words": f"{value:.{digits}f}", "anchor": "end"})
+        texts.append({"x": x, "y": 222, "words": f"{time_s:.0f}", "anchor": "middle"})
+    ways = [
+        _way(name, low + np.array(line) / most * size, color_of(number))
+        for number, (name, line) in enumerate(lines.items())
+        if line
     ]
-    scaled = {n: [(46 + 560 * x / most[0], 206 - 190 * y / max(most[1], 1e-9)) for x, y in p] for n, p in lines.items()}
-    return {"title": title, "ticks": ticks, "lines": {name: _points(line) for name, line in scaled.items()}}
+    places = {"view": "0 0 620 226", "width": 620}
+    return {"names": list(lines), "lines": axes, "rects": [], "texts": texts, "ways": ways, **places}
 
 
-def _points(places: Sequence[tuple[float, float]]) -> str:
-    return " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
-
-
-def _maps(pursuits: Mapping[str, Sequence[Pursuit]]) -> list[dict[str, Any]]:
-    """Draw from above, north up, the walks on which students differ most: the person's way and all flights."""
+def _maps(own: Mapping[str, Pursuits]) -> list[tuple[str, Chart]]:
+    """Draw the walks on which students differ most."""
     of: dict[tuple[str, str], dict[str, Pursuit]] = {}
-    for name, own in pursuits.items():
-        for one in own:
-            of.setdefault((one.town, one.episode), {})[name] = one
-    spread = {key: np.ptp([len(one.flown) for one in own.values()]) for key, own in of.items()}
-    found = []
-    for key in sorted(of, key=lambda key: (-spread[key], key))[:MOST_MAPS]:
-        ways = {name: np.array([frame.pose[:2] for frame in one.frames]) for name, one in of[key].items()}
-        longest = max(of[key].values(), key=lambda one: len(one.frames))
-        walk = np.array([frame.target_m[:2] for frame in longest.frames])
-        low, high = (end(np.concatenate([walk, *ways.values()]), axis=0) for end in (np.min, np.max))
-        scale = 300 / max(float((high - low).max()), 1.0)
-
-        def px(way: np.ndarray, west: Any = low[0], north: Any = high[1], scale: float = scale) -> str:
-            return _points([(10 + (x - west) * scale, 10 + (north - y) * scale) for x, y in way.tolist()])
-
-        size = (high - low) * scale + 20
-        lines = {name: px(way) for name, way in ways.items()}
-        title = f"{key[0]}, {key[1]}; 10 m: "
-        found.append({"title": title, "size": size.tolist(), "walk": px(walk), "lines": lines, "bar": 10 * scale})
-    return found
+    for name, pursuits in own.items():
+        for key, (pursuit, _) in pursuits.items():
+            of.setdefault(key, {})[name] = pursuit
+    spread = {key: np.ptp([len(one.flown) for one in flights.values()]) for key, flights in of.items()}
+    colors = {name: color_of(number) for number, name in enumerate(own)}
+    keys = sorted(of, key=lambda key: (-spread[key], key))[:MOST_MAPS]
+    return [(", ".join(key), _map(of[key], colors)) for key in keys]
 
 
-def _strips(one: Standing, folders: Sequence[Path]) -> dict[str, Any]:
+def _map(flights: Mapping[str, Pursuit], colors: Mapping[str, str]) -> Chart:
+    """Draw flights from above, north up, and the person's way."""
+    longest = max(flights.values(), key=lambda one: len(one.frames))
+    walk = np.array([frame.target_m[:2] for frame in longest.frames])
+    ways = {name: np.array([frame.pose[:2] for frame in one.frames]) for name, one in flights.items()}
+    view = TopView.around(np.concatenate([walk, *ways.values()]), MAP_PX)
+    (width, height), (x, y) = view.size_px, view.pixels(walk[:1])[0].tolist()
+    start = {"x": x - 5, "y": y - 5, "width": 10, "height": 10, "fill": "var(--faint)", "title": "start of the walk"}
+    bar = {"x": 0, "y": height + 14, "width": 10 * view.pixels_per_m, "height": 3, "fill": "var(--soft)", "title": ""}
+    drawn = [_way("the person", view.pixels(walk), "var(--faint)", dashes="5 4")]
+    drawn += [_way(name, view.pixels(way), colors[name]) for name, way in ways.items()]
+    texts = [{"x": 0, "y": height + 10, "words": "10 m", "anchor": "start"}]
+    places = {"view": f"0 0 {width} {height + 18}", "width": width}
+    return {"names": [], "lines": [], "rects": [start, bar], "texts": texts, "ways": drawn, **places}
+
+
+def _way(title: str, places: np.ndarray, stroke: str, dashes: str = "none") -> dict[str, str]:
+    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in places.tolist())
+    return {"title": title, "points": points, "stroke": stroke, "dashes": dashes}
+
+
+def _strips(one: Standing, own: Pursuits) -> list[dict[str, Any]]:
     """Give the best and the worst flight of a student, by how much of the walk shows the person: frames and words."""
-    ranked = sorted(one.score.flights, key=lambda f: (f.sums["in_view"][0] / f.sums["in_view"][1], f.episode))
-    found = []
-    for title, flight in (("best", ranked[-1]), ("worst", ranked[0])):
-        for folder in folders:
-            path = pursuit_file(folder, flight.episode)
-            if path.is_file() and (pursuit := read_pursuit(path)).town == flight.town:
-                places = np.unique(np.linspace(pursuit.num_lead, len(pursuit.frames) - 1, STRIP_FRAMES).astype(int))
-                tree = _flight_of(folder / "render", pursuit)
-                frames = [_frame(pursuit.frames[i], tree, i) for i in places.tolist()]
-                seen = flight.sums["in_view"][0] / flight.sums["in_view"][1]
-                found.append({"title": title, "flight": flight, "seen": seen, "frames": frames})
-                break
-    return {"name": one.name, "flights": found}
-
-
-def _frame(frame: PursuitFrame, tree: Flight | None, i: int) -> tuple[PursuitFrame, str | None]:
-    return frame, None if tree is None else thumbnail(tree.frame_folder(i), STRIP_PX)
-
-
-def _flight_of(tree: Path, pursuit: Pursuit) -> Flight | None:
-    flights = map(read_flight, find_flights(tree)) if tree.is_dir() else iter(())
-    return next((one for one in flights if one.source.get("scenario_id") == pursuit.walk), None)
+    shares = {(f.town, f.episode): f.sums["in_view"][0] / f.sums["in_view"][1] for f in one.score.flights}
+    ranked, found = sorted(shares, key=lambda key: (shares[key], key[1])), []
+    for title, key in (("best", ranked[-1]), ("worst", ranked[0])):
+        if key not in own:
+            continue
+        pursuit, folder = own[key]
+        tree = folder / "render"
+        drawn = (read_flight(path) for path in find_flights(tree)) if tree.is_dir() else ()
+        flight = next((one for one in drawn if one.source.get("scenario_id") == pursuit.walk), None)
+        places = np.unique(np.linspace(pursuit.num_lead, len(pursuit.frames) - 1, STRIP_FRAMES).astype(int)).tolist()
+        frames = [(pursuit.frames[i], flight and thumbnail(flight.frame_folder(i), STRIP_PX)) for i in places]
+        whose = f"{one.name}: {title}: {', '.join(key)}"
+        found.append({"title": whose, "ended": pursuit.ended, "seen": shares[key], "frames": frames})
+    return found

@@ -53,10 +53,7 @@ MEASURES = {
     "no_decision": "decisions that did not come, or were none",
     "decision_s": "time of a decision, s",
 }
-SHARES = {
-    *("success", "in_view", "in_picture", "lost", "reacquired", "in_band", "crashed", "left", "no_decision"),
-}
-MORE_IS_BETTER = {"success", "in_view", "in_picture", "tracked_frames", "kept_s", "reacquired", "in_band"}
+SHARES = {"success", "in_view", "in_picture", "lost", "reacquired", "in_band", "crashed", "left", "no_decision"}
 
 
 def measure(pursuit: Pursuit, trained_on: Iterable[str] | None = None) -> FlightScore:
@@ -189,13 +186,21 @@ def ratios(draws: np.ndarray, sums: np.ndarray) -> np.ndarray:
         return np.where(totals[..., 1] > 0, totals[..., 0] / totals[..., 1], np.nan)
 
 
+def draws_of(num_walks: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw walks, (1 + RESAMPLES, walks) how often each; the first has each once, as they were flown."""
+    return np.vstack([np.ones(num_walks), draw_walks(num_walks, RESAMPLES, rng)])
+
+
+def figures_of(drawn: np.ndarray, counts: Sequence[int], num_walks: int) -> dict[str, Figure]:
+    """Give all figures of their values on `draws_of` walks, (draws, figures); counts: what each is of."""
+    return {
+        name: figure_of_draws(float(drawn[0, k]), drawn[1:, k], counts[k], num_walks, CONFIDENCE)
+        for k, name in enumerate(MEASURES)
+    }
+
+
 def figures_of_flights(flights: Sequence[FlightScore], seed: int = 0) -> dict[str, Figure]:
     """Give all figures of some flights with their intervals, by bootstrap over walks."""
     walks, sums = walk_sums(flights, list(MEASURES))
-    whole = ratios(np.ones((1, len(walks))), sums)[0]
-    drawn = ratios(draw_walks(len(walks), RESAMPLES, rng_for(seed, "score", "draws")), sums)
-    counts = [sum(flight.sums[name][1] > 0 for flight in flights) for name in MEASURES]
-    return {
-        name: figure_of_draws(float(whole[k]), drawn[:, k], counts[k], len(walks), CONFIDENCE)
-        for k, name in enumerate(MEASURES)
-    }
+    drawn = ratios(draws_of(len(walks), rng_for(seed, "score", "draws")), sums)
+    return figures_of(drawn, [sum(flight.sums[name][1] > 0 for flight in flights) for name in MEASURES], len(walks))

@@ -16,7 +16,10 @@ from distill.evaluation.measure import STUDENT, UNPARSED_NAME, Evaluation, Figur
 from distill.evaluation.scores import FIGURES
 
 STYLE = "\n" + read_text(Path(__file__).with_name("pages.css"))
-COLORS = ("#2b6cb0", "#c05621", "#2f855a", "#6b46c1", "#b83280", "#4a5568")
+COLORS = (
+    *("#2b6cb0", "#c05621", "#2f855a", "#6b46c1", "#b83280", "#4a5568"),
+    *("#00a3c4", "#e0a800", "#7cb518", "#e53e3e", "#b794f4", "#8c6d46"),
+)  # fmt: skip
 SHARES = {name for name in FIGURES if not name.startswith(("bertscore", "macro", "tokens"))}
 NOTHING = "-"
 CELL_PX = 58  # of a confusion table
@@ -24,13 +27,23 @@ CELL_PX = 58  # of a confusion table
 
 def shown(name: str, figure: Figure, *, interval: bool = True) -> str:
     """Give a figure in words: its value and, in brackets, its interval."""
+    digits = "{:.2%}" if name in SHARES or name not in FIGURES else "{:.1f}" if name == "tokens" else "{:.4f}"
+    return shown_as(digits, figure, interval=interval)
+
+
+def shown_as(digits: str, figure: Figure, *, interval: bool = True) -> str:
+    """Give a figure in words, its numbers as `digits` has them ("{:.1%}")."""
     if figure.value is None:
         return NOTHING
-    digits = "{:.2%}" if name in SHARES or name not in FIGURES else "{:.1f}" if name == "tokens" else "{:.4f}"
     text = digits.format(figure.value)
     if not interval or figure.low is None or figure.high is None:
         return text
     return f"{text} ({digits.format(figure.low)} to {digits.format(figure.high)})"
+
+
+def color_of(number: int) -> str:
+    """Give the colour of one of several who stand side by side."""
+    return COLORS[number % len(COLORS)]
 
 
 def metric_lines(report: Evaluation) -> list[str]:
@@ -187,7 +200,7 @@ def bars(groups: Mapping[str, Mapping[str, Figure]], low: float = 0.0) -> Chart:
             if figure is None or figure.value is None:
                 continue
             x, top = left + number * width, y(figure.value)
-            title, fill = f"{name}, {label}: {figure.value:.4f} of {figure.count}", COLORS[number % 6]
+            title, fill = f"{name}, {label}: {figure.value:.4f} of {figure.count}", color_of(number)
             rects.append(_shape(x=x, y=top, width=width - 3, height=y(low) - top, fill=fill, title=title))
             if figure.low is not None and figure.high is not None:
                 middle = x + (width - 3) / 2
@@ -229,7 +242,7 @@ def histogram(who: Mapping[str, Sequence[int]]) -> Chart:
             x, height = 46 + (k - first) * width + number * width / kinds, 180 * counts[k] / most
             title = f"{name}, {k / num_bins:.2f} to {(k + 1) / num_bins:.2f}: {counts[k]}"
             size = {"width": max(1.0, width / kinds - 1), "height": height}
-            rects.append(_shape(x=x, y=200 - height, **size, fill=COLORS[number % 6], title=title))
+            rects.append(_shape(x=x, y=200 - height, **size, fill=color_of(number), title=title))
     ticks = range(first, num_bins + 1, max(1, (num_bins - first) // 8))
     places = [(46 + (k - first) * width, f"{k / num_bins:.2f}") for k in ticks]
     texts = [_shape(x=x, y=218, words=words, anchor="middle") for x, words in places]
