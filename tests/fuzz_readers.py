@@ -45,8 +45,9 @@ from cosfly.chat.refusals import kind_of
 from cosfly.chat.student_chat import TAUGHT, read_taught, write_taught
 from cosfly.chat.wire import Response, retry_after_s
 from cosfly.cli.options import resolve
-from cosfly.closed_loop.controller import CONTROLLER_FILE, read_controls
+from cosfly.closed_loop.controller import read_controls
 from cosfly.closed_loop.measures import score_pursuits
+from cosfly.closed_loop.settings import CONTROLLER_FILE
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.review import read_filled
 from cosfly.inspection.settings import InspectConfig

@@ -8,9 +8,9 @@ from specimens_planning import town_of, walk_along
 
 from caption.schema import FutureMotion, LabelConfig
 from caption.truth.actions import Motion, measure, table_of
-from cosfly.closed_loop.controller import CONTROLLER_FILE, Controller, read_controls
+from cosfly.closed_loop.controller import Controller, read_controls
 from cosfly.closed_loop.pilots import PilotAnswer
-from cosfly.closed_loop.settings import DroneConfig
+from cosfly.closed_loop.settings import CONTROLLER_FILE, DroneConfig
 from cosfly.closed_loop.stage import OpenFlight
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight
 from cosfly.errors import ConfigError
@@ -125,7 +125,7 @@ def test_a_command_that_cannot_be_flown_is_the_students_failure_and_the_drone_ho
     under_way = OpenFlight("path_00000", flight, controller, deque([moment]))
     under_way.step(PilotAnswer("ok", command=np.array(command)))
     [frame] = under_way.frames
-    assert (frame["answer"], frame["action"], frame["command"][:4]) == ("invalid", None, (0, 0, 0, 0))
+    assert (frame.answer, frame.action, frame.command[:4]) == ("invalid", None, (0, 0, 0, 0))
     assert under_way.moments[-1].index == moment.index + 1
 
 

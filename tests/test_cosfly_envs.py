@@ -12,9 +12,9 @@ from commands import invoke
 from gymnasium.utils.env_checker import check_env
 
 import cosfly.envs
+from cosfly.closed_loop.policy import MOST_LATE, Policy
 from cosfly.envs.episodes import HELD_OUT, TASKS, TRAINING, episode_of, read_list, world_of
 from cosfly.envs.follow import CRASH_REWARD, FULL_REWARD_M, NO_REWARD_M, reward_of
-from cosfly.envs.policy import MOST_LATE, Policy
 from cosfly.errors import InputError
 from cosfly.products.actions import shipped_actions
 from cosfly.products.pursuits import read_pursuit
@@ -199,7 +199,7 @@ def ask(follow, tmp_path, monkeypatch):
     outlook = SimpleNamespace(flight=follow._flight, moments=[follow._now])
 
     def answers(name, limit_s=0.4):
-        policy = Policy(f"own:{name}", limit_s, 0, lambda episode: "the man")
+        policy = Policy(f"own:{name}", limit_s, 0)
         try:
             names = ["a", "a", "a", "a", "b"]
             return [policy.decide([SimpleNamespace(**vars(outlook), episode=one)])[0] for one in names]

@@ -27,7 +27,7 @@ def fly(
         str | None, Option(help="A benchmark's list of episodes in place of map and walks: cosfly/Follow-v0.")
     ] = None,
     policy: Annotated[
-        str | None, Option(metavar="MODULE:CLASS", help="Of yours, with --env: runs its code; in place of --student.")
+        str | None, Option(metavar="MODULE:CLASS", help="Of yours, in place of --student: runs its code.")
     ] = None,
     student: Annotated[str | None, Option(show_default="rules", help=STUDENT), Sets("fly.student")] = None,
     as_student: Annotated[
@@ -47,10 +47,11 @@ def fly(
     """A student flies: its decisions move the drone, and what it then sees is drawn. Records of all, and their tree."""
     from cosfly.closed_loop import stage
 
+    if policy and student:
+        raise typer.BadParameter("either --policy or --student flies")
     cfg = job.cfg
-    run = stage.FlightsConfig(
-        fly=cfg.fly, plan=cfg.plan, render=cfg.render, caption=cfg.caption, infer=cfg.distill.infer
-    )
+    flown = cfg.fly.model_copy(update={"student": f"policy:{policy}"}) if policy else cfg.fly
+    run = stage.FlightsConfig(fly=flown, plan=cfg.plan, render=cfg.render, caption=cfg.caption, infer=cfg.distill.infer)
     if relabel is not None:
         if map_ is None or paths or env or policy or student:
             raise typer.BadParameter("--relabel takes --map, and who flew where stands in its folder")
@@ -60,16 +61,15 @@ def fly(
         job.finish(replan(run, relabel, map_, simplified or map_, out, **job.manner), out)
         return
     if env is not None:
-        if map_ or paths or simplified or others or (policy and student):
-            raise typer.BadParameter("--env has its own maps and walks, and either --policy or --student flies")
+        if map_ or paths or simplified or others:
+            raise typer.BadParameter("--env has its own maps and walks")
         from cosfly.envs import listed
 
         job.begin(out)
-        listing = listed.ListConfig(flights=run, env=env, policy=policy)
-        job.finish(listed.run(listing, out, seed=cfg.seed, **job.manner), out)
+        job.finish(listed.run(listed.ListConfig(**dict(run), env=env), out, seed=cfg.seed, **job.manner), out)
         return
-    if map_ is None or paths is None or policy:
-        raise typer.BadParameter("--map and --paths are needed, or --env, which --policy needs too")
+    if map_ is None or paths is None:
+        raise typer.BadParameter("--map and --paths are needed, or --env")
     job.begin(out, map_, simplified, paths, others)
     job.finish(stage.run(run, map_, simplified or map_, paths, out, seed=cfg.seed, others=others, **job.manner), out)
 

@@ -22,7 +22,6 @@ from cosfly.products.walks import TARGET_HEIGHT_M
 from cosfly.reading.documents import FileFormat
 from cosfly.work.config import Config, build, read_yaml
 
-CONTROLLER_FILE = Path(__file__).with_name("controller.yaml")
 CONTROLLER_FORMAT = FileFormat("cosfly.controller", "1.0", "controller")
 AIM_MOST_M = 100.0  # a camera that looks at the horizon has no place ahead
 

@@ -86,8 +86,12 @@ def open_pilot(cfg: FlyConfig, caption: CaptionConfig, infer: InferConfig, seed:
         return Ceiling()
     if cfg.student in FLOORS:
         return Floor(cfg.student, actions, seed)
-    if cfg.student.startswith("transformers:"):
+    if cfg.engine == "transformers":
         return LocalPilot(cfg, caption, infer, seed, answers)
+    if cfg.engine == "policy":
+        from cosfly.closed_loop.policy import Policy
+
+        return Policy(cfg.student.partition(":")[2], cfg.answer_limit_s, seed)
     return AskedPilot(cfg, caption, seed, answers)
 
 

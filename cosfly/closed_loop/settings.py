@@ -61,19 +61,20 @@ class RelabelConfig(Config):
     round: int = Field(1, ge=1, description="of DAgger; told in what is made")
 
 
+CONTROLLER_FILE = Path(__file__).with_name("controller.yaml")
 FLOORS = ("track_straight", "random")
-ENGINES = ("rules", "endpoint", "vllm", "transformers", *FLOORS, "planner")
-KINDS = "there are rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR, track_straight, random and planner"
+MODELS = ("endpoint", "vllm", "transformers")
+ENGINES = ("rules", *MODELS, "policy", *FLOORS, "planner")
+KINDS = (
+    "rules, a URL, vllm:MODEL_DIR, transformers:MODEL_DIR or policy:MODULE:CLASS; the floors track_straight and "
+    "random; the ceiling planner, which flies its plan"
+)
 
 
 class FlyConfig(Config):
     """`cosfly fly`: who flies, and how."""
 
-    student: str = Field(
-        "rules",
-        description="who decides: rules, a URL, vllm:MODEL_DIR or transformers:MODEL_DIR; the floors track_straight "
-        "and random; the ceiling planner, which flies its plan",
-    )
+    student: str = Field("rules", description=f"who decides: {KINDS}")
     as_student: Path | None = Field(
         None, description="what `distill train` or `merge` wrote: a model behind a URL is asked as it was taught"
     )
@@ -112,17 +113,27 @@ class FlyConfig(Config):
     @property
     def asks_model(self) -> bool:
         """Whether an engine decides: one process flies all, so that there is one engine and one batch."""
-        return self.student not in ("rules", "planner", *FLOORS)
+        return self.engine in MODELS
+
+    @property
+    def flock(self) -> int:
+        """Flights that a worker flies at once: of a policy one, as it remembers what it has seen."""
+        return 1 if self.engine == "policy" else self.side_by_side
+
+    @property
+    def table(self) -> Path:
+        """The file that says what each decision is flown as."""
+        return self.controller or CONTROLLER_FILE
 
     @model_validator(mode="after")
     def _is_known(self) -> Self:
         if self.engine not in ENGINES:
-            raise ValueError(f"there is no student {self.student!r}{nearest(self.student, ENGINES)}; {KINDS}")
+            raise ValueError(f"there is no student {self.student!r}{nearest(self.student, ENGINES)}; there are {KINDS}")
         if self.adapter is not None and self.engine != "transformers":
             raise ValueError(f"an adapter is read by transformers:MODEL_DIR alone, got student {self.student!r}")
         return self
 
     def recorded(self) -> dict[str, Any]:
-        """Where a student is asked does not decide what it says; a table of one's own counts by its content."""
+        """Where a model is asked does not decide what it says; a table of one's own counts by its content."""
         own = {name: "own" if getattr(self, name) else None for name in ("controller", "as_student", "adapter")}
-        return super().recorded() | {"student": self.engine} | own
+        return super().recorded() | {"student": self.engine if self.asks_model else self.student} | own

@@ -8,19 +8,20 @@ from __future__ import annotations
 
 import logging
 import os
-import time
 from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from caption.run.own_files import vocabulary_of
 from caption.schema import CaptionConfig
-from cosfly.closed_loop.controller import CONTROLLER_FILE, Control, Controller, read_controls
+from cosfly.closed_loop.controller import Control, Controller, read_controls
 from cosfly.closed_loop.measures import score_pursuits
-from cosfly.closed_loop.pilots import Outlook, Pilot, PilotAnswer, open_pilot
+from cosfly.closed_loop.pilots import Outlook, PilotAnswer, open_pilot
 from cosfly.closed_loop.settings import FlyConfig
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, Moment, as_drawn
 from cosfly.errors import ConfigError
@@ -31,7 +32,7 @@ from cosfly.products.boxes import read_boxes
 from cosfly.products.flight_scores import SCORE, SCORE_FORMAT
 from cosfly.products.motion import PlannedMotion
 from cosfly.products.pursuits import Pursuit, PursuitFrame, WalkStyle, pursuit_file, read_pursuit, write_pursuit
-from cosfly.products.traces import ARRAYS, DroneTrace, read_traces, write_traces
+from cosfly.products.traces import DroneTrace, read_traces, write_traces
 from cosfly.reading.files import sha256_file
 from cosfly.render import stage as rendering
 from cosfly.render.settings import RenderConfig
@@ -39,7 +40,7 @@ from cosfly.space.flight_metrics import flight_metrics
 from cosfly.space.kernels import BoxIndex, obstacle_index, visibility
 from cosfly.work.config import Config
 from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
-from cosfly.work.stage_folder import Kept, Resume, StageFolder, Tally
+from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import write_model
 from distill.inference.stage import InferConfig
 
@@ -61,27 +62,38 @@ class FlightsConfig(Config):
 
 @dataclass
 class OpenFlight:
-    """A flight under way: the moments that its student may look at, and all frames' records, but for clearances."""
+    """A flight under way: the moments that its student may look at, and the records of all frames but the last."""
 
     episode: str
     flight: ClosedLoopFlight
     controller: Controller
     moments: deque[Moment]
-    frames: list[dict] = field(default_factory=list)
+    frames: list[PursuitFrame] = field(default_factory=list)
 
-    def note(self, moment: Moment, decision: PilotAnswer, command: np.ndarray | None) -> None:
+    @classmethod
+    def begin(cls, episode: str, flight: ClosedLoopFlight, controls: dict[str, Control], num_frames: int) -> Self:
+        """Begin an episode with what nobody is asked about."""
+        plan, lead = flight.planned, flight.reset()
+        begun = cls(episode, flight, Controller(controls, flight.drone, lead[-1]), deque(lead, num_frames))
+        poses = np.hstack([plan.positions_m, plan.rotations_deg])
+        between = np.empty((len(poses), 0, 6))
+        flown = PlannedMotion(plan.time_s, poses, between, plan.rotations_deg[:, 1], plan.positions_m).action
+        for moment, command in zip(lead[:-1], flown, strict=False):
+            begun.note(moment, PilotAnswer("lead"), command, float(plan.clearances_m[moment.index]))
+        return begun
+
+    def note(self, moment: Moment, decision: PilotAnswer, command: np.ndarray | None, clearance_m: float) -> None:
         target = moment.target
-        self.frames.append({
-            "time_s": moment.time_s, "answer": decision.answer, "action": decision.action, "words": decision.words,
-            "answer_s": None if decision.answer_s is None else round(decision.answer_s, 4),
-            "command": None if command is None else tuple(np.round(command, 4).tolist()),
-            "in_view": target.in_view, "visible": target.visible, "visibility": target.visibility,
-            "num_pixels": target.num_pixels, "distance_m": round(moment.distance_m, 4),
-            "height_m": round(moment.height_m, 4),
-            "speed_mps": round(float(np.linalg.norm(moment.velocity_mps)), 4),
-            "pose": tuple(np.round([*moment.position_m, *moment.rotation_deg], 4).tolist()),
-            "target_m": tuple(np.round(moment.target_m, 4).tolist()),
-        })  # fmt: skip
+        self.frames.append(PursuitFrame(
+            time_s=moment.time_s, answer=decision.answer, action=decision.action, words=decision.words,
+            answer_s=None if decision.answer_s is None else round(decision.answer_s, 4),
+            command=None if command is None else tuple(np.round(command, 4).tolist()),
+            in_view=target.in_view, visible=target.visible, visibility=target.visibility,
+            num_pixels=target.num_pixels, distance_m=round(moment.distance_m, 4), height_m=round(moment.height_m, 4),
+            clearance_m=round(clearance_m, 4), speed_mps=round(float(np.linalg.norm(moment.velocity_mps)), 4),
+            pose=tuple(np.round([*moment.position_m, *moment.rotation_deg], 4).tolist()),
+            target_m=tuple(np.round(moment.target_m, 4).tolist()),
+        ))  # fmt: skip
 
     def step(self, decision: PilotAnswer) -> None:
         """Fly what was decided; what cannot be flown is the student's failure, and the drone hovers."""
@@ -90,10 +102,51 @@ class OpenFlight:
             decision, command = replace(decision, answer="invalid", action=None, command=None), None
         if command is None:
             command = self.controller.command(decision.action if decision.answer == "ok" else None, now)
-        self.note(now, decision, command)
-        self.moments.append(self.flight.step(command))
-        if self.flight.ended is not None:
-            self.note(self.moments[-1], PilotAnswer("end"), None)
+        seen = self.flight.step(command)
+        self.note(now, decision, command, seen.clearance_m)
+        self.moments.append(seen)
+
+    def record(self, about: dict[str, Any]) -> Pursuit:
+        """End it; gives its record. about: what those of all flights say alike."""
+        flight, plan, last = self.flight, self.flight.planned, self.moments[-1]
+        self.note(last, PilotAnswer("end"), None, last.clearance_m)
+        return Pursuit(
+            **about, episode=self.episode, town=flight.airspace.town, walk=plan.path_id,
+            style=style_of(plan, flight.num_lead - 1, flight.airspace.surroundings.obstacles), dt_s=flight.dt_s,
+            camera_px=(flight.camera.width_px, flight.camera.height_px), fov_deg=flight.camera.fov_deg,
+            drone_radius_m=flight.drone.radius_m, ended=flight.ended, frames=tuple(self.frames),
+            num_walk_frames=len(plan.time_s) - flight.num_lead,
+        )  # fmt: skip
+
+
+class Fleet:
+    """The student of this process, which flies several flights side by side. Made before a renderer is opened."""
+
+    def __init__(
+        self, cfg: FlightsConfig, out: Path, seed: int, num_workers: int, list_sha256: str | None = None
+    ) -> None:
+        os.environ.setdefault("LP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // num_workers)))
+        self.out, self.student = out, open_pilot(cfg.fly, cfg.caption, cfg.infer, seed, out / ANSWERS)
+        self.controls = read_controls(cfg.fly.table, vocabulary_of(cfg.caption).actions.tokens)
+        self.about = {
+            "student": self.student.name, "engine": cfg.fly.engine, "seed": seed, "list_sha256": list_sha256,
+            "controller_sha256": None if cfg.fly.engine == "planner" else sha256_file(cfg.fly.table),
+        }  # fmt: skip
+
+    def fly(self, episodes: Mapping[str, Callable[[], ClosedLoopFlight]], map_sha256: str) -> Outcome:
+        """Fly episodes to their ends, and write the record of each as it ends; those of before a kill stay."""
+        waiting = {name: opened for name, opened in episodes.items() if not pursuit_file(self.out, name).exists()}
+        how = self.controls, self.student.num_frames
+        flights = [OpenFlight.begin(name, opened(), *how) for name, opened in waiting.items()]
+        while flights:
+            outlooks = [Outlook(one.episode, one.flight, tuple(one.moments)) for one in flights]
+            for one, decision in zip(flights, self.student.decide(outlooks), strict=True):
+                one.step(decision)
+                advance()
+            for one in [one for one in flights if one.flight.ended is not None]:
+                write_pursuit(pursuit_file(self.out, one.episode), one.record(self.about | {"map_sha256": map_sha256}))
+                flights.remove(one)
+        return Outcome({"flights": list(episodes)})
 
 
 def run(
@@ -120,21 +173,11 @@ def run(
     if cfg.render.effects.is_on or cfg.render.frame_stride != 1:
         what, got = "a camera that cannot be flown with", "render.effects, or render.frame_stride beyond 1"
         raise ConfigError(what, where="render", got=got, fix="leave them out: frames are drawn plain, each pose")
-    table = cfg.fly.controller or CONTROLLER_FILE
-    read_controls(table, vocabulary_of(cfg.caption).actions.tokens)
+    read_controls(cfg.fly.table, vocabulary_of(cfg.caption).actions.tokens)
     how: dict[str, Any] = {"seed": seed, "workers": workers, "watch": watch, "resume": resume}
     inputs = {"boxes": boxes, "simplified": simplified, "paths": paths} | ({"others": others} if others else {})
-    begun = (PLAN, TREE)
-    stage = StageFolder.open(
-        out,
-        "fly",
-        config=cfg,
-        inputs=inputs,
-        seed=seed,
-        resume=resume,
-        package_files={"controller": table},
-        begun=begun,
-    )
+    more: dict[str, Any] = {"package_files": {"controller": cfg.fly.table}, "begun": (PLAN, TREE)}
+    stage = StageFolder.open(out, "fly", config=cfg, inputs=inputs, seed=seed, resume=resume, **more)
     if not stage.is_complete:
         plans = planning.run(cfg.plan, simplified, paths, out / PLAN, **how)
         _fly_all(stage, cfg, (boxes, simplified, plans, others), seed, workers, watch)
@@ -147,50 +190,50 @@ Inputs = tuple[Path, Path, Path, Path | None]
 
 
 def _fly_all(stage: StageFolder, cfg: FlightsConfig, inputs: Inputs, seed: int, workers: int, watch: Watch) -> None:
-    traces = read_traces(inputs[2])
-    numbers = [
-        n for n, trace in enumerate(traces) if trace.drop_reason is None and len(trace.time_s) > cfg.fly.lead_frames
-    ]
-    left_out = [trace for n, trace in enumerate(traces) if n not in numbers]
-    dropped = Counter(trace.drop_reason or "too_short" for trace in left_out)
+    traces, num = read_traces(inputs[2]), 1 if cfg.fly.asks_model else workers
+    why_not = [trace.drop_reason or (len(trace.time_s) <= cfg.fly.lead_frames and "too_short") for trace in traces]
+    numbers, dropped = [n for n, why in enumerate(why_not) if not why], Counter(why for why in why_not if why)
     if not numbers:
         expected = f"a plan of more than fly.lead_frames={cfg.fly.lead_frames} frames that is not dropped"
         raise stage.nothing_kept(Tally(input=len(traces), dropped=dropped), expected=expected)
-    lit = {n: Airspace.area_of(traces[n].targets_m) for n in numbers}
-    num = 1 if cfg.fly.asks_model else workers
-    ordered, most = sorted(numbers, key=lambda n: (lit[n], n)), min(cfg.fly.side_by_side, -(-len(numbers) // num))
-    flocks = [ordered[k : k + most] for k in range(0, len(ordered), most)]
-    steps = [sum(len(_cut(traces[n], cfg.fly).time_s) - cfg.fly.lead_frames for n in flock) for flock in flocks]
-    items = [Item(f"{traces[f[0]].path_id} and {len(f) - 1}", f, steps[k]) for k, f in enumerate(flocks)]
-    begun_s = time.monotonic()
-    done = run_items(stage, items, make_worker, (cfg, *inputs, stage.path, seed, num), workers=num, watch=watch)
-    seconds = time.monotonic() - begun_s
-    flown = [
-        n for item, record in zip(items, done.records, strict=True) if isinstance(record, Kept) for n in item.payload
-    ]
-    files = [pursuit_file(stage.path, traces[n].path_id) for n in sorted(flown)]
-    obstacles, facts = obstacle_index(read_boxes(inputs[1])), Counter[str]()
-    written = []
-    for path in files:
-        pursuit = read_pursuit(path)
-        written.append(trace_of(pursuit, obstacles))
-        facts.update({pursuit.ended: 1, "frames": pursuit.num_walk_frames, "decisions": len(pursuit.decisions)})
-        facts["in_view"] += sum(frame.in_view for frame in pursuit.flown)
-        facts["seen"] += sum(frame.visible for frame in pursuit.flown)
-    lost = Counter({"flights": len(numbers) - len(flown)} if len(flown) < len(numbers) else {})
-    tally = Tally(input=len(traces), kept=len(flown), dropped=dropped, failed=lost)
+    ordered = sorted(numbers, key=lambda n: (Airspace.area_of(traces[n].targets_m), n))
+    items, most = [], min(cfg.fly.flock, -(-len(numbers) // num))
+    for flock in [ordered[k : k + most] for k in range(0, len(ordered), most)]:
+        steps = sum(len(_cut(traces[n], cfg.fly).time_s) - cfg.fly.lead_frames for n in flock)
+        items.append(Item(f"{traces[flock[0]].path_id} and {len(flock) - 1}", flock, steps))
+    run_items(stage, items, make_worker, (cfg, *inputs, stage.path, seed, num), workers=num, watch=watch)
+    obstacles = obstacle_index(read_boxes(inputs[1]))
+    finish_flights(stage, cfg.fly, seed, [traces[n].path_id for n in numbers], dropped, obstacles)
+
+
+def finish_flights(
+    stage: StageFolder,
+    fly: FlyConfig,
+    seed: int,
+    episodes: Sequence[str],
+    dropped: Counter[str] | None = None,
+    obstacles: BoxIndex | None = None,
+) -> None:
+    """Write the score of the episodes that were flown and, of one map, `drone_trace.json`; and end the stage."""
+    files = [path for name in episodes if (path := pursuit_file(stage.path, name)).exists()]
+    dropped, failed = dropped or Counter(), +Counter({"flights": len(episodes) - len(files)})
+    tally = Tally(input=len(episodes) + dropped.total(), kept=len(files), dropped=dropped, failed=failed)
     if not files:
         raise stage.nothing_kept(tally)
-    write_traces(stage.path / TRACES, written, {"student": cfg.fly.student, "seed": seed})
-    score = score_pursuits(map(read_pursuit, files), trained_on=cfg.fly.trained_on, seed=seed)
+    outputs = [*files, stage.path / SCORE]
+    if obstacles is not None:
+        flown = [trace_of(read_pursuit(path), obstacles) for path in files]
+        write_traces(stage.path / TRACES, flown, {"student": fly.student, "seed": seed})
+        outputs.append(stage.path / TRACES)
+    score = score_pursuits(map(read_pursuit, files), trained_on=fly.trained_on, seed=seed)
     write_model(stage.path / SCORE, score, SCORE_FORMAT)
-    files.append(stage.path / SCORE)
-    stage.finish([stage.path / TRACES, *files], tally, flown=dict(sorted(facts.items())))
+    ended = Counter[str](flight.ended for flight in score.flights)
+    decisions = sum(sum(flight.answers.values()) for flight in score.flights)
+    stage.finish(outputs, tally, flown=dict(sorted(ended.items())) | {"decisions": decisions})
     log.info(
-        "fly: %s: the person in view in %.1f %%, seen in %.1f %% of %d frames; %s; %.1f decisions/s",
-        cfg.fly.student, 100 * facts["in_view"] / facts["frames"], 100 * facts["seen"] / facts["frames"],
-        facts["frames"], ", ".join(f"{facts[how]} {how}" for how in ("finished", "crashed", "lost", "left")),
-        facts["decisions"] / max(seconds, 1e-9),
+        "fly: %s: the person in view in %.1f %%, seen in %.1f %% of the walks; %s; %d decisions",
+        fly.student, *(100 * (score.figures[name].value or 0.0) for name in ("in_picture", "in_view")),
+        ", ".join(f"{count} {how}" for how, count in sorted(ended.items())), decisions,
     )  # fmt: skip
 
 
@@ -198,77 +241,24 @@ def make_worker(
     cfg: FlightsConfig, boxes: Path, simplified: Path, plans: Path, others: Path | None, out: Path, seed: int, num: int
 ) -> Work:
     """Open a renderer and a student in this process, and give the function that flies some flights side by side."""
-    os.environ.setdefault("LP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // num)))
-    traces = read_traces(plans)
+    fleet, traces = Fleet(cfg, out, seed, num), read_traces(plans)
     companies = rendering.companies_of(others, traces)
     num_others = rendering.num_others_of(companies)
     space = Airspace(cfg.render, read_boxes(boxes), read_boxes(simplified), seed=seed, num_others=num_others)
-    student = open_pilot(cfg.fly, cfg.caption, cfg.infer, seed, out / ANSWERS)
-    table = cfg.fly.controller or CONTROLLER_FILE
-    controls = read_controls(table, vocabulary_of(cfg.caption).actions.tokens)
-    about = {
-        "student": student.name, "engine": cfg.fly.engine, "town": space.town, "map_sha256": sha256_file(boxes),
-        "seed": seed, "controller_sha256": None if cfg.fly.engine == "planner" else sha256_file(table),
-    }  # fmt: skip
-
     bounds: dict[str, Any] = {"num_lead": cfg.fly.lead_frames, "drone": cfg.fly.drone, "lost_s": cfg.fly.lost_s}
+    map_sha256 = sha256_file(boxes)
 
-    def work(item: Item) -> Outcome:
-        flights = list[OpenFlight]()
-        for n in item.payload:
-            if not pursuit_file(out, traces[n].path_id).exists():  # else of before a kill
-                company, plan = companies.get(traces[n].path_id), _cut(traces[n], cfg.fly)
-                others = () if company is None else company.others
-                flight = ClosedLoopFlight(space, plan, number=n, **bounds, others=others)
-                flights.append(begin_flight(flight, controls, student.num_frames, plan.path_id))
-        fly_side_by_side(flights, student, out, about)
-        return Outcome({"flights": [traces[n].path_id for n in item.payload]})
+    def opened(n: int) -> ClosedLoopFlight:
+        company = companies.get(traces[n].path_id)
+        around = () if company is None else company.others
+        return ClosedLoopFlight(space, _cut(traces[n], cfg.fly), number=n, **bounds, others=around)
 
-    return work
-
-
-def fly_side_by_side(flights: list[OpenFlight], student: Pilot, out: Path, about: dict[str, Any]) -> None:
-    """Fly flights to their ends, and write the record of each as it ends. about: what their records say alike."""
-    while flights:
-        outlooks = [Outlook(one.episode, one.flight, tuple(one.moments)) for one in flights]
-        for one, decision in zip(flights, student.decide(outlooks), strict=True):
-            one.step(decision)
-            advance()
-        for one in [one for one in flights if one.flight.ended is not None]:
-            write_pursuit(pursuit_file(out, one.episode), _record(one, about))
-            flights.remove(one)
+    return lambda item: fleet.fly({traces[n].path_id: partial(opened, n) for n in item.payload}, map_sha256)
 
 
 def _cut(trace: DroneTrace, cfg: FlyConfig) -> DroneTrace:
     """Give a plan as far as it is flown."""
-    end = cfg.lead_frames + cfg.most_decisions if cfg.most_decisions else len(trace.time_s)
-    return replace(trace, **{name: getattr(trace, name)[:end] for name in (*ARRAYS, "clearances_m")})
-
-
-def begin_flight(flight: ClosedLoopFlight, controls: dict[str, Control], num_frames: int, episode: str) -> OpenFlight:
-    """Begin an episode with what nobody is asked about."""
-    plan = flight.planned
-    lead = flight.reset()
-    begun = OpenFlight(episode, flight, Controller(controls, flight.drone, lead[-1]), deque(lead, num_frames))
-    poses = np.hstack([plan.positions_m, plan.rotations_deg])
-    between = np.empty((len(poses), 0, 6))
-    flown = PlannedMotion(plan.time_s, poses, between, plan.rotations_deg[:, 1], plan.positions_m).action
-    for moment, command in zip(lead[:-1], flown, strict=False):
-        begun.note(moment, PilotAnswer("lead"), command)
-    return begun
-
-
-def _record(one: OpenFlight, about: dict) -> Pursuit:
-    flight, plan = one.flight, one.flight.planned
-    obstacles = flight.airspace.surroundings.obstacles
-    gaps = np.round(flight.poses.clearances_m, 4).tolist()
-    frames = [PursuitFrame(**frame, clearance_m=gap) for frame, gap in zip(one.frames, gaps, strict=False)]
-    return Pursuit(
-        **about, episode=one.episode, walk=plan.path_id, style=style_of(plan, flight.num_lead - 1, obstacles),
-        dt_s=flight.dt_s, camera_px=(flight.camera.width_px, flight.camera.height_px), fov_deg=flight.camera.fov_deg,
-        drone_radius_m=flight.drone.radius_m, ended=flight.ended, num_walk_frames=len(plan.time_s) - flight.num_lead,
-        frames=tuple(frames),
-    )  # fmt: skip
+    return trace.until(cfg.lead_frames + cfg.most_decisions) if cfg.most_decisions else trace
 
 
 def style_of(plan: DroneTrace, start: int, obstacles: BoxIndex) -> WalkStyle:

@@ -25,9 +25,8 @@ from cosfly.planners.reacquire import first_loss, screens_of
 from cosfly.planners.stage import plan_flight
 from cosfly.planners.styles import REACQUIRE
 from cosfly.products.boxes import BoxMap
-from cosfly.products.goals import SLOTS, words_of
 from cosfly.products.others import Other
-from cosfly.products.traces import ARRAYS, DroneTrace
+from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import walk_id
 from cosfly.reading.documents import FileFormat, read_model
 from cosfly.render.settings import RenderConfig
@@ -129,11 +128,8 @@ class BenchmarkWorld:
     def airspace(self, task: str, size_px: tuple[int, int] = SIZE_PX) -> Airspace:
         """Open a renderer for a task."""
         num_others = TASKS[task].others + TASKS[task].traffic
-        return Airspace(render_config(size_px), self.boxes, self.simplified, seed=self.town.seed, num_others=num_others)
-
-
-def render_config(size_px: tuple[int, int] = SIZE_PX) -> RenderConfig:
-    return RenderConfig(width_px=size_px[0], height_px=size_px[1], fovs_deg=(FOV_DEG,))
+        drawn = RenderConfig(width_px=size_px[0], height_px=size_px[1], fovs_deg=(FOV_DEG,))
+        return Airspace(drawn, self.boxes, self.simplified, seed=self.town.seed, num_others=num_others)
 
 
 @lru_cache(maxsize=16)
@@ -169,10 +165,6 @@ class BenchmarkEpisode:
         """Open it."""
         return ClosedLoopFlight(airspace, self.plan, number=self.number, num_lead=self.num_lead, others=self.others)
 
-    def goal(self, flight: ClosedLoopFlight) -> str:
-        """Say whom to follow: all that the person wears, which a look-alike does but for one thing."""
-        return words_of(("figure", *SLOTS), flight.looks)["en"]
-
 
 def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisode | None:
     """Make an episode of a walk of a town; None where the walk, or its plan, cannot be one."""
@@ -194,7 +186,7 @@ def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisod
     if plan.drop_reason is not None or len(plan.time_s) < num_lead + NUM_DECISIONS:
         return None
     end = num_lead + NUM_DECISIONS
-    plan = replace(plan, **{field: getattr(plan, field)[:end] for field in (*ARRAYS, "clearances_m")})
+    plan = plan.until(end)
     if turned_deg:
         rotations = plan.rotations_deg.copy()
         rotations[:num_lead, 1] += turned_deg

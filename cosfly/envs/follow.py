@@ -8,8 +8,9 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from cosfly.closed_loop.controller import CONTROLLER_FILE, Controller, read_controls
-from cosfly.closed_loop.settings import DroneConfig
+from cosfly.closed_loop.controller import Controller, read_controls
+from cosfly.closed_loop.policy import STATE_HIGH, STATE_LOW, observe
+from cosfly.closed_loop.settings import CONTROLLER_FILE, DroneConfig
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, Moment
 from cosfly.envs.episodes import (
     HELD_OUT,
@@ -22,28 +23,13 @@ from cosfly.envs.episodes import (
     world_of,
 )
 from cosfly.errors import ConfigError, InputError
-from cosfly.geometry import wrap_deg
 from cosfly.products.actions import shipped_actions
-from cosfly.products.motion import in_axes_of
 from cosfly.render.contract import FAR_M
 
-STATE = ("forward_mps", "left_mps", "up_mps", "height_m", "yaw_deg", "gimbal_pitch_deg", "time_s")
-STATE_LOW = np.array([-40, -40, -40, -100, -180, -90, 0], dtype=np.float32)
-STATE_HIGH = np.array([40, 40, 40, 1000, 180, 90, 3600], dtype=np.float32)
 GOAL_CHARACTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ -,"
 # Of the distance between drone and person: all of the reward up to the first, none beyond the second.
 FULL_REWARD_M, NO_REWARD_M = 35.0, 70.0
 CRASH_REWARD = -10.0
-
-
-def observe(flight: ClosedLoopFlight, now: Moment, goal: str, *, depth: bool = False) -> dict[str, Any]:
-    """Give what a policy sees: rgb (h, w, 3) uint8, state (7,) float32 as STATE, goal, and depth (h, w) float32 m."""
-    ground_m = float(flight.airspace.ground.height_at(now.position_m[None])[0])
-    pitch_deg, yaw_deg, _ = now.rotation_deg
-    height_m, velocity = float(now.position_m[2]) - ground_m, in_axes_of(float(yaw_deg), now.velocity_mps)
-    state = np.array([*velocity, height_m, wrap_deg(yaw_deg), pitch_deg, now.time_s], dtype=np.float32)
-    seen = {"rgb": now.frame.rgb, "state": np.clip(state, STATE_LOW, STATE_HIGH), "goal": goal}
-    return seen | {"depth": now.frame.depth} if depth else seen
 
 
 def reward_of(now: Moment, ended: str | None) -> float:
@@ -120,7 +106,7 @@ class FollowEnv(gymnasium.Env):
             if not any(self._begin(episode_of(self.task, world, number)) for number in numbers):
                 raise InputError("no walk of a town can be an episode", where=self.task, got=world.town.name)
         assert self._flight is not None
-        return observe(self._flight, self._now, self._goal, depth=self.has_depth), self._info()
+        return observe(self._flight, self._now, depth=self.has_depth), self._info()
 
     def _begin(self, episode: BenchmarkEpisode | None) -> bool:
         """Begin an episode; False where it cannot be one."""
@@ -131,7 +117,7 @@ class FollowEnv(gymnasium.Env):
             self._space = episode.world.airspace(self.task, self.size_px)
         self._episode, self._flight = episode, episode.flight(self._space)
         self._now = self._flight.reset()[-1]
-        self._goal, self._controller = episode.goal(self._flight), Controller(self._controls, self.drone, self._now)
+        self._controller = Controller(self._controls, self.drone, self._now)
         return episode.begins_well(self._now)
 
     def step(self, action: Any) -> tuple[dict, float, bool, bool, dict]:
@@ -151,7 +137,7 @@ class FollowEnv(gymnasium.Env):
             command = self.drone.within_speed(np.asarray(action, dtype=np.float64))
         self._now = self._flight.step(command)
         ended = self._flight.ended
-        seen = observe(self._flight, self._now, self._goal, depth=self.has_depth)
+        seen = observe(self._flight, self._now, depth=self.has_depth)
         return seen, reward_of(self._now, ended), ended in ("crashed", "left"), ended == "finished", self._info()
 
     def _info(self) -> dict[str, Any]:

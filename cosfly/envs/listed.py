@@ -1,38 +1,34 @@
-"""`cosfly fly --env`: a policy, or a student, through a fixed list of episodes, to the same records and score as
+"""`cosfly fly --env`: a policy, or another student, through a fixed list of episodes, to the same records and score as
 `cosfly fly` of walks of one's own.
 """
 
 from __future__ import annotations
 
-import os
+from functools import lru_cache, partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
-from caption.run.own_files import vocabulary_of
-from cosfly.closed_loop.controller import CONTROLLER_FILE, read_controls
-from cosfly.closed_loop.measures import score_pursuits
-from cosfly.closed_loop.pilots import Pilot, open_pilot
-from cosfly.closed_loop.stage import ANSWERS, FlightsConfig, begin_flight, fly_side_by_side
-from cosfly.envs.episodes import EPISODES_FILE, HELD_OUT, NUM_DECISIONS, episode_id, episode_of, read_list, world_of
-from cosfly.envs.policy import Policy
+from cosfly.closed_loop.stage import Fleet, FlightsConfig, finish_flights
+from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight
+from cosfly.envs.episodes import (
+    EPISODES_FILE,
+    HELD_OUT,
+    NUM_DECISIONS,
+    BenchmarkWorld,
+    episode_id,
+    episode_of,
+    read_list,
+    world_of,
+)
 from cosfly.errors import InputError
-from cosfly.products.flight_scores import SCORE, SCORE_FORMAT
-from cosfly.products.pursuits import pursuit_file, read_pursuit
-from cosfly.reading.files import sha256_file
-from cosfly.work.config import Config
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.work.stage_folder import Resume, StageFolder
-from cosfly.work.store import write_model
 
 
-class ListConfig(Config):
-    """What decides how a list is flown. env: as `read_list` takes it. policy: module:Class, None where fly.student
-    decides."""
+class ListConfig(FlightsConfig):
+    """What decides how a list is flown. env: as `read_list` takes it."""
 
-    flights: FlightsConfig
     env: str
-    policy: str | None = None
 
 
 def run(
@@ -44,63 +40,38 @@ def run(
         InputError: there is no such environment, list or policy. TeacherError: the student's engine cannot be used.
     """
     _, episodes, _ = read_list(cfg.env)
-    package_files = {"controller": CONTROLLER_FILE, "episodes": EPISODES_FILE}
-    stage = StageFolder.open(out, "fly", config=cfg, inputs={}, seed=seed, resume=resume, package_files=package_files)
-    if stage.is_complete:
-        return out
-    if cfg.policy:
-        Policy(cfg.policy, cfg.flights.fly.answer_limit_s, seed, str).close()  # tells what is wrong with it, at once
-    num = 1 if not cfg.policy and cfg.flights.fly.asks_model else workers
-    items = [
-        Item(town, [number for _, number in walks], NUM_DECISIONS * len(walks))
-        for town, walks in ((town, list(found)) for town, found in groupby(episodes, key=lambda one: one[0]))
-    ]
-    done = run_items(stage, items, make_worker, (cfg, stage.path, seed, num), workers=num, watch=watch)
-    files = [pursuit_file(out, episode_id(*episode)) for episode in episodes]
-    files = [path for path in files if path.exists()]
-    if not files:
-        raise stage.nothing_kept(done.tally)
-    score = score_pursuits(map(read_pursuit, files), trained_on=cfg.flights.fly.trained_on, seed=seed)
-    write_model(out / SCORE, score, SCORE_FORMAT)
-    stage.finish([out / SCORE, *files], done.tally)
+    files = {"controller": cfg.fly.table, "episodes": EPISODES_FILE}
+    stage = StageFolder.open(out, "fly", config=cfg, inputs={}, seed=seed, resume=resume, package_files=files)
+    if not stage.is_complete:
+        num, items = 1 if cfg.fly.asks_model else workers, []
+        for town, walks in groupby(episodes, key=lambda one: one[0]):
+            numbers = [number for _, number in walks]
+            flocks = [numbers[k : k + cfg.fly.flock] for k in range(0, len(numbers), cfg.fly.flock)]
+            items += [Item(f"{town} {one[0]}", (town, one), NUM_DECISIONS * len(one)) for one in flocks]
+        run_items(stage, items, make_worker, (cfg, stage.path, seed, num), workers=num, watch=watch)
+        finish_flights(stage, cfg.fly, seed, [episode_id(*episode) for episode in episodes])
     return out
 
 
 def make_worker(cfg: ListConfig, out: Path, seed: int, num: int) -> Work:
-    """Give the function that flies the episodes of one town."""
-    os.environ.setdefault("LP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // num)))
-    fly, (task, _, digest) = cfg.flights.fly, read_list(cfg.env)
-    goals: dict[str, str] = {}
-    student: Pilot = (
-        Policy(cfg.policy, fly.answer_limit_s, seed, goals.__getitem__)
-        if cfg.policy
-        else open_pilot(fly, cfg.flights.caption, cfg.flights.infer, seed, out / ANSWERS)
-    )
-    is_ceiling = not cfg.policy and fly.engine == "planner"  # which commands, and decides nothing
-    controls = read_controls(CONTROLLER_FILE, vocabulary_of(cfg.flights.caption).actions.tokens)
+    """Give the function that flies some episodes of a town."""
+    task, _, digest = read_list(cfg.env)
+    fleet = Fleet(cfg, out, seed, num, list_sha256=digest)
+
+    @lru_cache(maxsize=1)
+    def place_of(town: str) -> tuple[BenchmarkWorld, Airspace]:
+        world = world_of(HELD_OUT[town])
+        return world, world.airspace(task)
+
+    def opened(town: str, number: int) -> ClosedLoopFlight:
+        world, space = place_of(town)
+        if (episode := episode_of(task, world, number)) is None:
+            raise InputError("an episode that cannot be flown", where=f"{cfg.env}: {episode_id(town, number)}")
+        return episode.flight(space)
 
     def work(item: Item) -> Outcome:
-        world = world_of(HELD_OUT[item.item_id])
-        space = world.airspace(task)
-        about: dict[str, Any] = {
-            "student": student.name, "engine": "policy" if cfg.policy else fly.engine, "town": space.town,
-            "map_sha256": world.sha256, "seed": seed, "list_sha256": digest,
-            "controller_sha256": None if is_ceiling else sha256_file(CONTROLLER_FILE),
-        }  # fmt: skip
-        flights = []
-        for number in item.payload:
-            name = episode_id(item.item_id, number)
-            if pursuit_file(out, name).exists():  # of before a kill
-                continue
-            if (episode := episode_of(task, world, number)) is None:
-                raise InputError("an episode that cannot be flown", where=f"{cfg.env}: {name}")
-            flight = episode.flight(space)
-            goals[name] = episode.goal(flight)
-            flights.append(begin_flight(flight, controls, student.num_frames, name))
-            if cfg.policy:
-                fly_side_by_side(flights, student, out, about)
-        fly_side_by_side(flights, student, out, about)
-        space.renderer.close()
-        return Outcome({"flights": len(item.payload)})
+        town, numbers = item.payload
+        flights = {episode_id(town, number): partial(opened, town, number) for number in numbers}
+        return fleet.fly(flights, place_of(town)[0].sha256)
 
     return work

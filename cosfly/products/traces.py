@@ -78,6 +78,11 @@ class DroneTrace:
         """Give what decides how it looks, of the flight of that number."""
         return self.part_of or Excerpt(self.path_id, number, self.targets_m[:1])
 
+    def until(self, end: int) -> DroneTrace:
+        """Give the flight up to that point, which is left out, without its parts and its order."""
+        cut = {name: getattr(self, name)[:end] for name in (*ARRAYS, "clearances_m")}
+        return replace(self, **cut, segments=(), mission=None)
+
     def every(self, stride: int) -> DroneTrace:
         """Give the flight at every so many of its points; clearances are the least until the next of them."""
         if stride == 1:

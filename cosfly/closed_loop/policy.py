@@ -10,7 +10,6 @@ import importlib
 import os
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
 from multiprocessing import Pipe
@@ -20,28 +19,48 @@ from typing import Any
 import numpy as np
 
 from cosfly.closed_loop.pilots import Outlook, PilotAnswer
-from cosfly.envs.follow import observe
+from cosfly.closed_loop.stepper import ClosedLoopFlight, Moment
 from cosfly.errors import InputError
+from cosfly.geometry import wrap_deg
 from cosfly.products.actions import shipped_actions
-from cosfly.products.pursuits import MOST_WORDS
+from cosfly.products.goals import SLOTS, words_of
+from cosfly.products.motion import in_axes_of
+from cosfly.products.pursuits import MOST_WORDS, Answer
+from cosfly.work.worker import end_with_parent
 
 START_LIMIT_S = 300.0  # a policy may read a model first
 MOST_LATE = 3  # answers in a row: then its process ends, and it is not asked again in this episode
 
+STATE = ("forward_mps", "left_mps", "up_mps", "height_m", "yaw_deg", "gimbal_pitch_deg", "time_s")
+STATE_LOW = np.array([-40, -40, -40, -100, -180, -90, 0], dtype=np.float32)
+STATE_HIGH = np.array([40, 40, 40, 1000, 180, 90, 3600], dtype=np.float32)
+
+
+def observe(flight: ClosedLoopFlight, now: Moment, *, depth: bool = False) -> dict[str, Any]:
+    """Give what a policy sees, which is what a real drone has, and no more: rgb (h, w, 3) uint8, state (7,) float32 as
+    STATE, depth (h, w) float32 m, and goal: all that the person wears, which a look-alike does but for one thing."""
+    ground_m = float(flight.airspace.ground.height_at(now.position_m[None])[0])
+    pitch_deg, yaw_deg, _ = now.rotation_deg
+    height_m, velocity = float(now.position_m[2]) - ground_m, in_axes_of(float(yaw_deg), now.velocity_mps)
+    state = np.array([*velocity, height_m, wrap_deg(yaw_deg), pitch_deg, now.time_s], dtype=np.float32)
+    goal = words_of(("figure", *SLOTS), flight.looks)["en"]
+    seen = {"rgb": now.frame.rgb, "state": np.clip(state, STATE_LOW, STATE_HIGH), "goal": goal}
+    return seen | {"depth": now.frame.depth} if depth else seen
+
 
 class Policy:
-    """The process of a policy, as a pilot (cosfly/closed_loop/pilots.py) that flies one episode after the other."""
+    """The process of a policy, as a pilot (pilots.py) that flies one episode after the other."""
 
     num_frames = 1
 
-    def __init__(self, spec: str, limit_s: float, seed: int, goal_of: Callable[[str], str]) -> None:
+    def __init__(self, spec: str, limit_s: float, seed: int) -> None:
         """
         Args:
-            spec: module:Class, found from the working directory. goal_of: the goal of an episode.
+            spec: module:Class, found from the working directory.
         Raises:
             InputError: it cannot be imported or made.
         """
-        self.name, self._limit_s, self._seed, self._goal_of = spec, limit_s, seed, goal_of
+        self.name, self._limit_s, self._seed = spec, limit_s, seed
         self._tokens, self._episode = shipped_actions().tokens, ""
         self._process: subprocess.Popen | None = None
         self._failure: PilotAnswer | None = None
@@ -50,44 +69,45 @@ class Policy:
     def _start(self) -> None:
         self.close()
         self._connection, there = Pipe()
-        program = f"from cosfly.envs.policy import serve; serve({there.fileno()}, {self.name!r})"
+        program = f"from cosfly.closed_loop.policy import serve; serve({there.fileno()}, {os.getpid()}, {self.name!r})"
         command, fds = [sys.executable, "-c", program], (there.fileno(),)
         self._process = subprocess.Popen(command, pass_fds=fds, stdin=subprocess.DEVNULL, start_new_session=True)
         there.close()
-        self._num_late, self._awaits = 0, False
-        answer, words = self._receive(START_LIMIT_S)
+        self._num_late, self._awaits = 0, True
+        answer, words = self._ask(None, START_LIMIT_S)
         if answer != "ok":
             expected = "module:Class with reset(goal, seed) and act(observation), importable from here"
             got = f"{self.name}: {words}"
             raise InputError("a policy that cannot be made", where="--policy", got=got, expected=expected)
 
-    def close(self) -> None:
-        """End the process."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
-            self._connection.close()
-            self._process = None
+    def close(self) -> int | None:
+        """End the process; gives its status."""
+        if (process := self._process) is None:
+            return None
+        self._process = None
+        self._connection.close()
+        process.kill()
+        return process.wait()
 
     def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
         """Give what it answers."""
         return [self._decide(outlook) for outlook in outlooks]
 
     def _decide(self, outlook: Outlook) -> PilotAnswer:
-        goal, begun_s = self._goal_of(outlook.episode), time.monotonic()
+        begun_s, seen = time.monotonic(), observe(outlook.flight, outlook.moments[-1], depth=True)
         if outlook.episode != self._episode:
             self._episode, self._failure, self._num_late = outlook.episode, None, 0
             try:
                 if self._process is None or self._awaits:
                     self._start()
-                answer, words = self._ask("reset", goal, self._seed)
+                answer, words = self._ask(("reset", seen["goal"], self._seed), self._limit_s)
             except InputError as error:  # it could be made before
                 answer, words = "none", str(error)
             if answer != "ok":
                 self._failure = PilotAnswer("late" if answer == "late" else "none", words=words[:MOST_WORDS])
         if self._failure is not None:
             return self._failure
-        answer, said = self._ask("act", observe(outlook.flight, outlook.moments[-1], goal, depth=True))
+        answer, said = self._ask(("act", seen), self._limit_s)
         answer_s = time.monotonic() - begun_s
         if answer != "ok":
             return PilotAnswer(answer, words=str(said)[:MOST_WORDS], answer_s=answer_s)
@@ -106,48 +126,36 @@ class Policy:
                 return PilotAnswer("ok", answer_s=answer_s, command=drone.within_speed(command))
         return PilotAnswer("invalid", words=repr(said)[:MOST_WORDS], answer_s=answer_s)
 
-    def _ask(self, *call: Any) -> tuple[Any, Any]:
-        """Give what it answers; of one that still thinks about an earlier question, that it is late."""
-        until_s = time.monotonic() + self._limit_s
-        while self._awaits:
-            answer, words = self._receive(until_s - time.monotonic())
-            if answer in ("late", "none") and self._awaits:
-                return self._failed(answer, words)
+    def _ask(self, call: tuple | None, limit_s: float) -> tuple[Answer, Any]:
+        """Give what it answers; call None: what it says once it is made."""
+        until_s, told = time.monotonic() + limit_s, None
         try:
-            self._connection.send(call)
-        except OSError:
-            return self._failed("none", self._end())
-        self._awaits = True
-        answer, words = self._receive(until_s - time.monotonic())
-        return self._failed(answer, words) if self._awaits else (answer, words)
-
-    def _receive(self, limit_s: float) -> tuple[Any, Any]:
-        try:
-            if not self._connection.poll(max(limit_s, 0.0)):
-                return "late", f"no answer in {self._limit_s:g} s"
-            told = self._connection.recv()
+            if self._awaits:  # it may still think about what it was asked before
+                told = self._receive(until_s)
+            if call is not None and not self._awaits:
+                self._awaits = True
+                self._connection.send(call)
+                told = self._receive(until_s)
         except (EOFError, OSError):
-            return "none", self._end()
-        self._awaits, self._num_late = False, 0
-        return told
-
-    def _end(self) -> str:
-        assert self._process is not None
-        return f"its process ended with {self._process.wait()}"
-
-    def _failed(self, answer: str, words: str) -> tuple[str, str]:
-        """Note a failure without an answer; after the last that is borne its process ends."""
-        self._num_late += 1
-        if answer == "none" or self._num_late >= MOST_LATE:
-            self._failure = PilotAnswer("late" if answer == "late" else "none", words=f"not asked any more: {words}")
+            told = "none", f"its process ended with {self.close()}"
+        self._num_late = self._num_late + 1 if told is None else 0
+        answer, said = told or ("late", f"no answer in {limit_s:g} s")
+        if self._process is None or self._num_late >= MOST_LATE:
+            self._failure = PilotAnswer(answer, words=f"not asked any more: {said}")
             self.close()
-        return answer, words
+        return answer, said
+
+    def _receive(self, until_s: float) -> tuple[Answer, Any] | None:
+        if not self._connection.poll(max(until_s - time.monotonic(), 0.0)):
+            return None
+        self._awaits = False
+        return self._connection.recv()
 
 
-def serve(fd: int, spec: str) -> None:
+def serve(fd: int, parent_pid: int, spec: str) -> None:
     """Be the process of a policy: make it, and answer until nobody asks."""
-    connection, parent = Connection(fd), os.getppid()
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    end_with_parent(parent_pid)
+    connection = Connection(fd)
     try:
         module, _, name = spec.partition(":")
         policy = getattr(importlib.import_module(module), name)()
@@ -179,9 +187,3 @@ def _plain(said: Any) -> tuple[str, Any]:
     if numbers.ndim == 1 and numbers.size <= 64 and np.issubdtype(numbers.dtype, np.number):
         return "ok", numbers.astype(np.float64).tolist()
     return "unreadable", repr(said)[:MOST_WORDS]
-
-
-def _end_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(1.0)
-    os._exit(1)
