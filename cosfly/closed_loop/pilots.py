@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from caption.run.own_files import vocabulary_of
 from caption.schema import CaptionConfig, ObservedWindow, observed_frames
 from caption.teachers.prompts import Question, make_question
 from caption.teachers.students import as_taught
-from caption.teachers.teacher import AskingTeacher, first_budget, open_teacher
+from caption.teachers.teacher import first_budget, open_teacher
 from caption.writing.contract import Draft, more_fields
 from cosfly.chat.answers import Answer as BookAnswer
 from cosfly.chat.answers import AnswerBook
@@ -92,7 +92,7 @@ def open_pilot(cfg: FlyConfig, caption: CaptionConfig, infer: InferConfig, seed:
         from cosfly.closed_loop.policy import Policy
 
         return Policy(cfg.student.partition(":")[2], cfg.answer_limit_s, seed)
-    return AskedPilot(cfg, caption, seed, answers)
+    return AskedPilot(cfg, caption, infer, seed, answers)
 
 
 class Floor:
@@ -132,25 +132,22 @@ class AskedPilot:
     """Is asked as a teacher is (caption/teachers): the rules, a model behind an endpoint or in vLLM; one that was
     taught (`caption.student.folder`) with the prompts and pictures that it was taught with. All flights at once."""
 
-    def __init__(self, cfg: FlyConfig, caption: CaptionConfig, seed: int, answers: Path) -> None:
-        kind, _, place = cfg.student.partition(":")
-        folder = cfg.as_student or (Path(place) if kind == "vllm" and (Path(place) / TAUGHT).is_file() else None)
-        caption = _with_folder(caption, folder) if folder is not None else caption
+    def __init__(self, cfg: FlyConfig, caption: CaptionConfig, infer: InferConfig, seed: int, answers: Path) -> None:
+        folder = _taught_folder(cfg)
+        update: dict[str, Any] = {"teacher": "rules" if cfg.engine == "transformers" else cfg.student}
+        if folder is not None:
+            update["student"] = caption.student.model_copy(update={"folder": folder})
         self.vocabulary = vocabulary_of(caption)
-        teacher = caption.model_copy(update={"teacher": "rules" if kind == "transformers" else cfg.student})
-        self.cfg, self.seed, self.limit_s = as_taught(teacher, self.vocabulary), seed, cfg.answer_limit_s
-        self.num_frames = self.cfg.window.num_frames
+        self.cfg, self.limit_s = as_taught(caption.model_copy(update=update), self.vocabulary), cfg.answer_limit_s
+        self.num_frames, self._is_rules = self.cfg.window.num_frames, cfg.engine == "rules"
         self._book, self._runner = AnswerBook(answers), asyncio.Runner()
-        self._scratch: tempfile.TemporaryDirectory | None = None
-        self._open()
+        self._scratch = tempfile.TemporaryDirectory(prefix="cosfly-fly-")
+        self._open(cfg, infer, seed)
 
-    def _open(self) -> None:
-        opened = open_teacher(self.cfg, self._book, self.seed, first_budget(self.cfg, self._book.totals))
+    def _open(self, cfg: FlyConfig, infer: InferConfig, seed: int) -> None:
+        opened = open_teacher(self.cfg, self._book, seed, first_budget(self.cfg, self._book.totals))
         self._teacher = self._runner.run(opened.__aenter__())
         self.name = self._teacher.record.model
-        self._is_rules = not isinstance(self._teacher, AskingTeacher)
-        if not self._is_rules:
-            self._scratch = tempfile.TemporaryDirectory(prefix="cosfly-fly-")
 
     def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
         return self._runner.run(self._decide(outlooks))
@@ -188,10 +185,6 @@ class AskedPilot:
         return PilotAnswer("ok", parsed.coc.flight_decision, words, answer_s)
 
     def _question(self, outlook: Outlook) -> Question:
-        window = self._window(outlook)
-        return make_question(window, self.cfg.image, self.cfg.writing, self.vocabulary)
-
-    def _window(self, outlook: Outlook) -> ObservedWindow:
         flight, moments = outlook.flight, outlook.moments
         targets = [moment.target for moment in moments]
         company = [[moment.company.get(COMPANY[k]) for k in (0, 1, 4)] for moment in moments]
@@ -211,11 +204,12 @@ class AskedPilot:
         name = sample_id(f"{place[1]}_{place[2]}", indices[-1])
         height_px, width_px, _ = moments[-1].frame.rgb.shape
         files = (FILES,) * len(folders)
-        return ObservedWindow(name, *place, indices, width_px, height_px, frames, tuple(folders), files)
+        window = ObservedWindow(name, *place, indices, width_px, height_px, frames, tuple(folders), files)
+        return make_question(window, self.cfg.image, self.cfg.writing, self.vocabulary)
 
     def _folder(self, flight: ClosedLoopFlight, moment: Moment) -> Path:
         """Give the folder of a frame, written for whoever looks at pictures; those that nobody asks for any more go."""
-        if self._scratch is None:
+        if self._is_rules:  # which look at none
             return Path()
         above = Path(self._scratch.name, *flight.place)
         folder, frame = above / frame_name(moment.index), moment.frame
@@ -229,21 +223,21 @@ class AskedPilot:
         return folder
 
 
-def _with_folder(caption: CaptionConfig, folder: Path) -> CaptionConfig:
-    return caption.model_copy(update={"student": caption.student.model_copy(update={"folder": folder})})
+def _taught_folder(cfg: FlyConfig) -> Path | None:
+    """Give the folder that says how a student was taught, if one does."""
+    place = Path(cfg.student.partition(":")[2])
+    if cfg.engine == "transformers":
+        return cfg.adapter or place
+    return cfg.as_student or (place if cfg.engine == "vllm" and (place / TAUGHT).is_file() else None)
 
 
 class LocalPilot(AskedPilot):
     """A student in this process (distill/inference), all flights as one batch."""
 
-    def __init__(self, cfg: FlyConfig, caption: CaptionConfig, infer: InferConfig, seed: int, answers: Path) -> None:
-        self._infer, self._model, self._adapter = infer, Path(cfg.student.partition(":")[2]), cfg.adapter
-        super().__init__(cfg, _with_folder(caption, cfg.adapter or self._model), seed, answers)
-
-    def _open(self) -> None:
-        self._scratch = tempfile.TemporaryDirectory(prefix="cosfly-fly-")
-        inputs = Inputs((), {"": Path(self._scratch.name)}, self._model, self._adapter, self.vocabulary.actions)
-        self._local, self.name = local_answers(self._infer, inputs, self._book), inputs.name
+    def _open(self, cfg: FlyConfig, infer: InferConfig, seed: int) -> None:
+        model, trees = Path(cfg.student.partition(":")[2]), {"": Path(self._scratch.name)}
+        inputs = Inputs((), trees, model, cfg.adapter, self.vocabulary.actions)
+        self._local, self.name = local_answers(infer, inputs, self._book), inputs.name
 
     async def _decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
         begun_s = time.monotonic()

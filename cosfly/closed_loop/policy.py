@@ -43,7 +43,7 @@ def observe(flight: ClosedLoopFlight, now: Moment, *, depth: bool = False) -> di
     pitch_deg, yaw_deg, _ = now.rotation_deg
     height_m, velocity = float(now.position_m[2]) - ground_m, in_axes_of(float(yaw_deg), now.velocity_mps)
     state = np.array([*velocity, height_m, wrap_deg(yaw_deg), pitch_deg, now.time_s], dtype=np.float32)
-    goal = words_of(("figure", *SLOTS), flight.looks)["en"]
+    goal = words_of(("figure", *SLOTS), flight.script.clothes.looks)["en"]
     seen = {"rgb": now.frame.rgb, "state": np.clip(state, STATE_LOW, STATE_HIGH), "goal": goal}
     return seen | {"depth": now.frame.depth} if depth else seen
 

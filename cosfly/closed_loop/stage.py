@@ -109,11 +109,12 @@ class OpenFlight:
     def record(self, about: dict[str, Any]) -> Pursuit:
         """End it; gives its record. about: what those of all flights say alike."""
         flight, plan, last = self.flight, self.flight.planned, self.moments[-1]
+        camera = flight.script.cameras[0]
         self.note(last, PilotAnswer("end"), None, last.clearance_m)
         return Pursuit(
             **about, episode=self.episode, town=flight.airspace.town, walk=plan.path_id,
             style=style_of(plan, flight.num_lead - 1, flight.airspace.surroundings.obstacles), dt_s=flight.dt_s,
-            camera_px=(flight.camera.width_px, flight.camera.height_px), fov_deg=flight.camera.fov_deg,
+            camera_px=(camera.width_px, camera.height_px), fov_deg=camera.fov_deg,
             drone_radius_m=flight.drone.radius_m, ended=flight.ended, frames=tuple(self.frames),
             num_walk_frames=len(plan.time_s) - flight.num_lead,
         )  # fmt: skip

@@ -14,9 +14,8 @@ import numpy as np
 from cosfly.closed_loop.settings import DroneConfig
 from cosfly.geometry import step_s, wrap_deg
 from cosfly.products.boxes import BoxMap
-from cosfly.products.frames import Camera, TargetMeta
+from cosfly.products.frames import TargetMeta
 from cosfly.products.others import Other
-from cosfly.products.people import Appearance
 from cosfly.products.places import town_folder
 from cosfly.products.pursuits import Ended
 from cosfly.products.traces import DroneTrace
@@ -108,7 +107,8 @@ class Moment:
 
 class ClosedLoopFlight:
     """One flight after one walk. `reset` gives the frames of the plan with which it begins, `step` flies a command for
-    one time step of the walk and gives what is seen then; `ended` tells how it ended, None while it goes on."""
+    one time step of the walk and gives what is seen then; `ended` tells how it ended, None while it goes on. `script`:
+    what is drawn, cameras and clothes among it."""
 
     def __init__(
         self,
@@ -133,7 +133,7 @@ class ClosedLoopFlight:
         self.num_lead, self.lost_s, self.dt_s = num_lead, lost_s, step_s(planned.time_s)
         weather = weather_of(airspace.cfg, airspace.pools, number)
         plain = replace(planned, segments=(), mission=None)  # parts and orders are the plan's, not this flight's
-        self._script = script_flight(
+        self.script = script_flight(
             plain, number, "clean", airspace.town, airspace.surroundings, airspace.cfg, airspace.seed, others, weather
         )
         self._begin()
@@ -141,23 +141,13 @@ class ClosedLoopFlight:
     @property
     def place(self) -> tuple[str, str, str]:
         """Town, trajectory and track, as a playback tree names them."""
-        return self._script.town, self._script.trajectory, self._script.variant
-
-    @property
-    def camera(self) -> Camera:
-        """The first frame's."""
-        return self._script.cameras[0]
-
-    @property
-    def looks(self) -> Appearance:
-        """What the target wears."""
-        return self._script.clothes.looks
+        return self.script.town, self.script.trajectory, self.script.variant
 
     def _begin(self) -> None:
         planned, last = self.planned, self.num_lead - 1
         flown = Poses(planned.positions_m, planned.rotations_deg, planned.targets_m, planned.clearances_m)
-        self._script = replace(self._script, perturbed=PerturbedTrack.nothing(flown))  # which copies it
-        self.poses = self._script.perturbed.poses  # written as it is flown; what lies ahead is still the plan
+        self.script = replace(self.script, perturbed=PerturbedTrack.nothing(flown))  # which copies it
+        self.poses = self.script.perturbed.poses  # written as it is flown; what lies ahead is still the plan
         self.index, self._unseen_s = last, 0.0
         self.ended: Ended | None = None
         self.velocity_mps = (flown.positions_m[last] - flown.positions_m[last - 1]) / self.dt_s
@@ -186,7 +176,7 @@ class ClosedLoopFlight:
         gaps = np.minimum(gaps[:-1], np.minimum(over_ground[:-1], over_ground[1:]))  # of each part of the way
         hits = np.flatnonzero(gaps < self.drone.radius_m)
         end = int(hits[0]) if len(hits) else len(places) - 1  # it stops before the part that touches
-        clearance_m = min(float(gaps[: end + 1].min()), self._script.others.distance_m(i, places[end]))
+        clearance_m = min(float(gaps[: end + 1].min()), self.script.others.distance_m(i, places[end]))
         self.index = i
         self.poses.positions_m[i], self.poses.rotations_deg[i] = places[end], [pitch_deg, yaw_deg, 0.0]
         self.poses.clearances_m[i - 1 : i + 1] = clearance_m
@@ -223,7 +213,7 @@ class ClosedLoopFlight:
         return np.array(places), float(wrap_deg(yaw_deg)), float(pitch_deg)
 
     def _drawn(self, i: int, velocity_mps: np.ndarray, clearance_m: float) -> Moment:
-        script, poses = self._script, self.poses
+        script, poses = self.script, self.poses
         self.airspace.light(poses.targets_m, None if script.weather is None else script.weather.params)
         frame, seen = draw_frame(self.airspace.renderer, script, i, poses, self.airspace.cfg.visible_threshold)
         target = annotation(script, i, seen).target
