@@ -127,6 +127,19 @@ def test_each_flight_begins_as_its_plan_does(town, tmp_path):
         assert pursuit.decisions[0].in_view
 
 
+def test_a_policy_of_ones_own_flies_as_a_student_that_decides_the_same(town, tmp_path, monkeypatch):
+    code = "class Ahead:\n    def reset(self, goal, seed): pass\n    def act(self, seen): return 'track_straight'\n"
+    (tmp_path / "own.py").write_text(code)
+    monkeypatch.chdir(tmp_path)
+    flown = fly(town, tmp_path / "policy", f"{SHORT} --policy own:Ahead")
+    same = fly(town, tmp_path / "floor", f"{SHORT} --student track_straight")
+    for one, other in zip(flown.values(), same.values(), strict=True):
+        assert (one.engine, one.student) == ("policy", "own:Ahead")
+        assert [f.command for f in one.frames] == [f.command for f in other.frames]
+    assert "--policy" in attempt(town, tmp_path / "both", f"{SHORT} --policy own:Ahead --student rules").output
+    assert "own:Missing" in str(attempt(town, tmp_path / "none", f"{SHORT} --policy own:Missing").exception)
+
+
 # --- answers that are none --------------------------------------------------------------------------------------------
 
 ONE = "--set caption.endpoint.max_tries=1 --set fly.side_by_side=3"

@@ -1,6 +1,7 @@
 """cosfly/envs: the environments as Gymnasium has them, episodes, rewards that no cheat earns, policies that fail."""
 
 import json
+import re
 import warnings
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,6 +23,7 @@ from cosfly.work.config import read_yaml
 
 FOLLOW, SMALL = "cosfly/Follow-v0", (160, 96)
 TOKENS = shipped_actions().tokens
+DOCUMENT = Path(cosfly.envs.__file__).parents[2] / "docs" / "closed-loop.md"
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +141,7 @@ def test_nobody_trains_on_held_out_towns():
 
 
 def test_lists_are_fixed_and_their_digests_are_those_of_the_document():
-    text = (Path(cosfly.envs.__file__).parents[2] / "docs" / "closed-loop.md").read_text(encoding="utf-8")
+    text = DOCUMENT.read_text(encoding="utf-8")
     for task in TASKS:
         env, episodes, digest = read_list(f"{task}/test")
         assert (env, len(episodes), len({*episodes})) == (task, 20, 20)
@@ -230,6 +232,33 @@ def test_what_was_answered_is_what_is_flown(ask):
 def test_a_slow_answer_is_late_once_and_the_next_ones_are_in_time(ask):
     assert [one.answer for one in ask("Slow")][:4] == ["late", "ok", "ok", "ok"]
     assert MOST_LATE > 1
+
+
+def test_the_tracker_of_the_document_follows_the_person(tmp_path, monkeypatch):
+    [code] = re.findall(r"```python\n(.*?class Tracker.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "tracker.py").write_text(code)
+    monkeypatch.chdir(tmp_path)
+    env, policy = (
+        gymnasium.make(FOLLOW, episodes="test", actions="velocities").unwrapped,
+        Policy("tracker:Tracker", 60, 0),
+    )
+    try:
+        for episode in (0, 8):
+            away_m = []
+            for is_flown in (True, False):  # else it stands where it is
+                env.reset(options={"episode": episode})
+                for _ in range(40):
+                    outlook = SimpleNamespace(episode=str(episode), flight=env._flight, moments=[env._now])
+                    command = policy.decide([outlook])[0].command
+                    if not is_flown:
+                        command[:4] = 0.0
+                    *_, info = env.step(command.astype(np.float32))
+                    assert info["visible"] or not is_flown
+                away_m.append(info["distance_m"])
+            assert away_m[0] < away_m[1] - 5
+    finally:
+        policy.close()
+        env.close()
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,12 @@
-"""How many decisions a second the closed loop takes: 64 flights of 200 decisions with the rule teacher.
+"""How many decisions a second the closed loop takes: 64 flights of 200 decisions with the rule teacher; and how many
+steps a second an environment: alone, and two side by side in processes.
 
     python tests/benchmarks/bench_flying.py                     a town of our own, two workers, 640x360
     python tests/benchmarks/bench_flying.py --flights 8 --decisions 50 --rounds 3
+    python tests/benchmarks/bench_flying.py --envs --rounds 3   cosfly/Follow-v0, 640x360
 
-Planning is done first and not counted; starting workers, maps, drawing and deciding are.
+Planning is done first and not counted; starting workers, maps, drawing and deciding are. Of an environment its steps
+alone are counted, from the second on.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ from __future__ import annotations
 import argparse
 import os
 import tempfile
+import time
 from pathlib import Path
 
 from caption.schema import CaptionConfig
@@ -20,6 +24,7 @@ from cosfly.closed_loop.settings import FlyConfig
 from cosfly.pedestrians import stage as pedestrians
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners.contract import PlanConfig
+from cosfly.products.actions import shipped_actions
 from cosfly.products.boxes import write_boxes
 from cosfly.render.settings import RenderConfig
 from cosfly.simplify.passes import SimplifyConfig, simplify
@@ -29,13 +34,42 @@ from distill.inference.stage import InferConfig
 SEED = 64
 
 
+def time_envs(rounds: int) -> None:
+    import gymnasium
+
+    from cosfly.envs.episodes import NUM_DECISIONS
+
+    hover = shipped_actions().tokens.index("hover")  # which crashes nowhere, so that no town is made meanwhile
+    how = {"shared_memory": False, "context": "spawn"}
+    for _ in range(rounds):
+        for num in (1, 2):
+            mode = "async" if num > 1 else "sync"
+            envs = gymnasium.make_vec(
+                "cosfly/Follow-v0", num_envs=num, vectorization_mode=mode, vector_kwargs=how if num > 1 else {}
+            )
+            envs.reset(seed=SEED)
+            envs.step([hover] * num)
+            load, begun_s = os.getloadavg()[0], time.monotonic()
+            for _ in range(NUM_DECISIONS - 2):
+                envs.step([hover] * num)
+            seconds = time.monotonic() - begun_s
+            print(
+                f"{num} side by side: {num * (NUM_DECISIONS - 2) / seconds:.1f} steps a second; load before {load:.1f}"
+            )
+            envs.close()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--flights", type=int, default=64)
     parser.add_argument("--decisions", type=int, default=200)
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--envs", action="store_true", help="steps of environments in place of flights")
     asked = parser.parse_args()
+    if asked.envs:
+        time_envs(asked.rounds)
+        return
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
         box_map = load_map(seed=SEED)
