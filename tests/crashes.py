@@ -15,6 +15,7 @@ import multiprocessing
 import os
 import random
 import re
+import select
 import shutil
 import signal
 import sys
@@ -36,6 +37,7 @@ from release.verify.verify import verify
 
 PACKAGES = tuple(f"/{name}/" for name in ("cosfly", "caption", "distill", "release"))
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
+GONE_S = 30.0  # for workers to be gone after the process that was killed with them
 NAMES = {"os.rename": 2, "os.link": 2, "os.remove": 1, "os.mkdir": 1, "os.rmdir": 1, "os.truncate": 1, "os.symlink": 2}
 
 
@@ -168,11 +170,15 @@ def run(work: Callable[[], object], root: Path, *, die_at: Moment | None = None,
     """Run something in a child of its own that forks its workers; die_at None: undisturbed."""
     resource_tracker.ensure_running()
     said, trace = root.with_name(f"{root.name}.said"), root.with_name(f"{root.name}.steps")
+    gone, held = os.pipe()  # by the child and the workers that it forks, which have its lock too
     with open(said, "wb") as voice, open(trace, "wb") as steps:
         child = os.fork()
         if not child:
             _be_child(work, _Watch(root, die_at, steps.fileno() if traces else None), voice.fileno())
+        os.close(held)
         _, status = os.waitpid(child, 0)
+    select.select([gone], [], [], GONE_S)
+    os.close(gone)
     lines = trace.read_text().splitlines()
     return Ended(
         os.waitstatus_to_exitcode(status), said.read_text(errors="replace"), [Step(*json.loads(line)) for line in lines]
