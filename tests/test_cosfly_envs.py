@@ -158,7 +158,7 @@ def test_every_listed_episode_can_be_one(task):
 # --- policies ---------------------------------------------------------------------------------------------------------
 
 POLICIES = """
-import os, time
+import os, sys, time
 import numpy as np
 
 class Fine:
@@ -180,6 +180,8 @@ class Raises(Fine):
     def act(self, observation): raise RuntimeError("oops")
 class Dies(Fine):
     def act(self, observation): os._exit(7)
+class Quits(Fine):
+    def act(self, observation): sys.exit(3)
 class Never(Fine):
     def act(self, observation):
         while True: pass
@@ -216,11 +218,16 @@ def ask(follow, tmp_path, monkeypatch):
     [
         ("Fine", "ok"), ("Token", "ok"), ("Command", "ok"), ("Word", "invalid"), ("Beyond", "invalid"),
         ("Seventeen", "invalid"), ("Nothing", "unreadable"), ("Object", "unreadable"), ("Raises", "none"),
-        ("Dies", "none"), ("Never", "late"), ("BadReset", "none"),
+        ("Dies", "none"), ("Quits", "none"), ("Never", "late"), ("BadReset", "none"),
     ],
 )  # fmt: skip
 def test_what_a_policy_does_is_told_as_its_answer(ask, name, wanted):
     assert [one.answer for one in ask(name, 10.0 if wanted != "late" else 0.4)] == [wanted] * 5
+
+
+@pytest.mark.parametrize(("name", "status"), [("Dies", 7), ("Quits", 3)])
+def test_the_status_of_a_policy_that_ended_is_its_own(ask, name, status):
+    assert ask(name, 10)[0].words == f"its process ended with {status}"
 
 
 def test_what_was_answered_is_what_is_flown(ask):

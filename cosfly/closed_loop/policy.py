@@ -6,6 +6,7 @@ as ACTION. What it does wrong is its own failure: it is told as its answer, and 
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import subprocess
@@ -29,6 +30,7 @@ from cosfly.products.pursuits import MOST_WORDS, Answer
 from cosfly.work.worker import end_with_parent
 
 START_LIMIT_S = 300.0  # a policy may read a model first
+END_S = 5.0  # for a process that has hung up to end
 MOST_LATE = 3  # answers in a row: then its process ends, and it is not asked again in this episode
 
 STATE = ("forward_mps", "left_mps", "up_mps", "height_m", "yaw_deg", "gimbal_pitch_deg", "time_s")
@@ -137,6 +139,9 @@ class Policy:
                 self._connection.send(call)
                 told = self._receive(until_s)
         except (EOFError, OSError):
+            assert self._process is not None
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(END_S)  # of its own, so that its status is
             told = "none", f"its process ended with {self.close()}"
         self._num_late = self._num_late + 1 if told is None else 0
         answer, said = told or ("late", f"no answer in {limit_s:g} s")
