@@ -41,7 +41,8 @@ def fly(
     ] = None,
     others: Annotated[Path | None, Option(help="Who else moves: others.json, beside path.json.")] = None,
     relabel: Annotated[
-        Path | None, Option(help="Folder of `cosfly fly`: nobody flies, the planner goes on where that student erred.")
+        Path | None,
+        Option(help="Folder of `cosfly fly`: the planner goes on from where that student was."),
     ] = None,
 ) -> None:
     """A student flies: its decisions move the drone, and what it then sees is drawn. Records of all, and their tree."""

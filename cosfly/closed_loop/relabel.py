@@ -1,10 +1,10 @@
-"""`cosfly fly --relabel`, DAgger's data (Ross, Gordon and Bagnell 2011): what the planner does from where a student's
-own mistakes led it.
+"""`cosfly fly --relabel`, DAgger's data (Ross, Gordon and Bagnell 2011): what the planner does from where a student
+led itself.
 
 The planner knows the whole walk: it plans anew from the pose and the velocity that the student had reached, and
-that plan is flown as the ceiling flies (`pilots.Ceiling`). A window is kept where the student's decision is ruled out
-by that motion, or where it was about to lose the person. Each is a short flight: the student's observed frames, then
-the planner's, with the teacher's captions.
+that plan is flown as the ceiling flies (`pilots.Ceiling`). A decision is a mistake where it is ruled out by that
+motion, or where the student was about to lose the person; the others are kept too, unless the settings say otherwise.
+Each is a short flight: the student's observed frames, then the planner's, with the teacher's captions.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ def run(
     resume: Resume = "if-same",
 ) -> Path:
     """Reads a folder of `cosfly fly` and its map; writes `drone_trace.json`, the playback tree `render/` of what the
-    planner does where the student erred, and the teacher's `caption/` of it. Gives the folder.
+    planner does from where the student was, and the teacher's `caption/` of it. Gives the folder.
 
     Raises:
         InputError: a file is not what it must be. ConfigError: another planner than foresight, or pictures that
-            are not what the student saw. NothingKept: the student erred nowhere.
+            are not what the student saw. NothingKept: nothing can be learnt from it.
     """
     inputs = {"flown": flown, "boxes": boxes, "simplified": simplified}
     seed = _seed_of(flown, cfg)
@@ -148,7 +148,7 @@ def make_worker(cfg: FlightsConfig, flown: Path, boxes: Path, simplified: Path, 
         )
         motion = measure(future)
         reasons = _reasons(pursuit, i, pursuit.frames[i].action, table.verdict_of, motion, table.label_of(motion))
-        if not reasons:
+        if fly.relabel.mistakes_only and not reasons:
             return Outcome(drop_reason="no_mistake")
         solver = {"source": episode, "frame": i, "student": pursuit.student, "round": fly.relabel.round}
         solver |= {"decision": pursuit.frames[i].action, "reasons": reasons}

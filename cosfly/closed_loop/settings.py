@@ -58,6 +58,10 @@ class RelabelConfig(Config):
 
     stride: int = Field(5, ge=1, description="frames from one that is looked at to the next")
     future_frames: int = Field(10, ge=5, le=100, description="frames of the planner after the student's")
+    mistakes_only: bool = Field(
+        False,
+        description="leave out decisions that were no mistake; who learns from the others alone gets worse",
+    )
     round: int = Field(1, ge=1, description="of DAgger; told in what is made")
 
 
