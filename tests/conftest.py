@@ -1,6 +1,7 @@
 """Fixtures shared by all tests."""
 
 import contextlib
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -37,10 +38,13 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(autouse=True)
-def clean_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No test sees a key, or reaches a hub, because of the machine it runs on."""
+def clean_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """No test sees a key, or reaches a hub, because of the machine it runs on; none inherits the command's SIGTERM."""
     monkeypatch.delenv("COSFLY_API_KEY", raising=False)
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    before = signal.getsignal(signal.SIGTERM)
+    yield
+    signal.signal(signal.SIGTERM, before)
 
 
 HOLDER = """

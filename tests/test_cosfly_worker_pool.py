@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import pynvml
 import pytest
+from processes import is_running, wait_until
 from toy_workers import make_broken_worker, make_counting_worker, make_talking_worker, make_worker, stage_in
 
 from cosfly.errors import EnvironmentMissing
@@ -117,22 +118,8 @@ def start_program(folder: Path, until: Sequence[str] = ("0.pid", "1.pid"), **opt
     program = folder / "program.py"
     program.write_text(PROGRAM.format(tests=str(Path(__file__).parent), folder=str(folder)))
     parent = subprocess.Popen([sys.executable, str(program)], **options)
-    wait_for(lambda: all((folder / name).exists() for name in until))
+    wait_until(lambda: all((folder / name).exists() and (folder / name).read_text() for name in until))
     return parent
-
-
-def wait_for(what, seconds: float = 60.0) -> None:
-    deadline_s = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
-
-
-def is_running(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except OSError:
-        return False
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc")
@@ -142,7 +129,7 @@ def test_workers_end_when_their_parent_is_killed(tmp_path):
     assert all(map(is_running, pids))
     parent.kill()
     parent.wait()
-    wait_for(lambda: not any(map(is_running, pids)), 10.0)
+    wait_until(lambda: not any(map(is_running, pids)))
     assert not stage_in(tmp_path).is_complete  # and nobody holds the folder
 
 
@@ -171,7 +158,7 @@ def test_a_second_signal_that_breaks_off_the_ending_ends_the_workers_too(tmp_pat
     time.sleep(gap_s)
     process.send_signal(signal.SIGTERM)
     assert process.wait(timeout=30) in (130, 143, -signal.SIGTERM)
-    wait_for(lambda: not any(map(is_running, pids)), 10.0)
+    wait_until(lambda: not any(map(is_running, pids)))
 
 
 # --- telling how far it is --------------------------------------------------------------------------------------------

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
+import pickle
 import re
 from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -353,9 +356,6 @@ def _keys(samples) -> list[str]:
 
 
 def test_any_sample_by_its_number_in_any_process(tree, captions, tmp_path, monkeypatch):
-    import multiprocessing
-    import pickle
-
     monkeypatch.setattr("distill.schema.ROWS_AT_ONCE", 7)
     samples = open_split(prepared(tree, captions, tmp_path / "set"), "train")
     whole = list(samples)
@@ -368,9 +368,8 @@ def test_any_sample_by_its_number_in_any_process(tree, captions, tmp_path, monke
         samples[len(samples)]
     assert list(pickle.loads(pickle.dumps(samples))) == whole
     for way in ("fork", "spawn"):  # a fork has its parent's open file
-        with multiprocessing.get_context(way).Pool(2) as pool:
-            found = pool.map(_keys, [samples] * 2)
-            assert found == [_keys(whole)] * 2
+        with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context(way)) as pool:
+            assert list(pool.map(_keys, [samples] * 2)) == [_keys(whole)] * 2
     assert samples[order[0]] == whole[order[0]]
 
 

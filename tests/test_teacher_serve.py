@@ -9,10 +9,10 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+from processes import is_running, wait_until
 from simulator_serving import free_port
 from specimens_captions import settings
 from teacher_process import __file__ as SERVER
@@ -35,20 +35,6 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="what a killed p
 def serving(*more: object, **changes) -> ServeConfig:
     changes = {"port": free_port(), "ready_s": 60.0, **changes}
     return ServeConfig(command=COMMAND, arguments=tuple(map(str, more)), **changes)
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
-def wait_until(holds, patience_s: float = 60.0) -> None:
-    until_s = time.monotonic() + patience_s
-    while not holds():
-        assert time.monotonic() < until_s, "it never came to that"
-        time.sleep(0.02)
 
 
 def pids_in(path: Path) -> list[int]:
@@ -74,8 +60,8 @@ def test_replicas_have_accelerators_and_ports_of_their_own_and_end_with_their_ch
             log = servers.replicas[number].log_file
             wait_until(lambda log=log, devices=devices: devices in log.read_text())
         pids = pids_in(child)
-        assert all(map(is_alive, pids))
-    assert not any(map(is_alive, pids)), "the child has a session of its own"
+        assert all(map(is_running, pids))
+    assert not any(map(is_running, pids)), "the child has a session of its own"
     assert not listens(cfg.port)
     assert not servers.folder.exists()
     with pytest.raises(ConfigError, match=r"4 accelerators.*3 x 2"):
@@ -163,7 +149,7 @@ def test_no_server_is_left_however_the_command_ends(number, tmp_path):
         pids = pids_in(child)
         process.send_signal(number)
         assert process.wait(60) in (-number, 128 + number)
-        wait_until(lambda: not any(map(is_alive, pids)))
+        wait_until(lambda: not any(map(is_running, pids)))
         assert not listens(cfg.port)
     finally:
         process.kill()
@@ -189,7 +175,7 @@ def test_servers_of_one_run_begin_and_end_with_it_and_one_that_dies_or_hangs_cos
     keys = [record["key"] for record in kept_answers(tmp_path / "out")]
     assert len(keys) == len(set(keys)) == 22
     assert len({pid for pid, _ in journaled(journal)}) == 2, "it is of no use after fifteen answers"
-    assert not any(map(is_alive, pids_in(child)))
+    assert not any(map(is_running, pids_in(child)))
     asked = len(journaled(journal))
     run(served(cfg), tree, tmp_path / "out")  # complete: nothing is started
     assert len(journaled(journal)) == asked
@@ -206,10 +192,10 @@ def test_a_killed_run_leaves_no_server_and_goes_on(tmp_path):
     pids = pids_in(child)
     process.kill()
     process.wait()
-    wait_until(lambda: not any(map(is_alive, pids)))
+    wait_until(lambda: not any(map(is_running, pids)))
     kept = len(kept_answers(out))
     assert kept >= 4
     assert cosfly(*words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL).wait() == 0
     keys = [record["key"] for record in kept_answers(out)]
     assert len(keys) == len(set(keys)) > kept
-    assert not any(map(is_alive, pids_in(child)))
+    assert not any(map(is_running, pids_in(child)))
