@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 import warnings
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from commands import invoke
 from gymnasium.utils.env_checker import check_env
+from processes import is_running, wait_until
 
 import cosfly.envs
 from cosfly.closed_loop.policy import MOST_LATE, Policy
@@ -158,7 +160,7 @@ def test_every_listed_episode_can_be_one(task):
 # --- policies ---------------------------------------------------------------------------------------------------------
 
 POLICIES = """
-import os, sys, time
+import os, subprocess, sys, time
 import numpy as np
 
 class Fine:
@@ -188,6 +190,21 @@ class Never(Fine):
 class Slow(Fine):
     def act(self, observation):
         time.sleep(0.7 * (super().act(observation) + self.count == 1)); return 0
+class Complex(Fine): answer = np.zeros(5, complex)
+class Pipe(Fine):
+    def act(self, observation):
+        for fd in range(3, 30):
+            try: os.write(fd, self.answer)
+            except OSError: pass
+        return 0
+class Forged(Pipe): answer = b"\\0\\0\\0\\x0b[1, [2, 3]]"
+class Huge(Pipe): answer = b"\\xff" * 12
+class Closes(Fine):
+    def act(self, observation): os.closerange(3, 30); time.sleep(600)
+class Starts(Fine):
+    def __init__(self):
+        self.count = 0
+        with open("child.pid", "w") as file: file.write(str(subprocess.Popen(["sleep", "600"]).pid))
 class BadReset(Fine):
     def reset(self, goal, seed): raise ValueError("no")
 class NoAct: pass
@@ -219,6 +236,7 @@ def ask(follow, tmp_path, monkeypatch):
         ("Fine", "ok"), ("Token", "ok"), ("Command", "ok"), ("Word", "invalid"), ("Beyond", "invalid"),
         ("Seventeen", "invalid"), ("Nothing", "unreadable"), ("Object", "unreadable"), ("Raises", "none"),
         ("Dies", "none"), ("Quits", "none"), ("Never", "late"), ("BadReset", "none"),
+        ("Complex", "unreadable"), ("Forged", "none"), ("Huge", "none"), ("Closes", "none"),
     ],
 )  # fmt: skip
 def test_what_a_policy_does_is_told_as_its_answer(ask, name, wanted):
@@ -228,6 +246,13 @@ def test_what_a_policy_does_is_told_as_its_answer(ask, name, wanted):
 @pytest.mark.parametrize(("name", "status"), [("Dies", 7), ("Quits", 3)])
 def test_the_status_of_a_policy_that_ended_is_its_own(ask, name, status):
     assert ask(name, 10)[0].words == f"its process ended with {status}"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+def test_what_a_policy_started_ends_with_it(ask, tmp_path):
+    ask("Starts", 10)
+    pid = int((tmp_path / "child.pid").read_text())
+    wait_until(lambda: not is_running(pid))
 
 
 def test_what_was_answered_is_what_is_flown(ask):

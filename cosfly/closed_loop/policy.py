@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -30,6 +32,7 @@ from cosfly.products.pursuits import MOST_WORDS, Answer
 from cosfly.work.worker import end_with_parent
 
 START_LIMIT_S = 300.0  # a policy may read a model first
+MOST_REPLY_BYTES = 65_536
 END_S = 5.0  # for a process that has hung up to end
 MOST_LATE = 3  # answers in a row: then its process ends, and it is not asked again in this episode
 
@@ -73,7 +76,9 @@ class Policy:
         self._connection, there = Pipe()
         program = f"from cosfly.closed_loop.policy import serve; serve({there.fileno()}, {os.getpid()}, {self.name!r})"
         command, fds = [sys.executable, "-c", program], (there.fileno(),)
-        self._process = subprocess.Popen(command, pass_fds=fds, stdin=subprocess.DEVNULL, start_new_session=True)
+        self._process = subprocess.Popen(
+            command, pass_fds=fds, stdin=subprocess.DEVNULL, stdout=2, start_new_session=True
+        )
         there.close()
         self._num_late, self._awaits = 0, True
         answer, words = self._ask(None, START_LIMIT_S)
@@ -83,12 +88,13 @@ class Policy:
             raise InputError("a policy that cannot be made", where="--policy", got=got, expected=expected)
 
     def close(self) -> int | None:
-        """End the process; gives its status."""
+        """End the process, and those that it started; gives its status."""
         if (process := self._process) is None:
             return None
         self._process = None
         self._connection.close()
-        process.kill()
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
         return process.wait()
 
     def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
@@ -143,6 +149,9 @@ class Policy:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(END_S)  # of its own, so that its status is
             told = "none", f"its process ended with {self.close()}"
+        except (ValueError, TypeError, RecursionError):  # as where a process that it forked writes there, too
+            self.close()
+            told = "none", "what came from it is no answer"
         self._num_late = self._num_late + 1 if told is None else 0
         answer, said = told or ("late", f"no answer in {limit_s:g} s")
         if self._process is None or self._num_late >= MOST_LATE:
@@ -154,21 +163,28 @@ class Policy:
         if not self._connection.poll(max(until_s - time.monotonic(), 0.0)):
             return None
         self._awaits = False
-        return self._connection.recv()
+        answer, said = json.loads(self._connection.recv_bytes(MOST_REPLY_BYTES))
+        if answer not in ("ok", "unreadable", "none"):
+            raise ValueError(answer)
+        return answer, said
 
 
 def serve(fd: int, parent_pid: int, spec: str) -> None:
     """Be the process of a policy: make it, and answer until nobody asks."""
     end_with_parent(parent_pid)
     connection = Connection(fd)
+
+    def tell(answer: str, said: Any = "") -> None:
+        connection.send_bytes(json.dumps([answer, said]).encode())
+
     try:
         module, _, name = spec.partition(":")
         policy = getattr(importlib.import_module(module), name)()
         calls: dict[str, Callable[..., Any]] = {"reset": policy.reset, "act": policy.act}
     except Exception as error:
-        connection.send(("none", f"{type(error).__name__}: {error}"[:MOST_WORDS]))
+        tell("none", f"{type(error).__name__}: {error}"[:MOST_WORDS])
         return
-    connection.send(("ok", ""))
+    tell("ok")
     while True:
         try:
             name, *given = connection.recv()
@@ -179,7 +195,7 @@ def serve(fd: int, parent_pid: int, spec: str) -> None:
             told = _plain(said) if name == "act" else ("ok", "")
         except Exception as error:
             told = "none", f"{type(error).__name__}: {error}"[:MOST_WORDS]
-        connection.send(told)
+        tell(*told)
 
 
 def _plain(said: Any) -> tuple[str, Any]:
@@ -189,6 +205,6 @@ def _plain(said: Any) -> tuple[str, Any]:
     numbers = np.asarray(said)
     if numbers.ndim == 0 and np.issubdtype(numbers.dtype, np.integer):
         return "ok", int(numbers)
-    if numbers.ndim == 1 and numbers.size <= 64 and np.issubdtype(numbers.dtype, np.number):
+    if numbers.ndim == 1 and numbers.size <= 64 and numbers.dtype.kind in "iuf":
         return "ok", numbers.astype(np.float64).tolist()
     return "unreadable", repr(said)[:MOST_WORDS]
