@@ -9,7 +9,7 @@ from commands import invoke
 from test_closed_loop_fly import TINY, fly, town  # noqa: F401
 
 from cosfly.closed_loop.settings import DroneConfig
-from cosfly.errors import ConfigError, VerifyError
+from cosfly.errors import ConfigError, NothingKept, VerifyError
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight
@@ -103,6 +103,21 @@ def test_another_planner_than_foresight_is_refused(town, tmp_path):  # noqa: F81
     done = relabel(town, tmp_path / "flown", tmp_path / "made", "--set plan.planner=muco")
     assert isinstance(done.exception, ConfigError)
     assert "foresight alone" in str(done.exception)
+
+
+@pytest.mark.parametrize(
+    ("more", "reason"),
+    [
+        ("--set plan.safety_distance_m=25 --set plan.relaxed_safety_m=25", "too_near"),
+        ("--set plan.speed_max_mps=0.2", "no_path"),
+        ("--set fly.drone.radius_m=16", "crashes"),
+    ],
+)
+def test_why_nothing_can_be_shown_there_is_counted(town, tmp_path, more, reason):  # noqa: F811
+    fly(town, tmp_path / "flown", f"{STUDENT} --set fly.most_decisions=12")
+    done = relabel(town, tmp_path / "flown", tmp_path / "made", more)
+    assert isinstance(done.exception, NothingKept)
+    assert f"({reason} 6) of 6" in str(done.exception)
 
 
 @pytest.mark.parametrize("angle", np.linspace(0, 6, 13))
