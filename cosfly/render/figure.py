@@ -1,8 +1,8 @@
 """The figure of a walking person, as solids that any renderer draws: proportions of 1.8 m, a walk cycle driven by the
 distance walked, and what an appearance says is worn.
 
-It stays within the circle round the target's box (PERSON_HALF_EXTENTS_M): in mid-stride the tips of the shoes pass its
-sides by up to 12 cm.
+It stays within the circle round the target's box (PERSON_HALF_EXTENTS_M), to 3 mm: in mid-stride the tips of the shoes
+pass its sides by up to 13 cm.
 """
 
 from __future__ import annotations
