@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -19,6 +18,7 @@ torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
 from safetensors.torch import load_file  # noqa: E402
+from simulator_serving import free_port  # noqa: E402
 from specimens_students import TWELVE, log_of, losses_of  # noqa: E402
 
 from cosfly.errors import ConfigError, InputError  # noqa: E402
@@ -35,12 +35,6 @@ def alone(place, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("alone") / "out"
     assert finish(start(place, out, 1)) == [0]
     return out
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def start(place: Path, out: Path, size: int, **changes: object) -> list[subprocess.Popen]:
