@@ -7,7 +7,6 @@ import http.client
 import json
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -76,8 +75,9 @@ def pixel_of(page: Page, place: list[float]) -> tuple[float, float]:
 
 def settled(page: Page) -> None:
     """The cells are those of what is drawn."""
-    time.sleep(0.2)  # the page waits for more changes first
-    page.wait("!document.body.dataset.asks")
+    for _ in range(2):  # what was changed while it asked is asked for afterwards
+        page.run("new Promise((done) => setTimeout(done, 150))")  # ends after the 100 ms that it waits for more changes
+        page.wait("!document.body.dataset.asks")
 
 
 def message(page: Page) -> str:
