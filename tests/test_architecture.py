@@ -5,7 +5,6 @@ import importlib
 import re
 import subprocess
 import sys
-import time
 import tomllib
 from functools import cache
 from pathlib import Path
@@ -250,15 +249,14 @@ def test_no_public_class_name_stands_twice():
 
 
 def test_help_is_instant():
-    """No stage, no kernel, no image library is loaded to print help; the bound on time is generous, the one on modules
-    not."""
+    """No stage, no kernel, no image library is loaded to print help; the bound on its computing time is generous, the
+    one on modules not."""
     program = "import sys; sys.argv = ['cosfly', '--help']; from cosfly.cli import main\ntry: main()\n"
-    program += "except SystemExit: pass\nprint('LOADED', *sorted(sys.modules))"
-    start_s = time.monotonic()
+    program += "except SystemExit: pass\nimport time; print('LOADED', time.process_time(), *sorted(sys.modules))"
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert time.monotonic() - start_s < 5
-    loaded = set(result.stdout.split("LOADED")[1].split())
-    assert not loaded & {"numpy", "numba", "cv2", "pydantic", "torch", "scipy", "pyarrow"}
+    cpu_s, *loaded = result.stdout.split("LOADED")[1].split()
+    assert float(cpu_s) < 5
+    assert not set(loaded) & {"numpy", "numba", "cv2", "pydantic", "torch", "scipy", "pyarrow"}
 
 
 def test_settings_bring_no_solver_along():

@@ -156,9 +156,9 @@ def test_the_example_of_the_prompt_is_an_answer_that_is_taken():
     ids=["claims", "text", "braces", "objects", "lists", "thoughts", "fences"],
 )
 def test_a_huge_or_deep_answer_is_refused_quickly(text):
-    start_s = time.perf_counter()
+    begun_s = time.thread_time()
     assert parse_answer(text, shipped_actions(), "en", MORE).coc is None
-    assert time.perf_counter() - start_s < 1.0
+    assert time.thread_time() - begun_s < 1.0
 
 
 def test_a_run_writes_claims_and_the_record_keeps_them(tree, tmp_path):

@@ -201,7 +201,7 @@ def test_ctrl_c_is_one_line(code):
         if process.stdout.readline() == "ready\n":
             time.sleep(0.1)
             process.send_signal(signal.SIGINT)
-        _, text = process.communicate(timeout=20)
+        _, text = process.communicate(timeout=60)
     assert process.returncode == 130
     assert text.startswith("error: interrupted")
     assert text.count("\n") == 1

@@ -144,7 +144,7 @@ def test_a_signal_ends_a_command_and_its_workers_in_one_line(tmp_path, until, nu
     process = start_program(tmp_path, until, **options)
     time.sleep(0.2)
     os.killpg(process.pid, number)  # what a terminal and a service manager do
-    text, _ = process.communicate(timeout=20)
+    text, _ = process.communicate(timeout=60)
     assert process.returncode == 128 + number
     assert text.splitlines() == [f"error: {word}; finished work is kept: run the same command again to continue"]
 
@@ -157,7 +157,7 @@ def test_a_second_signal_that_breaks_off_the_ending_ends_the_workers_too(tmp_pat
     process.send_signal(signal.SIGINT)
     time.sleep(gap_s)
     process.send_signal(signal.SIGTERM)
-    assert process.wait(timeout=30) in (130, 143, -signal.SIGTERM)
+    assert process.wait(timeout=60) in (130, 143, -signal.SIGTERM)
     wait_until(lambda: not any(map(is_running, pids)))
 
 

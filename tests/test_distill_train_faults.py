@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+from processes import is_running, wait_until
 from specimens_distill import write_set
 
 torch = pytest.importorskip("torch", reason="needs the extra distill")
@@ -198,7 +199,4 @@ def test_workers_end_with_a_training_that_was_killed(tmp_path):
         workers = {int(process.stdout.readline()) for _ in range(2)}
         assert len(workers) == 2
         process.kill()
-    deadline_s = time.monotonic() + 20
-    while any(Path(f"/proc/{pid}").exists() for pid in workers):
-        assert time.monotonic() < deadline_s
-        time.sleep(0.05)
+    wait_until(lambda: not any(map(is_running, workers)))
