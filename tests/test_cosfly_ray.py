@@ -71,7 +71,7 @@ def nodes() -> Iterator[Nodes]:
 
 def quick(nodes: Nodes) -> Watch:
     cluster = RayConfig(address=nodes.address)
-    return Watch(cluster, item_limit_s=2.0, heartbeat_s=0.1, check_s=0.4, probe_s=0.3, failed_checks=5)
+    return Watch(cluster, item_limit_s=3.2, heartbeat_s=0.1, check_s=0.4, probe_s=0.3, failed_checks=5)
 
 
 def items_of(*kinds: str) -> list[Item]:

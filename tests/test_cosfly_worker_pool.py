@@ -34,7 +34,8 @@ from cosfly.work.stage_events import (
 from cosfly.work.stage_folder import Failed
 from cosfly.work.worker_pool import WorkerPool, limit_s
 
-QUICK = Watch(item_limit_s=2.0, heartbeat_s=0.1, check_s=0.4, probe_s=0.3, failed_checks=5)  # stands still after 2 s
+# Stands still after 2 s, and a while before its item has taken too long, or chance would say which of them it was.
+QUICK = Watch(item_limit_s=3.2, heartbeat_s=0.1, check_s=0.4, probe_s=0.3, failed_checks=5)
 
 
 def items_of(*kinds: str) -> list[Item]:

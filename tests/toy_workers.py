@@ -43,7 +43,7 @@ def _go_wrong(what: str) -> None:
         pass
     if what == "sleep":
         time.sleep(600)
-    if what == "slow":  # twice its limit in all, but it gets on
+    if what == "slow":  # more than its limit in all, but it gets on
         for _ in range(80):
             time.sleep(0.05)
             advance()
