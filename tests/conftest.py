@@ -56,7 +56,7 @@ from pathlib import Path
 from cosfly.work.folder_lock import hold_folder
 lock = hold_folder(Path(sys.argv[1]))
 print("held", flush=True)
-time.sleep(60)
+time.sleep(600)
 """
 
 

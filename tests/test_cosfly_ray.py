@@ -119,8 +119,8 @@ def meanwhile(folder: Path, num_done: int, do: Callable[[], object]) -> Iterator
     def wait() -> None:
         while sum(event.event == "item_done" for event in read_events(folder)) < num_done:
             time.sleep(0.01)
-        do()
         assert not (folder / "manifest.json").exists()
+        do()
 
     with ThreadPoolExecutor(1) as aside:
         doing = aside.submit(wait)
