@@ -6,6 +6,7 @@ They see the packages of this environment (torch among them, which is large) beh
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import shutil
 import subprocess
@@ -16,7 +17,7 @@ import pytest
 
 KEPT_IN = Path(__file__).resolve().parents[1] / ".venv-owners"
 UNREACHABLE = (
-    *("NewConnectionError", "ConnectTimeoutError", "name resolution"),
+    *("NewConnectionError", "ConnectTimeoutError", "ReadTimeoutError", "name resolution"),
     *("Network is unreachable", "Max retries exceeded"),
 )
 _LIGHT = (
@@ -43,7 +44,13 @@ def python_with(pins: tuple[str, ...]) -> Path:
     """Give the interpreter of an environment with these packages; skips the test only where no registry can be
     reached."""
     name = hashlib.sha256("\n".join([sys.version, *pins]).encode()).hexdigest()[:16]
-    folder = KEPT_IN / name
+    KEPT_IN.mkdir(exist_ok=True)
+    with open(KEPT_IN / f"{name}.lock", "w") as lock:  # the tests of another worker may need it now, too
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return _made(KEPT_IN / name, pins)
+
+
+def _made(folder: Path, pins: tuple[str, ...]) -> Path:
     python = folder / "bin" / "python"
     if (folder / ".complete").exists():
         return python
