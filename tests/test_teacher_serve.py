@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,13 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="what a killed p
 def serving(*more: object, **changes) -> ServeConfig:
     changes = {"port": free_port(), "ready_s": 60.0, **changes}
     return ServeConfig(command=COMMAND, arguments=tuple(map(str, more)), **changes)
+
+
+@pytest.fixture(autouse=True)
+def logs_stay_here(tmp_path, monkeypatch) -> None:
+    """Logs of servers that failed stay; those of a test, where the test is."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
 
 
 def pids_in(path: Path) -> list[int]:
@@ -72,7 +80,8 @@ def test_replicas_have_accelerators_and_ports_of_their_own_and_end_with_their_ch
     (["--silent"], {"ready_s": 1.5}, ["not ready within 1.5 s", "ready_s"]),
     (["--last-words", "torch.OutOfMemoryError: CUDA out of memory"], {}, ["memory is full", "status 3"]),
     (["--last-words", "RuntimeError: No CUDA GPUs are available"], {}, ["finds no accelerator", "RuntimeError: No CU"]),
-    (["--last-words", "ValueError: a head of 7"], {}, ["status 3", "ValueError: a head of 7", "engine did not start"]),
+    (["--last-words", "ValueError: a head of 7"], {}, ["status 3: 'ValueError: a head of 7'"]),
+    (["--last-words", "bye"], {}, ["status 3: 'the engine did not start'"]),
     (["--speed", "9"], {}, ["status 2", "does not know an argument", "--speed"]),
 ])  # fmt: skip
 def test_a_server_that_does_not_start_says_why(arguments, changes, words):
@@ -81,6 +90,32 @@ def test_a_server_that_does_not_start_says_why(arguments, changes, words):
         pass
     for word in [*words, f"http://127.0.0.1:{cfg.port}/v1"]:
         assert word in str(refused.value)
+
+
+WARNS = (
+    "(APIServer pid=1) WARNING 11-27 10:44:51 [system_utils.py:255] Found ulimit of 20000 and failed to automatically "
+    "increase. This can cause fd limit errors like `OSError: [Errno 24] Too many open files`."
+)
+ENDS = "RuntimeError: Engine core initialization failed. See root cause above. Failed core proc(s): {'EngineCore': 1}"
+
+
+@pytest.mark.parametrize(("lines", "told"), [
+    (["(Worker pid=3) ERROR 11-27 10:45:23 [multiproc_executor.py:1063] ValueError: Available memory on node 0", ENDS],
+     "status 3: '(Worker pid=3) ERROR 11-27 10:45:23 [multiproc_executor.py:1063] ValueError: Available memory"),
+    (["pydantic_core._pydantic_core.ValidationError: 1 validation error for ModelConfig",
+      "  Value error, User-specified max_model_len (2000000) is greater than the derived max_model_len"],
+     "status 3: 'Value error, User-specified max_model_len (2000000)"),
+    (["    raise LocalEntryNotFoundError(", "huggingface_hub.errors.LocalEntryNotFoundError: Cannot find a snapshot"],
+     "it has no such model: 'huggingface_hub.errors.LocalEntryNotFoundError"),
+    (["(EngineCore pid=2) ERROR 11-27 10:45:41 [core.py:1510] AssertionError: Not enough allowed NUMA nodes", ENDS],
+     "AssertionError: Not enough allowed NUMA nodes"),
+])  # fmt: skip
+def test_of_what_vllm_says_the_line_is_told_that_says_why(lines, told):
+    """Lines of vLLM 0.32.0, which warns in each of a limit of files."""
+    cfg = serving("--last-words", "\n".join([WARNS, *lines]))
+    with pytest.raises(CosflyError) as refused, TeacherServers("model", cfg, 15):
+        pass
+    assert told in str(refused.value)
 
 
 def test_a_port_that_is_taken_and_a_command_that_is_not_there():

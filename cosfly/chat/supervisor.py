@@ -45,8 +45,10 @@ CAUSES = {
     "it finds no accelerator": r"no cuda gpus|failed to infer device type|no cuda-capable|libcuda|nvml",
     "its port is taken": r"address already in use",
     "it does not know an argument": r"unrecognized arguments|invalid choice",
-    "it has no such model": r"repo id|repositorynotfound|is not a local folder|no such file or directory",
+    "it has no such model": r"repo id|(repository|localentry)notfound|is not a local folder|no such file or directory",
 }
+HARMLESS = r"\b(DEBUG|INFO|WARNING)\b"  # a warning quotes errors that others had
+SAYS_WHY = r"(^|[\])] )([\w.]*(Error|Exception): (?!\d+ validation error)|Value error, )"  # a logger puts more before
 
 
 class ServeConfig(Config):
@@ -129,15 +131,16 @@ class _Replica:
             return False
 
     def _why(self, begin: int) -> str:
-        """Give what its log says since it was started: a cause that is known, and the line that tells it, or its first
-        error and its last line."""
+        """Give what its log says since it was started: a cause that is known, and the line that tells it; else its
+        first error, for later ones follow from it; else its last line."""
         text = re.sub(r"\x1b\[[\d;]*m", "", read_tail(self.log_file, begin))
         lines = [" ".join(line.split())[:MOST_SAID] for line in text.splitlines() if line.strip()]
+        lines = [line for line in lines if not re.search(HARMLESS, line)] or lines
+        errors = [line for line in lines if re.search(SAYS_WHY, line)]
         for cause, signs in CAUSES.items():
-            if found := next((line for line in lines if re.search(signs, line, re.IGNORECASE)), None):
+            if found := next((line for line in errors + lines if re.search(signs, line, re.IGNORECASE)), None):
                 return f": {cause}: {found!r} (log: {self.log_file})"
-        told = [next((line for line in lines if re.search(r"\w(Error|Exception):", line)), ""), *lines[-1:]]
-        return f": its log ends {' ... '.join(dict.fromkeys(filter(None, told)))!r} ({self.log_file})"
+        return f": {(errors or lines[-1:] or ['it says nothing'])[0]!r} (log: {self.log_file})"
 
 
 def _devices(number: int, cfg: ServeConfig) -> dict[str, str]:
