@@ -28,6 +28,7 @@ def main() -> None:
     parser.add_argument("--journal", type=Path)
     parser.add_argument("--delay", type=float, default=0.0)
     parser.add_argument("--die-after", type=int, default=0, help="answers; then the process ends, each time")
+    parser.add_argument("--dying-s", type=float, default=0.0, help="time for which it answers 500 before it so ends")
     parser.add_argument("--hang-after", type=int, default=0, help="answers; then nobody is answered, and it lives")
     parser.add_argument("--status", type=int, default=0, help="of every answer, in place of one")
     parser.add_argument("--silent", action="store_true", help="never listen")
@@ -55,7 +56,11 @@ def main() -> None:
         with lock:
             num_answers += 1
             if args.die_after and num_answers > args.die_after:
-                os._exit(9)
+                if not args.dying_s:
+                    os._exit(9)
+                if num_answers == args.die_after + 1:
+                    threading.Timer(args.dying_s, os._exit, (9,)).start()
+                return 500, {"error": {"message": "EngineCore encountered an issue."}}
         hang()
         if args.journal:
             digest = hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()

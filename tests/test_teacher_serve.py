@@ -195,7 +195,7 @@ def served(cfg: ServeConfig) -> CaptionConfig:
     return settings("serve:test-teacher", endpoint=PATIENT, serve=cfg.model_dump())
 
 
-@pytest.mark.parametrize("fault", ["--die-after", "--hang-after"])
+@pytest.mark.parametrize("fault", ["--die-after 15", "--die-after 15 --dying-s 6", "--hang-after 15"])
 def test_servers_of_one_run_begin_and_end_with_it_and_one_that_dies_or_hangs_costs_nothing(
     monkeypatch, tmp_path, caplog, fault
 ):
@@ -203,10 +203,10 @@ def test_servers_of_one_run_begin_and_end_with_it_and_one_that_dies_or_hangs_cos
     monkeypatch.setattr("cosfly.chat.supervisor.ANSWER_S", 2.0)
     tree = make_playback_tree(tmp_path / "tree", 1, 20, with_augmented=False)  # 11 windows
     journal, child = tmp_path / "journal", tmp_path / "child"
-    hung_s = {"hung_s": 5.0} if fault == "--hang-after" else {}  # a busy machine's server is not hung
-    cfg = serving("--journal", journal, "--child", child, fault, 15, **hung_s)
+    hung_s = {"hung_s": 5.0} if "--hang-after" in fault else {}  # a busy machine's server is not hung
+    cfg = serving("--journal", journal, "--child", child, *fault.split(), **hung_s)
     run(served(cfg), tree, tmp_path / "out")
-    assert ("has not answered for" in caplog.text) == (fault == "--hang-after")
+    assert ("has not answered for" in caplog.text) == ("--hang-after" in fault)
     assert {caption.status for caption in read_captions(tmp_path / "out" / "captions.jsonl")} == {"accepted"}
     keys = [record["key"] for record in kept_answers(tmp_path / "out")]
     assert len(keys) == len(set(keys)) == 22

@@ -39,6 +39,8 @@ VLLM = (
 )  # fmt: skip
 LOOK_S, ANSWER_S, FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 5.0, 1.0, 60.0
 ASKED_BEFORE_HUNG = 10  # times that a server is asked whether it lives, before it counts as hung
+DYING_S = 10.0  # vLLM answers 500 so long once its engine has died, before it ends
+MOST_ENDS = 2  # of a server while a request is asked; at the next it may be the request that ends it
 MOST_SAID = 300  # characters of a line of a server's log
 CAUSES = {
     "its accelerator's memory is full": r"out of memory|no available memory|free memory on device",
@@ -80,7 +82,7 @@ class _Replica:
         filled |= {"gpus": cfg.gpus, "images": num_images}
         self.words = [Template(word).safe_substitute(filled) for word in (*cfg.command, *cfg.arguments)]
         self.environment = {"VLLM_NO_USAGE_STATS": "1", **os.environ, **_devices(number, cfg)}
-        self.is_ready, self.failure = False, ""
+        self.is_ready, self.failure, self.num_starts = False, "", 0
 
     def serve(self, stop: threading.Event) -> None:
         """Keep a server running until it is told to stop, or it was started anew too often; `failure` says why."""
@@ -103,6 +105,7 @@ class _Replica:
         except (OSError, OverflowError) as error:
             return f"port {self.port} cannot be had ({error}); choose another with --port"
         begin = self.log_file.stat().st_size if self.log_file.exists() else 0
+        self.num_starts += 1
         asked_s = answered_s = time.monotonic()
         with guarded(self.words, self.log_file, self.environment) as process:
             while not stop.wait(LOOK_S):
@@ -228,14 +231,28 @@ class ServedClient(ChatClient):
 
     async def answer(self, request: Request) -> Reply:
         """Answer as `ChatClient` does; servers that are being started anew are waited for."""
+        num_ends = 0
         while True:
+            number = self._number_if_ready()
             try:
                 return await super().answer(request)
             except NoAnswer as error:
                 self._supervised.check()
-                if error.is_final or any(one.is_ready for one in self._supervised.replicas):
+                if error.is_final:
                     raise
+                until_s = time.monotonic() + DYING_S
+                while (now := self._number_if_ready()) == number is not None and time.monotonic() < until_s:
+                    await asyncio.sleep(LOOK_S)
+                if number is not None:
+                    if now == number or num_ends == MOST_ENDS:
+                        raise
+                    num_ends += 1
             await asyncio.sleep(LOOK_S)
+
+    def _number_if_ready(self) -> int | None:
+        """Tell which servers these are, by how often one was started; None while none is ready."""
+        replicas = self._supervised.replicas
+        return sum(one.num_starts for one in replicas) if any(one.is_ready for one in replicas) else None
 
     async def close(self) -> None:
         await super().close()
