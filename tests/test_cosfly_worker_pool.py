@@ -7,6 +7,7 @@ import platform
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -32,6 +33,7 @@ from cosfly.work.stage_events import (
     read_events,
 )
 from cosfly.work.stage_folder import Failed
+from cosfly.work.worker import signals_held_back
 from cosfly.work.worker_pool import WorkerPool, limit_s
 
 # Stands still after 2 s, and a while before its item has taken too long, or chance would say which of them it was.
@@ -160,6 +162,27 @@ def test_a_second_signal_that_breaks_off_the_ending_ends_the_workers_too(tmp_pat
     process.send_signal(signal.SIGTERM)
     assert process.wait(timeout=60) in (130, 143, -signal.SIGTERM)
     wait_until(lambda: not any(map(is_running, pids)))
+
+
+def test_a_signal_that_another_thread_takes_waits_until_a_process_has_started():
+    done, steps = threading.Event(), []
+
+    def start() -> None:
+        with signals_held_back():
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.1)
+            steps.append("started")
+
+    other = threading.Thread(target=done.wait)
+    other.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            start()
+    finally:
+        done.set()
+        other.join()
+    assert steps == ["started"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 # --- telling how far it is --------------------------------------------------------------------------------------------

@@ -72,11 +72,21 @@ class Start:
 def signals_held_back() -> Iterator[None]:
     """Hold back Ctrl-C and its like while a process starts, which inherits that: what they raise is lost in hooks of a
     fork, and would hit a worker's imports."""
+    came, is_main = list[int](), threading.current_thread() is threading.main_thread()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, LEFT_TO_THE_PARENT)
+    # Another thread may take the signal all the same; what is done then is done in the main one, here.
+    handlers = {number: signal.getsignal(number) for number in LEFT_TO_THE_PARENT}
+    ours = [number for number, handler in handlers.items() if callable(handler)] if is_main else []
     try:
+        for number in ours:
+            signal.signal(number, lambda one, _: came.append(one))
         yield
     finally:
+        for number in ours:
+            signal.signal(number, handlers[number])
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for one in came:
+            signal.raise_signal(one)
 
 
 def keep_freed_memory() -> None:
