@@ -233,21 +233,18 @@ class ServedClient(ChatClient):
         """Answer as `ChatClient` does; servers that are being started anew are waited for."""
         num_ends = 0
         while True:
-            number = self._number_if_ready()
+            while (number := self._number_if_ready()) is None:
+                self._supervised.check()
+                await asyncio.sleep(LOOK_S)
             try:
                 return await super().answer(request)
             except NoAnswer as error:
-                self._supervised.check()
-                if error.is_final:
-                    raise
                 until_s = time.monotonic() + DYING_S
-                while (now := self._number_if_ready()) == number is not None and time.monotonic() < until_s:
+                while not error.is_final and self._number_if_ready() == number and time.monotonic() < until_s:
                     await asyncio.sleep(LOOK_S)
-                if number is not None:
-                    if now == number or num_ends == MOST_ENDS:
-                        raise
-                    num_ends += 1
-            await asyncio.sleep(LOOK_S)
+                if self._number_if_ready() == number or error.is_final or num_ends == MOST_ENDS:
+                    raise
+                num_ends += 1
 
     def _number_if_ready(self) -> int | None:
         """Tell which servers these are, by how often one was started; None while none is ready."""
