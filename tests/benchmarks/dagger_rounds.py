@@ -1,5 +1,5 @@
 """Does DAgger's data make a student better? A student is taught on the planner's flights, flies, is taught on what
-`fly --relabel` made of its mistakes too, and flies again, on walks of a town that it never saw.
+`fly --relabel` made of its own flights too, and flies again, on walks of a town that it never saw.
 
     cosfly run TRAIN.yaml --out train --until caption --set caption.repair.soft_conflict=repair
     cosfly run TEST.yaml --out test --until plan
@@ -57,12 +57,14 @@ def _rows(prompt: str, word: str) -> list[np.ndarray]:
     return [np.array([float(n) for n in re.split("[,;]", row)]) for row in TUPLE.findall(line.partition(":")[2])]
 
 
-def samples(captions: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Prompts in numbers (n, 40), and the decisions of accepted captions (n,)."""
+def samples(captions: Path, most_flights: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Prompts in numbers (n, 40), and the decisions of accepted captions (n,), of the first flights or all."""
+    accepted = [one for one in read_captions(captions) if one.status == "accepted"]
+    flights = sorted({one.trajectory for one in accepted})[:most_flights]
     found = [
         (features(one.prompt["en"].user), TOKENS.index(one.en.flight_decision))
-        for one in read_captions(captions)
-        if one.status == "accepted"
+        for one in accepted
+        if one.trajectory in flights
     ]
     return np.array([x for x, _ in found]), np.array([y for _, y in found])
 
@@ -116,10 +118,11 @@ def main() -> None:
     for name in ("train", "test", "out"):
         parser.add_argument(f"--{name}", type=Path, required=True)
     parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--first", type=int, help="flights of the planner that it is taught on first; all unless said")
     parser.add_argument("--set", action="append", default=[], help="settings of the flights")
     given = parser.parse_args()
     settings = [word for text in given.set for word in ("--set", text)]
-    first = x, y = samples(given.train / "caption/captions.jsonl")
+    first = x, y = samples(given.train / "caption/captions.jsonl", given.first)
     net, told = taught(x, y), []
     told.append(fly(net, given.test, given.out / "r0", settings))
     for number in range(1, given.rounds + 1):
