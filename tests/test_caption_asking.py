@@ -10,6 +10,7 @@ import logging
 import random
 import subprocess
 import sys
+import time
 from collections import Counter
 from pathlib import Path
 
@@ -198,8 +199,10 @@ def test_the_total_timeout_bounds_all_tries(tree, tmp_path):
         "max_tries": 50, "backoff_s": 0.3, "max_backoff_s": 0.3, "total_timeout_s": 0.5, "stop_after_failures": 1,
     }  # fmt: skip
     with deciding(fault=lambda number, body: "500") as server:
+        start_s = time.monotonic()
         with pytest.raises(TeacherError, match="total_timeout"):
             run(settings(server.url, endpoint=endpoint, limit=1), tree, tmp_path / "out")
+        assert time.monotonic() - start_s < 5.0
         assert 1 <= len(server.bodies) <= 4
 
 

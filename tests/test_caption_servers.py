@@ -239,7 +239,8 @@ def test_what_becomes_of_a_run_at_a_server_like_this(tree, tmp_path, caplog, who
             assert str(caught.value).isprintable()
             assert len(str(caught.value)) < 2000
         # One who waits so short a time may be gone before a busy server has read what was asked, which then comes late.
-        assert patience or len(server.bodies) == outcome.num_asked
+        num_asked = len(server.bodies)
+        assert num_asked <= outcome.num_asked if patience else num_asked == outcome.num_asked
         assert windows_of(out) == expected_windows(outcome)
         server.respond = None  # it is mended
         asked = len(server.bodies)

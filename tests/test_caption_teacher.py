@@ -342,5 +342,5 @@ def test_a_server_with_room_for_three_is_not_flooded(tmp_path):
         asked = len(server.bodies)
         answered = len(kept_answers(tmp_path / "out"))
     assert report_of(tmp_path / "out")["windows"]["failed"] == {}
-    assert asked - answered < 1.5 * answered  # 0.5 usually, 19 of a client that floods
+    assert asked - answered < answered  # most requests are answered at once; of one that floods, one in twenty
     assert asked > answered  # the limit was met

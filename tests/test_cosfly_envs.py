@@ -199,6 +199,7 @@ class Pipe(Fine):
             except OSError: pass
         return 0
 class Forged(Pipe): answer = b"\\0\\0\\0\\x0b[1, [2, 3]]"
+class Mistyped(Pipe): answer = b'\\0\\0\\0\\x21["ok", ["a", "b", "c", "d", "e"]]'
 class Huge(Pipe): answer = b"\\xff" * 12
 class Closes(Fine):
     def act(self, observation): os.closerange(3, 30); time.sleep(600)
@@ -241,7 +242,7 @@ def ask(follow, tmp_path, monkeypatch):
         ("Fine", "ok"), ("Token", "ok"), ("Command", "ok"), ("Word", "invalid"), ("Beyond", "invalid"),
         ("Seventeen", "invalid"), ("Nothing", "unreadable"), ("Object", "unreadable"), ("Raises", "none"),
         ("Dies", "none"), ("Quits", "none"), ("Never", "late"), ("BadReset", "none"),
-        ("Complex", "unreadable"), ("Forged", "none"), ("Huge", "none"), ("Closes", "none"),
+        ("Complex", "unreadable"), ("Forged", "none"), ("Mistyped", "none"), ("Huge", "none"), ("Closes", "none"),
     ],
 )  # fmt: skip
 def test_what_a_policy_does_is_told_as_its_answer(ask, name, wanted):

@@ -239,7 +239,9 @@ def test_a_server_that_we_start_and_that_hangs_is_ended_and_started_again(tmp_pa
     plain = " ".join(command(tmp_path / "boxes_3d.json", 0)).replace(" 0", " {port}")
     start = f"sh -c 'mkdir {tmp_path}/first 2>/dev/null && exec {plain} --fault hang@7; exec {plain}'"
     cfg = config(free_port(), timeout_s=300.0, server_command=start, health_check_s=2.0)
+    begin_s = time.monotonic()
     tree = run(cfg, *inputs, tmp_path / "tree", workers=1, watch=Watch(heartbeat_s=0.5, check_s=1.0))
+    assert time.monotonic() - begin_s < 200.0
     assert len(find_flights(tree)) == 1
     assert (tree / "events.jsonl").read_text().count('"worker_died"') == 1
 

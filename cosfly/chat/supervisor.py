@@ -239,11 +239,13 @@ class ServedClient(ChatClient):
             try:
                 return await super().answer(request)
             except NoAnswer as error:
-                until_s = time.monotonic() + DYING_S
-                while not error.is_final and self._number_if_ready() == number and time.monotonic() < until_s:
-                    await asyncio.sleep(LOOK_S)
-                if self._number_if_ready() == number or error.is_final or num_ends == MOST_ENDS:
+                if error.is_final or num_ends == MOST_ENDS:
                     raise
+                until_s = time.monotonic() + DYING_S
+                while self._number_if_ready() == number:
+                    if time.monotonic() > until_s:
+                        raise
+                    await asyncio.sleep(LOOK_S)
                 num_ends += 1
 
     def _number_if_ready(self) -> int | None:

@@ -41,8 +41,7 @@ def fly(
     ] = None,
     others: Annotated[Path | None, Option(help="Who else moves: others.json, beside path.json.")] = None,
     relabel: Annotated[
-        Path | None,
-        Option(help="Folder of `cosfly fly`: the planner goes on from where that student was."),
+        Path | None, Option(help="Folder of `cosfly fly`: the planner goes on from where that student was.")
     ] = None,
 ) -> None:
     """A student flies: its decisions move the drone, and what it then sees is drawn. Records of all, and their tree."""

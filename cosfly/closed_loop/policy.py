@@ -164,7 +164,8 @@ class Policy:
             return None
         self._awaits = False
         answer, said = json.loads(self._connection.recv_bytes(MOST_REPLY_BYTES))
-        if answer not in ("ok", "unreadable", "none"):
+        numbers = said if isinstance(said, list) else []
+        if answer not in ("ok", "unreadable", "none") or not all(isinstance(one, int | float) for one in numbers):
             raise ValueError(answer)
         return answer, said
 
