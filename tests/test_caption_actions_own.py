@@ -230,7 +230,7 @@ def test_a_run_tells_of_an_action_that_was_never_the_label(whole, mine, tmp_path
 
 
 @pytest.mark.slow
-def test_two_campaigns_of_other_sets_run_in_one_process_one_after_the_other_and_at_once(whole, mine, tmp_path):
+def test_two_stages_of_other_sets_run_in_one_process_one_after_the_other_and_at_once(whole, mine, tmp_path):
     entry = ENTRY.replace(OWN, "glide_along").replace("cruise along", "glide along").replace("巡航伴飞", "滑行伴飞")
     other = with_own(tmp_path / "other.yaml", entry, "  - [glide_along]\n")
 

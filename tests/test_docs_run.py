@@ -210,7 +210,6 @@ BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "CosFly-Track": lambda root, target: write_foreign_tree(target, trajectories=("trajectory_1", "trajectory_2")),
     "town.csv": _table,
     "town.geojson": _geojson,
-    "campaign.yaml": lambda root, target: target.write_text("name: two\nseeds: [0, 1]\n"),
     "file:captions.jsonl": _others_captions,
     "../shared/data/simworld-progen/progen_world.json": _world,
     "../shared/data/delft-bgt-lod1/delft.json.gz": _delft,

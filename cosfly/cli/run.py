@@ -11,7 +11,6 @@ from typer import Argument, Option
 
 from cosfly.cli import options
 from cosfly.cli.options import WORKERS, Job, takes
-from cosfly.errors import InputError
 
 if TYPE_CHECKING:
     from cosfly.app.pipeline import StageResult
@@ -50,45 +49,6 @@ def run(
     results = pipeline.run(job.cfg, out, resume=job.resume, until=until)
     _closing_table(results, out)
     job.check_failures({r.stage.name: r.manifest.counts for r in results}, out)
-
-
-@app.command()
-def campaign(
-    file: Annotated[Path, Argument(help="YAML file with maps, configurations and seeds; or the folder, to continue.")],
-    out: Annotated[
-        Path | None, Option(show_default="campaigns/<name>", help="Folder of the campaign, with one for each run.")
-    ] = None,
-    overrides: Annotated[
-        list[str] | None, Option("--set", "-s", metavar="A.B=C", help="Override a setting of the campaign; repeat it.")
-    ] = None,
-    resume: Annotated[Literal["never", "if-same"], Option(help=options.RESUME_HELP)] = "if-same",
-    dry_run: Annotated[
-        bool, Option("--dry-run", help="Name the runs, say what is left of each, and write nothing.")
-    ] = False,
-) -> None:
-    """Many runs (maps x configurations x seeds) as one job with one release. Run it again to continue."""
-    from cosfly.app import campaign as campaigns
-    from cosfly.app import estimate
-    from cosfly.work.console import answer_console, console
-    from release.stats.stats import shown
-
-    cfg, runs, out = campaigns.load_campaign(file, overrides or [], out)
-    failed = {} if dry_run else campaigns.run(cfg, runs, out, resume=resume)
-    table = [[shown(cell) for cell in row] for row in campaigns.table(runs, failed)]
-    title = f"What {'stands' if dry_run else 'was made'} in {out}"
-    where = answer_console if dry_run else console
-    options.tell_table(where, campaigns.HEAD, table, title=title, left=("state", "at hand"))
-    if dry_run:
-        every = [row for one in runs for row in estimate.estimate(one.cfg, one.folder, estimate.rates_near(one.folder))]
-        is_released = (out / "release/manifest.json").exists()
-        left = [row for row in every if not (row.is_done or (row.stage == "release" and is_released))]
-        line = f"what is left takes about {estimate.time_left(left)}; {estimate.space(left, out)}"
-        return answer_console.print(line, soft_wrap=True)
-    typer.echo(out / campaigns.REPORT)
-    if failed:
-        fix = "mend what the table names, then run the same command again; or leave them out (leave_out)"
-        raise InputError("some runs failed; the others are done", where=out, got=", ".join(failed), fix=fix)
-    typer.echo(out / "release/dataset")
 
 
 def _is_begun(config: Path, cfg: RunConfig) -> bool:
