@@ -120,11 +120,7 @@ class TrainingSet(_Strict):
 
 
 def read_training_set(dataset: Path) -> TrainingSet:
-    """Read a training set's record.
-
-    Raises:
-        InputError: it is missing, of another version, or malformed.
-    """
+    """Read a training set's record."""
     path = dataset / RECORD
     if not path.exists():
         raise InputError("no training set", where=dataset, got=f"no {RECORD}", fix="run cosfly distill prepare")
@@ -132,11 +128,7 @@ def read_training_set(dataset: Path) -> TrainingSet:
 
 
 def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
-    """Tell which of the given playback trees belongs to which run of a training set: run -> tree.
-
-    Raises:
-        InputError: a tree is none of those that the training set was made of, or one of those is not given.
-    """
+    """Tell which of the given playback trees belongs to which run of a training set: run -> tree."""
     record = read_training_set(dataset)
     run_of = {tree.sha256: tree.run for tree in record.trees}
     trees: dict[str, Path] = {}
@@ -221,12 +213,7 @@ class Samples(Sequence[Sample]):
 
 
 def open_split(dataset: Path, split: Split) -> Samples:
-    """Open a split.
-
-    Raises:
-        InputError: there is no training set, or it is of an earlier version. Reading a sample: names the file, the row
-            and the field.
-    """
+    """Open a split."""
     return Samples(dataset, split)
 
 

@@ -76,11 +76,7 @@ class WindowSource(Protocol):
 
 
 def open_source(source: Path, captions: Path | None, language: Language, split: str | None) -> WindowSource:
-    """Open a release, a run, or a playback tree with its captions; arguments as of `Windows`.
-
-    Raises:
-        ConfigError: a split of what has none. InputError: it is none of the three.
-    """
+    """Open a release, a run, or a playback tree with its captions; arguments as of `Windows`."""
     # A run is taken as its tree, which holds all of it, unless a split of its release is asked for.
     released = [source, source / "dataset", *([source / "release/dataset"] if split else [])]
     for folder in released if captions is None else ():
@@ -150,11 +146,7 @@ def _frames_in(folder: Path) -> set[int]:
 
 
 def facts_of(flight: Flight, window: Sequence[int]) -> dict[str, np.ndarray]:
-    """Give FACTS of some frames of a flight.
-
-    Raises:
-        InputError: it has not so many frames.
-    """
+    """Give FACTS of some frames of a flight."""
     if max(window) >= len(flight):
         raise InputError("a caption of a frame that is not in its flight", where=flight.folder, got=str(max(window)))
     at, mask = list(window), flight.target_mask_bbox
@@ -248,11 +240,7 @@ TYPES: dict[str, pa.DataType] = {
 
 
 def _check_columns(path: Path, tree: Path, wanted: Sequence[str]) -> None:
-    """Check that a shard has columns as they are read.
-
-    Raises:
-        InputError: names those that are missing or of another type.
-    """
+    """Check that a shard has columns as they are read."""
     with open_table(path, tree=tree) as table:
         found = {field.name: field.type for field in table.schema_arrow}
     if wrong := ", ".join(name for name in wanted if found.get(name) != TYPES.get(name, pa.string())):
@@ -303,9 +291,6 @@ class Windows(Sequence[WindowData]):
         language: of prompt and caption. split: of a release `train`, `validation` or `test`; None takes all.
         max_side_px: frames are scaled down to this longest side; None takes the size that pixels in prompt and caption
             refer to.
-    Raises:
-        ConfigError: an option that is none. InputError: nothing to read, or not readable; a picture, when its window is
-            read.
     """
 
     def __init__(

@@ -21,11 +21,7 @@ SKY_MM = 65535  # what 16 bits have left for the sky
 
 
 def depth_of(data: bytes, coded: DepthCoding, where: str) -> np.ndarray:
-    """Give a depth image in metres, (h, w) float32; SKY_DEPTH_M sky, 0 invalid.
-
-    Raises:
-        InputError: it is no whole image of the coding.
-    """
+    """Give a depth image in metres, (h, w) float32; SKY_DEPTH_M sky, 0 invalid."""
     if coded.coding != "millimetre_png":
         kind = np.float16 if coded.coding == "float16" else np.float32
         values = parse_array(data, where, dtype=kind, ndim=2, what="depth image")

@@ -35,8 +35,6 @@ def select_frames(num_points: int, num_frames: int | None, window_frames: int, u
     Returns:
         (min(n, m),) int64, strictly increasing; runs differ in length, and the gaps between them, by at most one. With
         two runs or more the first and the last frame are kept; one run stands in the middle.
-    Raises:
-        ValueError: n is negative, m or w is less than 1.
     """
     if num_points < 0 or window_frames < 1 or (num_frames is not None and num_frames < 1):
         raise ValueError(f"cannot choose {num_frames} of {num_points} frames for windows of {window_frames}")
@@ -68,9 +66,6 @@ def split_groups(
 ) -> dict[str, SplitName]:
     """Give each group, a walk or a family of towns, its split. Those of which no flight is released are not among them,
     and have no rank.
-
-    Raises:
-        InputError: there is no group; names `what` is missing.
     """
     shares: dict[Split, float] = {"val": fractions["validation"], "test": fractions["test"]}
     splits = assign_splits(groups, shares, seed, too_few="fill", what=what)

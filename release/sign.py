@@ -44,9 +44,6 @@ class Signature(Strict):
 def read_private_key(path: Path) -> Any:
     """Read an ed25519 private key, PEM as openssl or ssh-keygen write it; an encrypted one by the passphrase of the
     environment.
-
-    Raises:
-        InputError: it is none, or the passphrase is missing or wrong; it quotes neither the file nor the library.
     """
     data, serialization = _key_file(path, "private key", "PUBLIC KEY-----")
     is_ssh = b"BEGIN OPENSSH PRIVATE KEY" in data
@@ -112,9 +109,6 @@ def _of_kind(name: str, key: Any, path: Path) -> Any:
 def sign(folder: Path, key: Any) -> Path:
     """Sign the list of checksums of a release folder, after every file was compared with it; gives the file of the
     signature.
-
-    Raises:
-        VerifyError: a file is not the one of the list. InputError: there is no list.
     """
     digests = read_checksums(folder)
     wrong = [name for name, digest in digests.items() if sha256_file(folder / name, tree=folder) != digest]

@@ -231,11 +231,7 @@ class Asking:
             self.quarantine[sample_id] = Failed(id=sample_id, code=str(caption.drop_reason), message=refusal)
 
     def _note_outcome(self, caption: Caption) -> None:
-        """End the run where nothing of what a teacher answered first is accepted: the rest would be no better.
-
-        Raises:
-            TeacherError: it is so.
-        """
+        """End the run where nothing of what a teacher answered first is accepted: the rest would be no better."""
         if caption.status == "accepted":
             self.dropped = None
         most = self.cfg.stop_after_dropped if self.cfg.teacher_kind in ("endpoint", "vllm") else 0

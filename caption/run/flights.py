@@ -71,11 +71,7 @@ def _cut(flight: Flight, cfg: CaptionConfig, vocabulary: Vocabulary) -> Iterator
 
 
 def _twin_of(flight: Flight) -> Flight | None:
-    """Read the clean flight beside a perturbed one; one of other frames is left out, and the log says why.
-
-    Raises:
-        InputError: it cannot be read. Labels without it would stay when it is mended; a failure is done again.
-    """
+    """Read the clean flight beside a perturbed one; one of other frames is left out, and the log says why."""
     try:
         return read_twin(flight)
     except VerifyError as error:
@@ -84,12 +80,7 @@ def _twin_of(flight: Flight) -> Flight | None:
 
 
 def named_flights(data: Path, choice: FlightChoice = ALL_FLIGHTS) -> list[tuple[str, Path]]:
-    """Give (flight id, folder) in the order of the product.
-
-    Raises:
-        InputError: none is chosen, or two flights have one place below two folders, so their samples could not be told
-        apart.
-    """
+    """Give (flight id, folder) in the order of the product."""
     folders = find_flights(data, choice)
     ids = flight_ids([place_of(folder) for folder in folders])
     named = [(ids[place_of(folder)], folder) for folder in folders]

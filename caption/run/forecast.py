@@ -89,11 +89,7 @@ class Forecast:
 
 
 def make_forecast(cfg: CaptionConfig, data: Path, out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Forecast:
-    """Estimate a run by asking about a few windows.
-
-    Raises:
-        ConfigError: no endpoint is asked. InputError: no window. TeacherError: no trial window got an answer.
-    """
+    """Estimate a run by asking about a few windows."""
     if cfg.teacher_kind != "endpoint" and not cfg.reader.urls:
         expected = "--teacher URL or --reader URL"
         raise ConfigError("a plan needs an endpoint", where="--plan", got=cfg.teacher, expected=expected)

@@ -16,11 +16,7 @@ from cosfly.work.store import write_bytes
 
 
 def vocabulary_of(cfg: CaptionConfig) -> Vocabulary:
-    """Read the files that the settings name.
-
-    Raises:
-        ConfigError: one of them cannot be used.
-    """
+    """Read the files that the settings name."""
     prompts = shipped_prompts() if cfg.prompts is None else own_prompts(cfg.prompts)
     return Vocabulary(shipped_actions() if cfg.actions is None else _own_actions(cfg, cfg.actions), prompts)
 

@@ -133,11 +133,7 @@ def _publish(
 
 
 def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Resume) -> StageFolder:
-    """Open the stage's folder for these settings.
-
-    Raises:
-        ResumeError: it holds work made with another prompt, model or input; names what differs.
-    """
+    """Open the stage's folder for these settings."""
     inputs = {"data": data} if cfg.caption_file is None else {"data": data, "captions": cfg.caption_file}
     if cfg.student.folder is not None:
         inputs |= student_files(cfg.student.folder)
@@ -162,11 +158,7 @@ def _has_more(stage: StageFolder, cfg: CaptionConfig) -> bool:
 
 
 def _has_refused(stage: StageFolder, cfg: CaptionConfig) -> bool:
-    """Tell whether the server refused windows of a complete folder; it is then open again.
-
-    Raises:
-        ResumeError: it holds more windows than the limit now allows; it stays complete.
-    """
+    """Tell whether the server refused windows of a complete folder; it is then open again."""
     if not read_quarantine(stage.path):
         return False
     num_windows = read_manifest(stage.path).counts.input
@@ -189,11 +181,7 @@ def _take_back(stage: StageFolder, allotted: list[Allotted]) -> None:
 
 
 def _tell_what_is_left(cfg: CaptionConfig, asked: Asked, tally: Tally) -> None:
-    """Say why the product is not whole.
-
-    Raises:
-        TeacherError: a budget is used up, or windows got no answer.
-    """
+    """Say why the product is not whole."""
     missed = [failure for failure in asked.unanswered if failure.code != "not_asked"]
     if asked.stopped:
         raise TeacherError(

@@ -50,8 +50,6 @@ async def open_models(
     Args:
         where: URL and name of each; None takes the endpoint's only one.
         book: keeps the answers; None: they are not kept. budget: None sets no limit. troubles: notes tries that fail.
-    Raises:
-        TeacherError: an endpoint cannot be used.
     """
     settings = cfg.model_dump(include=EndpointConfig.model_fields.keys() - {"model", "max_tokens", "extra_body"})
     async with AsyncExitStack() as stack:

@@ -50,11 +50,7 @@ class Terms:
 
 
 def read_foreign(path: Path) -> dict[str, str]:
-    """Check the captions of a file; gives sample_id -> its line, which takes a tenth of the memory of what it says.
-
-    Raises:
-        InputError: names the file, the line and the field; or a window has two lines, or there is no line.
-    """
+    """Check the captions of a file; gives sample_id -> its line, which takes a tenth of the memory of what it says."""
     lines: dict[str, str] = {}
     fix = "give --teacher file:PATH with one caption a line"
     for number, (line, caption) in enumerate(model_lines(path, ForeignCaption, what="foreign captions", fix=fix), 1):
@@ -139,8 +135,6 @@ def read_student(path: Path, run: str | None = None) -> dict[str, Prediction]:
 
     Args:
         run: the tree, as the training set names it; None where the predictions leave no doubt.
-    Raises:
-        InputError: as `read_predictions`; or there is none, or several trees have a window of one name.
     """
     predictions = read_predictions(path)
     runs = sorted({prediction.run for prediction in predictions})

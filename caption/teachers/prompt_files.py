@@ -30,11 +30,7 @@ def shipped_prompts() -> dict[str, str]:
 
 
 def own_prompts(folder: Path) -> dict[str, str]:
-    """Read a folder of prompts, in the place of those that ship.
-
-    Raises:
-        ConfigError: something is wrong with them; each thing is told in a line of the log, with its file and line.
-    """
+    """Read a folder of prompts, in the place of those that ship."""
     if not folder.is_dir():
         raise ConfigError(
             "no such folder of prompts",
@@ -107,11 +103,7 @@ def prompt_format(name: str, vocabulary: Vocabulary) -> str:
 
 
 def export_prompts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
-    """Write prompts into a folder, to begin with; files that stand there already stay.
-
-    Raises:
-        ConfigError: a file of these names is there, with another text.
-    """
+    """Write prompts into a folder, to begin with; files that stand there already stay."""
     with storage_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     refuse_links(folder)

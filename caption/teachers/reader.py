@@ -174,11 +174,7 @@ class Reader:
         return [model.name for model in self.models]
 
     async def read(self, coc: Coc, facts: Facts, language: Language, sample_id: str) -> Read:
-        """Read a text twice. What cannot be read, or is refused, states nothing.
-
-        Raises:
-            NoAnswer: asking again later may help. BudgetSpent: one more request might pass a limit.
-        """
+        """Read a text twice. What cannot be read, or is refused, states nothing."""
         asked = [self._reading(number, coc, facts, language, sample_id) for number in range(READINGS)]
         readings = await asyncio.gather(*asked)
         read = Read(num_claims=[None if claims is None else len(claims) for claims, _ in readings])
@@ -257,11 +253,7 @@ class ReaderCheck:
 async def check_reader(
     cfg: ReaderConfig, vocabulary: Vocabulary, gold: Sequence[GoldCaption], seed: int = 0
 ) -> ReaderCheck:
-    """Measure the reader that the settings name.
-
-    Raises:
-        TeacherError: an endpoint cannot be used.
-    """
+    """Measure the reader that the settings name."""
     async with open_reader(cfg, vocabulary, seed) as reader:
         if reader is None:
             raise InputError("no reader to check", where="--reader", got="nothing", expected="the URL of an endpoint")

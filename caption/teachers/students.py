@@ -42,10 +42,6 @@ def as_taught(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfig:
     sampling.
 
     Where nobody is asked as a student they stay as they are.
-
-    Raises:
-        InputError: the folder does not say what the student was taught. ConfigError: it was taught something that
-        cannot be asked here.
     """
     folder = cfg.student.folder
     if folder is None:
@@ -77,11 +73,7 @@ def as_taught(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfig:
 
 
 def check_prompts(taught: Taught, folder: Path, vocabulary: Vocabulary) -> None:
-    """Check that prompts are written today as they were for the student.
-
-    Raises:
-        ConfigError: they are not, or it was taught no English, with which a caption begins.
-    """
+    """Check that prompts are written today as they were for the student."""
     if "en" not in taught.prompts:
         raise ConfigError("the student was taught no English", where=folder, got=", ".join(taught.prompts))
     for language, prompt in taught.prompts.items():

@@ -223,10 +223,6 @@ class AskingTeacher:
 
         One trial answers for all that were refused before it, and later for those between which enough windows are
         answered: a server that answers is not at fault. Two are tried, since a filter may stop one by chance.
-
-        Raises:
-            TeacherError: it is the server's: both are refused alike.
-            NoAnswer: it cannot be told.
         """
         refused_s = time.monotonic()
         async with self._trying:
@@ -277,11 +273,7 @@ EMBEDDED = ("rules", "file", "student")  # kinds that answer at once, in the pro
 
 
 def embedded_teacher(cfg: CaptionConfig, seed: int) -> Teacher:
-    """Make a teacher that asks nobody.
-
-    Raises:
-        InputError: its file cannot be read.
-    """
+    """Make a teacher that asks nobody."""
     path = cfg.caption_file
     if path is None:
         return RuleTeacher(seed)
@@ -293,8 +285,6 @@ def make_engine(cfg: CaptionConfig, troubles: Troubles | None = None) -> Engine:
 
     Args:
         troubles: where a server notes tries that fail.
-    Raises:
-        InputError: it is not a model folder.
     """
     if cfg.served_model is not None:
         return ServedClient(cfg.served_model, cfg.serve, cfg.num_images, cfg.endpoint, troubles)

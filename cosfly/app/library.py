@@ -56,8 +56,6 @@ def load_map(path: str | Path | None = None, *, source: str | None = None, seed:
         source: `synthetic`, `simworld`, `cityjson`, `boxes` or `carla`; None goes by the file. A running CARLA is asked
             by a process of its own: a script that asks it needs `if __name__ == "__main__":`.
         settings: of the source, as in `maps.<source>` of a configuration: `load_map(size_m=400)`.
-    Raises:
-        ConfigError: an unknown source or setting. InputError: the file is malformed. EnvironmentMissing: no server.
     """
     if not isinstance(seed, int):
         raise ConfigError("not a seed", where="load_map", got=repr(seed)[:40], expected="a whole number")
@@ -91,7 +89,6 @@ def plan(
         walk: settings of the walk, as in `pedestrians` of a configuration.
         settings: as in `plan` of a configuration: `plan(box_map, planner="muco", altitude_max_m=30)`.
     Raises:
-        ConfigError: a setting that is unknown, or changes nothing here. InputError: the way is none.
         NoPathError: there is no way, or no flight.
     """
     from cosfly.planners.reacquire import screens_of
@@ -144,9 +141,6 @@ def render_frames(
         settings: as in `render` of a configuration: `look`, `backend`, those of weather.
     Returns:
         n frames: rgb (h, w, 3) uint8, depth (h, w) float32 z-depth in m, kinds and instance ids (h, w).
-    Raises:
-        ConfigError: a setting that is unknown, or changes nothing here. InputError: shapes that do not belong
-            together. EnvironmentMissing: no OpenGL.
     """
     positions = _places(position_m, "position_m")
     targets = None if target_m is None else _places(target_m, "target_m", len(positions))

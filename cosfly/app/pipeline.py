@@ -164,11 +164,7 @@ def check(cfg: RunConfig) -> dict[str, RunConfig]:
 
 
 def check_out(out: Path) -> None:
-    """Refuse to make a run in the folder of a stage: its tree would hold a second one.
-
-    Raises:
-        ResumeError: there is a stage's record.
-    """
+    """Refuse to make a run in the folder of a stage: its tree would hold a second one."""
     if (out / "stage.json").exists() and not (out / "run.yaml").exists():
         fix = "choose another --out; a run goes on with its own folder, in which those of its stages stand"
         raise ResumeError("the folder of a stage, not of a run", where=out, got="stage.json in it", fix=fix)

@@ -27,9 +27,6 @@ def repair(folder: Path) -> int:
     """Set aside what is broken in the journals of a stage folder, or of all stages of a run; gives the number of lines.
 
     A finished stage of which something is set aside is open again. Links are left alone.
-
-    Raises:
-        ResumeError: another process is at work in it.
     """
     if not folder.is_dir():
         return 0

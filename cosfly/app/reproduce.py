@@ -186,11 +186,7 @@ class Places:
         return found
 
     def figures(self, place: str) -> list[Any]:
-        """Give the figures of a place of `paper.yaml`; None where a part of one is not there.
-
-        Raises:
-            MissingFile: the file is not there. InputError: it does not hold what it should.
-        """
+        """Give the figures of a place of `paper.yaml`; None where a part of one is not there."""
         found = list[Any]()
         for one in place.split(" + "):
             path, _, functions = one.partition("|")

@@ -34,11 +34,7 @@ class Setting:
 
 
 def explain(cfg: BaseModel, section: str | None = None) -> list[Setting]:
-    """Explain all settings in order, a group before what stands in it; or one section, or one setting.
-
-    Raises:
-        ConfigError: there is no such section.
-    """
+    """Explain all settings in order, a group before what stands in it; or one section, or one setting."""
     schema = type(cfg).model_json_schema()
     settings = list(_explain(schema, schema["$defs"], cfg.model_dump(mode="json"), ""))
     if section is None:
@@ -60,11 +56,7 @@ def changed(cfg: BaseModel, section: str | None = None) -> list[Setting]:
 
 
 def with_words(settings: Sequence[Setting], words: Sequence[str]) -> list[Setting]:
-    """Give those settings, no groups, whose name, value, kind or meaning have all the words.
-
-    Raises:
-        ConfigError: there is none.
-    """
+    """Give those settings, no groups, whose name, value, kind or meaning have all the words."""
 
     def has_all(one: Setting) -> bool:
         text = " ".join((one.name, dump_json(one.value), one.kind, one.meaning)).casefold()

@@ -103,11 +103,7 @@ class AnswerBook:
     """The journals of one folder. Use as a context manager; all methods run on one event loop."""
 
     def __init__(self, folder: Path) -> None:
-        """Count what the journals of earlier runs hold.
-
-        Raises:
-            InputError: a journal holds a line that cannot be used.
-        """
+        """Count what the journals of earlier runs hold."""
         self.folder = folder
         self.totals: Counter[str] = Counter()  # answers, prompt_tokens, completion_tokens: of all runs into this folder
         for path in sorted(folder.glob("*.jsonl")):

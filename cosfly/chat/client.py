@@ -115,10 +115,7 @@ class ChatServer:
     """Sends requests to one server, each once."""
 
     def __init__(self, url: str, cfg: EndpointConfig) -> None:
-        """
-        Raises:
-            TeacherError: it is no URL that can be asked, or holds a secret.
-        """
+        """"""
         try:
             check_url(url)
         except ValueError as error:
@@ -186,11 +183,7 @@ class ChatServer:
         return self._with_full_context(found, ask.request)
 
     def _refused(self, refusal: Refusal, ask: Ask, given_s: float, wait_s: float | None = None) -> Failure:
-        """Tell what a refusal means; wait_s: as the server says.
-
-        Raises:
-            NoAnswer: this request will not be answered. TeacherError: none will.
-        """
+        """Tell what a refusal means; wait_s: as the server says."""
         status = refusal.status
         if refusal.meaning.ends_run:
             raise self.error(refusal.meaning.what, got=refusal.said, fix=refusal.meaning.fix)
@@ -290,11 +283,7 @@ class ChatServer:
         )
 
     async def models(self) -> list[dict[str, Any]] | Refusal:
-        """Ask which models there are; gives what is said in place of a list.
-
-        Raises:
-            Unreachable: nobody answers. TeacherError: it refuses the key.
-        """
+        """Ask which models there are; gives what is said in place of a list."""
         try:
             response = await self._connections.exchange(f"{self.url}/models")
         except (TimeoutError, httpx.RequestError) as error:

@@ -45,8 +45,6 @@ class ChatClient:
         """
         Args:
             urls: an address, or several with commas between.
-        Raises:
-            TeacherError: one is no URL that can be asked, holds a secret, or stands there twice.
         """
         try:
             self.servers = [_Place(url, cfg) for url in split_urls(urls)]

@@ -133,11 +133,7 @@ def write_taught(folder: Path, taught: Taught) -> None:
 
 
 def read_taught(folder: Path) -> Taught:
-    """Read what a student was taught, from the folder of its weights or the output folder that they stand in.
-
-    Raises:
-        InputError: there is none, or it is malformed.
-    """
+    """Read what a student was taught, from the folder of its weights or the output folder that they stand in."""
     place = _place_of(folder)
     return read_model(place / TAUGHT, Taught, TAUGHT_FORMAT, tree=place)
 
@@ -146,9 +142,6 @@ def student_files(folder: Path) -> dict[str, Path]:
     """Give what decides who a student is, what it was taught and its weights, for the inputs of a stage: name -> path.
 
     A server tells a name only, and under one name may serve another student tomorrow.
-
-    Raises:
-        InputError: nothing there says what it was taught.
     """
     place = _place_of(folder)
     return {f"student/{path.name}": path for path in (place / TAUGHT, *sorted(place.glob("*.safetensors")))}

@@ -147,11 +147,7 @@ class _Replica:
 
 
 def _devices(number: int, cfg: ServeConfig) -> dict[str, str]:
-    """Give the variable that shows a server its accelerators; none where this machine has none.
-
-    Raises:
-        ConfigError: there are too few.
-    """
+    """Give the variable that shows a server its accelerators; none where this machine has none."""
     given = os.environ.get("CUDA_VISIBLE_DEVICES")
     devices = given.split(",") if given else [str(index) for index in range(num_gpus())]
     if not devices:
@@ -169,8 +165,6 @@ class TeacherServers:
         """
         Args:
             num_images: most pictures of one request.
-        Raises:
-            EnvironmentMissing: the command is not installed. ConfigError: too few accelerators.
         """
         if shutil.which(cfg.command[0]) is None:
             fix = 'pip install "cosfly[vllm]" where the servers run' if cfg.command == VLLM else "caption.serve.command"

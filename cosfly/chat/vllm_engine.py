@@ -51,8 +51,6 @@ class VllmEngine:
             sampling: whether a schema is enforced, and the sampling that is tried before the model is loaded.
             num_images: most pictures of one request. settings: section that `vllm` and `endpoint` stand in, for
             messages.
-        Raises:
-            InputError: not a model folder.
         """
         if not (folder / "config.json").is_file():
             raise InputError(
@@ -90,12 +88,7 @@ class VllmEngine:
     # --- on the thread ---
 
     def load(self) -> Any:
-        """Start vLLM.
-
-        Raises:
-            EnvironmentMissing: it is not installed, or does not start here.
-            ConfigError: it does not know a setting.
-        """
+        """Start vLLM."""
         if importlib.util.find_spec("vllm") is None:
             raise EnvironmentMissing("the vLLM engine is not installed", where=self.where, fix=INSTALL)
         os.environ.setdefault("VLLM_NO_USAGE_STATS", "1")  # else it reports to its makers

@@ -50,8 +50,6 @@ class Connections:
         Args:
             key: sent with each request; "": none.
             timeout_s: of one exchange. most_bytes: of one answer, unpacked.
-        Raises:
-            TeacherError: the key, or the environment's proxy or certificates, cannot be used.
         """
         if not (key.isascii() and key.isprintable()):  # an error of httpx would quote it
             raise TeacherError("the key holds what no header can, perhaps the end of a line", where=KEY_VARIABLE)

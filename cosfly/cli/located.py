@@ -23,11 +23,7 @@ NO_ADDRESS = {
 
 
 def located(words: Sequence[str], cache: Path, held: ExitStack) -> list[str]:
-    """Give the words of a command with working folders in place of addresses; `held` copies out what is written there.
-
-    Raises:
-        ConfigError: the command works at no address. CosflyError: what is there cannot be read or written.
-    """
+    """Give the words of a command with working folders in place of addresses; `held` copies out what is written there."""
     if not any(ADDRESS.match(word) for word in words):
         return list(words)
     from cosfly.work.locations import WorkingFolder

@@ -49,11 +49,7 @@ class ControlTable(Config):
 
 
 def read_controls(path: Path, tokens: tuple[str, ...]) -> dict[str, Control]:
-    """Read a table that has a row for each token.
-
-    Raises:
-        ConfigError: it is missing or malformed, or lacks an action.
-    """
+    """Read a table that has a row for each token."""
     found = build(ControlTable, read_yaml(path), path).actions
     if lacking := [token for token in tokens if token not in found]:
         raise ConfigError("a decision that nothing is flown as", where=path, got=", ".join(lacking), fix="add its row")

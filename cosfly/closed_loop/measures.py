@@ -127,11 +127,7 @@ def episode_digest(one: Pursuit) -> str:
 
 
 def score_pursuits(pursuits: Iterable[Pursuit], *, trained_on: Sequence[str] | None = None, seed: int = 0) -> Score:
-    """Score the flights of one student, in any order.
-
-    Raises:
-        InputError: there is none, or they are of several students or lists of episodes.
-    """
+    """Score the flights of one student, in any order."""
     flights, digests, whose = [], [], set()
     for one in pursuits:
         flights.append(measure(one, trained_on))

@@ -62,8 +62,6 @@ class Policy:
         """
         Args:
             spec: module:Class, found from the working directory.
-        Raises:
-            InputError: it cannot be imported or made.
         """
         self.name, self._limit_s, self._seed = spec, limit_s, seed
         self._tokens, self._episode = shipped_actions().tokens, ""

@@ -162,11 +162,7 @@ class ClosedLoopFlight:
         return tuple(self._drawn(i, velocities[i], float(self.poses.clearances_m[i])) for i in range(self.num_lead))
 
     def step(self, command: np.ndarray) -> Moment:
-        """Fly a command, (5,) as ACTION in the level axes of the present frame, until the next frame.
-
-        Raises:
-            ValueError: the command cannot be flown (`DroneConfig.problem_of`), or the flight has ended.
-        """
+        """Fly a command, (5,) as ACTION in the level axes of the present frame, until the next frame."""
         if self.ended is not None or (problem := self.drone.problem_of(command)):
             raise ValueError(f"the flight has ended: {self.ended}" if self.ended else problem)
         places, yaw_deg, pitch_deg = self._way(np.asarray(command, dtype=np.float64))

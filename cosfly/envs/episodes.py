@@ -84,11 +84,7 @@ class EpisodeLists(BaseModel):
 
 
 def read_list(name: str) -> tuple[str, tuple[tuple[str, int], ...], str]:
-    """Give environment, episodes and digest of a list, `cosfly/Follow-v0/test`, or of an environment's `test`.
-
-    Raises:
-        InputError: there is no such environment or list.
-    """
+    """Give environment, episodes and digest of a list, `cosfly/Follow-v0/test`, or of an environment's `test`."""
     env, _, listed = name.partition("-v0")
     env, listed = f"{env}-v0", listed.strip("/") or "test"
     known = read_model(EPISODES_FILE, EpisodeLists, EPISODES_FORMAT).lists

@@ -121,11 +121,7 @@ class FollowEnv(gymnasium.Env):
         return episode.begins_well(self._now)
 
     def step(self, action: Any) -> tuple[dict, float, bool, bool, dict]:
-        """Fly an action for 0.5 s. terminated: crashed or out of the map; truncated: the episode's time is over.
-
-        Raises:
-            InputError: an action out of its bounds, or no episode is under way.
-        """
+        """Fly an action for 0.5 s. terminated: crashed or out of the map; truncated: the episode's time is over."""
         if self._flight is None or self._flight.ended is not None:
             raise InputError("no episode is under way", where=self.task, fix="call reset first")
         if not self.action_space.contains(action):

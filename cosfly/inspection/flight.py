@@ -68,9 +68,6 @@ def inspect_flight(
         traces: the plans by id; None where nobody here planned the flight.
         box_map, obstacles: the map, and what of it is in the way; None where there is none.
         recorded: sha256 by path of what the tree's manifest lists; empty where it has none.
-    Raises:
-        InputError: `trajectory.json`, or that of the clean flight beside it, cannot be read at all; names the file and
-            the field.
     """
     report = Report()
     flight = _read(folder, report)
@@ -190,12 +187,7 @@ def check_surroundings(
 
 
 def check_shifts(flight: Flight, report: Report, metrics: dict[str, float | int | None]) -> None:
-    """Find the frames of a perturbed flight whose shift hides a target which the clean flight beside it shows.
-
-    Raises:
-        InputError: that one cannot be read. A warning would stay in this flight's record when it is mended; a failure
-            is done again.
-    """
+    """Find the frames of a perturbed flight whose shift hides a target which the clean flight beside it shows."""
     try:
         twin = read_twin(flight)
     except VerifyError as error:

@@ -36,20 +36,12 @@ class ReviewForm(BaseModel):
 
 
 def read_filled(path: Path) -> ReviewForm:
-    """Read what `review.html` saved.
-
-    Raises:
-        InputError: names the file and the field.
-    """
+    """Read what `review.html` saved."""
     return read_model(path, ReviewForm, FORMAT)
 
 
 def take(inspected: Path, filled: Path) -> list[Decision]:
-    """Put on record what `review.html` saved.
-
-    Raises:
-        InputError: it was made of another inspection, or cannot be used.
-    """
+    """Put on record what `review.html` saved."""
     found = read_filled(filled)
     if found.inspection != sha256_file(inspected):
         raise InputError(

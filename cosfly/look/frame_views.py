@@ -155,8 +155,6 @@ def read_view(
 
     Args:
         max_side_px: scale down to this longest side; None keeps the size.
-    Raises:
-        InputError: the view's file is missing or damaged.
     """
     if view == "rgb":
         return _bounded(read_rgb(frame), max_side_px)

@@ -31,11 +31,7 @@ BOX_COLOR = (255, 214, 10)
 
 
 def contact_sheet(tree: Path, out_png: Path, choice: FlightChoice = ALL_FLIGHTS) -> None:
-    """Reads a playback tree, writes one PNG below 2 MB: for each flight a few RGB frames, a depth image and a mask.
-
-    Raises:
-        InputError: no tree, or a frame that cannot be read.
-    """
+    """Reads a playback tree, writes one PNG below 2 MB: for each flight a few RGB frames, a depth image and a mask."""
     folders = find_flights(tree, choice)
     rows = [_row(read_flight(folder, strict=False)) for folder in folders[:MOST_ROWS]]
     sheet = np.vstack([_heading(len(folders), rows[0].shape[1]), *rows])
@@ -45,11 +41,7 @@ def contact_sheet(tree: Path, out_png: Path, choice: FlightChoice = ALL_FLIGHTS)
 def preview_gif(
     tree: Path, out_gif: Path, choice: FlightChoice = ALL_FLIGHTS, frames_per_s: float = 1000 / GIF_FRAME_MS
 ) -> None:
-    """Reads a playback tree, writes its first clean flight as an animation below 4 MB, the target's box drawn in.
-
-    Raises:
-        InputError: no tree, or the flight has no RGB frame.
-    """
+    """Reads a playback tree, writes its first clean flight as an animation below 4 MB, the target's box drawn in."""
     folders = find_flights(tree, choice)
     flight = read_flight(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
     frames = _frames_with(flight, "rgb.png")
@@ -73,8 +65,6 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
         box_map: what was drawn, for a frame without `debug.png`.
     Returns:
         the frame's folder in the tree.
-    Raises:
-        InputError: no such frame, one without pictures, or neither `debug.png` nor a map.
     """
     folder = best_frame(tree, *FRAME_FILES) if frame is None else frame_in(tree, frame)
     meta, rgb = read_meta(folder), read_rgb(folder)
@@ -102,11 +92,7 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
 
 
 def frame_in(tree: Path, frame: str | Path) -> Path:
-    """Give the folder of a frame of a tree, which is named from the tree on, or by a path that leads into it.
-
-    Raises:
-        InputError: the name leads out of the tree.
-    """
+    """Give the folder of a frame of a tree, which is named from the tree on, or by a path that leads into it."""
     place = Path(frame).resolve()
     if place.is_dir() and place.is_relative_to(tree.resolve()):
         return tree / place.relative_to(tree.resolve())

@@ -118,11 +118,7 @@ class _Row(NamedTuple):
 
 
 def load(cfg: BoxesConfig, seed: int = 0) -> BoxMap:
-    """Read boxes; the seed changes nothing.
-
-    Raises:
-        ConfigError: no file is given. InputError: says all that is wrong with the file, row by row.
-    """
+    """Read boxes; the seed changes nothing."""
     path = cfg.inputs()["boxes"]
     readers = {".csv": _table_rows, ".geojson": _feature_rows}
     suffix = path.suffix.lower()
@@ -394,8 +390,6 @@ def _read_values(values: Mapping[str, Any], types: Mapping[str, str]) -> tuple[s
 
     Args:
         values: by field, as the file has them. types: names of the file -> types of cosfly.
-    Raises:
-        WrongRow: says all that is wrong with them.
     """
     wrong, kind, numbers = list[str](), "", dict[str, float]()
     try:

@@ -88,12 +88,7 @@ def ask(cfg: CarlaConfig) -> CarlaTown:
 
 
 def load(cfg: CarlaMapConfig, seed: int) -> BoxMap:
-    """Give the town's boxes; the seed changes nothing.
-
-    Raises:
-        EnvironmentMissing: there is no server, or its client crashes. ConfigError: no such town.
-        InputError: it has no objects.
-    """
+    """Give the town's boxes; the seed changes nothing."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         try:
             told = pool.submit(ask, cfg).result()

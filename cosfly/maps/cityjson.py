@@ -112,11 +112,7 @@ class Facet(NamedTuple):
 
 
 def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
-    """Read a city model; the seed changes nothing.
-
-    Raises:
-        ConfigError: no file is given. InputError: the file is malformed; names the object and the field.
-    """
+    """Read a city model; the seed changes nothing."""
     cfg.inputs()
     assert cfg.path is not None
     model = read_model(cfg.path, cfg.polygon_vertices)

@@ -78,8 +78,6 @@ def cover(
         polygon: valid. shares: where to try to cut, from 0 to 1 along a side.
     Returns:
         rectangles that together cover the polygon, apart from pieces below MIN_AREA_M2.
-    Raises:
-        ValueError: a setting is out of range.
     """
     if not 0 < min_fill <= 1 or not min_size_m > 0 or not all(0 < share < 1 for share in shares):
         raise ValueError(f"min_fill {min_fill}, min_size_m {min_size_m}, shares {shares}")
@@ -119,11 +117,7 @@ def _cut(piece: Polygon, rectangle: Rectangle, shares: Sequence[float]) -> list[
 
 
 def check_outline(polygon: Polygon, where: str, most: int) -> None:
-    """Refuse an outline that crosses itself so often that mending it would take minutes and gigabytes.
-
-    Raises:
-        InputError: names the setting.
-    """
+    """Refuse an outline that crosses itself so often that mending it would take minutes and gigabytes."""
     if not polygon.is_valid and num_crossings(polygon, most) > most:
         fix = "mend it, or raise maps.cityjson.polygon_crossings if you trust the file"
         raise over_limit(where, "an outline that crosses itself", f"{most:,} crossings", fix)

@@ -136,11 +136,7 @@ class Centerline(NamedTuple):
 
 
 def load(cfg: SimWorldConfig, seed: int = 0) -> BoxMap:
-    """Read a SimWorld city; the seed changes nothing.
-
-    Raises:
-        ConfigError: no file is given. InputError: a file is malformed, or an asset is unknown.
-    """
+    """Read a SimWorld city; the seed changes nothing."""
     cfg.inputs()
     assert cfg.world is not None
     nodes = _read_nodes(cfg.world)

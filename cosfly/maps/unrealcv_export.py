@@ -76,12 +76,7 @@ class _Object:
 
 
 def load(cfg: UnrealCvMapConfig, seed: int) -> BoxMap:
-    """Give the level's boxes; the seed changes nothing.
-
-    Raises:
-        EnvironmentMissing: there is no server. ConfigError: no such level.
-        InputError: it has no objects, or too many of a `default` size.
-    """
+    """Give the level's boxes; the seed changes nothing."""
     connection = connect(cfg, cfg.port)
     try:
         with connection.asking("the objects were not given"):

@@ -43,8 +43,6 @@ def find_route(
             along x, along y, and along the diagonals of equal and of unlike signs.
     Returns:
         (k, 2) int64 cells from start to goal, both included (k is 1 if they are the same); None if there is no route.
-    Raises:
-        ValueError: `free` is not a contiguous array of bool, or an end lies off the grid or on a cell that is not free.
     """
     if free.ndim != 2 or free.dtype != np.bool_ or not free.flags.c_contiguous:
         raise ValueError("free must be a contiguous two-dimensional array of bool")

@@ -133,12 +133,7 @@ def _is_large(ring: shapely.LinearRing) -> bool:
 
 
 def run_propose(map_: Path, cfg: PedestriansConfig, out: Path) -> str:
-    """Reads a map, writes a first `roi_polygon.json`, says what it holds.
-
-    Raises:
-        InputError: the map says nowhere where its ground is, or the file is there already.
-        NoPathError: nobody can walk on it.
-    """
+    """Reads a map, writes a first `roi_polygon.json`, says what it holds."""
     if out.exists():
         what = "a folder, not a file" if out.is_dir() else "there is a region already"
         raise InputError(what, where=out, fix="name another file" + ("" if out.is_dir() else ", or remove this one"))
@@ -210,11 +205,7 @@ class Editor:
         return levels
 
     def region_of(self, data: bytes, where: Path) -> dict[str, Any]:
-        """Read a file's bytes; gives the region and its cells.
-
-        Raises:
-            InputError: the stage would not take it, or most of it lies outside the map.
-        """
+        """Read a file's bytes; gives the region and its cells."""
         roi = parse_roi(data, where, self.cfg.roi_vertices)
         roi.check_map(self.box_map, where)
         inside, turned = shares_on_map(roi, self.box_map)
@@ -292,12 +283,7 @@ def _from_above(box_map: BoxMap, grid: OccupancyGrid) -> np.ndarray:
 
 
 def open_editor(map_: Path, cfg: PedestriansConfig, roi: Path, port: int, backdrop: Path | None) -> Server:
-    """Read all that the page shows, and listen; `Server.serve` answers until it is interrupted.
-
-    Raises:
-        InputError: the map says nowhere where its ground is, or the region is not of this map.
-        EnvironmentMissing: the port is in use.
-    """
+    """Read all that the page shows, and listen; `Server.serve` answers until it is interrupted."""
     box_map = _read_map(map_)
     picture = None if backdrop is None else Backdrop.read(backdrop)
     if picture is not None and not picture.covers(box_map):

@@ -223,8 +223,6 @@ def walkable_ground(
 
     Args:
         where, roi_where: the files to name in an error.
-    Raises:
-        NoPathError: no cell is walkable, or no component is large enough.
     """
     clock = clock or Clock()
     with clock("grid"):
@@ -361,11 +359,7 @@ def shares_on_map(roi: Roi, box_map: BoxMap) -> tuple[float, float]:
 
 
 def _check_roi(roi: Roi, box_map: BoxMap, where: str | Path) -> str:
-    """Warn if most of a region lies outside the map; gives a remark if x and y look changed over.
-
-    Raises:
-        InputError: it says that it is of another map.
-    """
+    """Warn if most of a region lies outside the map; gives a remark if x and y look changed over."""
     roi.check_map(box_map, where)
     inside, turned = shares_on_map(roi, box_map)
     remark = f"; with x and y changed over, {turned:.0%} of it would lie inside: are they?" if turned > inside else ""

@@ -66,11 +66,7 @@ def speed_profile(
 
 
 def arrival_times(polyline_m: np.ndarray, speeds_mps: np.ndarray) -> np.ndarray:
-    """Times at the waypoints, (k,) s from 0: each piece takes its length over the mean of its two speeds.
-
-    Raises:
-        ValueError: a piece has a mean speed of 0.
-    """
+    """Times at the waypoints, (k,) s from 0: each piece takes its length over the mean of its two speeds."""
     lengths_m = np.linalg.norm(np.diff(polyline_m, axis=0), axis=1)
     means_mps = 0.5 * (speeds_mps[1:] + speeds_mps[:-1])
     if not (means_mps > 0).all():

@@ -375,11 +375,7 @@ def _number(value: float | None) -> float | None:
 
 
 def text_tables(found: Benchmark) -> list[TextTable]:
-    """Give the tables of the paper with its figures beside ours.
-
-    Raises:
-        InputError: a planner or figure is in one part of the benchmark and not in another.
-    """
+    """Give the tables of the paper with its figures beside ours."""
     try:
         return [table for table in _tables(found) if table.rows]
     except KeyError as error:

@@ -267,9 +267,6 @@ def raw_flight(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> tupl
     keeps, m.
 
     Where the wished places are free and see all that they are to see, nothing is searched.
-
-    Raises:
-        NoPathError: no places lead along this walk.
     """
     wished = scenario.as_flown(scenario.wish.places_m(scenario.targets_m, scenario.ground_m))
     ahead, step_m = slice(scenario.start, None), cfg.speed_max_mps * scenario.dt_s

@@ -210,11 +210,7 @@ PURSUIT_LEAST = 1 / 3  # of the flight
 def ended_by_order(
     intent: Intent, positions_m: np.ndarray, scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig
 ) -> tuple[Intent, np.ndarray]:
-    """End a pursuit as it was flown, (n, 3), with the way home, where the rest of the walk is just enough for it.
-
-    Raises:
-        NoPathError: the way home cannot be flown within the limits.
-    """
+    """End a pursuit as it was flown, (n, 3), with the way home, where the rest of the walk is just enough for it."""
     from cosfly.planners.smoothing import within_limits
 
     assert intent.order is not None

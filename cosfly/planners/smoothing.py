@@ -72,9 +72,6 @@ def smooth_flight(
 def within_limits(points: np.ndarray, scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> np.ndarray:
     """Give a flight (n, 3) that keeps the limits of speed, acceleration and clearance as it will be written; itself
     where it keeps them.
-
-    Raises:
-        NoPathError: none was found near it.
     """
     goal, pulls, band = points.copy(), np.full(len(points), PULL_STAYS), smoothness_band(len(points), scenario.dt_s)
     least_m = cfg.relaxed_safety_m - CLEARANCE_TOLERANCE_M

@@ -42,11 +42,7 @@ COORDINATE_MAX_M = 1e6  # beyond, float32 depth and four decimals of a metre in 
 
 
 def make_scenario(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig) -> Scenario:
-    """Check a walk and give the scenario of it, with the paper's wish.
-
-    Raises:
-        NoPathError: nobody can walk or follow this: one point, uneven times, huge coordinates, or a way through a box.
-    """
+    """Check a walk and give the scenario of it, with the paper's wish."""
     from cosfly.planners.courses import follow
     from cosfly.space.kernels import segments_hit
 
@@ -132,8 +128,6 @@ def plan_on(
         targets_m: (n, 3) hip points of the whole walk. flown_m: (k, 3), 3 <= k < n, where the drone was at the first.
     Returns:
         (n, 3), which begins with `flown_m`; from there on it keeps all limits of the settings.
-    Raises:
-        NoPathError: nothing was found.
     """
     from cosfly.planners.courses import follow, going_on
     from cosfly.planners.foresight import plan

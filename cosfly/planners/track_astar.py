@@ -334,11 +334,7 @@ def frames_per_layer(cfg: PlanConfig, dt_s: float = DT_S) -> int:
 
 
 def make_voxels(scenario: Scenario, cfg: PlanConfig) -> Voxels:
-    """Lay the grid round a walk: the corridor in the plane, the altitude bounds above it.
-
-    Raises:
-        NoPathError: more than MAX_CELLS.
-    """
+    """Lay the grid round a walk: the corridor in the plane, the altitude bounds above it."""
     settings, flat, wish = cfg.track_astar, scenario.targets_m[:, :2], scenario.wish
     low_xy = flat.min(axis=0) - settings.corridor_m
     num_xy = np.floor((np.ptp(flat, axis=0) + 2.0 * settings.corridor_m) / settings.voxel_m) + 1

@@ -254,11 +254,7 @@ class _ActionsFile(ActionSet):
 
 
 def read_actions(path: Path) -> ActionSet:
-    """Read a file of actions.
-
-    Raises:
-        ConfigError: it is missing or malformed; names everything that is wrong.
-    """
+    """Read a file of actions."""
     found = build(_ActionsFile, read_yaml(path), path)
     return ActionSet.model_construct(**{name: getattr(found, name) for name in ActionSet.model_fields})
 
@@ -282,11 +278,7 @@ RecordedActions = Annotated[ActionSet, BeforeValidator(_or_shipped), WrapSeriali
 
 
 def export_actions(path: Path) -> None:
-    """Write the file that ships, to begin with.
-
-    Raises:
-        ConfigError: there is something already.
-    """
+    """Write the file that ships, to begin with."""
     if path.exists() or path.is_symlink():
         raise ConfigError("there is something already", where=path, fix="choose another file")
     write_bytes(path, read_bytes(ACTIONS_FILE))
@@ -304,11 +296,7 @@ def write_own_actions(folder: Path, actions: ActionSet) -> list[Path]:
 
 
 def actions_beside(captions: Path) -> ActionSet:
-    """Give the set that captions were made with.
-
-    Raises:
-        InputError: the file is malformed.
-    """
+    """Give the set that captions were made with."""
     path = captions.parent / OWN_ACTIONS
     if not path.is_file():
         return shipped_actions()
@@ -323,11 +311,7 @@ def not_in_set(token: object, where: object, actions: ActionSet) -> InputError:
 
 
 def one_set(sets: Iterable[tuple[object, ActionSet]]) -> ActionSet:
-    """Give the one set that all were made with. sets: whose, and which; one at least.
-
-    Raises:
-        InputError: they were made with different ones.
-    """
+    """Give the one set that all were made with. sets: whose, and which; one at least."""
     found = list(sets)
     for whose, one in found[1:]:
         if one != found[0][1]:

@@ -166,11 +166,7 @@ def make_box_map(
 
 
 def check_boxes(box_map: BoxMap, where: str | Path) -> None:
-    """Check what every map must hold, whoever made it.
-
-    Raises:
-        InputError: NaN, a negative extent, an unknown kind or a repeated id; names the box and the field.
-    """
+    """Check what every map must hold, whoever made it."""
     for name, field_name in (("centers", "center"), ("half_extents", "extent"), ("rotations_deg", "rotation")):
         bad = np.flatnonzero(~(np.abs(getattr(box_map, name)) <= LARGEST).all(axis=1))  # NaN is not
         if len(bad):
@@ -191,11 +187,7 @@ def check_boxes(box_map: BoxMap, where: str | Path) -> None:
 
 
 def check_ground(box_map: BoxMap, path: Path) -> None:
-    """Check that a map says where its ground is: a height, a grid of heights, or one box of it.
-
-    Raises:
-        InputError: it does not; a plane at height 0 would be an invention.
-    """
+    """Check that a map says where its ground is: a height, a grid of heights, or one box of it."""
     told = box_map.header.model_fields_set & {"ground_z_m", "ground"}
     if not told and not box_map.is_any_of(GROUND_KINDS).any():
         what, got = "the map has no ground", "neither ground_z_m nor heights in the header, and no box of the ground"
@@ -274,11 +266,7 @@ def write_boxes(path: Path, box_map: BoxMap) -> None:
 
 
 def read_boxes(path: Path) -> BoxMap:
-    """Read `boxes_3d.json` or `step2_simplified.json`; also a bare list of boxes, as the paper's exporter writes.
-
-    Raises:
-        InputError: names the file, the box and the field.
-    """
+    """Read `boxes_3d.json` or `step2_simplified.json`; also a bare list of boxes, as the paper's exporter writes."""
     if path.suffix.lower() in (".csv", ".geojson"):
         fix = f"cosfly maps --source boxes --set maps.boxes.path={path} --out DIR makes boxes_3d.json of it"
         raise InputError("boxes of one's own, not a map yet", where=path, fix=fix)
@@ -306,11 +294,7 @@ def read_boxes(path: Path) -> BoxMap:
 
 
 def _check_told(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, path: Path) -> None:
-    """Compare what a file tells beside its boxes with what follows from them, which other axes or units would not.
-
-    Raises:
-        InputError: names the box and the field.
-    """
+    """Compare what a file tells beside its boxes with what follows from them, which other axes or units would not."""
     told = (("axes", AXES), ("num_boxes", len(box_map)), ("counts", box_map.counts()))
     for name, follows in told:
         if header.get(name, follows) != follows:

@@ -329,11 +329,7 @@ def write_caption_lines(path: Path, lines: Iterable[bytes]) -> int:
 
 
 def read_captions(path: Path) -> Iterator[Caption]:
-    """Yield the captions of `captions.jsonl`.
-
-    Raises:
-        InputError: names the file, the line and the field.
-    """
+    """Yield the captions of `captions.jsonl`."""
     return (caption for _, caption in caption_lines(path))
 
 

@@ -37,11 +37,7 @@ def records(value: dict, name: str, path: Path | str) -> list[dict]:
 
 
 def read_items(path: Path, form: FileFormat, name: str, parse: Callable[[dict, str], Item]) -> list[Item]:
-    """Read the items of a product, as `parse` makes them of a record and its place.
-
-    Raises:
-        InputError: names the file, the item and the field.
-    """
+    """Read the items of a product, as `parse` makes them of a record and its place."""
     value = check_schema(read_json(path, what=form.what), form, path)
     return [parse(record, f"{path}: {name}[{i}]") for i, record in enumerate(records(value, name, path))]
 

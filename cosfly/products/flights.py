@@ -19,11 +19,7 @@ TWIN_TOLERANCE_S = 1e-3
 
 
 def find_flights(root: Path, choice: FlightChoice = ALL_FLIGHTS) -> list[Path]:
-    """Find the folders that hold a `trajectory.json`, sorted; of them those that are chosen.
-
-    Raises:
-        InputError: the folder is missing or holds no flight, or none is chosen.
-    """
+    """Find the folders that hold a `trajectory.json`, sorted; of them those that are chosen."""
     if not root.is_dir():
         raise InputError("there is no such folder", where=root, expected="a playback tree", fix="check the path")
     folders = [path.parent for path in files_named(root, "trajectory.json")]
@@ -39,11 +35,7 @@ def find_flights(root: Path, choice: FlightChoice = ALL_FLIGHTS) -> list[Path]:
 
 
 def chosen_flights(folders: Sequence[Path], root: Path, choice: FlightChoice) -> list[Path]:
-    """Give the flights of a tree that are chosen.
-
-    Raises:
-        InputError: none is.
-    """
+    """Give the flights of a tree that are chosen."""
     chosen = [folder for folder in folders if choice.names(folder.relative_to(root).as_posix())]
     if folders and not chosen:
         what, expected = "no flight of the tree has such a name", folders[0].relative_to(root).as_posix()
@@ -73,7 +65,6 @@ def read_twin(flight: Flight) -> Flight | None:
     """Read the clean flight beside a perturbed one, the same walk frame by frame; None where there is none.
 
     Raises:
-        InputError: what stands there cannot be read.
         VerifyError: it is not the same frames.
     """
     if flight.is_original or flight.folder is None:

@@ -366,9 +366,6 @@ def far_clipped(depth: np.ndarray) -> np.ndarray:
 def depth_values(data: bytes | memoryview, where: Path) -> np.ndarray:
     """Give the numbers of a depth image's bytes, of either form, (h, w) float32 as `read_depth`; of a `.npy` without a
     copy.
-
-    Raises:
-        InputError: it is no complete image of that type.
     """
     if is_packed(data):
         return far_clipped(floats_of(data, where))

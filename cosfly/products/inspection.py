@@ -124,11 +124,7 @@ def write_inspection(path: Path, inspection: Inspection) -> None:
 
 
 def read_inspection(path: Path) -> Inspection:
-    """Read `inspect.json`.
-
-    Raises:
-        InputError: names the file and the field.
-    """
+    """Read `inspect.json`."""
     inspection = read_model(path, Inspection, INSPECT_FORMAT)
     counts = Counter(flight.folder for flight in inspection.flights)
     if twice := [folder for folder, count in counts.items() if count > 1]:

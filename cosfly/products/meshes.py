@@ -74,11 +74,7 @@ class Meshes:
         return {name: self.folder / name for name in names} if self.folder is not None else {}
 
     def resolved(self) -> dict[MeshRef, Mesh]:
-        """Read what the boxes name.
-
-        Raises:
-            InputError: a file is missing, outside of the folder, too large or malformed, or has no such node.
-        """
+        """Read what the boxes name."""
         most = self.most_triangles
         read = {
             name: read_meshes(path, tree=path.parents[len(Path(name).parts) - 1], most_triangles=most)

@@ -41,11 +41,7 @@ class Prediction(BaseModel):
 
 
 def read_predictions(path: Path) -> list[Prediction]:
-    """Read `predictions.jsonl`.
-
-    Raises:
-        InputError: names the file, the line and the field, or a prediction that stands there twice.
-    """
+    """Read `predictions.jsonl`."""
     predictions: dict[str, Prediction] = {}
     lines = model_lines(path, Prediction, what="predictions", fix="run cosfly distill infer first")
     for number, (_, prediction) in enumerate(lines, 1):

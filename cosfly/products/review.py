@@ -52,9 +52,6 @@ def read_decisions(inspected: Path) -> dict[str, Decision]:
 
     Args:
         inspected: path of `inspect.json`.
-    Raises:
-        InputError: a line is damaged or cannot be used, or was decided on another inspection. The last, cut short by a
-            kill, does not count.
     """
     path, digest = inspected.with_name(REVIEW), sha256_file(inspected)
     journal, found = Journal(path), dict[str, Decision]()
@@ -79,11 +76,7 @@ def read_decisions(inspected: Path) -> dict[str, Decision]:
 
 
 def undecided(inspected: Path) -> list[str]:
-    """Name the flights, by folder, that wait for a person: those in review that nobody has decided.
-
-    Raises:
-        InputError: as `read_inspection` and `read_decisions`.
-    """
+    """Name the flights, by folder, that wait for a person: those in review that nobody has decided."""
     decisions = read_decisions(inspected)
     flights = read_inspection(inspected).flights
     return [flight.folder for flight in flights if flight.result == "review" and flight.folder not in decisions]
@@ -101,9 +94,6 @@ def add_decisions(inspected: Path, choices: Iterable[Choice], by: str) -> list[D
     """Put choices on record; all of them, or none.
 
     A trajectory's folder stands for its flights in review; rejected with it are those that were accepted.
-
-    Raises:
-        InputError: one names no flight of the inspection, or accepts what a rule rejected.
     """
     read_decisions(inspected)  # what stands there must be of this inspection
     digest, at = sha256_file(inspected), datetime.now(UTC).isoformat(timespec="seconds")
@@ -148,9 +138,6 @@ def _chosen(choice: Choice, flights: list[FlightInspection], inspected: Path) ->
 def read_settled(inspected: Path) -> Inspection:
     """Read `inspect.json` with what people decided in it: results and the funnel of trajectories are those after
     review.
-
-    Raises:
-        InputError: as `read_inspection` and `read_decisions`.
     """
     inspection, decisions = read_inspection(inspected), read_decisions(inspected)
     if not decisions:

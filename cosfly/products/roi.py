@@ -56,11 +56,7 @@ class Roi(RoiPolygon):
         return shapely.union_all(areas)
 
     def check_map(self, box_map: BoxMap, where: str | Path) -> None:
-        """Check that a file which says where it was drawn was drawn on this map.
-
-        Raises:
-            InputError: it names another map, or other axes.
-        """
+        """Check that a file which says where it was drawn was drawn on this map."""
         for name, got, expected in (("map", self.map, box_map.name), ("axes", self.axes, AXES)):
             if got not in ("", expected):
                 what, fix = "a region of interest of another map", "draw it on this map: cosfly roi edit"
@@ -80,11 +76,7 @@ def read_roi(path: Path, most_vertices: int = MOST_VERTICES) -> Roi:
 
 
 def parse_roi(data: bytes, path: Path, most_vertices: int = MOST_VERTICES) -> Roi:
-    """Give the region of interest of a file's bytes.
-
-    Raises:
-        InputError: malformed, not closed, crossing or touching itself, or a ring of fewer than three finite points.
-    """
+    """Give the region of interest of a file's bytes."""
     value = parse_document(data, path, what=WHAT)
     if is_geojson(value):
         value = {"polygons": _polygons_of(features_of(value, path), path)}

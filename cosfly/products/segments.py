@@ -64,11 +64,7 @@ def mirrored(mission: Mission | None) -> Mission | None:
 
 
 def read_segments(value: Any, num_frames: int, where: str) -> tuple[Segment, ...]:
-    """Read segments; none is no segment.
-
-    Raises:
-        InputError: names the field.
-    """
+    """Read segments; none is no segment."""
     if value is None:
         return ()
     if not isinstance(value, list) or not all(isinstance(part, dict) for part in value):
@@ -83,11 +79,7 @@ def read_segments(value: Any, num_frames: int, where: str) -> tuple[Segment, ...
 
 
 def read_mission(value: Any, num_frames: int, where: str) -> Mission | None:
-    """Read a mission; null is none.
-
-    Raises:
-        InputError: names the field.
-    """
+    """Read a mission; null is none."""
     if value is None:
         return None
     home = value.get("home") if isinstance(value, dict) else None

@@ -175,8 +175,6 @@ def assign_splits(
         fractions: shares of `val` and `test`, together below 1; 0 or none: no such split.
         too_few: with fewer groups than splits: refuse, or fill train, then val, and leave the rest empty.
         what, fix: for the message.
-    Raises:
-        InputError: fewer groups than splits, and `too_few` is refuse; or none.
     """
     ranked = sorted(set(groups), key=lambda group: hashlib.sha256(f"{seed}/distill.split/{group}".encode()).digest())
     val, test = fractions.get("val", 0.0), fractions.get("test", 0.0)

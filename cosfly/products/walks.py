@@ -79,11 +79,7 @@ def pace_field(pace: str) -> dict[str, str]:
 
 
 def pace_of(record: dict, where: str) -> str:
-    """Read the pace of such a record: PLAIN_PACE where it names none.
-
-    Raises:
-        InputError: it is no text.
-    """
+    """Read the pace of such a record: PLAIN_PACE where it names none."""
     pace = record.get("pace", PLAIN_PACE)
     if not isinstance(pace, str):
         raise InputError("not a pace", where=f"{where}.pace", got=repr(pace)[:60], expected="a name")

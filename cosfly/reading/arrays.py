@@ -65,11 +65,7 @@ def parse_array_header(data: memoryview, where: str | Path, *, what: str = "arra
 
 
 def read_array(path: Path, *, dtype: type, ndim: int, what: str = "array", tree: Path | None = None) -> np.ndarray:
-    """Read a `.npy` file of a known type and number of dimensions.
-
-    Raises:
-        InputError: it cannot be read, is something else, cut short, or larger than pictures may be.
-    """
+    """Read a `.npy` file of a known type and number of dimensions."""
     with open_file(path, what=what, tree=tree) as file:
         return _array(file, path, what, dtype, ndim)
 

@@ -114,11 +114,7 @@ def _is_deep(value: Any) -> bool:
 
 
 def parse_document(data: bytes | str, where: str | Path, *, what: str = "file", each_key_once: bool = False) -> Any:
-    """Read the JSON text of a file.
-
-    Raises:
-        InputError: as `parse_json`.
-    """
+    """Read the JSON text of a file."""
     raw = data.encode() if isinstance(data, str) else data
     try:
         value = parse_json(raw, each_key_once=each_key_once)
@@ -233,8 +229,6 @@ def model_lines(path: Path, model: type[Model], *, what: str, fix: str) -> Itera
 
     Args:
         what, fix: for the message when there is no such file, or one of another `schema_version` than the model's.
-    Raises:
-        InputError: names the file, the line and the field.
     """
     version = field.default if (field := model.model_fields.get("schema_version")) else None
     for number, data in enumerate(read_lines(path, what=what, fix=fix), 1):
@@ -268,11 +262,7 @@ class FileFormat(NamedTuple):
 
 
 def check_schema(value: Any, form: FileFormat, path: Path | str) -> dict:
-    """Give a JSON value that is an object of the wanted schema and major version.
-
-    Raises:
-        InputError: it is not; names the file and the field.
-    """
+    """Give a JSON value that is an object of the wanted schema and major version."""
     schema, version, _ = form
     if not isinstance(value, dict):
         raise InputError(
@@ -295,11 +285,7 @@ def check_schema(value: Any, form: FileFormat, path: Path | str) -> dict:
 
 
 def model_of(value: Any, model: type[Model], form: FileFormat, where: Path | str) -> Model:
-    """Give what a JSON value of the wanted schema and major version says as a model.
-
-    Raises:
-        InputError: names the file and the field.
-    """
+    """Give what a JSON value of the wanted schema and major version says as a model."""
     value = check_schema(value, form, where)
     return validated(model, {key: v for key, v in value.items() if key not in form.header}, where)
 

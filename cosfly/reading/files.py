@@ -120,8 +120,6 @@ def read_into(
 
     Args:
         target: gives room for so many bytes.
-    Raises:
-        InputError: as `read_bytes`, and where the file becomes shorter meanwhile.
     """
     with open_file(path, what=what, fix=fix, tree=tree) as file, disk_errors(path, what, fix):
         size = _size_within(file, path)
@@ -168,11 +166,7 @@ def read_text(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Pa
 
 
 def decoded(data: bytes, where: object) -> str:
-    """Give UTF-8 bytes as text.
-
-    Raises:
-        InputError: they are none.
-    """
+    """Give UTF-8 bytes as text."""
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -266,9 +260,6 @@ def check_stays_below(path: Path, tree: Path, *, beside: bool = False) -> None:
 
     The tree itself may be a link. Where it is a snapshot in the cache of the hub's client, whose files are links to
     blobs, these are part of it.
-
-    Raises:
-        InputError: it leads out; names the setting that allows it.
     """
     if isinstance(tree, LinkedPath):
         return

@@ -37,9 +37,6 @@ def is_geojson(value: Any) -> bool:
 def read_features(path: Path, *, what: str = "GeoJSON") -> list[Feature]:
     """Read a FeatureCollection, a Feature or a bare geometry. What is wrong with a feature stands in it, so that all
     can be told at once.
-
-    Raises:
-        InputError: the document is not GeoJSON.
     """
     return features_of(read_json(path, what=what), path)
 

@@ -100,8 +100,6 @@ def read_meshes(path: Path, *, tree: Path, most_triangles: int = MOST_TRIANGLES)
 
     Args:
         tree: the folder that neither the file nor what it names may lie outside of.
-    Raises:
-        InputError: missing, outside, too large, of another format, or malformed; names the field.
     """
     source = _Source(path, tree, most_triangles)
     data = source.read(path, WHAT)

@@ -86,11 +86,7 @@ _Loader.yaml_implicit_resolvers = {
 
 
 def parse_yaml(text: str, where: str | Path, *, what: str = "configuration") -> Any:
-    """Read YAML text.
-
-    Raises:
-        ConfigError: it is not valid, or says more than settings may.
-    """
+    """Read YAML text."""
     if len(text) > MOST_BYTES:
         expected = f"at most {MOST_BYTES / 1e6:g} MB"
         raise ConfigError(f"the {what} is too long", where=where, got=f"{len(text) / 1e6:.1f} MB", expected=expected)

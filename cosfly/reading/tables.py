@@ -72,9 +72,6 @@ def open_table(path: Path, *, tree: Path | None = None) -> Iterator[_Table]:
 def open_stream(file: io.RawIOBase, where: str) -> Iterator[_Table]:
     """Open a parquet file that is read by ranges, as one that lies somewhere else; checksums of pages are held against
     the pages.
-
-    Raises:
-        InputError: it is no whole parquet file; or what `file` raises.
     """
     with arrow_errors(where):
         table = _Table(file, pre_buffer=True, page_checksum_verification=True)
@@ -102,9 +99,6 @@ def row_groups(
 def read_row_group(path: Path | str, table: _Table, k: int, columns: list[str] | None) -> pa.Table:
     """Read one row group of an open table; `path` is for messages. A text is unpacked once it is known how much all of
     them are.
-
-    Raises:
-        InputError: it is damaged, or over the limit.
     """
     _check_size(path, table, k)
     about = table.metadata.row_group(k)
@@ -174,9 +168,6 @@ GROUPS_HELD = 4  # row groups that a look at single rows keeps
 class TableRows(Sequence[dict[str, Any]]):
     """The rows of a parquet file by number. The file stays open, a few row groups in memory; each process opens its
     own.
-
-    Raises:
-        InputError: as `open_table`, when rows are counted or read; and for columns that are not there.
     """
 
     def __init__(self, path: Path, columns: list[str]) -> None:

@@ -30,8 +30,6 @@ def draw_backdrop(cfg: RenderConfig, box_map: BoxMap, view: TopView, seed: int =
 
     Returns:
         (h, w, 3) uint8 RGB of the view's size.
-    Raises:
-        EnvironmentMissing: no such renderer here. RenderError: it gave no picture.
     """
     side_px = max(16, round(TILE_M * view.pixels_per_m))
     side_m = side_px / view.pixels_per_m

@@ -183,12 +183,7 @@ class CarlaRenderer:
         person: PosedPerson | None,
         others: Sequence[PosedOther] = (),
     ) -> Frame:
-        """Draw one frame, as the contract says.
-
-        Raises:
-            RenderError: CARLA has no such lens, or a camera sends nothing.
-            EnvironmentMissing: the server does not answer any more.
-        """
+        """Draw one frame, as the contract says."""
         check_pose(camera_pose, intrinsic)
         fov_deg = fov_of(intrinsic, self._size_px, self.device)
         bodies = ({} if person is None else {PERSON_ID: person}) | {one.instance_id: one.body for one in others}
@@ -342,9 +337,6 @@ def _ids_in_pictures(server: CarlaConnection, box_map: BoxMap, num_others: int) 
 
     The link is the box: `get_level_bbs` gives boxes with the number of their actor. An actor of several boxes, as a
     building, has the id of the first of them on the map.
-
-    Raises:
-        InputError: no box of the map is in the server's town.
     """
     from scipy.spatial import cKDTree
 

@@ -46,11 +46,7 @@ def is_draped(box_map: BoxMap) -> np.ndarray:
 
 
 def drape(box_map: BoxMap) -> DrapedSurfaces:
-    """Lay the ground and the surfaces of a map on its heights.
-
-    Raises:
-        ValueError: the map's ground is flat.
-    """
+    """Lay the ground and the surfaces of a map on its heights."""
     ground = box_map.ground
     if ground.is_flat:
         raise ValueError("flat ground has no triangles")

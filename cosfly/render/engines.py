@@ -22,11 +22,7 @@ class NoPictureError(Exception):
 
 
 def keep_asking(draw: Callable[[], Frame], mend: Callable[[Exception], None], retries: int, device: str) -> Frame:
-    """Draw a frame, again after `mend` where that fails.
-
-    Raises:
-        RenderError: at last a camera sent no picture. EnvironmentMissing: the server does not answer.
-    """
+    """Draw a frame, again after `mend` where that fails."""
     problem: Exception | None = None
     for attempt in range(retries + 1):
         try:
@@ -45,11 +41,7 @@ def keep_asking(draw: Callable[[], Frame], mend: Callable[[Exception], None], re
 
 
 def fov_of(intrinsic: np.ndarray, size_px: tuple[int, int], device: str) -> float:
-    """Give the horizontal field of view, degrees, which is all that an engine is told of a lens.
-
-    Raises:
-        RenderError: there is more to it.
-    """
+    """Give the horizontal field of view, degrees, which is all that an engine is told of a lens."""
     width, height = size_px
     fov_deg = round(Camera(width, height, intrinsic).fov_deg, 6)
     f = focal_px(width, fov_deg)

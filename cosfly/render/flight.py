@@ -51,11 +51,7 @@ TOUCH_M = 0.01  # so deep in a box a camera still counts as touching it
 
 
 def check_flight(trace: DroneTrace, surroundings: Surroundings) -> None:
-    """Check that the camera is outside every obstacle and the person on or over the ground, in all frames of a plan.
-
-    Raises:
-        RenderError: names the flight and the first frame where that is not so, and how many there are.
-    """
+    """Check that the camera is outside every obstacle and the person on or over the ground, in all frames of a plan."""
     depths_m, _ = signed_distances(surroundings.obstacles, trace.positions_m, 0.0)
     inside = np.flatnonzero(depths_m < -TOUCH_M)
     if len(inside):
@@ -141,8 +137,6 @@ def render_flight(
 
     Returns:
         The flight as it was written.
-    Raises:
-        StorageError: a file cannot be written. RenderError: a picture cannot be encoded.
     """
     script = replace(script, perturbed=copy.deepcopy(script.perturbed))  # hidden targets are noted there
     poses = script.perturbed.poses

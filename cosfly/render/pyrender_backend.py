@@ -44,11 +44,7 @@ LIMB_SHARE = (0.85, 0.85, 0.95)  # of its half sizes, that a limb fills where it
 
 
 def _open_screen(width_px: int, height_px: int) -> Any:
-    """Load pyrender and open its context without a window.
-
-    Raises:
-        EnvironmentMissing: a package of the extra or EGL is not there.
-    """
+    """Load pyrender and open its context without a window."""
     os.environ["PYOPENGL_PLATFORM"] = "egl"  # read by the first import of OpenGL
     np.infty = np.inf  # type: ignore[attr-defined]  # pyrender 0.1.45 uses the name that NumPy 2 dropped
     try:
@@ -96,11 +92,7 @@ class PyrenderRenderer:
         self._scene.add(self._mesh(*_all_boxes(box_map, self._origin, num_others, rim)))
 
     def prepare(self, low_m: np.ndarray, high_m: np.ndarray, weather: WeatherParams | None = None) -> None:
-        """Nothing holds for a flight alone: there are no shadows, and no weather.
-
-        Raises:
-            RenderError: weather is asked for.
-        """
+        """Nothing holds for a flight alone: there are no shadows, and no weather."""
         if weather is not None:
             raise RenderError(
                 "the renderer pyrender draws no weather", fix="take render.backend gl, or weather_mode off"

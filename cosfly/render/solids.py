@@ -38,11 +38,7 @@ def are_solids(box_map: BoxMap) -> np.ndarray:
 
 
 def solids_of(box_map: BoxMap) -> Solids:
-    """Place the meshes of a map: each in its box, or one for all boxes that name one of the map's own places.
-
-    Raises:
-        InputError: a file is missing, malformed or too large, or has no such node.
-    """
+    """Place the meshes of a map: each in its box, or one for all boxes that name one of the map's own places."""
     corners, rows, colors, counts = [np.zeros((0, 3, 3))], [], [np.zeros((0, 3))], []
     meshes = box_map.meshes.resolved()
     placed = set()

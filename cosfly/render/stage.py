@@ -74,9 +74,6 @@ def open_renderer(
 
     Args:
         settings: of this renderer alone, where it has any; None takes its defaults.
-
-    Raises:
-        ConfigError: unknown name. EnvironmentMissing: what it needs is not there.
     """
     if name not in RENDERERS:
         raise ConfigError("unknown renderer", where="render.backend", got=name, expected=", ".join(RENDERERS))
@@ -242,11 +239,7 @@ def _item(number: int, trace: DroneTrace, track: str) -> Item:
 
 
 def _passed(stage: StageFolder, traces: list[DroneTrace], chosen: int | None) -> list[tuple[int, DroneTrace]]:
-    """Give the flights that are drawn, all or the chosen one, each with its number among all.
-
-    Raises:
-        NothingKept: there is none.
-    """
+    """Give the flights that are drawn, all or the chosen one, each with its number among all."""
     passed = [(n, trace) for n, trace in enumerate(traces) if trace.drop_reason is None and chosen in (None, n)]
     if not passed:
         tally = Tally(input=len(traces), dropped=Counter(str(trace.drop_reason) for trace in traces))
@@ -281,11 +274,7 @@ class _RenderedFlight(BaseModel):
 
 
 def companies_of(others: Path | None, traces: list[DroneTrace]) -> dict[str, Company]:
-    """Read the others of every flight, by the walk's id; nobody without a file.
-
-    Raises:
-        InputError: the file is malformed, has nobody for a walk, or is of other times.
-    """
+    """Read the others of every flight, by the walk's id; nobody without a file."""
     if others is None:
         return {}
     found = {company.path_id: company for company in read_others(others)}

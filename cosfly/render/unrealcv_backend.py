@@ -138,11 +138,7 @@ class UnrealCvRenderer:
         return f"/camera/{self._cfg.camera}"
 
     def _link(self, names: list[str]) -> None:
-        """Make tables from colours of the object mask to our ids and kinds.
-
-        Raises:
-            InputError: no box of the map is in the level. ConfigError: the level is of another scale.
-        """
+        """Make tables from colours of the object mask to our ids and kinds."""
         ids, rows = instance_ids(self._map, self._num_others), {int(k): row for row, k in enumerate(self._map.ids)}
         self._ids = np.full(COLORS, NO_INSTANCE, dtype=np.uint16)
         self._kinds = np.full(COLORS, KINDS["NONE"], dtype=np.uint8)
@@ -229,12 +225,7 @@ class UnrealCvRenderer:
         person: PosedPerson | None,
         others: Sequence[PosedOther] = (),
     ) -> Frame:
-        """Draw one frame, as the contract says.
-
-        Raises:
-            RenderError: Unreal has no such lens, the camera does not stay, or sends nothing.
-            EnvironmentMissing: the server does not answer any more.
-        """
+        """Draw one frame, as the contract says."""
         check_pose(camera_pose, intrinsic)
         fov_deg = fov_of(intrinsic, self._size_px, self.device)
         bodies = ({} if person is None else {PERSON_ID: person}) | {one.instance_id: one.body for one in others}

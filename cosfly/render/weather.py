@@ -140,12 +140,7 @@ class Pools:
 
 
 def read_pools(cfg: WeatherConfig) -> Pools:
-    """Read the files of presets that the settings name, or take the paper's.
-
-    Raises:
-        ConfigError: a file is missing or malformed, or the named presets are not in it; tells all problems of both at
-            once.
-    """
+    """Read the files of presets that the settings name, or take the paper's."""
     errors: list[ConfigError] = []
     pools: list[Any] = [WEATHERS, TIMES]
     own: Any = ((cfg.weather_pool, WeatherPool, "weather_name"), (cfg.tod_pool, TimePool, "tod_name"))

@@ -92,8 +92,6 @@ def clusters(mins: np.ndarray, maxs: np.ndarray, gap_m: float) -> np.ndarray:
         mins, maxs: (n, 3) m.
     Returns:
         (n,) int64: the lowest row of each box's cluster.
-    Raises:
-        ValueError: the shapes differ, or the gap is negative.
     """
     if mins.shape != maxs.shape or mins.ndim != 2 or mins.shape[1] != 3:
         raise ValueError(f"mins and maxs must be (n, 3), got {mins.shape} and {maxs.shape}")

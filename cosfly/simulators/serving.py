@@ -43,11 +43,7 @@ def due(faults: Iterable[Fault], name: str, tick: int, sensor: str = "") -> Faul
 
 
 def listen(host: str, port: int, talk: Callable[[socket.socket], None], note: str = "") -> None:
-    """Have everybody who connects talked with, each in a thread.
-
-    Raises:
-        EnvironmentMissing: the port is taken; note: what else to know when another is chosen.
-    """
+    """Have everybody who connects talked with, each in a thread."""
     try:
         listener = socket.create_server((host, port))
     except OSError as error:

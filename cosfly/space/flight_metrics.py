@@ -24,8 +24,6 @@ def derivative_rms(positions_m: np.ndarray, order: int, dt_s: float = DT_S) -> f
         positions_m: (n, 3). order: 1 speed (m/s), 2 acceleration (m/s^2), 3 jerk (m/s^3).
     Returns:
         0 for a path of `order` points or fewer: it has no such difference.
-    Raises:
-        ValueError: positions are not (n, 3), or dt_s is not positive.
     """
     differences = np.diff(_path(positions_m), n=order, axis=0)
     if dt_s <= 0:

@@ -68,12 +68,7 @@ class OccupancyGrid:
 
 
 def empty_grid(box_map: BoxMap, resolution_m: float = RESOLUTION_M) -> OccupancyGrid:
-    """Give a free grid over the bounds of all boxes, whatever their kind.
-
-    Raises:
-        ValueError: the map is empty or the resolution is not positive.
-        InputError: the grid would have more than MAX_CELLS cells.
-    """
+    """Give a free grid over the bounds of all boxes, whatever their kind."""
     if len(box_map) == 0:
         raise ValueError("a grid needs at least one box")
     if not resolution_m > 0:
@@ -259,8 +254,6 @@ def compare(one: OccupancyGrid, other: OccupancyGrid) -> tuple[float, float]:
 
     Returns:
         equal cells / all cells, and intersection / union of the occupied ones (IoU), 1 where there is none.
-    Raises:
-        ValueError: the grids do not cover the same cells.
     """
     same = (one.x_min_m, one.y_min_m, one.resolution_m) == (other.x_min_m, other.y_min_m, other.resolution_m)
     if not same or one.occupied.shape != other.occupied.shape:
@@ -278,9 +271,6 @@ def inflate(grid: OccupancyGrid, radius_m: float) -> OccupancyGrid:
 
     A cell becomes occupied if its centre lies within `radius_m` of the centre of an occupied one: at 0.5 m cells, 0.5 m
     adds the four straight neighbours, and 1.0 m is the circular element of two cells of app:simworld:step4.
-
-    Raises:
-        ValueError: the radius is negative.
     """
     if not radius_m >= 0:
         raise ValueError(f"radius_m must not be negative, got {radius_m}")

@@ -61,8 +61,6 @@ def index_boxes(
     Args:
         centers, half_extents: (k, 3) m. rotations: (k, 3, 3) world_from_box. cell_m: wanted cell size, grown if the map
             is vast.
-    Raises:
-        ValueError: a shape is wrong, a number is not finite, or a half extent is negative.
     """
     centers, half_extents = _points(centers, "centers"), _points(half_extents, "half_extents")
     rotations = np.ascontiguousarray(rotations, dtype=np.float64)

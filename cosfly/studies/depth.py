@@ -123,12 +123,7 @@ def run(frame: Path, out: Path) -> Study:
 
 
 def _truth(data: bytes, file: Path) -> np.ndarray:
-    """Read depth, (h, w) m; what others write for a pixel without, NaN or infinity, becomes INVALID_DEPTH_M.
-
-    Raises:
-        InputError: it is no array of this form, or of whole numbers, which may be millimetres as well as 256ths of a
-            metre.
-    """
+    """Read depth, (h, w) m; what others write for a pixel without, NaN or infinity, becomes INVALID_DEPTH_M."""
     if is_packed(data):
         truth = depth_values(data, file)
         return np.where(np.isfinite(truth), truth, np.float32(INVALID_DEPTH_M))

@@ -57,11 +57,7 @@ class VariantsConfig(PlanConfig):
     )
 
     def of(self, name: str) -> PlanConfig:
-        """Give the settings of a variant.
-
-        Raises:
-            ConfigError: a change cannot be.
-        """
+        """Give the settings of a variant."""
         plain = self.model_dump(mode="json", exclude={"variants"})
         return build(PlanConfig, apply_overrides(plain, self.variants[name]), f"the variant {name}")
 

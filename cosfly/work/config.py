@@ -72,11 +72,7 @@ def read_yaml(path: Path) -> dict:
 
 
 def apply_overrides(data: dict, overrides: Iterable[str]) -> dict:
-    """Give a copy of `data` with `a.b=c` assignments applied; values are read as YAML.
-
-    Raises:
-        ConfigError: one is no assignment, is no YAML, or goes below a setting that is no group.
-    """
+    """Give a copy of `data` with `a.b=c` assignments applied; values are read as YAML."""
     data = copy.deepcopy(data)
     for override in overrides:
         key, equals, text = override.partition("=")
@@ -196,11 +192,7 @@ def shipped(name: str) -> Path:
 
 
 def config_file(config: Path | None) -> Path | None:
-    """Give the file of a configuration: that of a path, of a run folder, or of the bare name of one that ships.
-
-    Raises:
-        ConfigError: there is none.
-    """
+    """Give the file of a configuration: that of a path, of a run folder, or of the bare name of one that ships."""
     if config is None or config.is_file():
         return config
     if (config / "run.yaml").is_file():

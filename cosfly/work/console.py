@@ -66,9 +66,6 @@ def set_up_logging(level: int, file: Path | None = None) -> None:
     """Send log lines of a level to the shared console, and all to a file. Called by the command line only.
 
     In a pipe or a file one record is one line and has its time.
-
-    Raises:
-        StorageError: the file cannot be written.
     """
     handler: logging.Handler
     if console.is_terminal:

@@ -55,11 +55,7 @@ class Journal:
                 yield record
 
     def read_as(self, read_record: Callable[[dict], T]) -> Iterator[T]:
-        """Yield what `read_record` makes of the records.
-
-        Raises:
-            InputError: it finds one that cannot be used, by a ValidationError; names the line.
-        """
+        """Yield what `read_record` makes of the records."""
         for record in self.read():
             try:
                 found = read_record(record)

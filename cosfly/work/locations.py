@@ -61,11 +61,7 @@ def _plain(link: str) -> str:
 
 
 def opened(address: str) -> tuple[Any, str]:
-    """Give the file system of an address, and the path in it.
-
-    Raises:
-        InputError: fsspec knows no such address. EnvironmentMissing: a package is not installed; says which.
-    """
+    """Give the file system of an address, and the path in it."""
     shown = without_secrets(address)
     try:
         from fsspec.core import url_to_fs
@@ -163,11 +159,7 @@ class WorkingFolder:
         _shown[self.local.absolute()] = self.shown
 
     def fetch(self, *, is_input: bool = True) -> None:
-        """Make `local` what is there, of a file with its stage's records beside it; only what is new travels.
-
-        Raises:
-            InputError: nothing is there, or a name cannot be. StorageError: it cannot be read.
-        """
+        """Make `local` what is there, of a file with its stage's records beside it; only what is new travels."""
         there = self._listed(self.local.name)
         if is_input and not there:
             raise InputError("there is nothing", where=self.shown, fix="check the address, and the bucket's name")
@@ -221,11 +213,7 @@ class WorkingFolder:
         return listed
 
     def take(self) -> None:
-        """Become the one who writes there, and make `local` what is there, unless it is what is there and more.
-
-        Raises:
-            ResumeError: another machine is at work there. StorageError: it cannot be written to.
-        """
+        """Become the one who writes there, and make `local` what is there, unless it is what is there and more."""
         found, is_ours = self._writer(), False
         if found is not None:
             is_ours, age_s = found.id == self._state.id, time.time() - found.seen_s

@@ -285,9 +285,6 @@ def was_made_of(product: Path, name: str) -> str | None:
 def stages_behind(products: Iterable[Path]) -> list[StageRecord]:
     """Give the records of the stages that made some products, before each those that made its inputs, as far as these
     still stand as they were.
-
-    Raises:
-        InputError: a record cannot be read.
     """
     found: set[str] = set()
     ordered: list[StageRecord] = []
@@ -320,8 +317,6 @@ def verify(paths: Iterable[Path]) -> int:
 
     Args:
         paths: files or folders; where there is no record of one, the log says so.
-    Raises:
-        VerifyError: names the files that are missing, have other bytes, or are in no record.
     """
     start_s, num_bytes, wrong = time.monotonic(), 0, []
     digests: dict[Path, str] = {}

@@ -246,11 +246,7 @@ def _host() -> type:
 
 
 def connected(cfg: RayConfig) -> Any:
-    """Connect this process to the cluster, if it is not; gives the module `ray`.
-
-    Raises:
-        EnvironmentMissing: Ray is not installed, no cluster answers, or it has another Python or Ray.
-    """
+    """Connect this process to the cluster, if it is not; gives the module `ray`."""
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     try:

@@ -94,11 +94,7 @@ ItemRecord = Kept | Dropped | Failed
 
 
 def result_of(record: Kept | Dropped, model: type[Model]) -> Model:
-    """Give the result of an item, which may have been done by an earlier run, as the stage's own model.
-
-    Raises:
-        InputError: the journal holds something else; names the field.
-    """
+    """Give the result of an item, which may have been done by an earlier run, as the stage's own model."""
     return validated(model, record.result, f"items.jsonl: {record.id}: result")
 
 
@@ -211,10 +207,6 @@ class StageFolder:
             grows: names of settings of which more means more items, those of before unchanged.
             begins_anew: with grown inputs all items are other ones, so none of before is kept.
             begun: files and folders that the stage writes before anything is finished, beside those of every stage.
-        Raises:
-            VerifyError: an input is not what its stage finished, or was made of another one than that which is given
-                with it.
-            ResumeError: the folder holds work that may not be continued; names what differs.
         """
         record = StageRecord(
             stage=stage,

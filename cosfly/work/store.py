@@ -141,11 +141,7 @@ def sha256_bytes(data: bytes) -> str:
 
 
 def refuse_link(path: Path) -> None:
-    """Refuse to write to a link, which may lead anywhere.
-
-    Raises:
-        StorageError: the path is a link; says where it leads.
-    """
+    """Refuse to write to a link, which may lead anywhere."""
     if path.is_symlink():
         raise StorageError(
             "a link stands where files are written, and writing follows none",

@@ -37,8 +37,6 @@ def plan_by_model(
 
     Returns:
         the plan, and the trace: what was asked and answered, to the letter.
-    Raises:
-        TeacherError: the endpoint cannot be used, or gives no plan. InputError: the plan cannot be.
     """
     schema = WorldPlan.model_json_schema()
     fields = "\n".join(

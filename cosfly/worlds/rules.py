@@ -30,11 +30,7 @@ MOST_CHARACTERS = 2000
 
 
 def check_prompt(prompt: str) -> str:
-    """Give a prompt on one line.
-
-    Raises:
-        InputError: it says nothing, or more than a planner reads.
-    """
+    """Give a prompt on one line."""
     text = " ".join(prompt.split())
     if not re.search(r"\w", text) or len(text) > MOST_CHARACTERS:
         expected = f"1 to {MOST_CHARACTERS} characters, as in 'a small village with a church'"
@@ -49,8 +45,6 @@ def plan_by_rules(prompt: str, seed: int) -> tuple[WorldPlan, dict[str, Any]]:
 
     Returns:
         the plan, and the trace: which words were read as what.
-    Raises:
-        InputError: it says two things that exclude each other.
     """
     text = prompt.lower().replace("’", "'")
     text = re.sub(
@@ -130,11 +124,7 @@ def _objects(text: str) -> tuple[list[NamedObject], str]:
 
 
 def _said(rest: str, words: list[str]) -> dict[str, str]:
-    """Tell which word of each group is said of the settlement.
-
-    Raises:
-        InputError: two that exclude each other.
-    """
+    """Tell which word of each group is said of the settlement."""
     said: dict[str, str] = {}
     for group, choices in WORDS["groups"].items():
         found: dict[str, str] = {}
@@ -152,11 +142,7 @@ def _said(rest: str, words: list[str]) -> dict[str, str]:
 
 
 def _heights(text: str, plan: dict[str, Any]) -> dict[str, Any]:
-    """Read heights in metres: between A and B m, at least A m, up to B m.
-
-    Raises:
-        InputError: the lowest is above the highest.
-    """
+    """Read heights in metres: between A and B m, at least A m, up to B m."""
     unit = r"\s*(?:m|metres?|meters?)\b"
     between = re.search(rf"\b(?:between|from)\s+(\d+)(?:{unit})?\s+(?:and|to)\s+(\d+){unit}", text)
     least = re.search(rf"\b(?:at least|over|above|more than)\s+(\d+){unit}", text)

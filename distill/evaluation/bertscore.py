@@ -75,8 +75,6 @@ class Scorer:
 
         Args:
             references: the texts that idf weights are counted on, if they are used.
-        Raises:
-            InputError: the folder does not hold a usable encoder. ConfigError: it has fewer layers than asked for.
         """
         require("torch", "transformers", "bert_score")
         quiet_transformers()

@@ -35,11 +35,7 @@ WRITTEN = ("shuffled", "constant")  # floors that have texts
 
 
 def coc_of(sample: Sample) -> Coc:
-    """Give a sample's answer.
-
-    Raises:
-        InputError: it is none.
-    """
+    """Give a sample's answer."""
     return validated(Coc, parse_document(sample.answer, sample.key, what="answer"), sample.key)
 
 
@@ -116,11 +112,7 @@ class Floors:
 
 
 def write_floors(dataset: Path, split: Split, out: Path, seed: int) -> list[Path]:
-    """Write the floors that have texts as predictions, so that `caption --teacher student:` judges their sentences too.
-
-    Raises:
-        InputError: the split is empty.
-    """
+    """Write the floors that have texts as predictions, so that `caption --teacher student:` judges their sentences too."""
     samples, actions = open_split(dataset, split), read_training_set(dataset).actions
     if not samples:
         fix = "choose another --split, or prepare more walks"

@@ -54,11 +54,7 @@ class _LastStart(BaseModel):
 
 
 def speed_of(predictions_path: Path, predictions: Sequence[Prediction]) -> Speed:
-    """Measure what can be measured beside `predictions.jsonl`.
-
-    Raises:
-        InputError: a record that stands there cannot be read.
-    """
+    """Measure what can be measured beside `predictions.jsonl`."""
     folder = predictions_path.parent
     seconds, num_new = _last_start(folder)
     tokens = [prediction.num_tokens for prediction in predictions if prediction.num_tokens]
@@ -164,11 +160,7 @@ def read_report(folder: Path) -> Evaluation:
 
 
 def pair_up(samples: Sequence[Sample], predictions: Sequence[Prediction]) -> list[tuple[Sample, Prediction]]:
-    """Give each sample that was asked its prediction, in the order of the samples.
-
-    Raises:
-        InputError: a prediction is for a sample that the split does not have.
-    """
+    """Give each sample that was asked its prediction, in the order of the samples."""
     by_key = {prediction.key: prediction for prediction in predictions}
     if unknown := by_key.keys() - {sample.key for sample in samples}:
         words, fix = "a prediction is for a sample that the split does not have", "give the training set that it is of"
@@ -181,8 +173,6 @@ def read_judged(paths: Sequence[Path], samples: Iterable[Sample]) -> dict[str, S
 
     Args:
         paths: one file a tree.
-    Raises:
-        InputError: as `read_captions`; somebody else wrote them, or several trees share the name of a window.
     """
     keys: dict[str, dict[str, str]] = {}  # window and language -> run -> sample's key
     for sample in samples:

@@ -106,11 +106,7 @@ def join(parts: Sequence[Mapping[str, Scores]]) -> dict[str, Scores]:
 
 
 def number_of(decision: str, sample: Sample, actions: ActionSet) -> int:
-    """Give the number of a decision.
-
-    Raises:
-        InputError: it is none of the closed set.
-    """
+    """Give the number of a decision."""
     if decision not in actions.actions:
         raise not_in_set(decision, sample.key, actions)
     return actions.tokens.index(decision)
@@ -189,11 +185,7 @@ def write_scores(path: Path, scores: Scores) -> None:
 
 
 def read_scores(path: Path, actions: ActionSet) -> Scores:
-    """Read `scores.parquet`, whose decisions are of a set.
-
-    Raises:
-        InputError: it is damaged, or holds something else.
-    """
+    """Read `scores.parquet`, whose decisions are of a set."""
     columns: dict[str, list[Any]] = {name: [] for name in COLUMNS}
     for group in row_groups(path):
         if wrong := [name for name in COLUMNS if group.column_names.count(name) != 1]:

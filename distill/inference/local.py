@@ -94,11 +94,7 @@ class LocalAnswers:
         self._threads.shutdown(wait=True, cancel_futures=True)
 
     async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[SampleOutcome, None]:
-        """Yield what becomes of each sample, in their order; `advance` is told of them as they come, a batch at a time.
-
-        Raises:
-            ConfigError: the memory does not hold even one.
-        """
+        """Yield what becomes of each sample, in their order; `advance` is told of them as they come, a batch at a time."""
         rest = iter(samples)
         while chosen := list(islice(rest, SHELF_BATCHES * self.batch_size)):
             shelf = _Shelf(chosen, VisionFeatures(self.student, memory_bytes=self._feature_bytes))
@@ -174,11 +170,7 @@ class LocalAnswers:
         return error is not None
 
     def _decode(self, shelf: _Shelf, samples: Sequence[Sample]) -> list[Completion]:
-        """Answer samples together, in halves where the memory does not hold them all.
-
-        Raises:
-            ConfigError: it does not hold one.
-        """
+        """Answer samples together, in halves where the memory does not hold them all."""
         import torch
 
         answers: list[Completion] = []
@@ -258,10 +250,7 @@ class AnswerSchemas:
     """Makes the constraints of batches; texts of a language share their grammar."""
 
     def __init__(self, student: Student, actions: ActionSet) -> None:
-        """
-        Raises:
-            EnvironmentMissing: llguidance is not installed.
-        """
+        """"""
         require("llguidance")
         from llguidance import LLMatcher
         from llguidance.hf import from_tokenizer

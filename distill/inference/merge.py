@@ -93,11 +93,7 @@ def run(cfg: MergeConfig, model: Path, adapter: Path, out: Path, *, resume: Resu
 
 
 def adapter_files(adapter: Path) -> dict[str, Path]:
-    """Give the files of an adapter, for the inputs of a stage: name -> path.
-
-    Raises:
-        InputError: it is none, or whole weights already.
-    """
+    """Give the files of an adapter, for the inputs of a stage: name -> path."""
     names = ("adapter_config.json", "adapter_model.safetensors")
     if not all((adapter / name).is_file() for name in names):
         if (adapter / "config.json").is_file():

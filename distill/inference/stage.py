@@ -41,11 +41,7 @@ WAITING = 4
 def make_request(
     sample: Sample, trees: Mapping[str, Path], sampling: StudentEndpointConfig, max_pixels: int, actions: ActionSet
 ) -> Request:
-    """Give a sample as chat messages: its pictures as the student was taught to see them, then the question.
-
-    Raises:
-        InputError: a picture of its playback tree cannot be read.
-    """
+    """Give a sample as chat messages: its pictures as the student was taught to see them, then the question."""
     pictures = iter([picture_to_send(picture, max_pixels) for picture in load_pictures(sample, trees)])
     frames = [[next(pictures) for _ in sample.views] for _ in sample.frames]
     return student_request(sample.prompt, frames, answer_schema(actions, language=sample.language), sampling)
@@ -77,11 +73,7 @@ class EngineAnswers:
         self._failed_in_row = 0
 
     async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[SampleOutcome, None]:
-        """Yield what becomes of each sample, in their order; `advance` is told of them as they come.
-
-        Raises:
-            TeacherError: the engine cannot be used, or too many samples in a row got no answer.
-        """
+        """Yield what becomes of each sample, in their order; `advance` is told of them as they come."""
         waiting: deque[asyncio.Task[SampleOutcome]] = deque()
         try:
             for sample in samples:
@@ -307,11 +299,7 @@ def run(
 
 
 def _answer_all(cfg: InferConfig, inputs: Inputs, out: Path) -> Results:
-    """Have all samples answered and write what came of them.
-
-    Raises:
-        ConfigError: the memory is full outside the batches.
-    """
+    """Have all samples answered and write what came of them."""
     try:
         return asyncio.run(_write_answers(cfg, inputs, out))
     except Exception as error:  # torch's class has no name here until torch is loaded; all others go on

@@ -92,20 +92,12 @@ def _page_of(record: TrackSet) -> bytes:
 
 
 def read_track_set(dataset: Path) -> TrackSet:
-    """Read the record of a set of windows.
-
-    Raises:
-        InputError: it is missing, of another version, or malformed.
-    """
+    """Read the record of a set of windows."""
     return read_model(dataset / RECORD, TrackSet, RECORD_FORMAT, tree=dataset)
 
 
 def read_track_samples(dataset: Path, split: Split) -> Iterator[TrackSample]:
-    """Yield the windows of a split, a row group in memory; none where it has none.
-
-    Raises:
-        InputError: names the file, the row and the field.
-    """
+    """Yield the windows of a split, a row group in memory; none where it has none."""
     if not read_track_set(dataset).samples.get(split):
         return
     path = split_path(dataset, split)

@@ -34,11 +34,7 @@ class RunSource:
 
     @classmethod
     def of_run(cls, folder: Path) -> RunSource:
-        """Take a run folder as `cosfly run` makes it.
-
-        Raises:
-            InputError: it is none.
-        """
+        """Take a run folder as `cosfly run` makes it."""
         if not (folder / "render").is_dir():
             expected, fix = "render/ and caption/ in it", "give --data and --captions where they stand elsewhere"
             raise InputError("not a run folder", where=folder, expected=expected, fix=fix)
@@ -68,22 +64,14 @@ def run_of(tree: Path) -> str:
 
 
 def check_names(runs: Sequence[str]) -> None:
-    """Check that no two runs have one name.
-
-    Raises:
-        InputError: two have.
-    """
+    """Check that no two runs have one name."""
     if len(set(runs)) < len(runs):
         fix = "rename the folder that one of the trees stands in"
         raise InputError("two runs have one name", got=", ".join(runs), fix=fix)
 
 
 def check_sources(sources: Sequence[RunSource], unbound: Literal["refuse", "accept"]) -> None:
-    """Check that runs can be told apart, and that captions are on record as made of a tree; the stage checks of which.
-
-    Raises:
-        InputError: two runs have one name. VerifyError: captions have no record of their tree.
-    """
+    """Check that runs can be told apart, and that captions are on record as made of a tree; the stage checks of which."""
     check_names([source.run for source in sources])
     for source in sources:
         if was_made_of(source.captions, "data") is not None:
@@ -147,11 +135,7 @@ class Flights:
         self._courses: list[Course] = []
 
     def of(self, source: RunSource, caption: Caption) -> CaptionedFlight:
-        """Find the flight of a caption.
-
-        Raises:
-            InputError: a name is none of a folder, or the flight cannot be read.
-        """
+        """Find the flight of a caption."""
         names = (caption.town, caption.trajectory, caption.variant)
         key = (source.run, *names)
         if key not in self._found:

@@ -67,8 +67,6 @@ def check_no_leak(
 
     Returns:
         split -> number of samples.
-    Raises:
-        VerifyError: names what is shared and by which splits.
     """
     owners: dict[tuple[str, str], str] = {}
     walks: dict[str, str] = {}

@@ -96,8 +96,6 @@ def make_sample(
 
     Args:
         run, walk: of its flight. sample_id: unique among the samples of all runs; "" takes the caption's.
-    Raises:
-        InputError: the prompt cannot say which pictures the student gets.
     """
     if reason := _reason_to_leave_out(caption, language, cfg):
         return reason

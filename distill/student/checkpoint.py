@@ -51,11 +51,7 @@ def learning_weights(student: Student) -> dict[str, Any]:
 
 
 def save_checkpoint(folder: Path, student: Student, optimizer: Any, progress: Progress) -> None:
-    """Write weights, optimizer state and progress into `folder`, whole or not at all.
-
-    Raises:
-        StorageError: the disk is full.
-    """
+    """Write weights, optimizer state and progress into `folder`, whole or not at all."""
     weights = learning_weights(student)
     moments = {
         f"{name}/{key}": value
@@ -101,11 +97,7 @@ def newest_checkpoint(folder: Path) -> Path | None:
 
 
 def check_whole(checkpoint: Path) -> None:
-    """Check that a checkpoint that is needed stands and is whole.
-
-    Raises:
-        InputError: it is gone or damaged.
-    """
+    """Check that a checkpoint that is needed stands and is whole."""
     damaged = _damage_of(checkpoint)
     if damaged is not None:
         fix = "train anew in another --out (keep=last takes the last weights instead)"
@@ -127,11 +119,7 @@ def read_progress(folder: Path) -> Progress:
 
 
 def load_checkpoint(folder: Path, student: Student, optimizer: Any = None) -> Progress:
-    """Put a checkpoint's weights, and the optimizer's state where one is given, into place.
-
-    Raises:
-        InputError: it is of another student.
-    """
+    """Put a checkpoint's weights, and the optimizer's state where one is given, into place."""
     import torch
     from safetensors.torch import load_file
 
@@ -249,11 +237,7 @@ class AdapterFacts(BaseModel):
 
 
 def read_adapter_facts(adapter: Path, model: Path) -> AdapterFacts:
-    """Read what stands beside an adapter, and check that it belongs to the model.
-
-    Raises:
-        InputError: it was trained on other weights, or is malformed.
-    """
+    """Read what stands beside an adapter, and check that it belongs to the model."""
     path, fix = adapter / ADAPTER_FACTS, "a training that was stopped goes on: run its cosfly distill train again"
     facts = validated(AdapterFacts, read_json(path, what="adapter", fix=fix), path)
     if facts.base_sha256 != (found := base_digests(model)):

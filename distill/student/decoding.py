@@ -37,8 +37,6 @@ def record_graph(step: Callable[[], None]) -> Play | None:
             what it keeps; a tensor that it makes anew stays where it is and gets new values each time it is played.
     Returns:
         What plays it; None where it cannot be recorded, which is logged: it is then computed plainly.
-    Raises:
-        OutOfMemoryError: of torch, the memory is full.
     """
     import torch
 

@@ -53,8 +53,6 @@ def load_pictures(sample: Sample, trees: Mapping[str, Path]) -> list[np.ndarray]
 
     Args:
         trees: run -> playback tree (`resolve_trees`).
-    Raises:
-        InputError: a picture is missing, damaged or of another size.
     """
     tree = trees[sample.run]
     return [picture for frame in sample.frames for picture in sample.pictures.read(inside(tree, frame))]

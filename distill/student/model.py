@@ -34,11 +34,7 @@ Dtype = Literal["auto", "float32", "bfloat16"]
 
 
 def require(*packages: str) -> None:
-    """Check that optional packages can be imported.
-
-    Raises:
-        EnvironmentMissing: names the first missing one and the install line.
-    """
+    """Check that optional packages can be imported."""
     for package in packages:
         if importlib.util.find_spec(package) is None:
             raise EnvironmentMissing("a package that students need is not installed", got=package, fix=INSTALL)
@@ -123,9 +119,6 @@ def is_hub_name(name: str) -> bool:
 def student_folder(name: str) -> Path:
     """Give the folder of a student: a folder as it is; of a repository's name, as `Qwen/Qwen3.5-2B`, the copy in the
     hub's cache.
-
-    Raises:
-        InputError: there is no such folder, or the repository cannot be had.
     """
     if not is_hub_name(name):
         return Path(name)
@@ -141,11 +134,7 @@ def student_folder(name: str) -> Path:
 
 
 def weight_files(folder: Path) -> dict[str, Path]:
-    """Give the files that decide what a model folder computes, for the inputs of a stage: name -> path.
-
-    Raises:
-        InputError: it is not a folder of a Qwen3.5 model with safetensors weights.
-    """
+    """Give the files that decide what a model folder computes, for the inputs of a stage: name -> path."""
     config = read_json(folder / "config.json", what="student model (a folder with config.json)")
     found = config.get("model_type") if isinstance(config, dict) else None
     if found != MODEL_TYPE:
@@ -160,11 +149,7 @@ def weight_files(folder: Path) -> dict[str, Path]:
 
 
 def pick_device(wanted: Device) -> str:
-    """Give the device to use: `cuda` if there is one, unless told otherwise.
-
-    Raises:
-        EnvironmentMissing: cuda was asked for and is not there.
-    """
+    """Give the device to use: `cuda` if there is one, unless told otherwise."""
     require("torch")
     import torch
 
@@ -198,9 +183,6 @@ def load_student(
         dtype: what it computes in; auto is bfloat16 on an accelerator and float32 on a CPU.
         max_pixels: images with more pixels are scaled down, sides to multiples of the patch.
         is_trained: keep the weights in float32 in any case, for an optimizer.
-    Raises:
-        InputError: the folder does not hold a whole model of Qwen3.5's structure, or the adapter does not fit it.
-        EnvironmentMissing: torch, transformers or peft is missing.
     """
     require("torch", "transformers", "peft")
     weight_files(folder)
@@ -240,11 +222,7 @@ def load_student(
 
 
 def check_tokens_fit(student: Student, folder: Path) -> None:
-    """Check that tokenizer and weights are of one model.
-
-    Raises:
-        InputError: the tokenizer knows more tokens than the model, or another one for pictures.
-    """
+    """Check that tokenizer and weights are of one model."""
     known, most = len(student.tokenizer), student.core.get_input_embeddings().weight.shape[0]
     if known > most:
         raise InputError("the tokenizer knows more tokens than the model", where=folder, got=known, expected=most)
@@ -255,11 +233,7 @@ def check_tokens_fit(student: Student, folder: Path) -> None:
 
 
 def load_processor(folder: Path, max_pixels: int) -> tuple[Any, Any]:
-    """Load the tokenizer and the image processor of a model folder.
-
-    Raises:
-        InputError: one of them is missing or has no chat template.
-    """
+    """Load the tokenizer and the image processor of a model folder."""
     require("transformers")
     from transformers import AutoTokenizer
     from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil

@@ -68,9 +68,6 @@ PRESETS = {
 def random_student_settings(name: str, given: RandomStudent) -> RandomStudent | None:
     """Give the settings of a student of random weights: of a preset's name, or `given` for `random`; None for any other
     name.
-
-    Raises:
-        InputError: there is no such preset.
     """
     if name == RANDOM:
         return given
@@ -93,8 +90,6 @@ def make_random_student(folder: Path, cfg: RandomStudent, seed: int, texts: Iter
         texts: what its byte-level tokenizer is trained on, beside a few lines of our own.
     Returns:
         `folder`, with config.json, model.safetensors, tokenizer and preprocessor files.
-    Raises:
-        EnvironmentMissing: torch or transformers is missing.
     """
     require("torch", "transformers")
     import torch

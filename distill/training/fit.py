@@ -186,8 +186,6 @@ def train_step(lesson: Lesson, optimizer: Any, ready: ReadyStep, rate: float) ->
 
     Returns:
         loss (nats an answer token, weighted), gradient_norm, answer_tokens, tokens, samples: of all processes.
-    Raises:
-        ConfigError: loss or gradient are not finite. InputError: no sample of the step could be read.
     """
     import torch
 

@@ -75,8 +75,6 @@ def in_order(function: Callable[[OrderT], ResultT], orders: Iterable[OrderT], wo
 
     Args:
         workers: processes; 0: everything is done here.
-    Raises:
-        CosflyError: the first one of the function. EnvironmentMissing: a worker was killed.
     """
     import torch
 
@@ -342,11 +340,7 @@ def take_census(
     ranks: Ranks,
     label: str,
 ) -> Census:
-    """Look at the chosen samples of a split; each process of the training takes its share.
-
-    Raises:
-        InputError: the training set cannot be read.
-    """
+    """Look at the chosen samples of a split; each process of the training takes its share."""
     chunks = [chosen[start : start + SAMPLES_AT_ONCE] for start in range(0, len(chosen), SAMPLES_AT_ONCE)]
     mine, counting = chunks[ranks.rank :: ranks.size], Counting(samples, processor, trees, max_tokens)
     seen, whole = SampleCounts(), SampleCounts()

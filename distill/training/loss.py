@@ -80,11 +80,7 @@ def chunked_loss(hidden: Any, head: Any, targets: Any, weights: Any, *, chunk: i
 
 
 def output_head(student: Student) -> Any:
-    """Give the weights of the head, (vocabulary, width).
-
-    Raises:
-        ConfigError: it is adapted, which the loss here would pass over.
-    """
+    """Give the weights of the head, (vocabulary, width)."""
     import torch
 
     head = student.core.get_output_embeddings()

@@ -106,11 +106,7 @@ def _buckets(gradients: list[Any]) -> Iterator[list[Any]]:
 
 
 def _collective(call: Callable[..., Any], *arguments: Any) -> None:
-    """Do something with all processes.
-
-    Raises:
-        EnvironmentMissing: one of them has ended.
-    """
+    """Do something with all processes."""
     try:
         call(*arguments)
     except RuntimeError as error:  # what torch.distributed raises of a broken connection
@@ -133,11 +129,7 @@ def _number(name: str, default: int) -> int:
 
 @contextlib.contextmanager
 def joined(device: Device) -> Iterator[Ranks]:
-    """Join the processes that were started together (RANK, WORLD_SIZE, LOCAL_RANK), or be alone.
-
-    Raises:
-        EnvironmentMissing: there are fewer accelerators than processes on this machine.
-    """
+    """Join the processes that were started together (RANK, WORLD_SIZE, LOCAL_RANK), or be alone."""
     import torch
 
     name, size = pick_device(device), _number("WORLD_SIZE", 1)

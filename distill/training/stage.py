@@ -34,8 +34,6 @@ def taught_by(samples: Iterable[Sample], max_pixels: int) -> Taught:
 
     Args:
         max_pixels: most that the student's image processor keeps of a picture.
-    Raises:
-        InputError: their windows are of different lengths.
     """
     prompts: dict[Language, Prompt] = {}
     looks: set[FrameLook] = set()
@@ -56,11 +54,7 @@ TOKENIZER_SAMPLES = 2000  # what the tokenizer of a student of random weights is
 
 
 def add_adapter(student: Student, cfg: TrainConfig, seed: int) -> Student:
-    """Wrap the student's model with a fresh LoRA adapter; only the adapter can be trained.
-
-    Raises:
-        ConfigError: no layer matches `target_modules`.
-    """
+    """Wrap the student's model with a fresh LoRA adapter; only the adapter can be trained."""
     import torch
     from peft import LoraConfig, get_peft_model
 

@@ -44,8 +44,6 @@ def compute_numbers(shards: list[Path], num_frames: int | None) -> Numbers:
     Args:
         shards: parquet files in their order.
         num_frames: the release's frames per flight, None for all; flights with fewer are counted as short.
-    Raises:
-        InputError: a shard cannot be read, or holds a number that is none.
     """
     counted = RowCounts()
     for shard in shards:
@@ -56,12 +54,7 @@ def compute_numbers(shards: list[Path], num_frames: int | None) -> Numbers:
 
 
 def row_lists(shard: Path, columns: list[str]) -> Iterator[list[dict[str, Any]]]:
-    """Yield the rows of a shard, a row group at a time, in which every value that must be there is there.
-
-    Raises:
-        InputError: it cannot be read, has other columns than a release, or a required column, or a part of a pose,
-        place or box, is null.
-    """
+    """Yield the rows of a shard, a row group at a time, in which every value that must be there is there."""
     for group in row_groups(shard, columns, tree=shard.parents[1]):
         check_columns(group, columns, shard)
         for member in group.schema:
@@ -90,11 +83,7 @@ def check_rows(shard: Path, rows: int) -> None:
 
 
 def check_columns(group: pa.Table, columns: Iterable[str], shard: Path) -> None:
-    """See that columns of a row group are those of a release.
-
-    Raises:
-        InputError: one is missing or of another type.
-    """
+    """See that columns of a row group are those of a release."""
     for name in columns:
         found = group.schema.field(name).type if group.schema.get_field_index(name) >= 0 else None
         if found != SCHEMA.field(name).type:

@@ -80,8 +80,6 @@ def read_lines(source: Path, left_out: Counter[str]) -> Iterator[CaptionLine]:
 
     Args:
         left_out: counts the others by reason.
-    Raises:
-        InputError: it is none of these, or cannot be read.
     """
     if source.is_file():
         return _of_captions(source, None, left_out)

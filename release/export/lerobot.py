@@ -218,11 +218,7 @@ def states(rows: list[dict[str, Any]]) -> np.ndarray:
 
 
 def tiff_of_depth(data: bytes, where: str) -> bytes:
-    """Give the bytes of a `depth.npy` as TIFF of float32, in which LeRobot keeps depth: the same numbers, uncompressed.
-
-    Raises:
-        InputError: it is no depth image.
-    """
+    """Give the bytes of a `depth.npy` as TIFF of float32, in which LeRobot keeps depth: the same numbers, uncompressed."""
     from PIL import Image
 
     buffer = io.BytesIO()
@@ -267,11 +263,7 @@ def task_of(goal: str, decision: str) -> str:
 
 
 def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[ExportUnit]:
-    """Number episodes and frames; a unit is a data file of whole flights.
-
-    Raises:
-        InputError: pictures of several sizes, or times that no whole number of frames a second gives.
-    """
+    """Number episodes and frames; a unit is a data file of whole flights."""
     fps, size_px = _fps(flights), _size(release)
     found = {decision for flight in flights for decision in flight.decisions}
     decisions = ("", *release.record.actions.tokens)

@@ -121,13 +121,7 @@ def split_of(shard: str) -> SplitName:
 
 
 def scan(release: Release) -> list[ReleasedRows]:
-    """Find the flights of a release and where their rows stand, splits in their order; reads no picture.
-
-    Raises:
-        InputError: a shard cannot be read, has other columns, or a flight cannot be (frames that do not rise, two
-        splits, a name
-            that is no part of a path); names them.
-    """
+    """Find the flights of a release and where their rows stand, splits in their order; reads no picture."""
     flights: dict[Place, ReleasedRows] = {}
     shards = sorted(
         (shard.path for shard in release.record.shards), key=lambda path: (SPLIT_NAMES.index(split_of(path)), path)
@@ -197,11 +191,7 @@ def read_span(release: Release, span: Span, columns: list[str] | None = None) ->
 
 
 def _check_values(group: pa.Table, where: str) -> None:
-    """See that what every row must have is there, and that numbers are finite.
-
-    Raises:
-        InputError: names the column.
-    """
+    """See that what every row must have is there, and that numbers are finite."""
     for member in group.schema:
         column = group.column(member.name)
         if member.name in REQUIRED and column.null_count:
@@ -221,11 +211,7 @@ def rows_of_flight(
 
 
 def picture(row: dict[str, Any], file: FrameFile) -> bytes:
-    """Give the bytes of a picture of a row.
-
-    Raises:
-        InputError: there are none, or those of a picture are no PNG.
-    """
+    """Give the bytes of a picture of a row."""
     value = row[PICTURES[file].name]
     data = value if file == "depth" else value and value["bytes"]
     if not data or (file != "depth" and png_size(data) is None):
@@ -240,9 +226,6 @@ def picture(row: dict[str, Any], file: FrameFile) -> bytes:
 def depth_npy(row: dict[str, Any], coding: DepthCoding | None) -> bytes:
     """Give the depth of a row as the bytes of a `depth.npy` of float32: the released ones, or decoded where the release
     has coded it.
-
-    Raises:
-        InputError: it is not what the record of the release says.
     """
     data, where = picture(row, "depth"), row["sample_id"]
     if coding is None or coding.coding == "float32":

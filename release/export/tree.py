@@ -42,11 +42,7 @@ Row = dict[str, Any]
 
 
 def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[ExportUnit]:
-    """A unit is one flight.
-
-    Raises:
-        InputError: the layout cannot hold the release; lists what is in the way.
-    """
+    """A unit is one flight."""
     wrong = [] if "rgb" in release.modalities else ["no colour pictures, which every frame of the layout has"]
     wrong += [
         f"{flight.name}: a town's folder begins with {TOWN}" for flight in flights if not flight.town.startswith(TOWN)
@@ -151,11 +147,7 @@ def _notes(units: Sequence[ExportUnit], written: Sequence[UnitFiles]) -> Iterato
 
 
 def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight:
-    """Give the flight that released rows are of; `number` is its trajectory's among those of the release.
-
-    Raises:
-        InputError: the pictures' size changes on the way.
-    """
+    """Give the flight that released rows are of; `number` is its trajectory's among those of the release."""
     sizes = {(r["width_px"], r["height_px"]) for r in rows}
     if len(sizes) != 1:
         raise InputError("a flight has pictures of one size", where=placed.name, got=f"{len(sizes)} sizes")

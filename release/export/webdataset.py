@@ -49,11 +49,7 @@ def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> li
 
 
 def write(release: Release, unit: ExportUnit, folder: Path, cfg: ExportConfig) -> UnitFiles:
-    """Write one shard.
-
-    Raises:
-        InputError: a picture is missing or damaged, or two frames have one key.
-    """
+    """Write one shard."""
     files = Files(folder)
     name, keys = f"{unit.name}.tar", set[str]()
     with (

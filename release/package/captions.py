@@ -100,8 +100,6 @@ def index_captions(
         lengths: of the flights that are released, their frames; others: the flights of the tree that are left out.
         actions: what a decision may be.
         tell: takes what is wrong with a caption, under its sample id.
-    Raises:
-        InputError: a line is no caption.
     """
     found = {key: FlightCaptions(path, bytearray(length)) for key, length in lengths.items()}
     account, first = CaptionAccount(), 0

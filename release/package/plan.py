@@ -143,12 +143,7 @@ class ReleasePlan:
 
 
 def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> ReleasePlan:
-    """Look at all of the material, and decide what goes where.
-
-    Raises:
-        InputError: it cannot be released; names everything that is wrong. NothingKept: there is no flight. ConfigError:
-        no licence.
-    """
+    """Look at all of the material, and decide what goes where."""
     faults = Faults(stage)
     actions = one_set((source.captions, actions_beside(source.captions)) for source in sources)
     choice, accepts = FlightChoice(match=cfg.flights), cfg.unbound == "accept"

@@ -58,8 +58,6 @@ def provenance_of(sources: list[Source], inputs: Mapping[str, StageInput], accou
 
     Args:
         inputs: of the stage, by their names (`input_names`).
-    Raises:
-        InputError: a stage's record cannot be read.
     """
     repaired = dict(sorted(account.repairs.items()))
     first = account.accepted - sum(repaired.values())
@@ -202,11 +200,7 @@ DATASET, PARTS = "dataset", "parts"  # in the folder of the stage: what gets pub
 
 
 def check_parts(parts: Sequence[tuple[Path, Shard]], out: Path) -> None:
-    """See that what was finished, also by an earlier run, is there; `out` is the folder of the stage.
-
-    Raises:
-        VerifyError: it is not.
-    """
+    """See that what was finished, also by an earlier run, is there; `out` is the folder of the stage."""
     for path, shard in parts:
         if not path.is_file() or path.stat().st_size != shard.bytes:
             raise VerifyError(

@@ -59,8 +59,6 @@ def check_picture(file: FrameFile, data: memoryview, size_px: tuple[int, int], w
 
     Args:
         size_px: width, height. is_known: its digest was compared, so that a PNG's own checksums need not be.
-    Raises:
-        InputError: it is not.
     """
     if file == "depth":
         _check_depth(depth_values(data, where), size_px, where)
@@ -239,9 +237,6 @@ class _Problems:
 def _digests(candidate: Candidate) -> dict[str, str]:
     """Give the sha256 of each file of a flight, as far as they are known, once it is clear that they are those that
     were inspected.
-
-    Raises:
-        VerifyError: they are not.
     """
     folder = candidate.folder
     if candidate.sha256 is None:
@@ -258,11 +253,7 @@ def _digests(candidate: Candidate) -> dict[str, str]:
 
 
 def _check_digest(folder: Path, name: str, data: memoryview | None, digests: Mapping[str, str]) -> None:
-    """Compare a file, of which `data` was read, with its digest where there is one.
-
-    Raises:
-        VerifyError: it is another one, or there are digests and none of it.
-    """
+    """Compare a file, of which `data` was read, with its digest where there is one."""
     if not digests or (data is None and not (folder / name).is_file()):
         return
     got = sha256_file(folder / name) if data is None else hashlib.sha256(data).hexdigest()

@@ -56,11 +56,7 @@ class Source:
 
     @classmethod
     def of_run(cls, folder: Path) -> Source:
-        """Take a run folder as `cosfly run` makes it.
-
-        Raises:
-            InputError: it is none.
-        """
+        """Take a run folder as `cosfly run` makes it."""
         if not (folder / "render").is_dir():
             raise InputError(
                 "not a run folder", where=folder, expected="a folder with render/, caption/ and inspect/",
@@ -143,10 +139,6 @@ def gather(
 ) -> Material:
     """Read the inspections of the runs, and list their flights; of a tree without one all. Those that are not chosen
     are left out.
-
-    Raises:
-        InputError: a file cannot be read, two runs or flights cannot be told apart, or nobody says of which tree the
-        captions were made.
     """
     name, count = Counter(source.run for source in sources).most_common(1)[0]
     if count > 1:  # rows and records know a run by its name alone
@@ -194,11 +186,7 @@ def _not_chosen(choice: FlightChoice, folder: str) -> str | None:
 
 
 def maps_of(candidates: list[Candidate]) -> list[ReleasedMap]:
-    """Give the maps that flights show, each once.
-
-    Raises:
-        InputError: a map's file cannot be read.
-    """
+    """Give the maps that flights show, each once."""
     towns = {(flight.place.town, flight.folder.parent.parent) for flight in candidates}
     shown = {ReleasedMap(town=town, **dict(read_town_map(folder))) for town, folder in towns}
     return sorted(shown, key=lambda one: (one.town, one.name, one.licence, one.credits))
@@ -236,9 +224,6 @@ def _sum_of(inspections: list[Inspection]) -> TrajectoryFunnel:
 def choose_licence(licence: str | None, maps: list[tuple[str, str]]) -> str:
     """Give the licence of the data set: `licence` where it is given, else that of the maps, of each its name and
     licence.
-
-    Raises:
-        ConfigError: it is not given, and the maps' are unknown or differ.
     """
     chosen = licence or maps[0][1]
     if chosen == UNKNOWN_LICENCE or (licence is None and len({one for _, one in maps}) > 1):

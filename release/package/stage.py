@@ -100,11 +100,7 @@ def run(
 def _write_parts(
     cfg: ReleaseConfig, plan: ReleasePlan, stage: StageFolder, parts: Path, workers: int, watch: Watch
 ) -> list[ShardResult]:
-    """Write all shards that are not written yet.
-
-    Raises:
-        InputError, VerifyError: a flight cannot be released.
-    """
+    """Write all shards that are not written yet."""
     how = ShardPlan(
         num_frames=cfg.num_frames, window_frames=plan.window_frames, uniform_stride=cfg.uniform_stride,
         files=cfg.modalities, depth=cfg.depth, row_group_bytes=cfg.row_group_bytes,
@@ -128,11 +124,7 @@ def _finished(plan: ReleasePlan, written: list[ShardResult], parts: Path) -> lis
 
 
 def _check_release(folder: Path) -> None:
-    """See that a release is one, before it has its name.
-
-    Raises:
-        VerifyError: names what is wrong.
-    """
+    """See that a release is one, before it has its name."""
     report = verify(folder, level="structure")
     if not report.is_ok:
         raise VerifyError("what was built does not verify, so it is not published", where=folder, got=str(report))

@@ -110,11 +110,7 @@ def look_of(flight: Flight, i: int) -> np.ndarray | None:
 
 
 def _check_frames(flight: Flight) -> None:
-    """See that a flight has a picture folder for each point, and for none beside them.
-
-    Raises:
-        InputError: it has not.
-    """
+    """See that a flight has a picture folder for each point, and for none beside them."""
     assert flight.folder is not None
     folder = flight.folder / FRAMES_DIR
     names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()

@@ -70,11 +70,7 @@ class Pixels:
 
 
 def look_at(dataset: Path, record: ReleaseRecord, most: int) -> Pixels:
-    """Decode at most `most` frames, spread evenly over the rows.
-
-    Raises:
-        InputError: a shard or a picture cannot be read.
-    """
+    """Decode at most `most` frames, spread evenly over the rows."""
     pixels, files = Pixels(), [file for file in record.settings.modalities if file != "rgb"]
     total = sum(shard.rows for shard in record.shards)
     wanted = {int(i) for i in np.linspace(0, total - 1, min(total, most)).round()} if files else set()

@@ -48,11 +48,7 @@ class Parcel:
 
 
 def check_name(repo: str) -> None:
-    """Check that a repository has a name that a hub takes.
-
-    Raises:
-        ConfigError: it has not.
-    """
+    """Check that a repository has a name that a hub takes."""
     if not REPO.fullmatch(repo) or ".." in repo or "--" in repo or repo.endswith(".git"):
         raise ConfigError(
             "not a name of a repository",
@@ -63,11 +59,7 @@ def check_name(repo: str) -> None:
 
 
 def pack(folder: Path) -> Parcel:
-    """Tell what of a release folder would go to a repository.
-
-    Raises:
-        InputError: it is no whole release, or the hub takes no such files; names them.
-    """
+    """Tell what of a release folder would go to a repository."""
     folder = open_release(folder).folder
     digests = read_checksums(folder)
     names = [*sorted(digests, key=lambda name: (SHARD_NAME.fullmatch(name) is None, name)), CHECKSUMS]
@@ -88,11 +80,7 @@ def pack(folder: Path) -> Parcel:
 
 
 def verified(parcel: Parcel, level: Level, *, reader: CaptionReader, workers: int, watch: Watch) -> Verified:
-    """Verify what would go.
-
-    Raises:
-        VerifyError: it is not what it says.
-    """
+    """Verify what would go."""
     report = verify(parcel.folder, level=level, workers=workers, watch=watch, reader=reader)
     if not report.is_ok:
         raise VerifyError(
@@ -112,9 +100,6 @@ def push(parcel: Parcel, repo: str, *, private: bool = True) -> str:
         repo: `OWNER/NAME`. private: of a repository that is made; one that is there stays as it is.
     Returns:
         the repository's address.
-    Raises:
-        ConfigError: the name is none. EnvironmentMissing: huggingface_hub is not installed. TeacherError: the hub
-        refuses, or cannot be reached.
     """
     try:
         from huggingface_hub import CommitOperationAdd, HfApi, constants

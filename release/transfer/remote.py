@@ -54,11 +54,7 @@ class Remote(Protocol):
 
 
 def open_remote(address: str) -> Remote:
-    """Give the files below an address; nothing is asked yet.
-
-    Raises:
-        InputError: no such folder, or not an address. EnvironmentMissing: what opens such addresses is not installed.
-    """
+    """Give the files below an address; nothing is asked yet."""
     scheme, mark, path = address.partition("://")
     if scheme.lower() in ("http", "https") and not CHAIN.search(address):
         return HttpRemote(address)

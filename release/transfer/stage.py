@@ -88,8 +88,6 @@ def fetch_record(remote: Remote, expected: str | None) -> tuple[ReleaseRecord, b
 
     Returns:
         the record, and its bytes.
-    Raises:
-        InputError: it is none, names other files than a release has, or is not the one that is expected.
     """
     where = f"{remote.shown}/{RECORD}"
     data = _small_file(remote, RECORD)
@@ -132,11 +130,7 @@ def _check_shards(record: ReleaseRecord, where: str) -> None:
 
 
 def chosen_flights(record: ReleaseRecord, choice: Selection) -> list[ReleasedFlight]:
-    """Give the flights that are wanted, each with its twin.
-
-    Raises:
-        InputError: a name that the release does not have, or nothing is left; says what there is.
-    """
+    """Give the flights that are wanted, each with its twin."""
     known: dict[str, set[str]] = {
         "towns": {flight.town for flight in record.flights if flight.town},
         "splits": set(map(str, record.splits.splits)),
@@ -213,12 +207,7 @@ def make_worker(plan: _Plan, parts: Path) -> Work:
 
 
 def fetch_shard(remote: Remote, shard: Shard, path: Path, plan: _Plan) -> _Got:
-    """Fetch the wanted part of one shard.
-
-    Raises:
-        InputError: the other side has another size, other columns, or other rows than the record says. VerifyError:
-        another sha256.
-    """
+    """Fetch the wanted part of one shard."""
     where = f"{remote.shown}/{shard.path}"
     if (size := remote.size(shard.path)) != shard.bytes:
         raise InputError(
@@ -310,9 +299,6 @@ def _checked(got: _Got, plan: _Plan, where: str) -> _Got:
 def _copy(remote: Remote, shard: Shard, path: Path) -> str:
     """Copy a whole shard; give its sha256, which is the record's. One that was broken off goes on with the bytes that
     are here.
-
-    Raises:
-        InputError: bytes are not to be had; those that came stay. VerifyError: another sha256; none stay.
     """
     begun = path.with_name(f"{path.name}.begun")
     refuse_link(begun)

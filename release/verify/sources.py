@@ -136,11 +136,7 @@ class Shards:
 
 
 def rows_of_table(table: Any, path: Path) -> list[Row]:
-    """Give a table's rows as plain values.
-
-    Raises:
-        InputError: text in it is none.
-    """
+    """Give a table's rows as plain values."""
     try:
         return table.to_pylist()
     except ValueError as error:

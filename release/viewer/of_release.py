@@ -70,11 +70,7 @@ class FlightScan:
 
 
 def show_release(dataset: Path, cfg: ViewerConfig) -> ViewerPage:
-    """Reads a release folder, gives what the page shows of it.
-
-    Raises:
-        InputError: the record or a shard cannot be read.
-    """
+    """Reads a release folder, gives what the page shows of it."""
     record = read_record(dataset / "release.json")
     names = [flight.flight for flight in record.flights]
     chosen = set(choose_flights(names, [name.rpartition("/")[0] for name in names], cfg.flights))
@@ -139,11 +135,7 @@ def _frame(row: Mapping[str, Any], record: ReleaseRecord, pictures: PagePictures
 
 
 def picture(row: Mapping[str, Any], file: FrameFile, record: ReleaseRecord) -> np.ndarray:
-    """Give a picture of a row as colours, (h, w, 3) uint8 RGB.
-
-    Raises:
-        InputError: it cannot be decoded.
-    """
+    """Give a picture of a row as colours, (h, w, 3) uint8 RGB."""
     where, cell = f"{row['sample_id']}: {COLUMNS[file].name}", row[COLUMNS[file].name]
     if file == "depth":
         assert record.depth is not None, "build writes it with depth"

@@ -71,11 +71,7 @@ def _of_run(folder: Path, captions: Path | None) -> Tree:
 
 
 def show_run(folder: Path, cfg: ViewerConfig, captions: Path | None = None) -> ViewerPage:
-    """Reads a run folder or a playback tree, gives what the page shows of it.
-
-    Raises:
-        InputError: there is no flight, or captions, inspection or map cannot be read.
-    """
+    """Reads a run folder or a playback tree, gives what the page shows of it."""
     trees = find_trees(folder, captions)
     found = [(tree, place) for tree in trees for place in find_flights(tree.data)]
     groups = [(tree.run, place_of(place).town, place_of(place).trajectory) for tree, place in found]

@@ -203,9 +203,6 @@ def start_trajectory(
 ) -> tuple[np.ndarray, str]:
     """Give a feasible trajectory to start from and its kind: `behind`, the wished places, or `search` where they are
     blocked or blind.
-
-    Raises:
-        NoPathError: neither is feasible.
     """
     targets = problem.targets
     plain = scenario.wish.places_m(targets, scenario.ground_m)

@@ -22,11 +22,7 @@ EXACT_M = 1e-6
 
 
 def sampled(task: Task, method: str, *, is_spline: bool = False) -> np.ndarray | None:
-    """Give the flight along the way that a planner of OMPL finds, (num, 3); None if it does not reach the goal.
-
-    Raises:
-        EnvironmentMissing: OMPL is not installed.
-    """
+    """Give the flight along the way that a planner of OMPL finds, (num, 3); None if it does not reach the goal."""
     base, geometric, util = load_ompl()
     util.RNG.setSeed(int(task.rng.integers(1, 2**31)))
     space, bounds = base.RealVectorStateSpace(3), base.RealVectorBounds(3)

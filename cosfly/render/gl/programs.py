@@ -18,11 +18,7 @@ FAIR, WEATHER_SKY, WEATHER_SCENE = ("look.glsl",), ("weather.glsl",), ("weather.
 
 
 def open_context() -> Any:
-    """Open a GL context without a window.
-
-    Raises:
-        EnvironmentMissing: no moderngl, no EGL or no driver; names the packages.
-    """
+    """Open a GL context without a window."""
     try:
         import moderngl
 
