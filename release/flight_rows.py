@@ -11,7 +11,7 @@ import numpy as np
 
 from cosfly.geometry import BODY_FROM_CAMERA, CORNER_SIGNS, rotation_matrices
 from cosfly.products.actions import ActionSet
-from cosfly.products.captions import FIELDS, Coc, Language
+from cosfly.products.captions import Language
 from cosfly.products.frames import Camera
 from cosfly.products.goals import Goal
 from cosfly.products.people import People
@@ -19,7 +19,7 @@ from cosfly.products.playback import EVENTS, Flight
 from cosfly.products.shown_captions import ShownCaption, ShownFlight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.reading.documents import parse_document
-from release.columns import BOX, COMPANY_COLUMNS, INTRINSICS, PICTURE_PX, POINT, POSE, WINDOW, between_of, matrices_of
+from release.columns import BOX, COMPANY_COLUMNS, INTRINSICS, POINT, POSE, between_of, matrices_of
 
 Row = dict[str, Any]
 LANGUAGES: tuple[Language, ...] = get_args(Language)
@@ -163,35 +163,22 @@ class FlightRows:
             else np.stack([self.numbers(name) for name in COMPANY_COLUMNS], axis=1),
         )  # fmt: skip
 
-    def shown(
-        self, twin: FlightRows | None, actions: ActionSet, settings: dict[str, Any], prompts: dict[str, str]
-    ) -> ShownFlight:
-        """Give what a reader of captions gets. actions, settings, prompts: of the captions, as the record has them."""
+    def shown(self, twin: FlightRows | None, actions: ActionSet, settings: dict[str, Any]) -> ShownFlight:
+        """Return what a reader of captions gets. actions, settings: of the captions, as the record has them."""
         captions = [shown_caption(row) for row in self.rows if row.get("has_caption")]
         same = twin is not None and np.array_equal(twin.index, self.index)
         other = twin.flight if twin is not None and same else None
-        return ShownFlight(self.flight, self.index, self.column("style"), captions, actions, other, settings, prompts)
+        return ShownFlight(self.flight, self.index, captions, actions, other, settings)
 
 
 def shown_caption(row: Row) -> ShownCaption:
-    """Give the caption of a row. Raises KeyError and TypeError where the row has not all of one, which is found
+    """Return the caption of a row. Raises KeyError and TypeError where the row has not all of one, which is found
     elsewhere."""
-    states = {language: row.get(f"sentence_states_{language}") for language in LANGUAGES}
     return ShownCaption(
         sample_id=row["sample_id"],
         frame_index=row["frame_index"],
-        window=tuple(row[WINDOW]),
-        picture_px=tuple(row[PICTURE_PX]),
-        answers={
-            language: Coc(**{name: row[f"caption_{language}_{name}"] for name in FIELDS}) for language in LANGUAGES
-        },
         prompts={language: row[f"prompt_{language}"] for language in LANGUAGES if row.get(f"prompt_{language}")},
-        systems={language: row[f"system_{language}"] for language in LANGUAGES if row.get(f"system_{language}")},
         decision=row["decision"],
         label=row["label"],
-        label_from=row["label_from"],
         verdict=row["verdict"],
-        writing=row["writing"],
-        states={language: tuple(found) for language, found in states.items() if found},
-        evidence=row.get("evidence"),
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import re
 import struct
 import zlib
 from collections.abc import Callable
@@ -271,40 +270,7 @@ CAPTION = [
     *(f"caption_{lang}_{name}" for lang in ("en", "zh") for name in FIELDS),
     "system_en", "system_zh", "prompt_en", "prompt_zh",
 ]  # fmt: skip
-TEXTS = [name for name in CAPTION if name.startswith(("caption_", "sentence", "proved_", "unread", "contradicted"))]
 DECISIONS = ("decision", "caption_en_flight_decision", "caption_zh_flight_decision")
-
-
-def in_one_text(pattern: str, new: Any, *fields: str) -> Lie:
-    """Change the first match of the first text that has one."""
-
-    def lie(rows: Rows) -> None:
-        for row in captioned(rows):
-            for name in fields:
-                text = re.sub(pattern, new, row[name], count=1)
-                if text != row[name]:
-                    row[name] = text
-                    return
-        raise AssertionError("nothing to change")
-
-    return lie
-
-
-def number_wrong_in_both_languages(rows: Rows) -> None:
-    en, zh = "caption_en_critical_components", "caption_zh_critical_components"
-    for row in captioned(rows):
-        found = re.search(r"(\d+\.\d) m\b", row[en])
-        if found and found[1] in row[zh]:
-            row.update({name: row[name].replace(found[1], f"{float(found[1]) + 7.3:.1f}") for name in (en, zh)})
-            return
-    raise AssertionError("no number to change")
-
-
-def texts_of_two_windows_exchanged(rows: Rows) -> None:
-    """Texts alone, of two windows with the same decision."""
-    own = captioned(rows)
-    pairs = ((one, other) for one in own for other in reversed(own) if one["trajectory"] != other["trajectory"])
-    swap(*next(pair for pair in pairs if pair[0]["decision"] == pair[1]["decision"]), *TEXTS)
 
 
 def hard_conflict_called_soft(row: Row) -> None:
@@ -403,7 +369,6 @@ def without_the_person(kind: tuple[int, ...] | int) -> Callable[[np.ndarray, np.
 not_hovering = first(captioned, lambda row: row["decision"] != "hover")
 caption, middle, middle_seen = at(captioned, 0), half(clean), half(seen)
 FALLBACK = "fallback: target hidden"
-ZH = ("caption_zh_reasoning_trace", "caption_zh_critical_components")
 ids_of_things_exchanged = change(middle, with_ids(ids_exchanged))
 box_moved = change(at(seen, 1), add("target_bbox", 4.0, *BOX))
 LIES_OF_ROWS: dict[str, Lie] = {
@@ -459,23 +424,11 @@ LIES_OF_ROWS: dict[str, Lie] = {
     "window_with_a_gap": alter(caption, caption_window=lambda w: [w[0] - 1, *w[1:]]),
     "window_with_a_frame_twice": alter(caption, caption_window=lambda w: [w[0], *w[:-1]]),
     "decision_differs_between_languages": put(not_hovering, caption_zh_flight_decision="hover"),
-    "number_differs_between_languages": in_one_text(r"(\d+)\.(\d)", lambda m: f"{int(m[1]) + 3}.{m[2]}", *ZH),
-    "side_differs_between_languages": in_one_text("[左右]", lambda m: "右" if m[0] == "左" else "左", *ZH),
-    "number_wrong_in_both_languages": number_wrong_in_both_languages,
     "captions_of_two_windows_exchanged": swapped(captioned, 0, -1, *CAPTION),
-    "texts_of_two_windows_exchanged": texts_of_two_windows_exchanged,
     "decision_and_label_changed_together": put(
         not_hovering, **dict.fromkeys((*DECISIONS, "label"), "hover"), verdict="CONSISTENT"
     ),
     "hard_conflict_called_soft": change(at(captioned, 1), hard_conflict_called_soft),
-    "prompt_that_holds_the_future": alter(
-        caption, prompt_en=lambda p: p + "\nIt turns left.", prompt_zh=lambda p: p + "\n然后无人机向左转。"
-    ),
-    "prompt_of_the_next_window": swapped(captioned, 0, 1, "prompt_en", "prompt_zh"),
-    "question_that_looks_ahead": alter(captioned, system_en=lambda s: s + " The frames that follow are shown too."),
-    "all_sentences_called_proved": alter(caption, proved_sentences_en=lambda n: (n or 0) + 1),
-    "text_about_something_else": put(caption, caption_en_critical_components="The person is 97.5 m ahead of it."),
-    "chinese_in_english": change(caption, lambda r: r.update({ZH[0]: r["caption_en_reasoning_trace"]})),
     "split_that_leaks": change(clean, another_split),
     "walk_renamed": put(lambda rows: [r for r in trajectory(rows) if r["track"] == "perturbed"], walk="another/walk"),
     "walk_of_nobody": walk_of_nobody,

@@ -1,8 +1,7 @@
-"""A caption as a release shows it, and what a reader of captions says of it: what `release verify` and `caption`
-exchange.
+"""A caption as a release shows it, and what a reader of captions finds: what `release verify` and `caption` exchange.
 
-Release knows rows and pictures, caption knows what is true of a window; neither imports the other. The command line
-brings them together.
+Release knows rows and pictures, caption knows labels and verdicts; neither imports the other. The command line brings
+them together.
 """
 
 from __future__ import annotations
@@ -14,53 +13,36 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cosfly.products.actions import ActionSet
-from cosfly.products.captions import Coc, Language, Writing
+from cosfly.products.captions import Language
 from cosfly.products.playback import Flight
 
 
 @dataclass(frozen=True)
 class ShownCaption:
-    """One caption of a flight. frame_index: its current frame; window: indices of what its prompt shows, as it says.
-
-    prompts, systems: user prompts by language and what stood before each, empty where none is shown. picture_px:
-    (width, height). states: by language, of its sentences, as its record says; empty where it does not say. evidence:
-    what they follow from, as JSON; None where it is not shown.
-    """
+    """One caption of a flight. frame_index: its current frame. prompts: by language, empty where none is shown."""
 
     sample_id: str
     frame_index: int
-    window: tuple[int, ...]
-    picture_px: tuple[int, int]
-    answers: dict[Language, Coc]
     prompts: dict[Language, str]
-    systems: dict[Language, str]
     decision: str
     label: str | None
-    label_from: str
     verdict: str | None
-    writing: Writing
-    states: dict[Language, tuple[str, ...]]
-    evidence: str | None
 
 
 @dataclass(frozen=True)
 class ShownFlight:
-    """A flight as far as it is released. flight: of the frames `frame_indices` (n,), in order, which may have gaps;
-    styles: (n,).
+    """A flight as far as it is released. flight: of the frames `frame_indices` (n,), in order, which may have gaps.
 
     actions: the closed set of their decisions. twin: the clean flight of a perturbed one, of the same frames; None
-    where it is not released or shows others. settings: the captions' own, as they are on record; empty: the defaults.
-    prompts: their questions, where these do not ship.
+    where it is not released or shows others. settings: of the captions, as recorded; empty: the defaults.
     """
 
     flight: Flight
     frame_indices: np.ndarray
-    styles: Sequence[str | None]
     captions: Sequence[ShownCaption]
     actions: ActionSet
     twin: Flight | None
     settings: dict[str, Any]
-    prompts: dict[str, str]
 
 
 class Lie(NamedTuple):

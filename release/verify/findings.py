@@ -115,7 +115,7 @@ REPAIRS: dict[str, tuple[bool, str]] = {
     ),
     "picture": (False, "render the frame again, inspect, and build again"),
     **dict.fromkeys(
-        ("prompt", "caption_text", "languages", "label", "verdict", "window", "caption", "decision", "sentences"),
+        ("label", "verdict", "window", "caption", "decision"),
         (False, "caption the flight again from its tree, and build again"),
     ),
     "leak": (False, "build again: splits are handed out by walk"),

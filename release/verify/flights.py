@@ -38,8 +38,8 @@ LOSSLESS = depth_record("float32", ())  # as in a playback tree
 class Context:
     """What the record says that the checks of flights need. actions: the closed set of decisions. by_town: splits
     share no town either. both: every flight's twin is released too. rounded_as: the coding that the depth went
-    through, whatever it is stored as. settings, draws, prompts: by run; settings by stage, of those that stand once in
-    its source."""
+    through, whatever it is stored as. settings, draws: by run; settings by stage, of those that stand once in its
+    source."""
 
     actions: ActionSet
     window_frames: int | None = None
@@ -49,7 +49,6 @@ class Context:
     rounded_as: DepthCodingName = "float32"
     settings: dict[str, dict[str, dict[str, Any]]] = field(default_factory=dict)
     draws: dict[str, DrawSettings | None] = field(default_factory=dict)
-    prompts: dict[str, dict[str, str]] = field(default_factory=dict)
 
     @classmethod
     def of_record(cls, record: ReleaseRecord) -> Context:
@@ -66,7 +65,7 @@ class Context:
         return cls(
             record.actions, asked.window_frames, coded, record.splits.by == "town",
             asked.pairs == "both" and len(asked.tracks) == 2, coded.coding, settings,
-            {run: DrawSettings.of_stages(stages) for run, stages in made.items()}, record.prompts,
+            {run: DrawSettings.of_stages(stages) for run, stages in made.items()},
         )  # fmt: skip
 
 
@@ -126,8 +125,7 @@ def _check_rows(
     settings = _of_run(context.settings, flight) or {}
 
     def read_captions() -> None:
-        prompts = _of_run(context.prompts, flight) or {}
-        shown = flight.shown(twin, context.actions, settings.get("caption", {}), prompts)
+        shown = flight.shown(twin, context.actions, settings.get("caption", {}))
         for lie in reader(shown) if reader is not None else ():
             findings.error(lie.code, lie.where, lie.got, lie.expected)
 

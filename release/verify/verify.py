@@ -68,7 +68,7 @@ def verify(
     Args:
         level: how far to go; each level does what the ones before it do.
         workers: processes; 0 works in this one.
-        reader: tells what the words of captions say; None: they are not read, which the report says.
+        reader: recomputes labels and verdicts; None: they are not recomputed, which the report says.
         watch: when a worker counts as stalled; its flight is then an error.
         source: of an export the release that it was made of, to make it again and compare.
         public_key: of who should have signed the release; all checksums are then compared at every level.
@@ -235,7 +235,7 @@ def _check_all(
             elif isinstance(record, Failed):
                 findings.error("not_checked", record.id, record.message, "a flight that can be checked")
         check_across(flights, rows, by_town=context.by_town, both=context.both, findings=findings)
-    words = f"texts of captions {'read' if how.reader is not None else 'not read against the flight'}"
+    words = f"labels and verdicts {'recomputed' if how.reader is not None else 'not recomputed'}"
     pictures = f", all their {', '.join(source.files)} pictures" if how.level == "pixels" else ""
     num_rows = sum(flight.num_rows for flight in flights)
     findings.facts.append(f"{num_rows:,} rows of {len(flights):,} flights{pictures}; {words}")
