@@ -245,9 +245,10 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "leaderboard": ["leaderboard {flown} --out {out}"],
     "study weather": ["study weather --map {maps} --traces {traces} --out {out} {tiny}"],
     "study zoom": ["study zoom {three} --out {out} --every 10"],
-    "render sample": ["render sample --data {tree} --map {maps} --out {out}/sample.png"],
-    "viewer": ["viewer {simple} --out {out}/scene.html --paths {walks} --traces {traces} --data {tree}"],
-    "gallery": ["gallery --data {tree} --out {out}"],
+    "view map": ["view {simple} --out {out}/scene.html --paths {walks} --traces {traces} --data {tree}"],
+    "view release": ["view {release} --out {out}/viewer.html"],
+    "view tree": ["view {tree} --out {out}/sheet.png"],
+    "view frame": ["view {tree} --out {out}/sample.png --frame best --map {maps}"],
     "inspect": ["inspect --map {simple} --traces {traces} --data {tree} --out {out} {tiny}"],
     "inspect review": [
         lambda place, out: copy_stage(place, out, "inspect"),
@@ -284,10 +285,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "release get": ["release get {served} --out {out} --workers 1"],
     "release get, a part": ["release get {served} --out {out} --workers 1 --modality rgb"],
     "release stats": ["release stats {release} --out {out}"],
-    "release card": ["release card {release} --out {out}/card.md"],
-    "release viewer": ["release viewer {release} --out {out}/viewer.html"],
-    "export captions": ["export captions {base} --format csv --out {out}/captions.csv"],
-    "tiny-student": ["distill tiny-student --out {out}/student"],
+    "release export captions": ["release export {base} --format csv --out {out}/captions.csv"],
     "distill prepare": [
         "distill prepare --captions {students}/captions.jsonl --data {students}/tree --out {out} "
         "--set distill.prepare.unbound=accept"
@@ -299,7 +297,6 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "distill train": ["distill train {set} --student {students}/student --out {out} {training}"],
     "distill infer": ["distill infer {set} --model {students}/student --out {out} {small}"],
     "distill merge": ["distill merge --model {students}/student --adapter {trained}/adapter --out {out}"],
-    "distill floors": ["distill floors --dataset {students}/set --out {out}"],
     "distill evaluate": [
         "distill evaluate --dataset {students}/set --predictions {inferred}/predictions.jsonl --out {out}"
     ],

@@ -94,12 +94,12 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, subtests):
         (("maps", "--out", "taken/inside"), ("taken", "cannot write", "--out")),
         (("run", "stage"), ("stage: a folder", "no run.yaml", "cosfly list stage")),
         (("config", "check", "deep/stage"), ("deep/stage: a folder", "no run.yaml", "quickstart")),
-        (("release", "viewer", "town.csv", "--out", "x"), ("town.csv", "there is no such folder", "check the path")),
+        (("view", "town", "--out", "x"), ("town", "there is no such folder", "check the path")),
         (("simplify", "--map", "zero.json", "--out", "x"), ("zero.json", "a device", "a regular file")),
         (("caption", "prompts", "--export", "taken"), ("taken", "cannot write", "--out")),
         (("run", "quickstart", "--out", "stage"), ("stage: the folder of a stage", "choose another --out")),
         (("run", "quickstart", "--out", "stage", "--dry-run"), ("stage: the folder of a stage", "another --out")),
-        (("config", "schema", "--log-file", "no/log.txt"), ("cannot write the log",)),
+        (("config", "show", "--log-file", "no/log.txt"), ("cannot write the log",)),
     ):
         with subtests.test(words=words):
             status, line = answer(capfd, monkeypatch, *words)

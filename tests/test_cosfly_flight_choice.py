@@ -148,8 +148,6 @@ def test_two_trees_are_refused_with_words_where_one_is_taken(tree, tmp_path, mon
     for words in (
         "caption --out out",
         "inspect --out out",
-        "gallery --out out",
-        "render sample --out out.png",
         "caption compare-strategies --out out",
     ):
         result = CliRunner().invoke(app, [*words.split(), "--data", str(tree), "--data", "another"])

@@ -1,4 +1,4 @@
-"""cosfly/look/overlay.py and `cosfly render sample`: boxes, ids and distances over a frame."""
+"""cosfly/look/overlay.py and `cosfly view --frame`: boxes, ids and distances over a frame."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_a_box_round_the_camera_is_cut_at_the_near_plane():
 
 @needs_gl
 def test_four_pictures_of_a_frame(trees, tmp_path):
-    result = CliRunner().invoke(app, ["render", "sample", "--data", str(trees[True]), "--out", str(tmp_path / "a.png")])
+    result = CliRunner().invoke(app, ["view", str(trees[True]), "--frame", "best", "--out", str(tmp_path / "a.png")])
     assert result.exit_code == 0, result.output
     assert Image.open(tmp_path / "a.png").size == (640, 2 * (180 + 36))
     name = four_panels(trees[False], tmp_path / "b.png", box_map=street())

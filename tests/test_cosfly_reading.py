@@ -375,7 +375,7 @@ def test_one_command_follows_links_and_the_next_in_this_process_does_not(tmp_pat
     tree = make_playback_tree(tmp_path / "data/tree", 1, 4, with_augmented=False)
     (picture,) = tree.rglob("frame_00001/rgb.png")
     picture.symlink_to(picture.rename(tmp_path / "rgb.png"))
-    words = ["gallery", "--data", str(tree), "--out", str(tmp_path / "out")]
+    words = ["view", str(tree), "--out", str(tmp_path / "out.png")]
     assert CliRunner().invoke(app, [*words, "--set", "follow_links=true"]).exit_code == 0
     assert "leads out" in str(CliRunner().invoke(app, words).exception)
 

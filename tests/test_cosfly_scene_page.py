@@ -108,7 +108,7 @@ def test_frames_are_left_out_to_keep_the_size(place, tmp_path):
 def test_the_page_works_offline_in_a_browser(place, tmp_path):
     """Kinds, paths and planners on and off; played back; frames and figures of the chosen path; nothing foreign runs."""
     out, files = tmp_path / "scene.html", " ".join(f"--traces {path}" for path in planners(place))
-    done = invoke(f"viewer {place / 'map.json'} --out {out} --data {place / 'tree'} {files}")
+    done = invoke(f"view {place / 'map.json'} --out {out} --data {place / 'tree'} {files}")
     assert done.exit_code == 0, done.output
     with browser(tmp_path / "profile") as page:
         page.open(out)

@@ -18,7 +18,6 @@ from specimens_distill import make_caption, write_set
 from cosfly.chat.answers import AnswerBook
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.actions import shipped_actions
-from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import write_captions
 from cosfly.products.figures import draw_walks
 from cosfly.products.flights import find_flights
@@ -29,7 +28,7 @@ from cosfly.work.stage_folder import StageFolder, Tally
 from cosfly.work.store import dump_json
 from distill.evaluation import compare
 from distill.evaluation.bertscore import BertScoreConfig, Scorer
-from distill.evaluation.floors import Floors, coc_of, majority, shuffled_groups, shuffled_places, write_floors
+from distill.evaluation.floors import Floors, coc_of, majority, shuffled_groups, shuffled_places
 from distill.evaluation.measure import (
     STUDENT,
     Evaluation,
@@ -306,22 +305,6 @@ def test_what_was_drawn_after_the_window_is_counted_apart(samples):
     assert figures["drawn_ahead"].value is figures["accuracy_settled"].value is None
 
 
-def test_floors_are_predictions_that_a_verifier_can_judge(place):
-    paths = write_floors(place / "set", "test", place / "floors", 0)
-    assert [path.parent.name for path in paths] == ["shuffled", "constant"]
-    for path in paths:
-        found = read_predictions(path)
-        assert len(found) == 16
-        assert all(
-            parse_answer(prediction.raw, shipped_actions(), prediction.language).coc == prediction.coc
-            for prediction in found
-        )
-        decisions = {
-            p.key: p.coc.flight_decision for p in found
-        }  # a verifier holds the two languages against each other
-        assert all(decisions[f"{p.sample_id}/en"] == decisions[f"{p.sample_id}/zh"] for p in found)
-
-
 @pytest.fixture
 def place(tmp_path, samples) -> Path:
     """A training set of two languages and two walks, and the predictions of its test split."""
@@ -409,12 +392,12 @@ def test_what_a_verifier_found_in_the_answers_is_read(place, samples):
     caption = make_caption("Town01", "trajectory_1", "ORI", 4, checks={"sentences": {"en": ["proved", "unread"]}})
     student = caption.model_copy(update={"teacher": caption.teacher.model_copy(update={"kind": "student"})})
     write_captions(place / "judged.jsonl", [student])
-    run(CFG, place / "predictions.jsonl", place / "set", place / "out", judged={"student": [place / "judged.jsonl"]})
+    run(CFG, place / "predictions.jsonl", place / "set", place / "out", judged=[place / "judged.jsonl"])
     figures = read_report(place / "out").all.who[STUDENT].figures
     assert (figures["proved"].value, figures["proved"].count) == (0.5, 2)
     write_captions(place / "rules.jsonl", [caption])
     with pytest.raises(InputError, match="no captions of a student"):
-        run(CFG, place / "predictions.jsonl", place / "set", place / "x", judged={"student": [place / "rules.jsonl"]})
+        run(CFG, place / "predictions.jsonl", place / "set", place / "x", judged=[place / "rules.jsonl"])
 
 
 def test_what_was_judged_tree_by_tree_finds_its_samples(place, samples):

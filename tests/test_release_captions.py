@@ -132,7 +132,7 @@ def test_conversations_of_a_release_are_of_one_split(dataset, tmp_path):
     lines = [json.loads(line) for line in (tmp_path / "all.jsonl").read_text(encoding="utf-8").splitlines()]
     for split in ("train", "validation"):
         to = ["--split", split, "--out", tmp_path / f"{split}.json"]
-        done = invoke("export captions", dataset, "--format sharegpt --language en", to)
+        done = invoke("release export", dataset, "--format sharegpt --language en", to)
         assert done.exit_code == 0, done.output
         found = [sample["id"] for sample in json.loads((tmp_path / f"{split}.json").read_text(encoding="utf-8"))]
         assert found == [f"{line['sample_id']}_en" for line in lines if line["split"] == split] != []
@@ -160,7 +160,7 @@ def test_what_cannot_be_exported_says_why_and_leaves_nothing(run, tmp_path):
 
 
 def test_the_command_tells_what_it_wrote(run, tmp_path):
-    done = invoke("export captions", run, "--format csv --out", tmp_path / "c.csv")
+    done = invoke("release export", run, "--format csv --out", tmp_path / "c.csv")
     assert done.exit_code == 0, done.output
     assert f"{len(accepted(run))} written; left out: dropped_hard_conflict 4" in done.output
 
@@ -178,6 +178,6 @@ def test_a_file_that_is_there_stays_unless_it_may_go(run, tmp_path):
     with pytest.raises(StorageError, match=r"c\.csv: there is a file already; --overwrite"):
         export(run, tmp_path / "c.csv", "csv")
     assert (tmp_path / "c.csv").read_text() == "mine"
-    told = invoke("export captions", run, "--format csv --overwrite --out", tmp_path / "c.csv")
+    told = invoke("release export", run, "--format csv --overwrite --out", tmp_path / "c.csv")
     assert told.exit_code == 0
     assert (tmp_path / "c.csv").read_text(encoding="utf-8-sig").startswith("sample_id,")

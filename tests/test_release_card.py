@@ -18,7 +18,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
-from commands import invoke
 from hypothesis import given
 from hypothesis import strategies as st
 from specimens_release import TWO_SPLITS, make_release, rows_by_id
@@ -253,15 +252,6 @@ def test_every_snippet_of_the_card_runs(record, built, tmp_path, monkeypatch):
     assert window["prompt"]
     assert window["caption"]
     assert len(values["places"]) == min(10, values["poses"].num_rows)
-
-
-def test_the_command_renders_what_verify_expects(built, tmp_path):
-    shown = invoke("release card", built)
-    assert shown.exit_code == 0, shown.output
-    assert shown.output == (built / "README.md").read_text(encoding="utf-8")
-    written = invoke("release card", built.parent, "--out", tmp_path / "card.md")
-    assert written.exit_code == 0, written.output
-    assert (tmp_path / "card.md").read_bytes() == (built / "README.md").read_bytes()
 
 
 # --- `croissant.json` -------------------------------------------------------------------------------------------------

@@ -561,11 +561,9 @@ def test_a_release_is_found_from_its_stage_and_from_its_run(below, dataset, tmp_
     (tmp_path / "run/render").mkdir()  # a run has its tree beside the release, and it is the release that is asked for
     assert open_release(tmp_path / "run").folder == tmp_path / "run" / below
     assert "by their record" in str(verify(tmp_path / "run", level="structure"))
-    card = invoke("release card", tmp_path / "run")
-    assert card.output == (dataset / "README.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("words", ["card", "stats --out x", "export --format tree --out x"])
+@pytest.mark.parametrize("words", ["stats --out x", "export --format tree --out x"])
 def test_where_there_is_no_release_that_is_said(words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     done = invoke("release", words, ".")

@@ -297,16 +297,14 @@ def test_bad_folders_are_refused(tmp_path):
     with pytest.raises(InputError):
         run(tmp_path, tmp_path / "page.html", ViewerConfig())
     assert not (tmp_path / "page.html").exists()
-    result = invoke("release viewer", tmp_path, "--out", tmp_path / "p.html", "--frames 0")
-    assert result.exit_code == 1
-    assert "frames" in str(result.exception or result.output)
+    result = invoke("view", tmp_path, "--out", tmp_path / "p.html", "--picture-px 0")
+    assert result.exit_code == 2
 
 
 def test_the_command_tells_the_size(run_folder, tmp_path):
-    result = invoke("release viewer", run_folder, "--out", tmp_path / "p.html", "--frames 2 --flights 2")
+    result = invoke("view", run_folder, "--out", tmp_path / "p.html")
     assert result.exit_code == 0, result.output
     assert re.search(r"p\.html: 0\.\d MB", result.output)
-    assert len(data_of((tmp_path / "p.html").read_text(encoding="utf-8"))["flights"]) == 2
 
 
 @given(st.text(max_size=60))

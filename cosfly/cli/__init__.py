@@ -22,12 +22,12 @@ from cosfly.cli.distill import app as distill_app
 from cosfly.cli.fly import app as fly_app
 from cosfly.cli.located import default_cache, located
 from cosfly.cli.release import app as release_app
-from cosfly.cli.release import export_app
 from cosfly.cli.run import app as run_app
 from cosfly.cli.sim import app as sim_app
 from cosfly.cli.stages import app as stages_app
 from cosfly.cli.studies import app as studies_app
 from cosfly.cli.teacher import app as teacher_app
+from cosfly.cli.view import app as view_app
 from cosfly.cli.world import app as world_app
 from cosfly.errors import CosflyError, plain
 
@@ -74,12 +74,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (run_app, stages_app, world_app, fly_app):
+for group in (run_app, stages_app, view_app, world_app, fly_app):
     app.add_typer(group)  # without a name: its commands stand at the top
 for name, named_group in (
     ("caption", caption_app),
     ("distill", distill_app),
-    ("export", export_app),
     ("release", release_app),
     ("sim", sim_app),
     ("study", studies_app),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
@@ -19,17 +19,7 @@ STUDENTS = (
     "A model folder, a repository as Qwen/Qwen3.5-2B, or of random weights: tiny, tiny:small, tiny:medium, random."
 )
 ENGINES = "transformers, endpoint (a server) or vllm."
-JUDGED = (
-    "captions.jsonl of `caption --teacher student:`, one a tree; of a floor's answers as shuffled=... or constant=..."
-)
-
-
-@app.command("tiny-student")
-def distill_tiny_student(out: options.Out, seed: Annotated[int, Option(help="Seed of the weights.")] = 0) -> None:
-    """Make a tiny, randomly initialised student, to try the way without weights."""
-    from distill.student.random_student import make_tiny_student
-
-    typer.echo(make_tiny_student(out, seed))
+JUDGED = "captions.jsonl of `caption --teacher student:`, one per tree; repeat it."
 
 
 @app.command("prepare")
@@ -130,21 +120,6 @@ def distill_merge(
     typer.echo(merge.run(job.cfg.distill.merge, model, adapter, out, resume=job.resume))
 
 
-@app.command("floors")
-@takes("seed")
-def distill_floors(
-    job: Job,
-    dataset: Dataset,
-    out: options.Out,
-    split: Annotated[Literal["train", "val", "test"], Option(help="Samples to answer.")] = "test",
-) -> None:
-    """Answers without a look at a window, as predictions that `caption --teacher student:` judges as a student's."""
-    from distill.evaluation.floors import write_floors
-
-    for path in write_floors(dataset, split, out, job.cfg.seed):
-        typer.echo(path)
-
-
 @app.command("evaluate")
 @takes("seed", "verify", "resume")
 def distill_evaluate(
@@ -162,7 +137,7 @@ def distill_evaluate(
     bertscore_zh: Annotated[
         Path | None, Option(help="Model folder for BERTScore of Chinese (bert-base-chinese); none: not computed.")
     ] = None,
-    judged: Annotated[list[str] | None, Option(metavar="[NAME=]CAPTIONS", help=JUDGED)] = None,
+    judged: Annotated[list[Path] | None, Option(help=JUDGED)] = None,
 ) -> None:
     """Parse rate, decisions, verdicts, BERTScore and evidence, each beside its floors and with its interval."""
     from distill.evaluation import stage as evaluate
@@ -170,21 +145,8 @@ def distill_evaluate(
     job.begin(out, predictions, dataset, *(data or []))
     given: Any = {"en": bertscore_en, "zh": bertscore_zh}
     more: Any = {"bertscore_models": {language: folder for language, folder in given.items() if folder is not None}}
-    more |= {"data": data or [], "judged": _judged(judged or []), "seed": job.cfg.seed, "resume": job.resume}
+    more |= {"data": data or [], "judged": judged or [], "seed": job.cfg.seed, "resume": job.resume}
     typer.echo(evaluate.run(job.cfg.distill.evaluate, predictions, dataset, out, **more))
-
-
-def _judged(given: list[str]) -> dict[str, list[Path]]:
-    """Give the files of captions by whose answers they judge."""
-    found: dict[str, list[Path]] = {}
-    for text in given:
-        name, mark, path = text.partition("=")
-        if not mark:
-            name, path = "student", text
-        elif name not in ("student", "shuffled", "constant"):
-            raise typer.BadParameter(f"{name}: not student, shuffled or constant", param_hint="--judged")
-        found.setdefault(name, []).append(Path(path))
-    return found
 
 
 @app.command("report")

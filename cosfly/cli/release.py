@@ -152,70 +152,47 @@ def release_stats(
     typer.echo(stats.run(folder, out, pixels=pixels))
 
 
-@app.command("card")
-@takes()
-def release_card(
-    job: Job,
-    folder: ReleaseFolder,
-    out: Annotated[Path | None, Option(help="File to write; by default it is printed.")] = None,
-) -> None:
-    """Render the data-set card of a release from its release.json, as `verify` expects it in README.md."""
-    from cosfly.work.store import write_bytes
-    from release.card.render import render_card
-    from release.record import read_record, release_folder
-
-    card = render_card(read_record(release_folder(folder) / "release.json"))
-    if out is None:
-        typer.echo(card, nl=False)
-    else:
-        write_bytes(out, card.encode())
-        typer.echo(out)
-
-
-@app.command("viewer")
-@takes()
-def release_viewer(
-    job: Job,
-    folder: Annotated[Path, Argument(help="Release folder, run folder or playback tree.")],
-    out: Annotated[Path, Option(help="The page.")],
-    captions: Annotated[
-        Path | None, Option(help="captions.jsonl of a playback tree; a run and a release have their own.")
-    ] = None,
-    flights: Annotated[int, Option(help="Most flights on the page; of more, spread evenly.")] = 100,
-    frames: Annotated[int, Option(help="Most frames of a flight.")] = 16,
-    picture_px: Annotated[int, Option(help="Width of a colour picture, px; depth and mask have half of it.")] = 320,
-    max_mb: Annotated[int, Option(help="Size of the page, MB: what would make it larger loses its pictures.")] = 64,
-) -> None:
-    """Make one page that works offline: flights, frames, tracks from above, captions with verdict and evidence."""
-    from cosfly.work.config import build
-    from release.viewer import page
-    from release.viewer.content import ViewerConfig
-
-    chosen = {"flights": flights, "frames": frames, "picture_px": picture_px, "max_mb": max_mb}
-    written = page.run(folder, out, build(ViewerConfig, chosen, "the options"), captions)
-    typer.echo(f"{written}: {written.stat().st_size / 1e6:,.1f} MB")
-
-
 @app.command("export")
 @takes(*WORKERS, "verify", "resume", "repair")
 def release_export(
     job: Job,
-    folder: ReleaseFolder,
-    out: Annotated[Path, Option(help="Folder for the export and its records.")],
+    source: Annotated[Path, Argument(help="Release; for captions alone also a run directory or captions.jsonl.")],
+    out: Annotated[Path, Option(help="Output directory; of captions the file.")],
     format: Annotated[
-        Literal["tree", "webdataset", "lerobot"],
-        Option(help="Playback tree (CosFly-Track v7), WebDataset, LeRobot v3.0."),
+        Literal["tree", "webdataset", "lerobot", "csv", "jsonl", "sharegpt", "llava"],
+        Option(
+            help="Playback tree (CosFly-Track v7), WebDataset or LeRobot v3.0; captions alone as a table, JSON lines, "
+            "or conversations for LLaMA-Factory or LLaVA."
+        ),
     ],
-    shard_mb: Annotated[int | None, Option(help="Size of a file of many frames, about, in MB.")] = None,
+    shard_mb: Annotated[int | None, Option(help="Approximate size of a file of many frames, MB.")] = None,
+    language: Annotated[Literal["en", "zh", "both"], Option(help="Captions: languages of the texts.")] = "both",
+    frames: Annotated[
+        Literal["all", "last"], Option(help="Conversations: pictures of all frames of the window, or of the last one.")
+    ] = "all",
+    split: Annotated[
+        Literal["train", "validation", "test"] | None,
+        Option(help="Captions: only this split; conversations of one split go to one file."),
+    ] = None,
+    overwrite: Annotated[bool, Option("--overwrite", help="Captions: replace an existing file.")] = False,
 ) -> None:
-    """Write a release in another format, without loss, with its licence and where it came from."""
+    """Write a release in another format, without loss, or its accepted captions to one file."""
     from cosfly.work.config import build
-    from release.export import stage as export
-    from release.export.contract import ExportConfig
 
-    job.begin(out, folder)
-    given = {"format": format} | ({} if shard_mb is None else {"shard_mb": shard_mb})
-    job.finish(export.run(build(ExportConfig, given, "--format, --shard-mb"), folder, out, **job.manner), out)
+    if format in ("tree", "webdataset", "lerobot"):
+        from release.export import stage as export
+        from release.export.contract import ExportConfig
+
+        job.begin(out, source)
+        given = {"format": format} | ({} if shard_mb is None else {"shard_mb": shard_mb})
+        job.finish(export.run(build(ExportConfig, given, "--format, --shard-mb"), source, out, **job.manner), out)
+        return
+    from release.columns import LANGUAGES
+    from release.export import captions
+
+    languages = LANGUAGES if language == "both" else [language]
+    tally = captions.export(source, out, format, languages=languages, shown=frames, split=split, overwrite=overwrite)
+    typer.echo(f"{out}: {tally}")
 
 
 @app.command("get")
@@ -284,39 +261,3 @@ def release_push(
     else:
         seen = "public" if public else "private"
         typer.echo(f"dry run: nothing was sent; with --yes it goes to {repo}, {seen} if it is made")
-
-
-export_app = typer.Typer(no_args_is_help=True, help="Write parts of a data set for tools of others.")
-
-
-@export_app.callback()
-def _group() -> None:
-    """A group even while it has one command."""
-
-
-@export_app.command("captions")
-def export_captions(
-    source: Annotated[Path, Argument(help="Run folder, captions.jsonl or its folder, or release.")],
-    out: Annotated[Path, Option(help="File to write.")],
-    format: Annotated[
-        Literal["csv", "jsonl", "sharegpt", "llava"],
-        Option(help="A table, JSON lines, or conversations as LLaMA-Factory or LLaVA read them."),
-    ],
-    language: Annotated[Literal["en", "zh", "both"], Option(help="Languages of the texts.")] = "both",
-    frames: Annotated[
-        Literal["all", "last"],
-        Option(help="Pictures of a conversation: of all frames of the window, or of the last one alone."),
-    ] = "all",
-    split: Annotated[
-        Literal["train", "validation", "test"] | None,
-        Option(help="Only this split of a release; conversations of one split go to one file."),
-    ] = None,
-    overwrite: Annotated[bool, Option("--overwrite", help="Replace the file where there is one.")] = False,
-) -> None:
-    """Write the accepted captions to one file; pictures are named relative to the playback tree."""
-    from release.columns import LANGUAGES
-    from release.export.captions import export
-
-    languages = LANGUAGES if language == "both" else [language]
-    told = export(source, out, format, languages=languages, shown=frames, split=split, overwrite=overwrite)
-    typer.echo(f"{out}: {told}")

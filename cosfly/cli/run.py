@@ -254,16 +254,6 @@ def _is_section(word: str) -> bool:
     return not path.exists() and path.suffix not in (".yaml", ".yml") and not shipped(f"{path.name}.yaml").exists()
 
 
-@config_app.command("schema")
-def config_schema() -> None:
-    """Print the JSON schema of a configuration file, for editors that complete and check one."""
-    from cosfly.app.settings import RunConfig
-    from cosfly.work.store import dump_json
-
-    dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "cosfly run"}
-    typer.echo(dump_json(RunConfig.model_json_schema() | dialect, indent=1))
-
-
 @app.command()
 def doctor(
     teacher: Annotated[str | None, Option(help="URL of an endpoint to ask as well.")] = None,

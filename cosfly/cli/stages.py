@@ -314,68 +314,6 @@ def render(
     job.finish(product, out)
 
 
-@render_app.command("sample")
-@takes()
-def render_sample(
-    job: Job,
-    out: Annotated[Path, Option(help="PNG to write.")],
-    data: options.Trees = None,
-    frame: Annotated[
-        str | None,
-        Option(show_default="one that shows the target whole", help="Folder of a frame, in the tree or a path."),
-    ] = None,
-    map_: Annotated[Path | None, Option("--map", help="Boxes that were drawn; needed without debug.png.")] = None,
-) -> None:
-    """One frame's four pictures: colours, depth, instances, and boxes with ids and distances."""
-    from cosfly.look.gallery import four_panels
-    from cosfly.products.boxes import read_boxes
-
-    box_map = None if map_ is None else read_boxes(map_)
-    typer.echo(four_panels(job.tree(data), out, frame=frame, box_map=box_map))
-    typer.echo(out)
-
-
-@app.command()
-@takes(flights="inspect.flights")
-def gallery(
-    job: Job,
-    out: Annotated[Path, Option(help="Folder for contact_sheet.png and preview.gif.")],
-    data: options.Trees = None,
-) -> None:
-    """A contact sheet and a preview GIF of a playback tree."""
-    from cosfly.look.gallery import contact_sheet, preview_gif
-
-    tree, choice = job.tree(data), job.cfg.inspect.flights
-    contact_sheet(tree, out / "contact_sheet.png", choice)
-    preview_gif(tree, out / "preview.gif", choice)
-    typer.echo(out)
-
-
-@app.command("viewer")
-@takes()
-def viewer(
-    job: Job,
-    map_: MapArgument,
-    out: Annotated[Path, Option(help="The page.")],
-    paths: Annotated[Path | None, Option(help="Walks: path.json.")] = None,
-    traces: Annotated[
-        list[Path] | None, Option(help="Flights: drone_trace.json; repeat it for planners side by side.")
-    ] = None,
-    data: Annotated[Path | None, Option(help="Playback tree: both tracks and their frames.")] = None,
-    most_paths: Annotated[int, Option(min=1, help="Most paths on the page.")] = 100,
-    picture_px: Annotated[int, Option(min=32, max=1280, help="Width of a frame, px.")] = 320,
-    max_mb: Annotated[float, Option(min=1, help="Size of the page, MB: frames are left out to keep it.")] = 24.0,
-) -> None:
-    """Make one page that works offline: the map in 3D, walks and flights played back, matrix, frames, planners."""
-    from cosfly.look import scene_page
-
-    written = scene_page.run(
-        map_, out, paths=paths, traces=traces or [], data=data,
-        most_paths=most_paths, picture_px=picture_px, max_mb=max_mb,
-    )  # fmt: skip
-    typer.echo(f"{written}: {written.stat().st_size / 1e6:,.1f} MB")
-
-
 inspect_app = options.stage_group("Step 6: accept, route to review or reject every flight.")
 app.add_typer(inspect_app, name="inspect")
 

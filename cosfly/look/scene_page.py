@@ -1,4 +1,4 @@
-"""`cosfly viewer`: one self-contained page of a map in 3D with walks, flights and frames, which needs no network.
+"""`cosfly view MAP`: one self-contained page of a map in 3D with walks, flights and frames, which needs no network.
 
 Bulk data goes in as binary arrays in base64; the page's script draws them (`space.js`, WebGL 2) and plays them back.
 """

@@ -477,7 +477,7 @@ class _Comparison(BaseModel):
 
 
 def text_tables(product: Path) -> list[TextTable]:
-    """Read `compare.json` and its manifest back as tables of text: figures, axes, and wins against each other planner."""
+    """Read `compare.json` and its manifest as tables of text: figures, axes, and wins against each other planner."""
     found = read_object(product, what="comparison")
     record = validated(_Comparison, found | {"timings": read_manifest(product.parent).facts.get("timings")}, product)
     try:

@@ -37,7 +37,7 @@ def draw_to_quota(shares: Mapping[str, float], rng: np.random.Generator) -> Iter
 
 
 def draw_by_share(shares: Mapping[str, float], rng: np.random.Generator) -> str:
-    """Draw one of the names, each as likely as its share of the sum. The names' order does not matter; takes one draw."""
+    """Return one of the names, each with the probability of its share. The order of names does not matter; one draw."""
     names, ends = _ends(shares)
     return names[int(np.searchsorted(ends, rng.random() * ends[-1], side="right"))]
 

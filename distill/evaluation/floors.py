@@ -14,24 +14,19 @@ import hashlib
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.products.actions import ActionSet
 from cosfly.products.captions import Coc, Language
-from cosfly.products.predictions import PREDICTIONS, Prediction
-from cosfly.products.splits import Split
 from cosfly.reading.documents import parse_document, validated
 from cosfly.space.blind import FITTED_ON, Decider, fit_deciders
 from cosfly.work.chance import rng_for
-from cosfly.work.store import dump_json, write_bytes
 from distill.evaluation.scores import ScoredAnswer, number_of
-from distill.schema import Sample, open_split, read_training_set
+from distill.schema import Sample
 
 SHUFFLED_AMONG = 1024  # samples that are scored together: what is shuffled within needs no text to be embedded twice
-WRITTEN = ("shuffled", "constant")  # floors that have texts
+WITH_TEXT = ("shuffled", "constant")  # floors that have texts
 
 
 def coc_of(sample: Sample) -> Coc:
@@ -109,34 +104,3 @@ class Floors:
         if pasts is not None:
             found |= {name: [bare[k] for k in decide(pasts).tolist()] for name, decide in self.deciders.items()}
         return found
-
-
-def write_floors(dataset: Path, split: Split, out: Path, seed: int) -> list[Path]:
-    """Write the floors that have texts as predictions, so that `caption --teacher student:` judges their sentences too."""
-    samples, actions = open_split(dataset, split), read_training_set(dataset).actions
-    if not samples:
-        fix = "choose another --split, or prepare more walks"
-        raise InputError("the split is empty", where=dataset, got=split, fix=fix)
-    lines: dict[str, list[str]] = {name: [] for name in WRITTEN}
-    languages: list[Language] = ["en", "zh"]
-    for language in languages:
-        own = [sample for sample in samples if sample.language == language]
-        if own:
-            references = [coc_of(sample) for sample in own]
-            floors = Floors(open_split(dataset, "train"), language, seed, actions).answers(own, references)
-            for name in WRITTEN:
-                for sample, answer in zip(own, floors.get(name, ()), strict=False):
-                    lines[name].append(_prediction(sample, split, name, answer).model_dump_json() + "\n")
-    paths = [out / name / PREDICTIONS for name in WRITTEN if lines[name]]
-    for path in paths:
-        write_bytes(path, "".join(lines[path.parent.name]).encode())
-    return paths
-
-
-def _prediction(sample: Sample, split: Split, name: str, answer: ScoredAnswer) -> Prediction:
-    assert answer.coc is not None
-    return Prediction(
-        sample_id=sample.sample_id, language=sample.language, run=sample.run, window_id=sample.window_id, split=split,
-        model=f"floor: {name}", raw=dump_json(answer.coc.model_dump()), num_tokens=0, is_finished=True, coc=answer.coc,
-        reason=None, recovered=[],
-    )  # fmt: skip

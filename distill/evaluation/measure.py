@@ -24,7 +24,7 @@ from cosfly.work.journal import Journal
 from cosfly.work.provenance import MANIFEST_FORMAT
 from cosfly.work.stage_folder import read_manifest
 from distill.evaluation.bertscore import Metric, score_beside_floors
-from distill.evaluation.floors import WRITTEN, Floors, coc_of
+from distill.evaluation.floors import WITH_TEXT, Floors, coc_of
 from distill.evaluation.scores import UNPARSED, ScoredAnswer, Scores, figures_of, score_answers
 from distill.schema import Sample
 
@@ -87,7 +87,7 @@ REPORT, REPORT_FORMAT = "report.json", FileFormat("cosfly.distill_report", "3.0"
 STAGE = "distill.evaluate"
 STUDENT = "student"
 UNPARSED_NAME = "(unparsed)"  # column of the confusion table beside the decisions
-SentenceStates = Mapping[str, Mapping[str, Sequence[SentenceState]]]  # who -> sample's key -> states of the sentences
+SentenceStates = Mapping[str, Sequence[SentenceState]]  # sample's key -> states of the student's sentences
 TextScorer = Callable[[Sequence[tuple[str, str]]], np.ndarray]  # (candidate, reference) -> (n, 3)
 
 
@@ -133,7 +133,7 @@ class Evaluation(_Strict):
     not_asked: int
     actions: RecordedActions = Field(default_factory=shipped_actions)  # the closed set
     metrics: dict[Language, Metric | None]  # None: BERTScore was not computed
-    judged: list[str]  # whose sentences were judged
+    judged: bool  # whether the student's sentences were judged
     speed: Speed
     languages: dict[Language, Measurement]
     all: Measurement
@@ -168,7 +168,7 @@ def pair_up(samples: Sequence[Sample], predictions: Sequence[Prediction]) -> lis
     return [(sample, by_key[sample.key]) for sample in samples if sample.key in by_key]
 
 
-def read_judged(paths: Sequence[Path], samples: Iterable[Sample]) -> dict[str, Sequence[SentenceState]]:
+def read_judged(paths: Sequence[Path], samples: Iterable[Sample]) -> SentenceStates:
     """Read what `cosfly caption --teacher student:` found out about a student's sentences: sample's key -> states.
 
     Args:
@@ -209,11 +209,11 @@ def score_language(
     who = {STUDENT: [ScoredAnswer.of(prediction) for _, prediction in pairs], **floors.answers(samples, references)}
     texts: dict[str, np.ndarray] = {}
     if scorer is not None:
-        written = {name: [text_of(a.coc) for a in who[name]] for name in (STUDENT, *WRITTEN) if name in who}
+        written = {name: [text_of(a.coc) for a in who[name]] for name in (STUDENT, *WITH_TEXT) if name in who}
         groups = floors.groups(len(samples))
         texts = score_beside_floors(scorer, groups, written, [text_of(c) for c in references], samples[0].language)
     return {
-        name: score_answers(samples, answers, floors.actions, texts.get(name), judged.get(name))
+        name: score_answers(samples, answers, floors.actions, texts.get(name), judged if name == STUDENT else None)
         for name, answers in who.items()
     }
 

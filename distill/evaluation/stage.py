@@ -64,7 +64,7 @@ def run(
     *,
     data: Sequence[Path] = (),
     bertscore_models: Mapping[Language, Path] | None = None,
-    judged: Mapping[str, Sequence[Path]] | None = None,
+    judged: Sequence[Path] = (),
     seed: int = 0,
     resume: Resume = "if-same",
 ) -> Path:
@@ -73,17 +73,16 @@ def run(
 
     Args:
         bertscore_models: local folders of the encoders; a language without one is not scored, and the report says so.
-        judged: who (`student`, `shuffled`, `constant`) -> the captions that `cosfly caption --teacher student:` made of
-            their answers, a file a tree.
+        judged: captions that `cosfly caption --teacher student:` made of the student's answers, one file per tree.
     Returns:
         The path of `report.json`.
     Raises:
         InputError: an input is missing, or predictions and training set do not belong together.
     """
-    models, captions = dict(bertscore_models or {}), dict(judged or {})
+    models = dict(bertscore_models or {})
     trees = resolve_trees(dataset, data) if data else {}
     inputs = {"predictions": predictions, "dataset": dataset, **tree_inputs(trees)}
-    inputs |= {f"judged/{name}/{n}": path for name, paths in captions.items() for n, path in enumerate(paths, 1)}
+    inputs |= {f"judged/{n}": path for n, path in enumerate(judged, 1)}
     for language, folder in models.items():
         require("torch", "transformers", "bert_score")
         check_encoder(getattr(cfg.bertscore, language), folder, language)
@@ -98,7 +97,7 @@ def run(
         raise InputError("predictions of one split are needed", where=predictions, got=", ".join(splits) or "none")
     samples = list(open_split(dataset, splits[0]))
     pairs = pair_up(samples, found)
-    sentences = {name: read_judged(paths, samples) for name, paths in captions.items()}
+    sentences = read_judged(judged, samples)
     report, scores = _evaluate(cfg, pairs, dataset, models, sentences, seed)
     num_left = len(samples) - len(pairs)
     report = report.model_copy(update={"not_asked": num_left, "speed": speed_of(predictions, found)})
@@ -155,7 +154,7 @@ def _evaluate(
         not_asked=0,
         actions=actions,
         metrics=metrics,
-        judged=sorted(judged),
+        judged=bool(judged),
         speed={},
         languages=measurements,
         all=measure(scores, predictions, **given) if len(parts) > 1 else next(iter(measurements.values())),

@@ -94,7 +94,7 @@ class LocalAnswers:
         self._threads.shutdown(wait=True, cancel_futures=True)
 
     async def answers(self, samples: Iterable[Sample], advance: Advance) -> AsyncGenerator[SampleOutcome, None]:
-        """Yield what becomes of each sample, in their order; `advance` is told of them as they come, a batch at a time."""
+        """Yield the outcome of each sample, in their order; `advance` is called after each batch."""
         rest = iter(samples)
         while chosen := list(islice(rest, SHELF_BATCHES * self.batch_size)):
             shelf = _Shelf(chosen, VisionFeatures(self.student, memory_bytes=self._feature_bytes))

@@ -71,7 +71,7 @@ def check_names(runs: Sequence[str]) -> None:
 
 
 def check_sources(sources: Sequence[RunSource], unbound: Literal["refuse", "accept"]) -> None:
-    """Check that runs can be told apart, and that captions are on record as made of a tree; the stage checks of which."""
+    """Check that run names differ, and that the captions are recorded as made from a tree; the stage checks which."""
     check_names([source.run for source in sources])
     for source in sources:
         if was_made_of(source.captions, "data") is not None:

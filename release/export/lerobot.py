@@ -218,7 +218,7 @@ def states(rows: list[dict[str, Any]]) -> np.ndarray:
 
 
 def tiff_of_depth(data: bytes, where: str) -> bytes:
-    """Give the bytes of a `depth.npy` as TIFF of float32, in which LeRobot keeps depth: the same numbers, uncompressed."""
+    """Return the bytes of a `depth.npy` as an uncompressed float32 TIFF, which is how LeRobot stores depth."""
     from PIL import Image
 
     buffer = io.BytesIO()

@@ -108,7 +108,7 @@ REPAIRS: dict[str, tuple[bool, str]] = {
         ("missing", "size", "checksum", "unreadable"), (True, f"{AGAIN} (cosfly release get resumes), or {REBUILD}")
     ),
     "unexpected": (True, "move it out of the folder"),
-    "card": (True, "write README.md again: cosfly release card gives it from release.json"),
+    "card": (True, "build the release again, or restore README.md"),
     **dict.fromkeys(("columns", "rows", "shard_name", "digest"), (False, REBUILD)),
     **dict.fromkeys(
         ("number", "sum", "split", "frames", "flight"), (False, f"{REBUILD}: its record is not of its shards")

@@ -1,4 +1,4 @@
-"""`cosfly release viewer`: one self-contained page of a release or run, for a browser without a network.
+"""`cosfly view`: one self-contained page of a release or run, for a browser without a network.
 
 The page holds its data as JSON; its one script (`viewer.js`) writes every foreign text as text, never as markup, and
 the page's policy lets no other script run.
