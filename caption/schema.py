@@ -17,10 +17,9 @@ from pydantic import Field, model_validator
 
 from cosfly.chat.budget import BudgetConfig
 from cosfly.chat.client import EndpointConfig
-from cosfly.chat.protocol import check_url, split_urls
 from cosfly.chat.student_chat import MAX_ANSWER_TOKENS
-from cosfly.chat.supervisor import ServeConfig
 from cosfly.chat.vllm_engine import VllmConfig
+from cosfly.chat.wire import check_url
 from cosfly.look.frame_views import DEPTH_RANGE_M, Layout, View
 from cosfly.products.captions import KeyframeRecord, LabelFrom, Language, SentenceState, TeacherKind, Verdict, Writing
 from cosfly.products.places import FlightChoice
@@ -316,8 +315,7 @@ class CaptionConfig(Config):
 
     teacher: str = Field(
         "rules",
-        description="`rules` (embedded, no model), the URL of an OpenAI-compatible endpoint, or several of one model "
-        "with commas between, `vllm:MODEL_DIR`, `serve:MODEL`, servers that are started for the run, "
+        description="`rules` (embedded, no model), the URL of an OpenAI-compatible endpoint, `vllm:MODEL_DIR`, "
         "`file:PATH`, captions of somebody else, one a line, or `student:PATH`, what `distill infer` wrote",
     )
     writing: Writing = Field(
@@ -344,7 +342,6 @@ class CaptionConfig(Config):
     endpoint: EndpointConfig = Field(EndpointConfig(), description="how an endpoint is asked")
     student: StudentConfig = Field(StudentConfig(), description="a teacher that is a student, asked as it was taught")
     vllm: MayDiffer[VllmConfig] = Field(VllmConfig(), description="the engine of teacher vllm:MODEL_DIR")
-    serve: MayDiffer[ServeConfig] = Field(ServeConfig(), description="servers of teacher serve:MODEL")
     budget: MayDiffer[BudgetConfig] = Field(BudgetConfig(), description="prices and limits of tokens and money")
     repair: RepairConfig = Field(RepairConfig(), description="re-generation of rejected samples")
     judge: JudgeConfig = Field(JudgeConfig(), description="an optional judge of conflicts")
@@ -380,13 +377,11 @@ class CaptionConfig(Config):
 
     @model_validator(mode="after")
     def _known_teacher(self) -> Self:
-        if self.served_model == "":
-            raise ValueError("teacher serve:MODEL names no model")
-        if self.teacher_kind == "endpoint" and self.served_model is None:
+        if self.teacher_kind == "endpoint":
             try:
-                split_urls(self.teacher)
+                check_url(self.teacher)
             except ValueError as error:
-                kinds = "`rules`, URLs, vllm:MODEL_DIR, serve:MODEL, file:PATH or student:PATH"
+                kinds = "`rules`, a URL, vllm:MODEL_DIR, file:PATH or student:PATH"
                 raise ValueError(f"teacher must be {kinds}; {error}") from None
         return self
 
@@ -401,11 +396,6 @@ class CaptionConfig(Config):
         return "vllm" if self.teacher.startswith("vllm:") else "endpoint"
 
     @property
-    def served_model(self) -> str | None:
-        """The model of teacher serve:MODEL, an endpoint that is started for the run."""
-        return self.teacher.removeprefix("serve:") if self.teacher.startswith("serve:") else None
-
-    @property
     def caption_file(self) -> Path | None:
         """The captions of teacher file:PATH, the predictions of student:PATH."""
         if self.teacher_kind == "student":
@@ -417,8 +407,7 @@ class CaptionConfig(Config):
     def most_in_flight(self) -> int:
         """Requests that the teacher takes at once."""
         if self.teacher_kind == "endpoint":
-            is_list = self.served_model is None
-            return self.endpoint.concurrency * (len(split_urls(self.teacher)) if is_list else self.serve.replicas)
+            return self.endpoint.concurrency
         return self.vllm.batch if self.teacher_kind == "vllm" else 1
 
     @property

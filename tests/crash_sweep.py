@@ -199,12 +199,9 @@ SHORT = {  # what commands have in common
 }
 
 
-def copy_stage(place: Place, out: Path, stage: str, *, damaged: str | None = None) -> None:
-    """Put a finished stage into `out`; of one of its journals the last line is damaged."""
+def copy_stage(place: Place, out: Path, stage: str) -> None:
+    """Put a finished stage into `out`."""
     shutil.copytree(f"{place.given('base')}/{stage}", out, dirs_exist_ok=True)
-    if damaged is not None:
-        data = (out / damaged).read_bytes()
-        (out / damaged).write_bytes(data[:-9] + b"?" + data[-8:])
 
 
 def lose_release(_: Place, out: Path) -> None:
@@ -255,10 +252,6 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
         "inspect review --inspect {out} --reject {walk} --by somebody --reason 'too near'",
     ],
     "inspect review, page": [lambda place, out: copy_stage(place, out, "inspect"), "inspect review --inspect {out}"],
-    "pedestrians, repaired": [
-        lambda place, out: copy_stage(place, out, "pedestrians", damaged="items.jsonl"),
-        "pedestrians --map {simple} --out {out} {tiny} --set pedestrians.ground=paved --repair",
-    ],
     "study muco": ["study muco {simple} {walks} --out {out} {tiny}"],
     "reproduce": ["reproduce {base} --out {out} --walks 1 --workers 1"],
     "study depth": ["study depth --data {tree} --out {out}"],

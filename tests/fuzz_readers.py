@@ -33,17 +33,10 @@ from caption.truth.references import parse_reference
 from cosfly.app import reproduce
 from cosfly.app.settings import RunConfig
 from cosfly.chat.answers import TOTALS, AnswerBook, journal_name
-from cosfly.chat.contract import Request
-from cosfly.chat.protocol import (
-    base_url,
-    error_words,
-    read_body,
-    read_completion,
-    read_models,
-)
+from cosfly.chat.protocol import error_words, read_body, read_completion, read_models
 from cosfly.chat.refusals import kind_of
 from cosfly.chat.student_chat import TAUGHT, read_taught, write_taught
-from cosfly.chat.wire import Response, retry_after_s
+from cosfly.chat.wire import Response, base_url, retry_after_s
 from cosfly.cli.options import resolve
 from cosfly.closed_loop.controller import read_controls
 from cosfly.closed_loop.measures import score_pursuits
@@ -546,9 +539,7 @@ def _slots(root: Path) -> None:
 def _reply(root: Path) -> None:
     data = _bytes(root / "reply.json")
     response = Response(200, data)
-    request = Request([{"role": "user", "content": "x"}], [], {}, {})
-    for structured in ("native", "plain"):
-        read_completion(response, request, structured)
+    read_completion(response, "plain")
     read_models(response)
     kind_of(400, data.decode("utf-8", "replace"))
     with contextlib.suppress(ValueError):  # what it says of a body that is no JSON

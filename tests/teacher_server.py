@@ -9,12 +9,11 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import re
 import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -181,28 +180,6 @@ def obedient_answer(server: TeacherServer, body: dict, fault: str | None = None)
     # Students are asked in both languages.
     texts = ENGLISH if str(body["messages"][0]["content"]).isascii() else CHINESE
     return {**texts, **fields, "flight_decision": decision}
-
-
-def written_answer(body: dict, can: Collection[str]) -> dict:
-    """Give a real answer in the way of writing that a request asks for; one that cannot puts a value where it must not
-    stand."""
-    system = body["messages"][0]["content"]
-    text = " ".join(part.get("text", "") for part in body["messages"][1]["content"])
-    way = "slots" if "{distance}" in system else "claims" if '"claims"' in system else "prose"
-    answer: dict = {"reasoning_trace": "Nothing else has to change, and this manoeuvre is as good as any other."}
-    if way == "claims":
-        speed = re.findall(r"^speed: .*?([\d.]+) mps$", text, re.MULTILINE)[-1]
-        answer["critical_components"] = f"The drone flies at {speed} m/s behind the person."
-        value = float(speed) if "claims" in can else 77.0
-        answer["claims"] = [
-            {"sentence": "C1", "quantity": "speed", "at": "t4", "value": value, "unit": "mps", "modality": "observed"}
-        ]
-    else:
-        speed = "{speed}" if way == "slots" and "slots" in can else "77 m/s"
-        said = "The person can be made out on the ground." if way == "prose" else f"The drone flies at {speed} for now."
-        answer["critical_components"] = said
-    other = "hover" if way != "prose" or "prose" in can else "ascend"
-    return answer | {"therefore": other, "flight_decision": "hover"}
 
 
 def _handler(server: TeacherServer) -> type[BaseHTTPRequestHandler]:

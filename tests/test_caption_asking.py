@@ -24,8 +24,8 @@ from caption.run.stage import run
 from cosfly.chat import answers
 from cosfly.chat.answers import Answer, AnswerBook, journal_name
 from cosfly.chat.budget import Budget, BudgetConfig, BudgetSpent
-from cosfly.chat.protocol import encode_body, with_image_ids
-from cosfly.errors import TeacherError
+from cosfly.chat.protocol import encode_body
+from cosfly.errors import InputError, TeacherError
 from cosfly.products.captions import Usage, read_captions
 from cosfly.work.journal import Journal
 from specimens import make_playback_tree
@@ -206,6 +206,13 @@ def test_the_total_timeout_bounds_all_tries(tree, tmp_path):
         assert 1 <= len(server.bodies) <= 4
 
 
+ANSWER = {
+    "key": "k", "sample_id": "a_ORI_frame_00004", "purpose": "free/0", "model": "m", "text": "t",
+    "usage": {"prompt_tokens": 10, "completion_tokens": 2},
+    "structured": "plain", "finish_reason": "stop", "latency_s": 1.0, "time": 5.0,
+}  # fmt: skip
+
+
 # --- the request ------------------------------------------------------------------------------------------------------
 
 
@@ -219,24 +226,6 @@ def test_a_body_is_the_json_that_it_stands_for():
     ]
     body = {"model": "m", "messages": [{"role": "system", "content": "s"}, {"role": "user", "content": parts}], "n": 1}
     assert json.loads(encode_body(body)) == body
-
-
-def test_image_ids_are_sent_when_asked_for_and_change_no_answer_key(tree, tmp_path):
-    out = tmp_path / "out"
-    with deciding() as server:
-        run(settings(server.url, limit=2), tree, out)
-        assert b'"uuid"' not in b"".join(server.bodies)
-        keys = keys_of(out)
-        run(settings(server.url, limit=2, endpoint={"image_uuid": True}), tree, tmp_path / "other")
-    assert keys_of(tmp_path / "other") == keys or set(keys_of(tmp_path / "other")) == set(keys)
-    with_images = [json.loads(body) for body in server.bodies[4:] if b"image_url" in body]
-    parts = [part for body in with_images for part in body["messages"][1]["content"] if part["type"] == "image_url"]
-    assert len(parts) == 30
-    assert all(len(part["uuid"]) == 64 for part in parts)
-    by_url = {part["image_url"]["url"]: part["uuid"] for part in parts}
-    assert len(set(by_url.values())) == len(by_url)  # the id stands for the bytes
-    message = {"role": "user", "content": "text"}
-    assert with_image_ids([message], []) == [message]
 
 
 # --- the display ------------------------------------------------------------------------------------------------------
@@ -329,6 +318,22 @@ def test_a_start_reads_the_last_line_of_finished_flights(tmp_path, monkeypatch):
         assert book.get(flight_name(3), record(3, 7).key) == record(3, 7)
         assert len(seen) == 20 + 20 + 21
         assert book.get(flight_name(99), "no such key") is None
+
+
+@pytest.mark.parametrize(
+    ("record", "field"),
+    [
+        (ANSWER | {"usage": {"prompt_tokens": 10, "completion_tokens": 10**30}}, "usage.completion_tokens"),
+        ({name: value for name, value in ANSWER.items() if name != "key"}, "key"),
+        ({"totals": {"answers": 2, "prompt_tokens": -1, "completion_tokens": 4}}, "totals.prompt_tokens"),
+    ],
+)
+def test_a_line_that_cannot_be_used_is_named(tmp_path, record, field):
+    with Journal(tmp_path / "a_ORI.jsonl") as journal:
+        for line in (ANSWER, record, ANSWER | {"key": "l"}):
+            journal.append(line)
+    with pytest.raises(InputError, match=f"a_ORI.jsonl:2: .*{field}"):
+        AnswerBook(tmp_path)
 
 
 def test_only_flights_that_are_worked_on_are_in_memory(tmp_path):

@@ -17,19 +17,12 @@ from pathlib import Path
 
 import pytest
 from commands import invoke
-from specimens_captions import QUICK, VOCABULARY, deciding, report_of, settings
+from specimens_captions import QUICK, deciding, report_of, settings
 from teacher_server import MODEL, TeacherServer, is_mirror, refusal
 
-from caption.run.flights import allot, named_flights
 from caption.run.stage import run
-from caption.schema import CaptionConfig
-from caption.teachers.prompts import make_question
-from caption.teachers.teacher import AskingTeacher, first_budget
-from cosfly.chat import client
-from cosfly.chat.answers import AnswerBook
-from cosfly.chat.client import EndpointConfig
+from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import NoAnswer, Reply, started
-from cosfly.chat.servers import ChatClient
 from cosfly.errors import ResumeError, TeacherError
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
@@ -95,17 +88,9 @@ SERVER_FAULTS = {
     "a lower image limit": (400, IMAGES, "--limit-mm-per-prompt"),
     "no vision": (500, "image input is not supported - hint: if this is unexpected, you may need to provide the mmproj",
     "--mmproj"),
-    "another model": (404, f"The model `{MODEL}` does not exist.", "--model"),
+    "another model": (404, f"The model `{MODEL}` does not exist.", "check URL and model"),
     "a parameter": (400, "Unsupported parameter: 'max_tokens' is not supported with this model.", "extra_body"),
     "no credit": (429, "You exceeded your current quota. insufficient_quota", "account"),
-    "a shorter context": (400, TOO_LONG, "--max-model-len"),
-    "a shorter context, TGI": (422, "Input validation error: `inputs` must have less than 4096 tokens. Given: 4545",
-    "max-model-len"),
-    "a shorter context, llama.cpp": (500, "Context size has been exceeded.", "--ctx-size"),
-    "a filter that stops all": (400, FILTERED, "filter"),
-    "a proxy with a small body": (413, "<html>413 Request Entity Too Large</html>", "see to the server"),
-    "words that nobody knows": (400, NOT_KNOWN, "see to the server"),
-    "a schema that is not the cause": (400, "json_schema: the worker is out of order", "json_schema"),
 }  # fmt: skip
 
 
@@ -126,6 +111,20 @@ def test_what_is_the_servers_fault_ends_the_run_and_is_no_windows(tree, tmp_path
         assert [caption.checks.refusal for caption in parts if caption.checks.refusal] == []
         behaviour.mend()
         assert run(settings(server.url), tree, out).read_bytes() == whole.product
+
+
+def test_a_server_that_refuses_every_window_ends_the_run_and_retry_failed_asks_again(tree, tmp_path, whole):
+    out, behaviour = tmp_path / "out", Switched(400, NOT_KNOWN)
+    with hovering(behaviour) as server:
+        cfg = settings(server.url, endpoint={"concurrency": 1, "stop_after_failures": 3})
+        with pytest.raises(TeacherError) as caught:
+            run(cfg, tree, out)
+        assert NOT_KNOWN in str(caught.value)
+        assert not (out / "manifest.json").exists()
+        assert {held["code"] for held in quarantine(out).values()} == {"refused_400"}
+        behaviour.mend()
+        run(cfg, tree, out)
+        assert run(cfg, tree, out, retry_failed=True).read_bytes() == whole.product
 
 
 # --- the window's fault -----------------------------------------------------------------------------------------------
@@ -192,48 +191,6 @@ def test_retry_failed_asks_about_what_was_refused_and_nothing_else(tree, tmp_pat
     assert (out / "manifest.json").exists()
 
 
-def test_refusals_between_which_windows_are_answered_cost_one_trial_prompt(tree, tmp_path, whole):
-    """Asked one after the other, so that it is plain which answer came before which refusal; every third is refused."""
-
-    async def ask_in_turn(cfg: CaptionConfig) -> list[bool]:
-        windows = [
-            window
-            for flight in allot(named_flights(tree), cfg, VOCABULARY)[0]
-            for window in flight.windows(cfg, VOCABULARY)
-        ]
-        refused = []
-        with AnswerBook(tmp_path / "answers") as book:
-            async with AskingTeacher(cfg, book, 0, first_budget(cfg, book.totals)) as teacher:
-                for number, window in enumerate(windows):
-                    server.respond = Picky(400, TOO_LONG, whole.seeds) if number % 3 == 2 else None
-                    try:
-                        await teacher.ask(make_question(window.observed, cfg.image, cfg.writing, VOCABULARY))
-                        refused.append(False)
-                    except NoAnswer:
-                        refused.append(True)
-        return refused
-
-    with hovering() as server:
-        refused = asyncio.run(ask_in_turn(settings(server.url, endpoint={"concurrency": 1})))
-    assert refused == [number % 3 == 2 for number in range(NUM_WINDOWS)]
-    assert len(server.bodies) == NUM_WINDOWS + 1
-
-
-def test_a_filter_that_stops_a_trial_prompt_by_chance_ends_no_run(tree, tmp_path, whole):
-    stopped: list[int] = []
-
-    def respond(body):
-        is_trial = not is_mirror(body) and body["seed"] not in whole.seeds
-        if is_trial and not stopped:
-            stopped.append(body["seed"])
-        return refusal(400, FILTERED) if body["seed"] in [*stopped, *whole.seeds[:1]] else None
-
-    with hovering(respond) as server:
-        run(settings(server.url), tree, tmp_path / "out")
-    assert len(stopped) == 1
-    assert report_of(tmp_path / "out")["windows"]["dropped"] == {"refused_content": 1}
-
-
 def test_a_retry_with_a_smaller_limit_is_refused_and_leaves_the_folder_complete(tree, tmp_path, whole):
     out = tmp_path / "out"
     with hovering(Picky(400, FILTERED, whole.seeds[:1])) as server:
@@ -244,33 +201,13 @@ def test_a_retry_with_a_smaller_limit_is_refused_and_leaves_the_folder_complete(
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
 
 
-def test_a_server_that_answers_no_trial_prompt_leaves_it_open_whose_fault_it_was(tree, tmp_path):
-    """It goes away right after a refusal: then the window has no answer, which is asked for again, and is not
-    dropped."""
-    seen: set[int] = set()
-
-    def respond(body):
-        first = not seen
-        seen.add(body["seed"])
-        return refusal(400, NOT_KNOWN) if first or "response_format" not in body else refusal(503, "Loading model")
-
-    words = "1 of 1 windows got no answer; got refused_400 1; the last: refused_400: HTTP 400 Something"
-    with hovering(respond) as server, pytest.raises(TeacherError, match=words):
-        run(settings(server.url, limit=1), tree, tmp_path / "out")
-    [held] = quarantine(tmp_path / "out").values()
-    assert held["code"] == "refused_400"
-    assert "a trial prompt: http_503: HTTP 503 Loading model" in held["message"]
-
-
 # --- the schema -------------------------------------------------------------------------------------------------------
 
 # How a server that takes no schema says so, and how many requests with one it is sent, one at a time.
 SCHEMA_FAULTS = {
     "by name": (400, "This response_format type is unavailable now", 1),
     "by name, 422": (422, "response_format.type `json_schema` is unavailable now", 1),
-    "by name, 500": (500, 'Grammar error: Unimplemented keys: ["propertyNames"]', 1),
     "by name, with 200": (200, "response_format is not supported by this provider", 1),
-    "in words that nobody knows": (400, "Bad Request", client.SCHEMA_DOUBTS),
 }  # fmt: skip
 
 
@@ -283,17 +220,6 @@ def test_a_server_that_refuses_the_schema_is_asked_without_it(tree, tmp_path, na
     assert len(server.bodies) == 8 + num_refused
     assert report_of(tmp_path / "out")["structured"] == {"plain": 4}
     assert report_of(tmp_path / "out")["refusals"] == {}
-
-
-def test_one_odd_refusal_that_goes_away_without_the_schema_does_not_switch_it_off(tree, tmp_path):
-    with hovering() as server:
-        server.respond = lambda body: (
-            refusal(400, "Bad Request") if len(server.bodies) % 5 == 0 and "response_format" in body else None
-        )
-        run(settings(server.url, endpoint={"concurrency": 1}), tree, tmp_path / "out")
-    structured = report_of(tmp_path / "out")["structured"]
-    assert structured["json_schema"] > structured["plain"] > 0
-    assert sum(structured.values()) == NUM_WINDOWS
 
 
 # --- room for the answer ----------------------------------------------------------------------------------------------
@@ -341,18 +267,6 @@ def ask(url: str, num_times: int = 1, **changes) -> Reply | NoAnswer:
             return found
 
     return asyncio.run(asked())
-
-
-def test_a_500_after_a_prompt_that_was_too_long_names_vllms_issue():
-    """Its issue 43941: any prompt with the same pictures is answered 500 from then on."""
-    replies = iter([refusal(400, TOO_LONG)])
-    with hovering(lambda body: next(replies, refusal(500, "Internal Server Error"))) as server:
-        found, plain = ask(server.url, 2), ask(server.url)
-        assert isinstance(found, NoAnswer)
-        assert isinstance(plain, NoAnswer)
-        assert found.cause == "http_500"
-        assert "43941" in found.detail
-        assert "43941" not in plain.detail
 
 
 def test_null_in_extra_body_leaves_a_field_out():

@@ -23,7 +23,7 @@ from typing import BinaryIO
 import pytest
 from specimens_captions import deciding, report_of
 from specimens_captions import settings as quick
-from teacher_server import CHINESE, ENGLISH, MODEL, Sent, TeacherServer, Wild, is_mirror, kept_answers, obedient_answer
+from teacher_server import CHINESE, ENGLISH, MODEL, Sent, TeacherServer, Wild, kept_answers, obedient_answer
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig
@@ -166,7 +166,6 @@ IMPATIENT = {"timeout_s": 1.0, "max_tries": 1}
 FAULTS: dict[str, tuple] = {
     # --- statuses
     "Cloudflare: 524 after 120 s, QuantumNous/new-api 4972": (page(524, CLOUDFLARE.format(524)), silent("http_524")),
-    "nginx: 413, a page": (page(413, "<html>413 Request Entity Too Large</html>"), Ended("refuses trial prompts", 3)),
     "TGI: 429, text-generation-inference 439": (error(429, "Model is overloaded"), silent("http_429",
     "Model is overloaded")),
     "vLLM: 500, a library of grammars is missing, vllm 16030": (
@@ -174,7 +173,6 @@ FAULTS: dict[str, tuple] = {
         silent("http_500")),
     "a gateway: 307 elsewhere, letta 3189": (page(307, "", Location="http://127.0.0.1:1/v1/chat/completions"),
     Ended("not a chat endpoint", 1)),
-    "nobody: 204": (raw(b"HTTP/1.1 204 No Content\r\n\r\n"), Ended("refuses trial prompts", 3)),
     "nobody: status 999": (raw(b"HTTP/1.1 999 Odd\r\nContent-Length: 0\r\n\r\n"), silent("http_999")),
     "nobody: a refusal without end": (raw(b"HTTP/1.1 500 No\r\n\r\n", b"no " * 99_999, is_endless=True),
     silent("http_500", "no no no")),
@@ -186,13 +184,11 @@ FAULTS: dict[str, tuple] = {
     # --- bodies
     "vLLM: all in its thoughts, vllm 17349": (message(content=None, reasoning_content="{}"),
     dropped("structure_empty")),
-    "LM Studio: another model answers, hermes-agent 64742": (top(model="ab-qwen3-32b"),
-    fine("says that ab-qwen3-32b answered")),
     "nobody: thoughts without end": (message(content="<think>" + "a <think> {" * 30_000),
     dropped("structure_too_long")),
     # --- counts of tokens
     "nobody: -10^30 tokens": (top(usage={"prompt_tokens": -(10**30), "completion_tokens": 10**400}),
-    fine("prompt_tokens and completion_tokens cannot be")),
+    fine()),
     # --- the wire
     "nobody: a body of 20 MB": (page(200, "[" + "1," * 10_000_000 + "1]"), silent("bad_reply",
     "longer than max_reply_mb=0.5")),
@@ -367,40 +363,6 @@ def test_a_proxy_that_cannot_be_used_is_one_line(tree, tmp_path, monkeypatch, pr
     ):
         run(settings(server.url), tree, tmp_path / "out")
     assert "hunter2" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "usage",
-    [
-        {"prompt_tokens": -5000, "completion_tokens": -500},
-        {"prompt_tokens": 0, "completion_tokens": 0},
-        {"prompt_tokens": -(10**30)},
-        {"prompt_tokens": 1, "completion_tokens": 1},  # of fifteen pictures
-    ],
-    ids=["negative", "zero", "huge", "one"],
-)
-def test_a_budget_holds_where_the_servers_count_cannot_be(tree, tmp_path, usage):
-    """By our own count, which the journal marks; and running it again does not spend the budget twice."""
-    most = 15_000
-    with deciding(respond=top(usage=usage)) as server:
-        cfg = settings(server.url, limit=None, budget={"max_tokens": most})
-        for _ in range(2):
-            with pytest.raises(TeacherError, match="stopped before the budget was passed"):
-                run(cfg, tree, tmp_path / "out")
-        kept = kept_answers(tmp_path / "out")
-        assert 0 < sum(sum(record["usage"].values()) for record in kept) <= most
-        assert {tuple(record["counted"]) for record in kept} == {("prompt_tokens", "completion_tokens")}
-        assert len(server.bodies) == len(kept)
-        run(settings(server.url, limit=None), tree, tmp_path / "out")  # without a limit it goes on
-
-
-def test_our_count_is_of_texts_and_pictures(tree, tmp_path):
-    with deciding(respond=top(usage={"prompt_tokens": 0, "completion_tokens": 0})) as server:
-        run(settings(server.url), tree, tmp_path / "out")
-    [english, chinese] = [record["usage"]["prompt_tokens"] for record in kept_answers(tmp_path / "out")]
-    assert 2000 < english < 6000  # 10 KB of text, and 15 pictures of a token each
-    assert 500 < chinese < english
-    assert [is_mirror(json.loads(body)) for body in server.bodies] == [False, True]
 
 
 @pytest.mark.parametrize(("header", "expected"), [

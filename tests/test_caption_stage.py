@@ -22,7 +22,6 @@ from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig, ImageConfig
 from caption.teachers.prompts import Correction, make_question
 from caption.teachers.teacher import RuleTeacher
-from caption.teachers.trials import SCENES, trial_window
 from caption.truth.actions import measure
 from cosfly.chat.budget import BudgetConfig
 from cosfly.errors import InputError, NothingKept, ResumeError
@@ -216,9 +215,11 @@ def test_a_perturbed_flight_waits_for_a_clean_one_that_cannot_be_read(tmp_path):
     assert Counter(caption.label_from for caption in found) == {"flight": 5, "twin": 5}
 
 
-def test_the_rule_teachers_mirror_is_of_its_answer_to_a_correction_too():
+def test_the_rule_teachers_mirror_is_of_its_answer_to_a_correction_too(tree):
     """The mirror is asked with the question alone; other slots in both languages dropped 2 of quickstart's windows."""
-    question = make_question(trial_window(SCENES[0], 5), ImageConfig(), "slots", VOCABULARY)
+    flight = allot(named_flights(tree), CaptionConfig(), VOCABULARY)[0][0]
+    window = next(flight.windows(CaptionConfig(), VOCABULARY)).observed
+    question = make_question(window, ImageConfig(), "slots", VOCABULARY)
     corrected = replace(question, correction=Correction("", "", 1))
     texts = [asyncio.run(RuleTeacher(0).ask(one)).text for one in (question, corrected)]
     assert texts[0] == texts[1]

@@ -21,8 +21,8 @@ from caption.run.reasons import REASONS, meaning_of
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from cosfly.chat.client import KEY_VARIABLE
-from cosfly.chat.protocol import base_url, check_url
 from cosfly.chat.throttle import Throttle
+from cosfly.chat.wire import base_url, check_url
 from cosfly.errors import CosflyError, NothingKept, TeacherError
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree

@@ -43,27 +43,6 @@ def test_a_server_that_failed_has_not_filtered_the_window():
     assert kind_of(400, text) == "content"
 
 
-# What servers say with 5xx of grammars and schemas: whether they refuse one, or broke.
-SCHEMAS_IN_500 = {
-    "schema": (
-        'Grammar error: Unimplemented keys: ["propertyNames"]', "failed to parse grammar",
-        "response_format json_schema is not supported by this backend", "Unsupported JSON schema keyword",
-    ),
-    "unknown": (
-        "EngineDeadError after grammar compilation thread ended", "outlines cache: database is locked",
-        "xgrammar.so: cannot open shared object file", "worker of structured_outputs was killed",
-        "llguidance: out of memory", "an exception while handling response_format",
-    ),
-}  # fmt: skip
-
-
-def test_a_server_that_broke_over_a_schema_has_not_refused_it():
-    for kind, text in ((kind, text) for kind, texts in SCHEMAS_IN_500.items() for text in texts):
-        assert kind_of(500, text) == kind, text
-        assert kind_of(400, text) != "unknown" or kind == "unknown"
-        assert Refusal(500, kind, text).may_pass is (kind == "unknown")
-
-
 def test_a_server_that_is_away_may_come_back_and_a_request_that_is_refused_stays_refused():
     for status in (408, 424, 429, 500, 502, 503, 504, 520, 522, 524, 529, 530, 599):
         assert Refusal(status, kind_of(status, "<html>Error</html>"), "").may_pass
@@ -74,10 +53,3 @@ def test_a_server_that_is_away_may_come_back_and_a_request_that_is_refused_stays
 def test_the_code_of_an_unknown_refusal_is_its_status():
     assert Refusal(400, "unknown", "no").code == "refused_400"
     assert Refusal(400, "too_long", "no").code == "refused_too_long"
-
-
-def test_only_what_may_be_the_schema_is_asked_again_without_it():
-    for status, kind in ((400, "schema"), (500, "schema"), (400, "unknown"), (422, "unknown")):
-        assert Refusal(status, kind, "").may_be_schema
-    for status, kind in ((413, "unknown"), (400, "too_long"), (400, "content")):
-        assert not Refusal(status, kind, "").may_be_schema

@@ -93,7 +93,7 @@ def test_every_command_that_writes_is_in_the_sweep():
     with."""
     told = {
         "list", "show", "doctor", "config check", "config show", "release verify", "caption doctor",
-        "caption judge-check", "caption reader-check", "sim serve", "teacher serve", "roi edit",
+        "caption judge-check", "caption reader-check", "sim serve", "roi edit",
     }  # fmt: skip
     root, names = get_command(app), set[str]()
     for name, found in root.commands.items():

@@ -48,9 +48,6 @@ FIRST, LAST = ("first-runs.md", "commands.md"), ("rendering.md",)
 QUICKSTART = "run quickstart --out runs/quickstart"  # what `make quickstart` does, beside installing
 # What no machine of the tests can do, or another test does: words of the command, and why.
 NOT_HERE = {
-    "http://node1:8000": "servers of several machines; tests/test_teacher_servers.py has several on this one",
-    "teacher serve ": "starts `vllm serve`; tests/test_teacher_serve.py runs it over a server of the tests",
-    "serve:MODEL": "starts `vllm serve` for the run; the same",
     "vllm serve ": "a server of real weights, on an accelerator; the teacher's server of the tests stands in for it",
     "torchrun --nproc-per-node 8": "eight accelerators; the command runs here in one process, and in two in "
     "tests/test_distill_train_ranks.py",
@@ -65,7 +62,6 @@ NOT_HERE = {
     "--env cosfly/": "1,600 frames each; tests/test_cosfly_envs.py flies a list and policies",
     "--out work/round1": "two short flights are too few walks to split; tests/test_distill_dataset.py has more",
     "roi edit work/": "it serves until it is stopped; tests/test_cosfly_roi_editor.py draws on its page",
-    "s3://bucket/": "a bucket is needed; tests/test_cosfly_locations.py works on one of a server of its own",
     "hf://datasets/": "a hub is asked; tests/test_release_get.py reads the same through fsspec from elsewhere",
     "--repo OWNER/NAME --yes": "a hub is written to; tests/test_release_push.py sends to one of its own",
     "render.carla.server_command=": "CARLA itself; tests/test_render_carla.py starts a server of ours by that setting",

@@ -27,9 +27,8 @@ from caption.schema import CaptionConfig
 from caption.teachers import teacher
 from caption.teachers.teacher import make_engine
 from cosfly.chat.answers import AnswerBook, KeptAnswers
-from cosfly.chat.client import EndpointConfig
+from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import NoAnswer, Reply, Request, started
-from cosfly.chat.servers import ChatClient
 from cosfly.chat.vllm_engine import VllmEngine
 from cosfly.errors import ConfigError, EnvironmentMissing, TeacherError
 from cosfly.products.actions import shipped_actions
@@ -355,7 +354,7 @@ def test_a_prompt_that_the_engine_refuses_costs_only_its_window(stand_in, tree, 
     assert len(stand_in.asked) == 10
     stand_in.refused = next(asked for asked in stand_in.asked if not is_mirror({"messages": asked}))
     run(cfg, tree, tmp_path / "second")
-    assert len(stand_in.asked) == 19  # the others once each, and a trial prompt that shows whose fault it is
+    assert len(stand_in.asked) == 18  # the others once each
     windows = json.loads((tmp_path / "second" / "caption_report.json").read_text())["windows"]
     assert windows == {"input": 5, "kept": 4, "dropped": {"engine": 1}, "failed": {}}
 

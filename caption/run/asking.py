@@ -217,7 +217,6 @@ class Asking:
         else:
             flight.captions.append(caption)
             self._note_refusal(caption)
-            self.failed_in_row = 0
             self._note_outcome(caption)
             self.display.finish(caption, time.monotonic() - begun_s)
 
@@ -226,9 +225,11 @@ class Asking:
         the same."""
         refusal, sample_id = caption.checks.refusal, caption.sample_id
         if refusal is None or caption.status == "accepted":
+            self.failed_in_row = 0
             self.quarantine.pop(sample_id, None)
         else:
             self.quarantine[sample_id] = Failed(id=sample_id, code=str(caption.drop_reason), message=refusal)
+            self._note_failure(refusal)
 
     def _note_outcome(self, caption: Caption) -> None:
         """End the run where nothing of what a teacher answered first is accepted: the rest would be no better."""
@@ -255,12 +256,16 @@ class Asking:
         self._leave_out(flight, failure)
         self.quarantine[failure.id] = failure
         self.display.miss()
+        self._note_failure(f"{common_causes(self.asked.unanswered)}; the last: {failure.message}")
+
+    def _note_failure(self, got: str) -> None:
+        """Note a window without an answer, or refused; so many in a row are the server's fault."""
         self.failed_in_row += 1
         if self.failed_in_row >= self.cfg.endpoint.stop_after_failures:
             raise TeacherError(
                 f"{self.failed_in_row} windows in a row got no answer",
                 where=self.cfg.teacher,
-                got=f"{common_causes(self.asked.unanswered)}; the last: {failure.message}",
+                got=got,
                 fix="see to the server, then run the same command again: nothing answered is asked twice",
             )
 

@@ -13,9 +13,8 @@ from rich.table import Table
 from caption.schema import AskedConfig
 from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget
-from cosfly.chat.client import EndpointConfig
+from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import Reply, Request, Troubles, started
-from cosfly.chat.servers import ChatClient
 from cosfly.products.places import flight_of
 
 

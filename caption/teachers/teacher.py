@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -27,17 +26,13 @@ from caption.teachers.images import EncodedImage, FrameEncoder
 from caption.teachers.prompts import Question, mirror_messages, question_messages
 from caption.teachers.rules import MODEL, write_templates
 from caption.teachers.students import TaughtStudent
-from caption.teachers.trials import SCENES, TrialFrames, TrialScene, trial_question
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft, more_fields, way_of
 from cosfly.chat.answers import AnswerBook, KeptAnswers
-from cosfly.chat.budget import Budget
-from cosfly.chat.contract import Engine, NoAnswer, Reply, Request, Troubles
-from cosfly.chat.protocol import BYTES_PER_TOKEN, PIXELS_PER_TOKEN
-from cosfly.chat.servers import ChatClient
-from cosfly.chat.supervisor import ServedClient
+from cosfly.chat.budget import BYTES_PER_TOKEN, PIXELS_PER_TOKEN, Budget
+from cosfly.chat.client import ChatClient
+from cosfly.chat.contract import Engine, Reply, Request, Troubles
 from cosfly.chat.vllm_engine import VllmEngine
-from cosfly.errors import TeacherError
 from cosfly.look.frame_views import Pictures
 from cosfly.products.answer_text import answer_schema
 from cosfly.products.captions import TeacherRecord, TeacherSettings, Writing
@@ -45,7 +40,6 @@ from cosfly.products.places import flight_of
 from cosfly.work.chance import draws_for, rng_for
 
 ENCODING_THREADS = 4
-NUM_TRIALS = 2
 
 
 class Teacher(Protocol):
@@ -170,10 +164,6 @@ class AskingTeacher:
         self.kept = KeptAnswers(self.engine, book, budget, only)
         self.student = None if cfg.student.folder is None else TaughtStudent(cfg)
         self.frames = SharedFrames(cfg.image, self.student.encode if self.student else None)
-        self._trying, self._sound_s = asyncio.Lock(), float("-inf")  # when a trial prompt was answered last
-        self._num_answered = 0  # questions that the engine answered
-        # Cause -> how many of them before the last window that was refused for it.
-        self._answered_before: dict[str, int] = {}
 
     async def __aenter__(self) -> AskingTeacher:
         try:
@@ -192,9 +182,7 @@ class AskingTeacher:
         await self.engine.close()
 
     async def ask(self, question: Question) -> Reply:
-        reply = await self._kept_answer(question, await self.request(question), question.purpose)
-        self._num_answered += not reply.is_kept
-        return reply
+        return await self._kept_answer(question, await self.request(question), question.purpose)
 
     async def mirror(self, question: Question, english: Draft, ask: int, complaint: str | None = None) -> Reply:
         sample_id, purpose = question.window.sample_id, f"mirror/{ask}"
@@ -211,47 +199,7 @@ class AskingTeacher:
 
     async def _kept_answer(self, question: Question, request: Request, purpose: str) -> Reply:
         sample_id = question.window.sample_id
-        try:
-            return await self.kept.ask(request, flight_of(sample_id), sample_id, purpose)
-        except NoAnswer as refused:
-            if refused.is_final:
-                await self._find_fault(question, refused)
-            raise
-
-    async def _find_fault(self, question: Question, refused: NoAnswer) -> None:
-        """Find out whether a refusal is the window's: then a trial prompt with pictures of the same kind is answered.
-
-        One trial answers for all that were refused before it, and later for those between which enough windows are
-        answered: a server that answers is not at fault. Two are tried, since a filter may stop one by chance.
-        """
-        refused_s = time.monotonic()
-        async with self._trying:
-            before = self._answered_before.get(refused.cause, self._num_answered)
-            self._answered_before[refused.cause] = self._num_answered
-            # As many as can be in flight: one of them at least was sent after the last refusal.
-            if self._sound_s > refused_s or self._num_answered - before >= self.all_cfg.most_in_flight:
-                return
-            for scene in SCENES[:NUM_TRIALS]:
-                try:
-                    await self._try_scene(question, scene)
-                except NoAnswer as error:
-                    if error.cause != refused.cause:
-                        raise NoAnswer(refused.cause, f"{refused.detail}; a trial prompt: {error}") from None
-                else:
-                    self._sound_s = time.monotonic()
-                    return
-        what = "the server refuses trial prompts as it does the windows, so the fault is not theirs"
-        raise TeacherError(what, where=self.engine.where, got=refused.detail, fix=refused.fix or None)
-
-    async def _try_scene(self, question: Question, scene: TrialScene) -> None:
-        """Ask about a made-up window, in the name of the question's: its tokens count, its answer is none of the
-        run's."""
-        trial = trial_question(question, self.all_cfg, scene)
-        sample_id, purpose = question.window.sample_id, f"trial/{time.time_ns()}"  # never one that the book holds
-        messages, digests = question_messages(trial, TrialFrames(trial.window, self.all_cfg.image))
-        schema = answer_schema(trial.way.vocabulary.actions, more=more_fields(trial.way))
-        request = self.cfg.request(messages, digests, schema, sampling_seed(self.seed, sample_id, purpose))
-        await self.kept.ask(request, flight_of(sample_id), sample_id, purpose)
+        return await self.kept.ask(request, flight_of(sample_id), sample_id, purpose)
 
     async def request(self, question: Question) -> Request:
         """Give what is asked of the engine.
@@ -286,8 +234,6 @@ def make_engine(cfg: CaptionConfig, troubles: Troubles | None = None) -> Engine:
     Args:
         troubles: where a server notes tries that fail.
     """
-    if cfg.served_model is not None:
-        return ServedClient(cfg.served_model, cfg.serve, cfg.num_images, cfg.endpoint, troubles)
     if cfg.teacher_kind == "endpoint":
         return ChatClient(cfg.teacher, cfg.endpoint, troubles)
     folder = Path(cfg.teacher.removeprefix("vllm:"))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from cosfly.chat.client import ChatServer, EndpointConfig
+from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.refusals import Refusal
 from cosfly.errors import EnvironmentMissing, TeacherError
 
@@ -112,7 +112,7 @@ def _endpoint(url: str) -> Check:
 
 
 async def _models(url: str) -> tuple[str, list[dict[str, Any]] | Refusal]:
-    client = ChatServer(url, EndpointConfig(timeout_s=10.0))
+    client = ChatClient(url, EndpointConfig(timeout_s=10.0))
     try:
         return client.where, await client.models()
     finally:

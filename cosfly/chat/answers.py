@@ -23,12 +23,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from cosfly.chat.budget import Budget
 from cosfly.chat.contract import MOST_TOKENS, CountName, Engine, NoAnswer, Reply, Request
-from cosfly.chat.protocol import answer_key
 from cosfly.errors import CosflyError
 from cosfly.products.captions import Usage
 from cosfly.reading.objects import CONTEXT_FULL
 from cosfly.work.journal import Journal
-from cosfly.work.store import sha256_bytes
+from cosfly.work.store import dump_json, sha256_bytes
 
 log = logging.getLogger(__name__)
 
@@ -50,8 +49,8 @@ Count = Annotated[int, Field(strict=True, ge=0, le=10**15)]  # of all runs into 
 class Answer(BaseModel):
     """A line of a journal: what an engine answered.
 
-    usage: empty where a server does not count. counted: counts of it that are ours. served_by: the model that answered,
-    where the server names another one than was asked for.
+    usage: empty where a server does not count. served_by: the model that answered, where the server names another one
+    than was asked for.
     """
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
@@ -62,7 +61,6 @@ class Answer(BaseModel):
     model: str = ""
     text: str
     usage: dict[CountName, Annotated[Count, Field(le=MOST_TOKENS)]]
-    counted: tuple[CountName, ...] = Field((), exclude_if=lambda names: not names)
     structured: str = ""
     finish_reason: str | None = None
     served_by: str | None = Field(None, exclude_if=lambda name: name is None)
@@ -73,7 +71,7 @@ class Answer(BaseModel):
     def reply(self) -> Reply:
         usage = Usage(**self.usage) if self.usage else None
         who = self.served_by or self.model
-        return Reply(self.text, usage, self.structured, self.finish_reason, self.counted, who, is_kept=True)
+        return Reply(self.text, usage, self.structured, self.finish_reason, who, is_kept=True)
 
 
 class Totals(BaseModel):
@@ -82,6 +80,18 @@ class Totals(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     totals: dict[str, Count]
+
+
+def answer_key(model: str, request: Request) -> str:
+    """Hash image bytes, prompt, model and sampling: what an answer depends on."""
+    texts = [
+        message
+        if isinstance(message["content"], str)
+        else message | {"content": [part.get("text", "image") for part in message["content"]]}
+        for message in request.messages
+    ]
+    sampling = {"model": model, **request.sampling}
+    return sha256_bytes(dump_json([texts, request.digests, sampling, request.schema]).encode())
 
 
 def read_line(record: dict) -> Answer | Totals:
@@ -264,7 +274,6 @@ class KeptAnswers:
                 model=self.engine.model,
                 text=reply.text,
                 usage=reply.usage.model_dump() if reply.usage else {},
-                counted=reply.counted,
                 structured=reply.structured,
                 finish_reason=reply.finish_reason,
                 served_by=None if reply.model == self.engine.model else reply.model,

@@ -20,6 +20,8 @@ from cosfly.products.captions import Usage
 from cosfly.work.config import Config
 
 MILLION = 1_000_000
+BYTES_PER_TOKEN = 3  # a low guess: a budget that counts with it is kept
+PIXELS_PER_TOKEN = 28 * 28  # of common vision encoders
 
 
 class BudgetConfig(Config):

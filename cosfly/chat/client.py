@@ -1,23 +1,26 @@
-"""One chat-completions server: what is sent to it, and what its answers mean. `servers` asks it, and others beside it.
+"""Engine `endpoint`: one server of chat completions, what is sent to it, and what its answers mean.
 
 The key comes from the environment variable COSFLY_API_KEY and goes into the request header only.
 """
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import logging
 import os
+import random
+import time
+from collections.abc import AsyncIterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import httpx
 from pydantic import Field
 
-from cosfly.chat.contract import NoAnswer, Reply, Request
+from cosfly.chat.contract import NoAnswer, Reply, Request, Troubles
 from cosfly.chat.protocol import (
     ERROR_INSTEAD,
-    base_url,
-    check_url,
     encode_body,
     error_words,
     read_body,
@@ -28,7 +31,7 @@ from cosfly.chat.protocol import (
 )
 from cosfly.chat.refusals import MEANINGS, Refusal, kind_of
 from cosfly.chat.throttle import Throttle
-from cosfly.chat.wire import KEY_VARIABLE, Connections, Response
+from cosfly.chat.wire import KEY_VARIABLE, Connections, Response, base_url, check_url
 from cosfly.errors import TeacherError
 from cosfly.reading.objects import CONTEXT_FULL
 from cosfly.work.config import Config, MayDiffer
@@ -37,8 +40,6 @@ log = logging.getLogger(__name__)
 
 BUSY_STATUS = frozenset({429, 503, 529})
 MOST_SAID = 300  # characters of a server's words that are kept
-SCHEMA_DOUBTS = 3  # refusals in words that the table does not know
-POISONED = "after a prompt that was too long vLLM answers so to any with the same pictures, its issue 43941: restart it"
 
 
 class EndpointConfig(Config):
@@ -47,7 +48,7 @@ class EndpointConfig(Config):
     top_p: float = Field(0.95, gt=0, le=1, description="nucleus sampling")
     max_tokens: int = Field(1024, ge=64, description="longest answer, tokens")
     concurrency: MayDiffer[int] = Field(
-        16, ge=1, le=4096, description="most requests in flight at each server; fewer while it says it is busy"
+        16, ge=1, le=4096, description="most requests in flight; fewer while it says it is busy"
     )
     timeout_s: MayDiffer[float] = Field(
         120.0, gt=0, description="limit of one request, from its first byte to its last"
@@ -65,9 +66,6 @@ class EndpointConfig(Config):
         20, ge=1, description="windows in a row without an answer that end the run"
     )
     json_schema: bool = Field(True, description="ask the server to enforce the answer's JSON schema")
-    image_uuid: MayDiffer[bool] = Field(
-        False, description="send a digest as `uuid` with each image, for servers (vLLM) that cache images by it"
-    )
     extra_body: dict[str, Any] = Field(
         default_factory=dict,
         description="further fields of the request, for instance chat_template_kwargs; null leaves one of the others "
@@ -93,50 +91,89 @@ class Failure:
     wait_s: float | None = None
 
 
-@dataclass
-class Ask:
-    """A request and what its tries have shown. suspect: the refusal that its schema may be the cause of."""
+class ChatClient:
+    """Has requests answered by one server."""
 
-    request: Request
-    body: dict[str, Any]
-    suspect: Refusal | None = None
-    is_structured: bool = False
+    kind: Literal["endpoint"] = "endpoint"
 
-    @property
-    def payload(self) -> dict[str, Any]:
-        return self.body | ({"response_format": response_format(self.request.schema)} if self.is_structured else {})
-
-
-class Unreachable(TeacherError):
-    """Nobody answers at an address."""
-
-
-class ChatServer:
-    """Sends requests to one server, each once."""
-
-    def __init__(self, url: str, cfg: EndpointConfig) -> None:
-        """"""
+    def __init__(self, url: str, cfg: EndpointConfig, troubles: Troubles | None = None) -> None:
+        """
+        Raises:
+            TeacherError: it is no URL that can be asked, or holds a secret.
+        """
         try:
             check_url(url)
         except ValueError as error:
             raise TeacherError(str(error)) from None
         self.url = self.where = base_url(url)
-        self.cfg, self.model = cfg, ""
+        self.cfg, self.model, self.troubles = cfg, "", troubles or Troubles()
         self.throttle = Throttle(cfg.concurrency)
         self.model_entry: dict[str, Any] = {}  # what the server's list says about the model
         self._is_schema_refused = not cfg.json_schema
-        self._num_doubts = 0  # refusals in a row that went away without the schema
-        self._was_too_long = False
-        self._warned: set[str] = set()
+        self._is_cut_told = False
         self._key = os.environ.get(KEY_VARIABLE, "")
         most_bytes = int(cfg.max_reply_mb * 1e6)
         self._connections = Connections(self._key, timeout_s=cfg.timeout_s, most_bytes=most_bytes)
+        self._changed = asyncio.Condition()  # of the requests in flight
+        self._jitter = random.Random()  # times of retries only: no product depends on it
 
     async def close(self) -> None:
         """Close all connections; none may be in use."""
         await self._connections.close()
 
     # --- one answer ---
+
+    async def answer(self, request: Request) -> Reply:
+        """Send a request until it is answered.
+
+        Raises:
+            NoAnswer: not within the tries and the time that the settings allow, or the server refuses it.
+            TeacherError: no request will get an answer.
+        """
+        attempt, deadline_s = 0, float("inf")
+        while True:
+            async with self._slot():
+                given_s = time.monotonic()
+                deadline_s = min(deadline_s, given_s + self.cfg.total_timeout_s)
+                found = await self._attempt(request, given_s)
+            if isinstance(found, Reply):
+                self.troubles.answered()
+                log.debug("%s: answered at try %d", self.where, attempt + 1)
+                return found
+            attempt += 1
+            is_last = attempt >= self.cfg.max_tries
+            pause_s = self._backoff_s(attempt - 1) if found.wait_s is None else found.wait_s
+            is_late = not is_last and time.monotonic() + pause_s >= deadline_s
+            if self.troubles.failed(found.detail):
+                what = "given up" if is_last or is_late else "trying again"
+                log.warning("%s: %s; %s, failed tries so far: %d", self.where, found.detail, what, self.troubles.num)
+            if is_late:
+                words = f"no answer within {self.cfg.total_timeout_s:g} s; the last: {found.detail}"
+                raise NoAnswer("total_timeout", words)
+            if is_last:
+                raise NoAnswer(found.cause, found.detail)
+            await asyncio.sleep(pause_s)
+
+    @contextlib.asynccontextmanager
+    async def _slot(self) -> AsyncIterator[None]:
+        """Wait until one more request may be in flight, and hold its place."""
+        async with self._changed:
+            while not self.throttle.has_room():
+                soonest_s = self.throttle.room_in_s()
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(None if soonest_s == float("inf") else soonest_s):
+                        await self._changed.wait()
+            self.throttle.num_active += 1
+        try:
+            yield
+        finally:
+            async with self._changed:
+                self.throttle.num_active -= 1
+                self._changed.notify(max(int(self.throttle.limit) - self.throttle.num_active, 0))
+
+    def _backoff_s(self, attempt: int) -> float:
+        longest = min(self.cfg.max_backoff_s, self.cfg.backoff_s * 2.0 ** min(attempt, 60))
+        return self._jitter.uniform(0.5, 1.0) * longest
 
     async def send(self, payload: dict) -> Response:
         """Send one request once.
@@ -146,27 +183,19 @@ class ChatServer:
         """
         return await self._connections.exchange(f"{self.url}/chat/completions", encode_body(payload))
 
-    def ask_of(self, request: Request) -> Ask:
-        """Give a request as it is sent to this server."""
-        return Ask(request, request_body(self.model, request, with_ids=self.cfg.image_uuid))
-
-    async def attempt(self, ask: Ask, given_s: float) -> Reply | Failure:
-        """Send a request once; where its schema may be what the server refuses, at once again without it.
-
-        Args:
-            given_s: when it was let through, by the throttle's clock.
-        Raises:
-            NoAnswer: the server refuses this request. TeacherError: it would refuse any.
-        """
+    async def _attempt(self, request: Request, given_s: float) -> Reply | Failure:
+        """Send a request once; where its schema is what the server refuses, at once again without it."""
+        body = request_body(self.model, request)
+        suspect: Refusal | None = None
         try:
-            # Another answer may have told meanwhile.
-            ask.is_structured = not (self._is_schema_refused or ask.suspect)
-            response = await self.send(ask.payload)
-            found = self.read(response, ask.request, is_structured=ask.is_structured)
-            if ask.is_structured and isinstance(found, Refusal) and found.may_be_schema:
-                ask.suspect, ask.is_structured = found, False
-                response = await self.send(ask.payload)
-                found = self.read(response, ask.request, is_structured=False)
+            is_structured = not self._is_schema_refused
+            shaped = {"response_format": response_format(request.schema)} if is_structured else {}
+            response = await self.send(body | shaped)
+            found = self.read(response, is_structured=is_structured)
+            if is_structured and isinstance(found, Refusal) and found.kind == "schema":
+                suspect = found
+                response = await self.send(body)
+                found = self.read(response, is_structured=False)
         except (TimeoutError, httpx.TimeoutException):
             self.throttle.failed()
             return Failure("timeout", f"no answer within {self.cfg.timeout_s:g} s")
@@ -176,14 +205,15 @@ class ChatServer:
         if isinstance(found, str):
             return Failure("bad_reply", found)
         if isinstance(found, Refusal):
-            return self._refused(found, ask, given_s, response.retry_after_s)
+            return self._refused(found, given_s, response.retry_after_s)
         self.throttle.succeeded()
-        self._judge_schema(ask)
-        self._warn_of_oddities(found)
-        return self._with_full_context(found, ask.request)
+        if suspect is not None and not self._is_schema_refused:
+            log.warning("%s: refuses a JSON schema (%s); asking without one", self.where, suspect.said)
+            self._is_schema_refused = True
+        return self._with_full_context(found, request)
 
-    def _refused(self, refusal: Refusal, ask: Ask, given_s: float, wait_s: float | None = None) -> Failure:
-        """Tell what a refusal means; wait_s: as the server says."""
+    def _refused(self, refusal: Refusal, given_s: float, wait_s: float | None) -> Failure:
+        """Give what a refusal is to the request: a failure of now, NoAnswer, or TeacherError where it is to all."""
         status = refusal.status
         if refusal.meaning.ends_run:
             raise self.error(refusal.meaning.what, got=refusal.said, fix=refusal.meaning.fix)
@@ -194,28 +224,11 @@ class ChatServer:
                 self.throttle.was_busy(given_s, None if is_long else wait_s)
             else:
                 self.throttle.failed()
-            poisoned = f" ({POISONED})" if status == 500 and self._was_too_long and ask.request.digests else ""
             asked = f" (asks to wait {wait_s:.0f} s)" if is_long else ""
-            return Failure(f"http_{status}", refusal.said + asked + poisoned, wait_s)
+            return Failure(f"http_{status}", refusal.said + asked, wait_s)
         if refusal.kind != "content":
             self.stop_if_fatal(refusal)
-        self._was_too_long |= refusal.kind == "too_long"
         raise NoAnswer(refusal.code, refusal.said, fix=refusal.meaning.fix, is_final=True)
-
-    def _judge_schema(self, ask: Ask) -> None:
-        """Learn from an answer whether the schema is what was refused: only a request that is answered without it
-        tells.
-
-        One refusal is enough where the server names the schema. Where the table does not know its words it takes
-        SCHEMA_DOUBTS, with no answer to a schema between them.
-        """
-        if ask.is_structured:
-            self._num_doubts = 0
-        elif ask.suspect is not None and not self._is_schema_refused:
-            self._num_doubts += SCHEMA_DOUBTS if ask.suspect.kind == "schema" else 1
-            if self._num_doubts >= SCHEMA_DOUBTS:
-                log.warning("%s: refuses a JSON schema (%s); asking without one", self.where, ask.suspect.said)
-                self._is_schema_refused = True
 
     def _with_full_context(self, reply: Reply, request: Request) -> Reply:
         """Name an answer that was cut before `max_tokens`: prompt and answer fill the server's context.
@@ -223,25 +236,15 @@ class ChatServer:
         vLLM shortens `max_tokens` to what is left of the context, and says no more than "length".
         """
         most, usage = request.sampling.get("max_tokens"), reply.usage
-        if reply.finish_reason != "length" or usage is None or reply.counted or type(most) is not int:
+        if reply.finish_reason != "length" or usage is None or type(most) is not int:
             return reply
         if not 0 < usage.completion_tokens < most or (self.context and usage.total < self.context - 1):
             return reply
-        what = f"an answer was cut after {usage.completion_tokens} of {most} tokens"
-        self._warn_once("cut", f"{what}: {MEANINGS['too_long'].what}; {MEANINGS['too_long'].fix}")
+        if not self._is_cut_told:
+            self._is_cut_told = True
+            what = f"an answer was cut after {usage.completion_tokens} of {most} tokens"
+            log.warning("%s: %s: %s; %s", self.where, what, MEANINGS["too_long"].what, MEANINGS["too_long"].fix)
         return replace(reply, finish_reason=CONTEXT_FULL)
-
-    def _warn_of_oddities(self, reply: Reply) -> None:
-        """Say once of a run what is odd about its server's answers and no fault of any."""
-        if reply.counted:
-            self._warn_once("count", f"its count of {' and '.join(reply.counted)} cannot be, so they are counted here")
-        if reply.model is not None and not _are_alike(reply.model, self.model):
-            self._warn_once("model", f"asked for the model {self.model}, and says that {reply.model} answered")
-
-    def _warn_once(self, oddity: str, words: str) -> None:
-        if oddity not in self._warned:
-            self._warned.add(oddity)
-            log.warning("%s: %s", self.where, words)
 
     @property
     def context(self) -> int | None:
@@ -251,17 +254,14 @@ class ChatServer:
 
     # --- errors ---
 
-    async def start(self, wanted: str | None = None) -> None:
-        """Ask which models there are and find ours among them: `wanted`, else that of the settings.
+    async def start(self) -> None:
+        """Ask which models there are and find that of the settings among them.
 
         Raises:
-            Unreachable: nobody answers, or not yet again.
-            TeacherError: it refuses the key, does not speak the protocol, or lacks the model.
+            TeacherError: nobody answers; it refuses the key, does not speak the protocol, or lacks the model.
         """
-        wanted, entries = wanted or self.cfg.model, await self.models()
+        wanted, entries = self.cfg.model, await self.models()
         if isinstance(entries, Refusal):
-            if self.model_entry and entries.may_pass:
-                raise Unreachable("lists no models now", where=self.where, got=entries.said)
             if wanted:
                 self.model = wanted  # some hosts list no models; the first request will tell
                 return
@@ -283,27 +283,31 @@ class ChatServer:
         )
 
     async def models(self) -> list[dict[str, Any]] | Refusal:
-        """Ask which models there are; gives what is said in place of a list."""
+        """Ask which models there are; gives what is said in place of a list.
+
+        Raises:
+            TeacherError: nobody answers, or it refuses the key.
+        """
         try:
             response = await self._connections.exchange(f"{self.url}/models")
         except (TimeoutError, httpx.RequestError) as error:
             is_late = isinstance(error, TimeoutError | httpx.TimeoutException)
             why = f"no answer within {self.cfg.timeout_s:g} s" if is_late else f"{type(error).__name__} {error}"
             fix = "start the server or check its address"
-            raise Unreachable("cannot reach the teacher", where=self.where, got=self.clean(why), fix=fix) from None
+            raise self.error("cannot reach the teacher", got=self.clean(why), fix=fix) from None
         if response.status in (401, 403):
             self.stop_if_fatal(self.refusal(response))
         entries = None if response.is_cut else read_models(response)
         return self.refusal(response) if entries is None else entries
 
-    def read(self, response: Response, request: Request, *, is_structured: bool) -> Reply | Refusal | str:
+    def read(self, response: Response, *, is_structured: bool) -> Reply | Refusal | str:
         """Give what a response says: a reply, what it refuses (some servers do so with status 200), or a word on what
         is wrong with it."""
         if response.status != 200:
             return self.refusal(response)
         if response.is_cut:
             return f"longer than max_reply_mb={self.cfg.max_reply_mb:g}"
-        found = read_completion(response, request, "json_schema" if is_structured else "plain")
+        found = read_completion(response, "json_schema" if is_structured else "plain")
         if isinstance(found, Reply):
             return found
         kind = kind_of(200, found) if found.startswith(ERROR_INSTEAD) else "unknown"
@@ -341,9 +345,3 @@ class ChatServer:
         if self._key:
             text = text.replace(self._key, "***")
         return "".join(character if character.isprintable() else "?" for character in text[:MOST_SAID])
-
-
-def _are_alike(one: str, two: str) -> bool:
-    """Tell whether two names may be of one model: a server may add a date, a folder or a file's ending."""
-    one, two = one.lower(), two.lower()
-    return one in two or two in one

@@ -1,20 +1,16 @@
-"""The chat-completions protocol: URLs, request bodies, and what a response says."""
+"""The chat-completions protocol: request bodies, and what a response says."""
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 import re
 from collections.abc import Callable
-from typing import Any, get_args
+from typing import Any
 
-import httpx
-
-from cosfly.chat.contract import MOST_TOKENS, CountName, Reply, Request
-from cosfly.chat.wire import KEY_VARIABLE, Response
+from cosfly.chat.contract import MOST_TOKENS, Reply, Request
+from cosfly.chat.wire import Response
 from cosfly.products.captions import Usage
-from cosfly.work.store import dump_json, sha256_bytes
+from cosfly.work.store import dump_json
 
 _IMAGE_MARK = re.compile(rb'"\\u0000(\d+)"')
 THOUGHT_FIELDS = ("reasoning_content", "reasoning", "thinking", "reasoning_details")  # of a message, beside its content
@@ -24,56 +20,6 @@ ENDED = (
     "abort",
 )  # finish reasons of an answer that a server gave up, SGLang with status 200 and nothing in it
 MOST_NAME = 256  # characters of a name that is kept: of a model, of why an answer ended
-BYTES_PER_TOKEN = 3  # a low guess: a budget that counts with it is kept
-PIXELS_PER_TOKEN = 28 * 28  # of common vision encoders
-# What no tokenizer and no vision encoder gets below: a count that is smaller is none.
-MOST_BYTES_PER_TOKEN, LEAST_PER_PICTURE = 16, 16
-
-
-def check_url(url: str) -> None:
-    """Check that a URL can be asked, and holds no secret: it is written into `run.yaml` and shown in messages.
-
-    Raises:
-        ValueError: says what is wrong, and nothing of the URL that may be a secret.
-    """
-    shown = "" if "@" in url else f", got {re.split('[?#]', url)[0][:200]!r}"
-    if not re.match(r"https?://", url, re.IGNORECASE):
-        raise ValueError(f"a URL must begin with http:// or https://{shown}")
-    if re.search(r"[\s\x00-\x1f\x7f]", url):
-        raise ValueError(f"a URL must not hold blanks{shown}")
-    if re.search("[@?#]", url):
-        what = "a URL must hold no user, password, query or fragment, since it is written down"
-        raise ValueError(f"{what}; a key goes into the environment variable {KEY_VARIABLE}{shown}")
-    try:
-        parts = httpx.URL(url)
-        host = parts.host
-        parts.raw_host.decode("ascii").encode("idna")  # as the system's resolver will
-    except (httpx.InvalidURL, ValueError) as error:
-        raise ValueError(f"not a URL that can be asked{shown} ({' '.join(str(error).split())[:100]})") from None
-    if not host or "%" in host:
-        raise ValueError(f"a URL must name a host{shown}")
-    if parts.port is not None and not 0 < parts.port < 65_536:
-        raise ValueError(f"the port must be from 1 to 65535{shown}")
-
-
-def split_urls(urls: str) -> list[str]:
-    """Give the addresses of servers that stand with commas between.
-
-    Raises:
-        ValueError: one is none that can be asked (check_url), or stands there twice.
-    """
-    found = [url.strip() for url in urls.split(",")]
-    for number, url in enumerate(found):
-        check_url(url)
-        if base_url(url) in map(base_url, found[:number]):
-            raise ValueError(f"a server stands in the list twice, got {url!r}")
-    return found
-
-
-def base_url(url: str) -> str:
-    """Give the API root of whatever form of URL a user has: host, host/v1, or the whole chat-completions path."""
-    root = url.rstrip("/").removesuffix("/chat/completions").rstrip("/")
-    return root if re.search(r"/v\d+(beta)?(/openai)?$", root) else f"{root}/v1"
 
 
 # --- requests ---------------------------------------------------------------------------------------------------------
@@ -103,16 +49,9 @@ def _marked_part(part: dict, urls: list[str]) -> dict:
     return part | {"image_url": part["image_url"] | {"url": f"\x00{len(urls) - 1}"}}
 
 
-def request_body(model: str, request: Request, *, with_ids: bool = False) -> dict[str, Any]:
-    """Give a request's body without its response format; `with_ids` as in with_image_ids."""
-    messages = with_image_ids(request.messages, request.digests) if with_ids else request.messages
-    return {"model": model, "messages": messages, **request.sampling}
-
-
-def with_image_ids(messages: list[dict], digests: list[str]) -> list[dict]:
-    """Give each image its digest as `uuid`, by which vLLM finds it in its cache."""
-    left = iter(digests)
-    return _with_parts(messages, lambda part: part | {"uuid": next(left)} if part["type"] == "image_url" else part)
+def request_body(model: str, request: Request) -> dict[str, Any]:
+    """Give a request's body without its response format."""
+    return {"model": model, "messages": request.messages, **request.sampling}
 
 
 def _with_parts(messages: list[dict], change: Callable[[dict], object]) -> list[dict]:
@@ -121,13 +60,6 @@ def _with_parts(messages: list[dict], change: Callable[[dict], object]) -> list[
         message if isinstance(message["content"], str) else message | {"content": [*map(change, message["content"])]}
         for message in messages
     ]
-
-
-def answer_key(model: str, request: Request) -> str:
-    """Hash image bytes, prompt, model and sampling: what an answer depends on."""
-    texts = _with_parts(request.messages, lambda part: part.get("text", "image"))
-    sampling = {"model": model, **request.sampling}
-    return sha256_bytes(dump_json([texts, request.digests, sampling, request.schema]).encode())
 
 
 # --- responses --------------------------------------------------------------------------------------------------------
@@ -164,8 +96,8 @@ def error_words(value: Any) -> str:
     return str(error.get("message", error) if isinstance(error, dict) else error)
 
 
-def read_completion(response: Response, request: Request, structured: str) -> Reply | str:
-    """Give the reply to a request that was sent in this way, or a word on what is wrong with it.
+def read_completion(response: Response, structured: str) -> Reply | str:
+    """Give the reply to a request of which the shape was enforced in this way, or a word on what is wrong with it.
 
     Nothing of it is taken on trust: what is kept has the type and size that it should have.
     """
@@ -184,8 +116,7 @@ def read_completion(response: Response, request: Request, structured: str) -> Re
         return f"{ERROR_INSTEAD}: {error_words(choice) if choice.get('error') else finish_reason}"
     if text is None:
         return "no text in the message"
-    usage, counted = _usage(value.get("usage"), request, message)
-    return Reply(text, usage, structured, _name(finish_reason), counted, _name(value.get("model")))
+    return Reply(text, _usage(value.get("usage")), structured, _name(finish_reason), _name(value.get("model")))
 
 
 def _name(value: Any) -> str | None:
@@ -211,6 +142,13 @@ def final_text(message: dict[str, Any]) -> str | None:
     return "" if is_thought else text
 
 
+def thoughts_of(completion: Any) -> int:
+    """Count the characters that a completion, of which a reply was read, says before its answer."""
+    message = completion["choices"][0].get("message")
+    thoughts = [message.get(name) for name in THOUGHT_FIELDS] if isinstance(message, dict) else []
+    return max((len(text) for text in thoughts if isinstance(text, str)), default=0)
+
+
 def _joined(content: Any) -> str | None:
     """Give the text of a content: a text, a list of parts, or an object that should have been a text."""
     if isinstance(content, list):
@@ -232,56 +170,12 @@ def _objects(value: Any) -> list[dict[str, Any]]:
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
-def _usage(value: Any, request: Request, message: dict[str, Any]) -> tuple[Usage | None, tuple[CountName, ...]]:
-    """Read the counts of tokens; gives None where the server counts nothing, and the names of those that are ours since
-    its cannot be."""
-    found = value if isinstance(value, dict) else {}
-    names = get_args(CountName)
-    if all(found.get(name) is None for name in names):
-        return None, ()
-    said = [text for text in (final_text(message), *map(message.get, THOUGHT_FIELDS)) if isinstance(text, str)]
-    texts, pictures = _asked(request)
-    least: dict[CountName, int] = {
-        "prompt_tokens": max(1, _least_tokens(texts) + LEAST_PER_PICTURE * len(pictures)),
-        "completion_tokens": max(min(1, _tokens(said)), _least_tokens(said)),
-    }
-    wrong = tuple(name for name in names if not _is_count(found.get(name), least[name]))
-    if not wrong:
-        return Usage(**{name: found[name] for name in names}), ()
-    pixels = (_num_pixels(picture) for picture in pictures if "prompt_tokens" in wrong)
-    asked = max(1, _tokens(texts)) + sum(-(-number // PIXELS_PER_TOKEN) for number in pixels)
-    ours = {"prompt_tokens": asked, "completion_tokens": _tokens(said)}
-    return Usage(**{name: ours[name] if name in wrong else found[name] for name in names}), wrong
-
-
-def _is_count(value: Any, least: int) -> bool:
-    """Tell whether this can be a number of tokens."""
-    return type(value) is int and least <= value <= MOST_TOKENS
-
-
-def _asked(request: Request) -> tuple[list[str], list[str]]:
-    """Give the texts and the pictures (data URLs) of a request."""
-    contents = [message["content"] for message in request.messages]
-    parts: list[dict] = [part for one in contents for part in ([{"text": one}] if isinstance(one, str) else one)]
-    texts = [part.get("text", "") for part in parts if "image_url" not in part]
-    pictures = [part["image_url"]["url"] for part in parts if "image_url" in part]
-    return texts, pictures
-
-
-def _num_pixels(data_url: str) -> int:
-    from PIL import Image
-
-    with Image.open(io.BytesIO(base64.b64decode(data_url.partition(",")[2]))) as image:
-        return image.width * image.height
-
-
-def _tokens(texts: list[str]) -> int:
-    return -(-sum(len(text.encode()) for text in texts) // BYTES_PER_TOKEN)
-
-
-def _least_tokens(texts: list[str]) -> int:
-    """Give fewer tokens than texts can have; white space counts for nothing, since a token may hold a line of it."""
-    return sum(len("".join(text.split()).encode()) for text in texts) // MOST_BYTES_PER_TOKEN
+def _usage(value: Any) -> Usage | None:
+    """Read the counts of tokens; gives None where the server counts nothing, or what can be no count."""
+    counts = [value.get(name) if isinstance(value, dict) else None for name in Usage.model_fields]
+    if not all(type(count) is int and 0 <= count <= MOST_TOKENS for count in counts) or not counts[0]:
+        return None
+    return Usage(**dict(zip(Usage.model_fields, counts, strict=True)))
 
 
 def read_models(response: Response) -> list[dict[str, Any]] | None:

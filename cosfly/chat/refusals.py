@@ -1,9 +1,8 @@
 """What a server means when it refuses a request, from the words that it gives: one table for all servers.
 
 Servers agree on no codes: what one calls 400 another calls 422 or 500. The patterns are of what vLLM, SGLang,
-llama.cpp, TGI, LM Studio, LiteLLM, OpenAI and hosts like it say; tests/refusals.tsv holds their texts, and is where the
-next one is added. The table names a cause, and decides what no other window would fare better with. Who is at fault for
-the rest is found out by asking (teachers/trials.py).
+llama.cpp, TGI, LM Studio, LiteLLM, OpenAI and hosts like it say; tests/refusals.tsv holds their texts. The table names
+a cause, and decides what no other window would fare better with.
 """
 
 from __future__ import annotations
@@ -12,9 +11,7 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
-Kind = Literal[
-    "account", "too_long", "num_images", "no_vision", "schema", "parameter", "model", "picture", "content", "unknown"
-]
+Kind = Literal["account", "too_long", "num_images", "no_vision", "schema", "parameter", "picture", "content", "unknown"]
 
 MOST_CHARACTERS = 4000  # of a text that are searched: some servers send the request back
 
@@ -52,7 +49,6 @@ MEANINGS: dict[Kind, Meaning] = {
         "out",
         True,
     ),
-    "model": Meaning("the server has no such model", "check --model and what is served", True),
     "picture": Meaning("the server cannot read a picture", "look at the frame", False),
     "content": Meaning("the server's filter refuses the content", "look at the window, or ask another server", False),
     "unknown": Meaning("the server refuses the request", "see to the server", False),
@@ -96,11 +92,6 @@ _PATTERNS: tuple[tuple[Kind, str], ...] = (
         r"|property .{0,80}is unsupported",
     ),
     (
-        "model",
-        r"\bmodel\b.{0,160}?(does not exist|not found|not exist|is not a valid|decommissioned|no longer (available"
-        r"|supported))|invalid model|model_not_found|no such model|is not a valid model|not available on this endpoint",
-    ),
-    (
         "picture",
         r"cannot identify image"
         r"|(failed|unable) to (load|decode|process|open) (the )?image|invalid[_ ]image|unsupported image"
@@ -117,13 +108,6 @@ _TABLE = tuple((kind, re.compile(pattern, re.IGNORECASE | re.DOTALL)) for kind, 
 # Statuses of a server that is busy or away, those above 511 Cloudflare's: whatever else their texts say, only an empty
 # account is more than that. 424 is what TGI says of a generation that broke.
 AWAY = frozenset({408, 409, 424, 425, 429, 502, 503, 504, *range(520, 531)})
-# What a server says with 5xx of a schema that it does not take; that a grammar stands in its words does not tell it
-# from one that broke.
-_REFUSES = r"unimplemented|unsupported|not support|invalid|unavailable|failed to (parse|compile|convert|initialize)"
-_NAMES = r"response_?format|schema|grammar"
-_SCHEMA_REFUSED = re.compile(
-    rf"({_REFUSES}).{{0,80}}({_NAMES})|({_NAMES}).{{0,80}}({_REFUSES})", re.IGNORECASE | re.DOTALL
-)
 
 
 def kind_of(status: int, text: str) -> Kind:
@@ -135,11 +119,8 @@ def kind_of(status: int, text: str) -> Kind:
     text = text[:MOST_CHARACTERS]
     found = (kind for kind, pattern in _TABLE if pattern.search(text))
     kind: Kind = "account" if status == 402 else next(found, "unknown")
-    if status >= 500 and kind == "content":
-        # a filter refuses with 4xx; "safety" in the text of a server that failed is no verdict on the window
-        return "unknown"
-    if status >= 500 and kind == "schema" and not _SCHEMA_REFUSED.search(text):
-        return "unknown"
+    if status >= 500 and kind in ("content", "schema"):
+        return "unknown"  # these words in the text of a server that failed are no verdict on a window or a schema
     return "unknown" if status in AWAY and kind != "account" else kind
 
 
@@ -168,8 +149,3 @@ class Refusal:
     def may_pass(self) -> bool:
         """Whether the same request may be answered later: the server is busy, away or broken."""
         return self.kind == "unknown" and (self.status in AWAY or self.status >= 500)
-
-    @property
-    def may_be_schema(self) -> bool:
-        """Whether the same request without its schema is worth a try."""
-        return self.kind == "schema" or (self.kind == "unknown" and self.status in (400, 422))

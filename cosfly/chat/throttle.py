@@ -29,15 +29,6 @@ class Throttle:
         self._is_ramping = True
         self._grows_at_s = float("inf")  # from the first request on
 
-    @property
-    def load(self) -> float:
-        """The share of its limit that is in flight."""
-        return self.num_active / self.limit
-
-    def restart(self) -> None:
-        """Begin anew, and with one: the server was away."""
-        self.limit, self._is_ramping, self._grows_at_s, self._held_until_s = 1.0, True, float("inf"), 0.0
-
     def has_room(self) -> bool:
         """Tell whether one more may be in flight; where that is asked and it is time, the limit grows."""
         now_s = self._clock()

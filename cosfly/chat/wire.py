@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import functools
 import math
+import re
 import ssl
 import time
 import zlib
@@ -21,6 +22,38 @@ KEY_VARIABLE = "COSFLY_API_KEY"
 # All that we can unpack within a limit. `identity` alone would do, but some proxies pack whatever a client says.
 HEADERS = {"Content-Type": "application/json", "Accept-Encoding": "gzip"}
 MOST_DATE = 64  # characters of a Retry-After
+
+
+def check_url(url: str) -> None:
+    """Check that a URL can be asked, and holds no secret: it is written into `run.yaml` and shown in messages.
+
+    Raises:
+        ValueError: says what is wrong, and nothing of the URL that may be a secret.
+    """
+    shown = "" if "@" in url else f", got {re.split('[?#]', url)[0][:200]!r}"
+    if not re.match(r"https?://", url, re.IGNORECASE):
+        raise ValueError(f"a URL must begin with http:// or https://{shown}")
+    if re.search(r"[\s\x00-\x1f\x7f]", url):
+        raise ValueError(f"a URL must not hold blanks{shown}")
+    if re.search("[@?#]", url):
+        what = "a URL must hold no user, password, query or fragment, since it is written down"
+        raise ValueError(f"{what}; a key goes into the environment variable {KEY_VARIABLE}{shown}")
+    try:
+        parts = httpx.URL(url)
+        host = parts.host
+        parts.raw_host.decode("ascii").encode("idna")  # as the system's resolver will
+    except (httpx.InvalidURL, ValueError) as error:
+        raise ValueError(f"not a URL that can be asked{shown} ({' '.join(str(error).split())[:100]})") from None
+    if not host or "%" in host:
+        raise ValueError(f"a URL must name a host{shown}")
+    if parts.port is not None and not 0 < parts.port < 65_536:
+        raise ValueError(f"the port must be from 1 to 65535{shown}")
+
+
+def base_url(url: str) -> str:
+    """Give the API root of whatever form of URL a user has: host, host/v1, or the whole chat-completions path."""
+    root = url.rstrip("/").removesuffix("/chat/completions").rstrip("/")
+    return root if re.search(r"/v\d+(beta)?(/openai)?$", root) else f"{root}/v1"
 
 
 @dataclass(frozen=True)

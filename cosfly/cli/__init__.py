@@ -10,7 +10,6 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,13 +19,11 @@ from cosfly import __version__
 from cosfly.cli.caption import app as caption_app
 from cosfly.cli.distill import app as distill_app
 from cosfly.cli.fly import app as fly_app
-from cosfly.cli.located import default_cache, located
 from cosfly.cli.release import app as release_app
 from cosfly.cli.run import app as run_app
 from cosfly.cli.sim import app as sim_app
 from cosfly.cli.stages import app as stages_app
 from cosfly.cli.studies import app as studies_app
-from cosfly.cli.teacher import app as teacher_app
 from cosfly.cli.view import app as view_app
 from cosfly.cli.world import app as world_app
 from cosfly.errors import CosflyError, plain
@@ -34,10 +31,9 @@ from cosfly.errors import CosflyError, plain
 # The exit codes of Ctrl-C, which Typer makes of a KeyboardInterrupt without a word, and of SIGTERM.
 ENDED = {130: "interrupted", 143: "terminated"}
 
-CACHE_HELP = "Where work on s3://... and the like is done, and kept; on Ray a folder that all nodes see."
 FLAGS = ("-v", "--verbose", "-q", "--quiet")  # of all commands; no command has others of these names
 
-VALUES = ("--log-file", "--cache")  # the same, with a value each
+VALUES = ("--log-file",)  # the same, with a value each
 
 log = logging.getLogger(__name__)
 
@@ -47,8 +43,7 @@ class _Root(typer.core.TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         try:
-            with ExitStack() as self._held:
-                return super().invoke(ctx)
+            return super().invoke(ctx)
         except typer.BadParameter as error:
             from pydantic import ValidationError
 
@@ -57,14 +52,6 @@ class _Root(typer.core.TyperGroup):
                 got = "" if detail["type"] == "value_error" else f", got {detail['input']!r}"
                 error.message = f"{plain(error.message)}{got}"
             raise
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        _, _, self._words = found = super().resolve_command(ctx, args)
-        return found
-
-    def locate(self, name: str, cache: Path) -> None:
-        """Put working folders in place of the addresses among the words of a command, which are yet to be read."""
-        self._words[:] = located([name, *self._words], cache, self._held)[1:]
 
 
 app = typer.Typer(
@@ -82,7 +69,6 @@ for name, named_group in (
     ("release", release_app),
     ("sim", sim_app),
     ("study", studies_app),
-    ("teacher", teacher_app),
 ):
     app.add_typer(named_group, name=name)
 
@@ -96,10 +82,6 @@ def _root(
     log_file: Annotated[
         Path | None, typer.Option("--log-file", help="Also append all that -v tells to this file, with times.")
     ] = None,
-    cache: Annotated[
-        Path | None,
-        typer.Option("--cache", envvar="COSFLY_CACHE", show_default="~/.cache/cosfly/locations", help=CACHE_HELP),
-    ] = None,
 ) -> None:
     if version:
         typer.echo(f"cosfly {__version__}")
@@ -108,8 +90,6 @@ def _root(
 
     set_up_logging(logging.DEBUG if verbose else logging.WARNING if quiet else logging.INFO, log_file)
     log.debug("cosfly %s, Python %s, in %s", __version__, sys.version.split()[0], Path.cwd())
-    if context.invoked_subcommand is not None and isinstance(context.command, _Root):
-        context.command.locate(context.invoked_subcommand, cache or default_cache())
 
 
 def options_first(words: Sequence[str]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,14 +13,10 @@ from cosfly.cli.options import STAGE, Job, Sets, takes
 
 if TYPE_CHECKING:
     from caption.schema import CaptionConfig
-    from cosfly.products.captions import Writing
 
 app = options.stage_group("Step 7: Chain-of-Cause captions in English and Chinese.")
 
-TEACHER = (
-    "rules, an OpenAI-compatible endpoint's URL or several with commas between, vllm:MODEL_DIR, serve:MODEL "
-    "(servers for this run), file:PATH, or student:PATH of `distill infer`."
-)
+TEACHER = "rules, an OpenAI-compatible endpoint's URL, vllm:MODEL_DIR, file:PATH, or student:PATH of `distill infer`."
 READERS = (
     "URL of an endpoint that reads prose into claims; give it twice for two models, else one is asked in two orders."
 )
@@ -80,12 +75,8 @@ def caption(
     target = out or tree.resolve().parent / "caption"
     job.begin(target, tree)
     is_student = cfg.student.folder is not None  # it knows one question, and no other is tried
-    is_there = cfg.teacher_kind == "endpoint" and cfg.served_model is None
-    if check and is_there and not is_student and not (target / "answers").exists():
-        _examine_endpoint(cfg.teacher, cfg, [cfg.writing])
-    if check and not (target / "readings").exists():
-        for url in cfg.reader.urls:
-            _examine_endpoint(url, cfg, (), as_reader=True)
+    if check and cfg.teacher_kind == "endpoint" and not is_student and not (target / "answers").exists():
+        _examine_endpoint(cfg.teacher, cfg)
     if plan_only:
         return _tell_forecast(job, tree, target)
     job.finish(stage.run(cfg, tree, target, seed=job.cfg.seed, retry_failed=retry_failed, **job.manner), target)
@@ -103,25 +94,20 @@ def _tell_forecast(job: Job, tree: Path, target: Path) -> None:
 @takes()
 def caption_doctor(
     job: Job,
-    url: Annotated[str, Argument(help="URL of an OpenAI-compatible endpoint, or several with commas between.")],
+    url: Annotated[str, Argument(help="URL of an OpenAI-compatible endpoint.")],
     model: Model = None,
-    as_reader: Annotated[
-        bool, Option("--as-reader", help="Try how it reads prose of others, for --reader; it needs no pictures.")
-    ] = False,
 ) -> None:
-    """Try what an endpoint can do: images, schema, thinking, context, ways of writing. Exit 1 if it cannot caption."""
-    from caption.writing.contract import WAYS
-
-    _examine_endpoint(url, job.cfg.caption, tuple(WAYS), as_reader=as_reader)
+    """Try what an endpoint can do: text, images, schema, thinking, context. Exit 1 if it cannot caption."""
+    _examine_endpoint(url, job.cfg.caption)
 
 
-def _examine_endpoint(url: str, cfg: CaptionConfig, ways: Sequence[Writing], *, as_reader: bool = False) -> None:
+def _examine_endpoint(url: str, cfg: CaptionConfig) -> None:
     """Print a table of what works; exit 1 when the endpoint is unusable."""
     from caption.run.own_files import vocabulary_of
     from caption.teachers.doctor import examine_endpoint
     from cosfly.work.console import console
 
-    findings = examine_endpoint(url, cfg, vocabulary_of(cfg), ways, as_reader=as_reader)
+    findings = examine_endpoint(url, cfg, vocabulary_of(cfg))
     options.tell_checks(findings, console, "What the endpoint can do")
 
 
@@ -215,7 +201,7 @@ def caption_reader_check(
 
 
 @app.command("compare-strategies")
-@takes("seed", "repair", flights="caption.flights")
+@takes("seed", flights="caption.flights")
 def caption_compare_strategies(
     job: Job,
     out: Annotated[Path, Option(help="Folder for compare_strategies.json and the answers.")],

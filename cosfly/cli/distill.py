@@ -84,7 +84,7 @@ def distill_train(
 
 
 @app.command("infer")
-@takes("verify", "resume", "repair")
+@takes("verify", "resume")
 def distill_infer(
     job: Job,
     dataset: Dataset,

@@ -51,7 +51,6 @@ GLOB_HELP = "Only flights whose folder, or one above it, matches: 'Town01/trajec
 TRACKS_HELP = "Only flights of this track."
 RESUME_HELP = "A folder that holds work: refuse it, or continue if settings and inputs are the same."
 VERIFY_HELP = "First compare every file of the stages that are read with its sha256."
-REPAIR_HELP = "First set aside, as FILE.aside, what is broken in the folder's journals."
 ENGINE_HELP = "Where the workers are: processes of this machine, or on the nodes of a Ray cluster."
 ADDRESS_HELP = "Head node of --engine ray, or auto; none: $RAY_ADDRESS, or a cluster of this machine."
 SHARED: dict[str, tuple[Any, Any, Any]] = {  # name -> type, option and default, in the order of the help
@@ -74,7 +73,6 @@ SHARED: dict[str, tuple[Any, Any, Any]] = {  # name -> type, option and default,
     "address": (str | None, Option(metavar="HOST:PORT", help=ADDRESS_HELP), None),
     "verify": (bool, Option("--verify", help=VERIFY_HELP), False),
     "resume": (Literal["never", "if-same"], Option(help=RESUME_HELP), "if-same"),
-    "repair": (bool, Option("--repair", help=REPAIR_HELP), False),
 }
 SET_BY = {
     "flights": Sets("match"),
@@ -83,7 +81,7 @@ SET_BY = {
     **{name: Sets(name) for name in ("seed", "workers", "engine")},
 }
 WORKERS = ("workers", "engine", "address")
-STAGE = ("town", "seed", *WORKERS, "verify", "resume", "repair")  # of a stage that does items by workers
+STAGE = ("town", "seed", *WORKERS, "verify", "resume")  # of a stage that does items by workers
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,6 @@ class Job:
     overrides: Sequence[str] = ()
     resume: Resume = "if-same"
     verify: bool = False
-    repair: bool = False
 
     @property
     def manner(self) -> dict[str, Any]:
@@ -124,12 +121,9 @@ class Job:
         raise InputError("no playback tree", where=Path.cwd(), got=got, fix="give --data DIR")
 
     def begin(self, out: Path, *inputs: Path | None) -> None:
-        """Do what --repair and --verify ask for, before the folder is opened; both where nobody does are nothing."""
-        from cosfly.app.repair import repair
+        """Do what --verify asks for, before the folder is opened."""
         from cosfly.work import provenance
 
-        if self.repair:
-            typer.echo(f"{out}: {repair(out)} lines set aside")
         if self.verify:
             provenance.verify(path for path in (*inputs, out) if path is not None and path.exists())
 
@@ -181,7 +175,7 @@ def takes(*names: str, flights: str | None = None) -> Callable[[Callable[..., No
                 return
             chosen = {name: one for name, one in sets.items() if given[name] not in (None, [])}
             extra = {one.path: one.value_of(given[name]) for name, one in chosen.items()}
-            manner = {name: given[name] for name in ("resume", "verify", "repair") if name in given}
+            manner = {name: given[name] for name in ("resume", "verify") if name in given}
             cfg = resolve(given["config"], given.get("overrides"), extra)
             town = _town_of(cfg, given["town"]) if "town" in shared else cfg
             job = Job(town, given.get("overrides") or (), **manner)

@@ -17,7 +17,7 @@ LevelBefore = Annotated[Literal["structure", "rows", "pixels"], Option(help="How
 
 
 @app.command("build")
-@takes(*WORKERS, "verify", "resume", "repair")
+@takes(*WORKERS, "verify", "resume")
 def release_build(
     job: Job,
     out: Annotated[Path, Option(help="Release folder.")],
@@ -153,7 +153,7 @@ def release_stats(
 
 
 @app.command("export")
-@takes(*WORKERS, "verify", "resume", "repair")
+@takes(*WORKERS, "verify", "resume")
 def release_export(
     job: Job,
     source: Annotated[Path, Argument(help="Release; for captions alone also a run directory or captions.jsonl.")],

@@ -23,7 +23,7 @@ PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)}
 
 
 @app.command()
-@takes("seed", *WORKERS, "verify", "resume", "repair")
+@takes("seed", *WORKERS, "verify", "resume")
 def run(
     job: Job,
     config: Annotated[Path, Argument(help=CONFIG)],

@@ -319,7 +319,7 @@ app.add_typer(inspect_app, name="inspect")
 
 
 @inspect_app.callback()
-@takes("town", *WORKERS, "verify", "resume", "repair", flights="inspect.flights")
+@takes("town", *WORKERS, "verify", "resume", flights="inspect.flights")
 def inspect(
     job: Job,
     out: options.Out,

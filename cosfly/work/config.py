@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from cosfly.errors import ConfigError, InputError, nearest, plain
 from cosfly.reading.files import read_text
@@ -31,15 +31,6 @@ class Config(BaseModel):
     """Base of every stage's settings: frozen, and an unknown key is an error."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    @field_validator("*")
-    @classmethod
-    def _lies_here(cls, value: Any) -> Any:
-        if isinstance(value, Path) and value.parts[:1] and value.parts[0].endswith(":"):  # of s3://bucket/file
-            raise ValueError(
-                "an address, which is not fetched: copy it here, or give it to a command in place of a path"
-            )
-        return value
 
     def recorded(self) -> dict[str, Any]:
         """Give the settings that decide what a stage makes, JSON-able: all but those that are MayDiffer."""

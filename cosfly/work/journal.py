@@ -15,10 +15,9 @@ from pydantic import ValidationError
 from cosfly.errors import InputError, plain
 from cosfly.reading.documents import parse_json
 from cosfly.reading.files import disk_errors, open_file, read_lines
-from cosfly.work.store import dump_json, refuse_link, sha256_bytes, storage_errors, write_bytes
+from cosfly.work.store import dump_json, sha256_bytes, storage_errors
 
 TAIL = 65_536  # bytes at the end in which `last` looks
-ASIDE = ".aside"  # what is added to the name of a journal for the file that holds its broken lines
 
 T = TypeVar("T")
 
@@ -67,8 +66,7 @@ class Journal:
         detail = error.errors(include_url=False, include_input=False)[0]
         field = ".".join(str(part)[:40] for part in detail["loc"]) or "top level"
         where, got = f"{self.path}:{self.line_num}", f"{field}: {plain(detail['msg'])[:200]}"
-        fix = "run the same command with --repair: such lines go into"
-        fix = f"{fix} {self.path.name}{ASIDE}, and what stood in them is done again"
+        fix = "delete this line from the file and run the same command: the item of the line is done again"
         return InputError("a line that cannot be used", where=where, got=got, fix=fix)
 
     def read_at(self, line_bytes: Iterable[int]) -> Iterator[dict]:
@@ -84,22 +82,6 @@ class Journal:
                     fix = "run the same command again: what stood in it is done again"
                     raise InputError("a line was damaged meanwhile", where=f"{self.path}: byte {line_byte}", fix=fix)
                 yield record
-
-    def set_aside(self, is_usable: Callable[[dict], bool]) -> int:
-        """Move lines that are damaged or cannot be used to the end of `<name>.aside`; gives their number."""
-        kept, broken = list[bytes](), list[bytes]()
-        for line in read_lines(self.path, what="journal"):
-            record = _record_of(line)
-            (broken if record is None or not is_usable(record) else kept).append(line)
-        if broken:
-            aside = self.path.with_name(self.path.name + ASIDE)
-            refuse_link(aside)
-            with storage_errors(aside), open(aside, "ab") as file:
-                file.write(b"".join(line.rstrip(b"\n") + b"\n" for line in broken))
-                file.flush()
-                os.fsync(file.fileno())
-            write_bytes(self.path, b"".join(kept))
-        return len(broken)
 
     def last(self) -> dict | None:
         """Give the last record without a look at the others; None where it is damaged, very long, or there is none."""

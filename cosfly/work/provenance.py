@@ -23,7 +23,6 @@ from cosfly.reading.documents import FileFormat, read_json, read_model, read_obj
 from cosfly.reading.files import files_named, sha256_file
 from cosfly.work.console import progress_bar
 from cosfly.work.journal import Journal
-from cosfly.work.locations import name_of, path_of
 from cosfly.work.store import CHECKSUMS, checksum_lines, dump_json, inside, read_checksums, sha256_bytes
 
 log = logging.getLogger(__name__)
@@ -155,7 +154,7 @@ def checked_inputs(inputs: Mapping[str, Path], audited: Collection[str] = ()) ->
         _check_name(path)
         if name not in audited:
             _check_finished(path)
-    found = {name: StageInput(path=name_of(path), sha256=fingerprint(path)) for name, path in sorted(inputs.items())}
+    found = {name: StageInput(path=str(path), sha256=fingerprint(path)) for name, path in sorted(inputs.items())}
     for name, path in inputs.items():
         _check_belongs(name, path, inputs, found)
     return found
@@ -299,7 +298,7 @@ def stages_behind(products: Iterable[Path]) -> list[StageRecord]:
             return
         found.add(known)
         for entry in record.inputs.values():
-            before = path_of(entry.path)
+            before = Path(entry.path)
             if before.exists() and _record_of(before) is not None and fingerprint(before) == entry.sha256:
                 visit(before)
         ordered.append(record)

@@ -11,9 +11,8 @@ from typing import Any
 
 from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget, BudgetConfig
-from cosfly.chat.client import EndpointConfig
+from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import NoAnswer, Reply, started
-from cosfly.chat.servers import ChatClient
 from cosfly.errors import TeacherError
 from cosfly.reading.documents import validated
 from cosfly.reading.objects import find_object

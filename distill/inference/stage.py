@@ -13,10 +13,9 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from cosfly.chat.answers import Answer, AnswerBook, KeptAnswers
+from cosfly.chat.answers import Answer, AnswerBook, KeptAnswers, answer_key
+from cosfly.chat.client import ChatClient
 from cosfly.chat.contract import Engine, NoAnswer, Request, started
-from cosfly.chat.protocol import answer_key, split_urls
-from cosfly.chat.servers import ChatClient
 from cosfly.chat.student_chat import TAUGHT, StudentEndpointConfig, picture_to_send, read_taught, student_request
 from cosfly.chat.vllm_engine import VllmConfig, VllmEngine
 from cosfly.errors import ConfigError, InputError, TeacherError
@@ -188,8 +187,7 @@ async def _answering(
             yield local.answers(inputs.samples, advance)
         return
     engine = _make_engine(cfg, inputs)
-    is_server = cfg.engine == "endpoint"
-    in_flight = cfg.endpoint.concurrency * len(split_urls(str(inputs.model))) if is_server else cfg.vllm.batch
+    in_flight = cfg.endpoint.concurrency if cfg.engine == "endpoint" else cfg.vllm.batch
     async with started(engine):
         max_pixels = cfg.max_pixels or (inputs.taught_pixels if cfg.engine == "vllm" else 0)
         how: Any = {"max_pixels": max_pixels, "in_flight": in_flight}
@@ -226,10 +224,10 @@ def _identified(cfg: InferConfig, url: str, out: Path) -> tuple[InferConfig, str
     A folder that is complete is not asked for again, so its server need not run.
 
     Returns:
-        The settings, and a digest of the servers' addresses, which itself stays out of records.
+        The settings, and a digest of the server's address, which itself stays out of records.
     """
     client = ChatClient(url, cfg.sampling)
-    server = sha256_bytes(",".join(sorted(client.where.split(","))).encode())[:16]
+    server = sha256_bytes(client.where.encode())[:16]
     if (out / "manifest.json").exists():
         facts = read_manifest(out).facts
         name = str(facts.get("model"))
