@@ -94,12 +94,13 @@ def parse_json(text: str | bytes, *, each_key_once: bool = False) -> Any:
         value = json.loads(data.decode() if isinstance(text, bytes) else text, parse_constant=_no_constants, **hooks)
     except RecursionError:
         raise ValueError("nested too deeply") from None
-    if num_groups > DEPTH and _is_deep(value):
+    if num_groups > DEPTH and is_deep(value):
         raise ValueError(f"nested deeper than {DEPTH}")
     return value
 
 
-def _is_deep(value: Any) -> bool:
+def is_deep(value: Any) -> bool:
+    """Tell whether lists and objects are nested deeper than DEPTH."""
     level = [value]
     for _ in range(DEPTH + 1):
         level = [
