@@ -297,20 +297,9 @@ class History(Strict):
     captions: CaptionHistory
 
 
-class PartOf(Strict):
-    """The release that this one is a part of: its name and content digest, the address it was fetched from, what was
-    asked for."""
-
-    name: str
-    content_digest: str
-    source: str
-    choice: dict[str, Any]
-
-
 class ReleaseRecord(Strict):
     """The whole file. actions: the closed set of decisions, null for the one that ships. prompts: by run the questions
-    (`user_en`, `user_zh`) of captions that were asked with prompts of their own. part_of: null for what `release build`
-    made, whole as it is."""
+    (`user_en`, `user_zh`) of captions that were asked with prompts of their own."""
 
     name: str
     licence: str
@@ -330,8 +319,7 @@ class ReleaseRecord(Strict):
     flights: list[ReleasedFlight]
     content_digest: str
     shards: list[Shard]
-    part_of: PartOf | None = None
-    ceilings: Ceilings | None = None  # of a part they are not measured
+    ceilings: Ceilings | None = None
 
 
 def numbers_of_splits(flights: Sequence[ReleasedFlight], captions: Mapping[str, int]) -> dict[SplitName, SplitNumbers]:

@@ -146,23 +146,6 @@ def _judge(place: Place) -> str:
     return server.url
 
 
-def _key(place: Place) -> Path:
-    from cryptography.hazmat.primitives import serialization
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
-    form = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    (place.root / "key").write_bytes(Ed25519PrivateKey.generate().private_bytes(*form))
-    return place.root / "key"
-
-
-def _served(place: Place) -> str:
-    from test_release_get import served
-
-    server, address = place.stack.enter_context(served(Path(place.given("base")) / "release/dataset"))
-    server.handle_error = lambda *_: None  # of one that asked and was killed
-    return address
-
-
 def _simulator(protocol: str, place: Place) -> int:
     from simulator_serving import serving
 
@@ -174,8 +157,8 @@ def _simulator(protocol: str, place: Place) -> int:
 
 INPUTS: dict[str, Callable[[Place], object]] = {
     "base": _base, "students": _students, "trained": _trained, "inferred": _inferred, "evaluated": _evaluated,
-    "erred": _erred, "flown": _flown, "walk": _walk, "teacher": _teacher, "judge": _judge, "served": _served,
-    "key": _key, "carla": partial(_simulator, "carla"), "unrealcv": partial(_simulator, "unrealcv"),
+    "erred": _erred, "flown": _flown, "walk": _walk, "teacher": _teacher, "judge": _judge,
+    "carla": partial(_simulator, "carla"), "unrealcv": partial(_simulator, "unrealcv"),
 }  # fmt: skip
 
 TRAINING = (
@@ -271,12 +254,6 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "release export tree": ["release export {release} --format tree --out {out} --workers 1"],
     "release export webdataset": ["release export {release} --format webdataset --out {out} --workers 1"],
     "release export lerobot": ["release export {release} --format lerobot --out {out} --workers 1"],
-    "release sign": [
-        lambda place, out: copy_stage(place, out, "release/dataset"),
-        "release sign {out} --key {key} --level structure",
-    ],
-    "release get": ["release get {served} --out {out} --workers 1"],
-    "release get, a part": ["release get {served} --out {out} --workers 1 --modality rgb"],
     "release stats": ["release stats {release} --out {out}"],
     "release export captions": ["release export {base} --format csv --out {out}/captions.csv"],
     "distill prepare": [

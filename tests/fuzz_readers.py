@@ -80,7 +80,7 @@ from cosfly.products.roi import read_roi
 from cosfly.products.town import IDS_FILE, IDS_FORMAT, read_instance_ids, read_town_map, write_town_map
 from cosfly.products.traces import DroneTrace, read_traces, write_traces
 from cosfly.products.walks import read_paths, write_paths
-from cosfly.reading.documents import read_json, read_model
+from cosfly.reading.documents import read_json
 from cosfly.reading.files import read_bytes, sha256_file
 from cosfly.reading.meshes import Mesh, read_meshes
 from cosfly.render.settings import RenderConfig
@@ -113,7 +113,6 @@ from distill.student import checkpoint
 from distill.student import model as student
 from distill.training.stage import taught_by
 from distill.windows import Windows
-from release import sign
 from release.export import stage as export
 from release.export.captions import export as export_captions
 from release.export.contract import ExportConfig
@@ -122,8 +121,6 @@ from release.package import stage as package
 from release.package.sources import Source
 from release.record import read_record
 from release.stats import stats
-from release.transfer import stage as get
-from release.transfer.stage import Selection
 from release.verify.verify import verify
 from release.viewer import page as viewer
 from release.viewer.content import ViewerConfig
@@ -185,11 +182,6 @@ TEXTS = {
     "url.txt": "https://[::1]:8000/v1/chat/completions",
     "header.txt": "120",
     "reply.json": json.dumps(REPLY),
-    "signature.json": json.dumps({
-        **sign.FORMAT.header, "algorithm": "ed25519",
-        "signed_file": "checksums.sha256",
-        "public_key": f"{'A' * 43}=", "signature": f"{'A' * 86}==",
-    }),
 }  # fmt: skip
 
 
@@ -712,10 +704,6 @@ def _exported(root: Path, scratch: Path, format: str) -> None:
     _stage(lambda: export.run(cfg, dataset, scratch / "export"), scratch / "export")
 
 
-def _fetched(dataset: Path, scratch: Path, **wanted: Any) -> None:
-    _stage(lambda: get.run(build(Selection, wanted, "x"), str(dataset), scratch / "get"), scratch / "get")
-
-
 def _released(root: Path, scratch: Path) -> None:
     source = Source("one", root / "render", root / "captions.jsonl", root / "inspect.json")
     _stage(lambda: package.run(RELEASE, [source], scratch / "release"), scratch / "release")
@@ -870,10 +858,6 @@ READERS: dict[str, Reader] = {
         hashes=True,
     ),
     "release record": _one("release/dataset/release.json", read_record),
-    "signature": _one(
-        "signature.json",
-        lambda path: read_model(path, sign.Signature, sign.FORMAT),
-    ),
     "release, verify": Reader(
         (
             "shard.parquet",
@@ -903,18 +887,6 @@ READERS: dict[str, Reader] = {
         ("shard.parquet",),
         lambda root, scratch: export_captions(_changed_release(root, scratch), scratch / "c.csv", "csv"),
         share=0.2,
-        hashes=True,
-    ),
-    "release, get": Reader(
-        ("release/dataset/release.json", f"release/dataset/{CHECKSUMS}"),
-        lambda root, scratch: _fetched(root / "release/dataset", scratch),
-        share=0.2,
-        hashes=True,
-    ),
-    "release, get a part": Reader(
-        ("shard.parquet",),
-        lambda root, scratch: _fetched(_changed_release(root, scratch), scratch, modalities=["rgb"]),
-        share=0.1,
         hashes=True,
     ),
     "export record": _one("export/webdataset/webdataset/export.json", read_export),

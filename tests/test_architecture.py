@@ -169,7 +169,6 @@ ALLOWED_TO_READ = {
     ("distill.student.random_student", "loads"),  # what the tokenizer's own library gives
     ("distill.student.checkpoint", "load_file"),  # tensors, whose checksums were compared
     ("cosfly.unreal.guard", "loads"),  # lines of the process that started it
-    ("release.transfer.remote", "open"),  # files of another place, by ranges of known length
 }
 
 
@@ -313,11 +312,7 @@ def test_what_the_container_and_ci_install_is_pinned_and_is_what_the_project_nee
     in_container = names([*needed, *extras["pyrender"], *setup["build-system"]["requires"]])
     assert in_container <= {name for name, _ in hashed}
     constrained = names([line for line in text_of("tests/constraints.txt").splitlines() if not line.startswith("#")])
-    in_ci = [
-        line
-        for extra in ("carla", "dev", "distill", "pyrender", "remote", "sign", "unrealcv")
-        for line in extras[extra]
-    ]
+    in_ci = [line for extra in ("carla", "dev", "distill", "pyrender", "unrealcv") for line in extras[extra]]
     assert names([*needed, *in_ci]) <= constrained
 
 

@@ -1,5 +1,5 @@
 """Every command of the documentation runs, page after page in one folder, as somebody would who reads along. Small
-settings stand in the place of large ones, servers of the tests in that of a teacher's and a release's, and what a
+settings stand in the place of large ones, a server of the tests in that of a teacher's, and what a
 reader brings (a map, a public tree, a student) is made beforehand.
 """
 
@@ -12,7 +12,6 @@ import json
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -30,7 +29,6 @@ from test_caption_doctor import patient
 from test_cosfly_maps import node, write_world
 from test_distill_evaluate import make_encoder
 from test_docs_commands import ALL, PAGES, blocks
-from test_release_get import served
 from typer.testing import CliRunner
 
 from cosfly.cli import app, options_first
@@ -62,8 +60,6 @@ NOT_HERE = {
     "--env cosfly/": "1,600 frames each; tests/test_cosfly_envs.py flies a list and policies",
     "--out work/round1": "two short flights are too few walks to split; tests/test_distill_dataset.py has more",
     "roi edit work/": "it serves until it is stopped; tests/test_cosfly_roi_editor.py draws on its page",
-    "hf://datasets/": "a hub is asked; tests/test_release_get.py reads the same through fsspec from elsewhere",
-    "--repo OWNER/NAME --yes": "a hub is written to; tests/test_release_push.py sends to one of its own",
     "render.carla.server_command=": "CARLA itself; tests/test_render_carla.py starts a server of ours by that setting",
     "--teacher vllm:": "vLLM needs an accelerator; tests/test_engines_contract.py holds its engine to the documents",
     "--engine vllm": "the same",
@@ -113,7 +109,6 @@ class Place:
 
     root: Path
     teacher: str
-    release: str
     ports: dict[str, int]  # of simulators, by those in the documents
 
     def make(self, text: str) -> None:
@@ -126,7 +121,7 @@ class Place:
 
     def words(self, text: str) -> list[str]:
         """The words of a command as a shell gives them on, with what is small in place of what is large."""
-        text = text.replace("http://localhost:8000", self.teacher).replace("https://host/release", self.release)
+        text = text.replace("http://localhost:8000", self.teacher)
         for told, port_here in self.ports.items():
             port = free_port() if text.startswith("sim serve") else port_here
             text = re.sub(rf"(port[ =]){told}\b", rf"\g<1>{port}", text)
@@ -197,10 +192,6 @@ def _others_captions(root: Path, target: Path) -> None:
     target.write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 
-def _openssl(*words: str | Path) -> None:
-    subprocess.run(["openssl", *map(str, words)], check=True, capture_output=True)
-
-
 # What a reader brings: path, as a command names it -> what makes it. The longer path before the shorter.
 BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "CosFly-Track": lambda root, target: write_foreign_tree(target, trajectories=("trajectory_1", "trajectory_2")),
@@ -213,8 +204,6 @@ BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "data/b/progen_world.json": _world,
     "data/a/Bbox.json": _world,
     "data/b/Bbox_total.json": copy_of("data/b/Bbox.json"),
-    "key.pem": lambda root, target: _openssl("genpkey", "-algorithm", "ed25519", "-out", target),
-    "public.pem": lambda root, target: _openssl("pkey", "-in", root / "key.pem", "-pubout", "-out", target),
     "runs/town1": copy_of("runs/diverse/grid"),
     "runs/town2": copy_of("runs/diverse/old_town"),
     "work/flown0": copy_of("work/random"),
@@ -265,17 +254,15 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
     town = invent(SyntheticConfig(name="Town10HD_Opt", size_m=150.0, num_blocks=1), 0)
     with (
         TeacherServer(respond=answer) as teacher,
-        served(root / "work/theirs/release/dataset") as (_, release),
         serving(town, tmp_path / "carla") as carla,
         serving(town, tmp_path / "unrealcv", protocol="unrealcv") as unrealcv,
     ):
-        yield Place(root, teacher.url, release, {"2000": carla, "9000": unrealcv})
+        yield Place(root, teacher.url, {"2000": carla, "9000": unrealcv})
 
 
 def in_order() -> list[tuple[str, str]]:
     pages = [*FIRST, *sorted({page for page, _ in ALL} - {*FIRST, *LAST}), *LAST]
-    found = [("commands.md", QUICKSTART), *((page, text) for wanted in pages for page, text in ALL if page == wanted)]
-    return sorted(found, key=lambda one: "https://host/release" in one[1])  # what is there others of them have made
+    return [("commands.md", QUICKSTART), *((page, text) for wanted in pages for page, text in ALL if page == wanted)]
 
 
 def test_what_cannot_run_here_is_in_the_documents():

@@ -13,7 +13,6 @@ from cosfly.cli.options import WORKERS, Job, Sets, takes
 
 app = typer.Typer(no_args_is_help=True, help="Package captions and frames as a data set that opens with one line.")
 ReleaseFolder = Annotated[Path, Argument(help="Release folder, or a run with one.")]
-LevelBefore = Annotated[Literal["structure", "rows", "pixels"], Option(help="How far the release is verified before.")]
 
 
 @app.command("build")
@@ -78,61 +77,22 @@ def release_verify(
             help="structure: names, sizes, records, card. rows: every row too. pixels: checksums and every picture too."
         ),
     ] = "pixels",
-    source: Annotated[
-        Path | None,
-        Option(help="Of an export: the release it was made of; it is made again and every file compared."),
-    ] = None,
-    public_key: Annotated[
-        Path | None, Option(help="Public key of who should have signed it; all checksums are then compared.")
-    ] = None,
     json_file: Annotated[Path | None, Option("--json", help="Write the findings for machines here.")] = None,
-    repair_plan: Annotated[
-        bool, Option("--repair-plan", help="Say what could be mended, and how; changes nothing.")
-    ] = False,
 ) -> None:
     """Check that a release is what its records say and can be true, from cheap to dear. Exit 1 if anything is wrong."""
     from caption.run.released import read_released
     from cosfly.app.settings import manner_of_work
     from cosfly.work.store import write_json
-    from release.sign import read_public_key
     from release.verify.verify import LEVELS, verify
 
     if level not in LEVELS:
         raise typer.BadParameter(f"one of {', '.join(LEVELS)}", param_hint="--level")
-    key = None if public_key is None else read_public_key(public_key)
-    report = verify(folder, level=level, reader=read_released, source=source, public_key=key, **manner_of_work(job.cfg))
+    report = verify(folder, level=level, reader=read_released, **manner_of_work(job.cfg))
     typer.echo(str(report))
-    for line in report.repair_plan() if repair_plan else []:
-        typer.echo(f"repair plan: {line}")
     if json_file is not None:
         write_json(json_file, report.as_json())
     if not report.is_ok:
         raise typer.Exit(1)
-
-
-@app.command("sign")
-@takes(*WORKERS)
-def release_sign(
-    job: Job,
-    folder: ReleaseFolder,
-    key: Annotated[Path, Option(help="Private ed25519 key, PEM of openssl or ssh-keygen.")],
-    level: LevelBefore = "pixels",
-) -> None:
-    """Verify a release, then sign its checksums with your key, for `release verify --public-key`."""
-    from caption.run.released import read_released
-    from cosfly.app.settings import manner_of_work
-    from release import sign
-    from release.record import release_folder
-    from release.verify.verify import verify
-
-    private_key, release = sign.read_private_key(key), release_folder(folder)
-    sign.remove_unfinished(release)
-    report = verify(release, level=level, reader=read_released, **manner_of_work(job.cfg))
-    typer.echo(str(report))
-    if not report.is_ok:
-        typer.echo("nothing was signed", err=True)
-        raise typer.Exit(1)
-    typer.echo(sign.sign(release, private_key))
 
 
 @app.command("stats")
@@ -193,71 +153,3 @@ def release_export(
     languages = LANGUAGES if language == "both" else [language]
     tally = captions.export(source, out, format, languages=languages, shown=frames, split=split, overwrite=overwrite)
     typer.echo(f"{out}: {tally}")
-
-
-@app.command("get")
-@takes(*WORKERS, "resume")
-def release_get(
-    job: Job,
-    source: Annotated[
-        str,
-        Argument(help="Release folder, a run with one, or an address: https://..., hf://datasets/..., zip://::..."),
-    ],
-    out: Annotated[Path, Option(help="Folder for the release and its records.")],
-    town: Annotated[list[str] | None, Option(help="Only this town; repeat for more.")] = None,
-    split: Annotated[list[str] | None, Option(help="Only this split: train, validation, test; repeat.")] = None,
-    flight: Annotated[
-        list[str] | None, Option(help="Only this run/town/trajectory, with its twin flights; repeat.")
-    ] = None,
-    modality: Annotated[
-        list[str] | None,
-        Option(help="Only these pictures: rgb, depth, instance; repeat. Others do not travel."),
-    ] = None,
-    digest: Annotated[
-        str | None, Option(help="Content digest that the release must have, 12 characters of it or more.")
-    ] = None,
-    findings: Annotated[
-        Literal["refuse", "accept"],
-        Option(help="What rows say that cannot be true: refuse the release, or keep it and say so."),
-    ] = "refuse",
-) -> None:
-    """Fetch a release, or some towns, splits, flights and pictures of it; only these travel, and are checked."""
-    from cosfly.work.config import build
-    from release.transfer import stage as get
-    from release.transfer.stage import Selection
-
-    asked = {"towns": town, "splits": split, "flights": flight, "modalities": modality, "expected": digest}
-    choice = build(Selection, {name: value for name, value in asked.items() if value}, "the options")
-    job.finish(get.run(choice, source, out, **job.manner, findings=findings), out)
-
-
-@app.command("push")
-@takes(*WORKERS)
-def release_push(
-    job: Job,
-    folder: ReleaseFolder,
-    repo: Annotated[str, Option(help="Repository of data on the hub: OWNER/NAME; made if there is none.")],
-    yes: Annotated[bool, Option("--yes", help="Send it. Without: only say what would go.")] = False,
-    public: Annotated[bool, Option("--public", help="A repository that is made is public; else private.")] = False,
-    level: LevelBefore = "pixels",
-) -> None:
-    """Send a release to a hub that speaks the Hugging Face protocol; verified first, and a dry run without --yes."""
-    from caption.run.released import read_released
-    from cosfly.app.settings import manner_of_work
-    from cosfly.work.console import answer_console
-    from release.transfer import push
-
-    push.check_name(repo)
-    parcel = push.pack(folder)
-    rows = [(name, f"{size:>15,}") for name, size in parcel.files.items()]
-    title = f"{len(rows)} files, {parcel.num_bytes / 1e6:,.1f} MB, to {repo}"
-    options.tell_table(answer_console, (), rows, title=title)
-    for name in parcel.stays:
-        answer_console.print(f"stays here, as it is not of the release: {name}", soft_wrap=True)
-    report = push.verified(parcel, level, reader=read_released, **manner_of_work(job.cfg))
-    typer.echo(str(report))
-    if yes:
-        typer.echo(push.push(parcel, repo, private=not public))
-    else:
-        seen = "public" if public else "private"
-        typer.echo(f"dry run: nothing was sent; with --yes it goes to {repo}, {seen} if it is made")

@@ -52,7 +52,7 @@ def _check_split_rule(record: ReleaseRecord, findings: Findings) -> None:
     is_whole = math.isclose(sum(shares.values()), 1.0, abs_tol=1e-6) and all(0 <= one <= 1 for one in shares.values())
     if shares.keys() != set(NAME_OF.values()) or not is_whole:
         findings.error("rule", "release.json: splits.fractions", shares, "three shares, together 1")
-    elif record.part_of is None and record.flights:
+    elif record.flights:
         group_of = {f.flight: f.walk if told.by == "walk" else town_family(f.town) for f in record.flights}
         splits = split_groups(group_of.values(), shares, told.seed, f"{told.by}s")
         for flight in record.flights:
@@ -64,7 +64,7 @@ def _check_split_rule(record: ReleaseRecord, findings: Findings) -> None:
 
 def _check_names(record: ReleaseRecord, findings: Findings) -> None:
     """A walk is called by its first trajectory in the alphabet: a released one, but where flights went for want of
-    their twin, or were not asked for. A town's folder that render made is named by its map, or by the setting
+    their twin. A town's folder that render made is named by its map, or by the setting
     `render.town`."""
     trajectories: dict[str, set[str]] = defaultdict(set)
     chosen: dict[str, set[str]] = {}
@@ -72,7 +72,7 @@ def _check_names(record: ReleaseRecord, findings: Findings) -> None:
         trajectories[flight.walk].add(flight.trajectory)
         for config in _configs(record, flight.flight, "render"):
             chosen.setdefault(flight.town, set()).add(str(config.get("town") or ""))
-    may_be_gone = record.part_of is not None or record.history.flights.left_out.get(WITHOUT_TWIN, 0) > 0
+    may_be_gone = record.history.flights.left_out.get(WITHOUT_TWIN, 0) > 0
     for walk, own in trajectories.items():
         if walk > min(own) or (walk != min(own) and not may_be_gone):
             expected = f"{min(own)}, the first of its trajectories"

@@ -89,37 +89,3 @@ class Verified(Report):
             "schema": "cosfly.verification", "schema_version": "1.0", "level": self.level, "ok": self.is_ok,
             "facts": self.facts, "findings": [kind.model_dump(exclude={"where"}) for kind in self.kinds],
         }  # fmt: skip
-
-    def repair_plan(self) -> list[str]:
-        """Give one line for each kind of error: whether it could be mended, and how; nothing is changed."""
-        told = {
-            kind.code: (kind.count, *REPAIRS.get(kind.code, ELSE)) for kind in self.kinds if kind.severity == "error"
-        }
-        return [
-            f"{code} ({count:,}): {'could be mended' if can_be else 'not to be mended here'}: {how}"
-            for code, (count, can_be, how) in told.items()
-        ]
-
-
-AGAIN, REBUILD = "fetch the file again from where the release is published", "build the release again from its runs"
-# code -> (can it be mended without making anything anew, how)
-REPAIRS: dict[str, tuple[bool, str]] = {
-    **dict.fromkeys(
-        ("missing", "size", "checksum", "unreadable"), (True, f"{AGAIN} (cosfly release get resumes), or {REBUILD}")
-    ),
-    "unexpected": (True, "move it out of the folder"),
-    "card": (True, "build the release again, or restore README.md"),
-    **dict.fromkeys(("columns", "rows", "shard_name", "digest"), (False, REBUILD)),
-    **dict.fromkeys(
-        ("number", "sum", "split", "frames", "flight"), (False, f"{REBUILD}: its record is not of its shards")
-    ),
-    "picture": (False, "render the frame again, inspect, and build again"),
-    **dict.fromkeys(
-        ("label", "verdict", "window", "caption", "decision"),
-        (False, "caption the flight again from its tree, and build again"),
-    ),
-    "leak": (False, "build again: splits are handed out by walk"),
-    "signature": (False, f"{AGAIN}, or ask its maker to sign it: cosfly release sign"),
-    "licence": (True, "name licence and credits of the maps: release.licence and release.credits of the build"),
-}
-ELSE = (False, "no file of the folder tells what was true: render or build the flights that are named again")

@@ -17,7 +17,8 @@ from cosfly.work.store import CHECKSUMS, read_checksums
 from release.verify.findings import Findings
 
 ALLOWED = (".git", ".gitattributes", ".cache", ".huggingface")  # what the hub and its client put beside a data set
-LICENCES = ("LICENSE", "LICENSE.txt", "LICENSE.md")  # files that may lie there, with the text of one
+# Files that may be there and are in no list: the text of a licence, and a signature over the list itself.
+UNLISTED = ("LICENSE", "LICENSE.txt", "LICENSE.md", f"{CHECKSUMS}.sig")
 SMALL_BYTES = 64_000_000  # a file whose checksum is compared with the cheap checks
 
 
@@ -45,7 +46,7 @@ def check_names(folder: Path, expected: Mapping[str, int | None], findings: Find
     """
     found: dict[str, int] = {}
     for name in files_below(folder):
-        if name not in expected and name not in LICENCES:
+        if name not in expected and name not in UNLISTED:
             got = "an empty folder" if name.endswith("/") else "a file"
             findings.error("unexpected", name, got, "nothing that no record knows")
             continue

@@ -283,7 +283,7 @@ def check_flights(record: ReleaseRecord, flights: list[Summary], findings: Findi
             findings.error("frames", name, got, f"{wanted} frames by the rule of release.json")
     captions = record.history.captions
     for name, most in (("window_not_whole", num_cut), ("frame_not_selected", num_absent)):
-        if record.part_of is None and (told := getattr(captions, name)) > most:
+        if (told := getattr(captions, name)) > most:
             expected = f"at most {most}, the frames that a caption could have lost by the choice of frames"
             findings.error("sum", f"release.json: history.captions.{name}", told, expected)
 
@@ -317,7 +317,7 @@ def check_shards(folder: Path, record: ReleaseRecord, findings: Findings) -> Non
                             if found != f"{own}_{file}":
                                 findings.error("name", f"{own}: {column}.path", repr(found), f"{own}_{file}")
     told = record.provenance.versions.get("pyarrow")
-    if record.part_of is None and told and writers and not any(f"version {told}" in one for one in writers):
+    if told and writers and not any(f"version {told}" in one for one in writers):
         # A build that was broken off may have gone on with another version.
         expected = f"that of the shards, {', '.join(sorted(writers))}"
         findings.warn("provenance", "release.json: provenance.versions.pyarrow", told, expected)

@@ -6,7 +6,7 @@ A source is small and pickles: worker processes open the files themselves.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
@@ -47,34 +47,14 @@ class Entry:
         return Place(*self.name.split("/"))
 
 
-def with_ids(entries: list[Entry], shown: Mapping[str, str] | None = None) -> list[Entry]:
-    """Give the entries what their sample ids must begin with; None where two flights have one name.
-
-    Args:
-        shown: of a part of a release, which another town or run with a trajectory of the same name may have been left
-        out of, the sample id
-            of a row of each entry.
-    """
+def with_ids(entries: list[Entry]) -> list[Entry]:
+    """Return the entries with what their sample ids must begin with; None where two flights have one name."""
     places = [entry.place for entry in entries]
-    elsewhere = [
-        _left_out(place, (shown or {}).get(entry.name, "")) for entry, place in zip(entries, places, strict=True)
-    ]
     try:
-        ids = flight_ids([*places, *{place for place in elsewhere if place is not None}])
+        ids = flight_ids(places)
     except (InputError, TypeError):
         return entries
     return [replace(entry, given_id=ids[entry.place]) for entry in entries]
-
-
-def _left_out(place: Place, sample_id: str) -> Place | None:
-    """Give a flight that must have stood beside this one where its rows have such an id: of another town, or of another
-    run."""
-    own = f"{place.trajectory}_{place.variant}_frame_"
-    if sample_id.startswith(f"{place.run}_{place.town}_{own}"):
-        return Place("", place.town, place.trajectory, place.variant)
-    return (
-        Place(place.run, "", place.trajectory, place.variant) if sample_id.startswith(f"{place.town}_{own}") else None
-    )
 
 
 # --- shards -----------------------------------------------------------------------------------------------------------
@@ -82,12 +62,10 @@ def _left_out(place: Place, sample_id: str) -> Place | None:
 
 @dataclass(frozen=True)
 class Shards:
-    """Parquet files of a release folder. A part is (shard, row group, first row, row behind the last). is_part: of a
-    whole release."""
+    """Parquet files of a release folder. A part is (shard, row group, first row, row behind the last)."""
 
     folder: Path
     files: tuple[FrameFile, ...]
-    is_part: bool = False
 
     def entries(self, names: list[str]) -> list[Entry]:
         """Find which rows are of which flight, in the order in which they stand.
@@ -96,18 +74,16 @@ class Shards:
             InputError: a shard cannot be read.
         """
         parts: dict[str, list[tuple[str, int, int, int]]] = defaultdict(list)
-        shown: dict[str, str] = {}
         for name in names:
             path = self.folder / name
             with open_table(path, tree=self.folder) as table:
                 for group in range(table.num_row_groups):
-                    places = read_row_group(path, table, group, [*PLACE, "sample_id"])
+                    places = read_row_group(path, table, group, list(PLACE))
                     for place, begin, end in flight_spans(places):
                         parts[flight_name(place)].append((name, group, begin, end))
-                        shown.setdefault(flight_name(place), str(places.column("sample_id")[begin]))
         entries = [Entry(name, tuple(own), sum(end - begin for *_, begin, end in own)) for name, own in parts.items()]
         entries = [entry for entry in entries if entry.name.count("/") == len(PLACE) - 1]
-        return with_ids(entries, shown if self.is_part else None)
+        return with_ids(entries)
 
     def rows(self, entry: Entry) -> list[Row]:
         found: list[Row] = []

@@ -27,7 +27,6 @@ from cosfly.work.store import CHECKSUMS
 from release.card.croissant import CROISSANT
 from release.export.contract import FORMATS
 from release.record import RECORD, DepthCoding, ReleaseRecord, read_record, release_folder
-from release.sign import SIGNATURE, is_signed, signature_fault
 from release.verify import by_rule, records
 from release.verify.across import RowFiles, Summary, check_across
 from release.verify.exports import EXPORT, check_export
@@ -49,8 +48,6 @@ class _How:
     reader: CaptionReader | None
     workers: int
     watch: Watch
-    source: Path | None
-    public_key: bytes | None
 
 
 def verify(
@@ -60,8 +57,6 @@ def verify(
     workers: int = 0,
     reader: CaptionReader | None = None,
     watch: Watch = Watch(),
-    source: Path | None = None,
-    public_key: bytes | None = None,
 ) -> Verified:
     """Check a folder (or the release inside a release stage's or a run's, or the format's inside an export's).
 
@@ -70,13 +65,11 @@ def verify(
         workers: processes; 0 works in this one.
         reader: recomputes labels and verdicts; None: they are not recomputed, which the report says.
         watch: when a worker counts as stalled; its flight is then an error.
-        source: of an export the release that it was made of, to make it again and compare.
-        public_key: of who should have signed the release; all checksums are then compared at every level.
     Returns:
         the report; `is_ok` is False when anything is wrong. Later checks are left out where earlier ones make them
         senseless.
     """
-    findings, how = Findings(), _How(level, reader, workers, watch, source, public_key)
+    findings, how = Findings(), _How(level, reader, workers, watch)
     if not any((folder / name).is_file() for name in (RECORD, EXPORT)):
         exports = (folder / name / EXPORT for name in FORMATS)  # in the stage's folder
         folder = next((path.parent for path in exports if path.is_file()), release_folder(folder))
@@ -84,15 +77,13 @@ def verify(
     if not folder.is_dir():
         findings.error("missing", folder, "no such folder", ANYTHING)
     elif (folder / EXPORT).is_file():
-        record = check_export(folder, level != "structure", source, workers, watch, findings)
+        record = check_export(folder, level != "structure", findings)
         if record is not None and record.format == "tree":
             _verify_tree(folder, how, findings, record.depth)
     elif is_release or ((folder / CHECKSUMS).is_file() and next(folder.rglob("trajectory.json"), None) is None):
         _verify_release(folder, how, findings)
     else:
         _verify_tree(folder, how, findings, None)
-    if public_key is not None and not is_release:
-        findings.error("signature", folder, "no release", "a signed release: exports and trees carry no signature")
     return findings.report(level)
 
 
@@ -107,9 +98,6 @@ def _verify_release(folder: Path, how: _How, findings: Findings) -> None:
         findings.error("record", where, error.got or error.what, error.expected or "a release record")
         return
     expected: dict[str, int | None] = dict.fromkeys(RECORDS) | {shard.path: shard.bytes for shard in record.shards}
-    _check_signature(folder, record, how, findings)
-    if is_signed(folder):
-        expected[SIGNATURE] = None
     good = check_names(folder, expected, findings)
     digests = read_digests(folder, findings)
     _check_lists(record, digests, findings)
@@ -124,22 +112,8 @@ def _verify_release(folder: Path, how: _How, findings: Findings) -> None:
         findings.note("not_checked", "data", "shards that are missing or of other columns", "rows of all shards")
     elif how.level != "structure":
         _verify_rows(folder, record, how, findings)
-    if how.level == "pixels" or how.public_key is not None:  # a signature is over the list of digests
+    if how.level == "pixels":
         check_digests(folder, digests, [name for name in good if name not in small], findings)
-
-
-def _check_signature(folder: Path, record: ReleaseRecord, how: _How, findings: Findings) -> None:
-    if how.public_key is None:
-        state = "signed, the key was not checked: --public-key FILE" if is_signed(folder) else "not signed"
-    elif (fault := signature_fault(folder, how.public_key)) is None:
-        state = "signed with the key that was given"
-    else:
-        got, expected = fault
-        if not is_signed(folder) and record.part_of is not None:
-            expected = "the whole release: a part that was fetched does not carry its maker's signature"
-        findings.error("signature", SIGNATURE, got, expected)
-        return
-    findings.facts.append(f"signature: {state}")
 
 
 def _check_lists(record: ReleaseRecord, digests: dict[str, str], findings: Findings) -> None:
@@ -155,7 +129,7 @@ def _check_lists(record: ReleaseRecord, digests: dict[str, str], findings: Findi
 
 def _verify_rows(folder: Path, record: ReleaseRecord, how: _How, findings: Findings) -> None:
     """Check rows, and at level `pixels` pictures, of a release whose shards are all there and have its columns."""
-    source = Shards(folder, tuple(record.settings.modalities), record.part_of is not None)
+    source = Shards(folder, tuple(record.settings.modalities))
     try:
         entries = source.entries([shard.path for shard in record.shards])
     except InputError as error:
