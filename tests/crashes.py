@@ -30,7 +30,6 @@ from typing import Any
 
 from cosfly.errors import CosflyError
 from cosfly.work import worker_pool
-from cosfly.work.journal import ASIDE
 from cosfly.work.provenance import checked_inputs, recorded_digests
 from cosfly.work.stage_events import EVENTS
 from release.verify.verify import verify
@@ -224,7 +223,7 @@ TIMES = re.compile(
 def contents(root: Path) -> dict[str, bytes]:
     """Give what stands below a folder, without what is documented to differ: times, what happened to workers, broken
     lines."""
-    paths = [path for path in sorted(root.rglob("*")) if path.name != EVENTS and not path.name.endswith(ASIDE)]
+    paths = [path for path in sorted(root.rglob("*")) if path.name != EVENTS]
     found = {path.relative_to(root).as_posix(): path for path in paths if path.stem != "reproduction"}  # tells times
     return {name: b"a folder" if path.is_dir() else _plain(path) for name, path in found.items()}
 
