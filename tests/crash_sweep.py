@@ -203,10 +203,6 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "world": ["world 'a small village with a well' --out {out}"],
     "simplify": ["simplify --map {maps} --out {out} {tiny}"],
     "pedestrians": ["pedestrians --map {simple} --out {out} {tiny}"],
-    "pedestrians, more": [
-        "pedestrians --map {simple} --out {out} {tiny}",
-        "pedestrians --map {simple} --out {out} {tiny} --set pedestrians.num_paths=2",
-    ],
     "roi propose": ["roi propose {simple} --out {out}/roi_polygon.json {tiny}"],
     "plan": ["plan --map {simple} --paths {walks} --out {out} {tiny}"],
     "plan compare": ["plan compare {simple} {walks} --out {out} {tiny} --planner foresight --planner track_astar"],
@@ -272,7 +268,6 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     ],
     "distill report": ["distill report {evaluated} --out {out}"],
     "run": ["run quickstart --out {out} {tiny}"],
-    "run, more": ["run quickstart --out {out} {tiny}", "run {out} --set pedestrians.num_paths=2"],
     "run, towns": ["run quickstart --out {out} {tiny} {towns}"],
     "run, towns, release": ["run quickstart --out {out} {tiny} {towns}", lose_release, "run {out}"],
 }  # fmt: skip

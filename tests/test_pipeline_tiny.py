@@ -218,19 +218,6 @@ def test_what_was_made_with_other_settings_is_not_done(base):
     assert "made with other settings (render.width_px)" in shown.output
 
 
-def test_of_more_walks_a_dry_run_counts_what_is_added(base):
-    more = tiny(**{"pedestrians.num_paths": 3})
-    rows = {row.name: row for row in estimate(more, base, rates_near(base))}
-    frames = sum(flight["num_frames"] for flight in read_json(base / "render/manifest.json")["flights"])
-    assert [name for name, row in rows.items() if row.is_done] == ["maps", "simplify"]
-    assert (rows["pedestrians"].count, rows["plan"].count) == (1, 1)
-    assert rows["render"].count == pytest.approx(frames / 2, abs=4)
-    assert rows["release"].count == frames + rows["render"].count  # made anew, of all
-    shown = CliRunner().invoke(app, ["run", str(base), "--set", "pedestrians.num_paths=3", "--dry-run"])
-    assert "goes on with 1 more walks" in " ".join(shown.output.split())
-    assert "refuse" not in shown.output
-
-
 def test_what_a_teacher_will_take_is_not_made_up(base, tmp_path):
     rows = {
         r.name: r for r in estimate(tiny(**{"caption.teacher": "http://localhost:1"}), tmp_path / "x", rates_near(base))
@@ -271,7 +258,7 @@ def test_other_settings_are_refused_by_name_and_nothing_is_touched(base, tmp_pat
     out = begin(base, tmp_path / "run", "plan")
     before = (out / "run.yaml").read_bytes()
     caplog.set_level("INFO")
-    with pytest.raises(ResumeError, match=r"num_paths was 2, is 1"):  # more are added, fewer are not
+    with pytest.raises(ResumeError, match=r"num_paths was 2, is 1"):
         pipeline.run(tiny(**{"pedestrians.num_paths": 1}), out)
     assert (out / "run.yaml").read_bytes() == before
     assert "pedestrians: already complete" not in caplog.text
@@ -530,40 +517,3 @@ def test_shares_of_a_town_replace_those_of_the_run():
     assert (town.plan.styles, town.plan.segment_s) == ({"top": 1.0}, 20.0)
     assert (town.pedestrians.pace, town.pedestrians.traffic) == ({"hurry": 1.0}, 2)
     assert cfg.of_town("b").plan == cfg.plan
-
-
-# --- more walks -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_more_walks_are_added_to_a_finished_run_and_leave_the_others_as_they_were(base, tmp_path):
-    run = shutil.copytree(base, tmp_path / "run")
-    frames = {path.relative_to(run): path.read_bytes() for path in (run / "render").rglob("*.png")}
-    paths = [walk.as_json() for walk in read_walks(run / "pedestrians/path.json")]
-    captions = list(read_captions(run / "caption/captions.jsonl"))
-    more = tiny(**{"pedestrians.num_paths": 3})
-    results = pipeline.run(more, run)
-    assert [r.stage.name for r in results if r.was_complete] == ["maps", "simplify"], "the others went on"
-    assert [walk.as_json() for walk in read_walks(run / "pedestrians/path.json")][:2] == paths
-    assert {path: (run / path).read_bytes() for path in frames} == frames
-    assert len(find_flights(run / "render")) == 6
-    found = {caption.sample_id: caption for caption in read_captions(run / "caption/captions.jsonl")}
-    assert all(found[caption.sample_id] == caption for caption in captions)
-    assert len(found) > len(captions)
-    assert verify(run / "release/dataset", level="rows").is_ok
-    assert results[-1].manifest.counts.kept == 6
-    assert load(RunConfig, run / "run.yaml").pedestrians.num_paths == 3
-    assert all(result.was_complete for result in pipeline.run(more, run))  # and again: nothing to do
-    with pytest.raises(ResumeError, match=r"num_paths was 3, is 2"):
-        pipeline.run(tiny(), run)
-    with pytest.raises(ResumeError, match="seed was 0, is 1"):
-        pipeline.run(tiny(**{"pedestrians.num_paths": 4, "seed": 1}), run)
-
-
-def test_a_walk_that_was_changed_is_no_walk_that_was_added(base, tmp_path):
-    run = shutil.copytree(base, tmp_path / "run")
-    work(tiny(**{"pedestrians.num_paths": 3}), run, "pedestrians")
-    record = read_json(run / "pedestrians/stage.json")
-    write_json(run / "pedestrians/stage.json", {**record, "grown_from": ["0" * 64]})
-    with pytest.raises(ResumeError, match="the input paths"):
-        work(tiny(**{"pedestrians.num_paths": 3}), run, "plan")

@@ -179,25 +179,13 @@ def num_windows(cfg: RunConfig, frames: list[int]) -> int:
     return sum(math.ceil(max(0, count) / window.stride) for count in whole)
 
 
-def _amounts(cfg: RunConfig, out: Path, rates: Rates, more: int) -> tuple[dict[str, int], dict[str, int]]:
-    """Count what a run is of in all, and what `more` walks are of alone."""
+def _amounts(cfg: RunConfig, out: Path, rates: Rates) -> dict[str, int]:
+    """Count what a run is of."""
     walks, tracks = cfg.pedestrians.num_paths, len(cfg.render.tracks)
     each = round(rates.frames_a_metre * _straight_frames(cfg))
     made = _walks_of(out)
-    known = _frames_of(cfg, out) if made in (walks, walks - more) else []
-    frames = known + [each] * ((walks - made if known else walks) * tracks)
-    return _counts(cfg, walks, frames), _counts(cfg, more, [each] * (more * tracks))
-
-
-def _counts(cfg: RunConfig, walks: int, frames: list[int]) -> dict[str, int]:
+    frames = (_frames_of(cfg, out) if made == walks else []) or [each] * (walks * tracks)
     return {"map": 1, "walks": walks, "frames": sum(frames), "windows": num_windows(cfg, frames)}
-
-
-def more_walks(cfg: RunConfig, out: Path) -> int:
-    """Count the walks that these settings add to what stands in a run folder; 0 where anything else differs."""
-    if other_settings(cfg, out) != ["pedestrians.num_paths"]:
-        return 0
-    return max(0, cfg.pedestrians.num_paths - load(RunConfig, out / "run.yaml").pedestrians.num_paths)
 
 
 def other_settings(cfg: RunConfig, out: Path) -> list[str]:
@@ -229,13 +217,11 @@ def estimate(cfg: RunConfig, out: Path, rates: Rates) -> list[StageEstimate]:
 
 
 def _stages(cfg: RunConfig, out: Path, rates: Rates, names: tuple[str, ...]) -> Iterator[StageEstimate]:
-    more = more_walks(cfg, out)
-    whole, added = _amounts(cfg, out, rates, more)
+    counts = _amounts(cfg, out, rates)
     changed = {name.partition(".")[0] for name in other_settings(cfg, out)}
     fresh = 0 if changed - set(names) else min((names.index(name) for name in changed), default=len(names))
     for place, name in enumerate(names):
-        is_added_to = place >= fresh and more > 0 and name != "release" and _is_complete(out / name)
-        yield _stage(name, (added if is_added_to else whole)[UNITS[name]], cfg, out, rates, place < fresh)
+        yield _stage(name, counts[UNITS[name]], cfg, out, rates, place < fresh)
 
 
 def _stage(name: str, count: int, cfg: RunConfig, out: Path, rates: Rates, stands: bool = True) -> StageEstimate:
@@ -284,14 +270,10 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
     lines += caveats(cfg)
     if any(row.tokens is None for row in rows):
         lines.append(f"tokens are {UNKNOWN_TOKENS}")
-    if more := more_walks(cfg, out):
-        kept = "what stands there is kept and not counted, but for the release, which is built anew"
-        lines.append(f"{out} goes on with {more} more walks; {kept}")
-    elif others := other_settings(cfg, out):
+    if others := other_settings(cfg, out):
         listed = f"{', '.join(others[:6])}{' ...' if len(others) > 6 else ''}"
         lines.append(
-            f"{out} was made with other settings ({listed}): its finished stages refuse them, "
-            "and only a greater pedestrians.num_paths goes on there; choose another --out"
+            f"{out} was made with other settings ({listed}): its finished stages refuse them; choose another --out"
         )
     if sum(row.bytes for row in rows) > free_bytes(out):
         lines.append("there is not enough space for it: choose another --out, or fewer walks or pixels")

@@ -321,7 +321,7 @@ def run(
     """
     inputs = {"map": simplified_map} | ({"roi": roi} if roi else {})
     settings = cfg.model_dump(mode="json")
-    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume, grows=("num_paths",))
+    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
     product = out / "path.json"
     if stage.is_complete:
         return product

@@ -22,7 +22,6 @@ from cosfly.errors import InputError, VerifyError
 from cosfly.reading.documents import FileFormat, read_json, read_model, read_object
 from cosfly.reading.files import files_named, sha256_file
 from cosfly.work.console import progress_bar
-from cosfly.work.journal import Journal
 from cosfly.work.store import CHECKSUMS, checksum_lines, dump_json, inside, read_checksums, sha256_bytes
 
 log = logging.getLogger(__name__)
@@ -47,8 +46,7 @@ class StageInput(_Record):
 
 
 class StageRecord(_Record):
-    """`stage.json`: what the folder was begun with. `grown_from` lists the sha256 of its products before more items
-    were added, which its product now begins with or holds unchanged.
+    """`stage.json`: what the folder was begun with.
 
     package_files: sha256 of what cosfly itself brings and a later version may bring otherwise, as prompts.
     """
@@ -59,7 +57,6 @@ class StageRecord(_Record):
     inputs: dict[str, StageInput]
     code_version: str
     package_files: dict[str, str] = Field({}, exclude_if=lambda digests: not digests)
-    grown_from: list[str] = Field([], exclude_if=lambda digests: not digests)
 
 
 class Output(_Record):
@@ -101,12 +98,6 @@ def fingerprint(path: Path) -> str:
     for file in files_named(path, FLIGHT):
         digest.update(f"{file.relative_to(path)} {sha256_file(file)}\n".encode())
     return digest.hexdigest()
-
-
-def has_grown_from(path: Path, digest: str) -> bool:
-    """Tell whether an input is what it was with that fingerprint, and more items."""
-    begun = _record_of(path)
-    return begun is not None and digest in begun.grown_from
 
 
 def folder_digests(folder: Path) -> dict[str, str]:
@@ -185,12 +176,6 @@ def _record_of(path: Path) -> StageRecord | None:
     return read_stage_record(folder) if folder is not None and _has_record(folder, *RECORDS[1]) else None
 
 
-def _kept_nothing(folder: Path) -> str | None:
-    """Say what became of the items of a stage that came to its end and dropped all of them; None of another one."""
-    items = {str(record.get("id")): str(record.get("status")) for record in Journal(folder / "items.jsonl").read()}
-    return f"{len(items)} items, all dropped" if items and set(items.values()) == {"dropped"} else None
-
-
 def _check_finished(path: Path) -> None:
     """Compare an input with the manifest of its stage: a file with its line, a folder with all of them."""
     folder = _stage_folder(path)
@@ -198,10 +183,6 @@ def _check_finished(path: Path) -> None:
         return
     for name, schema in RECORDS:
         if not _has_record(folder, name, schema):
-            if path.is_file() and (dropped := _kept_nothing(folder)):
-                what, expected = "the stage that made this kept nothing", "at least one item that was kept"
-                fix = f"see in {folder} why, mend that or change the stage's settings, and choose another --out"
-                raise VerifyError(what, where=path, got=dropped, expected=expected, fix=fix)
             what, got = "the stage that makes this is not finished, or its records are gone", f"no {name} in {folder}"
             fix = "run that stage again; to use what is there as it is, copy it to a folder of its own"
             raise VerifyError(what, where=path, got=got, expected=f"{name} of that stage", fix=fix)

@@ -30,10 +30,7 @@ from cosfly.work.provenance import (
     Output,
     StageRecord,
     checked_inputs,
-    fingerprint,
-    has_grown_from,
     read_stage_record,
-    recorded_digests,
 )
 from cosfly.work.stage_events import EVENTS, lost_steps
 from cosfly.work.store import (
@@ -188,14 +185,9 @@ class StageFolder:
         resume: Resume = "if-same",
         package_files: Mapping[str, Path] = MappingProxyType({}),
         audited: Collection[str] = (),
-        grows: Collection[str] = (),
-        begins_anew: bool = False,
         begun: Collection[str] = (),
     ) -> StageFolder:
         """Start or continue a stage.
-
-        A folder whose inputs have grown, and one whose settings in `grows` have, is gone on with: its items stay, more
-        are added.
 
         Args:
             config: the stage's settings; those that are MayDiffer are not put on record.
@@ -204,8 +196,6 @@ class StageFolder:
                 seed.
             package_files: name -> file or flat folder of the package that decides what is made.
             audited: names of inputs that the stage itself holds against their records, item by item.
-            grows: names of settings of which more means more items, those of before unchanged.
-            begins_anew: with grown inputs all items are other ones, so none of before is kept.
             begun: files and folders that the stage writes before anything is finished, beside those of every stage.
         """
         record = StageRecord(
@@ -220,12 +210,12 @@ class StageFolder:
             log.debug("%s: reads %s: %s", stage, name, path)
         if out.exists() and not out.is_dir():
             raise StorageError("the output folder is a file", where=out, fix="choose another --out")
-        if (out / "manifest.json").exists() and (complete := cls._complete(out, record, resume, grows)):
+        if (out / "manifest.json").exists() and (complete := cls._complete(out, record, resume)):
             return complete
         lock = hold_folder(out, nothing=("stage.json",))
         try:
             refuse_links(out)
-            record = _taken_up(out, record, resume, grows, begins_anew, (*BEGUN, *begun))
+            _take_up(out, record, resume, (*BEGUN, *begun))
             # Failed items are tried again; the others stand in the journal.
             (out / "manifest.json").unlink(missing_ok=True)
             write_model(out / "stage.json", record, STAGE_FORMAT)
@@ -236,10 +226,11 @@ class StageFolder:
         return cls(out, stage, False, lock)
 
     @classmethod
-    def _complete(cls, out: Path, record: StageRecord, resume: Resume, grows: Collection[str]) -> StageFolder | None:
+    def _complete(cls, out: Path, record: StageRecord, resume: Resume) -> StageFolder | None:
         """Give a folder that is complete as `record` says, which takes no lock; None where there is something to do."""
         manifest = read_manifest(out)
-        if _may_continue(out, record, resume, grows) or manifest.counts.failed:
+        _check_same(out, record, resume)
+        if manifest.counts.failed:
             return None
         _check_outputs_exist(out, manifest)
         remove_left_lock(out)
@@ -317,46 +308,30 @@ class StageFolder:
         )
 
 
-def _taken_up(
-    out: Path, record: StageRecord, resume: Resume, grows: Collection[str], begins_anew: bool, begun: Collection[str]
-) -> StageRecord:
-    """Make what stands in a folder ready to be gone on with; gives the record with what has grown noted."""
+def _take_up(out: Path, record: StageRecord, resume: Resume, begun: Collection[str]) -> None:
+    """Make what stands in a folder ready to be gone on with; ResumeError where it may not be."""
     if not (out / "stage.json").exists():
         # A kill may have come while the record was being written.
         if any(entry.name != LOCK and not is_partial_of("stage.json", entry) for entry in out.iterdir()):
             raise ResumeError(
                 "the output folder holds files that are not cosfly's", where=out, fix="choose an empty --out"
             )
-        return record
-    found = read_stage_record(out)
-    # An attempt that ended before anything was finished binds nobody to its settings, unless it grew from what was.
-    if not _holds_work(out, begun) and not found.grown_from:
+        return
+    # An attempt that ended before anything was finished binds nobody to its settings.
+    if not _holds_work(out, begun):
         # stage.json stays until the new one is written: without it a kill would leave what looks like foreign files.
         for path in (out / name for name in begun if name != "stage.json"):
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
-        return record
-    grown = _may_continue(out, record, resume, grows)
-    before = list(found.grown_from)
-    if grown:
-        log.info("%s: goes on with more: %s", out, "; ".join(grown))
-        if (out / "manifest.json").exists():
-            before += [d for d in (fingerprint(out), *recorded_digests(out).values()) if d not in before]
-            # While the manifest stands: once it is gone, nobody could say any more what the products of before were.
-            noted = found.model_copy(update={"grown_from": before})
-            write_model(out / "stage.json", noted, STAGE_FORMAT)
-        if begins_anew:
-            (out / "items.jsonl").unlink(missing_ok=True)
-    return record.model_copy(update={"grown_from": before})
+        return
+    _check_same(out, record, resume)
 
 
-def _may_continue(out: Path, record: StageRecord, resume: Resume, grows: Collection[str]) -> list[str]:
-    """See whether the work that stands in a folder may be continued as `record` says; gives what has only grown."""
+def _check_same(out: Path, record: StageRecord, resume: Resume) -> None:
+    """Raise ResumeError where the work in a folder may not be continued as `record` says."""
     found = read_stage_record(out)
     if resume == "never":
         raise ResumeError("the folder already holds work", where=out, fix="choose another --out, or --resume if-same")
-    grown = _grown(found, record, grows)
-    differences = [phrase for name, phrase in _differences(found, record) if name not in grown]
-    if differences:
+    if differences := _differences(found, record):
         raise ResumeError(
             "the folder holds work made with other settings or inputs",
             where=out,
@@ -365,7 +340,6 @@ def _may_continue(out: Path, record: StageRecord, resume: Resume, grows: Collect
         )
     if found.code_version != record.code_version:
         log.warning("%s: continued by version %s, begun by %s", out, record.code_version, found.code_version)
-    return list(grown.values())
 
 
 def _holds_work(out: Path, begun: Collection[str]) -> bool:
@@ -379,41 +353,23 @@ def _holds_work(out: Path, begun: Collection[str]) -> bool:
     )
 
 
-def _grown(found: StageRecord, wanted: StageRecord, grows: Collection[str]) -> dict[str, str]:
-    """Name what is more than it was and else the same: settings in `grows`, inputs whose stage has grown from what they
-    were."""
-    before, after = flattened(found.config), flattened(wanted.config)
-    grown = {
-        name: f"{name} was {before[name]!r}, is {after[name]!r}"
-        for name in grows
-        if isinstance(before.get(name), int) and isinstance(after.get(name), int) and after[name] > before[name]
-    }
-    for name in found.inputs.keys() & wanted.inputs.keys():
-        old, new = found.inputs[name], wanted.inputs[name]
-        if old.sha256 != new.sha256 and has_grown_from(Path(new.path), old.sha256):
-            grown[f"input {name}"] = f"the input {name} has grown"
-    return dict(sorted(grown.items()))
-
-
-def _differences(found: StageRecord, wanted: StageRecord) -> list[tuple[str, str]]:
-    """Say which settings, inputs or seed differ: a name and a phrase each."""
+def _differences(found: StageRecord, wanted: StageRecord) -> list[str]:
+    """Say which settings, inputs or seed differ."""
     before, after = flattened(found.config), flattened(wanted.config)
     changed = [
-        (key, f"{key} was {before.get(key)!r}, is {after.get(key)!r}")
+        f"{key} was {before.get(key)!r}, is {after.get(key)!r}"
         for key in sorted(before.keys() | after.keys())
         if before.get(key) != after.get(key)
     ]
     if found.seed != wanted.seed:
-        changed.append(("seed", f"seed was {found.seed}, is {wanted.seed}"))
+        changed.append(f"seed was {found.seed}, is {wanted.seed}")
     for name in sorted(found.inputs.keys() | wanted.inputs.keys()):
         old, new = found.inputs.get(name), wanted.inputs.get(name)
         if old is None or new is None or old.sha256 != new.sha256:
-            changed.append((f"input {name}", f"the input {name} ({new.path if new else 'none'}) has changed"))
+            changed.append(f"the input {name} ({new.path if new else 'none'}) has changed")
     both = found.package_files.keys() & wanted.package_files.keys()
     changed += [
-        (name, f"the {name} changed")
-        for name in sorted(both)
-        if found.package_files[name] != wanted.package_files[name]
+        f"the {name} changed" for name in sorted(both) if found.package_files[name] != wanted.package_files[name]
     ]
     return changed
 

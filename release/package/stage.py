@@ -71,8 +71,7 @@ def run(
     inputs = {
         name: source.files[role] for source, roles in zip(sources, names, strict=True) for role, name in roles.items()
     }
-    # With more flights splits and shards are others.
-    stage = StageFolder.open(out, "release", config=cfg, inputs=inputs, seed=0, resume=resume, begins_anew=True)
+    stage = StageFolder.open(out, "release", config=cfg, inputs=inputs, seed=0, resume=resume)
     dataset, parts = out / DATASET, out / PARTS
     if stage.is_complete:
         shutil.rmtree(parts, ignore_errors=True)
