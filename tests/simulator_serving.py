@@ -28,8 +28,8 @@ def free_port() -> int:
 
 def command(town: Path, port: int, *faults: str, protocol: str = "carla") -> list[str]:
     told = [word for fault in faults for word in ("--fault", fault)]
-    words = ["sim", "serve", str(town), "--port", str(port), "--protocol", protocol]
-    return [sys.executable, "-m", "cosfly", *words, *told]
+    simulators = str(Path(__file__).with_name("simulators"))
+    return [sys.executable, simulators, str(town), "--port", str(port), "--protocol", protocol, *told]
 
 
 @contextlib.contextmanager

@@ -11,6 +11,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from simulator_serving import free_port, serving
+from simulators import unrealcv_server
+from simulators.scene import Fault
+from simulators.unrealcv_server import UnrealCvServer
 from test_renderers_contract import street
 from typer.testing import CliRunner
 
@@ -22,9 +25,6 @@ from cosfly.maps.synthetic import load as invent
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig, level_map
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.kinds import KINDS
-from cosfly.simulators.serving import Fault
-from cosfly.simulators.unrealcv import server as server_module
-from cosfly.simulators.unrealcv.server import FAULTS, UnrealCvServer
 from cosfly.unreal.assets import id_of, kind_of
 
 pytest.importorskip("unrealcv")
@@ -34,7 +34,7 @@ pytest.importorskip("unrealcv")
 def beside(box_map: BoxMap, *faults: str):
     """A server in a thread of this process; gives its port."""
     port = free_port()
-    server = UnrealCvServer(box_map, "127.0.0.1", port, [Fault.of(text, FAULTS) for text in faults])
+    server = UnrealCvServer(box_map, port, [Fault.of(text) for text in faults])
     threading.Thread(target=server.serve, daemon=True).start()
     yield port
 
@@ -113,7 +113,7 @@ def test_a_server_that_is_not_there_silent_old_or_another_is_named(monkeypatch):
         with pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port}.*does not greet"):
             unrealcv_export.load(UnrealCvMapConfig(port=port, timeout_s=0.5), 0)
     for version in ("0.3.10", "error Can not find a handler"):
-        monkeypatch.setattr(server_module, "VERSION", version)
+        monkeypatch.setattr(unrealcv_server, "VERSION", version)
         with (
             beside(street()) as port,
             pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port}.*{version}.*0\.4\.0"),

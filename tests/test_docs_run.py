@@ -12,7 +12,6 @@ import json
 import re
 import shlex
 import shutil
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from typing import Any
 
 import pytest
 import yaml
-from simulator_serving import free_port, listening, serving
+from simulator_serving import serving
 from specimens_foreign import write_foreign_tree
 from specimens_slopes import sloped_city
 from teacher_server import TeacherServer
@@ -123,8 +122,7 @@ class Place:
         """The words of a command as a shell gives them on, with what is small in place of what is large."""
         text = text.replace("http://localhost:8000", self.teacher)
         for told, port_here in self.ports.items():
-            port = free_port() if text.startswith("sim serve") else port_here
-            text = re.sub(rf"(port[ =]){told}\b", rf"\g<1>{port}", text)
+            text = re.sub(rf"(port[ =]){told}\b", rf"\g<1>{port_here}", text)
         words = [part for word in shlex.split(text, comments=True) for part in (sorted(glob.glob(word)) or [word])]
         small = max((name for name in SMALL if text.startswith(f"{name} ")), key=len, default=None)
         return options_first([*words, *SMALL.get(small or "", [])])
@@ -303,9 +301,6 @@ def test_every_command_runs(place, in_this_process, room_on_the_disk):
         place.make(text)
         place.clear(text)
         start = time.monotonic()
-        if text.startswith("sim serve"):  # it never ends; the page's other commands have a server of the right town
-            with listening([sys.executable, "-m", "cosfly", *place.words(text)]):
-                continue
         result = CliRunner().invoke(app, place.words(text))
         print(f"{time.monotonic() - start:6.1f} s, {result.exit_code}: {page}: cosfly {text}", flush=True)
         if result.exit_code:

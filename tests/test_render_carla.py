@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from simulator_serving import as_client, command, free_port, listening, serving
+from simulators.scene import clothes_of
 from test_renderers_contract import circling, street, write_inputs
 
 from cosfly.errors import ConfigError, EnvironmentMissing, InputError, RenderError
@@ -28,7 +29,6 @@ from cosfly.render.carla_backend import CarlaRenderConfig
 from cosfly.render.contract import PERSON_ID, PosedPerson
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
-from cosfly.simulators.scene import clothes_of
 from cosfly.unreal.conventions import DEPTH_STEP_M
 from cosfly.work.config import build
 from cosfly.work.runner import Watch
@@ -349,11 +349,14 @@ def test_a_killed_client_leaves_the_world_as_it_was_found(tmp_path):
 def test_a_server_of_another_version_is_refused_by_name(tmp_path):
     write_boxes(tmp_path / "boxes_3d.json", street())
     port = free_port()
-    old = "import sys; from cosfly.simulators.carla import server; server.CARLA_VERSION = '0.9.15'; "
+    old = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); from simulators import carla_server; "
+        "carla_server.CARLA_VERSION = '0.9.15'; from simulators.__main__ import main; main()"
+    )
     words = command(tmp_path / "boxes_3d.json", port)
     told = rf"127\.0\.0\.1:{port}: a CARLA server of another version; got 0\.9\.15; expected 0\.9\.16"
     cfg = build(CarlaRenderConfig, {"port": port, **QUICK}, "test")
-    with listening([sys.executable, "-c", old + "from cosfly.cli import app; app()", *words[3:]]):
+    with listening([sys.executable, "-c", old, *words[2:]]):
         with pytest.raises(EnvironmentMissing, match=told):
             open_renderer("carla", street(), 160, 90, settings=cfg)
         with pytest.raises(EnvironmentMissing, match=told):

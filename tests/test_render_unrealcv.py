@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from simulator_serving import command, free_port, serving
+from simulators.scene import clothes_of
+from simulators.unrealcv_server import UnrealCvServer
 from test_cosfly_maps_unrealcv import beside
 from test_render_carla import FRAMES, files_of, flown, pictures_of
 from test_renderers_contract import street
@@ -29,8 +31,6 @@ from cosfly.render.contract import PERSON_ID, PosedCar, PosedOther, PosedPerson,
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.render.unrealcv_backend import UnrealCvRenderConfig
-from cosfly.simulators.scene import clothes_of
-from cosfly.simulators.unrealcv.server import UnrealCvServer
 from cosfly.unreal.assets import id_of
 from cosfly.unreal.unrealcv_client import UnrealCvConfig, connect
 from cosfly.work.config import build

@@ -1,4 +1,4 @@
-"""The server of `cosfly sim serve`, through the unmodified client of CARLA 0.9.16 over a real socket."""
+"""The CARLA server of the tests, through the unmodified client of CARLA 0.9.16 over a real socket."""
 
 from __future__ import annotations
 
@@ -8,15 +8,12 @@ from concurrent.futures.process import BrokenProcessPool
 
 import numpy as np
 import pytest
-from simulator_serving import as_client, free_port, serving
+from simulator_serving import as_client, serving
 from test_renderers_contract import street
 
-from cosfly.errors import ConfigError, EnvironmentMissing
 from cosfly.geometry import intrinsic_matrix, world_from_camera
 from cosfly.products.kinds import KINDS
 from cosfly.render.stage import open_renderer
-from cosfly.simulators.carla.server import FAULTS, CarlaServer
-from cosfly.simulators.serving import Fault
 from cosfly.unreal.conventions import (
     DEPTH_STEP_M,
     camera_rotation_deg,
@@ -221,12 +218,3 @@ def test_a_malformed_stream_ends_the_clients_process_not_the_servers(tmp_path):
         with pytest.raises(BrokenProcessPool):
             as_client(frames_of, port, 4)
         assert as_client(frames_of, port, 2)[0] == [1, 2]
-
-
-def test_a_fault_that_is_none_and_a_port_that_is_taken_are_told(tmp_path):
-    with pytest.raises(ConfigError, match=r"no such fault.*explode.*drop, delay"):
-        Fault.of("explode@3", FAULTS)
-    port = free_port()
-    CarlaServer(street(), "127.0.0.1", port, [])
-    with pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port}: cannot listen"):
-        CarlaServer(street(), "127.0.0.1", port, [])

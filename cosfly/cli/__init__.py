@@ -21,7 +21,6 @@ from cosfly.cli.distill import app as distill_app
 from cosfly.cli.fly import app as fly_app
 from cosfly.cli.release import app as release_app
 from cosfly.cli.run import app as run_app
-from cosfly.cli.sim import app as sim_app
 from cosfly.cli.stages import app as stages_app
 from cosfly.cli.studies import app as studies_app
 from cosfly.cli.view import app as view_app
@@ -67,7 +66,6 @@ for name, named_group in (
     ("caption", caption_app),
     ("distill", distill_app),
     ("release", release_app),
-    ("sim", sim_app),
     ("study", studies_app),
 ):
     app.add_typer(named_group, name=name)

@@ -1,13 +1,11 @@
-"""The server: text commands and their answers at one port, one client at a time, and faults that can be planted.
+"""An UnrealCV server: text commands and their answers at one port, one client at a time. One thread answers.
 
-A level of boxes, each an object of class KIND_C; people and vehicles that are spawned; camera 0. Depth is what UnrealCV
-sends: z-depth in centimetres, rounded to half precision.
+A box is an object KIND_ID of class KIND_C. Depth is z-depth in centimetres, rounded to half precision.
 """
 
 from __future__ import annotations
 
 import io
-import logging
 import os
 import queue
 import re
@@ -26,26 +24,20 @@ from cosfly.products.kinds import KIND_NAMES, KINDS
 from cosfly.products.others import BUILDS
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.contract import Frame
-from cosfly.simulators.scene import MOST_MOVERS, Mover, ServedScene
-from cosfly.simulators.serving import Fault, due, listen, send
 from cosfly.unreal.assets import is_person
 from cosfly.unreal.conventions import CM_PER_M, FAR_CM, unreal_pose
-
-log = logging.getLogger(__name__)
+from simulators.scene import Fault, Mover, ServedScene, due, listen, send
 
 MAGIC = 0x9E2B83C1  # before each message, with its length
-MOST_BYTES = 1 << 20  # of a command
 VERSION = "1.1.0"
-FAULTS = ("drop", "delay", "duplicate", "malformed", "hang", "die")  # simulators.md
-PICTURES = ("lit", "depth", "object_mask")
 GROUND = "Landscape_0"  # the plane under everything
-WALK_CM_S = 140.0  # of a person whose speed nobody sets
+WALK_CM_S = 140.0  # default speed of a person
 
 
 class UnrealCvServer:
-    """A level behind a port. `serve` works until the process ends."""
+    """A level behind a port."""
 
-    def __init__(self, town: BoxMap, host: str, port: int, faults: list[Fault]) -> None:
+    def __init__(self, town: BoxMap, port: int, faults: list[Fault]) -> None:
         self.town, self.faults, self.num_lit = town.name, faults, 0
         self._scene, self._map = ServedScene(town), town
         names = [f"{KIND_NAMES[int(kind)]}_{number}" for kind, number in zip(town.kinds, town.ids, strict=True)]
@@ -56,23 +48,19 @@ class UnrealCvServer:
         self._since_s, self._paused = time.monotonic(), False
         self._commands = self._make_commands()
         self._one, self._asked = threading.Lock(), queue.SimpleQueue[tuple[socket.socket, str, str]]()
-        listen(host, port, self._talk)
+        listen(port, self._talk)
 
     def serve(self) -> None:
-        """Answer in this one thread, which draws."""
         while True:
             self._answer(*self._asked.get())
 
-    # --- messages -----------------------------------------------------------------------------------------------------
-
     def _talk(self, connection: socket.socket) -> None:
-        with self._one:  # the next client is greeted when this one is gone
+        with self._one, connection.makefile("rb") as stream:  # the next client is greeted when this one is gone
             send(connection, _framed(f"connected to {self.town}".encode()))
-            while head := _exactly(connection, 8):
-                magic, length = struct.unpack("<II", head)
-                if magic != MAGIC or length > MOST_BYTES:
-                    return
-                number, _, command = _exactly(connection, length).decode("utf-8", "replace").partition(":")
+            while len(head := stream.read(8)) == 8:
+                number, _, command = (
+                    stream.read(struct.unpack("<II", head)[1]).decode("utf-8", "replace").partition(":")
+                )
                 self._asked.put((connection, number, command))
 
     def _answer(self, connection: socket.socket, number: str, command: str) -> None:
@@ -95,7 +83,7 @@ class UnrealCvServer:
         return due(self.faults, name, self.num_lit, sensor)
 
     def _done(self, command: str) -> bytes:
-        """Do one command; what comes out is text, or a picture's bytes."""
+        """Do one command and return its text, or the bytes of a picture."""
         if not (self._paused and command.startswith("vget")):
             self._scene.forget()
         for pattern, do in self._commands:
@@ -105,20 +93,15 @@ class UnrealCvServer:
                 except (KeyError, ValueError) as error:
                     answer = f"error {error}"
                 return answer if isinstance(answer, bytes) else str("ok" if answer is None else answer).encode()
-        log.info("not known: %s", command)
         return b"error Can not find a handler for URI"
 
     def _make_commands(self) -> list[tuple[re.Pattern, Callable[..., Any]]]:
-        """What it can, by UnrealCV's templates."""
-        camera, floats = self._camera, lambda *texts: [float(text) for text in texts]
+        camera = self._camera
         table: dict[str, Callable[..., Any]] = {
-            "vget /unrealcv/commands": lambda: "\n".join(sorted(table)),
-            "vget /unrealcv/status": lambda: f"Is Listening\nClient Connected\n{self.town}",
             "vget /unrealcv/version": lambda: VERSION,
             "vget /level/name": lambda: self.town,
             "vset /action/game/level [str]": self._open,
-            "vset /action/game/pause": lambda: self._pause(True),
-            "vset /action/game/resume": lambda: self._pause(False),
+            "vset /action/game/(pause|resume)": self._pause,
             "vget /objects": lambda: " ".join([*self._rows, GROUND, *self._movers]),
             "vget /object/[str]/uclass_name": self._class,
             "vget /object/[str]/bounds": lambda name: _text(*(CM_PER_M * part for part in self._bounds(name))),
@@ -140,7 +123,7 @@ class UnrealCvServer:
             "vget /camera/0/rotation": lambda: _text(*camera["pose"][3:]),
             "vget /camera/0/fov": lambda: _text(camera["fov"]),
             "vget /camera/0/size": lambda: "{} {}".format(*camera["size"]),
-            f"vset /camera/0/pose {' '.join(['[float]'] * 6)}": lambda *to: camera.update(pose=floats(*to)),
+            f"vset /camera/0/pose{' [float]' * 6}": lambda *to: camera.update(pose=[float(text) for text in to]),
             "vset /camera/0/fov [float]": lambda fov: camera.update(fov=float(fov)),
             "vset /camera/0/size [uint] [uint]": lambda *size: camera.update(size=tuple(map(int, size))),
             "vget /camera/0/lit png": lambda: _png(self._frame().rgb[..., ::-1]),
@@ -148,10 +131,7 @@ class UnrealCvServer:
             "vget /camera/0/depth npy": lambda: _npy(np.minimum(self._frame().depth * CM_PER_M, FAR_CM)),
         }
         words = {"[str]": r"(\S+)", "[float]": r"(-?[\d.]+(?:e[+-]?\d+)?)", "[uint]": r"(\d+)"}
-        patterns = [re.sub(r"\[\w+\]", lambda word: words[word[0]], template) for template in table]
-        return list(zip(map(re.compile, patterns), table.values(), strict=True))
-
-    # --- the level ----------------------------------------------------------------------------------------------------
+        return [(re.compile(re.sub(r"\[\w+\]", lambda w: words[w[0]], text)), do) for text, do in table.items()]
 
     def _open(self, name: str) -> None:
         if name != self.town:
@@ -164,7 +144,7 @@ class UnrealCvServer:
         return "Terrain_C" if name == GROUND else f"{KIND_NAMES[int(self._map.kinds[self._rows[name]])]}_C"
 
     def _bounds(self, name: str) -> list[float]:
-        """Lowest and highest corner in Unreal's axes, m."""
+        """Return the lowest and the highest corner in Unreal's axes, m."""
         if name == GROUND:
             (x, y, z), half = self._map.bounds()[0], 5e3
             return [x - half, -y - half, z - 10.0, x + half, -y + half, z]
@@ -175,20 +155,14 @@ class UnrealCvServer:
         return [x0, -y1, z0, x1, -y0, z1]
 
     def _pose(self, name: str) -> list[float]:
-        """Of a box where its foot is; m."""
-        if name in self._movers:
-            return self._movers[name].pose
-        if name == GROUND:
-            return [0.0] * 6
+        """Return a pose in m; of a box the pose of its bottom."""
+        if name in self._movers or name == GROUND:
+            return self._movers[name].pose if name in self._movers else [0.0] * 6
         row = self._rows[name]
         pose = unreal_pose(self._map.centers[row], np.asarray(self._map.rotations_deg[row]))
         return [*pose[:2], float(self._map.mins[row, 2]), *pose[3:]]
 
-    # --- who moves ----------------------------------------------------------------------------------------------------
-
     def _spawn(self, path: str, name: str) -> str:
-        if name in self._rows or name in self._movers or len(self._movers) >= MOST_MOVERS:
-            raise ValueError(f"Failed to spawn {name}, object exists, or there are {MOST_MOVERS}")
         walks, model = is_person(path), path.rpartition(".")[2]
         half_m = PERSON_HALF_EXTENTS_M if walks else BUILDS["Car"].half_extents_m
         self._movers[name] = Mover(model=model, is_person=walks, half_extents_m=half_m, pose=[0.0] * 6)
@@ -199,8 +173,6 @@ class UnrealCvServer:
         del self._movers[name], self._colors[name]
 
     def _paint(self, name: str, *color: str) -> None:
-        if name not in self._colors:
-            raise KeyError(name)
         self._colors[name] = tuple(int(part) & 0xFF for part in color)
 
     def _move(self, name: str, first: int, to: tuple[str, ...]) -> None:
@@ -209,7 +181,7 @@ class UnrealCvServer:
         self._movers[name].pose[first : first + 3] = [float(part) / scale for part in to]
 
     def _lead(self, name: str, speed_cm_s: float | None) -> None:
-        """Have a person walk on as it looks; None: as fast as it was told last."""
+        """Let a person walk in its direction; None: at its speed."""
         self._pass_time()
         mover = self._movers[name]
         if speed_cm_s is None:
@@ -218,9 +190,9 @@ class UnrealCvServer:
             speed_cm_s = mover.speed_mps * CM_PER_M or WALK_CM_S
         mover.speed_mps = speed_cm_s / CM_PER_M
 
-    def _pause(self, paused: bool) -> None:
+    def _pause(self, word: str) -> None:
         self._pass_time()
-        self._paused = paused
+        self._paused = word == "pause"
 
     def _pass_time(self) -> None:
         now_s = time.monotonic()
@@ -228,26 +200,23 @@ class UnrealCvServer:
             mover.step(now_s - self._since_s)
         self._since_s = now_s
 
-    # --- what is seen -------------------------------------------------------------------------------------------------
-
     def _frame(self) -> Frame:
         self._pass_time()
         pose = [part / scale for part, scale in zip(self._camera["pose"], [CM_PER_M] * 3 + [1.0] * 3, strict=True)]
         return self._scene.draw(self._camera["size"], self._camera["fov"], pose, list(self._movers.values()))
 
     def _mask(self) -> np.ndarray:
-        """Every object in its colour, BGR; the sky in none."""
+        """Return every object in its colour, BGR; the sky in none."""
         frame, movers = self._frame(), list(self._movers.values())
-        names = [*self._rows, *self._movers, GROUND]
-        colors = np.array([self._colors[name] for name in names], dtype=np.uint8)
+        colors = np.array([self._colors[name] for name in (*self._rows, *self._movers, GROUND)], dtype=np.uint8)
         mask = colors[self._scene.owners(frame.ids, movers)]
         mask[frame.kinds == KINDS["Sky"]] = 0
         return mask[..., ::-1]
 
 
 def _color(number: int) -> tuple[int, ...]:
-    """A colour of its own for each number up to 2 ** 24, the low ones far apart."""
-    number = number * 0x9E3779B1 & 0xFFFFFF  # odd: every one is met once
+    """Return a distinct colour for each number up to 2 ** 24, the low ones far apart."""
+    number = number * 0x9E3779B1 & 0xFFFFFF  # odd: a permutation
     return number >> 16, number >> 8 & 0xFF, number & 0xFF
 
 
@@ -268,14 +237,3 @@ def _npy(depth_cm: np.ndarray) -> bytes:
 
 def _framed(payload: bytes) -> bytes:
     return struct.pack("<II", MAGIC, len(payload)) + payload
-
-
-def _exactly(connection: socket.socket, num_bytes: int) -> bytes:
-    """Read so many bytes; none where the client is gone."""
-    data = b""
-    while len(data) < num_bytes:
-        part = connection.recv(num_bytes - len(data))
-        if not part:
-            return b""
-        data += part
-    return data

@@ -1,1 +1,0 @@
-"""UnrealCV's protocol, as an unmodified client of the package `unrealcv` speaks it."""
