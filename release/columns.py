@@ -41,7 +41,6 @@ from cosfly.work.store import dump_json
 POSE = ("x_m", "y_m", "z_m", "pitch_deg", "yaw_deg", "roll_deg")
 POINT = ("x_m", "y_m", "z_m")
 INTRINSICS = ("fx", "fy", "cx", "cy")
-DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 LOOK = tuple(Look.model_fields)
 WEATHER_PARAMS = tuple(WeatherParams.model_fields)
 BOX = ("xmin_px", "ymin_px", "xmax_px", "ymax_px")
@@ -71,8 +70,6 @@ CONTRACT: dict[str, Any] = {
     "camera": "pose is the camera's; image x right, y down, z along the optical axis; pixel (0, 0) is the corner, "
     "the centre of the first pixel is (0.5, 0.5)",
     "projection": "u = fx * x / z + cx, v = fy * y / z + cy for a point (x, y, z) in camera axes",
-    "distortion": "of `image` alone: k1, k2, p1, p2, k3 of OpenCV's model with `intrinsics`, zeros of a pinhole; "
-    "depth, instance, boxes and pixels of the target are the pinhole's, to which cv2.undistort brings the image",
     "depth": f"z-depth along the optical axis, metres, float32; {SKY_DEPTH_M:g} sky, {INVALID_DEPTH_M:g} invalid",
     "instance": "PNG; R semantic number (CARLA 0.9.16 CityObjectLabel), G low and B high byte of the instance id",
     "target": "hip of the tracked person; target_heading_deg, whither it walks, as yaw; null before its first step",
@@ -316,7 +313,6 @@ FRAME = (  # everything of a frame but pictures and depth
         "intrinsics", INTRINSICS, lambda f, i: f.camera_at(i).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]], required=True,
         constant=True,
     ),
-    Column("distortion", DISTORTION, lambda f, i: np.array(f.distortion), required=True, constant=True),
     Column(
         "pose", POSE, lambda f, i: np.concatenate([f.positions_m[i], f.rotations_deg[i]]),
         ranges={"pitch_deg": (-90.0, 90.0), "yaw_deg": (-360.0, 360.0), "roll_deg": (-180.0, 180.0)},

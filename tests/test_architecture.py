@@ -17,7 +17,7 @@ STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")
 # From the ground up: a room may import what stands before it, and itself; stages do not import each other, nor do
 # siblings.
 ROOMS = ("root", "reading", "work", "products", "space", "look", "chat", "unreal", "stages", "siblings", "app", "cli")
-ASSEMBLY = ("app", "closed_loop", "envs", "simulators", "studies", "worlds")  # what may know all stages and siblings
+ASSEMBLY = ("app", "closed_loop", "envs", "studies", "worlds")  # what may know all stages and siblings
 HEAVY = {
     *("torch", "transformers", "peft", "accelerate", "bert_score", "datasets"),
     *("vllm", "pyrender", "trimesh", "carla", "ray"),
@@ -164,7 +164,6 @@ ALLOWED_TO_READ = {
     ("cosfly.products.png", "decompress"),  # of a picture, up to the size that its header gives
     ("cosfly.chat.protocol", "loads"),  # the reply, of a bounded size
     ("cosfly.closed_loop.policy", "loads"),  # the answer of a process that it started, of a bounded size
-    ("cosfly.render.effects", "imdecode"),  # a picture that we made, for its losses
     ("cosfly.chat.wire", "decompress"),  # of a reply, up to that size
     ("distill.student.random_student", "loads"),  # what the tokenizer's own library gives
     ("distill.student.checkpoint", "load_file"),  # tensors, whose checksums were compared

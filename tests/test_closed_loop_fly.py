@@ -228,7 +228,7 @@ def test_a_student_is_asked_with_the_very_prompts_that_it_was_taught_with(town, 
         ("--student ruels", "did you mean"),
         ("--student rules --adapter x", "transformers"),
         ("--set fly.controller=nowhere.yaml", "nowhere.yaml"),
-        ("--set render.effects.noise=2", "render.effects"),
+        ("--set render.frame_stride=2", "render.frame_stride"),
         ("--student http://127.0.0.1:9/v1", "cannot reach"),
     ],
 )

@@ -168,9 +168,6 @@ def test_a_town_is_what_its_map_was_made_with(record):
     assert "of a real place" in delft
     assert "no real place" not in delft
     assert "no sensor noise, motion blur, lens distortion or rolling shutter" in delft
-    seen = render_card(with_stages(record, ("render", {"effects": {"noise": 2.0}})))
-    assert "noise, motion blur, a lens, compression, is of a model" in seen
-    assert "no sensor noise" not in seen
     odd = render_card(with_stages(record, ("maps", {"source": "another"}), ("render", {})))
     assert "made elsewhere; what it shows is not known" in odd
 

@@ -171,9 +171,9 @@ def run(
         ConfigError: settings that cannot be flown. InputError: a file is not what it must be. NothingKept: no walk has
             a plan. TeacherError: the student's engine cannot be used.
     """
-    if cfg.render.effects.is_on or cfg.render.frame_stride != 1:
-        what, got = "a camera that cannot be flown with", "render.effects, or render.frame_stride beyond 1"
-        raise ConfigError(what, where="render", got=got, fix="leave them out: frames are drawn plain, each pose")
+    if cfg.render.frame_stride != 1:
+        what, got = "a camera that cannot be flown with", "render.frame_stride beyond 1"
+        raise ConfigError(what, where="render", got=got, fix="leave it out: every pose is drawn")
     read_controls(cfg.fly.table, vocabulary_of(cfg.caption).actions.tokens)
     how: dict[str, Any] = {"seed": seed, "workers": workers, "watch": watch, "resume": resume}
     inputs = {"boxes": boxes, "simplified": simplified, "paths": paths} | ({"others": others} if others else {})

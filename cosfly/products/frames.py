@@ -175,11 +175,9 @@ class CameraMeta(_Group):
     intrinsic: list[list[float]]
     near_m: float
     far_m: float
-    # Of rgb.png alone: k1, k2, p1, p2, k3 of OpenCV's model; absent where the lens bends nothing.
-    distortion: tuple[float, float, float, float, float] | None = Field(None, exclude_if=lambda value: value is None)
 
 
-def camera_meta(camera: Camera, near_m: float, far_m: float, distortion: tuple[float, ...] | None = None) -> CameraMeta:
+def camera_meta(camera: Camera, near_m: float, far_m: float) -> CameraMeta:
     """Give what a frame says of its camera; clip planes in m."""
     return CameraMeta(
         width=camera.width_px,
@@ -190,7 +188,6 @@ def camera_meta(camera: Camera, near_m: float, far_m: float, distortion: tuple[f
         intrinsic=camera.intrinsic.tolist(),
         near_m=near_m,
         far_m=far_m,
-        distortion=distortion,  # type: ignore[arg-type]
     )
 
 

@@ -209,12 +209,6 @@ class Flight:
         except ValidationError:
             return None
 
-    @property
-    def distortion(self) -> list[float]:
-        """How the lens bends `rgb.png`: k1, k2, p1, p2, k3 of OpenCV's model; zeros where the file says nothing."""
-        told = object_of(self.raw, "camera").get("distortion")
-        return told if isinstance(told, list) and len(told) == 5 and all(map(is_number, told)) else [0.0] * 5
-
     def told_legibility(self, index: int) -> dict[str, float | bool | None]:
         """Give what a point tells of LEGIBILITY; None where it says nothing."""
         points = self.raw.get("points", [])

@@ -9,7 +9,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from cosfly.errors import RenderError
@@ -36,7 +35,6 @@ from cosfly.render.camera import (
     view_target,
 )
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
-from cosfly.render.effects import Effects, bent
 from cosfly.render.goal import MOST_TRIED, find_goal
 from cosfly.render.person import Cast, Gait
 from cosfly.render.perturbation import HIDDEN, STEP_UP_M, PerturbedTrack, Poses, Surroundings
@@ -96,13 +94,7 @@ class FlightScript:
     segments: tuple[Segment, ...] = ()
     mission: Mission | None = None
     weather: WeatherRecord | None = None  # in the place of `look`
-    effects: Effects | None = None
     between: np.ndarray | None = None  # planned poses that are not drawn (Flight.between)
-
-    @property
-    def distortion(self) -> tuple[float, ...] | None:
-        """k1, k2, p1, p2, k3 of the lens; None of one that bends nothing."""
-        return None if self.effects is None else self.effects.cfg.distortion
 
 
 @dataclass(frozen=True)
@@ -234,14 +226,9 @@ def _with_goal(flight: Flight, renderer: Renderer, script: FlightScript, thresho
 def _write_frame(
     folder: Path, frame: Frame, meta: FrameMeta, writing: Writing, script: FlightScript
 ) -> tuple[TargetMeta, dict[str, str]]:
-    """Encode and write one frame, as the camera has it, beside the drawing; gives the target's annotation, and file
+    """Encode and write one frame beside the drawing; gives the target's annotation, and file
     name -> sha256."""
     name, is_person = frame_name(meta.index), frame.ids == PERSON_ID
-    if script.effects is not None:
-        camera = script.cameras[meta.index]
-        frame = replace(frame, rgb=script.effects.apply(frame.rgb, frame.depth, camera, meta.index))
-        if script.distortion is not None:
-            is_person = bent(is_person.astype(np.uint8), camera.intrinsic, script.distortion, cv2.INTER_NEAREST) > 0
     person = meta.target.model_copy(update=legibility(meta.target, contrast_of(frame.rgb, is_person)))
     meta = meta.model_copy(update={"target": person})
     makers: dict[FrameFile, Callable[[], tuple[str, bytes]]] = {
@@ -274,7 +261,7 @@ def annotation(script: FlightScript, i: int, seen: TargetSight) -> FrameMeta:
         town=script.town,
         trajectory=script.trajectory,
         variant=script.variant,
-        camera=frames.camera_meta(script.cameras[i], NEAR_M, FAR_M, script.distortion),
+        camera=frames.camera_meta(script.cameras[i], NEAR_M, FAR_M),
         drone_pose=frames.tree_pose(perturbed.poses.positions_m[i], perturbed.poses.rotations_deg[i]),
         target=TargetMeta(
             world_location=frames.tree_position(perturbed.poses.targets_m[i]),
@@ -350,7 +337,6 @@ def _flight(script: FlightScript, targets: list[TargetMeta], visibility: np.ndar
         is_original=script.is_original,
         raw={
             **({} if script.weather is None else {"weather": script.weather.model_dump()}),
-            **({} if script.distortion is None else {"camera": {"distortion": list(script.distortion)}}),
             "points": [
                 {"perturbation": dict(state), "target": target.model_dump(include=set(LEGIBILITY)), **others}
                 for state, target, others in zip(perturbed.states, targets, company, strict=True)

@@ -11,7 +11,6 @@ from cosfly.products.places import folder_name
 from cosfly.reading.arrays import LONGEST_SIDE_PX
 from cosfly.reading.meshes import MOST_TRIANGLES
 from cosfly.render.carla_backend import CarlaRenderConfig
-from cosfly.render.effects import EffectsConfig
 from cosfly.render.lens import ZoomConfig
 from cosfly.render.perturbation import PerturbationConfig
 from cosfly.render.unrealcv_backend import UnrealCvRenderConfig
@@ -78,7 +77,6 @@ class RenderConfig(WeatherConfig):
     debug: bool = Field(
         False, description="also write debug.png: boxes, ids and distances projected over the colour picture"
     )
-    effects: EffectsConfig = Field(EffectsConfig(), description="what a camera does to the colours after drawing")
     rim: bool = Field(
         False,
         description="draw fields, roads, low houses and a skyline beyond the map, in place of a lawn to the horizon; "
@@ -103,8 +101,8 @@ class RenderConfig(WeatherConfig):
         return getattr(self, self.backend, None)
 
     def recorded(self) -> dict[str, Any]:
-        """Without effects, a rim, a flight alone, or a renderer of settings of its own, they are those of before."""
-        used = {"effects": self.effects.is_on, "rim": self.rim, "path_index": self.path_index is not None}
+        """Without a rim, a flight alone, or a renderer of settings of its own, they are those of before."""
+        used = {"rim": self.rim, "path_index": self.path_index is not None}
         used |= {name: self.backend == name for name in ENGINES}
         return {name: value for name, value in super().recorded().items() if used.get(name, True)}
 

@@ -30,7 +30,6 @@ from cosfly.products.walks import pace_field
 from cosfly.products.weather import WeatherRecord
 from cosfly.reading.meshes import MOST_TRIANGLES
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids, other_id
-from cosfly.render.effects import Effects
 from cosfly.render.flight import FlightScript, Writing, check_flight, render_flight
 from cosfly.render.lens import cameras_of
 from cosfly.render.person import cast_of, choose_clothes, gait_of
@@ -147,9 +146,6 @@ def script_flight(
         segments=trace.segments,
         mission=trace.mission,
         between=planned.between(cfg.frame_stride),
-        effects=Effects(cfg.effects, poses, trace.time_s, seed, f"{trace.path_id}/{VARIANTS[track]}")
-        if cfg.effects.is_on and track in cfg.effects.tracks
-        else None,
         source={
             "path_index": number,
             "scenario_id": trace.path_id,

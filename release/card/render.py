@@ -74,7 +74,6 @@ def render_card(record: ReleaseRecord) -> str:
         front_matter=_front_matter(record),
         ours=[source.run for source in record.provenance.sources if _is_rendered_by_us(source)],
         others=[source.run for source in record.provenance.sources if not _is_rendered_by_us(source)],
-        effects=any("effects" in stage.config for one in record.provenance.sources for stage in one.stages),
         map_kinds=by_kind,
         first_split=first_split(record),
         frames_by={title: getattr(numbers.frames_by, name) for name, title in FRAMES_BY.items()},

@@ -164,7 +164,7 @@ def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight
             **pace_field(rows[0]["pace"]),
         },
         goal=_goal(found, placed),
-        raw={"points": [_point(row) for row in rows]} | _weather(rows[0]) | _lens(rows[0]),
+        raw={"points": [_point(row) for row in rows]} | _weather(rows[0]),
     )
 
 
@@ -185,11 +185,6 @@ def _point(row: Row) -> dict[str, Any]:
     others = dict(zip(COMPANY, (row[name] for name in COMPANY_COLUMNS), strict=True))
     point = {"perturbation": told, "target": target, "others": others if others["in_view"] is not None else {}}
     return {name: one for name, one in point.items() if one}
-
-
-def _lens(row: Row) -> dict[str, Any]:
-    bent = list(row["distortion"].values())
-    return {"camera": {"distortion": bent}} if any(bent) else {}
 
 
 def _weather(row: Row) -> dict[str, Any]:

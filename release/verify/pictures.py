@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from cosfly.errors import InputError
@@ -15,10 +14,9 @@ from cosfly.products.kinds import KINDS
 from cosfly.products.png import parse_png
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.camera import contrast_of
-from cosfly.render.effects import bent
 from cosfly.space.reprojection import COLUMNS, FLAT, GRID_ROWS, View, median_of
 from cosfly.work.compiled import njit
-from release.columns import PICTURES, matrices_of
+from release.columns import PICTURES
 from release.depth import depth_of
 from release.flight_rows import FlightRows
 from release.record import DepthCoding
@@ -126,9 +124,6 @@ def _check_contrast(flight: FlightRows, i: int, rgb: np.ndarray, instance: np.nd
     if row.get("target_height_px") is None or rgb.shape != instance.shape:
         return
     is_person = (instance[..., 1:] == 255).all(axis=2)  # PERSON_ID
-    if any(lens := tuple((row.get("distortion") or {}).values())):
-        matrix = matrices_of(flight.intrinsics[i : i + 1])[0]
-        is_person = bent(is_person.astype(np.uint8), matrix, lens, cv2.INTER_NEAREST) > 0
     got, expected = row.get("target_contrast"), contrast_of(rgb, is_person)
     if (got is None) != (expected is None) or abs((got or 0.0) - (expected or 0.0)) > CONTRAST:
         findings.error("contrast", flight.where(i, "target_contrast"), got, f"{expected}, of the picture")
