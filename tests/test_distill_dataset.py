@@ -112,32 +112,13 @@ def test_which_captions_teach_and_how_much():
         ({"checks": checks}, "en", {"contradicted": "keep"}),
     ):
         assert isinstance(made(changes, language, **settings), Sample)
-    one, mended = made({}), made({"repair": repaired}, repaired_weight=0.5)
-    assert (one.weight, one.repair, mended.weight, mended.repair) == (1.0, None, 0.5, "anchored")
+    one, mended = made({}), made({"repair": repaired})
+    assert (one.repair, mended.repair) == (None, "anchored")
     assert made({"label": "hover"}).label == "hover"
     assert made({"label": "hover", "label_from": "perturbed"}, variant="aug_001").label is None  # it is noisy
     dark = made({"depth_range_m": 40.0}, modalities=("depth",))
     assert "black is 40 m and beyond" in dark.prompt.user
     assert dark.pictures.depth_range_m == 40.0
-
-
-@pytest.mark.parametrize(
-    ("states", "proved", "weight"),
-    [
-        (None, None, 0.5),
-        (["unread", "unread"], 0.0, 0.5),
-        (["proved", "unread"], 0.5, 0.75),
-        (["proved"] * 4, 1.0, 1.0),
-    ],
-)
-def test_what_is_proved_is_carried_weighed_and_filtered(states, proved, weight):
-    checks = {"sentences": {"en": states}} if states else {}
-    caption = make_caption("Town01", "trajectory_1", "ORI", 4, checks=checks)
-    sample = make_sample(caption, "en", PrepareConfig(weigh_proved=True), shipped_actions())
-    assert (sample.proved, sample.weight) == (proved, weight)
-    strict = make_sample(caption, "en", PrepareConfig(min_proved=0.5), shipped_actions())
-    assert strict == "too_little_proved" if (proved or 0.0) < 0.5 else strict.weight == 1.0
-    assert make_sample(caption, "zh", PrepareConfig(min_proved=0.5), shipped_actions()) == "too_little_proved"
 
 
 @pytest.fixture(scope="module")
@@ -403,40 +384,39 @@ def ranked(windows: list[tuple[str, str, str]], seed: int = 0) -> WindowRanks:
     return ranks
 
 
-def balanced(windows: list[tuple[str, str]], ratio: float, seed: int = 0) -> list[tuple[str, str]]:
+def balanced(windows: list[tuple[str, str]], seed: int = 0) -> list[tuple[str, str]]:
     ranks = ranked([(f"group_{i % 3}", *window) for i, window in enumerate(windows)], seed)
-    last_rank = balance_of(ranks, ranks.flights, ratio).last_rank
+    last_rank = balance_of(ranks, ranks.flights).last_rank
     return [window for window in windows if keeps(last_rank, seed, *window)]
 
 
 @given(
     counts=st.dictionaries(st.sampled_from(shipped_actions().tokens), st.integers(1, 60), min_size=1),
-    ratio=st.sampled_from([0.01, 0.3, 1.0, 1.7, 20.0]),
     seed=st.integers(0, 3),
 )
 @bounded(max_examples=40)
-def test_each_decision_keeps_what_it_has_up_to_the_bound_in_any_order(counts, ratio, seed):
+def test_each_decision_keeps_what_it_has_up_to_the_bound_in_any_order(counts, seed):
     windows = windows_of(counts)
-    found = balanced(windows, ratio, seed)
-    most = max(1, int(ratio * len(windows) / len(counts)))
+    found = balanced(windows, seed)
+    most = max(1, len(windows) // len(counts))
     assert Counter(decision for decision, _ in found) == {name: min(count, most) for name, count in counts.items()}
-    assert set(balanced(windows[::-1], ratio, seed)) == set(found)
+    assert set(balanced(windows[::-1], seed)) == set(found)
 
 
 def test_stray_decisions_do_not_take_the_others_with_them():
     counts = {"track_straight": 600, "yaw_left_to_follow": 390, "hover": 4, "slow_down": 3, "ascend": 2, "descend": 1}
-    assert len(balanced(windows_of(counts), 1.0)) == 166 + 166 + 10
+    assert len(balanced(windows_of(counts))) == 166 + 166 + 10
 
 
 def test_the_cost_by_hand():
     windows = windows_of({"track_straight": 8, "hover": 2, "slow_down": 2})
-    cost = balance_of(ranked([("group", *window) for window in windows]), ["group"], 0.5).cost(12, shipped_actions())
-    # Effective decisions before: 1.5 ** (2 / 3) * 6 ** (1 / 3), then three of one size.
-    assert cost.pop("effective_decisions") == [pytest.approx(2.38, abs=0.01), 3.0]
+    cost = balance_of(ranked([("group", *window) for window in windows]), ["group"]).cost(12, shipped_actions())
+    # Effective decisions before: 1.5 ** (2 / 3) * 6 ** (1 / 3), then 2 ** (1 / 2) * 4 ** (1 / 2).
+    assert cost.pop("effective_decisions") == [pytest.approx(2.38, abs=0.01), pytest.approx(2.83, abs=0.01)]
     assert set(cost.pop("absent")) == set(shipped_actions().tokens) - {"track_straight", "hover", "slow_down"}
     assert cost == {
-        "ratio": 0.5, "most_windows": 2, "windows": {"hover": 2, "slow_down": 2, "track_straight": 8},
-        "windows_left_out": {"track_straight": 6}, "samples_left_out": 12,
+        "most_windows": 4, "windows": {"hover": 2, "slow_down": 2, "track_straight": 8},
+        "windows_left_out": {"track_straight": 4}, "samples_left_out": 12,
     }  # fmt: skip
 
 
@@ -444,17 +424,17 @@ def test_the_cost_by_hand():
     counts=st.dictionaries(st.sampled_from(shipped_actions().tokens), st.integers(1, 60), min_size=1),
     part=st.floats(0.0, 1.2),
     seed=st.integers(0, 2),
-    ratio=st.sampled_from([0.0, 0.5, 1.0]),
+    is_balanced=st.booleans(),
 )
 @bounded(max_examples=40)
-def test_a_limit_is_exact_and_each_decision_has_its_share_in_any_order(counts, part, seed, ratio):
+def test_a_limit_is_exact_and_each_decision_has_its_share_in_any_order(counts, part, seed, is_balanced):
     """Half of the flights are cut first, as those of train are."""
     windows = [(f"flight_{i % 5}", *window) for i, window in enumerate(windows_of(counts))]
 
     def limited(windows: list[tuple[str, str, str]]) -> tuple[list, list, object]:
         ranks = ranked(windows, seed)
         train = [flight for flight in ranks.flights if flight < "flight_2"]
-        balance = balance_of(ranks, train, ratio) if ratio and train else Balance(1.0, 1, {}, {})
+        balance = balance_of(ranks, train) if is_balanced and train else Balance(1, {}, {})
         left = [one for one in windows if one[0] not in train or keeps(balance.last_rank, seed, *one[1:])]
         limit = limit_to(ranks, int(part * len(left)), train, balance)
         return [one for one in left if limit is None or keeps(limit, seed, *one[1:])], left, limit

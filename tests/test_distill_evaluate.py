@@ -513,8 +513,7 @@ def encoder(tmp_path_factory) -> Path:
 
 
 def evaluated(place: Path, encoder: Path, language: str = "en", **settings: object) -> Evaluation:
-    bertscore = {"device": "cpu", **{k: v for k, v in settings.items() if k == "idf"}}
-    bertscore[language] = {"layer": 2, **{k: v for k, v in settings.items() if k != "idf"}}
+    bertscore = {"device": "cpu", language: {"layer": 2, **settings}}
     cfg = EvaluateConfig.model_validate({"resamples": 100, "bertscore": bertscore})
     out = place / f"out_{len(list(place.iterdir()))}"
     run(cfg, place / "predictions.jsonl", place / "set", out, bertscore_models={language: encoder})
@@ -535,7 +534,7 @@ def test_identical_texts_score_one_shuffled_less_and_unparsed_zero(place, encode
     assert scores["majority"]["bertscore_f1"].value is None
     assert sum(report.languages[language].histogram_f1) == 6
     metric = report.metrics[language]
-    assert (metric.layer, metric.idf, metric.baseline_sha256) == (2, False, None)
+    assert (metric.layer, metric.baseline_sha256) == (2, None)
     assert set(metric.versions) == {"bert-score", "transformers", "torch"}
     assert {"model.safetensors", "config.json", "tokenizer.json"} <= set(metric.sha256)
     other = {"en": "zh", "zh": "en"}[language]
@@ -543,20 +542,17 @@ def test_identical_texts_score_one_shuffled_less_and_unparsed_zero(place, encode
     assert report.languages[other].who[STUDENT].figures["bertscore_f1"].value is None
 
 
-@pytest.mark.parametrize("idf", [False, True])
-def test_scores_are_those_of_the_library(encoder, idf):
+def test_scores_are_those_of_the_library(encoder):
     """Texts of very different lengths, doubles, one longer than the model reads."""
     import bert_score
 
     texts = [text for frame in FRAMES for text in (text_of(coc_of(sample_of(frame))), sample_of(frame, "zh").answer)]
     texts += ["short one", "a " * 700, texts[0]]
     candidates = [*texts[1:], texts[0]]
-    cfg = BertScoreConfig.model_validate({"en": {"layer": 2}, "idf": idf, "device": "cpu", "batch_size": 4})
+    cfg = BertScoreConfig.model_validate({"en": {"layer": 2}, "device": "cpu"})
     own = Scorer(cfg, "en", encoder, texts)
-    plain = bert_score.BERTScorer(model_type=str(encoder), num_layers=2, idf=idf, device="cpu", nthreads=1)
+    plain = bert_score.BERTScorer(model_type=str(encoder), num_layers=2, device="cpu", nthreads=1)
     plain._tokenizer.model_max_length = 512
-    if idf:
-        plain.compute_idf(texts)
     expected = np.stack([part.numpy() for part in plain.score(candidates, texts)], axis=1)
     found = own.score(list(zip(candidates, texts, strict=True)))
     assert np.abs(found - expected).max() < 1e-5

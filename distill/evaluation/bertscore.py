@@ -23,6 +23,7 @@ from distill.student.model import Device, pick_device, quiet_transformers, requi
 
 log = logging.getLogger(__name__)
 
+BATCH_SIZE = 64  # texts embedded together
 FOREIGN_TOKENS = 1.5  # tokens a character of Chinese: bert-base-chinese has 1, a byte-level English vocabulary 2 to 3
 
 
@@ -38,8 +39,6 @@ class BertScoreConfig(Config):
 
     en: LanguageMetric = Field(LanguageMetric(), description="English: layer 17 of roberta-large, as in the paper")
     zh: LanguageMetric = Field(LanguageMetric(layer=8), description="Chinese: layer 8 of bert-base-chinese")
-    idf: bool = Field(False, description="weigh tokens by their rarity in the references")
-    batch_size: int = Field(64, ge=1, description="texts embedded together")
     device: Device = Field("auto", description="auto, cpu or cuda")
 
 
@@ -53,7 +52,6 @@ class Metric(BaseModel):
 
     model: str
     layer: int
-    idf: bool
     baseline_sha256: str | None
     max_tokens: int
     cut: int
@@ -74,7 +72,7 @@ class Scorer:
         """Load the model.
 
         Args:
-            references: the texts that idf weights are counted on, if they are used.
+            references: the texts whose lengths and languages are checked.
         """
         require("torch", "transformers", "bert_score")
         quiet_transformers()
@@ -84,7 +82,7 @@ class Scorer:
 
         try:
             self._library = bert_score.BERTScorer(
-                model_type=str(folder), num_layers=own.layer, batch_size=cfg.batch_size, nthreads=1, idf=cfg.idf,
+                model_type=str(folder), num_layers=own.layer, batch_size=BATCH_SIZE, nthreads=1,
                 device=pick_device(cfg.device), rescale_with_baseline=own.baseline is not None,
                 baseline_path=str(own.baseline) if own.baseline else None,
                 lang="en" if own.baseline else None,  # asked for by the library, unused with a baseline file
@@ -96,14 +94,11 @@ class Scorer:
         tokenizer = self._library._tokenizer
         limit = min(int(min(tokenizer.model_max_length, 10**9)), positions - 2)
         tokenizer.model_max_length = limit
-        if cfg.idf:
-            self._library.compute_idf(list(references))  # after the limit is set: it tokenizes
         lengths = [len(tokenizer(text, truncation=False)["input_ids"]) for text in references]
         _warn_of_foreign(language, references, sum(lengths), folder)
         self.metric = Metric(
             model=folder.name,
             layer=own.layer,
-            idf=cfg.idf,
             baseline_sha256=sha256_file(own.baseline) if own.baseline else None,
             max_tokens=limit,
             cut=sum(length > limit for length in lengths),

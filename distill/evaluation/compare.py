@@ -36,6 +36,7 @@ from distill.evaluation.pages import (
     table,
 )
 from distill.evaluation.scores import (
+    CONFIDENCE,
     FIGURES,
     LESS_IS_BETTER,
     NEITHER,
@@ -54,7 +55,6 @@ Names = dict[str, Evaluation]
 class ReportConfig(Config):
     """Settings of `distill report`."""
 
-    confidence: float = Field(0.95, gt=0, lt=1, description="level of the intervals of differences")
     resamples: int = Field(5000, ge=100, description="draws of walks that they are made of")
 
 
@@ -124,7 +124,7 @@ def compare(
     for first, second in combinations(reports, 2):
         _check_references(first, scores[first], second, scores[second])
         rng = rng_for(seed, STAGE, f"{first}/{second}")
-        given: Any = {"resamples": cfg.resamples, "confidence": cfg.confidence, "rng": rng}
+        given: Any = {"resamples": cfg.resamples, "confidence": CONFIDENCE, "rng": rng}
         count, found = differences_of(scores[first], scores[second], **given)
         if not count:
             strangers.append(f"{first} and {second} were asked no sample in common")
@@ -136,7 +136,7 @@ def compare(
         floors={name: someone.who[name] for name in FLOORS if name in someone.who},
         pairings=pairings,
         not_comparable=[*_mismatches(reports), *strangers],
-        confidence=cfg.confidence,
+        confidence=CONFIDENCE,
         resamples=cfg.resamples,
     )
 

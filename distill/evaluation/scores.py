@@ -29,6 +29,7 @@ from cosfly.work.store import atomic_file, dump_json, sha256_bytes
 from distill.schema import Sample
 
 SCORES = "scores.parquet"
+CONFIDENCE = 0.95  # level of the intervals
 REFERENCE_DIGITS = 16  # of a digest of 64
 VERDICTS: tuple[Verdict, ...] = ("CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN")
 STATES: tuple[SentenceState, ...] = ("proved", "contradicted", "unread")

@@ -40,19 +40,18 @@ from distill.evaluation.measure import (
     text_of,
 )
 from distill.evaluation.pages import markdown_of, page_of
-from distill.evaluation.scores import SCORES, Scores, join, write_scores
+from distill.evaluation.scores import CONFIDENCE, SCORES, Scores, join, write_scores
 from distill.schema import Sample, open_split, read_training_set, resolve_trees, tree_inputs
 from distill.student.model import require
 
+NUM_EXAMPLES = 12  # samples that the page shows next to their answers
 THUMBNAIL_PX = 256  # width of a frame on the page
 
 
 class EvaluateConfig(Config):
     """Settings of `distill evaluate`."""
 
-    confidence: float = Field(0.95, gt=0, lt=1, description="level of the intervals")
     resamples: int = Field(2000, ge=100, description="draws of walks that the intervals are made of")
-    examples: int = Field(12, ge=0, description="samples that the page shows side by side with their answers")
     bertscore: BertScoreConfig = Field(BertScoreConfig(), description="semantic similarity of the texts")
 
 
@@ -127,7 +126,7 @@ def _evaluate(
     judged: SentenceStates,
     seed: int,
 ) -> tuple[Evaluation, Scores]:
-    given: Any = {"resamples": cfg.resamples, "confidence": cfg.confidence, "seed": seed}
+    given: Any = {"resamples": cfg.resamples, "confidence": CONFIDENCE, "seed": seed}
     actions = read_training_set(dataset).actions
     parts: list[dict[str, Scores]] = []
     measurements: dict[Language, Measurement] = {}
@@ -158,6 +157,6 @@ def _evaluate(
         speed={},
         languages=measurements,
         all=measure(scores, predictions, **given) if len(parts) > 1 else next(iter(measurements.values())),
-        examples=list(examples_of(asked, scores[STUDENT], cfg.examples, seed)),
+        examples=list(examples_of(asked, scores[STUDENT], NUM_EXAMPLES, seed)),
         notes=NOTES,
     ), scores[STUDENT]

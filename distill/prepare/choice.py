@@ -67,7 +67,6 @@ class Balance:
     last_rank: decision that has too many -> rank of the last window that stays.
     """
 
-    ratio: float
     most_windows: int
     windows: Mapping[str, int]
     last_rank: Mapping[str, int]
@@ -76,7 +75,6 @@ class Balance:
         """Give `balance` of the manifest. effective_decisions: as many equally frequent ones have the same entropy."""
         after = {decision: min(count, self.most_windows) for decision, count in self.windows.items()}
         return {
-            "ratio": self.ratio,
             "most_windows": self.most_windows,
             "windows": dict(self.windows),
             "windows_left_out": {name: n - after[name] for name, n in self.windows.items() if n > after[name]},
@@ -86,23 +84,23 @@ class Balance:
         }
 
 
-def balance_of(ranks: WindowRanks, train: Collection[str], ratio: float) -> Balance:
-    """Leave of each decision at most `ratio` times an equal share, and one window at least.
+def balance_of(ranks: WindowRanks, train: Collection[str]) -> Balance:
+    """Keep of each decision at most an equal share of the windows, and at least one.
 
     An equal share is the windows over the decisions that occur. The median or the least of the counts would be no
     measure: a few stray decisions of one or two windows bring them down, and nearly all of the others with them.
 
     Args:
-        train: flights of the training split, one at least. ratio: > 0.
+        train: flights of the training split, at least one.
     """
     found: dict[str, list[np.ndarray]] = defaultdict(list)
     for flight, decision, own in ranks.by_kind():
         if flight in train:
             found[decision].append(own)
     windows = {decision: sum(map(len, own)) for decision, own in sorted(found.items())}
-    most = max(1, math.floor(ratio * sum(windows.values()) / len(windows)))
+    most = max(1, sum(windows.values()) // len(windows))
     last_rank = {decision: _last(own, most) for decision, own in found.items() if windows[decision] > most}
-    return Balance(ratio, most, windows, last_rank)
+    return Balance(most, windows, last_rank)
 
 
 def limit_to(

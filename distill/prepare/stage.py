@@ -56,20 +56,14 @@ class PrepareConfig(SplitConfig):
         description="captions of which no record says from which tree they were made, as after copying the file",
     )
     repaired: Literal["keep", "exclude"] = Field("keep", description="what happens to captions that a repair made")
-    repaired_weight: float = Field(1.0, gt=0, le=1, description="weight of a repaired sample in the loss; 1: as any")
     verdicts: tuple[Verdict, ...] = Field(
         ("CONSISTENT", "SOFT_CONFLICT", "ABSTAIN"), min_length=1, description="captions of these verdicts are learnt"
     )
     contradicted: Literal["keep", "exclude"] = Field(
         "exclude", description="what happens to answers of which the geometry contradicts a sentence"
     )
-    min_proved: float = Field(0.0, ge=0, le=1, description="least share of proved sentences; 0 takes unread ones too")
-    weigh_proved: bool = Field(False, description="multiply a sample's weight by half of that share and a half")
     balance: Literal["none", "decisions"] = Field(
-        "none", description="decisions: training windows of a decision beyond `balance_ratio` are left out"
-    )
-    balance_ratio: float = Field(
-        1.0, gt=0, allow_inf_nan=False, description="most training windows of a decision, in equal shares of all"
+        "none", description="decisions: training windows of a decision beyond an equal share are dropped"
     )
     limit: int = Field(0, ge=0, description="windows in all splits together, of each decision its share; 0: all")
 
@@ -129,7 +123,7 @@ def make_sample(
         contradicted=None if is_noisy or (ruled_out := caption.checks.contradicted) is None else tuple(ruled_out),
         repair=None if caption.repair is None else caption.repair.strategy,
         proved=caption.coverage(language),
-        weight=(1.0 if caption.repair is None else cfg.repaired_weight) * _evidence(caption.coverage(language), cfg),
+        weight=1.0,
     )
 
 
@@ -143,13 +137,7 @@ def _reason_to_leave_out(caption: Caption, language: Language, cfg: PrepareConfi
         return f"verdict_{str(caption.verdict).lower()}"
     if cfg.contradicted == "exclude" and "contradicted" in (caption.checks.sentences or {}).get(language, []):
         return "contradicted"
-    if (caption.coverage(language) or 0.0) < cfg.min_proved:
-        return "too_little_proved"
     return None
-
-
-def _evidence(proved: float | None, cfg: PrepareConfig) -> float:
-    return 0.5 + 0.5 * (proved or 0.0) if cfg.weigh_proved else 1.0
 
 
 @dataclass(frozen=True)
@@ -298,7 +286,7 @@ def _choose(cfg: PrepareConfig, windows: _Windows, ranks: WindowRanks, seed: int
     owners = cfg.assigned(set(keys.values()), windows.walks, seed, "usable captions", fix)
     split_of = {key: split for key, (_, split) in owners.items()}
     train = {flight for flight, key in keys.items() if split_of[key] == "train"}
-    balance = balance_of(ranks, train, cfg.balance_ratio) if cfg.balance == "decisions" else None
+    balance = balance_of(ranks, train) if cfg.balance == "decisions" else None
     limit = limit_to(ranks, cfg.limit, train, balance) if cfg.limit else None
     return _Selection(split_of, Counter(split for _, split in set(owners.values())), balance, limit, seed)
 

@@ -44,7 +44,7 @@ from distill.training.loading import Census, ReadyStep, Row, Supply
 from distill.training.loss import answer_loss
 from distill.training.preflight import used_gb
 from distill.training.ranks import Ranks
-from distill.training.settings import STAGE, Steps, TrainConfig, learning_rate_at, share_of
+from distill.training.settings import MAX_GRADIENT_NORM, STAGE, Steps, TrainConfig, learning_rate_at, share_of
 
 log = logging.getLogger(__name__)
 
@@ -208,7 +208,7 @@ def train_step(lesson: Lesson, optimizer: Any, ready: ReadyStep, rate: float) ->
     for parameter in parameters:
         if parameter.grad is not None:
             parameter.grad /= weight
-    norm = float(torch.nn.utils.clip_grad_norm_(parameters, cfg.max_gradient_norm or math.inf))
+    norm = float(torch.nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM))
     if not math.isfinite(total) or not math.isfinite(norm):
         words, got = "the loss or its gradient is not finite", f"{cfg.learning_rate}"
         fix = "lower learning_rate and choose another --out; the last checkpoint stays usable"

@@ -25,6 +25,7 @@ TARGET_MODULES = (
     r"|mlp\.(gate|up|down)_proj)"
 )
 STAGE = "distill.train"
+MAX_GRADIENT_NORM = 1.0  # gradients are scaled down to this norm
 
 
 class TrainConfig(Config):
@@ -37,7 +38,6 @@ class TrainConfig(Config):
     train_vision: bool = Field(False, description="with method full: the vision tower learns too; no features are kept")
     lora_rank: int = Field(16, ge=1, description="rank of the LoRA update")
     lora_alpha: float = Field(32.0, gt=0, description="LoRA scale; the update is multiplied by alpha / rank")
-    lora_dropout: float = Field(0.0, ge=0, lt=1, description="dropout before the LoRA matrices; it follows batch_size")
     target_modules: str = Field(TARGET_MODULES, description="regular expression over the full names of adapted layers")
     epochs: int = Field(3, ge=1, description="passes over the training split")
     max_steps: int = Field(0, ge=0, description="stop after this many optimizer steps; 0: only by epochs")
@@ -46,7 +46,6 @@ class TrainConfig(Config):
     schedule: Literal["cosine", "constant"] = Field("cosine", description="learning rate after the warm-up")
     warmup_fraction: float = Field(0.03, ge=0, lt=1, description="share of the steps with a rising rate; 0: none")
     weight_decay: float = Field(0.0, ge=0, description="AdamW's decoupled weight decay")
-    max_gradient_norm: float = Field(1.0, ge=0, description="gradients are scaled down to this norm; 0: off")
     max_pixels: int = Field(0, ge=0, description="most pixels of a picture; 0: all, as texts speak of them")
     max_tokens: int = Field(4096, ge=16, description="longest sample with images and answer; longer ones are left out")
     dtype: Dtype = Field("auto", description="what is computed in; auto: bfloat16 on cuda, float32 on a CPU")
@@ -129,7 +128,7 @@ def share_of(chosen: Sequence[int], lengths: np.ndarray, rank: int, num_ranks: i
 
 
 def learning_rate_at(cfg: TrainConfig, step: int, num_steps: int) -> float:
-    """Give the rate of a step: a linear rise, then a half cosine to zero or a constant."""
+    """Return the learning rate of a step: a linear rise, then a half cosine to zero or a constant."""
     warmup = math.ceil(cfg.warmup_fraction * num_steps)
     if step < warmup:
         return cfg.learning_rate * (step + 1) / warmup

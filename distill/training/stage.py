@@ -65,7 +65,6 @@ def add_adapter(student: Student, cfg: TrainConfig, seed: int) -> Student:
     lora = LoraConfig(
         r=cfg.lora_rank,
         lora_alpha=cfg.lora_alpha,  # type: ignore[arg-type]  # a plain number; the library says int
-        lora_dropout=cfg.lora_dropout,
         target_modules=cfg.target_modules,
         task_type="CAUSAL_LM",
     )
