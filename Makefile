@@ -9,12 +9,10 @@ TOOLS := $(VENV)-tools
 PINNED := docs/deploy/requirements.txt
 RUN ?= runs/quickstart
 SLOW ?=
-FUZZ_INPUTS ?= 150000
-FUZZ_SEED ?= 1
 LINT := $(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri
 
-.PHONY: quickstart test fuzz lint format site audit sbom lock clean
+.PHONY: quickstart test lint format site audit sbom lock clean
 
 quickstart: $(VENV)/.installed  ## Map to release on the embedded synthetic town
 	$(BIN)/cosfly run quickstart --out $(RUN)
@@ -25,9 +23,6 @@ test: $(VENV)/.installed-dev  ## What must hold, without the tests that take lon
 	wait $$lint || failed=1
 	cat $(VENV)/lint.txt
 	exit $$failed
-
-fuzz: $(VENV)/.installed-dev  ## Hostile inputs to every reader, about an hour; fewer with FUZZ_INPUTS=5000, others with FUZZ_SEED=2
-	$(BIN)/python tests/fuzz.py --inputs $(FUZZ_INPUTS) --seed $(FUZZ_SEED)
 
 lint: $(VENV)/.installed-dev
 	$(LINT)

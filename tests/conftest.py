@@ -22,7 +22,7 @@ SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 # Files that take a minute or more, the longest first: begun last, one would leave the other worker without work.
 LONG = (
-    "test_docs_run.py", "test_release_honest.py", "test_crashes.py", "test_fuzz.py", "test_release_verify.py",
+    "test_docs_run.py", "test_release_honest.py", "test_crashes.py", "test_release_verify.py",
     "test_pipeline_tiny.py", "test_planners_contract.py", "test_release_build.py",
 )  # fmt: skip
 

@@ -4,7 +4,6 @@ import gzip
 import io
 import json
 import os
-import pickle
 import socket
 import struct
 import tracemalloc
@@ -26,13 +25,11 @@ from cosfly.maps import cityjson
 from cosfly.maps.footprints import check_outline, num_crossings
 from cosfly.products.boxes import read_boxes
 from cosfly.products.frames import depth_bytes, read_depth, rgb_bytes
-from cosfly.products.inspection import Inspection, read_inspection, write_inspection
-from cosfly.products.roi import read_roi
 from cosfly.reading import arrays, documents, files, tables
 from cosfly.reading.files import LinkedPath, read_text
 from cosfly.work.config import Config, apply_overrides, build, read_yaml
 from cosfly.work.journal import Journal
-from cosfly.work.stage_folder import Kept, StageFolder, read_failures, result_of
+from cosfly.work.stage_folder import StageFolder, read_failures
 from cosfly.work.store import inside
 from release.record import RELEASE_FORMAT, read_record
 from specimens import make_playback_tree
@@ -42,7 +39,7 @@ class _Dated(Config):
     name: str = ""
 
 
-# --- what is no regular file (hostile contents, to every reader: tests/test_fuzz.py) ----------------------------------
+# --- what is no regular file (hostile contents: tests/test_hostile_files.py) ------------------------------------------
 
 
 @pytest.mark.timeout(60)
@@ -97,13 +94,6 @@ def test_a_key_that_is_given_twice_in_a_file_of_ours(tmp_path):
         documents.read_json(tmp_path / "x.json", each_key_once=True)
 
 
-@pytest.mark.timeout(20)
-def test_a_key_given_twice_among_very_many_is_found_soon():
-    text = "{" + ", ".join(f'"k{k}": 0' for k in (*range(300_000), 299_999)) + "}"
-    with pytest.raises(ValueError, match="'k299999' is given twice"):
-        documents.parse_json(text, each_key_once=True)
-
-
 @pytest.mark.parametrize("field", ["shards", "flights", "maps"])
 def test_a_list_of_empty_objects_is_refused_at_the_first(tmp_path, field):
     head = {**RELEASE_FORMAT.header, field: [{}] * 30_000}
@@ -121,12 +111,6 @@ def test_a_list_of_empty_objects_is_refused_at_the_first(tmp_path, field):
 def test_more_brackets_than_a_text_of_its_size_has_are_refused_before_they_are_lists():
     with pytest.raises(ValueError, match="20,000,000 lists and objects"):
         documents.parse_json(b"[" + b"{},[]," * 9_999_999 + b"{}]")
-
-
-def test_the_place_of_a_number_is_named(tmp_path):
-    (tmp_path / "x.json").write_text('{"a": [0, {"b": 1e999}]}')
-    with pytest.raises(InputError, match=r"x\.json: a\[1\]\.b: .*got 1e999"):
-        documents.read_json(tmp_path / "x.json")
 
 
 # --- records of stages ------------------------------------------------------------------------------------------------
@@ -151,58 +135,7 @@ def test_a_forged_line_of_a_journal_is_an_error(tmp_path, record):
         StageFolder.open(tmp_path / "out", "demo", config=_Dated(name="other"), inputs={}, seed=0)
 
 
-def test_a_line_of_a_journal_that_is_no_object_is_damage(tmp_path):
-    assert list(_with_line(tmp_path / "out", [1]).items()) == []
-
-
-def test_an_inspection_that_tells_of_a_flight_twice(tmp_path):
-    flight = {
-        "town": "Town01",
-        "trajectory": "t",
-        "variant": "ORI",
-        "folder": "Town01/t/ORI",
-        "trace_id": None,
-        "result": "rejected",
-        "issues": [],
-        "metrics": {},
-    }
-    counts = {"planned": 1, "dropped": {}, "not_rendered": 0, "rendered": 1, "accepted": 1, "review": 0, "rejected": 0}
-    flights = {"inspected": 1, "accepted": 1, "review": 0, "rejected": 0, "without_trace": 0, "reasons": {}}
-    funnel = {"trajectories": counts, "flights": flights}
-    once = Inspection(settings={}, funnel=funnel, flights=[flight])
-    write_inspection(tmp_path / "inspect.json", once)
-    assert read_inspection(tmp_path / "inspect.json") == once
-    write_inspection(
-        tmp_path / "inspect.json",
-        Inspection(settings={}, funnel=funnel, flights=[flight, flight | {"result": "accepted"}]),
-    )
-    with pytest.raises(InputError, match=r"flights: a flight has two records; got Town01/t/ORI"):
-        read_inspection(tmp_path / "inspect.json")
-
-
-def test_a_result_of_another_shape_is_named():
-    with pytest.raises(InputError, match=r"items\.jsonl: a: result: name: .*got 7"):
-        result_of(Kept(id="a", result={"name": 7}), _Dated)
-
-
 # --- limits -----------------------------------------------------------------------------------------------------------
-
-
-def test_text_of_another_coding_is_placed(tmp_path):
-    path = tmp_path / "town.csv"
-    path.write_bytes("type,name\nBuildings,Köln\n".encode("latin-1"))
-    with pytest.raises(
-        InputError, match=r"not UTF-8 text; got the byte 0xf6 in line 2; if it is text, save it as UTF-8"
-    ):
-        read_text(path)
-
-
-def test_a_limit_is_named_with_what_to_do(tmp_path):
-    path = tmp_path / "x.json"
-    path.write_text(json.dumps("x" * 1_100_000))
-    with pytest.raises(InputError, match=r"over the limit; got 1.1 MB; expected at most 1 MB in one piece; split it"):
-        documents.read_json(path, most_mb=1)
-    assert len(documents.read_json(path, most_mb=2)) == 1_100_000
 
 
 def test_a_sparse_file_is_refused_before_it_is_read(tmp_path):
@@ -340,16 +273,6 @@ def test_a_chunk_that_goes_on_beyond_the_file_gets_no_memory(monkeypatch):
         arrays.parse_picture(bytes(picture), "x")
 
 
-@pytest.mark.parametrize(
-    "data",
-    [b"", _png(0, 3), b"BM" + b"\0" * 90, cv2.imencode(".jpg", np.zeros((9, 9, 3), np.uint8))[1].tobytes()],
-    ids=len,
-)
-def test_other_pictures_are_refused(data):
-    with pytest.raises(InputError):
-        arrays.parse_picture(data, "x")
-
-
 # --- links ------------------------------------------------------------------------------------------------------------
 
 
@@ -378,13 +301,6 @@ def test_one_command_follows_links_and_the_next_in_this_process_does_not(tmp_pat
     words = ["view", str(tree), "--out", str(tmp_path / "out.png")]
     assert CliRunner().invoke(app, [*words, "--set", "follow_links=true"]).exit_code == 0
     assert "leads out" in str(CliRunner().invoke(app, words).exception)
-
-
-def test_what_is_made_of_a_trusted_path_is_trusted_in_a_worker_too(tmp_path):
-    (tmp_path / "x").mkdir()
-    tree = LinkedPath(tmp_path)
-    made = (tree / "x", *tree.glob("*"), *tree.iterdir(), tree.parent, (tree / "x").parents[0], tree.absolute())
-    assert all(isinstance(path, LinkedPath) for path in (*made, pickle.loads(pickle.dumps(tree)), tree.with_name("y")))
 
 
 def test_links_within_a_tree_and_to_a_tree_are_followed(tmp_path):
@@ -468,21 +384,12 @@ def test_names_that_lead_out_or_nowhere(tmp_path, name):
 # --- settings ---------------------------------------------------------------------------------------------------------
 
 HOSTILE_YAML = {
-    "aliases of aliases": "a: &a [x, x, x, x, x, x, x, x, x]\n"
-    + "".join(f"{b}: &{b} [{', '.join(['*' + a] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)),
-    "an alias in itself": "a: &a [*a]",
-    "60,000 keys": "".join(f"k{i}: 1\n" for i in range(60_000)),
     "deep": "[" * 20_000,
-    "deep blocks": "".join(" " * i + "a:\n" for i in range(500)),
     "a tag": "a: !!binary aGk=",
     "a tag of Python": "a: !!python/object/apply:os.system ['x']",
-    "a tagged date": "a: !!timestamp 2024-01-01",
-    "400 digits": "a: " + "1" * 400,
+    "a key twice": "a: 1\na: 2",
     "5,000 digits": "a: " + "1" * 5000,
-    "half a surrogate pair": 'a: "\\ud800"',
-    "a NUL": 'a: "\\0"',
     "a list as key": "? [a]\n: 1",
-    "two documents": "a: 1\n---\nb: 2",
     "2 MB": "a: '" + "x" * 2_000_000 + "'",
     "no UTF-8": b"a: \xff",
 }  # fmt: skip
@@ -497,23 +404,10 @@ def test_hostile_settings_are_one_clear_line(tmp_path, case):
     with pytest.raises(ConfigError, match=r"run\.yaml") as caught:
         read_yaml(path)
     assert len(str(caught.value)) < 500
-    if isinstance(text, str) and "\0" not in text:
-        with pytest.raises(ConfigError, match="--set a"):
-            apply_overrides({}, [f"a={text}"])
 
 
 def test_a_date_is_the_text_that_it_looks_like():
     assert build(_Dated, apply_overrides({}, ["name=2026-11-22"]), "x").name == "2026-11-22"
-
-
-def test_anchors_that_stay_small_are_fine(tmp_path):
-    (tmp_path / "x.yaml").write_text("a: &a {b: 1}\nc:\n  <<: *a\n  d: *a\n")
-    assert read_yaml(tmp_path / "x.yaml") == {"a": {"b": 1}, "c": {"b": 1, "d": {"b": 1}}}
-
-
-def test_a_setting_of_very_many_parts():
-    with pytest.raises(ConfigError, match="not an assignment"):
-        apply_overrides({}, ["a" + ".a" * 5000 + "=1"])
 
 
 # --- polygons ---------------------------------------------------------------------------------------------------------
@@ -528,20 +422,5 @@ def test_crossings_are_counted():
     assert num_crossings(Polygon([(0, 0), (9, 0), (3, 0), (6, 0), (1, 5)]), 10) > 1  # back and forth
 
 
-@pytest.mark.timeout(60)
-@pytest.mark.parametrize("num_vertices", [300, 3_000])
-def test_a_tangled_outline_is_refused_at_once(num_vertices):
-    points = np.random.default_rng(0).random((num_vertices, 2)) * 1000
-    with pytest.raises(InputError, match=r"lawn: over the limit; .* raise maps\.cityjson\.polygon_crossings"):
-        check_outline(Polygon(points), "lawn", 500)
-
-
 def test_an_outline_that_crosses_itself_now_and_then_is_mended():
     check_outline(Polygon([(0, 0), (4, 4), (4, 0), (0, 4)]), "lawn", 500)
-
-
-def test_a_region_of_too_many_vertices(tmp_path):
-    (tmp_path / "roi.json").write_text(json.dumps({"points_world": [[0, 0], [9, 0], [9, 9], [0, 9]]}))
-    with pytest.raises(InputError, match=r"got 4 vertices; expected at most 3; .*pedestrians\.roi_vertices"):
-        read_roi(tmp_path / "roi.json", 3)
-    assert len(read_roi(tmp_path / "roi.json", 4).rings()) == 1

@@ -50,7 +50,6 @@ NOT_HERE = {
     "tests/test_distill_train_ranks.py",
     "make quickstart": "it installs first; what it runs then is QUICKSTART",
     "make test": "that is this",
-    "make fuzz": "an hour; tests/test_fuzz.py begins it",
     "pip install -e": "the tests stand in that environment",
     "pip install --no-deps": "the same",
     "python tests/benchmarks/": "minutes each; what they measure stands beside them in the documents",

@@ -9,7 +9,6 @@ and in files of ours a key that is given twice.
 from __future__ import annotations
 
 import builtins
-import contextlib
 import functools
 import json
 import math
@@ -40,30 +39,25 @@ _LONG_EXPONENT, _LONG_NUMBER = b"e000", b"0" * (DIGITS + 1)
 _SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 
 
-class _BadNumber(ValueError):
-    """A number stands in JSON text that is not finite, or has too many digits for one."""
-
-    def __init__(self, word: str, wanted: str = "a finite number") -> None:
-        self.got = word if len(word) <= MOST_SHOWN else f"{word[:MOST_SHOWN]}... of {len(word)} characters"
-        super().__init__(f"{self.got} is not a number that a file may hold, expected {wanted}")
-        self.wanted = wanted
-
-
 def _no_constants(text: str) -> float:
-    raise _BadNumber(text)
+    raise ValueError(f"{_short(text)} is not a finite number")
 
 
 def _finite(text: str) -> float:
     number = float(text)
     if not math.isfinite(number):
-        raise _BadNumber(text)
+        raise ValueError(f"{_short(text)} is not a finite number")
     return number
 
 
 def _whole(text: str) -> int:
     if len(text.lstrip("-")) > DIGITS:
-        raise _BadNumber(text, f"at most {DIGITS} digits")
+        raise ValueError(f"{_short(text)} has more than {DIGITS} digits")
     return int(text)
+
+
+def _short(word: str) -> str:
+    return word if len(word) <= MOST_SHOWN else f"{word[:MOST_SHOWN]}... of {len(word)} characters"
 
 
 def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -121,14 +115,6 @@ def parse_document(data: bytes | str, where: str | Path, *, what: str = "file", 
         value = parse_json(raw, each_key_once=each_key_once)
         if _SURROGATE.search(raw):
             json.dumps(value, ensure_ascii=False).encode()  # fails on half of a pair
-    except _BadNumber as error:
-        place = f"{where}: {_place_of_bad_number(raw)}".removesuffix(": ")
-        raise InputError(
-            f"the {what} holds a number that is not finite or too long",
-            where=place,
-            got=error.got,
-            expected=error.wanted,
-        ) from None
     except UnicodeDecodeError as error:
         raise not_utf8(error, where) from None
     except UnicodeEncodeError:
@@ -138,26 +124,6 @@ def parse_document(data: bytes | str, where: str | Path, *, what: str = "file", 
     except ValueError as error:
         raise InputError("not valid JSON", where=where, got=str(error)) from None
     return value
-
-
-def _place_of_bad_number(data: bytes) -> str:
-    """Name the first field that holds one; empty where the text is broken farther on."""
-    with contextlib.suppress(ValueError, RecursionError):
-        return (_place_in(json.loads(data)) or "").lstrip(".")
-    return ""
-
-
-def _place_in(value: Any) -> str | None:
-    """Name the first field that holds no usable number, as in `.boxes[3].center[0]`; None where there is none."""
-    if isinstance(value, int | float):
-        return None if abs(value) < 10**DIGITS or (isinstance(value, float) and math.isfinite(value)) else ""
-    if not isinstance(value, dict | list):
-        return None
-    for key, member in value.items() if isinstance(value, dict) else enumerate(value):
-        place = _place_in(member)
-        if place is not None:
-            return (f".{key}" if isinstance(value, dict) else f"[{key}]") + place
-    return None
 
 
 def read_json(

@@ -23,7 +23,6 @@ from cosfly.errors import InputError
 
 log = logging.getLogger(__name__)
 
-TAIL_BYTES = 200_000
 MB = 1_000_000
 FILE_MB = 2_048  # read as a whole: the flights of a town are some 100 MB a million frames
 LINE_MB = 64  # of a JSON-lines file: a caption with its evidence has some 8 kB
@@ -143,13 +142,6 @@ def read_span(path: Path, first: int, size: int, *, what: str = "file", fix: str
             f"the {what} became shorter while it was read", where=path, got=f"{first + len(data)} bytes", fix=fix
         )
     return data
-
-
-def read_tail(path: Path, first: int = 0) -> str:
-    """Read a log of ours from byte `first` on, of a long one its end; what is no text stands as a mark."""
-    size = path.stat().st_size
-    first = max(first, size - TAIL_BYTES)
-    return read_span(path, first, size - first, what="log").decode(errors="replace")
 
 
 def _size_within(file: io.BufferedReader, path: Path, most_mb: float = FILE_MB, split: str = SPLIT) -> int:

@@ -12,10 +12,11 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from cosfly.errors import ConfigError, InputError, nearest, plain
 from cosfly.reading.files import read_text
-from cosfly.reading.settings_text import MOST_DEPTH, parse_yaml
+from cosfly.reading.settings_text import parse_yaml
 
 MOST_LISTED = 15  # names of settings in a message
 MOST_ELSEWHERE = 3  # places of an unknown name, as in "did you mean plan.x or render.x"
+MOST_PARTS = 32  # of a setting's name
 # What validators are given as context where wrong values were left out: then what is lacking is nobody's mistake.
 LEFT_OUT = {"wrong values": "left out"}
 
@@ -67,7 +68,7 @@ def apply_overrides(data: dict, overrides: Iterable[str]) -> dict:
     data = copy.deepcopy(data)
     for override in overrides:
         key, equals, text = override.partition("=")
-        if not equals or not all(key.split(".")) or key.count(".") > MOST_DEPTH:
+        if not equals or not all(key.split(".")) or key.count(".") > MOST_PARTS:
             raise ConfigError(
                 "not an assignment",
                 where="--set",
