@@ -68,17 +68,6 @@ def open_table(path: Path, *, tree: Path | None = None) -> Iterator[_Table]:
             yield table
 
 
-@contextlib.contextmanager
-def open_stream(file: io.RawIOBase, where: str) -> Iterator[_Table]:
-    """Open a parquet file that is read by ranges, as one that lies somewhere else; checksums of pages are held against
-    the pages.
-    """
-    with arrow_errors(where):
-        table = _Table(file, pre_buffer=True, page_checksum_verification=True)
-    with table:
-        yield table
-
-
 def num_rows(path: Path) -> int:
     """Give the number of rows; raises as `open_table`."""
     with open_table(path) as table:
