@@ -86,19 +86,6 @@ def test_nothing_answered_is_asked_twice(place, tmp_path):
         assert len(server.bodies) == num_asked + num_samples - num_kept
 
 
-def test_several_servers_answer_as_one(place, tmp_path):
-    with TeacherServer() as one, TeacherServer() as two, TeacherServer(lambda number, body: "500") as broken:
-        alone = infer_with(settings(), place, one.url, tmp_path / "alone")
-        num_alone = len(one.bodies)
-        several = infer_with(settings(), place, f"{two.url},{broken.url},{one.url}", tmp_path / "several")
-        assert several.read_bytes() == alone.read_bytes()
-        assert len(two.bodies) > 0
-        assert len(one.bodies) > num_alone
-        assert infer_with(settings(), place, f"{one.url},{two.url},{broken.url}", tmp_path / "several") == several
-    with pytest.raises(TeacherError, match="twice"):
-        infer_with(settings(), place, f"{one.url},{one.url}", tmp_path / "twice")
-
-
 def test_one_sample_without_an_answer_costs_no_other(place, tmp_path):
     """And the command ends with status 1; run again, it asks about that sample alone."""
     words = ["distill", "infer", "--dataset", place / "set", "--data", place / "tree", "--engine", "endpoint"]

@@ -10,8 +10,8 @@ import re
 import ssl
 import time
 import zlib
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from email.utils import parsedate_to_datetime
 
 import httpx
@@ -61,14 +61,12 @@ class Response:
     """What a server answered. body: unpacked; of one that is longer than the limit its beginning (`is_cut`).
 
     retry_after_s: how long it asks to wait; None where it does not say, or says what nobody can wait for.
-    headers: by their names, in whatever case.
     """
 
     status: int
     body: bytes
     is_cut: bool = False
     retry_after_s: float | None = None
-    headers: Mapping[str, str] = field(default_factory=dict)
 
 
 class Connections:
@@ -95,29 +93,19 @@ class Connections:
         for connection in self._free:
             await connection.aclose()
 
-    async def exchange(
-        self,
-        url: str,
-        content: bytes | None = None,
-        headers: Mapping[str, str] = HEADERS,
-        *,
-        tls_name: str | None = None,
-    ) -> Response:
+    async def exchange(self, url: str, content: bytes | None = None) -> Response:
         """Send one request, a POST where it has a content, and read its answer. Redirects are not followed: the key
         stays here.
 
-        Args:
-            tls_name: whose certificate is asked for, where the URL names an IP address.
         Raises:
             TimeoutError: it was not all there in time, from the first byte sent to the last one read, however steadily
             it dripped. httpx.RequestError: no connection, or it broke; or what came is not packed as it says.
         """
         method = "GET" if content is None else "POST"
-        about = {"sni_hostname": tls_name} if tls_name else None
         with self._connection() as connection, _url_errors():
             async with (
                 asyncio.timeout(self._timeout_s),
-                connection.stream(method, url, content=content, headers=headers, extensions=about) as response,
+                connection.stream(method, url, content=content, headers=HEADERS) as response,
             ):
                 body = _Body(response.headers.get("content-encoding", ""), self._most_bytes)
                 async for packed in response.aiter_raw():
@@ -125,7 +113,7 @@ class Connections:
                     if body.is_cut:  # the rest stays unread, and the connection is closed
                         break
                 wait_s = retry_after_s(response.headers.get("retry-after", ""), time.time())
-                return Response(response.status_code, body.whole(), body.is_cut, wait_s, response.headers)
+                return Response(response.status_code, body.whole(), body.is_cut, wait_s)
 
     @contextlib.contextmanager
     def _connection(self) -> Iterator[httpx.AsyncClient]:

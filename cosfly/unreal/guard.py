@@ -7,17 +7,23 @@ that put the camera back. Where the input ends, so has the process that wrote it
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import shlex
+import signal
 import socket
 import subprocess
 import sys
 import time
+from collections import defaultdict
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 from cosfly.errors import EnvironmentMissing
-from cosfly.work.server_process import end_server, start_process
-from cosfly.work.worker import adopt_orphans
+from cosfly.work.stage_events import process_stat
+from cosfly.work.worker import LEFT_TO_THE_PARENT, adopt_orphans, end_with_parent, signals_held_back
 
 PATIENCE_S = 20.0  # for a server that is to be left in order
 
@@ -92,12 +98,53 @@ def _put_back_unrealcv(host: str, port: int, commands: list[str]) -> None:
     connection.close()
 
 
+def _start_server(command: str) -> subprocess.Popen:
+    """Start a process that is killed with this one. In a session of its own: Ctrl-C is not for it."""
+    with signals_held_back():
+        return subprocess.Popen(
+            shlex.split(command),
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,
+            preexec_fn=partial(_begin, os.getpid()),
+        )
+
+
+def _begin(parent_pid: int) -> None:
+    end_with_parent(parent_pid)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, LEFT_TO_THE_PARENT)
+
+
+def _end_server(server: subprocess.Popen) -> None:
+    """Kill a server and all that it started, wherever they went."""
+    if sys.platform != "linux":  # nothing tells what else it started
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(server.pid, signal.SIGKILL)
+    while left := _descendants():
+        for pid in left:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        server.poll()
+        time.sleep(0.02)
+
+
+def _descendants() -> list[int]:
+    """Give the processes below this one, without those that have ended."""
+    children = defaultdict[int, list[int]](list)
+    for path in Path("/proc").glob("[0-9]*"):
+        if (stat := process_stat(int(path.name))) and stat[0] != b"Z":
+            children[int(stat[1])].append(int(path.name))
+    found = [os.getpid()]
+    for pid in found:
+        found += children[pid]
+    return found[1:]
+
+
 def main(engine: str, host: str, port: str, command: str) -> None:
     adopt_orphans()
-    server = start_process(shlex.split(command)) if command else None
+    server = _start_server(command) if command else None
     lines = [json.loads(line) for line in sys.stdin]
     if server is not None:
-        end_server(server, 0.0)
+        _end_server(server)
     elif lines:
         try:
             if engine == "carla":

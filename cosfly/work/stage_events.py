@@ -213,12 +213,6 @@ def gpu_use(pids: Mapping[int, int]) -> dict[str, Any]:
     return of_devices | {"worker_gpu_percent": percent, "worker_gpu_mib": mib}
 
 
-def num_gpus() -> int:
-    """Give how many NVIDIA devices the driver here tells of."""
-    nvml = _nvml()
-    return 0 if nvml is None else _asked(nvml.nvmlDeviceGetCount) or 0
-
-
 @lru_cache(maxsize=1)
 def _nvml() -> Any:
     """Give the library of the NVIDIA driver; None where there is none, or no device."""

@@ -126,6 +126,9 @@ class Tally(BaseModel):
         total = self.kept + self.dropped.total() + self.failed.total()
         assert total == self.input, f"{total} outcomes for {self.input} items: {self}"
 
+    def __add__(self, other: Tally) -> Tally:
+        return Tally(**{name: getattr(self, name) + getattr(other, name) for name in Tally.model_fields})
+
     @field_serializer("dropped", "failed")
     def _sorted(self, counts: Counter[str]) -> dict[str, int]:
         return dict(sorted(counts.items()))
