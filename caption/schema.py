@@ -209,30 +209,17 @@ class EvidenceConfig(Config):
     relative: float = Field(0.02, ge=0, le=1, description="share of the measured value, where that is more")
     drop: bool | None = Field(
         None,
-        description="drop a sample whose text contradicts a measured value; empty: where slots, claims or a reader say "
-        "what it states",
+        description="drop a sample whose text contradicts a measured value; empty: where slots say what it states",
     )
 
 
-class AskedConfig(Config):
-    """How a model beside the teacher is asked."""
-
-    max_tokens: int = Field(512, ge=64, description="longest answer, tokens")
-    concurrency: MayDiffer[int] = Field(16, ge=1, le=4096, description="most requests in flight")
-    timeout_s: MayDiffer[float] = Field(120.0, gt=0, description="limit of one request")
-    max_tries: MayDiffer[int] = Field(6, ge=1, description="tries of one request when the server is busy or fails")
-    max_reply_mb: MayDiffer[float] = Field(
-        4.0, gt=0, le=1000, description="longest answer of the server as it is read, unpacked, megabytes"
-    )
-    json_schema: bool = Field(True, description="ask the server to enforce the answer's JSON schema")
-    extra_body: dict[str, Any] = Field(default_factory=dict, description="further fields of the request")
-
-
-class JudgeConfig(AskedConfig):
+class JudgeConfig(Config):
     """A language model that judges conflicts between a decision and the label; never over a hard conflict."""
 
     url: str | None = Field(None, description="OpenAI-compatible endpoint of the judge; empty: no judge")
     model: str | None = Field(None, description="model name; empty takes the endpoint's only model")
+    concurrency: MayDiffer[int] = Field(16, ge=1, le=4096, description="most requests in flight")
+    extra_body: dict[str, Any] = Field(default_factory=dict, description="further fields of the request")
 
     @model_validator(mode="after")
     def _is_url(self) -> Self:
@@ -243,28 +230,6 @@ class JudgeConfig(AskedConfig):
     def recorded(self) -> dict[str, Any]:
         """Where a judge is asked does not decide what it says."""
         return super().recorded() | {"url": None if self.url is None else "endpoint"}
-
-
-class ReaderConfig(AskedConfig):
-    """Language models that read somebody else's prose into claims, twice (caption/teachers/reader.py)."""
-
-    urls: tuple[str, ...] = Field(
-        (), max_length=2, description="endpoints of one reader, asked in two orders, or of two readers; empty: none"
-    )
-    models: tuple[str, ...] = Field(
-        (), max_length=2, description="their model names; empty takes each endpoint's only one"
-    )
-    max_tokens: int = Field(4096, ge=64, description="longest reading, tokens")
-
-    @model_validator(mode="after")
-    def _are_urls(self) -> Self:
-        for url in self.urls:
-            check_url(url)
-        return self
-
-    def recorded(self) -> dict[str, Any]:
-        """Where a reader is asked does not decide what it says."""
-        return super().recorded() | {"urls": len(self.urls)}
 
 
 class RepairConfig(Config):
@@ -320,8 +285,7 @@ class CaptionConfig(Config):
     )
     writing: Writing = Field(
         "slots",
-        description="how a teacher writes. slots: it names facts, their values are filled in; claims: plain text "
-        "beside a list of what it states; prose: plain text, read afterwards",
+        description="how a teacher writes. slots: it names facts, their values are filled in; prose: plain text",
     )
     prompts: Path | None = Field(
         None,
@@ -345,7 +309,6 @@ class CaptionConfig(Config):
     budget: MayDiffer[BudgetConfig] = Field(BudgetConfig(), description="prices and limits of tokens and money")
     repair: RepairConfig = Field(RepairConfig(), description="re-generation of rejected samples")
     judge: JudgeConfig = Field(JudgeConfig(), description="an optional judge of conflicts")
-    reader: ReaderConfig = Field(ReaderConfig(), description="an optional reader of prose that came without claims")
     structure_asks: int = Field(3, ge=1, le=10, description="asks until an answer has the right structure")
     correction_asks: int = Field(
         1,

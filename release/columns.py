@@ -230,11 +230,7 @@ def _text(language: Language, name: str, caption: Caption) -> str | None:
 
 
 def _evidence(caption: Caption) -> str:
-    evidence = caption.evidence
-    if evidence.reader is not None:
-        models = [published_name(model) for model in evidence.reader.models]
-        evidence = evidence.model_copy(update={"reader": evidence.reader.model_copy(update={"models": models})})
-    return dump_json(evidence.model_dump(mode="json", exclude_none=True))
+    return dump_json(caption.evidence.model_dump(mode="json", exclude_none=True))
 
 
 def _prompt(language: Language, part: str, caption: Caption) -> str | None:

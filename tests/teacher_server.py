@@ -28,10 +28,6 @@ ENGLISH = {
     "reasoning_trace": "The line of sight is free and the motion is regular, so this manoeuvre keeps the target in "
     "frame.",
 }
-CLAIMS = [
-    {"sentence": "C1", "quantity": "visibility", "at": "t4", "value": "visible", "unit": "", "modality": "observed"},
-    {"sentence": "C1", "quantity": "target_motion", "at": "", "value": "walking", "unit": "", "modality": "observed"},
-]
 CHINESE = {
     "critical_components": "目标行人{visibility}，正在无人机前方的道路上行走。",
     "reasoning_trace": "视线通畅且运动规律，因此该动作可将目标保持在画面内。",
@@ -56,7 +52,6 @@ FAULTS = (
     *STATUS_FAULTS, *TEXT_FAULTS, "reset", "truncated_body", "not_json", "false_gzip", "empty_choices", "null_content",
     "slow", "drip",
     "schema_refused", "schema_ignored", "wrong_mirror_decision", "wrong_mirror_number", "wrong_therefore",
-    "wrong_claims",
     "echo_key",
 )  # fmt: skip
 
@@ -175,8 +170,6 @@ def obedient_answer(server: TeacherServer, body: dict, fault: str | None = None)
         decision = allowed[0]
     therefore = "hover" if fault == "wrong_therefore" and decision != "hover" else decision
     fields = {"therefore": therefore} if "therefore" in json.dumps(body) else {}  # students are not asked for it
-    if "claims" in schema.get("properties", {}):
-        fields["claims"] = [{**CLAIMS[0], "at": "t9"}] if fault == "wrong_claims" else CLAIMS
     # Students are asked in both languages.
     texts = ENGLISH if str(body["messages"][0]["content"]).isascii() else CHINESE
     return {**texts, **fields, "flight_decision": decision}

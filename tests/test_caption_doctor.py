@@ -6,13 +6,12 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import pytest
 from commands import invoke
 from specimens_captions import VOCABULARY, deciding, report_of, settings
 from teacher_server import ENGLISH, TeacherServer
 
-from caption.run.forecast import estimate, make_forecast
+from caption.run.forecast import make_forecast
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.doctor import ODD_WORD, Finding, examine_endpoint, largest_messages
@@ -164,43 +163,24 @@ def test_the_command_exits_with_1_when_unusable():
 # --- the plan ---------------------------------------------------------------------------------------------------------
 
 
-def test_estimate_is_students_interval():
-    found = estimate([8.0, 10.0, 12.0])
-    assert found.expected == 10.0
-    half = 2.919986 * 2.0 / np.sqrt(3)  # t(0.95, 2 degrees of freedom), standard deviation 2
-    assert (found.low, found.high) == pytest.approx((10 - half, 10 + half), rel=1e-5)
-    assert estimate([5.0]).low == 0.0
-    assert estimate([4.0, 4.0]).low == estimate([4.0, 4.0]).high == 4.0
-
-
 def test_the_plan_is_what_the_run_then_takes(tree, tmp_path):
     budget = {"price_prompt": 2.0, "price_completion": 10.0}
-    with deciding(delay_s=0.1) as server:
+    with deciding() as server:
         cfg = settings(server.url, budget=budget)
-        forecast = make_forecast(cfg, tree, tmp_path / "out")
+        rows = dict(make_forecast(cfg, tree, tmp_path / "out"))
         num_trial_requests = len(server.bodies)
         run(cfg, tree, tmp_path / "out")
-        asked = len(server.bodies) - 2  # two requests measured the pictures' tokens
+        asked = len(server.bodies)
     report = report_of(tmp_path / "out")
-    assert forecast.num_windows == report["windows"]["input"] == 5
-    assert forecast.calls.expected == asked == 10
-    assert forecast.prompt_tokens.expected == report["tokens"]["prompt_tokens"] == 10_000
-    assert forecast.completion_tokens.low == report["tokens"]["completion_tokens"] == 1_000
-    assert forecast.cost.expected == pytest.approx((10_000 * 2.0 + 1_000 * 10.0) / 1e6)
-    assert num_trial_requests == 2 * forecast.num_trials + 2  # and the run did not ask about these windows again
-    assert 0 < forecast.seconds.low <= forecast.seconds.expected <= forecast.seconds.high
-    assert ("cost", "0.03 (0.03 to 0.03)") in forecast.rows()
+    assert rows["windows"] == f"about {report['windows']['input']} to do"
+    assert rows["calls"] == str(asked) == "10"
+    assert rows["tokens in"] == f"{report['tokens']['prompt_tokens']:,}" == "10,000"
+    assert rows["tokens out"] == f"{report['tokens']['completion_tokens']:,}" == "1,000"
+    assert rows["cost"] == "0.03"
+    assert num_trial_requests == asked  # the run did not ask about the trial windows again
 
 
-def test_the_plan_knows_the_images_share(tree, tmp_path):
-    with TeacherServer(respond=patient(max_images=99)) as server:
-        forecast = make_forecast(settings(server.url), tree, tmp_path / "out")
-    assert forecast.image_tokens is not None
-    asks = forecast.image_tokens.expected / (15 * TOKENS_PER_IMAGE * forecast.num_windows)
-    assert asks == round(asks)  # whole asks of 15 pictures
-
-
-@pytest.mark.parametrize("writing", ["slots", "claims", "prose"])
+@pytest.mark.parametrize("writing", ["slots", "prose"])
 def test_the_largest_prompt_bounds_real_ones_with_their_corrections(tree, tmp_path, writing):
     with deciding("ascend", lambda number, body: "wrong_therefore") as server:
         cfg = CaptionConfig.model_validate({"teacher": server.url, "writing": writing, "limit": 2})

@@ -71,14 +71,10 @@ def captions_of(lines: list[dict], tree: Path, folder: Path, **settings) -> list
 
 def test_a_file_is_judged_as_answers_are(tree, rules, tmp_path):
     lines = [line(caption) for caption in rules[:-1]]
-    lines[1] |= {
-        "claims": [{"sentence": "C1", "quantity": "visibility", "value": "visible"}],
-        "therefore": lines[1]["en"]["flight_decision"],
-    }
+    lines[1]["therefore"] = lines[1]["en"]["flight_decision"]
     found = captions_of(lines, tree, tmp_path / "a")
     assert [caption.status for caption in found[:-1]] == ["accepted"] * (len(rules) - 1)
     assert (found[-1].drop_reason, found[-1].en) == ("not_in_file", None)
-    assert [caption.writing for caption in found[:2]] == ["prose", "claims"]
     assert (found[0].therefore, found[1].therefore) == (None, lines[1]["therefore"])
     assert (found[0].teacher.kind, found[0].teacher.model) == ("file", "theirs.jsonl")
     assert found[0].verdict == "CONSISTENT"
@@ -91,15 +87,14 @@ def test_a_file_is_judged_as_answers_are(tree, rules, tmp_path):
     assert (report["refusals"], found[-1].checks.refusal) == ({}, None)
 
 
-def test_a_contradiction_is_on_record_and_drops_its_window_unless_the_settings_say_otherwise(tree, rules, tmp_path):
-    wrong = {"sentence": "C1", "quantity": "altitude", "at": "t4", "value": 777.0, "unit": "m"}
+def test_a_contradiction_is_on_record_and_drops_its_window_where_the_settings_say_so(tree, rules, tmp_path):
     said = EN | {"critical_components": "The person can be made out from 777 m up.", "flight_decision": rules[0].label}
-    lines = [line(rules[0], en=said, zh=None, claims=[wrong]), line(rules[1])]
-    found = captions_of(lines, tree, tmp_path / "a", evidence={"drop": False})
+    lines = [line(rules[0], en=said, zh=None), line(rules[1])]
+    found = captions_of(lines, tree, tmp_path / "a")
     assert found[0].status == "accepted"
-    assert found[0].checks.evidence == ["en false: altitude@t4 = 777 m"]
+    assert [problem.partition(":")[0] for problem in found[0].checks.evidence] == ["en number"]
     assert (found[0].checks.sentences or {})["en"][0] == "contradicted"
-    dropped = captions_of(lines, tree, tmp_path / "b")
+    dropped = captions_of(lines, tree, tmp_path / "b", evidence={"drop": True})
     assert [caption.drop_reason for caption in dropped[:2]] == ["evidence", None]
 
 
@@ -119,7 +114,6 @@ def test_english_alone_is_judged_and_kept(tree, rules, tmp_path):
         ({"zh": ZH | {"flight_decision": "return_to_home"}}, "bilingual_decision"),
         ({"zh": EN | {"flight_decision": "hover"}}, "bilingual_structure_"),
         ({"en": EN | {"reasoning_trace": "So.", "flight_decision": "hover"}}, "structure_reasoning_trace_too_short"),
-        ({"claims": [{"sentence": "C1", "quantity": "x" * 60, "value": 1}]}, "claims_malformed"),
     ],
 )
 def test_what_is_wrong_with_a_caption_drops_its_window(tree, rules, tmp_path, changes, reason):
@@ -149,10 +143,6 @@ BAD = [
     ("{broken", ":2"),
     ('{"sample_id": "a", "en": {"critical_components": 7}}', "en.critical_components"),
     (json.dumps({"sample_id": "a", "en": EN | {"flight_decision": "hover"}, "colour": "red"}), "colour"),
-    (
-        json.dumps({"sample_id": "a", "en": EN | {"flight_decision": "hover"}, "claims": [{"sentence": "C1"}]}),
-        "claims[0].quantity",
-    ),
     (json.dumps({"sample_id": "first", "en": EN | {"flight_decision": "hover"}}), "sample_id"),
 ]
 

@@ -80,9 +80,10 @@ def test_what_cannot_be_read_is_never_an_acceptance(tree, tmp_path):
     assert report["judgements"] == {UNJUDGED: len(asked)}
 
 
-def test_a_judge_that_does_not_answer_leaves_conflicts_unjudged(tree, tmp_path):
+def test_a_judge_that_does_not_answer_leaves_conflicts_unjudged(tree, tmp_path, monkeypatch):
+    monkeypatch.setattr("caption.teachers.judge.MAX_TRIES", 1)
     with TeacherServer(lambda number, body: "500") as server:
-        cfg = CaptionConfig.model_validate({"judge": {"url": server.url, "max_tries": 1}, "limit": 9})
+        cfg = CaptionConfig.model_validate({"judge": {"url": server.url}, "limit": 9})
         captions = list(read_captions(run(cfg, tree, tmp_path / "out")))
     asked = [c for c in captions if c.judge]
     assert asked

@@ -107,13 +107,11 @@ def test_every_code_of_a_dropped_window_is_explained_in_one_table():
     rows = dict(re.findall(r"^\| `([a-z_]+)(?:\.\.\.)?` \| (.+) \|$", docs, re.MULTILINE))
     assert {code: rows.get(code) for code in REASONS} == REASONS
     sources = [path.read_text("utf-8") for path in (ROOT / "caption").rglob("*.py") if path.name != "reasons.py"]
-    codes = {
-        code for text in sources for code in re.findall(r"\"((?:slots|claims|conflict|regeneration)_[a-z_]+)\"", text)
-    }
-    assert {code for code in codes if code not in REASONS} <= {"slots_", "claims_"}
+    codes = {code for text in sources for code in re.findall(r"\"((?:slots|conflict|regeneration)_[a-z_]+)\"", text)}
+    assert {code for code in codes if code not in REASONS} <= {"slots_"}
 
 
-@pytest.mark.parametrize("writing", ["slots", "claims", "prose"])
+@pytest.mark.parametrize("writing", ["slots", "prose"])
 def test_a_decision_against_its_own_reasoning_is_asked_for_again_with_what_was_wrong(tree, tmp_path, writing):
     """In every way of writing the action that the reasoning came to stands before the decision."""
     with deciding("ascend", first("wrong_therefore")) as server:
@@ -288,7 +286,7 @@ def test_no_command_takes_a_url_that_cannot_be_asked_or_holds_a_secret(tmp_path,
     at, data, asked = ["--out", tmp_path / "out"], ["--data", tmp_path], [url]
     commands = [
         ("caption --teacher", asked, data), ("caption --judge", asked, data), ("caption --plan --teacher", asked, data),
-        ("caption doctor", asked), ("caption judge-check", asked), ("caption reader-check", asked),
+        ("caption doctor", asked), ("caption judge-check", asked),
         ("caption compare-strategies --teacher", asked, at, data),
         ("run quickstart --set", [f"caption.teacher={json.dumps(url)}"], "--set caption.writing=prose", at),
     ]  # fmt: skip

@@ -85,7 +85,6 @@ SMALL = {
     "run runs/five --set": _set("pedestrians.num_paths=3"),
     "bench": ["--workers", "2"],
     "reproduce": ["--walks", "1", "--workers", "1"],
-    "caption reader-check": ["--limit", "12"],
     "distill train": _set(
         *("distill.train.max_steps=2", "distill.train.max_pixels=4096", "distill.train.samples_per_step=2"),
         *("distill.train.batch_size=1", "distill.train.validation_samples=2", "distill.train.data_workers=0"),

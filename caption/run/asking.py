@@ -22,7 +22,6 @@ from caption.run.reasons import explained
 from caption.run.window_loop import caption_window
 from caption.schema import CaptionConfig, Window
 from caption.teachers.judge import open_judge
-from caption.teachers.reader import open_reader
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
 from caption.truth.vocabulary import Vocabulary
 from cosfly.chat.answers import AnswerBook
@@ -36,7 +35,7 @@ from cosfly.work.stage_folder import Failed, StageFolder, Tally, read_failures, 
 
 log = logging.getLogger(__name__)
 
-ANSWERS, JUDGEMENTS, READINGS = "answers", "judgements", "readings"  # folders
+ANSWERS, JUDGEMENTS = "answers", "judgements"  # folders
 QUARANTINE, FAILURES = "quarantine.jsonl", "failures.jsonl"
 # Begun beyond `concurrency`, so that pictures are encoded and answers checked while others are asked.
 WAITING_WINDOWS = 16
@@ -87,7 +86,7 @@ class Asking:
         self.failures: list[Failed] = []  # flights that cannot be read
         self.quarantine = read_quarantine(stage.path)
         self.only = frozenset(self.quarantine) if retry_failed else None
-        beside = [cfg.judge.concurrency] * bool(cfg.judge.url) + [cfg.reader.concurrency] * bool(cfg.reader.urls)
+        beside = [cfg.judge.concurrency] * bool(cfg.judge.url)
         in_flight = max(cfg.most_in_flight, *beside, 0)
         self.most_open = in_flight + WAITING_WINDOWS
         self.was_whole = was_whole
@@ -101,16 +100,15 @@ class Asking:
             TeacherError: no window would get an answer. What was answered is kept.
         """
         guesses = {flight.name: flight.guess_num_windows(self.cfg.window) for flight in allotted}
-        self.books = tuple(AnswerBook(self.stage.path / name) for name in (ANSWERS, JUDGEMENTS, READINGS))
-        answers, judgements, readings = self.books
+        self.books = tuple(AnswerBook(self.stage.path / name) for name in (ANSWERS, JUDGEMENTS))
+        answers, judgements = self.books
         budget, troubles = first_budget(self.cfg, *(book.totals for book in self.books)), Troubles()
         display = Display(sum(guesses.values()), budget, of_judge=judgements.totals, troubles=troubles)
         try:
-            with answers, judgements, readings, display as self.display:
+            with answers, judgements, display as self.display:
                 async with (
                     open_teacher(self.cfg, answers, self.seed, budget, self.only, troubles) as teacher,
                     open_judge(self.cfg.judge, self.vocabulary, self.seed, judgements, budget, troubles) as self.judge,
-                    open_reader(self.cfg.reader, self.vocabulary, self.seed, readings, budget, troubles) as self.reader,
                     self._heartbeat(),
                 ):
                     await self._ask_all(allotted, teacher, guesses)
@@ -200,7 +198,7 @@ class Asking:
     async def _caption(self, flight: _OpenFlight, window: Window, teacher: Teacher) -> None:
         sample_id, begun_s = window.observed.sample_id, time.monotonic()
         try:
-            caption = await caption_window(window, teacher, self.cfg, self.vocabulary, self.judge, self.reader)
+            caption = await caption_window(window, teacher, self.cfg, self.vocabulary, self.judge)
         except BudgetSpent as error:
             self.asked.stopped = self.asked.stopped or error.what
             self._leave_out(flight, Failed(id=sample_id, code="not_asked", message=error.what))

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from caption.run.chance import ChanceCounts, ChanceReport
 from cosfly.products.actions import ActionSet, shipped_actions
 from cosfly.products.captions import Caption, Language, SentenceState, TeacherRecord, Usage
 from cosfly.products.sentences import sentences_of
@@ -78,7 +77,6 @@ class CaptionReport(_Record):
     labels: dict[str, int]
     label_from: dict[str, int]
     confusion: dict[str, dict[str, int]] = Field(alias="confusion_label_to_first_decision")
-    chance: ChanceReport | None  # None: no window has an answer
     repair: RepairCounts
     lengths: dict[str, dict[str, Histogram]]  # language -> field
     judgements: dict[str, int]
@@ -106,7 +104,7 @@ class CaptionReport(_Record):
             for token in sorted(own)
             if self.labels and token not in self.labels
         ]
-        return refused + never + (self.chance.warnings if self.chance else [])
+        return refused + never
 
     def as_json(self) -> dict:
         left_out = {"judge_tokens"} if self.judge_tokens is None else set()
@@ -150,7 +148,6 @@ class Ledger:
         self.num_asks = self.num_skipped = self.num_missed = 0
         self.teacher: TeacherRecord | None = None
         self.shelf = Shelf()
-        self.chance = ChanceCounts(actions.tokens)
         self.words = {name: Counter[str]() for name in WORDS}
         self.keyframes: Counter[str] = Counter()
         self.repairs: Counter[str] = Counter()
@@ -196,7 +193,6 @@ class Ledger:
                 for field in TEXT_FIELDS:
                     self.lengths[language, field, len(getattr(coc, field)) // BIN_CHARACTERS[language]] += 1
         self.shelf.add(caption)
-        self.chance.add(caption)
         if caption.judge:
             self.words["judgements"][caption.judge.verdict] += 1
             if caption.judge.overruled_by is not None:
@@ -236,7 +232,6 @@ class Ledger:
             asks=self.num_asks,
             tokens=dict(sorted(self.tokens.items())),
             confusion=confusion,
-            chance=self.chance.report(),
             repair=RepairCounts(
                 rejected=self.repairs.total(),
                 rungs=_sorted(self.repairs),
@@ -289,10 +284,8 @@ def _sorted(counts: Counter[str]) -> dict[str, int]:
 def _proved_by_claims(caption: Caption, language: Language, states: Sequence[SentenceState]) -> int:
     """Count the proved sentences of a text that its claims prove; a template holds those of such sentences alone."""
     template = (caption.slots or {}).get(language)
-    if template is None:
-        return states.count("proved")
     coc = caption.en if language == "en" else caption.zh
-    if not template.claims or coc is None:
+    if template is None or not template.claims or coc is None:
         return 0
     claimed = {claim.sentence for claim in template.claims}
     return sum(s == "proved" and name in claimed for (name, _), s in zip(sentences_of(coc), states, strict=True))

@@ -63,7 +63,7 @@ def page_html(
         "caption/run/report.html", title=name, style=STYLE, report=report, meanings=VERDICTS, states=STATES,
         who=f"teacher: {teacher.kind}, model {teacher.model}" if teacher else "teacher: none, model unknown",
         is_rules=teacher is not None and teacher.kind == "rules", tiles=_tiles(report), verdicts=verdicts, share=_share,
-        proved_by=_proved_by(report), language_names=LANGUAGE_NAMES, chance=_chance(report),
+        proved_by=_proved_by(report), language_names=LANGUAGE_NAMES,
         confusion=_confusion(report.confusion, actions.tokens), warnings=report.warnings(actions),
         repairs=_repairs(report), checks=_checks(report),
         cost=_cost(report, budget),
@@ -100,18 +100,6 @@ def _proved_by(report: CaptionReport) -> dict[str, str]:
         parts = (("slots", counts.get("proved", 0) - count), ("claims", count))
         found[language] = ", ".join(f"proved by {name} {n:,} ({100 * n / total:.1f} %)" for name, n in parts)
     return found
-
-
-def _chance(report: CaptionReport) -> dict[str, Any]:
-    chance = report.chance
-    if chance is None:
-        return {}
-    return {
-        "this run": chance.first_answers,
-        "every action equally often": chance.random_decisions,
-        "the same decisions, dealt at random": chance.shuffled_decisions,
-        f"always {chance.decision.replace('_', ' ')}": chance.one_decision,
-    }
 
 
 def _confusion(confusion: Mapping[str, Mapping[str, int]], tokens: Sequence[str]) -> dict[str, list[str]]:

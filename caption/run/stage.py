@@ -85,7 +85,7 @@ def run(
         return out / PRODUCT
     allotted, is_cut = allot(named_flights(data, cfg.flights), cfg, vocabulary)
     restore_parts(stage.path, out / PRODUCT, allotted)
-    if cfg.teacher_kind in EMBEDDED and cfg.judge.url is None and not cfg.reader.urls:
+    if cfg.teacher_kind in EMBEDDED and cfg.judge.url is None:
         items = [Item(flight.item_id, flight) for flight in allotted]
         args = (cfg, vocabulary, stage.path, seed)
         asked = Asked(run_items(stage, items, make_worker, args, workers=workers, watch=watch, label="caption").tally)

@@ -16,13 +16,12 @@ from caption.schema import CaptionConfig, Judged, Strategy, Window
 from caption.teachers.foreign import Terms
 from caption.teachers.judge import Case, Judge
 from caption.teachers.prompts import Correction, Question, make_question, prompt_hash
-from caption.teachers.reader import Reader, judge_text
 from caption.teachers.teacher import Teacher, terms_of
 from caption.truth.actions import ActionTable, Motion, measure, table_of
 from caption.truth.facts import Facts
 from caption.truth.mirror import check_translation
+from caption.truth.references import measured_series
 from caption.truth.vocabulary import Vocabulary
-from caption.writing.claims import MAX_COMPLAINTS, measured_series
 from caption.writing.contract import Draft, Refused, refuse_decision
 from cosfly.chat.contract import NoAnswer, Reply
 from cosfly.errors import InputError, RenderError
@@ -33,13 +32,14 @@ from cosfly.products.captions import (
     Coc,
     JudgeRecord,
     Language,
-    ReaderRecord,
     RepairRecord,
     Usage,
     Verdict,
 )
 from cosfly.reading.objects import CONTEXT_FULL
 from cosfly.work.store import dump_json
+
+MAX_COMPLAINTS = 8  # named at once
 
 
 class Prepared(NamedTuple):
@@ -76,28 +76,25 @@ async def caption_window(
     cfg: CaptionConfig,
     vocabulary: Vocabulary,
     judge: Judge | None = None,
-    reader: Reader | None = None,
 ) -> Caption:
     """Caption one window.
 
     Args:
-        judge: asked about conflicts; None: none is. reader: asked what prose states that came without claims; None:
-        none is.
+        judge: asked about conflicts; None: none is.
     Raises:
         NoAnswer: the teacher gave none, and asking again later may help.
         TeacherError: no window will get one.
     """
     [prepared] = prepare([window], teacher, cfg, vocabulary)
-    return await caption_prepared(prepared, teacher, cfg, judge, reader)
+    return await caption_prepared(prepared, teacher, cfg, judge)
 
 
 async def caption_prepared(
-    prepared: Prepared, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None, reader: Reader | None = None
+    prepared: Prepared, teacher: Teacher, cfg: CaptionConfig, judge: Judge | None = None
 ) -> Caption:
     """Caption a window that is prepared; as `caption_window`."""
     window, question = prepared.window, prepared.question
     loop = _Loop(teacher, cfg, prepared, judge)
-    loop.reader = reader
     loop.checks["keyframe"] = window.keyframe
     loop.checks["contradicted"] = prepared.contradicted
     reason = window.problem
@@ -142,7 +139,6 @@ def _record(prepared: Prepared, teacher: Teacher, loop: _Loop, reason: str | Non
         label=loop.label,
         verdict=loop.verdict,
         judge=loop.judgement,
-        reader=loop.reading,
         repair=loop.repair,
         checks=Checks(**loop.checks),
         status="accepted" if reason is None else "dropped",
@@ -203,8 +199,6 @@ class _Loop:
         self.answered: Question | None = None  # the one that `english` answers
         self.verdict: Verdict | None = None
         self.judgement: JudgeRecord | None = None
-        self.reader: Reader | None = None
-        self.reading: ReaderRecord | None = None
         self.repair: RepairRecord | None = None
         self.checks: dict[str, Any] = {}
         self.usage = Usage()
@@ -238,7 +232,7 @@ class _Loop:
         elif reason is None:
             self.checks["bilingual"] = "no_chinese"
         if reason is None or (self.terms.is_given and self.english is not None):
-            found = await self._check_evidence(question)  # what was given is judged even where its window is dropped
+            found = self._check_evidence(question)  # what was given is judged even where its window is dropped
             reason = reason or found
         return reason
 
@@ -259,7 +253,6 @@ class _Loop:
             "therefore": english.therefore,
             **{language: draft.coc for language, draft in drafts.items()},
             "slots": {language: draft.template for language, draft in drafts.items() if draft.template} or None,
-            "claims": list(english.claims) or None,
         }
 
     async def ask_freely(self, question: Question) -> str | None:
@@ -304,13 +297,7 @@ class _Loop:
             return Refused(parsed.reason or "", "")
         if "therefore" in self.terms.fields and (refused := refuse_decision(parsed)):
             return refused
-        return self._kept(self.way.read(parsed, question.facts))
-
-    def _kept(self, answer: Draft | Refused) -> Draft | Refused:
-        """Keep what somebody else wrote in spite of claims that do not hold: it is judged as it stands."""
-        if self.terms.is_given and isinstance(answer, Refused) and answer.reason.startswith("claims_"):
-            return answer.draft or answer
-        return answer
+        return self.way.read(parsed, question.facts)
 
     async def _treat(self, question: Question) -> str | None:
         """Keep, repair or drop the answer for its verdict; gives the reason to drop the window."""
@@ -411,7 +398,7 @@ class _Loop:
                 if parsed.reason == CONTEXT_FULL:
                     break
                 continue
-            answer = self._kept(self.way.read_mirror(parsed, self.english, self.answered.facts))
+            answer = self.way.read_mirror(parsed, self.english, self.answered.facts)
             if isinstance(answer, Draft):
                 answer = self._translated(self.english, answer)
             if isinstance(answer, Draft):
@@ -429,20 +416,14 @@ class _Loop:
         found = check_translation(english.coc, chinese.coc, self.way.vocabulary)
         return Refused(*found, chinese) if found else chinese
 
-    async def _check_evidence(self, question: Question) -> str | None:
+    def _check_evidence(self, question: Question) -> str | None:
         """Put on record what was found out about every sentence; gives the reason to drop the window."""
         assert self.english is not None
         drafts: dict[Language, Draft] = {"en": self.english}
         if self.chinese is not None:
             drafts["zh"] = self.chinese
-        writing, facts = self.terms.writing, question.facts
-        if self.reader is not None and writing == "prose":
-            texts = {language: draft.coc for language, draft in drafts.items()}
-            before = self.reading
-            self.reading = await self.reader.record(texts, facts, question.window.sample_id)
-            self.reading.usage += before.usage if before else Usage()
         judged: dict[Language, list[Judged]] = {
-            language: judge_text(draft, self.way, self.reading, facts, self.cfg.evidence, language)
+            language: self.way.judge(draft, question.facts, self.cfg.evidence, language)
             for language, draft in drafts.items()
         }
         self.checks["sentences"] = {
@@ -456,8 +437,7 @@ class _Loop:
         ]
         self.checks["evidence"] = found or "ok"
         drop = self.cfg.evidence.drop
-        is_stated = writing != "prose" or self.reading is not None  # by slots, claims or a reader
-        return "evidence" if found and (is_stated if drop is None else drop) else None
+        return "evidence" if found and (self.terms.writing == "slots" if drop is None else drop) else None
 
     def _read(self, reply: Reply, language: Language) -> Parsed:
         self.asks += 1

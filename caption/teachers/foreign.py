@@ -1,7 +1,7 @@
 """Captions of somebody else: a JSON-lines file in a teacher's place (`--teacher file:PATH`), or what a student answered
 (`student:PATH`).
 
-One line a window: sample_id, en {three fields}; where its writer has them, zh {three fields}, claims, therefore. Or
+One line a window: sample_id, en {three fields}; where its writer has them, zh {three fields}, therefore. Or
 `predictions.jsonl`. Nothing can be asked for again. A window without a line is dropped.
 """
 
@@ -17,7 +17,7 @@ from caption.teachers.prompts import Question
 from caption.writing.contract import Draft
 from cosfly.chat.contract import NoAnswer, Reply
 from cosfly.errors import InputError
-from cosfly.products.captions import Claim, Coc, Language, TeacherRecord, TeacherSettings, Writing
+from cosfly.products.captions import Coc, Language, TeacherRecord, TeacherSettings, Writing
 from cosfly.products.predictions import FAILED, Prediction, read_predictions
 from cosfly.reading.documents import model_lines
 from cosfly.work.store import dump_json
@@ -33,7 +33,6 @@ class ForeignCaption(BaseModel):
     sample_id: str
     en: Coc
     zh: Coc | None = None
-    claims: list[Claim] | None = None  # of the English text
     therefore: str | None = None
 
 
@@ -81,18 +80,15 @@ class FileTeacher:
         caption = self._caption(sample_id)
         if caption is None:
             return Terms("prose", (), is_given=True, has_mirror=False)
-        fields = {"claims": caption.claims, "therefore": caption.therefore}
-        given = tuple(name for name, value in fields.items() if value is not None)
-        writing: Writing = "prose" if caption.claims is None else "claims"
-        return Terms(writing, given, is_given=True, has_mirror=caption.zh is not None)
+        given = () if caption.therefore is None else ("therefore",)
+        return Terms("prose", given, is_given=True, has_mirror=caption.zh is not None)
 
     async def ask(self, question: Question) -> Reply:
         sample_id = question.window.sample_id
         caption = self._caption(sample_id)
         if caption is None:
             raise NoAnswer(NOT_IN_FILE, sample_id, is_final=True)
-        more = caption.model_dump(include={"claims", "therefore"}, exclude_none=True)
-        return _given(caption.en.model_dump() | more)
+        return _given(caption.en.model_dump() | caption.model_dump(include={"therefore"}, exclude_none=True))
 
     async def mirror(self, question: Question, english: Draft, ask: int, complaint: str | None = None) -> Reply:
         caption = self._caption(question.window.sample_id)

@@ -16,19 +16,21 @@ from typing import get_args
 from rich.table import Table
 
 from caption.schema import JudgeConfig, Judgement
-from caption.teachers.asked import AskedModel, figures_table, open_models
 from caption.truth.gold import GoldCaption, read_gold
 from caption.truth.vocabulary import Vocabulary
-from cosfly.chat.answers import AnswerBook
+from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget
-from cosfly.chat.contract import NoAnswer, Troubles
+from cosfly.chat.client import ChatClient, EndpointConfig
+from cosfly.chat.contract import NoAnswer, Request, Troubles, started
 from cosfly.errors import InputError
 from cosfly.products.captions import Coc, JudgeRecord
+from cosfly.products.places import flight_of
 from cosfly.reading.objects import find_object
 from cosfly.work.store import dump_json
 
 JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)
 UNJUDGED = "unjudged"
+MAX_TOKENS, MAX_TRIES = 512, 6  # of a judgement
 
 _MEANINGS: dict[Judgement, str] = {
     "ACCEPT_ALTERNATIVE": "the reasoning is sound and its decision is an acceptable alternative to the label",
@@ -84,8 +86,10 @@ def parse_judgement(text: str, finish_reason: str | None = None) -> tuple[str, s
 class Judge:
     """Asks an endpoint about conflicts. Made by `open_judge`."""
 
-    def __init__(self, model: AskedModel, vocabulary: Vocabulary) -> None:
-        self.model, self.vocabulary = model, vocabulary
+    def __init__(self, kept: KeptAnswers, cfg: JudgeConfig, vocabulary: Vocabulary, seed: int) -> None:
+        self.kept, self.vocabulary = kept, vocabulary
+        # The most likely answer.
+        self.sampling = {"temperature": 0.0, "seed": seed, "max_tokens": MAX_TOKENS, **cfg.extra_body}
 
     async def judge(self, case: Case, order: Sequence[Judgement] = JUDGEMENTS) -> JudgeRecord:
         """Judge a case; the verdict is `unjudged` where none could be read or the judge did not answer.
@@ -95,12 +99,13 @@ class Judge:
         """
         try:
             messages = judge_messages(case, self.vocabulary, order)
-            reply = await self.model.ask(messages, judge_schema(order), case.sample_id, "judge")
+            request = Request(messages, [], judge_schema(order), self.sampling)
+            reply = await self.kept.ask(request, flight_of(case.sample_id), case.sample_id, "judge")
         except NoAnswer as error:  # not kept: a later run may ask again
             verdict, reason = UNJUDGED, f"no answer: {error}"
         else:
             verdict, reason = parse_judgement(reply.text, reply.finish_reason)
-        return JudgeRecord(verdict=verdict, reason=reason, model=self.model.name)
+        return JudgeRecord(verdict=verdict, reason=reason, model=self.kept.engine.model)
 
 
 @asynccontextmanager
@@ -112,20 +117,24 @@ async def open_judge(
     budget: Budget | None = None,
     troubles: Troubles | None = None,
 ) -> AsyncIterator[Judge | None]:
-    """Connect to the judge that the settings name; None where they name none. Arguments and errors as of
-    `open_models`."""
+    """Connect to the judge that the settings name; None where they name none.
+
+    Args:
+        book: keeps the answers; None: they are not kept. budget: None sets no limit. troubles: notes tries that fail.
+    """
     if cfg.url is None:
         yield None
         return
-    async with open_models(cfg, [(cfg.url, cfg.model)], seed, book, budget, troubles) as [model]:
-        yield Judge(model, vocabulary)
+    client = ChatClient(cfg.url, EndpointConfig(model=cfg.model, concurrency=cfg.concurrency, max_tries=MAX_TRIES), troubles)
+    async with started(client):
+        yield Judge(KeptAnswers(client, book, budget), cfg, vocabulary, seed)
 
 
 # --- how good a judge is ----------------------------------------------------------------------------------------------
 
 
 def gold_conflicts() -> list[tuple[Case, Judgement]]:
-    """Give conflicts of the first gold set with their right judgements, as many of each.
+    """Return conflicts of the gold set with their right judgements, as many of each.
 
     A true caption for another decision than the label is an acceptable alternative; with one thing in it made false it
     must be written anew; a true caption for the label of which only the decision was changed has the wrong label field.
@@ -134,8 +143,6 @@ def gold_conflicts() -> list[tuple[Case, Judgement]]:
     for caption in read_gold():
         coc, label = caption.coc, caption.label
         changed = [error.in_text(coc) for error in caption.errors]
-        if label is None or caption.set != 1:
-            continue
         if coc.flight_decision != label:
             false = next(text for text in changed if text.flight_decision == coc.flight_decision)
             found["ACCEPT_ALTERNATIVE"].append(_gold_case(caption, coc, "alternative"))
@@ -211,7 +218,7 @@ async def check_judge(
             num_agreed += verdicts.count(right)
             num_moved += len(set(verdicts)) > 1
             num_first += sum(verdict == order[0] for verdict, order in zip(verdicts, orders, strict=True))
-        model = f"{judge.model.name} at {judge.model.kept.engine.where}"
+        model = f"{judge.kept.engine.model} at {judge.kept.engine.where}"
     num_asks = len(gold) * len(orders)
     num_unjudged = sum(count for (_, verdict), count in confusion.items() if verdict == UNJUDGED)
     first_share = num_first / max(1, num_asks - num_unjudged)
@@ -220,7 +227,7 @@ async def check_judge(
 
 def judge_check_table(check: JudgeCheck) -> Table:
     """Give the figures as a table for the terminal."""
-    table = figures_table(f"Judge {check.model}")
+    table = Table("figure", "value", "meaning", title=f"Judge {check.model}", title_justify="left")
     asks = f"of {check.num_asks} asks ({check.num_cases} cases, three orders of the options)"
     table.add_row("agreement", f"{100 * check.agreement:.1f} %", f"with the gold judgement, {asks}; chance is 33.3 %")
     share = f"{100 * check.first_share:.1f} %"

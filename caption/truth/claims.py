@@ -1,7 +1,7 @@
 """Claims: what a sentence states, in a form that can be compared exactly with the facts.
 
-A claim names a fact by its reference (references.py) and gives its value. Teachers that cannot write slots write claims
-beside their prose, a reader writes them for prose of others. One comparison serves both.
+A claim names a fact by its reference (references.py) and gives its value. A teacher that writes slots claims what it
+says in words of its own (quoted.py).
 """
 
 from __future__ import annotations
@@ -31,62 +31,25 @@ from caption.truth.sizes import BOUND_SHARE, RATIO_SLACK, about_share, numeral_o
 from caption.truth.stated import read_stated
 from cosfly.products.actions import ActionSet
 from cosfly.products.answer_text import normalize_action
-from cosfly.products.captions import Claim, Coc, Language, SentenceState
-from cosfly.products.sentences import sentences_of
-
-
-def judge_claims(
-    coc: Coc, claims: Sequence[Claim], facts: Facts, cfg: EvidenceConfig, language: Language, actions: ActionSet
-) -> list[Judged]:
-    """Compare the claims of a text with the facts and with its own words; gives the state of every sentence, in order.
-
-    Observed claims are compared with the facts, predicted ones with the decision, hypothetical ones with the words
-    alone. A numeral or a word of an opposite without a claim must be true of the window, and proves nothing
-    (coverage.py).
-    """
-    sentences = list(sentences_of(coc))
-    names = {name for name, _ in sentences}
-    of_names = {claim.sentence: _nearest(claim.sentence, names) for claim in claims}
-    stray = [f"claim of no sentence: {name}" for name, nearest in of_names.items() if nearest is None]
-    judged = []
-    for name, text in sentences:
-        own = [claim for claim in claims if of_names[claim.sentence] == name]
-        beside = [claim for claim in claims if claim not in own and _is_beside(of_names[claim.sentence], name)]
-        judged.append(judge_sentence(name, text, own, beside, coc.flight_decision, facts, cfg, language, actions))
-    if stray and judged:
-        first = judged[0]
-        judged[0] = Judged(first.name, first.text, "contradicted", (*first.problems, *dict.fromkeys(stray)))
-    return judged
-
-
-CUT_OTHERWISE = 2  # by so many sentences a writer may count differently
-
-
-def _nearest(name: str, names: set[str]) -> str | None:
-    """Give the sentence that a name means: the last of its field where a writer counted on; None far outside."""
-    if name in names:
-        return name
-    last = sum(one[0] == name[0] for one in names)
-    is_near = name[1:].isdigit() and last < int(name[1:]) <= last + CUT_OTHERWISE
-    return f"{name[0]}{last}" if is_near and last else None
-
-
-def _is_beside(one: str | None, other: str) -> bool:
-    return one is not None and one[0] == other[0] and abs(int(one[1:]) - int(other[1:])) == 1
+from cosfly.products.captions import Claim, Language, SentenceState
 
 
 def judge_sentence(
     name: str,
     text: str,
     claims: Sequence[Claim],
-    beside: Sequence[Claim],
     decision: str,
     facts: Facts,
     cfg: EvidenceConfig,
     language: Language,
     actions: ActionSet,
 ) -> Judged:
-    """Judge one sentence by its claims; beside: those of the sentences before and after it."""
+    """Judge one sentence by its claims.
+
+    Observed claims are compared with the facts, predicted ones with the decision, hypothetical ones with the words
+    alone. A numeral or a word of an opposite without a claim must be true of the window, and proves nothing
+    (coverage.py).
+    """
     about = cfg if read_stated(text, language).is_approximate else None
     problems, states = [], []
     for claim in claims:
@@ -95,7 +58,7 @@ def judge_sentence(
         states.append(state)
         if problem:
             problems.append(problem)
-    coverage = cover(text, claims, facts, language, actions, beside)
+    coverage = cover(text, claims, facts, language, actions)
     problems += coverage.problems
     if problems:
         return Judged(name, text, "contradicted", tuple(dict.fromkeys(problems)))

@@ -47,9 +47,7 @@ class ClaimCoverage:
     is_whole: bool
 
 
-def cover(
-    text: str, claims: Sequence[Claim], facts: Facts, language: Language, actions: ActionSet, beside: Sequence[Claim]
-) -> ClaimCoverage:
+def cover(text: str, claims: Sequence[Claim], facts: Facts, language: Language, actions: ActionSet) -> ClaimCoverage:
     """Say what of a sentence neither a claim covers nor the facts bear out, and which claims it says the opposite of.
 
     A word or a number without a claim is no problem where it is true of the window, unless a claim of its kind is
@@ -58,12 +56,11 @@ def cover(
 
     Args:
         text: a sentence. claims: all of it.
-        beside: claims of the sentences before and after it.
     """
     stated = read_stated(text, language)
-    said, around = (Said(of, facts, language, actions) for of in (claims, [*claims, *beside]))
+    said = Said(claims, facts, language, actions)
     uncovered = [numeral for numeral in stated.numerals if not said.covers_numeral(numeral, stated)]
-    problems = [f"uncovered: {text}" for text in _wrong_numerals(stated, said, around, uncovered)]
+    problems = [f"uncovered: {text}" for text in _wrong_numerals(stated, said, uncovered)]
     poles = list(_uncovered_poles(stated, said, facts, language))
     problems += [f"uncovered: {pole.word}" for pole, is_problem in poles if is_problem]
     problems += [f"text says otherwise: {name}" for name in _denied_words(stated, said)]
@@ -73,8 +70,8 @@ def cover(
     return ClaimCoverage(tuple(problems), not uncovered and not poles)
 
 
-def _wrong_numerals(stated: Stated, said: Said, around: Said, uncovered: Sequence[Numeral]) -> Iterator[str]:
-    """Yield the numerals that stand in the place of a claim's, or that neither the facts nor claims beside bear out."""
+def _wrong_numerals(stated: Stated, said: Said, uncovered: Sequence[Numeral]) -> Iterator[str]:
+    """Yield the numerals that stand in the place of a claim's, or that the facts do not bear out."""
     missing = [claim for claim in said.numbers if not said.is_written(claim, stated)]
     for numeral in stated.numerals:
         in_place_of = [claim for claim in missing if _is_of_kind(numeral, claim)]
@@ -83,7 +80,7 @@ def _wrong_numerals(stated: Stated, said: Said, around: Said, uncovered: Sequenc
                 yield f"{numeral.text} once more"
         elif in_place_of and _is_said_otherwise(numeral, missing, said):
             continue
-        elif in_place_of or not (bears_out_number(numeral, said.facts) or around.covers_numeral(numeral, stated)):
+        elif in_place_of or not bears_out_number(numeral, said.facts):
             yield numeral.text
 
 

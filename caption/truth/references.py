@@ -464,3 +464,18 @@ def _side_holds(word: str, reference: Reference, facts: Facts) -> bool | None:
         return False
     value = fact.value if word == positive else -fact.value
     return True if value > 0 else None if value > -0.5 * band and value != 0 else False
+
+
+def measured_series(facts: Facts) -> list[str]:
+    """Return a line for each quantity that was measured: its values at the frames."""
+    return [
+        f"{name}: {series} {quantity.unit}"
+        for name, quantity in QUANTITIES.items()
+        if (series := _series(quantity.read(facts), quantity.digits))
+    ]
+
+
+def _series(values: Sequence[float | None], digits: int) -> str:
+    """Return a series as text, "" where nothing of it is known."""
+    known = any(value is not None for value in values)
+    return ", ".join("-" if value is None else f"{value:.{digits}f}" for value in values) if known else ""

@@ -1,7 +1,6 @@
 """What a way of writing is: how a teacher states its reasons so that they can be held against the facts.
 
-The window loop asks, reads and records; what differs between slots, claims and prose stands behind
-`WayOfWriting`, and WAYS names them.
+The window loop asks, reads and records; what differs between slots and prose is in `WayOfWriting`, and WAYS names them.
 """
 
 from __future__ import annotations
@@ -16,11 +15,10 @@ from caption.schema import EvidenceConfig, Judged
 from caption.truth.facts import Facts
 from caption.truth.vocabulary import Vocabulary
 from cosfly.products.answer_text import Parsed
-from cosfly.products.captions import Claim, Coc, Language, Template, Writing
+from cosfly.products.captions import Coc, Language, Template, Writing
 
 WAYS: dict[Writing, str] = {
     "slots": "caption.writing.slots:Slots",
-    "claims": "caption.writing.claims:Claims",
     "prose": "caption.writing.prose:Prose",
 }
 DECISION_REASON = "decision_against_reasoning"
@@ -39,7 +37,6 @@ class Draft:
     template: Template | None = None
     judged: tuple[Judged, ...] = ()
     doubt: str = ""
-    claims: tuple[Claim, ...] = ()
 
     @property
     def written(self) -> dict[str, Any]:

@@ -15,10 +15,10 @@ from caption.truth.claims import judge_sentence
 from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
 from caption.truth.mirror import TEXTS, lacking
+from caption.truth.quoted import QUOTED_SCHEMA, read_quoted
 from caption.truth.references import QUANTITIES
 from caption.truth.stated import Pole, read_stated
 from caption.truth.vocabulary import Vocabulary
-from caption.writing.claims import QUOTED_SCHEMA, read_quoted
 from caption.writing.contract import Draft, Refused, WayOfWriting
 from caption.writing.earned import is_earned
 from caption.writing.filling import Filler, facts_of
@@ -141,7 +141,7 @@ def _judge_beside(name: str, sentence: Sentence, claims: Sequence[Claim], filler
     """Judge a sentence that its slots do not prove by claims of the words beside them."""
     facts, language, actions = filler.facts, filler.language, filler.vocabulary.actions
     beside, references = sentence.beside, [place.slot.reference for place in sentence.places]
-    found = judge_sentence(name, beside, claims, (), filler.decision, facts, EvidenceConfig(), language, actions)
+    found = judge_sentence(name, beside, claims, filler.decision, facts, EvidenceConfig(), language, actions)
     problems = tuple(one for one in found.problems if one.startswith(CONTRADICTIONS))
     if problems:
         return Judged(name, "", "contradicted", problems)

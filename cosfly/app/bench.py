@@ -82,7 +82,7 @@ def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterab
         raise ConfigError("not a stage that can be measured", where="--stage", got=stage, expected=", ".join(STAGES))
     if out.exists() and any(out.iterdir()):
         raise ResumeError("the folder is not empty", where=out, fix="choose another --out")
-    asked = cfg.caption.teacher_kind not in EMBEDDED or cfg.caption.judge.url or cfg.caption.reader.urls
+    asked = cfg.caption.teacher_kind not in EMBEDDED or cfg.caption.judge.url
     if stage == "caption" and asked:
         raise ConfigError(
             "captions that a server writes are no work of workers",

@@ -17,9 +17,6 @@ if TYPE_CHECKING:
 app = options.stage_group("Step 7: Chain-of-Cause captions in English and Chinese.")
 
 TEACHER = "rules, an OpenAI-compatible endpoint's URL, vllm:MODEL_DIR, file:PATH, or student:PATH of `distill infer`."
-READERS = (
-    "URL of an endpoint that reads prose into claims; give it twice for two models, else one is asked in two orders."
-)
 STUDENT = "Folder of `distill train` or `merge`: the teacher is that student behind a server, asked as it was taught."
 Teacher = Annotated[str | None, Option(show_default="rules", help=TEACHER), Sets("caption.teacher")]
 Model = Annotated[
@@ -45,7 +42,6 @@ def caption(
     judge: Annotated[
         str | None, Option(help="URL of an endpoint that judges conflicts."), Sets("caption.judge.url")
     ] = None,
-    reader: Annotated[list[str] | None, Option(help=READERS), Sets("caption.reader.urls")] = None,
     keyframes: Annotated[
         bool | None,
         Option("--keyframes", help="Only windows at which the label changes, plus a stride."),
@@ -87,7 +83,7 @@ def _tell_forecast(job: Job, tree: Path, target: Path) -> None:
     from cosfly.work.console import console
 
     forecast = make_forecast(job.cfg.caption, tree, target, seed=job.cfg.seed, resume=job.resume)
-    options.tell_table(console, (), forecast.rows(), title="What this run will take")
+    options.tell_table(console, (), forecast, title="What this run will take")
 
 
 @app.command("doctor")
@@ -174,30 +170,6 @@ def caption_judge_check(
     cfg, seed = job.cfg.caption, job.cfg.seed
     found = asyncio.run(check_judge(cfg.judge, vocabulary_of(cfg), gold_conflicts(), seed))
     console.print(judge_check_table(found))
-
-
-@app.command("reader-check")
-@takes()
-def caption_reader_check(
-    job: Job,
-    urls: Annotated[list[str], Argument(help="OpenAI-compatible endpoint, or two."), Sets("caption.reader.urls")],
-    model: Annotated[
-        list[str] | None, Option(help="Its model, or those of both."), Sets("caption.reader.models")
-    ] = None,
-    limit: Annotated[int | None, Option(min=1, help="Only so many captions, spread over the set.")] = None,
-) -> None:
-    """Measure a reader of prose on the gold set: true captions flagged, errors caught, claims, requests, tokens."""
-    import asyncio
-
-    from caption.run.own_files import vocabulary_of
-    from caption.teachers.reader import check_reader, reader_check_table
-    from caption.truth.gold import read_gold
-    from cosfly.work.console import console
-
-    cfg, gold = job.cfg.caption, list(read_gold())
-    gold = gold if limit is None else gold[:: -(-len(gold) // limit)]
-    found = asyncio.run(check_reader(cfg.reader, vocabulary_of(cfg), gold, job.cfg.seed))
-    console.print(reader_check_table(found, cfg.budget))
 
 
 @app.command("compare-strategies")

@@ -20,7 +20,7 @@ from cosfly.work.store import atomic_file
 FIELDS = ("critical_components", "reasoning_trace", "flight_decision")
 Language = Literal["en", "zh"]
 TeacherKind = Literal["rules", "endpoint", "vllm", "file", "student"]
-Writing = Literal["slots", "claims", "prose"]
+Writing = Literal["slots", "prose"]
 Modality = Literal["observed", "predicted", "hypothetical"]
 SentenceState = Literal["proved", "contradicted", "unread"]
 Verdict = Literal["CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN"]
@@ -172,8 +172,7 @@ class Claim(BaseModel):
 
     sentence: `C1` is the first of critical_components, `R1` of reasoning_trace. quantity: what is claimed, with its
     aspect (`distance`, `trend:speed`), or `decision`. at: `t4`, `t0-t4`; empty: the current frame, the whole window.
-    unit: m, mps, deg ... quote: the words of the sentence that it stands for, of a reader or
-    beside slots.
+    unit: m, mps, deg ... quote: the words of the sentence that it stands for.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -185,22 +184,6 @@ class Claim(BaseModel):
     unit: str | None = None
     modality: Modality = "observed"
     quote: _Given[str] = None
-
-
-class ReaderRecord(BaseModel):
-    """What language models read in texts that came without claims.
-
-    models: one or two. prompt: digest of the prompts. claims: language -> what both readings say, which is what was
-    judged. num_claims: language -> claims of each reading; None: it could not be read.
-    """
-
-    model_config = ConfigDict(extra="forbid")
-
-    models: list[str]
-    prompt: str
-    claims: dict[Language, list[Claim]]
-    num_claims: dict[Language, list[int | None]]
-    usage: Usage
 
 
 class Template(BaseModel):
@@ -217,16 +200,13 @@ class Evidence(BaseModel):
     """What the states of a caption's sentences follow from, so that an outsider can judge them again: the column
     `evidence` of a release.
 
-    slots: the templates that the texts were filled from. claims: what the English text states, by its writer. reader:
-    what language models read in texts that came without claims. problems: what is contradicted. contradicted: decisions
-    that the flight contradicts.
+    slots: the templates that the texts were filled from. problems: what is contradicted. contradicted: decisions that
+    the flight contradicts.
     """
 
     model_config = ConfigDict(extra="forbid")
 
     slots: _Given[dict[Language, Template]] = None
-    claims: _Given[list[Claim]] = None
-    reader: _Given[ReaderRecord] = None
     problems: list[str] = []
     contradicted: list[str] = []
 
@@ -276,17 +256,15 @@ class Caption(BaseModel):
     teacher: TeacherRecord
     usage: Usage  # of the teacher, all asks
     attempts: int
-    writing: Writing = "prose"  # how the texts were made: filled slots, prose beside claims, prose
+    writing: Writing = "prose"  # how the texts were made: filled slots or prose
     therefore: str | None = None  # the decision that the reasoning came to, before the decision itself
     en: Coc | None = None
     zh: Coc | None = None
     slots: dict[Language, Template] | None = None  # what the texts were filled from
-    claims: list[Claim] | None = None  # what the English text states, by its writer
     label_from: LabelFrom
     label: str | None  # ground-truth decision from the future geometry; None: geometry cannot tell
     verdict: Verdict | None = None
     judge: JudgeRecord | None = None
-    reader: _Given[ReaderRecord] = None
     repair: RepairRecord | None = None
     checks: Checks = Checks()
     status: Literal["accepted", "dropped"]
@@ -295,8 +273,7 @@ class Caption(BaseModel):
     @property
     def evidence(self) -> Evidence:
         problems = self.checks.evidence if isinstance(self.checks.evidence, list) else []
-        told: dict[str, Any] = {"slots": self.slots, "claims": self.claims, "reader": self.reader}
-        return Evidence(**told, problems=problems, contradicted=self.checks.contradicted or [])
+        return Evidence(slots=self.slots, problems=problems, contradicted=self.checks.contradicted or [])
 
     def coverage(self, language: Language) -> float | None:
         """Share of a language's sentences that are proved; None where none was judged."""

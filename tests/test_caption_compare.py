@@ -1,0 +1,108 @@
+"""What becomes of conflicts: soft ones by their setting, and the four strategies compared on the same ones."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+from specimens_captions import ACTION_TABLE, VOCABULARY
+from teacher_server import TeacherServer
+
+from caption.run.compare import STRATEGIES, compare, run
+from caption.run.window_loop import Trial, caption_window
+from caption.run.windows import cut_windows
+from caption.schema import CaptionConfig, RepairConfig, WindowConfig
+from caption.teachers.teacher import RuleTeacher
+from cosfly.errors import TeacherError
+from cosfly.products.captions import Caption, Coc
+from specimens import make_flight, make_playback_tree
+
+CFG = CaptionConfig(window=WindowConfig(require_images=False))
+
+
+@pytest.mark.parametrize("treatment", ["keep", "repair", "drop"])
+def test_what_becomes_of_a_soft_conflict(treatment):
+    flight = dataclasses.replace(make_flight(60)[0], folder=Path("nowhere"))
+    windows = list(cut_windows(flight, CFG.window, ACTION_TABLE))
+
+    def captioned(repair: RepairConfig) -> list[Caption]:
+        cfg = CFG.model_copy(update={"repair": repair})
+        return [asyncio.run(caption_window(window, RuleTeacher(0), cfg, VOCABULARY)) for window in windows]
+
+    soft = [i for i, caption in enumerate(captioned(RepairConfig())) if caption.verdict == "SOFT_CONFLICT"]
+    assert soft
+    treated = captioned(RepairConfig(soft_conflict=treatment))
+    for caption in (treated[i] for i in soft):
+        if treatment == "keep":
+            assert (caption.status, caption.verdict, caption.repair) == ("accepted", "SOFT_CONFLICT", None)
+        elif treatment == "drop":
+            assert caption.drop_reason == "soft_conflict"
+        else:
+            assert (caption.verdict, caption.repair.first_verdict) == ("CONSISTENT", "SOFT_CONFLICT")
+
+
+# --- the four strategies on the same conflicts, by the rule teacher and by a server -----------------------------------
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return make_playback_tree(tmp_path_factory.mktemp("tree"), 3, 30, with_images=False)
+
+
+def coc(text: str) -> Coc:
+    return Coc(critical_components=text, reasoning_trace="r", flight_decision="hover")
+
+
+def test_a_budget_that_is_used_up_is_one_clear_error(tmp_path):
+    tree = make_playback_tree(tmp_path / "tree", 1, 12)
+    with TeacherServer(decision=lambda body: "hover") as server:
+        cfg = CaptionConfig.model_validate({"teacher": server.url, "budget": {"max_tokens": 5_000}})
+        with pytest.raises(TeacherError, match=r"budget.max_tokens: .* of at most 5,000 tokens are used; raise it"):
+            run(cfg, tree, tmp_path / "out")
+
+
+def test_a_comparison_by_hand():
+    trials = [
+        Trial(coc("a b c"), coc("a b c"), "CONSISTENT", 1, 100),
+        Trial(coc("a b c"), coc("x y z"), "SOFT_CONFLICT", 2, 200),
+        Trial(coc("a b c"), None, "HARD_CONFLICT", 3, 300),
+    ]
+    found = compare("hint", trials)
+    assert (found.num_conflicts, found.repaired, found.consistent) == (3, 2, 1)
+    assert (found.asks_per_conflict, found.tokens_per_conflict, found.text_distance) == (2.0, 200.0, 0.375)
+
+
+SETTINGS = {"window": {"require_images": False}}
+
+
+def test_the_rule_teacher_repeats_itself_unless_it_is_anchored(tree, tmp_path):
+    found = {c.strategy: c for c in run(CaptionConfig.model_validate(SETTINGS), tree, tmp_path / "out")}
+    assert set(found) == set(STRATEGIES)
+    counts = {c.num_conflicts for c in found.values()}
+    assert len(counts) == 1
+    count = counts.pop()
+    assert count >= 3
+    assert found["anchored"].consistent == found["cascade"].consistent == count
+    assert (found["anchored"].asks_per_conflict, found["cascade"].asks_per_conflict) == (1.0, 3.0)
+    # Its decision depends on the facts alone, so asking again changes nothing.
+    assert found["hint"].repaired == found["multi_sample"].repaired == 0
+    value = json.loads((tmp_path / "out" / "compare_strategies.json").read_text())
+    assert [row["strategy"] for row in value["strategies"]] == list(STRATEGIES)
+
+
+def test_a_server_is_asked_once_for_the_first_answers(tree, tmp_path):
+    with TeacherServer() as server:
+        cfg = CaptionConfig.model_validate(SETTINGS | {"teacher": server.url})
+        found = {c.strategy: c for c in run(cfg, tree, tmp_path / "out", conflicts=6)}
+        assert {c.num_conflicts for c in found.values()} == {6}
+        assert found["anchored"].consistent == 6
+        assert found["anchored"].tokens_per_conflict == 1100.0
+        assert found["cascade"].asks_per_conflict <= 3.0
+        assert len(set(server.digests())) == len(server.digests()), "an answer that is kept was asked again"
+        num_asked = len(server.bodies)
+        again = run(cfg, tree, tmp_path / "out", conflicts=6)
+        assert {c.strategy: c for c in again} == found
+        assert len(server.bodies) == num_asked
