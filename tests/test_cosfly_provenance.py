@@ -63,31 +63,12 @@ def test_what_belongs_together_is_taken(run):
     assert found["simplified"].sha256 == sha256_bytes(b"boxes")
     listed = read_json(run / "render/manifest.json")["outputs"]
     assert found["data"].sha256 == sha256_bytes(dump_json(listed).encode()), "as in the records of earlier runs"
-    assert provenance.verify(inputs_of(run).values()) == 1 + 1 + 6 + 1
-
-
-def test_a_picture_is_noticed_when_all_is_read(run):
-    one, two = (run / f"render/Town1/trajectory_{k}/ORI/frames_playback/frame_00000/rgb.png" for k in (1, 2))
-    text = one.read_text()
-    one.write_text(two.read_text())
-    provenance.checked_inputs(inputs_of(run))
-    with pytest.raises(VerifyError, match=r"trajectory_1/ORI/\S+rgb\.png has other bytes"):
-        provenance.verify([run / "render"])
-    one.unlink()
-    with pytest.raises(VerifyError, match=r"rgb\.png is missing"):
-        provenance.verify([run / "render"])
-    one.write_text(text)
-    (one.parent / "more.png").write_text("")
-    with pytest.raises(VerifyError, match=r"more\.png is in no record"):
-        provenance.verify([run / "render"])
 
 
 def test_a_flight_of_another_tree_is_no_flight_of_this_one(run):
     shutil.copytree(run / "render/Town1/trajectory_1", run / "render/Town1/trajectory_3")
     with pytest.raises(VerifyError, match=r"trajectory_3/ORI/trajectory.json is no flight of this tree"):
         provenance.checked_inputs(inputs_of(run))
-    with pytest.raises(VerifyError, match=r"trajectory_3/ORI/trajectory.json is no flight of this tree"):
-        provenance.verify([run / "render"])
 
 
 def test_captions_of_another_tree_are_refused(run):
@@ -119,13 +100,6 @@ def test_a_map_that_the_plan_was_not_made_on_is_refused(run):
         provenance.checked_inputs({"simplified": other, "traces": run / "plan/traces.json"})
 
 
-def test_a_file_and_a_folder_beside_it_are_verified_as_one_types_them(run, monkeypatch):
-    monkeypatch.chdir(run)
-    (run / "render/Town1/trajectory_1/ORI/frames_playback/frame_00000/rgb.png").write_text("another")
-    with pytest.raises(VerifyError, match=r"rgb.png has other bytes"):
-        provenance.verify([Path("caption/captions.jsonl"), Path("render")])
-
-
 @pytest.mark.parametrize("name", ["manifest.json", "stage.json"])
 def test_a_stage_without_its_records_is_not_finished(run, name):
     (run / "caption" / name).unlink()
@@ -145,12 +119,10 @@ def test_a_name_that_no_record_can_hold(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_records_of_others_are_not_ours(tmp_path, caplog):
+def test_records_of_others_are_not_ours(tmp_path):
     write_json(tmp_path / "manifest.json", {"name": "an app"})
     write_json(tmp_path / "map.json", [])
     provenance.checked_inputs({"map": tmp_path / "map.json"})
-    assert provenance.verify([tmp_path / "map.json"]) == 0
-    assert "there is no record to hold it against" in caplog.text
 
 
 def test_a_tree_of_others_with_a_manifest_of_theirs_is_known_by_its_flights(tmp_path):

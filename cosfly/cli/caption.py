@@ -69,7 +69,6 @@ def caption(
 
     cfg, tree = job.cfg.caption, job.tree(data)
     target = out or tree.resolve().parent / "caption"
-    job.begin(target, tree)
     is_student = cfg.student.folder is not None  # it knows one question, and no other is tried
     if check and cfg.teacher_kind == "endpoint" and not is_student and not (target / "answers").exists():
         _examine_endpoint(cfg.teacher, cfg)
@@ -186,7 +185,6 @@ def caption_compare_strategies(
     from caption.run import compare
     from cosfly.work.console import console
 
-    job.begin(out)
     tree = job.tree(data)
     comparisons = compare.run(job.cfg.caption, tree, out, seed=job.cfg.seed, conflicts=conflicts)
     console.print(compare.comparison_table(comparisons))

@@ -23,7 +23,7 @@ JUDGED = "captions.jsonl of `caption --teacher student:`, one per tree; repeat i
 
 
 @app.command("prepare")
-@takes("seed", "verify", "resume", flights="distill.prepare.flights")
+@takes("seed", "resume", flights="distill.prepare.flights")
 def distill_prepare(
     job: Job,
     out: options.Out,
@@ -46,12 +46,11 @@ def distill_prepare(
         if len(trees) != len(captions or []):
             raise typer.BadParameter("give --data and --captions, one of each for a tree, or run folders")
         sources += [RunSource.of_files(*files) for files in zip(trees, captions or [], strict=True)]
-    job.begin(out, *(path for source in sources for path in (source.data, source.captions)))
     typer.echo(prepare.run(job.cfg.distill.prepare, sources, out, seed=job.cfg.seed, resume=job.resume))
 
 
 @app.command("dual-track")
-@takes("seed", "verify", "resume")
+@takes("seed", "resume")
 def distill_dual_track(job: Job, out: options.Out, runs: Runs = None, data: options.Trees = None) -> None:
     """Windows over clean and perturbed flights, to learn denoising and prediction from, by split."""
     from distill.prepare import dual_track
@@ -59,12 +58,11 @@ def distill_dual_track(job: Job, out: options.Out, runs: Runs = None, data: opti
     trees = [folder / "render" for folder in runs or []]
     if data or not trees:
         trees += job.trees(data)
-    job.begin(out, *trees)
     job.finish(dual_track.run(job.cfg.distill.dual_track, trees, out, seed=job.cfg.seed, resume=job.resume), out)
 
 
 @app.command("train")
-@takes("seed", "verify", "resume")
+@takes("seed", "resume")
 def distill_train(
     job: Job,
     dataset: Dataset,
@@ -77,14 +75,13 @@ def distill_train(
     from distill.training.ranks import is_first_process
 
     cfg, trees = job.cfg, job.trees(data)
-    job.begin(out, dataset, *trees)
     product = train.run(cfg.distill.train, dataset, trees, student, out, seed=cfg.seed, resume=job.resume)
     if is_first_process():
         typer.echo(product)
 
 
 @app.command("infer")
-@takes("verify", "resume")
+@takes("resume")
 def distill_infer(
     job: Job,
     dataset: Dataset,
@@ -100,13 +97,12 @@ def distill_infer(
     from distill.inference import stage as infer
 
     trees = job.trees(data)
-    job.begin(out, dataset, *trees, adapter)
     product = infer.run(job.cfg.distill.infer, dataset, trees, model, out, adapter=adapter, resume=job.resume)
     job.finish(product, out)
 
 
 @app.command("merge")
-@takes("verify", "resume")
+@takes("resume")
 def distill_merge(
     job: Job,
     model: Annotated[Path, Option(help="Folder of the student's base model.")],
@@ -116,12 +112,11 @@ def distill_merge(
     """Put an adapter into the weights of its base: a model folder for transformers, vLLM and servers."""
     from distill.inference import merge
 
-    job.begin(out, adapter)
     typer.echo(merge.run(job.cfg.distill.merge, model, adapter, out, resume=job.resume))
 
 
 @app.command("evaluate")
-@takes("seed", "verify", "resume")
+@takes("seed", "resume")
 def distill_evaluate(
     job: Job,
     dataset: Dataset,
@@ -142,7 +137,6 @@ def distill_evaluate(
     """Parse rate, decisions, verdicts, BERTScore and evidence, each beside its floors and with its interval."""
     from distill.evaluation import stage as evaluate
 
-    job.begin(out, predictions, dataset, *(data or []))
     given: Any = {"en": bertscore_en, "zh": bertscore_zh}
     more: Any = {"bertscore_models": {language: folder for language, folder in given.items() if folder is not None}}
     more |= {"data": data or [], "judged": judged or [], "seed": job.cfg.seed, "resume": job.resume}

@@ -57,7 +57,6 @@ def fly(
             raise typer.BadParameter("--relabel takes --map, and who flew where stands in its folder")
         from cosfly.closed_loop.relabel import run as replan
 
-        job.begin(out, map_, simplified, relabel)
         job.finish(replan(run, relabel, map_, simplified or map_, out, **job.manner), out)
         return
     if env is not None:
@@ -65,12 +64,10 @@ def fly(
             raise typer.BadParameter("--env has its own maps and walks")
         from cosfly.envs import listed
 
-        job.begin(out)
         job.finish(listed.run(listed.ListConfig(**dict(run), env=env), out, seed=cfg.seed, **job.manner), out)
         return
     if map_ is None or paths is None:
         raise typer.BadParameter("--map and --paths are needed, or --env")
-    job.begin(out, map_, simplified, paths, others)
     job.finish(stage.run(run, map_, simplified or map_, paths, out, seed=cfg.seed, others=others, **job.manner), out)
 
 
@@ -103,6 +100,5 @@ def leaderboard(
         if is_share and float(value) > 1:
             raise typer.BadParameter(f"{value}: a share is at most 1", param_hint="--open-loop")
         told[name] = float(value) if is_share else board.open_loop_of(Path(value))
-    job.begin(out, *(folder for _, folder in named))
     cfg = board.LeaderboardConfig(rounds=rounds, open_loop=told)
     typer.echo(board.run(cfg, named, out, seed=job.cfg.seed, resume=job.resume))

@@ -50,7 +50,6 @@ TRACKS = {"clean": ["clean"], "perturbed": ["perturbed"], "both": ["clean", "per
 GLOB_HELP = "Only flights whose folder, or one above it, matches: 'Town01/trajectory_17*/ORI', 'Town0[12]'; repeat it."
 TRACKS_HELP = "Only flights of this track."
 RESUME_HELP = "A folder that holds work: refuse it, or continue if settings and inputs are the same."
-VERIFY_HELP = "First compare every file of the stages that are read with its sha256."
 ENGINE_HELP = "Where the workers are: processes of this machine, or on the nodes of a Ray cluster."
 ADDRESS_HELP = "Head node of --engine ray, or auto; none: $RAY_ADDRESS, or a cluster of this machine."
 SHARED: dict[str, tuple[Any, Any, Any]] = {  # name -> type, option and default, in the order of the help
@@ -71,7 +70,6 @@ SHARED: dict[str, tuple[Any, Any, Any]] = {  # name -> type, option and default,
     "workers": (int | None, Option(help="Worker processes; 0 takes one per core."), None),
     "engine": (Literal["local", "ray"] | None, Option(show_default="local", help=ENGINE_HELP), None),
     "address": (str | None, Option(metavar="HOST:PORT", help=ADDRESS_HELP), None),
-    "verify": (bool, Option("--verify", help=VERIFY_HELP), False),
     "resume": (Literal["never", "if-same"], Option(help=RESUME_HELP), "if-same"),
 }
 SET_BY = {
@@ -81,7 +79,7 @@ SET_BY = {
     **{name: Sets(name) for name in ("seed", "workers", "engine")},
 }
 WORKERS = ("workers", "engine", "address")
-STAGE = ("town", "seed", *WORKERS, "verify", "resume")  # of a stage that does items by workers
+STAGE = ("town", "seed", *WORKERS, "resume")  # of a stage that does items by workers
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,6 @@ class Job:
     cfg: RunConfig
     overrides: Sequence[str] = ()
     resume: Resume = "if-same"
-    verify: bool = False
 
     @property
     def manner(self) -> dict[str, Any]:
@@ -119,13 +116,6 @@ class Job:
                 return [self.cfg.opened(candidate)]
         got = "no --data, and this is not a run folder"
         raise InputError("no playback tree", where=Path.cwd(), got=got, fix="give --data DIR")
-
-    def begin(self, out: Path, *inputs: Path | None) -> None:
-        """Do what --verify asks for, before the folder is opened."""
-        from cosfly.work import provenance
-
-        if self.verify:
-            provenance.verify(path for path in (*inputs, out) if path is not None and path.exists())
 
     def finish(self, product: Path, out: Path) -> None:
         """Name a stage's product. Too much that failed is an error: whoever calls the next stage must know."""
@@ -175,7 +165,7 @@ def takes(*names: str, flights: str | None = None) -> Callable[[Callable[..., No
                 return
             chosen = {name: one for name, one in sets.items() if given[name] not in (None, [])}
             extra = {one.path: one.value_of(given[name]) for name, one in chosen.items()}
-            manner = {name: given[name] for name in ("resume", "verify") if name in given}
+            manner = {name: given[name] for name in ("resume",) if name in given}
             cfg = resolve(given["config"], given.get("overrides"), extra)
             town = _town_of(cfg, given["town"]) if "town" in shared else cfg
             job = Job(town, given.get("overrides") or (), **manner)

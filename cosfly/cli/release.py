@@ -16,7 +16,7 @@ ReleaseFolder = Annotated[Path, Argument(help="Release folder, or a run with one
 
 
 @app.command("build")
-@takes(*WORKERS, "verify", "resume")
+@takes(*WORKERS, "resume")
 def release_build(
     job: Job,
     out: Annotated[Path, Option(help="Release folder.")],
@@ -59,7 +59,6 @@ def release_build(
                 "give --data and --captions, and --inspect or none, one of each for a tree; or run folders"
             )
         sources += [Source.of_files(*files) for files in zip(trees, captions or [], inspections, strict=True)]
-    job.begin(out, *(path for source in sources for path in source.files.values()))
     job.finish(package.run(job.cfg.release, sources, out, **job.manner), out)
 
 
@@ -113,7 +112,7 @@ def release_stats(
 
 
 @app.command("export")
-@takes(*WORKERS, "verify", "resume")
+@takes(*WORKERS, "resume")
 def release_export(
     job: Job,
     source: Annotated[Path, Argument(help="Release; for captions alone also a run directory or captions.jsonl.")],
@@ -143,7 +142,6 @@ def release_export(
         from release.export import stage as export
         from release.export.contract import ExportConfig
 
-        job.begin(out, source)
         given = {"format": format} | ({} if shard_mb is None else {"shard_mb": shard_mb})
         job.finish(export.run(build(ExportConfig, given, "--format, --shard-mb"), source, out, **job.manner), out)
         return

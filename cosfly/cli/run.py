@@ -23,7 +23,7 @@ PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)}
 
 
 @app.command()
-@takes("seed", *WORKERS, "verify", "resume")
+@takes("seed", *WORKERS, "resume")
 def run(
     job: Job,
     config: Annotated[Path, Argument(help=CONFIG)],
@@ -45,7 +45,6 @@ def run(
         pipeline.check_out(out)
         pipeline.check_with_files(job.cfg)
         return _tell_estimate(job.cfg, out)
-    job.begin(out, *sorted(path.parent for depth in ("*", "*/*") for path in out.glob(f"{depth}/manifest.json")))
     results = pipeline.run(job.cfg, out, resume=job.resume, until=until)
     _closing_table(results, out)
     job.check_failures({r.stage.name: r.manifest.counts for r in results}, out)

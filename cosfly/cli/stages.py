@@ -107,12 +107,11 @@ def maps_roi_backdrop(
 
 
 @app.command()
-@takes("town", "verify", "resume")
+@takes("town", "resume")
 def simplify(job: Job, map_: options.Map, out: options.Out) -> None:
     """Step 2: merge, crop and prune boxes_3d.json into step2_simplified.json."""
     from cosfly.simplify import stage
 
-    job.begin(out, map_)
     job.finish(stage.run(job.cfg.simplify, map_, out, resume=job.resume), out)
 
 
@@ -127,7 +126,6 @@ def pedestrians(
     """Step 3: walks of 50-100 m on the simplified map, path.json."""
     from cosfly.pedestrians import stage
 
-    job.begin(out, map_, roi)
     product = stage.run(job.cfg.pedestrians, map_, out, seed=job.cfg.seed, roi=job.cfg.roi, **job.manner)
     job.finish(product, out)
 
@@ -182,7 +180,6 @@ def plan(
     """Step 4: a drone flight for every walk, drone_trace.json."""
     from cosfly.planners import stage
 
-    job.begin(out, map_, paths)
     job.finish(stage.run(job.cfg.plan, map_, paths, out, seed=job.cfg.seed, **job.manner), out)
 
 
@@ -206,7 +203,6 @@ def plan_compare(
 
     settings = job.cfg.plan.model_dump() | ({"planners": planner} if planner else {})
     compared = build(compare.CompareConfig, settings, "--planner")
-    job.begin(out, map_, paths)
     product = compare.run(compared, map_, paths, out, seed=job.cfg.seed, **job.manner)
     for table in text_tables(product):
         options.tell_table(console, table.columns, table.rows, title=table.title)
@@ -230,7 +226,6 @@ def plan_benchmark(
 
     settings = job.cfg.plan.model_dump() | {"scenarios": scenarios} | ({"planners": planner} if planner else {})
     cfg = build(benchmark.BenchmarkConfig, settings, "plan benchmark")
-    job.begin(out, map_, paths)
     product = benchmark.run(cfg, map_, paths, out, seed=job.cfg.seed, **job.manner)
     table, *_ = benchmark.text_tables(benchmark.read_benchmark(product))
     narrow = [[row[k] for k in (0, 1, 5, 6, 7)] for row in (table.columns, *table.rows)]  # eighty columns hold these
@@ -306,7 +301,6 @@ def render(
     modalities: list[str] = [name for name in job.cfg.render.modalities if wanted.get(name) is not False]
     modalities += [name for name, is_wanted in wanted.items() if is_wanted and name not in modalities]
     cfg = build(RenderConfig, job.cfg.render.model_dump() | {"modalities": modalities}, "render")
-    job.begin(out, map_, simplified, traces, others)
     manner = job.manner | {"seed": job.cfg.seed, "others": others}
     product = stage.run(cfg, map_, simplified, traces, out, **manner)
     if gif:
@@ -319,7 +313,7 @@ app.add_typer(inspect_app, name="inspect")
 
 
 @inspect_app.callback()
-@takes("town", *WORKERS, "verify", "resume", flights="inspect.flights")
+@takes("town", *WORKERS, "resume", flights="inspect.flights")
 def inspect(
     job: Job,
     out: options.Out,
@@ -331,7 +325,6 @@ def inspect(
     from cosfly.inspection import stage
 
     tree = job.tree(data)
-    job.begin(out, map_, traces, tree)
     job.finish(stage.run(job.cfg.inspect, map_, traces, tree, out, **job.manner), out)
 
 

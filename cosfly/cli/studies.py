@@ -95,7 +95,6 @@ def study_zoom(
 
     given = {name: value for name, value in (("num_flights", flights), ("every", every)) if value is not None}
     studied = build(zoom.ZoomStudyConfig, job.cfg.render.model_dump() | given, "--flights, --every")
-    job.begin(out, map_, simplified, traces)
     product = zoom.run(studied, map_, simplified, traces, out, seed=job.cfg.seed, **job.manner)
     head, rows = zoom.HEAD, zoom.text_rows(read_object(product, what="zoom study"))
     options.tell_table(console, head, rows, title="Zoom (mean ± standard deviation over flights)", left=head)
@@ -115,7 +114,6 @@ def study_muco(
     from cosfly.studies import variants
     from cosfly.work.console import console
 
-    job.begin(out, map_, paths)
     product = variants.run(variants.weight_study(job.cfg.plan), map_, paths, out, seed=job.cfg.seed, **job.manner)
     head = ("weight", *(f"x {factor:g}" for factor in variants.FACTORS), "kept")
     found = read_object(product)["changes"]

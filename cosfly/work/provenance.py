@@ -2,7 +2,7 @@
 
 `manifest.json` holds the sha256 of what a stage made, `stage.json` that of what it was made of, and a flight's
 `checksums.sha256` that of each of its files. Every stage compares its inputs with the first two when it begins, for it
-reads them anyway; `verify` reads all of it. The digests find what was changed, exchanged or mixed up; they are no
+reads them anyway. The digests find what was changed, exchanged or mixed up; they are no
 signatures against somebody who changes the records too.
 """
 
@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from cosfly.errors import InputError, VerifyError
 from cosfly.reading.documents import FileFormat, read_json, read_model, read_object
 from cosfly.reading.files import files_named, sha256_file
-from cosfly.work.console import progress_bar
 from cosfly.work.store import CHECKSUMS, checksum_lines, dump_json, inside, read_checksums, sha256_bytes
 
 log = logging.getLogger(__name__)
@@ -287,50 +285,3 @@ def stages_behind(products: Iterable[Path]) -> list[StageRecord]:
     for path in products:
         visit(path)
     return ordered
-
-
-# --- all of it --------------------------------------------------------------------------------------------------------
-
-
-def verify(paths: Iterable[Path]) -> int:
-    """Hash every file of the stages that made some products, pictures and shards included; gives how many.
-
-    Args:
-        paths: files or folders; where there is no record of one, the log says so.
-    """
-    start_s, num_bytes, wrong = time.monotonic(), 0, []
-    digests: dict[Path, str] = {}
-    folders = list(dict.fromkeys(_stage_folder(path) or path for path in map(Path.absolute, paths)))
-    for folder in folders:
-        listed, strangers = _recorded_files(folder) if folder.is_dir() else ({}, [])
-        if not listed:
-            log.warning("verify: %s: there is no record to hold it against", folder)
-        digests |= listed
-        wrong += strangers
-    with progress_bar("verify", total=len(digests)) as advance:
-        for path, digest in digests.items():
-            wrong += _changed(path.parent, {path.name: digest})
-            num_bytes += path.stat().st_size if path.is_file() else 0
-            advance(1)
-    if wrong:
-        raise _not_as_recorded(Path(os.path.commonpath(folders)), wrong)
-    seconds = time.monotonic() - start_s
-    log.info("verify: %d files, %.0f MB in %.1f s", len(digests), num_bytes / 1e6, seconds)
-    return len(digests)
-
-
-def _recorded_files(folder: Path) -> tuple[dict[Path, str], list[str]]:
-    """Give the sha256 of every file that a stage folder or tree has on record, and name the files that are in none."""
-    found = {inside(folder.resolve(), name): digest for name, digest in recorded_digests(folder).items()}
-    strangers = list(_strangers(folder, recorded_digests(folder)))
-    for lists in sorted(folder.rglob(CHECKSUMS)):
-        if found.get(lists.resolve()) not in (None, sha256_file(lists)):
-            continue  # what it says counts for nothing, and it is named itself
-        root = lists.parent.resolve()
-        found |= {root / name: digest for name, digest in read_checksums(root).items()}
-        for path in sorted(root.rglob("*")):
-            # What a hub puts there is not.
-            is_ours = not any(part.startswith(".") for part in path.relative_to(root).parts)
-            if is_ours and path.is_file() and path.name != CHECKSUMS and path not in found:
-                strangers.append(f"{path} is in no record")
-    return found, strangers
