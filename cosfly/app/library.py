@@ -42,7 +42,7 @@ OF_PACE = {
     "cruise_speed_mps", "curvature_gain_m", "speed_jitter", "min_speed_mps", "max_speed_mps", "pace", "hurry_speed_mps",
     "dt_s",
 }  # fmt: skip
-OF_PICTURE = {"backend", "look", "mesh_triangles", "rim", *WeatherConfig.model_fields}
+OF_PICTURE = {"backend", "look", "rim", *WeatherConfig.model_fields}
 STEP_S = 0.5  # between the places of `render_frames`, for the person's stride
 FILE_SETTING = {"simworld": "world", "cityjson": "path", "boxes": "path"}  # of a source: which setting names its file
 

@@ -22,8 +22,7 @@ from cosfly.maps.unrealcv_export import UnrealCvMapConfig
 from cosfly.products.boxes import BoxMap, check_ground, write_boxes
 from cosfly.products.meshes import MESHES_FILE
 from cosfly.reading.files import LinkedPath
-from cosfly.reading.meshes import MOST_TRIANGLES
-from cosfly.work.config import Config, MayDiffer
+from cosfly.work.config import Config
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import write_bytes
 
@@ -50,9 +49,6 @@ class MapsConfig(Config):
         default_factory=UnrealCvMapConfig, description="the level of a running UnrealCV server, as SimWorld's"
     )
     picture_px: int = Field(1200, ge=200, le=8000, description="longer side of the overview picture, px")
-    mesh_triangles: MayDiffer[int] = Field(
-        MOST_TRIANGLES, ge=1, description="most triangles of a file of meshes, and of all that the map draws of them"
-    )
 
     @property
     def licence(self) -> str:
@@ -68,7 +64,7 @@ class MapsConfig(Config):
 def load_map(cfg: MapsConfig, *, seed: int = 0, follow_links: bool = False) -> BoxMap:
     """Read or build the map that the settings name; its meshes are read when they are drawn."""
     box_map = SOURCES[cfg.source](getattr(cfg, cfg.source), seed)
-    meshes = replace(box_map.meshes, most_triangles=cfg.mesh_triangles)
+    meshes = box_map.meshes
     if follow_links and meshes.folder is not None:
         meshes = replace(meshes, folder=LinkedPath(meshes.folder))
     return replace(box_map, meshes=meshes)

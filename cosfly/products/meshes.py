@@ -60,13 +60,12 @@ class MeshRef(BaseModel):
 @dataclass(frozen=True)
 class Meshes:
     """The meshes of a map. refs: box id -> what it is drawn as; folder: that their files are below; made: node -> mesh
-    of a MESHES_FILE that is not written yet; most_triangles: of each file, and of all that is drawn.
+    of a MESHES_FILE that is not written yet.
     """
 
     refs: dict[int, MeshRef] = field(default_factory=dict)
     folder: Path | None = None
     made: dict[str, Mesh] = field(default_factory=dict)
-    most_triangles: int = MOST_TRIANGLES
 
     def files(self) -> dict[str, Path]:
         """The files that boxes name, by name."""
@@ -75,11 +74,8 @@ class Meshes:
 
     def resolved(self) -> dict[MeshRef, Mesh]:
         """Read what the boxes name."""
-        most = self.most_triangles
-        read = {
-            name: read_meshes(path, tree=path.parents[len(Path(name).parts) - 1], most_triangles=most)
-            for name, path in self.files().items()
-        }
+        files = self.files().items()
+        read = {name: read_meshes(path, tree=path.parents[len(Path(name).parts) - 1]) for name, path in files}
         found: dict[MeshRef, Mesh] = {}
         for box_id, ref in self.refs.items():
             nodes = read.get(ref.file, self.made)
@@ -90,8 +86,8 @@ class Meshes:
                 found[ref] = joined(list(nodes.values())) if ref.node is None else nodes[ref.node]
         num_drawn = sum(len(found[ref]) for ref in self.refs.values() if ref.fit == "box")
         num_drawn += sum(len(mesh) for ref, mesh in found.items() if ref.fit == "world")
-        if num_drawn > most:
-            raise too_many(self.folder or "map", f"{num_drawn:,} triangles drawn", most)
+        if num_drawn > MOST_TRIANGLES:
+            raise too_many(self.folder or "map", num_drawn)
         return found
 
     def beside(self, folder: Path) -> Meshes:

@@ -9,7 +9,6 @@ from pydantic import Field, field_validator, model_validator
 from cosfly.products.frames import LEAST_FOV_DEG, MOST_FOV_DEG, DepthFormat, FrameFile, Look
 from cosfly.products.places import folder_name
 from cosfly.reading.arrays import LONGEST_SIDE_PX
-from cosfly.reading.meshes import MOST_TRIANGLES
 from cosfly.render.carla_backend import CarlaRenderConfig
 from cosfly.render.lens import ZoomConfig
 from cosfly.render.perturbation import PerturbationConfig
@@ -90,9 +89,6 @@ class RenderConfig(WeatherConfig):
     )
     encoder_threads: MayDiffer[int] = Field(
         2, ge=1, le=64, description="threads that encode and write beside the drawing"
-    )
-    mesh_triangles: MayDiffer[int] = Field(
-        MOST_TRIANGLES, ge=1, description="most triangles of a file of meshes, and of all that the map draws of them"
     )
 
     @property

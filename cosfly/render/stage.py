@@ -10,7 +10,6 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +27,6 @@ from cosfly.products.town import IDS_FILE, IDS_FORMAT, write_town_map
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.walks import pace_field
 from cosfly.products.weather import WeatherRecord
-from cosfly.reading.meshes import MOST_TRIANGLES
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids, other_id
 from cosfly.render.flight import FlightScript, Writing, check_flight, render_flight
 from cosfly.render.lens import cameras_of
@@ -65,11 +63,10 @@ def open_renderer(
     height_px: int,
     look: Look | None = None,
     num_others: int = 0,
-    mesh_triangles: int = MOST_TRIANGLES,
     rim: BoxMap | None = None,
     settings: Config | None = None,
 ) -> Renderer:
-    """Open a renderer of the table for one map, of at most so many triangles of meshes, and at most so many others.
+    """Open a renderer of the table for one map and at most so many others.
 
     Args:
         settings: of this renderer alone, where it has any; None takes its defaults.
@@ -77,7 +74,6 @@ def open_renderer(
     if name not in RENDERERS:
         raise ConfigError("unknown renderer", where="render.backend", got=name, expected=", ".join(RENDERERS))
     module, _, attribute = RENDERERS[name].partition(":")
-    box_map = replace(box_map, meshes=replace(box_map.meshes, most_triangles=mesh_triangles))
     own = {} if settings is None else {"settings": settings}
     make = getattr(importlib.import_module(module), attribute)
     return make(box_map, width_px, height_px, look or Look(), num_others, rim, **own)
@@ -86,8 +82,7 @@ def open_renderer(
 def renderer_of(cfg: RenderConfig, box_map: BoxMap, seed: int, num_others: int = 0) -> Renderer:
     """Open the renderer that the settings ask for."""
     rim, size_px = rim_of(box_map, seed) if cfg.rim else None, (cfg.width_px, cfg.height_px)
-    most = cfg.mesh_triangles
-    return open_renderer(cfg.backend, box_map, *size_px, cfg.look, num_others, most, rim, cfg.of_backend)
+    return open_renderer(cfg.backend, box_map, *size_px, cfg.look, num_others, rim, cfg.of_backend)
 
 
 # --- from traces to scripts -------------------------------------------------------------------------------------------
