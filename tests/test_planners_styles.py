@@ -319,7 +319,8 @@ def test_every_style_stands_in_the_documents_with_a_picture():
 
 def test_ranges_bind_a_run_where_its_styles_have_them():
     assert "style_ranges" not in PlanConfig().recorded()
-    assert list(styled("side").recorded()["style_ranges"]) == ["side"]
+    ranges = {"side": {"altitude_m": (9, 10)}, "top": {"altitude_m": (50, 51)}}
+    assert list(styled("side", style_ranges=ranges).recorded()["style_ranges"]) == ["side"]
 
 
 # --- the shipped towns ------------------------------------------------------------------------------------------------

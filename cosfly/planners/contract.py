@@ -21,7 +21,7 @@ from pydantic import Field, field_validator, model_validator
 
 from cosfly.errors import NoPathError, nearest
 from cosfly.geometry import DT_S
-from cosfly.planners.styles import ALTITUDE_LEAST_M, NAMES, OTHER_SIDE, ROWS, Style, StyleRanges
+from cosfly.planners.styles import ALTITUDE_LEAST_M, NAMES, OTHER_SIDE, ROWS, Range, Style, with_ranges
 from cosfly.products.segments import FOLLOW
 from cosfly.space.flight_metrics import (
     ACCEL_RMS_MAX_MPS2,
@@ -193,9 +193,10 @@ class PlanConfig(Config):
         description="shares of the styles that flights are drawn from, by name; they need not add up to one",
         examples=[*NAMES],
     )
-    style_ranges: StyleRanges = Field(
-        default_factory=StyleRanges,
-        description="where each style but follow stands to the walker: drawn evenly from a range for each part",
+    style_ranges: dict[str, dict[str, Range]] = Field(
+        {},
+        description="style -> range -> [least, greatest]: ranges that replace those of the table of styles, for "
+        "instance {side: {altitude_m: [11, 13]}}",
     )
     segment_s: float = Field(
         0.0, ge=0, description="length of the parts of a flight that draw a style each, about, s; 0: one style a flight"
@@ -220,6 +221,15 @@ class PlanConfig(Config):
             raise ValueError("the shares of the styles must add up to more than 0")
         return shares
 
+    @field_validator("style_ranges")
+    @classmethod
+    def _are_ranges(cls, ranges: dict[str, dict[str, Range]]) -> dict[str, dict[str, Range]]:
+        for name, own in ranges.items():
+            if name not in ROWS:
+                raise ValueError(f"there is no style {name!r} with ranges{nearest(name, ROWS)}")
+            with_ranges(ROWS[name], own)
+        return ranges
+
     @model_validator(mode="after")
     def _check(self) -> PlanConfig:
         wrong = []
@@ -240,7 +250,7 @@ class PlanConfig(Config):
     def style(self, name: str) -> Style:
         """Give a row of the table of styles with the ranges of the settings."""
         plain = name.removeprefix(OTHER_SIDE)
-        row = replace(ROWS[plain], **getattr(self.style_ranges, plain).model_dump())
+        row = with_ranges(ROWS[plain], self.style_ranges.get(plain, {}))
         if name.startswith(OTHER_SIDE) and row.bearing_deg is not None:
             row = replace(row, bearing_deg=(-row.bearing_deg[1], -row.bearing_deg[0]))
         return row

@@ -1,20 +1,17 @@
 """The table of styles: how the drone stands to the walker while a part of a flight lasts, and which decisions that
 shows.
 
-A row is data; `courses.py` makes a wish of it, its ranges are settings (`plan.style_ranges`), and a new row needs no
+A row is data; `courses.py` makes a wish of it, `plan.style_ranges` can replace its ranges, and a new row needs no
 code. Labels come from the motion that was flown, not from the style. Two styles are more than a row: `reacquire` looks
 for a place where the walker disappears, `return_home` ends with a mission.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Annotated, Any
-
-from pydantic import AfterValidator, Field, PositiveFloat, create_model
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 
 from cosfly.products.segments import FOLLOW
-from cosfly.work.config import Config
 
 REACQUIRE, RETURN_HOME = "reacquire", "return_home"
 ALTITUDE_LEAST_M = 8.0  # bound of every style but `follow`, unless their ranges begin lower
@@ -90,52 +87,21 @@ def suits(name: str) -> str:
     return "" if row is None else row.suits
 
 
-# --- settings ---------------------------------------------------------------------------------------------------------
-
-
-def _ordered(ends: Range) -> Range:
-    if ends[0] > ends[1]:
-        raise ValueError(f"a range is its least and its greatest value, got {ends[0]:g} before {ends[1]:g}")
-    return ends
-
-
-AnyRange = Annotated[tuple[float, float], AfterValidator(_ordered)]
-PositiveRange = Annotated[tuple[PositiveFloat, PositiveFloat], AfterValidator(_ordered)]
-MEANINGS = {
-    "altitude_m": "height above the ground under the walker, m",
-    "altitude_end_m": "height at the end of a part, m",
-    "climb_m": "how much higher it searches, m",
-    "ground_distance_m": "distance to the walker in the plane, m",
-    "ground_distance_end_m": "distance in the plane at the end of a part, of reacquire while it searches, m",
-    "bearing_deg": "azimuth of the drone from the walker, degrees: 0 in front, 90 left, 180 behind",
-    "round_mps": "speed round the walker, m/s: positive counter-clockwise from above",
-    "hop_s": "stands still for so long before it takes a new place, s",
-    "pace_mps": "speed at which its distance changes on the way there, m/s",
-}
-
-
-def _settings_of(name: str, style: Style) -> type[Config]:
-    """Make the settings of a style: the ranges that its row has."""
-    plain, made = {field.name: field.default for field in fields(Style)}, dict[str, Any]()
-    for field, meaning in MEANINGS.items():
-        if (value := getattr(style, field)) != plain[field]:
-            kind = AnyRange if field in ("bearing_deg", "round_mps") else PositiveRange
-            made[field] = kind, Field(value, description=meaning)
-    return create_model(f"Style_{name}", __base__=Config, __doc__=f"Ranges of the style {name}.", **made)
-
-
 ROWS: dict[str, Style] = TABLE | {REACQUIRE: HIDING}
-_MODELS = {name: _settings_of(name, row) for name, row in ROWS.items()}
-globals().update({model.__name__: model for model in _MODELS.values()})  # pickle looks for a class by its name
-if TYPE_CHECKING:
-    StyleRanges = Config
-else:
-    StyleRanges = create_model(
-        "StyleRanges",
-        __base__=Config,
-        __doc__="Ranges of each style.",
-        **{
-            name: (model, Field(default_factory=model, description=f"for {', '.join(ROWS[name].purpose)}"))
-            for name, model in _MODELS.items()
-        },
-    )
+
+
+def with_ranges(row: Style, ranges: Mapping[str, Range]) -> Style:
+    """Return a row with some of its ranges replaced.
+
+    Raises:
+        ValueError: If the row has no such range, its ends are not in ascending order, or it is not positive.
+    """
+    known = [one.name for one in fields(Style) if isinstance(getattr(row, one.name), tuple) and one.name != "purpose"]
+    for name, (low, high) in ranges.items():
+        if name not in known:
+            raise ValueError(f"{name} is not a range of this style; its ranges are {', '.join(known)}")
+        if low > high:
+            raise ValueError(f"{name} is a least and a greatest value, got {low:g} before {high:g}")
+        if low <= 0 and name not in ("bearing_deg", "round_mps", "climb_m"):
+            raise ValueError(f"{name} must be greater than 0, got {low:g}")
+    return replace(row, **dict(ranges))
