@@ -95,7 +95,7 @@ def workplace(specimen, tmp_path) -> Path:
 
 
 # The specimen's drone is jerkier than a planned one, so the plan's rules get their own tests below.
-CFG = InspectConfig(accel_rms_max_mps2=50, jerk_rms_max_mps3=200, smoothness_min=0, thumbnail_px=64)
+CFG = InspectConfig(accel_rms_max_mps2=50, jerk_rms_max_mps3=200, smoothness_min=0)
 NO_SUMS = CFG.model_copy(update={"check_checksums": False})
 
 

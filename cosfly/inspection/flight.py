@@ -17,7 +17,17 @@ from cosfly.errors import InputError, VerifyError
 from cosfly.geometry import project, step_s, world_from_camera, wrap_deg
 from cosfly.inspection.files import Checksums, check_files, check_recorded
 from cosfly.inspection.frames import FrameNumbers, check_frames, check_others, choose_frames, others_told, target_box
-from cosfly.inspection.settings import InspectConfig
+from cosfly.inspection.settings import (
+    DRONE_SPEED_MAX_MPS,
+    INVALID_DEPTH_MAX,
+    POSE_TOLERANCE_M,
+    REPROJECTION_TOLERANCE_PX,
+    ROTATION_TOLERANCE_DEG,
+    TARGET_SPEED_MAX_MPS,
+    THUMBNAIL_PX,
+    TRACK_QUALITY_MIN,
+    InspectConfig,
+)
 from cosfly.inspection.view import FlightView, draw_flight
 from cosfly.products.coverage import Coverage, coverage_of
 from cosfly.products.flights import read_twin
@@ -103,7 +113,7 @@ def inspect_flight(
         issues=issues,
         metrics={name: None if value is None else round(value, 4) for name, value in metrics.items()},
     )
-    view = draw_flight(flight, _heights_m(flight), clearance_m, box_map, cfg.thumbnail_px, report.issues)
+    view = draw_flight(flight, _heights_m(flight), clearance_m, box_map, THUMBNAIL_PX, report.issues)
     return InspectedFlight(record=record, view=view, coverage=coverage_of(flight))
 
 
@@ -225,12 +235,12 @@ def check_poses(flight: Flight, trace: DroneTrace, cfg: InspectConfig, report: R
         report.error("pose_differs", where, f"{flight.time_s[i]:.3f} s", "a time of the plan")
     turns = wrap_deg(flight.rotations_deg - flight.rotation_offsets_deg - trace.rotations_deg[row])
     checks = (
-        ("drone_pose", flight.positions_m - flight.drone_offsets_m - trace.positions_m[row], cfg.pose_tolerance_m, "m"),
-        ("drone_pose", np.where(is_shifted(flight)[:, None], 0.0, turns), cfg.rotation_tolerance_deg, "deg"),
+        ("drone_pose", flight.positions_m - flight.drone_offsets_m - trace.positions_m[row], POSE_TOLERANCE_M, "m"),
+        ("drone_pose", np.where(is_shifted(flight)[:, None], 0.0, turns), ROTATION_TOLERANCE_DEG, "deg"),
         (
             "target.world_location",
             flight.targets_m - flight.target_offsets_m - trace.targets_m[row],
-            cfg.pose_tolerance_m,
+            POSE_TOLERANCE_M,
             "m",
         ),
     )
@@ -245,8 +255,8 @@ def check_motion(flight: Flight, cfg: InspectConfig, report: Report) -> None:
     """Find teleports: steps between frames that nothing flies or walks. Recorded perturbations are taken off."""
     drone_offsets_m, target_offsets_m = np.nan_to_num(flight.drone_offsets_m), np.nan_to_num(flight.target_offsets_m)
     limits = (
-        ("drone_pose", flight.positions_m - drone_offsets_m, cfg.drone_speed_max_mps),
-        ("target.world_location", flight.targets_m - target_offsets_m, cfg.target_speed_max_mps),
+        ("drone_pose", flight.positions_m - drone_offsets_m, DRONE_SPEED_MAX_MPS),
+        ("target.world_location", flight.targets_m - target_offsets_m, TARGET_SPEED_MAX_MPS),
     )
     for name, positions_m, limit_mps in limits:
         speeds = np.linalg.norm(np.diff(positions_m, axis=0), axis=1) / np.diff(flight.time_s)
@@ -267,9 +277,9 @@ def check_projection(flight: Flight, cfg: InspectConfig, report: Report) -> None
         uv, depth_m = project(flight.targets_m[i : i + 1], pose, flight.camera_at(i).intrinsic)
         box = target_box(flight, i)
         recorded = (
-            ("image_uv", flight.target_uv[i], uv[0], cfg.reprojection_tolerance_px, "px"),
+            ("image_uv", flight.target_uv[i], uv[0], REPROJECTION_TOLERANCE_PX, "px"),
             # Another's person is of another size than ours.
-            ("bbox_2d", flight.target_bbox[i] if flight.is_ours else box, box, 2 * cfg.reprojection_tolerance_px, "px"),
+            ("bbox_2d", flight.target_bbox[i] if flight.is_ours else box, box, 2 * REPROJECTION_TOLERANCE_PX, "px"),
             ("depth", flight.target_depth_m[i : i + 1], depth_m, 0.01, "m"),
         )
         for name, found, expected, tolerance, unit in recorded:
@@ -323,10 +333,10 @@ def _rendered_metrics(
     )
     if not flight.target_visible.any():
         report.warn("never_visible", "trajectory.json: points[].target.visible", "false everywhere", "a target")
-    if quality is not None and quality < cfg.track_quality_min:
-        report.warn("track_quality", "instance.png", f"IoU {quality:.3f}", f"at least {cfg.track_quality_min}")
-    if invalid is not None and invalid > cfg.invalid_depth_max:
-        expected = f"at most {cfg.invalid_depth_max:g} of the pixels of a frame"
+    if quality is not None and quality < TRACK_QUALITY_MIN:
+        report.warn("track_quality", "instance.png", f"IoU {quality:.3f}", f"at least {TRACK_QUALITY_MIN}")
+    if invalid is not None and invalid > INVALID_DEPTH_MAX:
+        expected = f"at most {INVALID_DEPTH_MAX:g} of the pixels of a frame"
         report.warn("invalid_depth", "depth.npy", f"{invalid:.3f} of a frame", expected)
 
 

@@ -17,7 +17,15 @@ from cosfly.errors import InputError
 from cosfly.geometry import box_corners, box_iou, mask_box, project, world_from_camera
 from cosfly.inspection.files import Checksums
 from cosfly.inspection.pixels import NUM_IDS, Picture, PixelFigures, look_at, unpack
-from cosfly.inspection.settings import InspectConfig
+from cosfly.inspection.settings import (
+    FLAT_PAIRS_MIN,
+    FLAT_SURFACE_MAX,
+    JUMP_GONE_MAX,
+    MAGENTA_MAX,
+    MASK_VISIBILITY_MIN,
+    Z_FIGHTING_MAX,
+    InspectConfig,
+)
 from cosfly.products.frames import (
     DEPTH_NPY,
     FILE_NAMES,
@@ -76,9 +84,9 @@ class Jumps:
         if not self.flight.is_ours and not self._is_one_world():
             return 0
         for i, pair in zip(self._frames, self._found, strict=True):
-            if pair.gone > cfg.jump_gone_max:
+            if pair.gone > JUMP_GONE_MAX:
                 got = f"{pair.gone:.1%} of what this frame or the one before shows is not there in the other"
-                report.warn("temporal_jump", _depth_place(self.flight, i), got, f"at most {cfg.jump_gone_max:.1%}")
+                report.warn("temporal_jump", _depth_place(self.flight, i), got, f"at most {JUMP_GONE_MAX:.1%}")
         return len(self._found)
 
     def _is_one_world(self) -> bool:
@@ -204,12 +212,12 @@ def check_frames(
             report.error("frozen_frame", f"{where}/rgb.png", got, "another picture: the camera has moved")
         previous = (i, small)
         left_out = _ids_of(told.get(i))
-        look = look_at(picture, left_out, cfg.flat_pairs_min)
+        look = look_at(picture, left_out, FLAT_PAIRS_MIN)
         _check_surfaces(look, where, cfg, report)
         if picture.depth.size and _check_depth(picture.depth, _depth_place(flight, i), numbers, report):
             jumps.see(i, picture)
             if picture.instance.size:
-                _check_mask(flight, i, picture, look, left_out, cfg.mask_visibility_min, numbers, report)
+                _check_mask(flight, i, picture, look, left_out, MASK_VISIBILITY_MIN, numbers, report)
     numbers.num_compared = jumps.judge(cfg, report)
     return numbers
 
@@ -234,19 +242,19 @@ def _ids_of(told: OthersMeta | None) -> np.ndarray:
 
 def _check_surfaces(look: PixelFigures, where: str, cfg: InspectConfig, report: Report) -> None:
     """Say where a texture may be missing, and where surfaces fight for pixels."""
-    if look.flat > cfg.flat_surface_max:
+    if look.flat > FLAT_SURFACE_MAX:
         got = (
             f"{look.flat:.1%} of the picture is a surface of one colour "
             f"({KIND_NAMES.get(look.flat_kind, look.flat_kind)})"
         )
-        report.warn("missing_texture", f"{where}/rgb.png", got, f"at most {cfg.flat_surface_max:.1%}")
-    if look.magenta > cfg.magenta_max:
+        report.warn("missing_texture", f"{where}/rgb.png", got, f"at most {FLAT_SURFACE_MAX:.1%}")
+    if look.magenta > MAGENTA_MAX:
         report.warn(
-            "missing_texture", f"{where}/rgb.png", f"{look.magenta:.2%} magenta", f"at most {cfg.magenta_max:.2%}"
+            "missing_texture", f"{where}/rgb.png", f"{look.magenta:.2%} magenta", f"at most {MAGENTA_MAX:.2%}"
         )
-    if look.fighting > cfg.z_fighting_max:
+    if look.fighting > Z_FIGHTING_MAX:
         got = f"{look.fighting:.3%} of the pixels alternate between two surfaces of one plane"
-        report.warn("z_fighting", f"{where}/instance.png", got, f"at most {cfg.z_fighting_max:.3%}")
+        report.warn("z_fighting", f"{where}/instance.png", got, f"at most {Z_FIGHTING_MAX:.3%}")
 
 
 def _moved(flight: Flight, i: int, k: int) -> bool:

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from cosfly.errors import InputError
 from cosfly.inspection.flight import InspectedFlight
 from cosfly.inspection.report import cards
-from cosfly.inspection.settings import InspectConfig
+from cosfly.inspection.settings import PAGE_MB
 from cosfly.inspection.view import FlightView
 from cosfly.look.page import page, run_name, scripts
 from cosfly.products.inspection import read_inspection
@@ -85,8 +85,7 @@ def page_html(inspected: Path) -> str:
     """Give the page. It works without a network, and saves a file that `cosfly inspect review --decisions` takes."""
     inspection = read_inspection(inspected)
     queue = [flight for flight in inspection.flights if flight.result == "review"]
-    page_mb = float(inspection.settings.get("page_mb", InspectConfig().page_mb))
-    rows = cards(queue, _views(inspected), page_mb, read_decisions(inspected))
+    rows = cards(queue, _views(inspected), PAGE_MB, read_decisions(inspected))
     data = {**FORMAT.header, "inspection": sha256_file(inspected), "file": FILLED}
     return page("cosfly/inspection/review.html", title=run_name(inspected.parent), script=SCRIPT, data=data, **rows)
 

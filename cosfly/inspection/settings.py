@@ -13,6 +13,34 @@ from cosfly.work.config import Config
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
+POSE_TOLERANCE_M = 1e-3  # distance allowed between a flight's pose and its plan, m
+ROTATION_TOLERANCE_DEG = 0.01  # turn allowed between a flight's pose and its plan
+REPROJECTION_TOLERANCE_PX = 0.5  # distance allowed between the recorded and the projected target, px
+DRONE_SPEED_MAX_MPS = 25.0  # a faster step between two frames is a teleport, m/s
+TARGET_SPEED_MAX_MPS = 10.0  # the same for the person, m/s
+TRACK_QUALITY_MIN = 0.25  # mean IoU of projected box and mask below this goes to review
+MASK_VISIBILITY_MIN = 0.5  # a frame at least this visible must show pedestrian pixels at the target's box
+INVALID_DEPTH_MAX = 0.01  # share of invalid depth pixels above this in any frame goes to review
+# a surface of one colour that fills more of a picture goes to review (a missing texture); drawn ones have grain,
+# rounding and light
+FLAT_SURFACE_MAX = 0.01
+# a surface is of one colour where so many of its neighbouring pixels are equal; renders of three maps have at most
+# 0.95
+FLAT_PAIRS_MIN = 0.99
+# share of a picture in the magenta that engines paint for a missing texture; more goes to review; renders have none
+MAGENTA_MAX = 1e-3
+# share of pixels that alternate every 3 px or less between two surfaces in one plane, of other kinds or colours; more
+# goes to review; renders of three maps have at most 1.2e-4
+Z_FIGHTING_MAX = 1e-3
+# share of what stood still in this frame or the one before and is looked through in the other; more goes to review;
+# renders have 0
+JUMP_GONE_MAX = 0.02
+THUMBNAIL_PX = 240  # width of the pictures in report.html, px
+# size of report.html, and of review.html, beyond which flights are listed without pictures, map and plots, accepted
+# ones first, MB; a flight takes 0.06
+PAGE_MB = 25.0
+
+
 class InspectConfig(Config):
     """Thresholds of the inspection. An error rejects a flight, a warning routes it to manual review."""
 
@@ -35,53 +63,3 @@ class InspectConfig(Config):
     )
     pixel_sample: int = Field(16, ge=1, description="frames per flight that check_pixels: sample decodes")
     check_checksums: bool = Field(True, description="read every file and compare it with checksums.sha256")
-    pose_tolerance_m: float = Field(1e-3, ge=0, description="distance allowed between a flight's pose and its plan, m")
-    rotation_tolerance_deg: float = Field(0.01, ge=0, description="turn allowed between a flight's pose and its plan")
-    reprojection_tolerance_px: float = Field(
-        0.5, gt=0, description="distance allowed between the recorded and the projected target, px"
-    )
-    drone_speed_max_mps: float = Field(25.0, gt=0, description="a faster step between two frames is a teleport, m/s")
-    target_speed_max_mps: float = Field(10.0, gt=0, description="the same for the person, m/s")
-    track_quality_min: Share = Field(
-        0.25, description="mean IoU of projected box and mask below this goes to review; 0 turns the rule off"
-    )
-    mask_visibility_min: Share = Field(
-        0.5, description="a frame at least this visible must show pedestrian pixels at the target's box"
-    )
-    invalid_depth_max: Share = Field(
-        0.01, description="share of invalid depth pixels above this in any frame goes to review"
-    )
-    flat_surface_max: Share = Field(
-        0.01,
-        gt=0,
-        description="a surface of one colour that fills more of a picture goes to review (a missing texture); drawn "
-        "ones have grain, rounding and light; 1 turns the rule off",
-    )
-    flat_pairs_min: Share = Field(
-        0.99,
-        gt=0,
-        description="a surface is of one colour where so many of its neighbouring pixels are equal; renders of three "
-        "maps have at most 0.95",
-    )
-    magenta_max: Share = Field(
-        1e-3,
-        description="share of a picture in the magenta that engines paint for a missing texture; more goes to review; "
-        "renders have none; 1 turns the rule off",
-    )
-    z_fighting_max: Share = Field(
-        1e-3,
-        description="share of pixels that alternate every 3 px or less between two surfaces in one plane, of other "
-        "kinds or colours; more goes to review; renders of three maps have at most 1.2e-4; 1 turns the rule off",
-    )
-    jump_gone_max: Share = Field(
-        0.02,
-        description="share of what stood still in this frame or the one before and is looked through in the other; "
-        "more goes to review; renders have 0; 1 turns the rule off",
-    )
-    thumbnail_px: int = Field(240, ge=32, le=640, description="width of the pictures in report.html, px")
-    page_mb: float = Field(
-        25.0,
-        gt=0,
-        description="size of report.html, and of review.html, beyond which flights are listed without pictures, map "
-        "and plots, accepted ones first, MB; a flight takes 0.06",
-    )

@@ -14,7 +14,7 @@ from pathlib import Path
 from cosfly.errors import InputError
 from cosfly.inspection.flight import InspectedFlight, inspect_flight, trace_id
 from cosfly.inspection.report import report_html
-from cosfly.inspection.settings import InspectConfig
+from cosfly.inspection.settings import PAGE_MB, InspectConfig
 from cosfly.inspection.view import FlightView
 from cosfly.look.page import run_name
 from cosfly.products.boxes import read_boxes
@@ -96,7 +96,7 @@ def run(
     finished = run_items(stage, items, make_worker, arguments, workers=workers, watch=watch, label=label)
     inspection, views = assemble(finished, planned, cfg, data)
     write_inspection(product, inspection)
-    write_bytes(out / "report.html", report_html(run_name(out), inspection, views, cfg.page_mb).encode())
+    write_bytes(out / "report.html", report_html(run_name(out), inspection, views, PAGE_MB).encode())
     stage.finish([product, out / "report.html"], finished.tally, funnel=inspection.funnel.model_dump(mode="json"))
     _tell_review(inspection.funnel.flights, out)
     return product
