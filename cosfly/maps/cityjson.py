@@ -52,6 +52,24 @@ SURFACE_TOPS_M = {
 }  # fmt: skip
 
 
+SOLID_FILL = 0.9  # share of a building's boxes that its footprint fills
+SOLID_PIECE_M = 3.0  # building pieces of at most this length are not cut again, m
+WALL_FILL = 0.6  # share of each box of a wall that the wall fills
+WALL_PIECE_M = 1.0  # wall pieces of at most this length are not cut again, m
+WALL_MAX_M = 2.5  # highest wall, m: laser heights are often of trees above
+SURFACE_FILL = 0.8  # share of each slab that its surface fills
+SURFACE_PIECE_M = 2.0  # slabs of at most this length are not cut again, m
+SURFACE_MAX_M = 60.0  # longer slabs are cut however full they are, m
+WATER_FILL = 0.97  # the same for water, an obstacle that must not spill over quays and bridges
+WATER_PIECE_M = 1.5  # slabs of water of at most this length are not cut again, m
+CANOPY_M = 2.5  # green that rises higher than this over the ground is a tree, m
+CANOPY_MAX_M = 40.0  # tallest tree, m
+CANOPY_CELL_M = 2.0  # raster cell of canopies, m
+CROWN_CELLS = 3  # cells along a tree's side at most
+GROUND_CELL_M = 4.0  # cell of the heights of ground that slopes, m
+CROWN_MIN_M = 3.6  # least width of a crown, m: a street tree's plot is smaller
+
+
 class CityJsonConfig(Config):
     """A CityJSON city model."""
 
@@ -65,25 +83,7 @@ class CityJsonConfig(Config):
     solids: bool = Field(
         True, description="draw solids with their own roofs and walls (meshes.glb); planners keep to the boxes"
     )
-    solid_fill: float = Field(0.9, gt=0.0, le=1.0, description="share of a building's boxes that its footprint fills")
-    solid_piece_m: float = Field(3.0, gt=0.0, description="building pieces of at most this length are not cut again, m")
-    wall_fill: float = Field(0.6, gt=0.0, le=1.0, description="share of each box of a wall that the wall fills")
-    wall_piece_m: float = Field(1.0, gt=0.0, description="wall pieces of at most this length are not cut again, m")
-    wall_max_m: float = Field(2.5, gt=0.0, description="highest wall, m: laser heights are often of trees above")
-    surface_fill: float = Field(0.8, gt=0.0, le=1.0, description="share of each slab that its surface fills")
-    surface_piece_m: float = Field(2.0, gt=0.0, description="slabs of at most this length are not cut again, m")
-    surface_max_m: float = Field(60.0, gt=0.0, description="longer slabs are cut however full they are, m")
-    water_fill: float = Field(
-        0.97, gt=0.0, le=1.0, description="the same for water, an obstacle that must not spill over quays and bridges"
-    )
-    water_piece_m: float = Field(1.5, gt=0.0, description="slabs of water of at most this length are not cut again, m")
-    canopy_m: float = Field(2.5, gt=0.0, description="green that rises higher than this over the ground is a tree, m")
-    canopy_max_m: float = Field(40.0, gt=0.0, description="tallest tree, m")
-    canopy_cell_m: float = Field(2.0, gt=0.2, description="raster cell of canopies, m")
-    crown_cells: int = Field(3, ge=1, description="cells along a tree's side at most")
-    ground_cell_m: float = Field(4.0, ge=0.5, le=100.0, description="cell of the heights of ground that slopes, m")
     flat_within_m: float = Field(3.0, ge=0.0, description="ground that rises less over the whole map is made flat, m")
-    crown_min_m: float = Field(3.6, gt=0.0, description="least width of a crown, m: a street tree's plot is smaller")
     derive_ground: bool = Field(
         True,
         description="a model without streets, pavements and squares gets pavement along facades, asphalt between near "
@@ -117,7 +117,7 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
     assert cfg.path is not None
     model = read_model(cfg.path, cfg.polygon_vertices)
     objects, offset = _centred(model.objects, cfg.path)
-    ground = ground_of(objects, cell_m=cfg.ground_cell_m, flat_within_m=cfg.flat_within_m)
+    ground = ground_of(objects, cell_m=GROUND_CELL_M, flat_within_m=cfg.flat_within_m)
     objects = objects if ground.is_flat else [_over_ground(item, ground) for item in objects]
     facets = {item.object_id: _facets(item, cfg.polygon_crossings) for item in objects}
     footprints = {key: united([facet.polygon for facet in value]) for key, value in facets.items()}
@@ -138,14 +138,14 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
                 footprint_m2, boxes_m2 = footprint_m2 + footprint.area, boxes_m2 + outline.area
                 covered_m2 += shapely.intersection(footprint, outline).area
         elif item.rule.form == "wall":
-            _add_wall(boxes, cfg, item, footprint, is_flat=ground.is_flat)
+            _add_wall(boxes, item, footprint, is_flat=ground.is_flat)
         elif item.rule.kind != "Water":
-            _add_surface(boxes, cfg, item.rule.kind, footprint)
+            _add_surface(boxes, item.rule.kind, footprint)
         if item.rule.kind == "Bridge":
-            _add_surface(boxes, cfg, "Sidewalks", footprint)  # what people walk on
+            _add_surface(boxes, "Sidewalks", footprint)  # what people walk on
         if item.rule.form == "green":
-            _add_trees(boxes, cfg, item, facets[item.object_id])
-    _add_water(boxes, cfg, objects, footprints)
+            _add_trees(boxes, item, facets[item.object_id])
+    _add_water(boxes, objects, footprints)
     header = MapHeader(
         name=cfg.name,
         source=MapSource(tool=cfg.tool, version=f"CityJSON {model.version}", file=cfg.path.name),
@@ -238,51 +238,51 @@ def _add_solid(
     outlines = []
     for polygon in polygons_of(footprint):
         outline = polygon.simplify(0.05)
-        for rectangle in cover(outline, min_fill=cfg.solid_fill, min_size_m=cfg.solid_piece_m, shares=CUT_SHARES):
+        for rectangle in cover(outline, min_fill=SOLID_FILL, min_size_m=SOLID_PIECE_M, shares=CUT_SHARES):
             top = high if mesh is None else top_within(mesh, rectangle, high)
             boxes.add(item.rule.kind, rectangle.center, rectangle.size, low, max(top, low + 0.1), rectangle.yaw_deg)
             outlines.append(rectangle_polygon(rectangle))
     return united(outlines), mesh
 
 
-def _add_wall(boxes: BoxList, cfg: CityJsonConfig, item: CityObject, footprint, *, is_flat: bool) -> None:
+def _add_wall(boxes: BoxList, item: CityObject, footprint, *, is_flat: bool) -> None:
     """Add a wall piece by piece along its course, as high as the middle of its heights says."""
-    high = float(np.clip(np.percentile(item.corners()[:, 2], 75), 0.3, cfg.wall_max_m))
+    high = float(np.clip(np.percentile(item.corners()[:, 2], 75), 0.3, WALL_MAX_M))
     for polygon in polygons_of(footprint):
         longest_m, low = (np.inf, -SLAB_M) if is_flat else (SLOPED_WALL_M, -SLOPED_WALL_DEPTH_M)
         outline = polygon.simplify(0.02)
-        for rectangle in cover(outline, min_fill=cfg.wall_fill, min_size_m=cfg.wall_piece_m, max_size_m=longest_m):
+        for rectangle in cover(outline, min_fill=WALL_FILL, min_size_m=WALL_PIECE_M, max_size_m=longest_m):
             boxes.add(item.rule.kind, rectangle.center, rectangle.size, low, high, rectangle.yaw_deg)
 
 
-def _add_surface(boxes: BoxList, cfg: CityJsonConfig, kind: str, footprint) -> None:
+def _add_surface(boxes: BoxList, kind: str, footprint) -> None:
     """Add a surface as slabs at the height of its kind: the map is flat, so that nothing of it stands in the way."""
     top = SURFACE_TOPS_M.get(kind, -0.1)
-    fill, piece_m = (cfg.water_fill, cfg.water_piece_m) if kind == "Water" else (cfg.surface_fill, cfg.surface_piece_m)
+    fill, piece_m = (WATER_FILL, WATER_PIECE_M) if kind == "Water" else (SURFACE_FILL, SURFACE_PIECE_M)
     for polygon in polygons_of(footprint):
-        for rectangle in cover(polygon.simplify(0.05), min_fill=fill, min_size_m=piece_m, max_size_m=cfg.surface_max_m):
+        for rectangle in cover(polygon.simplify(0.05), min_fill=fill, min_size_m=piece_m, max_size_m=SURFACE_MAX_M):
             boxes.add(kind, rectangle.center, rectangle.size, top - SLAB_M, top, rectangle.yaw_deg)
 
 
-def _add_water(boxes: BoxList, cfg: CityJsonConfig, objects: list[CityObject], footprints: dict[str, Any]) -> None:
+def _add_water(boxes: BoxList, objects: list[CityObject], footprints: dict[str, Any]) -> None:
     """Add water, cut out where anything crosses it: nobody walks on water, but people walk over bridges."""
     water = [footprints[item.object_id] for item in objects if item.rule.kind == "Water"]
     if not water:
         return
     crossing = [footprints[i.object_id] for i in objects if i.rule.kind in ("Bridge", "Roads", "Sidewalks", "Ground")]
     rest = shapely.difference(united(water), shapely.buffer(united(crossing), 0.05)) if crossing else united(water)
-    _add_surface(boxes, cfg, "Water", rest)
+    _add_surface(boxes, "Water", rest)
 
 
-def _add_trees(boxes: BoxList, cfg: CityJsonConfig, item: CityObject, facets: list[Facet]) -> None:
+def _add_trees(boxes: BoxList, item: CityObject, facets: list[Facet]) -> None:
     """Add a vegetation box for every patch of raster cells where the green rises over `canopy_m`."""
     if not facets:
         return
-    heights, low = canopy_heights(item, facets, cfg.canopy_cell_m)
-    for x0, y0, x1, y1, top in crowns(heights, cfg.canopy_m, cfg.crown_cells):
+    heights, low = canopy_heights(item, facets, CANOPY_CELL_M)
+    for x0, y0, x1, y1, top in crowns(heights, CANOPY_M, CROWN_CELLS):
         first, last = (np.array(corner) + low for corner in ((x0, y0), (x1, y1)))
-        size = np.maximum((last - first) * cfg.canopy_cell_m, cfg.crown_min_m)
-        boxes.add("Vegetation", (first + last) / 2 * cfg.canopy_cell_m, size, 0.0, min(top, cfg.canopy_max_m))
+        size = np.maximum((last - first) * CANOPY_CELL_M, CROWN_MIN_M)
+        boxes.add("Vegetation", (first + last) / 2 * CANOPY_CELL_M, size, 0.0, min(top, CANOPY_MAX_M))
 
 
 def canopy_heights(item: CityObject, facets: list[Facet], cell_m: float) -> tuple[np.ndarray, np.ndarray]:
