@@ -66,7 +66,7 @@ def write_answers(facts: Facts, rng: np.random.Generator, decision: str | None =
     return first.coc, second.coc
 
 
-QUICK = {"max_tries": 2, "backoff_s": 0.01, "max_backoff_s": 0.02, "timeout_s": 30.0, "concurrency": 4}
+QUICK = {"max_tries": 2, "timeout_s": 30.0, "concurrency": 4}
 
 
 def settings(url: str, **changes) -> CaptionConfig:

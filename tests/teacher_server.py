@@ -19,9 +19,11 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import BinaryIO
 
+from cosfly.chat import client
 from cosfly.products.actions import shipped_actions
 from cosfly.work.journal import Journal
 
+client.FIRST_PAUSE_S, client.LONGEST_PAUSE_S = 0.01, 0.02  # no test waits for a server that fails
 MODEL = "test-teacher"
 ENGLISH = {
     "critical_components": "The target pedestrian is {visibility} and walks on the road ahead of the drone.",

@@ -21,7 +21,7 @@ from teacher_server import is_mirror, kept_answers
 
 from caption.run.progress import Display
 from caption.run.stage import run
-from cosfly.chat import answers
+from cosfly.chat import answers, client
 from cosfly.chat.answers import Answer, AnswerBook, journal_name
 from cosfly.chat.budget import Budget, BudgetConfig, BudgetSpent
 from cosfly.chat.protocol import encode_body
@@ -194,10 +194,10 @@ def test_retry_failed_leaves_alone_what_was_never_asked(tree, tmp_path, whole):
         assert run(settings(server.url), tree, out).read_bytes() == whole
 
 
-def test_the_total_timeout_bounds_all_tries(tree, tmp_path):
-    endpoint = {
-        "max_tries": 50, "backoff_s": 0.3, "max_backoff_s": 0.3, "total_timeout_s": 0.5, "stop_after_failures": 1,
-    }  # fmt: skip
+def test_the_total_timeout_bounds_all_tries(tree, tmp_path, monkeypatch):
+    monkeypatch.setattr(client, "FIRST_PAUSE_S", 0.3)
+    monkeypatch.setattr(client, "LONGEST_PAUSE_S", 0.3)
+    endpoint = {"max_tries": 50, "total_timeout_s": 0.5, "stop_after_failures": 1}
     with deciding(fault=lambda number, body: "500") as server:
         start_s = time.monotonic()
         with pytest.raises(TeacherError, match="total_timeout"):

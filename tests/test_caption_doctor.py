@@ -93,7 +93,7 @@ def patient(
 
 def examine(behaviour: Callable, context: int = CONTEXT, **changes) -> dict[str, Finding]:
     with TeacherServer(respond=behaviour, model_facts={"max_model_len": context}) as server:
-        cfg = CaptionConfig.model_validate({"endpoint": {"backoff_s": 0.01, **changes.pop("endpoint", {})}, **changes})
+        cfg = CaptionConfig.model_validate(changes)
         return {finding.name: finding for finding in examine_endpoint(server.url, cfg, VOCABULARY)}
 
 

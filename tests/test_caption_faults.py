@@ -286,7 +286,9 @@ def test_an_outage_is_shown_with_the_servers_last_word(tree, tmp_path, caplog, m
     caplog.set_level(logging.INFO)
     with hovering() as server:
         server.respond = lambda body: refusal(503, "Loading model") if len(server.bodies) <= 24 else None
-        endpoint = {"max_tries": 100, "backoff_s": 0.1, "max_backoff_s": 0.1}
+        endpoint = {"max_tries": 100}
+        monkeypatch.setattr("cosfly.chat.client.FIRST_PAUSE_S", 0.1)
+        monkeypatch.setattr("cosfly.chat.client.LONGEST_PAUSE_S", 0.1)
         run(settings(server.url, limit=3, endpoint=endpoint), tree, tmp_path / "out")
     lines = [line for line in caplog.messages if "failed tries" in line]
     assert any(re.search(r"no answer for \d s, the last: HTTP 503 Loading model", line) for line in lines)

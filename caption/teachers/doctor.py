@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -70,7 +69,6 @@ class _Probe:
     detail: str = ""
     refusal: Refusal | None = None
     thoughts: int = 0
-    seconds: float = 0.0
 
     @property
     def text(self) -> str:
@@ -111,7 +109,6 @@ class _Examination:
         body = request_body(self.client.model, request)
         if schema is not None:
             body["response_format"] = response_format(schema)
-        start_s = time.monotonic()
         try:
             response = await self.client.send(body)
         except (TimeoutError, httpx.RequestError) as error:
@@ -122,24 +119,17 @@ class _Examination:
             return _Probe(None, found.said + fix, found)
         if isinstance(found, str):
             return _Probe(None, found)
-        return _Probe(found, "", None, thoughts_of(read_body(response.body)), time.monotonic() - start_s)
-
-    # --- the checks, in order ---
+        return _Probe(found, "", None, thoughts_of(read_body(response.body)))
 
     async def _text(self) -> bool:
         probe = await self._ask([_user("Reply with the one word: ready")], self.cfg.endpoint.max_tokens)
         if not probe.text:
-            limit = self.cfg.endpoint.max_tokens
-            only = f"{probe.thoughts} characters of thinking and no answer within {limit} tokens: {NO_THINKING}"
-            detail = probe.detail or (only if probe.thoughts else "an empty answer")
-            self._add("answers", "unusable", detail)
+            only = f"{probe.thoughts} characters of thinking and no answer: {NO_THINKING}"
+            self._add("answers", "unusable", probe.detail or (only if probe.thoughts else "an empty answer"))
             return False
-        self._add("answers", "ok", f"in {probe.seconds:.1f} s: {probe.text[:40]!r}")
-        if probe.thoughts or "<think" in probe.text:
-            length = probe.thoughts or len(probe.text)
-            self._add("thinking", "warning", f"on: {length} characters before the answer; switch it off: {NO_THINKING}")
-        else:
-            self._add("thinking", "ok", "off")
+        self._add("answers", "ok", f"{probe.text[:40]!r}")
+        is_on = probe.thoughts > 0 or "<think" in probe.text
+        self._add("thinking", "warning" if is_on else "ok", f"switch it off: {NO_THINKING}" if is_on else "off")
         return True
 
     async def _schema(self) -> None:
@@ -150,12 +140,9 @@ class _Examination:
             "additionalProperties": False,
         }
         probe = await self._ask([_user("Hello! How are you today?")], 256, schema)
-        if probe.refusal is not None and probe.refusal.kind == "schema":
-            self.takes_schema = False
-            self._add("JSON schema", "warning", f"refused ({probe.detail}); answers are parsed from plain text")
-            return
         if probe.reply is None:
-            self._add("JSON schema", "warning", f"could not be tried: {probe.detail}")
+            self.takes_schema &= probe.refusal is None or probe.refusal.kind != "schema"
+            self._add("JSON schema", "warning", f"refused ({probe.detail}); answers are parsed from plain text")
             return
         try:
             is_applied = parse_json(probe.text) == {"animal": ODD_WORD, "legs": 7}
@@ -196,8 +183,7 @@ class _Examination:
         probe = await self._ask(messages, limit, schema)
         known = f" of {length} that the model holds" if length else ""
         if probe.reply is None:
-            detail = f"the largest prompt with {limit} tokens for the answer{known}: {probe.detail}"
-            self._add("context length", "unusable", detail)
+            self._add("context length", "unusable", f"the largest prompt{known} refused: {probe.detail}")
             return
         used = probe.prompt_tokens
         detail = f"{used or 'unknown'} tokens of the largest prompt and {limit} for the answer"

@@ -125,7 +125,9 @@ async def open_judge(
     if cfg.url is None:
         yield None
         return
-    client = ChatClient(cfg.url, EndpointConfig(model=cfg.model, concurrency=cfg.concurrency, max_tries=MAX_TRIES), troubles)
+    client = ChatClient(
+        cfg.url, EndpointConfig(model=cfg.model, concurrency=cfg.concurrency, max_tries=MAX_TRIES), troubles
+    )
     async with started(client):
         yield Judge(KeptAnswers(client, book, budget), cfg, vocabulary, seed)
 

@@ -39,6 +39,7 @@ from cosfly.work.config import Config, MayDiffer
 log = logging.getLogger(__name__)
 
 BUSY_STATUS = frozenset({429, 503, 529})
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # after a failure: the pause doubles, with jitter
 MOST_SAID = 300  # characters of a server's words that are kept
 
 
@@ -57,8 +58,6 @@ class EndpointConfig(Config):
         900.0, gt=0, description="limit of one answer with all its tries, from the first request on"
     )
     max_tries: MayDiffer[int] = Field(6, ge=1, description="tries of one request when the server is busy or fails")
-    backoff_s: MayDiffer[float] = Field(1.0, gt=0, description="first wait after a failure; doubles, with jitter")
-    max_backoff_s: MayDiffer[float] = Field(60.0, gt=0, description="longest wait between two tries")
     max_reply_mb: MayDiffer[float] = Field(
         4.0, gt=0, le=1000, description="longest answer of the server as it is read, unpacked, megabytes"
     )
@@ -172,7 +171,7 @@ class ChatClient:
                 self._changed.notify(max(int(self.throttle.limit) - self.throttle.num_active, 0))
 
     def _backoff_s(self, attempt: int) -> float:
-        longest = min(self.cfg.max_backoff_s, self.cfg.backoff_s * 2.0 ** min(attempt, 60))
+        longest = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0 ** min(attempt, 60))
         return self._jitter.uniform(0.5, 1.0) * longest
 
     async def send(self, payload: dict) -> Response:

@@ -249,9 +249,7 @@ def _check_surfaces(look: PixelFigures, where: str, cfg: InspectConfig, report: 
         )
         report.warn("missing_texture", f"{where}/rgb.png", got, f"at most {FLAT_SURFACE_MAX:.1%}")
     if look.magenta > MAGENTA_MAX:
-        report.warn(
-            "missing_texture", f"{where}/rgb.png", f"{look.magenta:.2%} magenta", f"at most {MAGENTA_MAX:.2%}"
-        )
+        report.warn("missing_texture", f"{where}/rgb.png", f"{look.magenta:.2%} magenta", f"at most {MAGENTA_MAX:.2%}")
     if look.fighting > Z_FIGHTING_MAX:
         got = f"{look.fighting:.3%} of the pixels alternate between two surfaces of one plane"
         report.warn("z_fighting", f"{where}/instance.png", got, f"at most {Z_FIGHTING_MAX:.3%}")

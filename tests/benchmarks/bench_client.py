@@ -4,9 +4,6 @@ A local server in its own process answers every request after a fixed 200 ms. Th
 of 640x360; the requests it sent are then sent again by bare httpx loops with the same concurrency, from bytes made
 beforehand: one loop with one client and its pool of connections, one with a client to each worker. Reported: requests
 per second of all and the ratio to the faster loop, once with pictures encoded beforehand and once encoded on the way.
-
-`--servers 1,2,3 --rounds 2`: instead, windows per second over so many servers at once, each with `--concurrency`
-requests in flight and answers after `--delay` seconds; the counts by turns, in each round.
 """
 
 from __future__ import annotations
@@ -16,7 +13,6 @@ import asyncio
 import contextlib
 import json
 import multiprocessing
-import os
 import shutil
 import sys
 import tempfile
@@ -62,13 +58,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--windows", type=int, default=1600)
     parser.add_argument("--concurrency", type=int, default=64)
-    parser.add_argument("--servers", default="", help="counts of servers, with commas")
-    parser.add_argument("--rounds", type=int, default=2)
-    parser.add_argument("--delay", type=float, default=1.0)
     args = parser.parse_args()
-    if args.servers:
-        compare_servers(list(map(int, args.servers.split(","))), args)
-        return
     context = multiprocessing.get_context("spawn")
     port = context.Queue()
     server = context.Process(target=_serve, args=(port,), daemon=True)
@@ -95,32 +85,6 @@ def main() -> None:
         ("caption client, pictures encoded before", warm_s), ("caption client, encoded on the way", cold_s),
     ):  # fmt: skip
         print(f"{name:<42} {count / seconds:7.1f} requests/s   {seconds:6.2f} s   ratio {best_s / seconds:.3f}")
-
-
-def compare_servers(counts: list[int], args: argparse.Namespace) -> None:
-    context = multiprocessing.get_context("spawn")
-    port = context.Queue()
-    servers = [context.Process(target=_serve, args=(port, args.delay), daemon=True) for _ in range(max(counts))]
-    for server in servers:
-        server.start()
-    urls = [f"http://127.0.0.1:{port.get(timeout=60)}/v1" for _ in servers]
-    folder = Path(tempfile.mkdtemp(prefix="bench_client_"))
-    try:
-        tree = _make_tree(folder / "tree", args.windows)
-        _, _, encoder = _client(_settings(",".join(urls), 64), tree, folder / "warm", None)
-        for number in range(args.rounds):
-            for count in counts:
-                cfg = _settings(",".join(urls[:count]), args.concurrency)
-                took_s, _, _ = _client(cfg, tree, folder / f"{number}_{count}", encoder)
-                load = os.getloadavg()[0]
-                print(
-                    f"{count} servers: {args.windows / took_s:6.2f} windows/s  {took_s:6.2f} s  (load {load:.0f})",
-                    flush=True,
-                )
-    finally:
-        for server in servers:
-            server.terminate()
-        shutil.rmtree(folder)
 
 
 def _settings(url: str, concurrency: int) -> CaptionConfig:
@@ -208,7 +172,7 @@ def _make_tree(root: Path, num_windows: int) -> Path:
     return root
 
 
-def _serve(port, delay_s: float = DELAY_S) -> None:
+def _serve(port) -> None:
     """Answer chat completions after the fixed delay, with as little work as can be."""
     replies = [_reply(answer) for answer in (ENGLISH, CHINESE)]
 
@@ -223,7 +187,7 @@ def _serve(port, delay_s: float = DELAY_S) -> None:
                 body = await reader.readexactly(length)
                 start_s = time.monotonic()
                 reply = replies[0] if b'"image_url"' in body else replies[1]
-                await asyncio.sleep(delay_s - (time.monotonic() - start_s))
+                await asyncio.sleep(DELAY_S - (time.monotonic() - start_s))
                 writer.write(reply)
                 await writer.drain()
         except (asyncio.IncompleteReadError, ConnectionError):
