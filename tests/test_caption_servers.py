@@ -38,8 +38,13 @@ TRIES = 2
 
 def settings(url: str, **changes) -> CaptionConfig:
     # Slow servers are slow for ever: the limit is what a good answer never takes here, however busy the machine is.
-    endpoint = {"timeout_s": 20.0, "concurrency": 1, "max_reply_mb": 0.5} | changes.pop("endpoint", {})
+    endpoint = {"timeout_s": 20.0, "concurrency": 1} | changes.pop("endpoint", {})
     return quick(url, endpoint=endpoint, **{"limit": 1, **changes})
+
+
+@pytest.fixture(autouse=True)
+def small_replies(monkeypatch):
+    monkeypatch.setattr("cosfly.chat.client.MOST_REPLY_MB", 0.5)
 
 
 @pytest.fixture(scope="module")
@@ -191,14 +196,14 @@ FAULTS: dict[str, tuple] = {
     fine()),
     # --- the wire
     "nobody: a body of 20 MB": (page(200, "[" + "1," * 10_000_000 + "1]"), silent("bad_reply",
-    "longer than max_reply_mb=0.5")),
+    "longer than 0.5 MB")),
     "nobody: a bomb of gzip": (lambda body: Sent(200, BOMB, {"Content-Encoding": "gzip"}), silent("bad_reply",
-    "max_reply_mb=0.5")),
+    "longer than 0.5 MB")),
     "nobody: a bomb in a bomb": (
         lambda body: Sent(200, gzip.compress(BOMB), {"Content-Encoding": "gzip, gzip"}), silent("connection",
         "not asked for")),
     "nobody: a stream without end": (raw(CHUNKED, b"1000\r\n" + b" " * 4096 + b"\r\n", is_endless=True),
-    silent("bad_reply", "max_reply_mb")),
+    silent("bad_reply", "longer than 0.5 MB")),
     "a proxy: x-gzip, nab 591": (packed(gzip.compress, "x-gzip"), fine()),
     "a proxy: gzip that is none, got 1964": (packed(bytes, "gzip"), silent("connection", "incorrect header check")),
     "a proxy: gzip that ends early": (packed(lambda data: gzip.compress(data)[:-9], "gzip"), silent("connection",
@@ -328,7 +333,7 @@ def test_of_a_bomb_no_more_is_unpacked_than_the_limit(tree, tmp_path):
     bomb = gzip.compress(bytes(200_000_000))
     with deciding(respond=lambda body: Sent(200, bomb, {"Content-Encoding": "gzip"})) as server:
         tracemalloc.start()
-        with pytest.raises(TeacherError, match="max_reply_mb"):
+        with pytest.raises(TeacherError, match=r"longer than 0\.5 MB"):
             run(settings(server.url), tree, tmp_path / "out")
         peak_mb = tracemalloc.get_traced_memory()[1] / 1e6
         tracemalloc.stop()

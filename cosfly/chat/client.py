@@ -40,6 +40,7 @@ log = logging.getLogger(__name__)
 
 BUSY_STATUS = frozenset({429, 503, 529})
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # after a failure: the pause doubles, with jitter
+MOST_REPLY_MB = 4.0  # of one answer, unpacked
 MOST_SAID = 300  # characters of a server's words that are kept
 
 
@@ -58,9 +59,6 @@ class EndpointConfig(Config):
         900.0, gt=0, description="limit of one answer with all its tries, from the first request on"
     )
     max_tries: MayDiffer[int] = Field(6, ge=1, description="tries of one request when the server is busy or fails")
-    max_reply_mb: MayDiffer[float] = Field(
-        4.0, gt=0, le=1000, description="longest answer of the server as it is read, unpacked, megabytes"
-    )
     stop_after_failures: MayDiffer[int] = Field(
         20, ge=1, description="windows in a row without an answer that end the run"
     )
@@ -111,8 +109,7 @@ class ChatClient:
         self._is_schema_refused = not cfg.json_schema
         self._is_cut_told = False
         self._key = os.environ.get(KEY_VARIABLE, "")
-        most_bytes = int(cfg.max_reply_mb * 1e6)
-        self._connections = Connections(self._key, timeout_s=cfg.timeout_s, most_bytes=most_bytes)
+        self._connections = Connections(self._key, timeout_s=cfg.timeout_s, most_bytes=int(MOST_REPLY_MB * 1e6))
         self._changed = asyncio.Condition()  # of the requests in flight
         self._jitter = random.Random()  # times of retries only: no product depends on it
 
@@ -305,7 +302,7 @@ class ChatClient:
         if response.status != 200:
             return self.refusal(response)
         if response.is_cut:
-            return f"longer than max_reply_mb={self.cfg.max_reply_mb:g}"
+            return f"longer than {MOST_REPLY_MB:g} MB"
         found = read_completion(response, "json_schema" if is_structured else "plain")
         if isinstance(found, Reply):
             return found

@@ -33,8 +33,6 @@ class VllmConfig(Config):
 
     batch: int = Field(256, ge=1, description="most requests in the engine at once")
     max_model_len: int | None = Field(None, ge=1024, description="context length; empty takes the model's")
-    gpu_memory_utilization: float = Field(0.9, gt=0, le=1, description="share of the accelerator's memory")
-    tensor_parallel_size: int = Field(1, ge=1, description="accelerators that share the model")
     engine: dict[str, Any] = Field(default_factory=dict, description="further arguments of vllm.LLM")
 
 
@@ -114,8 +112,7 @@ class VllmEngine:
         arguments: dict[str, Any] = {
             "model": str(self.folder),
             "limit_mm_per_prompt": {"image": self.num_images, "video": 0},  # without the 0, room is kept for a video
-            "gpu_memory_utilization": cfg.gpu_memory_utilization,
-            "tensor_parallel_size": cfg.tensor_parallel_size,
+            "gpu_memory_utilization": 0.9,
             # Free whitespace between fields lets a model pad for ever and slows decoding several times. vLLM forbids it
             # only where the backend is named; "auto" is refused.
             "structured_outputs_config": {"backend": "xgrammar", "disable_any_whitespace": True},
