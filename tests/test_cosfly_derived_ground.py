@@ -92,7 +92,7 @@ def test_a_city_model_without_streets_gets_it_and_the_same_bytes_twice(tmp_path:
 
 def test_boxes_of_ones_own_get_it_where_they_ask_for_it(tmp_path: Path):
     path = tmp_path / "own.csv"
-    path.write_text("type,x,y,length,width,height\nBuildings,0,0,20,10,8\nBuildings,0,30,20,10,8\n")
+    path.write_text("type,x_m,y_m,length_m,width_m,height_m\nBuildings,0,0,20,10,8\nBuildings,0,30,20,10,8\n")
     plain, derived = (
         load_map(MapsConfig(source="boxes", boxes=BoxesConfig(path=path, derive_ground=wanted)))
         for wanted in (False, True)

@@ -88,7 +88,7 @@ def test_a_pose_is_drawn_and_its_depth_is_the_distance(town, flight):
 def test_files_and_sources_are_loaded(town, tmp_path):
     write_boxes(tmp_path / "boxes_3d.json", town)
     assert len(cosfly.load_map(tmp_path / "boxes_3d.json")) == len(town)
-    (tmp_path / "own.csv").write_text("type,x,y,length,width,height\nhouse,0,0,9,9,8\n")
+    (tmp_path / "own.csv").write_text("type,x_m,y_m,length_m,width_m,height_m\nhouse,0,0,9,9,8\n")
     assert cosfly.load_map(tmp_path / "own.csv", types={"house": "Buildings"}).counts() == {"Buildings": 1}
 
 

@@ -504,7 +504,9 @@ def test_the_gallery_has_nine_pictures_and_a_sheet_of_all(trees, tmp_path):
 
 @pytest.mark.parametrize(("kind", "is_dark"), [("Buildings", True), ("Sidewalks", False), ("Poles", False)])
 def test_flights_that_nobody_can_see_are_told_before_they_are_drawn(tmp_path, kind, is_dark):
-    (tmp_path / "own.csv").write_text(f"type,x,y,length,width,height\nBuildings,0,0,9,9,8\n{kind},20,0,9,9,3\n")
+    (tmp_path / "own.csv").write_text(
+        f"type,x_m,y_m,length_m,width_m,height_m\nBuildings,0,0,9,9,8\n{kind},20,0,9,9,3\n"
+    )
     settings = "{maps: {source: boxes, boxes: {path: own.csv, licence: cc-by-4.0}}, pedestrians: {num_paths: 8},"
     settings += " render: {weather_mode: random_per_path}}"
     (tmp_path / "own.yaml").write_text(settings.replace("own.csv", str(tmp_path / "own.csv")))

@@ -153,7 +153,7 @@ def _table(root: Path, target: Path) -> None:
     town = invent(SyntheticConfig(size_m=120.0, num_blocks=1), 0)
     with target.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["type", "x", "y", "z", "length", "width", "height", "yaw_deg"])
+        writer.writerow(["type", "x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_deg"])
         for kind, center, half, rotation in zip(
             town.kinds, town.centers, town.half_extents, town.rotations_deg, strict=True
         ):
@@ -163,7 +163,7 @@ def _table(root: Path, target: Path) -> None:
 def _geojson(root: Path, target: Path) -> None:
     ring = [[0, 0], [40, 0], [40, 30], [0, 30], [0, 0]]
     shape = {"type": "Polygon", "coordinates": [ring]}
-    house = {"type": "Feature", "properties": {"type": "Buildings", "height": 9}, "geometry": shape}
+    house = {"type": "Feature", "properties": {"type": "Buildings", "height_m": 9}, "geometry": shape}
     target.write_text(json.dumps({"type": "FeatureCollection", "features": [house]}))
 
 

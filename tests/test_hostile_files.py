@@ -46,7 +46,7 @@ FLIGHT = "tree/Town01/*/ORI"
 FRAME = f"{FLIGHT}/frames_playback/frame_00003"
 RING = [[-30, -8], [30, -8], [30, 8], [-30, 8], [-30, -8]]
 HOUSE = {
-    "type": "Feature", "properties": {"type": "Buildings", "height": 9, "yaw": 0},
+    "type": "Feature", "properties": {"type": "Buildings", "height_m": 9, "yaw_deg": 0},
     "geometry": {"type": "Polygon", "coordinates": [RING]},
 }  # fmt: skip
 CITY = {
@@ -104,7 +104,7 @@ def specimens(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ):  # fmt: skip
         write_json(root / name, value)
     write_json(root / "Bbox.json", {"all": {"BP_Tree1_C": {"bbox": {"x": 800, "y": 600, "z": 1200}}}})
-    (root / "own.csv").write_text("id,type,x,y,z,length,width,height,yaw\n1,Buildings,0,0,4,9,9,8,30\n")
+    (root / "own.csv").write_text("id,type,x_m,y_m,z_m,length_m,width_m,height_m,yaw_deg\n1,Buildings,0,0,4,9,9,8,30\n")
     (root / "answer.txt").write_text(f"<think>hm</think>\n```json\n{json.dumps(ANSWER)}\n```")
     return root
 

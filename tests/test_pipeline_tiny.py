@@ -81,7 +81,7 @@ def test_the_licence_of_the_map_reaches_the_card(base):
 
 
 def test_what_the_release_would_refuse_is_refused_before_the_run_begins(tmp_path):
-    (tmp_path / "town.csv").write_text("type,x,y,length,width\nBuildings,1,1,4,4\n")
+    (tmp_path / "town.csv").write_text("type,x_m,y_m,length_m,width_m\nBuildings,1,1,4,4\n")
     city = {"maps.source": "cityjson", "maps.cityjson.path": "/nowhere.json"}
     town = {"maps.source": "boxes", "maps.boxes.path": str(tmp_path / "town.csv"), "maps.boxes.licence": "mit"}
     for changes, error, words in (
