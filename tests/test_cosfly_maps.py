@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from benchmarks.census_town import CENSUS, census_town
 from shapely.geometry import Point, Polygon, box
 from tables import each
 from test_cosfly_map_kinds import city as two_houses
@@ -19,7 +20,6 @@ from test_cosfly_map_kinds import document, load
 from cosfly.errors import ConfigError, InputError, ResumeError
 from cosfly.look.topview import TopView, draw_map, draw_text
 from cosfly.maps.boxlist import BoxList
-from cosfly.maps.census_town import CENSUS
 from cosfly.maps.cityjson import CityJsonConfig, crowns
 from cosfly.maps.cityjson_file import rule_of
 from cosfly.maps.footprints import Rectangle, cover, oriented_rectangle, rectangle_polygon, united
@@ -72,8 +72,7 @@ def test_a_town_has_what_the_passes_and_the_walks_need(seed):
 
 
 def test_the_census_town_has_the_papers_counts_and_simplifies_to_a_few_thousand():
-    cfg = build(MapsConfig, {"synthetic": {"preset": "town10"}}, "x")
-    town, other = (load_map(cfg, seed=seed) for seed in (0, 1))
+    town, other = (census_town("Town", seed) for seed in (0, 1))
     assert town.counts() == other.counts() == CENSUS
     assert len(town) == 65_614
     assert not np.array_equal(town.centers, other.centers)
@@ -100,7 +99,7 @@ def test_towns_of_other_sizes(size_m, num_blocks):
     assert "Buildings" in town.counts()
 
 
-OTHER_TOWNS = sorted(set(PRESETS) - {"small_town", "town10"})
+OTHER_TOWNS = sorted(set(PRESETS) - {"small_town"})
 HIGHEST_M = {"village": (5, 15), "park": (5, 15), "market": (9, 22), "old_town": (10, 20), "towers": (60, 125)}
 
 

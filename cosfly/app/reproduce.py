@@ -337,7 +337,6 @@ def measure(
     compared = build(compare.CompareConfig, plan.model_dump() | {"planners": PLANNERS}, "planners")
     compare.run(compared, simplified, paths, out / "compare", **how)
     variants.run(variants.beam_study(plan, BEAMS), simplified, paths, out / "beam", **how)
-    variants.run(variants.weight_study(plan), simplified, paths, out / "muco", **how)
     if "release" in done:
         release_stats(run / "release/dataset", out / "release", pixels=0)
     if "render" not in done:

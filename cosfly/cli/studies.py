@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer import Argument, Option
+from typer import Option
 
 from cosfly.cli import options
 from cosfly.cli.options import STAGE, Job, takes
@@ -98,26 +98,4 @@ def study_zoom(
     product = zoom.run(studied, map_, simplified, traces, out, seed=job.cfg.seed, **job.manner)
     head, rows = zoom.HEAD, zoom.text_rows(read_object(product, what="zoom study"))
     options.tell_table(console, head, rows, title="Zoom (mean ± standard deviation over flights)", left=head)
-    job.finish(product, out)
-
-
-@app.command("muco")
-@takes(*STAGE)
-def study_muco(
-    job: Job,
-    map_: Annotated[Path, Argument(metavar="MAP", help="Boxes: step2_simplified.json.")],
-    paths: Annotated[Path, Argument(metavar="PATHS", help="Walks: path.json.")],
-    out: options.Out,
-) -> None:
-    """MuCO's weights, each at a quarter to four times its value and without its term, on the same walks."""
-    from cosfly.reading.documents import read_object
-    from cosfly.studies import variants
-    from cosfly.work.console import console
-
-    product = variants.run(variants.weight_study(job.cfg.plan), map_, paths, out, seed=job.cfg.seed, **job.manner)
-    head = ("weight", *(f"x {factor:g}" for factor in variants.FACTORS), "kept")
-    found = read_object(product)["changes"]
-    for figure, title, _ in variants.SHOWN:
-        rows = [[name, *map(str, row)] for name, row in found[figure].items()]
-        options.tell_table(console, head, rows, title=f"Change of {title} (*: the interval leaves 0 out)")
     job.finish(product, out)

@@ -20,7 +20,6 @@ from pydantic import Field, model_validator
 
 from cosfly.errors import nearest
 from cosfly.maps.boxlist import BoxList
-from cosfly.maps.census_town import census_town
 from cosfly.maps.town_blocks import (
     BASE_TOP_M,
     BLOCKS,
@@ -51,7 +50,6 @@ RAILING_M = 0.2
 # one is not yet known to hold in another.
 PRESETS: dict[str, dict[str, Any]] = {
     "small_town": {},
-    "town10": {},
     "grid": {
         "size_m": 330.0, "num_blocks": 4, "street_m": 18.0, "boulevard_m": 26.0, "unevenness": 0.0, "parked_share": 0.6,
         "blocks": {"courtyard": 0.6, "towers": 0.2, "square": 0.1, "park": 0.1},
@@ -94,8 +92,7 @@ class SyntheticConfig(Config):
     name: str = Field("SynthTown", min_length=1, description="map name, the head of the playback tree's folder names")
     preset: str = Field(
         "small_town",
-        description="kind of town, which sets what is not given below (a name in PRESETS); town10: the paper's town in "
-        "boxes of each kind, over 619 x 506 m, where the fields below count for nothing",
+        description="kind of town, which sets what is not given below (a name in PRESETS)",
     )
     size_m: float = Field(280.0, ge=80.0, le=4000.0, description="side of the square town, m")
     num_blocks: int = Field(3, ge=1, le=60, description="building blocks along each side")
@@ -191,8 +188,6 @@ class Streets:
 
 def load(cfg: SyntheticConfig, seed: int) -> BoxMap:
     """Build the town of a seed."""
-    if cfg.preset == "town10":
-        return census_town(cfg.name, seed)
     boxes = BoxList()
     streets = street_grid(cfg, seed)
     half = cfg.size_m / 2

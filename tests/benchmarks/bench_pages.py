@@ -14,9 +14,9 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from browser import Page, browser
+from census_town import census_town
 
 from cosfly.look.scene_page import run as write_scene
-from cosfly.maps.synthetic import SyntheticConfig, load
 from cosfly.pedestrians.roi_editor import open_editor
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.products.boxes import write_boxes
@@ -46,7 +46,7 @@ def frames_per_s(page: Page, counter: str, button: str) -> float:
 
 
 def main() -> None:
-    box_map = load(SyntheticConfig(preset="town10"), 0)
+    box_map = census_town("Town", 0)
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
         write_boxes(root / "map.json", box_map)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from census_town import census_town
 from threadpoolctl import threadpool_limits
 
 from cosfly.maps.stage import MapsConfig, load_map
@@ -27,7 +28,7 @@ CITY_GAP_M = 20.0  # between the tiles of map (c)
 
 def town(seed: int = SEED) -> BoxMap:
     """Map (a): the synthetic town with the paper's box census, raw; other seeds give other towns."""
-    return load_map(build(MapsConfig, {"synthetic": {"preset": "town10", "name": "Town"}}, "benchmark"), seed=seed)
+    return census_town("Town", seed)
 
 
 def city() -> BoxMap | None:
