@@ -10,7 +10,7 @@ from caption.schema import FutureMotion, LabelConfig
 from caption.truth.actions import Motion, measure, table_of
 from cosfly.closed_loop.controller import Controller, read_controls
 from cosfly.closed_loop.pilots import PilotAnswer
-from cosfly.closed_loop.settings import CONTROLLER_FILE, DroneConfig
+from cosfly.closed_loop.settings import CONTROLLER_FILE, Drone
 from cosfly.closed_loop.stage import OpenFlight
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight
 from cosfly.errors import ConfigError
@@ -37,7 +37,7 @@ def begin():
     def start(num_lead=40):
         flight = ClosedLoopFlight(airspace, plan, num_lead=num_lead)
         moment = flight.reset()[-1]
-        return flight, Controller(CONTROLS, DroneConfig(), moment), moment
+        return flight, Controller(CONTROLS, Drone(), moment), moment
 
     yield start
     airspace.renderer.close()
@@ -115,7 +115,7 @@ def test_it_flies_home_and_stays_there(begin):
 def test_every_command_can_be_flown(begin):
     _, controller, moment = begin()
     for token in TOKENS * 3:
-        assert DroneConfig().problem_of(controller.command(token, moment)) is None
+        assert Drone().problem_of(controller.command(token, moment)) is None
         assert len(controller.command(token, moment)) == len(ACTION)
 
 

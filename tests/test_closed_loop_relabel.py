@@ -8,11 +8,13 @@ import pytest
 from commands import invoke
 from test_closed_loop_fly import TINY, fly, town  # noqa: F401
 
-from cosfly.closed_loop.settings import DroneConfig
+from cosfly.closed_loop.settings import Drone
+from cosfly.closed_loop.stepper import ClosedLoopFlight
 from cosfly.errors import ConfigError, NothingKept, VerifyError
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight
+from cosfly.work.runner import run_items
 
 STUDENT, FRAMES = "--workers 1 --student track_straight --set fly.tree=false", 5
 
@@ -110,11 +112,15 @@ def test_another_planner_than_foresight_is_refused(town, tmp_path):  # noqa: F81
     [
         ("--set plan.safety_distance_m=25 --set plan.relaxed_safety_m=25", "too_near"),
         ("--set plan.speed_max_mps=0.2", "no_path"),
-        ("--set fly.drone.radius_m=16", "crashes"),
+        ("", "crashes"),
     ],
 )
-def test_why_nothing_can_be_shown_there_is_counted(town, tmp_path, more, reason):  # noqa: F811
+def test_why_nothing_can_be_shown_there_is_counted(town, tmp_path, monkeypatch, more, reason):  # noqa: F811
     fly(town, tmp_path / "flown", f"{STUDENT} --set fly.most_decisions=12")
+    if reason == "crashes":
+        monkeypatch.setitem(ClosedLoopFlight.__init__.__kwdefaults__, "drone", Drone(radius_m=16.0))
+        here = lambda *given, **how: run_items(*given, **how | {"workers": 0})  # noqa: E731  # in this process
+        monkeypatch.setattr("cosfly.closed_loop.relabel.run_items", here)
     done = relabel(town, tmp_path / "flown", tmp_path / "made", more)
     assert isinstance(done.exception, NothingKept)
     assert f"({reason} 6) of 6" in str(done.exception)
@@ -122,7 +128,7 @@ def test_why_nothing_can_be_shown_there_is_counted(town, tmp_path, more, reason)
 
 @pytest.mark.parametrize("angle", np.linspace(0, 6, 13))
 def test_a_command_as_fast_as_may_be_can_be_flown(angle):
-    drone = DroneConfig()
+    drone = Drone()
     command = np.array([*(drone.speed_max_mps * np.array([np.cos(angle), np.sin(angle)])), 0, 0, -40.0])
     command[:2] *= 1 + 1e-15
     assert drone.problem_of(np.clip(command, *drone.bounds)) is None

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from specimens_planning import CANYON, town_of, walk_along
 
-from cosfly.closed_loop.settings import DroneConfig
+from cosfly.closed_loop.settings import Drone
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_flight
@@ -59,7 +59,7 @@ def test_it_begins_with_the_plan_and_the_person_in_view(airspace, planned):
 
 
 def test_a_held_command_is_reached_as_fast_as_the_drone_can_and_no_faster(airspace, planned):
-    drone = DroneConfig(accel_max_mps2=2.0, yaw_accel_max_degps2=20.0)
+    drone = Drone(accel_max_mps2=2.0, yaw_accel_max_degps2=20.0)
     flight = ClosedLoopFlight(airspace, planned, drone=drone)
     moments = flown(flight, *[(0.0, 0.0, 1.0, 20.0)] * 6)[4:]
     velocities = np.array([m.velocity_mps for m in moments])

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from cosfly.closed_loop.settings import DroneConfig
+from cosfly.closed_loop.settings import Drone
 from cosfly.closed_loop.stepper import Moment
 from cosfly.errors import ConfigError
 from cosfly.geometry import look_at, wrap_deg
@@ -59,7 +59,7 @@ def read_controls(path: Path, tokens: tuple[str, ...]) -> dict[str, Control]:
 class Controller:
     """The controller of one flight."""
 
-    def __init__(self, controls: dict[str, Control], drone: DroneConfig, start: Moment) -> None:
+    def __init__(self, controls: dict[str, Control], drone: Drone, start: Moment) -> None:
         self.controls, self.drone = controls, drone
         self._home, self._height_m = start.position_m, start.height_m - TARGET_HEIGHT_M
         down = np.tan(np.radians(max(-start.rotation_deg[0], 0.1)))

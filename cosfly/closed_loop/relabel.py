@@ -128,7 +128,7 @@ def make_worker(cfg: FlightsConfig, flown: Path, boxes: Path, simplified: Path, 
         cut: Any = {name: getattr(planned, name)[begin:end] for name in (*ARRAYS, "clearances_m")}
         part_of = Excerpt(plan.path_id, number, plan.targets_m[: begin + 1])
         planned = replace(planned, **cut, part_of=part_of)
-        flight = ClosedLoopFlight(space, planned, number=number, num_lead=num.num_frames, drone=fly.drone)
+        flight = ClosedLoopFlight(space, planned, number=number, num_lead=num.num_frames)
         moments = [*flight.reset()]
         while flight.ended is None:
             moments.append(flight.step(Ceiling.to_next(flight, moments[-1])))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -15,17 +16,18 @@ from cosfly.work.config import Config
 ROUNDING = 1e-9  # of a command that was made as fast as it may be
 
 
-class DroneConfig(Config):
-    """What the drone can do; a command beyond its bounds is none."""
+@dataclass(frozen=True)
+class Drone:
+    """The limits of the drone; a command outside its bounds is rejected."""
 
-    speed_max_mps: float = Field(10.0, gt=0, description="greatest speed over ground (tab:drone_params), m/s")
-    climb_max_mps: float = Field(4.0, gt=0, description="greatest speed up and down, m/s")
-    accel_max_mps2: float = Field(5.0, gt=0, description="greatest change of velocity (sec:step6), m/s^2")
-    yaw_rate_max_degps: float = Field(60.0, gt=0, description="greatest turn, degrees/s")
-    yaw_accel_max_degps2: float = Field(120.0, gt=0, description="greatest change of it, degrees/s^2")
-    gimbal_rate_max_degps: float = Field(60.0, gt=0, description="how fast the camera tilts, degrees/s")
-    gimbal_deg: tuple[float, float] = Field((-90.0, 30.0), description="least and greatest pitch of the camera")
-    radius_m: float = Field(0.5, gt=0, description="of the drone: nearer to an obstacle or the ground it has crashed")
+    speed_max_mps: float = 10.0  # over ground (tab:drone_params)
+    climb_max_mps: float = 4.0  # up and down
+    accel_max_mps2: float = 5.0  # sec:step6
+    yaw_rate_max_degps: float = 60.0
+    yaw_accel_max_degps2: float = 120.0
+    gimbal_rate_max_degps: float = 60.0
+    gimbal_deg: tuple[float, float] = (-90.0, 30.0)  # least and greatest pitch of the camera
+    radius_m: float = 0.5  # nearer to an obstacle or to the ground the drone has crashed
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -86,7 +88,6 @@ class FlyConfig(Config):
     controller: Path | None = Field(
         None, description="file of yours in the place of the table that says what each decision is flown as"
     )
-    drone: DroneConfig = Field(DroneConfig(), description="what the drone can do")
     lead_frames: int = Field(
         21,
         ge=5,

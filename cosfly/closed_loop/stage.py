@@ -246,7 +246,7 @@ def make_worker(
     companies = rendering.companies_of(others, traces)
     num_others = rendering.num_others_of(companies)
     space = Airspace(cfg.render, read_boxes(boxes), read_boxes(simplified), seed=seed, num_others=num_others)
-    bounds: dict[str, Any] = {"num_lead": cfg.fly.lead_frames, "drone": cfg.fly.drone, "lost_s": cfg.fly.lost_s}
+    bounds: dict[str, Any] = {"num_lead": cfg.fly.lead_frames, "lost_s": cfg.fly.lost_s}
     map_sha256 = sha256_file(boxes)
 
     def opened(n: int) -> ClosedLoopFlight:

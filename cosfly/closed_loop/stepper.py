@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cosfly.closed_loop.settings import DroneConfig
+from cosfly.closed_loop.settings import Drone
 from cosfly.geometry import step_s, wrap_deg
 from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import TargetMeta
@@ -117,7 +117,7 @@ class ClosedLoopFlight:
         *,
         number: int = 0,
         num_lead: int = 5,
-        drone: DroneConfig = DroneConfig(),
+        drone: Drone = Drone(),
         lost_s: float = 0.0,
         others: Sequence[Other] = (),
     ) -> None:

@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 from cosfly.closed_loop.controller import Controller, read_controls
 from cosfly.closed_loop.policy import STATE_HIGH, STATE_LOW, observe
-from cosfly.closed_loop.settings import CONTROLLER_FILE, DroneConfig
+from cosfly.closed_loop.settings import CONTROLLER_FILE, Drone
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, Moment
 from cosfly.envs.episodes import (
     HELD_OUT,
@@ -71,7 +71,7 @@ class FollowEnv(gymnasium.Env):
             raise ConfigError("no such actions", where=task, got=actions, expected="decisions or velocities")
         self.task, self.size_px, self.has_depth, self.render_mode = task, (size_px[0], size_px[1]), depth, render_mode
         self.listed = None if episodes == "train" else read_list(f"{task}/{episodes}")[1]
-        self.drone, self.tokens = DroneConfig(), shipped_actions().tokens
+        self.drone, self.tokens = Drone(), shipped_actions().tokens
         self._controls = read_controls(CONTROLLER_FILE, self.tokens)
         low, high = (bound.astype(np.float32) for bound in self.drone.bounds)
         self.action_space = spaces.Discrete(len(self.tokens)) if actions == "decisions" else spaces.Box(low, high)
