@@ -44,14 +44,12 @@ class FlightRows:
     is None everywhere.
 
     name: `run/town/trajectory/variant`. given_id: what its sample ids must begin with, None where nobody knows.
-    is_foreign: nothing says that cosfly drew it, so that its person may be of another size. num_frames: of the whole
-    flight, None where nobody says.
+    is_foreign: nothing says that cosfly drew it, so that its person may be of another size.
     """
 
     name: str
     rows: Sequence[Row]
     given_id: str | None = None
-    num_frames: int | None = None
 
     def __len__(self) -> int:
         return len(self.rows)

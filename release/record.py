@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from cosfly.errors import InputError
 from cosfly.products.actions import RecordedActions, shipped_actions
 from cosfly.products.coverage import Coverage
-from cosfly.products.frames import FrameFile
+from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile
 from cosfly.products.inspection import TrajectoryFunnel
 from cosfly.products.town import TownMap
 from cosfly.reading.documents import FileFormat, read_model
@@ -24,7 +24,6 @@ RECORD = "release.json"
 
 Counts = dict[str, int]
 SplitBy = Literal["walk", "town"]
-DepthCodingName = Literal["float32", "float16", "millimetre_png"]
 Pairs = Literal["both", "any"]
 
 
@@ -87,20 +86,13 @@ class Settings(Strict):
     modalities: list[FrameFile] = Field(min_length=1)
 
 
-class DepthCoding(Strict):
-    """How `depth` is stored. The error is the greatest one of a pixel, measured over all released ones that are neither
-    sky nor invalid.
+class StoredDepth(Strict):
+    """How `depth` is stored: float32, without loss."""
 
-    min_m, max_m: of these pixels; null where nothing was coded anew, so that nothing was measured.
-    """
-
-    coding: DepthCodingName
-    unit: Literal["metre", "millimetre"]
-    sky: float
-    invalid: float
-    min_m: float | None
-    max_m: float | None
-    max_error_m: float
+    coding: Literal["float32"] = "float32"
+    unit: Literal["metre"] = "metre"
+    sky: float = SKY_DEPTH_M
+    invalid: float = INVALID_DEPTH_M
 
 
 class SplitNumbers(Strict):
@@ -308,7 +300,7 @@ class ReleaseRecord(Strict):
     made_by: str
     settings: Settings
     frame_selection: str
-    depth: DepthCoding | None  # null: without depth
+    depth: StoredDepth | None  # null: without depth
     coordinates: dict[str, Any]
     actions: RecordedActions = Field(default_factory=shipped_actions)
     prompts: dict[str, dict[str, str]] = Field(default_factory=dict)

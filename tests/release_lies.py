@@ -15,7 +15,6 @@ from release_tampering import depth_of, pixels_of, png, set_depth
 
 from cosfly.geometry import box_corners, project, world_from_camera
 from cosfly.products.captions import FIELDS
-from cosfly.products.kinds import KINDS
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 
 Row = dict[str, Any]
@@ -76,17 +75,11 @@ def first(choose: Choose, holds: Callable[[Row], Any]) -> Choose:
     return lambda rows: [next(row for row in choose(rows) if holds(row))]
 
 
-def nearest_seen(rows: Rows) -> Rows:
-    """The row that shows most of the person's box, through which enough rays go for a judgement."""
-    return [min((row for row in clean(rows) if row["visibility"] > 0.6), key=lambda row: row["target_depth_m"])]
-
-
 def everything(rows: Rows) -> Rows:
     return rows
 
 
 shifted = first(perturbed, lambda row: row["perturbation"]["position"] == "applied")
-unturned = first(perturbed, lambda row: row["perturbation"]["rotation"] == "none")
 
 
 def twin_of(rows: Rows, row: Row) -> Row:
@@ -234,11 +227,6 @@ def mirrored_world(row: Row) -> None:
         row["target_heading_deg"] = 90.0 - row["target_heading_deg"]
 
 
-def heading_backwards(row: Row) -> None:
-    if row["target_heading_deg"] is not None:
-        row["target_heading_deg"] = row["target_heading_deg"] % 360.0 - 180.0
-
-
 def nobody_followed(row: Row) -> None:
     nulls = ("target", "target_uv", "target_bbox", "target_mask_bbox", "target_depth_m", "target_heading_deg")
     row.update(dict.fromkeys(nulls), target_in_view=False, target_visible=False, visibility=0.0)
@@ -250,16 +238,6 @@ def with_poses(own: Rows, others: Rows) -> None:
     for row, pose in zip(own, poses, strict=True):
         row["pose"] = pose
         projected(row)
-
-
-def perturbation_taken_off(rows: Rows) -> None:
-    """A frame is that of the clean flight, pictures too: flag, words, offsets, pose and pixels agree."""
-    (row,) = shifted(rows)
-    twin, kept = twin_of(rows, row), {"sample_id", "variant", "track", "pair", *CAPTION}
-    row.update({name: copy.deepcopy(value) for name, value in twin.items() if name not in kept})
-    for file in ("image", "instance"):
-        row[file]["path"] = row[file]["path"].replace(twin["sample_id"], row["sample_id"])
-    row["perturbation"] = {"position": "none", "rotation": "none"}
 
 
 CAPTION = [
@@ -338,15 +316,6 @@ def walk_of_nobody(rows: Rows) -> None:
     put(lambda _: [row for row in rows if row["walk"] == walk], walk=new)(rows)
 
 
-def renamed_kind(pixels: np.ndarray, ids: np.ndarray) -> None:
-    for kind in ("Buildings", "Sidewalks", "Vegetation", "Roads"):  # one of them both trajectories see
-        pixels[pixels[..., 0] == KINDS[kind], 0] = KINDS["Walls"]
-
-
-def transparent(pixels: np.ndarray, row: Row) -> bytes:
-    return cv2.imencode(".png", np.dstack([pixels[..., ::-1], np.zeros(pixels.shape[:2], np.uint8)]))[1].tobytes()
-
-
 def as_jpeg(pixels: np.ndarray, row: Row) -> bytes:
     return cv2.imencode(".jpg", pixels)[1].tobytes()
 
@@ -368,7 +337,6 @@ def without_the_person(kind: tuple[int, ...] | int) -> Callable[[np.ndarray, np.
 
 not_hovering = first(captioned, lambda row: row["decision"] != "hover")
 caption, middle, middle_seen = at(captioned, 0), half(clean), half(seen)
-FALLBACK = "fallback: target hidden"
 ids_of_things_exchanged = change(middle, with_ids(ids_exchanged))
 box_moved = change(at(seen, 1), add("target_bbox", 4.0, *BOX))
 LIES_OF_ROWS: dict[str, Lie] = {
@@ -383,15 +351,9 @@ LIES_OF_ROWS: dict[str, Lie] = {
     "called_legible": put(at(clean, 0), target_legible=True, target_contrast=1.0),
     "higher_than_its_box": put(first(seen, lambda r: r["target_height_px"] < 40), target_height_px=40.0),
     "visible_but_not_in_view": put(at(seen, 0), target_in_view=False),
-    "perturbed_without_offsets": put(first(perturbed, lambda r: not r["is_perturbed"]), is_perturbed=True),
-    "offsets_without_flag": put(shifted, is_perturbed=False),
     "track_against_variant": put(clean, track="perturbed"),
     "path_that_escapes": put(clean, run=".."),
     "time_backwards": swapped(clean, 2, 3, "time_s"),
-    "a_second_lost": change(lambda rows: clean(rows)[5:], add("time_s", 1.0)),
-    "time_stretched": change(clean, lambda r: r.update(time_s=r["time_s"] * 1.5)),
-    "clock_that_starts_late": change(trajectory, add("time_s", 10.0)),
-    "clean_flight_from_another_time": change(perturbed, add("time_s", 0.5)),
     "all_targets_null": change(everything, nobody_followed),
     "infinite_angle": change(at(clean, 1), lambda r: r["drone_offset"].update(roll_deg=math.inf)),
     "field_of_view_against_focal_length": put(clean, fov_deg=75.0),
@@ -405,21 +367,6 @@ LIES_OF_ROWS: dict[str, Lie] = {
     "pose_frozen": lambda rows: with_poses(clean(rows)[5:12], clean(rows)[5:6] * 7),
     "pose_jumps": turned(at(clean, 6), add("pose", 20.0, "x_m")),
     "lower_than_it_was": change(clean, add("pose", -3.0, "z_m")),
-    "heading_backwards": change(clean, heading_backwards),
-    "action_called_faster": alter(at(clean, 3), action=lambda a: a | {"forward_mps": a["forward_mps"] + 1.0}),
-    "action_lost": put(at(clean, 4), actions=None),
-    "waypoints_of_another_height": alter(at(perturbed, 5), waypoints=lambda w: [*w[:2], w[2] + 2.0, *w[3:]]),
-    "waypoints_cut_short": alter(at(clean, 6), body_waypoints=lambda w: w[:8]),
-    "headings_lost": put(clean, target_heading_deg=None),
-    "offsets_with_the_other_sign": change(
-        perturbed, lambda r: r.update(drone_offset={name: -value + 0.0 for name, value in r["drone_offset"].items()})
-    ),
-    "target_offset_lost": put(shifted, target_offset=dict.fromkeys(XYZ, 0.0)),
-    "unperturbed_called_applied": alter(unturned, perturbation=lambda p: p | {"rotation": "applied"}),
-    "undrawn_event_called_fallback": alter(unturned, perturbation=lambda p: p | {"rotation": FALLBACK}),
-    "perturbation_taken_off": perturbation_taken_off,
-    "pace_called_otherwise": put(trajectory, pace="hurry"),
-    "style_called_otherwise": put(trajectory, style="orbit_left"),
     "window_into_the_future": alter(caption, caption_window=lambda w: [i + 1 for i in w]),
     "window_with_a_gap": alter(caption, caption_window=lambda w: [w[0] - 1, *w[1:]]),
     "window_with_a_frame_twice": alter(caption, caption_window=lambda w: [w[0], *w[:-1]]),
@@ -430,12 +377,8 @@ LIES_OF_ROWS: dict[str, Lie] = {
     ),
     "hard_conflict_called_soft": change(at(captioned, 1), hard_conflict_called_soft),
     "split_that_leaks": change(clean, another_split),
-    "walk_renamed": put(lambda rows: [r for r in trajectory(rows) if r["track"] == "perturbed"], walk="another/walk"),
     "walk_of_nobody": walk_of_nobody,
     "pair_lost": put(clean, pair=None),
-    "weather_that_nobody_drew": put(everything, weather="HardRainNoon"),
-    "night_that_nobody_drew": put(everything, time_of_day="night"),
-    "names_of_pictures_exchanged": lambda rows: swap(clean(rows)[2]["image"], clean(rows)[3]["image"], "path"),
 }  # fmt: skip
 POSES = ("pose", "target", "target_uv", "target_bbox", "target_depth_m", "target_heading_deg", "intrinsics", "fov_deg")
 LIES_OF_PIXELS: dict[str, Lie] = {
@@ -444,8 +387,6 @@ LIES_OF_PIXELS: dict[str, Lie] = {
     "target_far_behind_on_its_line": turned(seen, farther_on_its_line),
     "poses_of_two_flights_exchanged": swapped_flights(*POSES),
     "world_turned": turned(clean, mirrored_world),
-    "colours_of_neighbours_exchanged": swapped(perturbed, 4, 5, "image"),
-    "colours_of_two_flights_exchanged": swapped_flights("image"),
     "depth_of_neighbours_exchanged": swapped(perturbed, 4, 5, "depth"),
     "depth_of_the_twin": lambda rows: swap(shifted(rows)[0], twin_of(rows, shifted(rows)[0]), "depth"),
     "instances_of_neighbours_exchanged": swapped(perturbed, 4, 5, "instance"),
@@ -460,7 +401,6 @@ LIES_OF_PIXELS: dict[str, Lie] = {
     "depth_in_centimetres_called_lossless": change(clean, with_depth(lambda depth, _: np.round(depth, 2))),
     "depth_scaled_by_a_fiftieth": change(everything, with_depth(lambda depth, _: depth * 1.02)),
     "depth_set_off": change(everything, with_depth(lambda depth, _: depth + 0.3)),
-    "depth_of_a_flight_scaled": change(clean, with_depth(lambda depth, _: depth * 1.02)),
     "noise_in_one_depth": change(middle, with_depth(noise)),
     "obstacle_that_is_not_there": change(middle, boxed),
     "thing_farther_in_one_frame": change(middle, one_thing_farther),
@@ -469,18 +409,9 @@ LIES_OF_PIXELS: dict[str, Lie] = {
     "person_without_an_instance_of_a_person": change(at(seen, 2), with_ids(without_the_person(3))),
     "second_person_far_away": change(middle_seen, with_ids(second_person, box=True)),
     "ids_of_things_exchanged": ids_of_things_exchanged,
-    "things_of_another_kind_in_a_trajectory": change(trajectory, with_ids(renamed_kind)),
     "frame_mirrored_with_its_boxes": change(middle_seen, frame_mirrored_with_its_boxes),
     "jpeg_under_a_png_name": change(at(clean, 2), with_colours(as_jpeg)),
     "smaller_picture": change(at(clean, 2), with_colours(lambda pixels, _: png(pixels[::2, ::2]))),
-    "picture_that_one_sees_through": change(middle, with_colours(transparent)),
-    "bytes_behind_a_picture": alter(middle, image=lambda i: i | {"bytes": i["bytes"] + b"something else " * 100}),
-    "words_in_a_picture": change(middle, chunk(b"tEXt", b"Author\0somebody")),
-    "colours_meant_darker": change(middle, chunk(b"gAMA", struct.pack(">I", 200_000))),
-    "one_picture_in_two_rows": lambda rows: put(at(clean, 9), image=clean(rows)[2]["image"])(rows),
-    "other_visibility": put(nearest_seen, visibility=0.3),
-    "contrast_a_little_higher": change(first(seen, lambda r: r["target_contrast"] > 5), add("target_contrast", 1.0)),
-    "visibility_a_little_lower": change(nearest_seen, add("visibility", -0.05)),
 }  # fmt: skip
 # name -> the lie, and whether only pixels tell it
 LIES = {name: (lie, False) for name, lie in LIES_OF_ROWS.items()} | {

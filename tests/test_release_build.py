@@ -33,7 +33,6 @@ from cosfly.products.inspection import write_inspection
 from cosfly.products.playback import read_flight, write_flight
 from cosfly.reading.arrays import parse_picture
 from cosfly.reading.files import sha256_file
-from release.depth import encoded
 from release.package.config import ReleaseConfig
 from release.package.sources import Source
 from release.package.stage import run
@@ -232,19 +231,7 @@ def test_published_names(text, public):
     assert published({"x": [text, 1, None]}) == {"x": [public, 1, None]}
 
 
-@pytest.mark.parametrize(("coding", "most_m"), [("float16", 0.02), ("millimetre_png", 0.00051)])
-def test_coded_depth_says_its_range_and_its_measured_error(coding, most_m):
-    values = np.full((9, 16), 1000.0, np.float32)
-    values[:5] = np.linspace(0.3, 60.0, 80, dtype=np.float32).reshape(5, 16)
-    values[7] = 0.0
-    data, cost = encoded(memoryview(depth_bytes(values)), coding, Path("x"))
-    assert cost.min_m == pytest.approx(0.3)
-    assert cost.max_m == pytest.approx(60.0)
-    assert 0 < cost.max_error_m <= most_m
-    assert len(data) < values.nbytes
-
-
-def test_depth_is_lossless_unless_asked_and_millimetres_end_at_65_5_m(material, tmp_path):
+def test_depth_is_lossless_in_either_form_of_the_tree(material, tmp_path):
     folder = run(split_cfg(), [source_of(material)], tmp_path / "r")
     row = table_of(folder, ["town", "trajectory", "variant", "frame_index", "depth"])[3]
     flight = read_flight(material / "tree" / row["town"] / row["trajectory"] / row["variant"])
@@ -257,12 +244,6 @@ def test_depth_is_lossless_unless_asked_and_millimetres_end_at_65_5_m(material, 
     } == {p.name: p.read_bytes() for p in folder.rglob("*.parquet")}, (
         "a release does not tell in which form the tree keeps depth"
     )
-    with pytest.raises(InputError, match=r"depth that a PNG of millimetres cannot hold.*at most 65\.5 m"):
-        run(split_cfg(depth="millimetre_png"), [source_of(material)], tmp_path / "mm")
-    record = record_of(material, tmp_path / "half", split_cfg(depth="float16"))
-    assert record.depth is not None
-    assert (record.depth.coding, record.depth.unit) == ("float16", "metre")
-    assert 0 < record.depth.max_error_m < 0.3
 
 
 # --- what is refused, with all that is wrong --------------------------------------------------------------------------

@@ -21,21 +21,18 @@ from public_reader import read_public
 from specimens_release import (
     CFG,
     NUM_POINTS,
-    TOWNS,
     all_bytes,
     build,
     make_inspection,
     make_release,
-    release_of,
     rows_by_id,
 )
 
 from cosfly.errors import InputError, ResumeError
 from cosfly.products.captions import write_captions
 from cosfly.products.flights import find_flights
-from cosfly.products.frames import depth_bytes, read_depth
+from cosfly.products.frames import depth_bytes
 from cosfly.products.inspection import write_inspection
-from cosfly.products.places import sample_id
 from cosfly.products.playback import read_flight
 from cosfly.products.town import read_town_map
 from cosfly.reading.arrays import parse_picture
@@ -45,13 +42,12 @@ from cosfly.work.store import CHECKSUMS, read_checksums
 from release.columns import POSE
 from release.export.contract import FORMATS, ExportConfig, ExportUnit, Files, FormatFacts
 from release.export.lerobot import merged, runs_of, states, summarize, tiff_of_depth
-from release.export.source import ReleasedRows, Span, depth_npy, open_release, rows_of_flight, scan
+from release.export.source import ReleasedRows, Span, open_release, rows_of_flight, scan
 from release.export.stage import read_export
 from release.export.stage import run as export
 from release.package import stage as package
 from release.package.sources import Source
 from release.verify.verify import verify
-from specimens import make_playback_tree
 
 
 def config(format: str, **more) -> ExportConfig:
@@ -223,49 +219,6 @@ def test_webdataset_opens_it(dataset, tmp_path):
         assert sample["json"]["pose"] == row["pose"]
     first_two = wds.WebDataset(shards, shardshuffle=False).to_tuple("rgb.png", "json").slice(2)
     assert len(list(first_two)) == 2
-
-
-# --- depth ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("coding", "ending"), [("float16", "depth.npy"), ("millimetre_png", "depth.png")])
-def test_depth_that_was_coded_stands_with_its_measured_error(coding, ending, tmp_path):
-    exact = {}
-    for folder in find_flights(make_near_tree(tmp_path / "tree")):
-        flight = read_flight(folder)
-        exact |= {sample_id(flight.flight_id, i): read_depth(flight.frame_folder(i)) for i in range(len(flight))}
-    dataset = release_of(tmp_path, depth=coding)
-    record = open_release(dataset).record
-    product = export(config("webdataset"), dataset, tmp_path / "wds")
-    said = read_export(product / "export.json").codings["depth"]
-    assert f"{record.depth.max_error_m:g} m" in said
-    assert record.depth.unit in said
-    rows = rows_by_id(dataset)
-    assert any(name.endswith(ending) for shard in product.glob("*.tar") for name in names_in(shard))
-    worst = 0.0
-    for name, row in rows.items():
-        decoded = np.load(io.BytesIO(depth_npy(row, record.depth)))
-        assert decoded.dtype == np.float32
-        is_distance = (exact[name] != 0) & (exact[name] != 1000)
-        assert (decoded[~is_distance] == exact[name][~is_distance]).all()
-        worst = max(worst, np.abs(decoded.astype(np.float64) - exact[name])[is_distance].max(initial=0.0))
-    assert 0 < worst <= record.depth.max_error_m + 1e-5  # a millimetre in float32
-    tree = export(config("tree"), dataset, tmp_path / "back")
-    for folder in find_flights(tree):
-        flight = read_flight(folder)
-        for i in range(len(flight)):
-            assert read_depth(flight.frame_folder(i)).dtype == np.float32
-
-
-def make_near_tree(root: Path) -> Path:
-    """A tree whose depth ends at 60 m but for the sky, as millimetres in 16 bits ask."""
-    tree = make_playback_tree(root, 2, NUM_POINTS, width_px=96, height_px=54, towns=TOWNS)
-    for path in tree.rglob("depth.npy"):
-        depth = read_depth(path.parent)
-        depth[(depth > 60) & (depth < 1000)] = 60.0
-        depth[0, 0], depth[0, 1] = 0.0, 1000.0
-        path.write_bytes(depth_bytes(depth))
-    return tree
 
 
 # --- LeRobot: what needs no LeRobot -----------------------------------------------------------------------------------

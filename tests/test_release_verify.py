@@ -28,18 +28,14 @@ from cosfly.products.flights import find_flights
 from cosfly.products.frames import instance_bytes
 from cosfly.reading.documents import read_json
 from cosfly.work.store import write_bytes
-from release.columns import INTRINSICS, POSE
-from release.export.contract import FORMATS, ExportConfig
+from release.columns import INTRINSICS
+from release.export.contract import ExportConfig
 from release.export.stage import run as export
-from release.flight_rows import FlightRows
 from release.package import stage as package
 from release.package.config import ReleaseConfig
 from release.package.sources import Source
-from release.record import read_record
 from release.rules import split_groups
-from release.verify.by_rule import check_settings
 from release.verify.findings import EXAMPLES, Findings
-from release.verify.records import check_shards
 from release.verify.verify import verify
 
 TINY = [
@@ -132,9 +128,9 @@ def test_trees_pass_ours_and_the_public_layout(honest_run, tmp_path):
 
 # One of each kind of check; all of them take a minute and more.
 QUICK_LIES = {
-    "sample_id_of_another_frame", "target_pixel_moved", "offsets_with_the_other_sign", "pace_called_otherwise",
+    "sample_id_of_another_frame", "target_pixel_moved",
     "hard_conflict_called_soft", "window_into_the_future", "split_that_leaks", "box_against_mask",
-    "depth_set_off", "bytes_behind_a_picture", "called_legible", "contrast_a_little_higher",
+    "depth_set_off", "called_legible",
     "ids_of_things_exchanged", "poses_of_two_frames_exchanged",
 }  # fmt: skip
 
@@ -149,82 +145,19 @@ def test_a_lie_is_found(honest, tmp_path, name):
     assert errors_in(forged, "pixels" if is_of_pixels else "rows"), name
 
 
-def test_statistics_that_a_filter_goes_by_are_the_rows(honest, dataset):
-    """A footer is bytes of the same length with another word for a split in it."""
-    record = read_record(dataset / "release.json")
-    found = Findings()
-    check_shards(dataset, record, found)
-    assert not found.kinds
-    shard = next(shard for shard in record.shards if shard.split == "train")
-    data = (dataset / shard.path).read_bytes()
-    begin = len(data) - 8 - int.from_bytes(data[-8:-4], "little")
-    (dataset / shard.path).write_bytes(data[:begin] + data[begin:].replace(b"train", b"trail"))
-    check_shards(dataset, record, found)
-    assert {code for _, code in found.kinds} == {"statistics"}
-
-
-def test_the_shards_tell_which_library_wrote_them(honest):
-    record = read_record(honest / "release.json")
-    record.provenance.versions["pyarrow"] = "1.0.0"
-    found = Findings()
-    check_shards(honest, record, found)
-    assert [kind.severity for kind in found.kinds.values()] == ["warning"]
-
-
-@pytest.mark.parametrize(("most", "num_frames", "is_found"), [(5.0, 20, False), (0.5, 20, True), (0.5, 30, False)])
-def test_a_whole_clean_flight_keeps_the_bounds_of_its_inspection(most, num_frames, is_found):
-    """One that goes to and fro by a metre every second; of a flight in part nobody knows."""
-    poses = [dict.fromkeys(POSE, 0.0) | {"x_m": float(k // 2 % 2)} for k in range(20)]
-    rows = [{"frame_index": k, "time_s": 0.5 * k, "track": "clean", "pose": pose} for k, pose in enumerate(poses)]
-    found = Findings()
-    settings = {"inspect": {"accel_rms_max_mps2": most}}
-    check_settings(FlightRows("run/Town/trajectory/ORI", rows, num_frames=num_frames), settings, found)
-    assert [code for _, code in found.kinds] == ["settings"] * is_found
-
-
 RECORD_LIES = {
     "axes of the other hand": lambda r: r["coordinates"].update(handedness="left"),
     "no coordinates": lambda r: r["coordinates"].clear(),
     "no maps": lambda r: r["maps"].clear(),
     "another rule of frames": lambda r: r.update(frame_selection="the best ones"),
-    "nothing was repaired": lambda r: r["provenance"]["repairs"].update(accepted=0),
-    "another teacher": lambda r: r["provenance"]["teachers"][0].update(model="somebody"),
-    "fewer captions were read": lambda r: r["provenance"]["teachers"][0].update(captions=1),
     "flights were left out": lambda r: r["history"]["flights"]["left_out"].update(bad=3),
-    "another version": lambda r: r.update(made_by="cosfly 99"),
-    "a run that is no source": lambda r: r["provenance"]["sources"][0].update(run="elsewhere"),
     "fewer frames available": lambda r: r["flights"][0].update(frames_available=r["flights"][0]["frames"]),
     "splits by town": lambda r: r["splits"].update(by="town"),
     "another rule of splits": lambda r: r["splits"].update(rule="by taste"),
     "another seed of splits": lambda r: r["splits"].update(seed=_seed_of_other_splits(r)),
     "shares above one": lambda r: r["splits"]["fractions"].update(test=1.5),
-    "fewer asks than captions": lambda r: r["provenance"].update(asks=1),
-    "rules that take tokens": lambda r: r["provenance"]["tokens"].update(completion_tokens=1_000_000),
-    "captions of another tree": lambda r: _stage(r, "caption")["inputs"].update(data="0" * 64),
-    "an inspection of another tree": lambda r: _stage(r, "inspect")["inputs"].update(data="0" * 64),
-    "a flight rejected for nothing": lambda r: _one_less(r, "rejected"),
-    "larger pictures": lambda r: _stage(r, "render")["config"].update(width_px=1920, height_px=1080),
-    "longer windows": lambda r: _stage(r, "caption")["config"]["window"].update(num_frames=9),
-    "windows lost that none could lose": lambda r: _more_lost(r, "window_not_whole", 900),
-    "frames not chosen that there are none of": lambda r: _more_lost(r, "frame_not_selected", 90_000),
-    "a smaller error of the depth": lambda r: r["depth"].update(max_error_m=0.1),
     "a sky of 999 m": lambda r: r["depth"].update(sky=999.0),
-    "a town of another map": lambda r: r["maps"][0].update(name="Delft"),
 }
-
-
-def _more_lost(record: dict, name: str, count: int) -> None:
-    """More captions were accepted and lost by the choice of frames; every sum is right."""
-    captions, made = record["history"]["captions"], record["provenance"]
-    for counts, key in (
-        (captions, name), (captions, "accepted"), (captions, "read"), (made, "asks"), (made["repairs"], "accepted"),
-        (made["repairs"], "first_answers"), (made["teachers"][0], "captions"),
-    ):  # fmt: skip
-        counts[key] += count
-    shares = made["repairs"]["shares"]
-    for share in shares:
-        counted = made["repairs"]["repaired_by_rung"] | {"first_answers": made["repairs"]["first_answers"]}
-        shares[share] = round(counted[share.removeprefix("repaired: ")] / made["repairs"]["accepted"], 4)
 
 
 def _seed_of_other_splits(record: dict) -> int:
@@ -232,64 +165,6 @@ def _seed_of_other_splits(record: dict) -> int:
     told = record["splits"]
     walks = {flight["walk"]: flight["split"] for flight in record["flights"]}
     return next(seed for seed in range(100) if split_groups(walks, told["fractions"], seed, "walks") != walks)
-
-
-def _stage(record: dict, name: str) -> dict:
-    return next(stage for stage in record["provenance"]["sources"][0]["stages"] if stage["stage"] == name)
-
-
-def test_another_teacher_in_rows_and_record_is_found(honest, tmp_path):
-    def rows_too(rows):
-        for row in rows:
-            if row["has_caption"]:
-                row["teacher_kind"], row["teacher_model"] = "endpoint", "somebody"
-
-    def teachers(record):
-        for teacher in record["provenance"]["teachers"]:
-            teacher.update(kind="endpoint", model="somebody")
-
-    assert "provenance" in errors_in(forge(honest, tmp_path / "forged", rows_too, teachers), "rows")
-
-
-@pytest.mark.parametrize(("stage", "key"), [("plan", "map"), ("render", "boxes")])
-def test_stages_that_went_by_other_maps_are_told(honest, tmp_path, stage, key):
-    forged = forge(
-        honest, tmp_path / "forged", change_record=lambda r: _stage(r, stage)["inputs"].update({key: "0" * 64})
-    )
-    report = verify(forged, level="structure")
-    assert report.is_ok
-    assert [(kind.severity, kind.code) for kind in report.kinds] == [("warning", "provenance")]
-
-
-def _one_less(record: dict, reason: str) -> None:
-    """One flight more was found, and left out."""
-    flights = record["history"]["flights"]
-    flights["found"] += 1
-    flights["left_out"][reason] = 1
-
-
-def test_rejected_flights_without_a_rejected_trajectory_are_told(honest, tmp_path):
-    """A warning: flights that nobody planned count for no trajectory."""
-    forged = forge(honest, tmp_path / "forged", change_record=lambda r: _one_less(r, "rejected: jerk"))
-    report = verify(forged, level="structure")
-    assert [(kind.severity, kind.code) for kind in report.kinds] == [("warning", "sum")]
-
-
-def test_another_seed_of_the_draws_is_told(honest, tmp_path):
-    """A warning: another version may have drawn."""
-    forged = forge(honest, tmp_path / "forged", change_record=lambda r: _stage(r, "render").update(seed=99))
-    report = verify(forged, level="rows")
-    assert {(kind.severity, kind.code) for kind in report.kinds} == {("warning", "draw")}
-
-
-def test_decisions_of_people_have_a_digest(honest, tmp_path):
-    def rejected(record, digest=None):
-        _one_less(record, "rejected: review")
-        record["provenance"]["sources"][0]["review_sha256"] = digest
-
-    for digest, codes in ((None, ["provenance", "sum"]), ("0" * 64, ["sum"])):
-        forged = forge(honest, tmp_path / "forged", change_record=lambda r, digest=digest: rejected(r, digest))
-        assert [kind.code for kind in verify(forged, level="structure").kinds] == codes
 
 
 @pytest.mark.parametrize("name", [name for name in RECORD_LIES if name != "splits by town"])
@@ -475,12 +350,11 @@ def test_a_frame_that_is_missing_in_a_tree_is_found(honest_run, tmp_path):
     assert {"missing", "picture"} <= set(errors_in(tree))
 
 
-# --- exports --------------------------------------------------------------------------------------------------------
+# --- trees --
 
 
 @pytest.fixture(scope="module")
 def near_run(tmp_path_factory) -> Path:
-    """A walk of which nothing is farther away than a PNG of millimetres holds."""
     told = ["pedestrians.num_paths=1", "pedestrians.min_distance_m=10", "pedestrians.max_distance_m=20", *TINY[3:5]]
     return run_here([*told, "workers=1"], tmp_path_factory.mktemp("exports") / "run")
 
@@ -490,44 +364,11 @@ def near(near_run, tmp_path_factory) -> Path:
     return released(near_run, tmp_path_factory.mktemp("exports") / "release", num_frames=16)
 
 
-@pytest.fixture(scope="module")
-def honest_exports(near, tmp_path_factory) -> dict[str, Path]:
-    folder = tmp_path_factory.mktemp("formats")
-    return {name: exported_as(name, near, folder / name) for name in FORMATS}
-
-
 def exported_as(name: str, release: Path, out: Path) -> Path:
     return export(ExportConfig(format=name), release, out, workers=0)
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_an_honest_export_passes(honest_exports, name):
-    for level in ("structure", "pixels"):
-        report = verify(honest_exports[name], level=level, reader=read_released)
-        assert report.is_ok, str(report)
-        assert [kind.code for kind in report.kinds] == ["not_checked"] * (name != "tree"), "the release tells more"
-
-
-@pytest.mark.parametrize("coding", ["float16", "millimetre_png"])
-def test_an_honest_tree_of_coded_depth_passes(near_run, tmp_path, coding):
-    release = released(near_run, tmp_path / "release", num_frames=16, depth=coding)
-    report = verify(exported_as("tree", release, tmp_path / "tree"), level="pixels", reader=read_released)
-    assert report.issues == [], str(report)
-
-
-@pytest.mark.parametrize("name", ["depth_doubled", "empty_instances", "pose_jumps"])
+@pytest.mark.parametrize("name", ["depth_doubled", "empty_instances", "another_camera_all_along"])
 def test_a_lie_is_found_in_a_tree(near, tmp_path, name):
     forged = forge(near, tmp_path / "forged", LIES[name][0])
     assert errors_in(exported_as("tree", forged, tmp_path / "export"))
-
-
-@pytest.mark.parametrize("name", FORMATS)
-def test_changed_files_of_an_export_are_found(honest_exports, tmp_path, name):
-    folder = shutil.copytree(honest_exports[name], tmp_path / name)
-    largest = max((path for path in folder.rglob("*") if path.is_file()), key=lambda path: path.stat().st_size)
-    data = bytearray(largest.read_bytes())
-    data[len(data) // 2] ^= 1
-    largest.write_bytes(data)
-    (folder / "README.md").write_text("words")
-    (folder / "more.txt").write_text("words")
-    assert {"card", "checksum", "unexpected"} <= set(errors_in(folder))

@@ -1,9 +1,9 @@
 """Codes the depth of one frame in all the ways there are, decodes it, and compares: `depth_study.json`,
 `depth_study.md`, and a figure.
 
-Whole numbers of 8 to 16 bits share the frame's own range evenly, as the paper's table does. float16 and PNGs of
-millimetres are coded by the release's own coder. The truth is what the file holds: float32, whose rounding is then told
-as half the step between neighbouring numbers at the farthest pixel, or float64, against which float32 is measured.
+Whole numbers of 8 to 16 bits share the frame's own range evenly, as the paper's table does. The truth is what the file
+holds: float32, whose rounding is then told as half the step between neighbouring numbers at the farthest pixel, or
+float64, against which float32 is measured.
 """
 
 from __future__ import annotations
@@ -32,10 +32,9 @@ from cosfly.reading.arrays import parse_array, parse_array_header
 from cosfly.reading.documents import FileFormat
 from cosfly.reading.files import read_bytes
 from cosfly.work.store import write_bytes, write_model
-from release.depth import MOST_PNG_M, depth_of, depth_record, encoded
-from release.record import DepthCodingName
 
 FORMAT = FileFormat("cosfly.depth_study", "1.0")
+MM_A_METRE, SKY_MM, MOST_PNG_M = 1000.0, 65535, 65.5  # 16 bits of millimetres; what is left for the sky
 MOST_HALF_M = float(np.finfo(np.float16).max)  # more is no number in 16 bits
 BITS = (8, 10, 12, 16)
 ENTROPY_BINS = 8192  # of the frame's range, the same for all codings: exact values of a float are nearly all unlike
@@ -163,22 +162,18 @@ def _decoded(truth: np.ndarray, measured: np.ndarray, file: Path) -> tuple[dict[
         blob = codes.astype(np.uint8).tobytes() if bits == 8 else codes.tobytes()
         found[f"{bits}-bit"] = (values, truth.size * bits / 8.0, blob)
     single = truth.astype(np.float32)
-    npy = depth_bytes(single)
-    codings: tuple[tuple[str, DepthCodingName], ...] = (
-        ("16-bit float", "float16"),
-        ("16-bit PNG of millimetres", "millimetre_png"),
-    )
-    for title, coding in codings:
-        if coding == "float16" and truth[measured].max() > MOST_HALF_M:
-            left_out[title] = f"depths beyond {MOST_HALF_M:g} m"
-            continue
-        try:
-            blob, errors = encoded(memoryview(npy), coding, file)
-        except InputError:
-            left_out[title] = f"depths beyond {MOST_PNG_M:g} m"
-            continue
-        values = depth_of(blob, depth_record(coding, [errors]), str(file)).astype(np.float64)
-        found[title] = (values, float(len(blob)), blob)
+    farthest = truth[measured].max()
+    if farthest > MOST_HALF_M:
+        left_out["16-bit float"] = f"depths beyond {MOST_HALF_M:g} m"
+    else:
+        half = single.astype(np.float16)
+        blob = depth_bytes(half)
+        found["16-bit float"] = (half.astype(np.float64), float(len(blob)), blob)
+    if farthest > MOST_PNG_M:
+        left_out["16-bit PNG of millimetres"] = f"depths beyond {MOST_PNG_M:g} m"
+    else:
+        blob, values = _millimetres(single, file)
+        found["16-bit PNG of millimetres"] = (values, float(len(blob)), blob)
     found["32-bit float"] = (single.astype(np.float64), float(single.nbytes), single.tobytes())
     # The same numbers, their bytes sorted by significance: exponents stand beside exponents, which deflating likes.
     planes = np.frombuffer(single.tobytes(), np.uint8).reshape(-1, 4).T.tobytes()
@@ -186,6 +181,19 @@ def _decoded(truth: np.ndarray, measured: np.ndarray, file: Path) -> tuple[dict[
     if truth.dtype == np.float64:
         found["64-bit float"] = (truth, float(truth.nbytes), truth.tobytes())
     return found, left_out
+
+
+def _millimetres(depth_m: np.ndarray, where: Path) -> tuple[bytes, np.ndarray]:
+    """Return a depth image as a PNG of 16-bit millimetres, and the metres that it decodes to."""
+    codes = np.clip(np.rint(depth_m * np.float32(MM_A_METRE)), 1, SKY_MM - 1).astype(np.uint16)
+    codes[depth_m == SKY_DEPTH_M] = SKY_MM
+    codes[depth_m == INVALID_DEPTH_M] = 0
+    is_done, data = cv2.imencode(".png", codes)
+    if not is_done:
+        raise InputError("cannot encode a PNG", where=where, got=str(depth_m.shape))
+    values = codes.astype(np.float32) / np.float32(MM_A_METRE)
+    values[codes == SKY_MM] = SKY_DEPTH_M
+    return data.tobytes(), values.astype(np.float64)
 
 
 def _from_planes(planes: bytes, shape: tuple[int, ...]) -> np.ndarray:

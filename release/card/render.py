@@ -24,7 +24,7 @@ from cosfly.products.frames import FrameFile
 from cosfly.reading.files import read_text
 from cosfly.space.blind import DRAWN_AHEAD, LEAST_WINDOWS, LOOKS_BACK
 from release.columns import CAPTION, PICTURES, SCALARS, SPLIT_NAMES, schema
-from release.record import DepthCodingName, History, ReleaseRecord, SourceRecord, shard_pattern
+from release.record import History, ReleaseRecord, SourceRecord, shard_pattern
 
 # What a map is, by what made it (`maps.source`): no more than the program knows.
 MAPS = {
@@ -34,21 +34,6 @@ MAPS = {
     "surfaces and plants are drawn by cosfly",
 }
 UNKNOWN_MAP = "made elsewhere; what it shows is not known to cosfly, see its licence and credits"
-DEPTH: dict[DepthCodingName, dict[str, str]] = {  # in words, and how a row of it is decoded
-    "float32": {
-        "text": "z-depth in metres, float32 `.npy` bytes, lossless",
-        "decode": 'depth_m = np.load(io.BytesIO(row["depth"]))  # float32 (height, width)',
-    },
-    "float16": {
-        "text": "z-depth in metres, float16 `.npy` bytes",
-        "decode": 'depth_m = np.load(io.BytesIO(row["depth"])).astype(np.float32)  # (height, width)',
-    },
-    "millimetre_png": {
-        "text": "z-depth in millimetres, PNG of 16 bits",
-        "decode": 'depth_m = np.asarray(Image.open(io.BytesIO(row["depth"]))) / np.float32(1000.0)  '
-        "# (height, width); 65.535 is sky, 0 invalid",
-    },
-}
 FEW_WALKS = 10
 
 
@@ -70,7 +55,6 @@ def render_card(record: ReleaseRecord) -> str:
         looks_back=LOOKS_BACK,
         least=LEAST_WINDOWS,
         drawn_ahead=DRAWN_AHEAD,
-        depth=None if record.depth is None else DEPTH[record.depth.coding],
         front_matter=_front_matter(record),
         ours=[source.run for source in record.provenance.sources if _is_rendered_by_us(source)],
         others=[source.run for source in record.provenance.sources if not _is_rendered_by_us(source)],

@@ -33,10 +33,9 @@ from cosfly.work.store import atomic_file, dump_json
 from release.columns import BOX, CAPTION_FIELDS, PICTURES, POINT, POSE, SPLIT_NAMES
 from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
 from release.export.source import (
+    DEPTH_CODING,
     Release,
     ReleasedRows,
-    depth_in_words,
-    depth_npy,
     picture,
     read_span,
     rows_of_flight,
@@ -422,7 +421,7 @@ def _pictures(release: Release, episode: Episode) -> Iterator[tuple[int, list[di
 
 def _image(release: Release, row: dict[str, Any], file: FrameFile) -> dict[str, Any]:
     if file == "depth":
-        data = tiff_of_depth(depth_npy(row, release.record.depth), row["sample_id"])
+        data = tiff_of_depth(picture(row, "depth"), row["sample_id"])
         return {"bytes": data, "path": f"{row['sample_id']}.depth.tiff"}
     return {"bytes": picture(row, file), "path": f"{row['sample_id']}.{file}.png"}
 
@@ -430,7 +429,7 @@ def _image(release: Release, row: dict[str, Any], file: FrameFile) -> dict[str, 
 def _pixels(release: Release, row: dict[str, Any], file: FrameFile) -> np.ndarray:
     where = row["sample_id"]
     if file == "depth":
-        return thinned(parse_array(depth_npy(row, release.record.depth), where, dtype=np.float32, ndim=2))
+        return thinned(parse_array(picture(row, "depth"), where, dtype=np.float32, ndim=2))
     return thinned(parse_picture(picture(row, file), where)[..., ::-1])
 
 
@@ -511,7 +510,7 @@ def finish(
     num_flights = sum(len(unit.flights) for unit in units)
     codings = dict.fromkeys(release.modalities, "PNG, the released bytes")
     if "depth" in codings:
-        codings["depth"] = depth_in_words(release.record.depth, "TIFF, the released numbers")
+        codings["depth"] = DEPTH_CODING.format("TIFF, the released numbers")
     rounded = "float32 of the released float64: a coordinate of 1,000 m is rounded by at most 0.00003 m"
     return FormatFacts(
         version=VERSION,

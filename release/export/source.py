@@ -15,19 +15,19 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cosfly.errors import InputError
-from cosfly.products.frames import FrameFile, depth_bytes
+from cosfly.products.frames import FrameFile
 from cosfly.reading.arrays import png_size
 from cosfly.reading.files import sha256_file
 from cosfly.reading.tables import arrow_errors, open_table, read_row_group, row_groups
 from cosfly.work.store import inside
 from release.columns import PICTURES, PLACE, REQUIRED, SPLIT_NAMES, SplitName, flight_spans, schema
-from release.depth import depth_of
-from release.record import DepthCoding, ReleaseRecord, read_record, release_folder
+from release.record import ReleaseRecord, read_record, release_folder
 
 # Names of columns below come from `release/columns.py`; those of shards from `release build`.
 SHARD_NAME = re.compile(r"data/(train|validation|test)-[0-9a-f]{12}-\d{5}-of-\d{5}\.parquet")
 LIGHT = [*PLACE, "frame_index", "time_s", "sample_id", "decision", "goal_en"]
 # What one part of a path may be that rows name: no separator, nothing hidden, no ".."
+DEPTH_CODING = "{}: float32, metres, lossless"
 PART = re.compile(r"\w[\w.-]{0,200}", re.ASCII)
 
 Place = tuple[str, str, str, str]  # run, town, trajectory, variant
@@ -221,24 +221,3 @@ def picture(row: dict[str, Any], file: FrameFile) -> bytes:
             got="none" if not data else "no PNG",
         )
     return data
-
-
-def depth_npy(row: dict[str, Any], coding: DepthCoding | None) -> bytes:
-    """Give the depth of a row as the bytes of a `depth.npy` of float32: the released ones, or decoded where the release
-    has coded it.
-    """
-    data, where = picture(row, "depth"), row["sample_id"]
-    if coding is None or coding.coding == "float32":
-        return data
-    return depth_bytes(depth_of(data, coding, where))
-
-
-def depth_in_words(coding: DepthCoding | None, stored: str) -> str:
-    """Say how depth is stored, with unit, range and error where it is not the float32 that was rendered."""
-    if coding is None or coding.coding == "float32":
-        return f"{stored}: float32, metres, lossless"
-    return (
-        f"{stored}: of {coding.coding} in the release ({coding.unit}, {coding.min_m} to {coding.max_m} m; "
-        f"{coding.sky:g} sky, {coding.invalid:g} invalid), whose greatest error, "
-        f"measured over all pixels, is {coding.max_error_m:g} m"
-    )

@@ -23,7 +23,7 @@ from cosfly.work.stage_folder import Resume, StageFolder, result_of
 from cosfly.work.store import CHECKSUMS, dump_json, inside, sha256_bytes, storage_errors, write_bytes, write_checksums
 from release.export.contract import ExportConfig, ExportUnit, FormatFacts, UnitFiles, format_of
 from release.export.source import Release, open_release, scan
-from release.record import DepthCoding, ReleasedMap, Strict
+from release.record import ReleasedMap, StoredDepth, Strict
 
 EXPORT_FORMAT = FileFormat("cosfly.export", "1.1", "record of an export")
 
@@ -53,7 +53,7 @@ class ExportRecord(Strict):
     prompts: dict[str, dict[str, str]] = Field(default_factory=dict)
     settings: dict[str, Any]
     codings: dict[str, str]
-    depth: DepthCoding | None
+    depth: StoredDepth | None
     notes: list[str]
     how_to_open: str
     frames: int

@@ -34,7 +34,7 @@ from cosfly.work.runner import advance
 from cosfly.work.store import CHECKSUMS, checksum_lines, write_model
 from release.columns import COMPANY_COLUMNS, PICTURES, SCALAR_NAMES, TARGET_PICTURE, matrices_of
 from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
-from release.export.source import Release, ReleasedRows, depth_in_words, depth_npy, picture, read_span
+from release.export.source import DEPTH_CODING, Release, ReleasedRows, picture, read_span
 from release.flight_rows import FlightRows
 
 VERSION = "drone_nav_traj_v7 7.0.0"
@@ -76,7 +76,7 @@ def write(release: Release, unit: ExportUnit, folder: Path, cfg: ExportConfig) -
     for i, row in enumerate(_rows(release, rows)):
         for file in release.modalities:
             name = f"{frame_name(i)}/{FILE_NAMES[file]}"
-            data = depth_npy(row, release.record.depth) if file == "depth" else picture(row, file)
+            data = picture(row, file)
             digests[name] = files.put(f"{place}/{name}", data, listed=False)
         if row[TARGET_PICTURE] is not None:
             digests[TARGET_FILE] = files.put(f"{place}/{TARGET_FILE}", row[TARGET_PICTURE]["bytes"], listed=False)
@@ -111,7 +111,7 @@ def finish(
     return FormatFacts(
         version=VERSION,
         codings={
-            file: depth_in_words(release.record.depth, FILE_NAMES[file])
+            file: DEPTH_CODING.format(FILE_NAMES[file])
             if file == "depth"
             else f"{FILE_NAMES[file]}, the released bytes"
             for file in release.modalities

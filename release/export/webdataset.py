@@ -20,7 +20,7 @@ from cosfly.work.runner import advance
 from cosfly.work.store import atomic_file, dump_json
 from release.columns import PICTURES, SPLIT_NAMES, TARGET_PICTURE
 from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
-from release.export.source import PART, Release, ReleasedRows, Span, depth_in_words, picture, read_span
+from release.export.source import DEPTH_CODING, PART, Release, ReleasedRows, Span, picture, read_span
 
 MB = 1024 * 1024
 VERSION = "tar, keys sorted"
@@ -72,16 +72,10 @@ def write(release: Release, unit: ExportUnit, folder: Path, cfg: ExportConfig) -
 def members(row: dict[str, Any], release: Release) -> list[tuple[str, bytes]]:
     """Give the files of one frame, by their endings in order."""
     scalars = {name: value for name, value in row.items() if name not in PICTURE_COLUMNS}
-    pictures = {ending: picture(row, file) for file, ending in endings(release).items()}
+    pictures = {ENDINGS[file]: picture(row, file) for file in release.modalities}
     if (target := scalars.pop(TARGET_PICTURE)) is not None:
         pictures["target.png"] = target["bytes"]
     return sorted({"json": (dump_json(scalars) + "\n").encode(), **pictures}.items())
-
-
-def endings(release: Release) -> dict[FrameFile, str]:
-    """Give what the files of a frame's pictures end with."""
-    coded = release.record.depth is not None and release.record.depth.coding == "millimetre_png"
-    return {file: "depth.png" if file == "depth" and coded else ENDINGS[file] for file in release.modalities}
 
 
 def _header(name: str, size: int) -> tarfile.TarInfo:
@@ -94,9 +88,9 @@ def finish(
     release: Release, units: Sequence[ExportUnit], written: Sequence[UnitFiles], folder: Path, cfg: ExportConfig
 ) -> FormatFacts:
     """Say how the shards are opened."""
-    codings = {file: f"{ending}, the released bytes" for file, ending in endings(release).items()}
+    codings = {file: f"{ENDINGS[file]}, the released bytes" for file in release.modalities}
     if "depth" in codings:
-        codings["depth"] = depth_in_words(release.record.depth, codings["depth"])
+        codings["depth"] = DEPTH_CODING.format(codings["depth"])
     first = units[0].extra
     last = sum(unit.extra == first for unit in units) - 1
     shards = f"{first}-{{00000..{last:05d}}}.tar" if last else f"{first}-00000.tar"

@@ -9,7 +9,7 @@ from cosfly.products.frames import FILE_NAMES, FrameFile
 from cosfly.products.places import Track
 from cosfly.work.config import Config
 from release.columns import SplitName
-from release.record import DepthCodingName, Pairs, SplitBy
+from release.record import Pairs, SplitBy
 
 MB = 1024 * 1024
 
@@ -52,10 +52,6 @@ class ReleaseConfig(Config):
     split_seed: int = Field(0, ge=0, description="seed of the division into splits")
     modalities: tuple[FrameFile, ...] = Field(
         tuple(FILE_NAMES), min_length=1, description="pictures to include: rgb, depth, instance"
-    )
-    depth: DepthCodingName = Field(
-        "float32",
-        description="float32: lossless; float16, millimetre_png (16 bits, to 65.5 m): smaller, with a measured error",
     )
     shard_mb: int = Field(
         500, ge=1, description="size that a parquet file should not pass by more than one flight, MB before compression"

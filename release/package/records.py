@@ -22,7 +22,6 @@ from cosfly.work.store import write_bytes, write_checksums
 from release import columns
 from release.card.croissant import CROISSANT, render_croissant
 from release.card.render import render_card
-from release.depth import depth_record
 from release.package.captions import CaptionAccount, teacher_settings
 from release.package.config import ReleaseConfig
 from release.package.plan import ReleasePlan
@@ -43,6 +42,7 @@ from release.record import (
     Shard,
     SourceRecord,
     Splits,
+    StoredDepth,
     content_digest,
     numbers_of_splits,
     shard_paths,
@@ -181,7 +181,7 @@ def make_record(
             modalities=list(cfg.modalities),
         ),
         frame_selection=RULE,
-        depth=depth_record(cfg.depth, [result.depth for result in written]) if "depth" in cfg.modalities else None,
+        depth=StoredDepth() if "depth" in cfg.modalities else None,
         coordinates=columns.CONTRACT,
         actions=plan.actions,
         prompts=prompts,

@@ -19,14 +19,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import BaseModel
 
-from cosfly.products.frames import FILE_NAMES, FrameFile, frame_path, is_packed
+from cosfly.products.frames import FILE_NAMES, FrameFile, depth_bytes, depth_values, frame_path, is_packed
 from cosfly.products.places import sample_id
 from cosfly.products.playback import Flight
 from cosfly.reading.files import read_into
 from release import columns
 from release.columns import PICTURES
-from release.depth import DepthErrors, encoded
-from release.record import DepthCodingName
 
 BLOCK = 4 * 1024 * 1024  # bytes that are handed to the disk at once
 NUM_BLOCKS = 3  # one is filled, one is written, one waits
@@ -134,7 +132,6 @@ class ShardPlan(BaseModel):
     window_frames: int
     uniform_stride: bool
     files: tuple[FrameFile, ...]
-    depth: DepthCodingName
     row_group_bytes: int
 
 
@@ -195,16 +192,13 @@ class Rows:
         self._scalars: list[dict[str, Any]] = []
         self._paths: list[str] = []
         self._num_bytes = 0
-        self.depth = DepthErrors()
 
     def add(self, scalars: dict[str, Any], flight: Flight, i: int, *, keep: bool) -> None:
         """Add a frame whose pictures were read. keep: False where nothing will be written any more."""
         depth = self.pictures.get("depth")
-        if depth is not None and (self._plan.depth != "float32" or is_packed(depth.last())):
+        if depth is not None and is_packed(depth.last()):
             where = frame_path(flight.frame_folder(i), FILE_NAMES["depth"])
-            coded, cost = encoded(depth.last(), self._plan.depth, where)
-            depth.replace(coded)
-            self.depth = self.depth.merged(cost)
+            depth.replace(depth_bytes(depth_values(depth.last(), where)))
         if not keep:
             return
         self._scalars.append(scalars)

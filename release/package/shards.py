@@ -37,7 +37,6 @@ from cosfly.work.provenance import FLIGHT, digest_of, folder_digests
 from cosfly.work.store import CHECKSUMS, atomic_file, read_checksums
 from release import columns
 from release.columns import Placement, ReleasedCaption, caption_values
-from release.depth import DepthErrors
 from release.package.captions import FlightCaptions
 from release.package.rows import HashedFile, Rows, ShardPlan, open_writer
 from release.package.sources import Candidate
@@ -141,7 +140,6 @@ class ShardResult(BaseModel):
     bytes: int
     sha256: str
     flights: list[ReleasedPart]
-    depth: DepthErrors
 
 
 def write_shard(path: Path, parts: Sequence[FlightPart], plan: ShardPlan) -> ShardResult:
@@ -162,7 +160,7 @@ def write_shard(path: Path, parts: Sequence[FlightPart], plan: ShardPlan) -> Sha
         problems.raise_any()
         size, sha256 = hashed.finish()
     num_rows = sum(flight.frames for flight in flights)
-    return ShardResult(rows=num_rows, bytes=size, sha256=sha256, flights=flights, depth=rows.depth)
+    return ShardResult(rows=num_rows, bytes=size, sha256=sha256, flights=flights)
 
 
 def _write_flight(part: FlightPart, plan: ShardPlan, rows: Rows, problems: _Problems) -> ReleasedPart:

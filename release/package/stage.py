@@ -102,7 +102,7 @@ def _write_parts(
     """Write all shards that are not written yet."""
     how = ShardPlan(
         num_frames=cfg.num_frames, window_frames=plan.window_frames, uniform_stride=cfg.uniform_stride,
-        files=cfg.modalities, depth=cfg.depth, row_group_bytes=cfg.row_group_bytes,
+        files=cfg.modalities, row_group_bytes=cfg.row_group_bytes,
     )  # fmt: skip
     items = [Item(shard.name, shard.parts, num_steps=shard.num_frames) for shard in plan.shards]
     finished = run_items(stage, items, make_worker, (how, parts), workers=workers, watch=watch, label="release: frames")

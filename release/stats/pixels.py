@@ -14,14 +14,13 @@ import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.look.frame_views import small_jpeg
-from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile
+from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.products.kinds import KIND_NAMES
 from cosfly.reading.arrays import parse_picture
 from cosfly.reading.tables import arrow_errors, open_table, row_groups
 from cosfly.work.console import progress_bar
 from release.card.numbers import check_columns
 from release.columns import PICTURES
-from release.depth import depth_of
 from release.record import ReleaseRecord
 
 BIN_M, MOST_M = 0.25, 1000.0  # bins of the depth histogram; percentiles are to a bin
@@ -80,8 +79,7 @@ def look_at(dataset: Path, record: ReleaseRecord, most: int) -> Pixels:
             for file in files:
                 where, cell = f"{row['sample_id']}: {PICTURES[file].name}", row[PICTURES[file].name]
                 if file == "depth":
-                    assert record.depth is not None, "build writes it with depth"
-                    pixels.add_depth(depth_of(cell or b"", record.depth, where))
+                    pixels.add_depth(depth_values(cell or b"", Path(where)))
                 else:
                     pixels.add_kinds(parse_picture((cell or {}).get("bytes") or b"", where)[..., 2])
             advance(1)

@@ -1,5 +1,4 @@
-"""What verification finds: one line for each kind of problem, with its count and the first places; flat in memory
-however much is wrong."""
+"""The findings of a verification: one line for each kind of problem, with its count and the first places."""
 
 from __future__ import annotations
 

@@ -1,8 +1,5 @@
-"""What stands in a folder of files with a list of checksums: names, sizes, links, and, dearest, the checksums
-themselves.
-
-Nothing is followed out of the folder but links of the hub client's cache into its blobs; a loop of links ends at its
-first link.
+"""Check the files of a folder: names, sizes, links and checksums. No link is followed out of the folder but those of
+the hub client's cache into its blobs.
 """
 
 from __future__ import annotations

@@ -9,14 +9,12 @@ from cosfly.geometry import BODY_FROM_CAMERA
 from cosfly.products.frames import PERSON_ID
 from cosfly.products.goals import LANDMARKS, SeenFrame, meant, target_picture, words_of
 from cosfly.products.kinds import KINDS
-from cosfly.products.people import People
 from cosfly.products.png import parse_png
-from release.columns import COMPANY_COLUMNS, TARGET_PICTURE, matrices_of
+from release.columns import TARGET_PICTURE, matrices_of
 from release.flight_rows import FlightRows
 from release.verify.findings import Findings
 
 SAME_LEVELS = 3.0  # of 255, in the mean: libraries enlarge differently
-SAME_PLACE_M = 1.0  # the pixels of somebody, limbs or what is not hidden, are so near to the middle
 
 
 def check_goal(
@@ -24,8 +22,6 @@ def check_goal(
 ) -> None:
     """Check the goal in the row that it is of. decoded: depth and instance, empty where there is none."""
     depth, instance = decoded
-    if flight.people is not None and instance.size and flight.rows[i].get("others_in_view") is not None:
-        _check_company(flight, flight.people, i, _picture(flight, i, decoded), found)
     goal, people = flight.goal, flight.people
     if goal is None or goal.frame != flight.index[i] or not instance.size:
         return
@@ -54,28 +50,6 @@ def check_goal(
         expected = target_picture(of_frame, flight.mask_box[i].tolist()).astype(float)
         if pixels.shape != expected.shape or np.abs(pixels - expected).mean() > SAME_LEVELS:
             found.error("goal", where, "another picture", "target_mask_bbox of image, with room around")
-
-
-def _check_company(flight: FlightRows, people: People, i: int, picture: SeenFrame, findings: Findings) -> None:
-    """Check what a row says of other people in view: how many, the nearest, the most alike."""
-    count, away_m, nearest, *alike = (flight.rows[i].get(name) for name in COMPANY_COLUMNS)
-    seen = [number for number in people.others if (picture.ids == number).any()]
-    if len(seen) != count:
-        findings.error("others", flight.where(i, "others_in_view"), count, f"{len(seen)}, of `people` who have a pixel")
-    if tuple(alike) != (expected := people.most_alike(seen)):
-        findings.error("others", flight.where(i, "alike_id"), alike, f"{expected}, of `people` who have a pixel")
-    if nearest is None or away_m is None:
-        is_right, got = not seen, "null"
-    else:
-        offset_m, got = flight.pose[i, :2] - flight.target_m[i, :2], f"{nearest}, {away_m:g} m away"
-        measured_m = dict.fromkeys(seen, float(away_m))
-        if picture.depth.size:
-            measured_m = {number: float(np.hypot(*(picture.place_m(number)[:2] + offset_m))) for number in seen}
-        least_m = min(measured_m.values(), default=0.0)
-        is_right = abs(measured_m.get(nearest, np.inf) - away_m) <= SAME_PLACE_M and away_m <= least_m + SAME_PLACE_M
-    if not is_right:
-        who = "the nearest of `people` who have a pixel, as far as their depth says, null without any"
-        findings.error("others", flight.where(i, "other_id"), got, who)
 
 
 def _picture(flight: FlightRows, i: int, decoded: tuple[np.ndarray, np.ndarray]) -> SeenFrame:

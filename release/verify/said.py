@@ -1,19 +1,14 @@
-"""Checks of a row's caption that need no flight: it is complete, decided as its label and verdict say, and made from
-the past alone.
-
-Labels and verdicts are recomputed from the flight by a reader of captions (caption/run/released.py).
-"""
+"""Check a row's caption without the flight: complete, decided as label and verdict say, made from the past alone."""
 
 from __future__ import annotations
 
 from functools import partial
 
-from release.columns import CAPTION, CAPTION_NAMES, LANGUAGES, PICTURE_PX, WINDOW
+from release.columns import CAPTION, CAPTION_NAMES, LANGUAGES, WINDOW
 from release.flight_rows import FlightRows, Row
 from release.verify.findings import Findings
 
 NEVER_NULL = [column.name for column in CAPTION if column.required]
-MOST_SIDE_PX, SAME_SHAPE = 20_000, 0.1  # of a picture that a teacher was shown
 
 
 def check_captions(flight: FlightRows, window_frames: int | None, findings: Findings) -> None:
@@ -40,7 +35,7 @@ def _tell(flight: FlightRows, i: int, findings: Findings, code: str, column: str
 
 
 def _check_window(row: Row, released: set[int], window_frames: int | None, tell: partial[None]) -> None:
-    window, index, size = row[WINDOW], row["frame_index"], row[PICTURE_PX]
+    window, index = row[WINDOW], row["frame_index"]
     if any(frame is None or frame > index for frame in window):
         tell("window", WINDOW, window, f"nothing after frame {index}, which is the current one")
     elif window != list(range(index - len(window) + 1, index + 1)):
@@ -49,10 +44,6 @@ def _check_window(row: Row, released: set[int], window_frames: int | None, tell:
         tell("window", WINDOW, f"{len(window)} frames", f"{window_frames}, as settings.window_frames says")
     elif not released.issuperset(window):
         tell("window", WINDOW, f"frame {min(set(window) - released)} is not in the rows", "windows that are whole")
-    if len(size) != 2 or not all(1 <= (side or 0) <= MOST_SIDE_PX for side in size):
-        tell("caption", PICTURE_PX, size, "width and height of a picture")
-    elif abs(size[0] / size[1] / (row["width_px"] / row["height_px"]) - 1.0) >= SAME_SHAPE:
-        tell("caption", PICTURE_PX, size, f"the shape of {row['width_px']} x {row['height_px']} px")
 
 
 def _check_decision(row: Row, tell: partial[None]) -> None:
@@ -66,6 +57,3 @@ def _check_decision(row: Row, tell: partial[None]) -> None:
         tell("verdict", "verdict", got, "CONSISTENT exactly where the decision is the label")
     elif (verdict == "ABSTAIN" and label is not None) or (verdict == "SOFT_CONFLICT" and label is None):
         tell("verdict", "verdict", f"{verdict}, label {label}", "ABSTAIN where there is no label, and else not")
-    if (row["label_from"] == "flight") != (row.get("track") == "clean"):
-        got = f"{row['label_from']} in a {row.get('track')} flight"
-        tell("label_from", "label_from", got, "flight exactly in a clean one")

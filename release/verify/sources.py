@@ -1,7 +1,4 @@
-"""Where the rows and pictures of flights come from: the shards of a release, or a playback tree.
-
-A source is small and pickles: worker processes open the files themselves.
-"""
+"""Read rows and pictures of flights from the shards of a release or from a playback tree, in worker processes."""
 
 from __future__ import annotations
 
@@ -13,9 +10,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from cosfly.errors import InputError
 from cosfly.products.flights import find_flights
@@ -33,14 +28,12 @@ Pictures = dict[FrameFile, bytes | memoryview | None]
 
 @dataclass(frozen=True)
 class Entry:
-    """A flight of a source. parts: where its rows are, in the source's own terms. num_frames: of the whole flight, None
-    where nobody says."""
+    """A flight of a source. parts: where its rows are, in the source's own terms."""
 
     name: str
     parts: tuple[Any, ...]
     num_rows: int
     given_id: str | None = None
-    num_frames: int | None = None
 
     @property
     def place(self) -> Place:
@@ -89,7 +82,10 @@ class Shards:
         found: list[Row] = []
         for path, table, group, begin, end in self._groups(entry):
             own = read_row_group(path, table, group, SCALAR_NAMES)
-            found += rows_of_table(own.slice(begin, end - begin), path)
+            try:
+                found += own.slice(begin, end - begin).to_pylist()
+            except ValueError as error:
+                raise InputError("not text", where=path, got=str(error)) from None
         return found
 
     def pictures(self, entry: Entry) -> Iterator[Pictures]:
@@ -111,28 +107,13 @@ class Shards:
                     yield path, table, group, begin, end
 
 
-def rows_of_table(table: Any, path: Path) -> list[Row]:
-    """Give a table's rows as plain values."""
-    try:
-        return table.to_pylist()
-    except ValueError as error:
-        raise InputError("not text", where=path, got=str(error)) from None
-
-
 def pictures_of(batch: pa.RecordBatch, names: dict[FrameFile, str]) -> list[Pictures]:
-    """Give the pictures of a batch's rows where they lie in its memory, since a value that Arrow gives is a copy.
-    names: of their columns."""
-    found: list[Pictures] = [{} for _ in range(len(batch))]
-    for file, name in names.items():
-        column = batch.column(name)
-        values = column.field("bytes") if pa.types.is_struct(column.type) else column
-        _, bounds, data = values.buffers()
-        begins = np.frombuffer(bounds, np.int32)[values.offset :]
-        known = pc.and_(column.is_valid(), values.is_valid()).to_pylist()
-        whole = memoryview(data or b"").cast("B")
-        for i, row in enumerate(found):
-            row[file] = whole[begins[i] : begins[i + 1]] if known[i] else None
-    return found
+    """Return the pictures of a batch's rows. names: of their columns."""
+    values = {file: batch.column(name).to_pylist() for file, name in names.items()}
+    return [
+        {file: cells[i]["bytes"] if isinstance(cells[i], dict) else cells[i] for file, cells in values.items()}
+        for i in range(len(batch))
+    ]
 
 
 # --- a playback tree --------------------------------------------------------------------------------------------------
@@ -190,4 +171,4 @@ FlightSource = Shards | TreeFlights
 
 
 def flight_rows(source: FlightSource, entry: Entry) -> FlightRows:
-    return FlightRows(entry.name, source.rows(entry), entry.given_id, entry.num_frames)
+    return FlightRows(entry.name, source.rows(entry), entry.given_id)

@@ -1,12 +1,10 @@
-"""`cosfly release verify`: is a folder what its records say, and can it be true? From cheap to dear, reading nothing
-but the folder.
+"""`cosfly release verify`: check a folder against its records and recompute what is cheap to recompute.
 
     structure   names, sizes, links, records against each other and against the shards' footers, the card
-    rows        every row: ids, ranges, geometry, motion, captions; flights against each other; every number computed
-    again pixels      checksums of all files; every picture: whole, of its row, and one world with the pictures beside
-    it
+    rows        every row: schema, geometry, labels; splits and pairs; every number of the card
+    pixels      checksums of all files; every picture: masks, boxes, and reprojection into the next frame
 
-A release, a playback tree (ours or the public one), and what `cosfly release export` writes.
+A release, or a playback tree, ours or the public one. `sha256sum -c checksums.sha256` checks an export.
 """
 
 from __future__ import annotations
@@ -25,19 +23,17 @@ from cosfly.work.runner import Watch, run_items
 from cosfly.work.stage_folder import Failed, Kept, StageFolder
 from cosfly.work.store import CHECKSUMS
 from release.card.croissant import CROISSANT
-from release.export.contract import FORMATS
-from release.record import RECORD, DepthCoding, ReleaseRecord, read_record, release_folder
-from release.verify import by_rule, records
-from release.verify.across import RowFiles, Summary, check_across
-from release.verify.exports import EXPORT, check_export
+from release.record import RECORD, ReleaseRecord, read_record, release_folder
+from release.verify import records
+from release.verify.across import Summary, check_across
 from release.verify.findings import Findings, Verified
-from release.verify.flights import LOSSLESS, SENSELESS, Context, FlightJob, Level, make_worker
+from release.verify.flights import SENSELESS, Context, FlightJob, Level, make_worker
 from release.verify.folder import SMALL_BYTES, check_digests, check_names, read_digests
 from release.verify.sources import Entry, FlightSource, Shards, TreeFlights
 
 RECORDS = ("README.md", RECORD, CROISSANT, CHECKSUMS)
 LEVELS: tuple[Level, ...] = ("structure", "rows", "pixels")
-ANYTHING = "a release, a playback tree, or an export of a release"
+ANYTHING = "a release or a playback tree"
 
 
 @dataclass(frozen=True)
@@ -58,32 +54,21 @@ def verify(
     reader: CaptionReader | None = None,
     watch: Watch = Watch(),
 ) -> Verified:
-    """Check a folder (or the release inside a release stage's or a run's, or the format's inside an export's).
+    """Check a release (also of a release stage or a run) or a playback tree.
 
     Args:
-        level: how far to go; each level does what the ones before it do.
-        workers: processes; 0 works in this one.
-        reader: recomputes labels and verdicts; None: they are not recomputed, which the report says.
-        watch: when a worker counts as stalled; its flight is then an error.
-    Returns:
-        the report; `is_ok` is False when anything is wrong. Later checks are left out where earlier ones make them
-        senseless.
+        level: each level does what the ones before it do. workers: processes; 0 works in this one. reader: recomputes
+        labels and verdicts; None: they are not recomputed. watch: when a worker counts as stalled.
     """
     findings, how = Findings(), _How(level, reader, workers, watch)
-    if not any((folder / name).is_file() for name in (RECORD, EXPORT)):
-        exports = (folder / name / EXPORT for name in FORMATS)  # in the stage's folder
-        folder = next((path.parent for path in exports if path.is_file()), release_folder(folder))
+    folder = release_folder(folder)
     is_release = (folder / RECORD).is_file()
     if not folder.is_dir():
         findings.error("missing", folder, "no such folder", ANYTHING)
-    elif (folder / EXPORT).is_file():
-        record = check_export(folder, level != "structure", findings)
-        if record is not None and record.format == "tree":
-            _verify_tree(folder, how, findings, record.depth)
     elif is_release or ((folder / CHECKSUMS).is_file() and next(folder.rglob("trajectory.json"), None) is None):
         _verify_release(folder, how, findings)
     else:
-        _verify_tree(folder, how, findings, None)
+        _verify_tree(folder, how, findings)
     return findings.report(level)
 
 
@@ -104,7 +89,6 @@ def _verify_release(folder: Path, how: _How, findings: Findings) -> None:
     small = [name for name in good if (folder / name).stat().st_size <= SMALL_BYTES and name in RECORDS]
     check_digests(folder, digests, small, findings)
     records.check_record(record, findings)
-    by_rule.check_rules(record, findings)
     readable = records.check_footers(folder, record, good, findings)
     records.check_card(folder, record, findings)
     findings.facts.append(f"structure: {len(record.shards):,} shards, {record.numbers.frames:,} frames by their record")
@@ -135,19 +119,14 @@ def _verify_rows(folder: Path, record: ReleaseRecord, how: _How, findings: Findi
     except InputError as error:
         findings.error("unreadable", str(error.where).replace(f"{folder}/", ""), error.got or error.what, "rows")
         return
-    available = {flight.flight: flight.frames_available for flight in record.flights}
-    entries = [replace(entry, num_frames=available.get(entry.name)) for entry in entries]
     flights = _check_all(source, entries, Context.of_record(record), how, findings)
     records.check_flights(record, flights, findings)
     split_of, splits = {shard.path: shard.split for shard in record.shards}, {one.name: one.split for one in flights}
-    for entry in entries:
-        for shard in dict.fromkeys(part[0] for part in entry.parts):
-            if splits.get(entry.name, split_of[shard]) != split_of[shard]:
-                got = f"rows of {splits[entry.name]} in {shard}"
-                findings.error("leak", entry.name, got, f"{split_of[shard]}, the shard's split")
+    for name, shard in ((entry.name, part[0]) for entry in entries for part in entry.parts):
+        if splits.get(name, split_of[shard]) != split_of[shard]:
+            findings.error("leak", name, f"rows of {splits[name]} in {shard}", f"{split_of[shard]}, the shard's split")
     try:
         records.check_numbers(folder, record, findings)
-        records.check_shards(folder, record, findings)
     except (InputError, *SENSELESS) as error:  # rows that no number comes of, which are found above
         findings.error("number", "release.json: numbers", f"{type(error).__name__}: {error}", "numbers of the rows")
 
@@ -155,34 +134,22 @@ def _verify_rows(folder: Path, record: ReleaseRecord, how: _How, findings: Findi
 # --- a playback tree --------------------------------------------------------------------------------------------------
 
 
-def _verify_tree(folder: Path, how: _How, findings: Findings, coded: DepthCoding | None) -> None:
-    """Check a playback tree. coded: how the release that it was made of coded the depth, which is float32 here."""
+def _verify_tree(folder: Path, how: _How, findings: Findings) -> None:
     try:
         source, entries = TreeFlights.found(folder)
     except InputError as error:
         findings.error("missing", folder, f"{error.what}: {error.got}" if error.got else error.what, ANYTHING)
         return
     findings.facts.append(f"structure: a playback tree of {len(entries):,} flights, with {', '.join(source.files)}")
-    digests: dict[str, dict[str, str]] = {}  # the flights' own lists, where they have them
-    for flight in (entry.parts[0] for entry in entries if (folder / entry.parts[0] / CHECKSUMS).is_file()):
-        digests[flight] = read_digests(folder / flight, findings)
-        for name in digests[flight]:
-            if not (folder / flight / name).is_file():
-                findings.error("missing", f"{flight}/{name}", "no such file", f"a file of {CHECKSUMS}")
-    if how.level == "structure":
-        return
-    context = Context(shipped_actions(), rounded_as=(coded or LOSSLESS).coding)
-    _check_all(source, entries, context, replace(how, reader=None), findings)
-    if how.level == "pixels":
-        for flight, own in digests.items():
-            check_digests(folder / flight, own, list(own), findings)
+    if how.level != "structure":
+        _check_all(source, entries, Context(shipped_actions()), replace(how, reader=None), findings)
+    for flight in (folder / entry.parts[0] for entry in entries):
+        if how.level == "pixels" and (flight / CHECKSUMS).is_file():
+            digests = read_digests(flight, findings)
+            check_digests(flight, digests, list(digests), findings)
 
 
 # --- all flights ------------------------------------------------------------------------------------------------------
-
-
-class _Settings(Config):
-    """A verification has no settings that a product would depend on."""
 
 
 def _check_all(
@@ -191,15 +158,14 @@ def _check_all(
     """Check every flight, by several processes, and all of them against each other; gives what was kept of each."""
     clean = {e.name.rpartition("/")[0]: e for e in entries if e.name.rpartition("/")[2] == ORIGINAL}
     items = []
-    for number, entry in enumerate(entries):
+    for entry in entries:
         twin = clean.get(entry.name.rpartition("/")[0])
-        job = FlightJob(entry, f"{number:07d}.rows", None if twin is entry else twin)
+        job = FlightJob(entry, None if twin is entry else twin)
         items.append(Item(entry.name, job, entry.num_rows if how.level == "pixels" and entry.num_rows else None))
     flights = []
     with tempfile.TemporaryDirectory(prefix="cosfly-verify-") as place:
-        stage = StageFolder.open(Path(place) / "verify", "verify", config=_Settings(), inputs={}, seed=0)
-        rows = RowFiles(Path(place) / "rows")
-        started = (source, how.level, context, how.reader, rows)
+        stage = StageFolder.open(Path(place) / "verify", "verify", config=Config(), inputs={}, seed=0)
+        started = (source, how.level, context, how.reader)
         done = run_items(stage, items, make_worker, started, workers=how.workers, watch=how.watch, label="verify")
         for record in done.records:
             if isinstance(record, Kept):
@@ -208,7 +174,7 @@ def _check_all(
                     flights.append(Summary(**record.result["summary"]))
             elif isinstance(record, Failed):
                 findings.error("not_checked", record.id, record.message, "a flight that can be checked")
-        check_across(flights, rows, by_town=context.by_town, both=context.both, findings=findings)
+        check_across(flights, by_town=context.by_town, both=context.both, findings=findings)
     words = f"labels and verdicts {'recomputed' if how.reader is not None else 'not recomputed'}"
     pictures = f", all their {', '.join(source.files)} pictures" if how.level == "pixels" else ""
     num_rows = sum(flight.num_rows for flight in flights)

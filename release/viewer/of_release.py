@@ -12,14 +12,13 @@ import numpy as np
 import pyarrow as pa
 
 from cosfly.look.frame_views import View, depth_colors, segmentation_colors
-from cosfly.products.frames import FrameFile
+from cosfly.products.frames import FrameFile, depth_values
 from cosfly.reading.arrays import parse_picture
 from cosfly.reading.tables import arrow_errors, row_groups
 from cosfly.work.console import progress_bar
 from release.card.numbers import bounded, check_columns, check_rows, row_lists
 from release.columns import PICTURES as COLUMNS
 from release.columns import PLACE, POINT, SHORT_NAMES
-from release.depth import depth_of
 from release.record import ReleaseRecord, read_record
 from release.viewer.content import (
     PageFlight,
@@ -138,8 +137,7 @@ def picture(row: Mapping[str, Any], file: FrameFile, record: ReleaseRecord) -> n
     """Give a picture of a row as colours, (h, w, 3) uint8 RGB."""
     where, cell = f"{row['sample_id']}: {COLUMNS[file].name}", row[COLUMNS[file].name]
     if file == "depth":
-        assert record.depth is not None, "build writes it with depth"
-        return depth_colors(depth_of(cell or b"", record.depth, where))
+        return depth_colors(depth_values(cell or b"", Path(where)))
     data = (cell or {}).get("bytes") or b""
     if file == "rgb":
         return cv2.cvtColor(parse_picture(data, where), cv2.COLOR_BGR2RGB)
