@@ -50,10 +50,6 @@ STATES: tuple[SentenceState, ...] = get_args(SentenceState)
 CAPTION_FIELDS = tuple(f"caption_{language}_{name}" for language in LANGUAGES for name in FIELDS)
 TARGET_PICTURE = "target_picture"
 COMPANY_COLUMNS = ("others_in_view", "other_distance_m", "other_id", "alike_id", "alike_differences")  # frames.COMPANY
-CAPTION_SHARES = (
-    "proved_en",
-    "proved_zh",
-)  # of the sentences, those that the geometry proves; null where none was judged
 WINDOW, PICTURE_PX = "caption_window", "caption_picture_px"
 ReleasedCaption = dict[str, Any]  # name of a column of CAPTION -> value
 PLACE = ("run", "town", "trajectory", "variant")  # what a flight is told from others by
@@ -211,17 +207,8 @@ def _decision(caption: Caption) -> str | None:
     return None if coc is None else coc.flight_decision
 
 
-def _share(language: Language, caption: Caption) -> float | None:
-    return caption.coverage(language)
-
-
 def _states(language: Language, caption: Caption) -> list[SentenceState] | None:
     return (caption.checks.sentences or {}).get(language)
-
-
-def _sentences(language: Language, state: SentenceState, caption: Caption) -> int | None:
-    states = _states(language, caption)
-    return None if states is None else states.count(state)
 
 
 def _text(language: Language, name: str, caption: Caption) -> str | None:
@@ -394,18 +381,7 @@ CAPTION = (  # what a row holds of an accepted caption, and nulls where there is
         "writing", "string", of_caption=lambda c: c.writing, words=get_args(Writing), required=True,
         title="written as", counted=True, shown=True,
     ),
-    *(
-        Column(name, "float64", of_caption=partial(_share, language), ranges=NONE_TO_ONE)
-        for language, name in zip(LANGUAGES, CAPTION_SHARES, strict=True)
-    ),
-    *(  # of its sentences, those that the geometry proves, contradicts, leaves unread; null where none was judged
-        Column(
-            f"{state}_sentences_{language}", "int32",
-            of_caption=partial(_sentences, language, state),
-        )
-        for language in LANGUAGES for state in STATES
-    ),
-    *(
+    *(  # of each sentence, whether the geometry proves it, contradicts it, or leaves it unread
         Column(f"sentence_states_{language}", "texts", of_caption=partial(_states, language))
         for language in LANGUAGES
     ),

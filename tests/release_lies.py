@@ -242,8 +242,6 @@ def with_poses(own: Rows, others: Rows) -> None:
 
 CAPTION = [
     "decision", "label", "label_from", "verdict", "repair_strategy", "teacher_kind", "teacher_model", "writing",
-    "proved_en", "proved_zh",
-    *(f"{state}_sentences_{lang}" for state in ("proved", "contradicted", "unread") for lang in ("en", "zh")),
     "sentence_states_en", "sentence_states_zh",
     *(f"caption_{lang}_{name}" for lang in ("en", "zh") for name in FIELDS),
     "system_en", "system_zh", "prompt_en", "prompt_zh",

@@ -25,5 +25,5 @@ def make_row(i: int, variant: str = "ORI", trajectory: str = "trajectory_1", **c
         "target_visible": True, "has_caption": i % 2 == 0,
     }  # fmt: skip
     if row["has_caption"]:
-        row |= dict.fromkeys((*COUNTED, *CAPTION_FIELDS), "word") | WORDS | {"proved_en": 0.5}
+        row |= dict.fromkeys((*COUNTED, *CAPTION_FIELDS), "word") | WORDS | {"sentence_states_en": ["proved", "unread"]}
     return row | change

@@ -98,8 +98,7 @@ def test_load_dataset_gives_pictures_poses_and_both_languages(loaded, release_in
     for row in captioned:
         assert row["writing"] == "slots"
         assert row["caption_picture_px"] == [96, 54]
-        assert row["proved_en"] == (0.5 if row["frame_index"] % 2 else None)
-        assert row["proved_zh"] is None
+        assert row["sentence_states_zh"] is None
     bare = loaded.filter(lambda row: not row["has_caption"])
     assert bare[0]["caption_en_reasoning_trace"] is None
     assert bare[0]["caption_window"] is bare[0]["caption_picture_px"] is bare[0]["target_mask_bbox"] is None

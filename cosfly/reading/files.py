@@ -16,7 +16,7 @@ import logging
 import os
 import stat
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path, PosixPath
 
 from cosfly.errors import InputError
@@ -105,27 +105,6 @@ def read_bytes(
     """
     with open_file(path, what=what, fix=fix, tree=tree) as file, disk_errors(path, what, fix):
         return file.read(_size_within(file, path, most_mb, split))
-
-
-def read_into(
-    path: Path,
-    target: Callable[[int], memoryview],
-    *,
-    what: str = "file",
-    fix: str = CHECK_PATH,
-    tree: Path | None = None,
-) -> int:
-    """Read a whole file into memory that is used again and again; gives its size.
-
-    Args:
-        target: gives room for so many bytes.
-    """
-    with open_file(path, what=what, fix=fix, tree=tree) as file, disk_errors(path, what, fix):
-        size = _size_within(file, path)
-        found = file.readinto(target(size))
-    if found != size:
-        raise InputError(f"the {what} became shorter while it was read", where=path, got=f"{found} bytes", fix=fix)
-    return size
 
 
 def read_span(path: Path, first: int, size: int, *, what: str = "file", fix: str = CHECK_PATH) -> bytes:

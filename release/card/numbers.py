@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 from cosfly.errors import InputError
 from cosfly.products.coverage import AXES, Coverage, axis_values
 from cosfly.reading.tables import arrow_errors, num_rows, open_table, row_groups
-from release.columns import CAPTION_FIELDS, CAPTION_SHARES, COUNTED, PICTURES, PLACE, POINT, REQUIRED, schema
+from release.columns import CAPTION_FIELDS, COUNTED, LANGUAGES, PICTURES, PLACE, POINT, REQUIRED, schema
 from release.record import CaptionNumbers, FileNumbers, FramesBy, Numbers, Spread
 
 DIGITS = 4
@@ -29,10 +29,11 @@ LARGEST = 1e9  # of a value: beyond any town, flight and picture
 # Columns of yes and no whose frames are counted.
 FLAGS = ("is_perturbed", "target_in_view", "target_visible", "target_legible", "has_caption")
 COVERED = ("style", "pace", "label")
+PROVED = {f"proved_{language}": f"sentence_states_{language}" for language in LANGUAGES}  # mean -> column
 COLUMNS = [
     "sample_id", *PLACE, "track", "style", "pace", "weather", "time_of_day", "frame_index", "time_s", "width_px",
     "height_px", "fov_deg", "pose", "drone_offset", "target",
-    "target_heading_deg", "target_mask_bbox", "visibility", *FLAGS, *COUNTED, *CAPTION_SHARES, *CAPTION_FIELDS,
+    "target_heading_deg", "target_mask_bbox", "visibility", *FLAGS, *COUNTED, *PROVED.values(), *CAPTION_FIELDS,
 ]  # fmt: skip
 SCHEMA = schema(tuple(PICTURES))
 Place3 = tuple[float, float, float]  # m
@@ -176,7 +177,7 @@ def clean_place(row: Mapping[str, Any]) -> Place3 | None:
     return x, y, z
 
 
-SUMS = ("height_m", "distance_m", "visibility", *CAPTION_SHARES)
+SUMS = ("height_m", "distance_m", "visibility", *PROVED)
 
 
 @dataclass
@@ -230,9 +231,8 @@ class RowCounts:
         if target is not None:
             self.sums["height_m"].add(offset[2])
             self.sums["distance_m"].add(math.hypot(*offset))
-        for name in ("visibility", *CAPTION_SHARES):
-            if row[name] is not None:
-                self.sums[name].add(row[name])
+        if row["visibility"] is not None:
+            self.sums["visibility"].add(row["visibility"])
         if row["has_caption"]:
             self._add_caption(row)
         height_px = None if box is None else box["ymax_px"] - box["ymin_px"]
@@ -244,6 +244,9 @@ class RowCounts:
             self.counts[name]["none" if row[name] is None else row[name]] += 1
         self.totals["with_label"] += row["label"] is not None
         self.totals["decision_equals_label"] += row["label"] is not None and row["decision"] == row["label"]
+        for name, column in PROVED.items():
+            if states := row[column]:
+                self.sums[name].add(states.count("proved") / len(states))
         texts = {name: row[name] for name in CAPTION_FIELDS}
         self.example = self.example or {"sample_id": row["sample_id"], **texts}
         self.characters.update({name: len(text or "") for name, text in texts.items()})
@@ -290,7 +293,7 @@ class RowCounts:
             with_label=self.totals["with_label"],
             decision_equals_label=self.totals["decision_equals_label"],
             frames_by={name: _sorted(self.counts[name]) for name in COUNTED},
-            mean_proved={name: self.sums[name].spread().mean for name in CAPTION_SHARES},
+            mean_proved={name: self.sums[name].spread().mean for name in PROVED},
             mean_characters={
                 name: round(characters[name] / num_captions, 1) if num_captions else None for name in CAPTION_FIELDS
             },

@@ -1,7 +1,6 @@
 """One shard: the frames of some flights, read once, held against their digests and written as parquet.
 
-A worker writes whole shards, so that no byte is written twice, and pictures are read into memory that is used again:
-parquet takes them from there.
+A worker writes whole shards, so that no byte is written twice.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 from pydantic import BaseModel
 
 from cosfly.errors import CosflyError, InputError, VerifyError
@@ -31,14 +29,14 @@ from cosfly.products.frames import (
 )
 from cosfly.products.playback import TARGET_FILE, Flight
 from cosfly.reading.arrays import PNG_HEADER_BYTES, PNG_SIGNATURE, png_size
-from cosfly.reading.files import check_stays_below, sha256_file
+from cosfly.reading.files import check_stays_below, read_bytes, sha256_file
 from cosfly.work.items import advance
 from cosfly.work.provenance import FLIGHT, digest_of, folder_digests
 from cosfly.work.store import CHECKSUMS, atomic_file, read_checksums
 from release import columns
 from release.columns import Placement, ReleasedCaption, caption_values
 from release.package.captions import FlightCaptions
-from release.package.rows import HashedFile, Rows, ShardPlan, open_writer
+from release.package.rows import Rows, ShardPlan, open_writer
 from release.package.sources import Candidate
 from release.package.survey import look_of, open_flight
 from release.rules import is_whole, select_frames
@@ -53,7 +51,7 @@ PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 RENDER = "render it again, or put the file back"
 
 
-def check_picture(file: FrameFile, data: memoryview, size_px: tuple[int, int], where: Path, *, is_known: bool) -> None:
+def check_picture(file: FrameFile, data: bytes, size_px: tuple[int, int], where: Path, *, is_known: bool) -> None:
     """See that a file is whole and of its flight's size.
 
     Args:
@@ -62,7 +60,7 @@ def check_picture(file: FrameFile, data: memoryview, size_px: tuple[int, int], w
     if file == "depth":
         _check_depth(depth_values(data, where), size_px, where)
         return
-    found = png_size(bytes(data[:PNG_HEADER_BYTES]))
+    found = png_size(data[:PNG_HEADER_BYTES])
     if found is None or data[-len(PNG_END) :] != PNG_END:
         got = f"{len(data)} bytes that do not {'begin' if found is None else 'end'} as a PNG"
         raise InputError("a picture is damaged or cut short", where=where, got=got, fix=RENDER)
@@ -95,12 +93,12 @@ def _check_depth(values: np.ndarray, size_px: tuple[int, int], where: Path) -> N
         )
 
 
-def _broken_chunks(view: memoryview) -> Iterator[str]:
+def _broken_chunks(view: bytes) -> Iterator[str]:
     """Name the chunks of a PNG whose bytes are not those of their checksums."""
     at = len(PNG_SIGNATURE)
     while at + CHUNK_FRAME_BYTES <= len(view):
         end = at + CHUNK_FRAME_BYTES + int.from_bytes(view[at : at + 4], "big")
-        name = bytes(view[at + 4 : at + 8])
+        name = view[at + 4 : at + 8]
         if end > len(view) or zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
             yield repr(name.decode("latin-1"))
         at = end
@@ -150,17 +148,16 @@ def write_shard(path: Path, parts: Sequence[FlightPart], plan: ShardPlan) -> Sha
     """
     problems = _Problems()
     flights: list[ReleasedPart] = []
-    with atomic_file(path) as file, HashedFile(file) as hashed:
-        with open_writer(pa.PythonFile(hashed, mode="w"), columns.schema(plan.files)) as writer:
+    with atomic_file(path) as file:
+        with open_writer(file, columns.schema(plan.files)) as writer:
             rows = Rows(writer, plan)
             for part in parts:
                 with problems.collected():
                     flights.append(_write_flight(part, plan, rows, problems))
             rows.flush()
         problems.raise_any()
-        size, sha256 = hashed.finish()
     num_rows = sum(flight.frames for flight in flights)
-    return ShardResult(rows=num_rows, bytes=size, sha256=sha256, flights=flights)
+    return ShardResult(rows=num_rows, bytes=path.stat().st_size, sha256=sha256_file(path), flights=flights)
 
 
 def _write_flight(part: FlightPart, plan: ShardPlan, rows: Rows, problems: _Problems) -> ReleasedPart:
@@ -178,11 +175,14 @@ def _write_flight(part: FlightPart, plan: ShardPlan, rows: Rows, problems: _Prob
                 check_stays_below(frame, tree)
             _check_digest(folder, f"{frame_name(i)}/{META}", None, digests)
             placement = replace(part.placement, look=look_of(flight, i))
+            pictures = dict[FrameFile, bytes]()
             for file in plan.files:
                 path = frame_path(frame, FILE_NAMES[file])
-                data = _read_picture(flight, path, file, tree, rows, is_known=bool(digests))
-                _check_digest(folder, f"{frame_name(i)}/{path.name}", data, digests)
-            rows.add(columns.scalar_row(flight, i, captions.get(i), placement), flight, i, keep=not problems.errors)
+                pictures[file] = _read_picture(flight, path, file, tree, is_known=bool(digests))
+                _check_digest(folder, f"{frame_name(i)}/{path.name}", pictures[file], digests)
+            scalars = columns.scalar_row(flight, i, captions.get(i), placement)
+            if not problems.errors:  # else nothing will be written any more
+                rows.add(scalars, pictures, flight, i)
         advance()
     return ReleasedPart(
         name=part.candidate.name, frames=len(selected), frames_available=len(flight), captions=len(captions),
@@ -250,7 +250,7 @@ def _digests(candidate: Candidate) -> dict[str, str]:
     return digests
 
 
-def _check_digest(folder: Path, name: str, data: memoryview | None, digests: Mapping[str, str]) -> None:
+def _check_digest(folder: Path, name: str, data: bytes | None, digests: Mapping[str, str]) -> None:
     """Compare a file, of which `data` was read, with its digest where there is one."""
     if not digests or (data is None and not (folder / name).is_file()):
         return
@@ -261,12 +261,13 @@ def _check_digest(folder: Path, name: str, data: memoryview | None, digests: Map
         raise VerifyError(what, where=folder / name, got=got, expected=expected, fix=ANEW)
 
 
-def _read_picture(flight: Flight, path: Path, file: FrameFile, tree: Path, rows: Rows, *, is_known: bool) -> memoryview:
-    """Read a picture into its column, and see that it is what it must be.
+def _read_picture(flight: Flight, path: Path, file: FrameFile, tree: Path, *, is_known: bool) -> bytes:
+    """Read a picture, and see that it is what it must be.
 
     Args:
         is_known: its digest will be compared.
     """
-    data = rows.pictures[file].read(path, tree if path.is_symlink() else None)  # its folder was looked at
+    inside = tree if path.is_symlink() else None  # its folder was looked at
+    data = read_bytes(path, what="frame's file", fix="render it again", tree=inside)
     check_picture(file, data, (flight.camera.width_px, flight.camera.height_px), path, is_known=is_known)
     return data

@@ -16,14 +16,13 @@ from typing import Any
 from cosfly.products.captions import FIELDS
 from cosfly.products.walks import TARGET_HEIGHT_M
 from release.card.numbers import Place3, Sum, bounded, clean_place
-from release.columns import BOX, LANGUAGES, PLACE, POINT, POSE, SCALARS, STATES
+from release.columns import BOX, LANGUAGES, PLACE, POINT, POSE, SCALARS
 
 SAME_FOV_DEG = 0.05
 LEAST_STEP_S = 1e-3  # between two frames
 STATES_OF = {  # shifted, turned
     (False, False): "unperturbed", (True, False): "position only", (False, True): "rotation only", (True, True): "full",
 }  # fmt: skip
-LOOK = "sun {sun_azimuth_deg:g} deg, {sun_elevation_deg:g} deg high; haze {haze_m:g} m; exposure {exposure:g}"
 TEXT_BIN = {"en": 25, "zh": 10}  # characters
 # What a frame may be annotated with: a name, and the column that holds it.
 ANNOTATIONS = {column.title: column.name for column in SCALARS if column.annotation}
@@ -143,12 +142,9 @@ class Counts:
     verdicts: Counter[tuple[str, str]] = field(default_factory=Counter)  # verdict, track
     repairs: Counter[str] = field(default_factory=Counter)
     sentences: Counter[tuple[str, str]] = field(default_factory=Counter)  # language, state
-    # Language, what the sentences of a caption are together.
-    whole: Counter[tuple[str, str]] = field(default_factory=Counter)
     lengths: dict[tuple[str, str], Sum] = field(default_factory=lambda: defaultdict(Sum))  # language, field
     length_bins: Counter[tuple[str, str, int]] = field(default_factory=Counter)
     weather: Counter[tuple[str | None, str | None]] = field(default_factory=Counter)
-    looks: Counter[str] = field(default_factory=Counter)
     events: Counter[tuple[str, str, str]] = field(default_factory=Counter)  # track, event, outcome
     states: Counter[str] = field(default_factory=Counter)  # of perturbed flights: which of the two offsets are not zero
     styles: Counter[str] = field(default_factory=Counter)
@@ -168,8 +164,6 @@ class Counts:
             self.step_s[round(row["time_s"] - self.last[2], 3)] += 1
         self.last = (place, row["frame_index"], row["time_s"])
         self.weather[row["weather"], row["time_of_day"]] += 1
-        if row["look"] is not None:
-            self.looks[LOOK.format(**row["look"])] += 1
         self._over_frames(row)
         self._perturbed(row)
         if row["has_caption"]:
@@ -195,13 +189,6 @@ class Counts:
             walker_m = 0.0 if walker is None else math.hypot(*(walker[name] for name in POINT))
             is_shifted, is_turned = shift_m > 0.0 or walker_m > 0.0, turn_deg > 0.0
             self.states[STATES_OF[is_shifted, is_turned]] += 1
-            for name, value in (
-                ("shift of the drone, m", shift_m),
-                ("shift of the person, m", walker_m),
-                ("turn of the view, deg", turn_deg),
-            ):
-                if value > 0.0:
-                    self.over_frames[name].add(value)
 
     def _caption(self, row: Mapping[str, Any]) -> None:
         decision, label, verdict = (row[name] or "none" for name in ("decision", "label", "verdict"))
@@ -211,13 +198,7 @@ class Counts:
         self.verdicts[verdict, row["track"]] += 1
         self.repairs[row["repair_strategy"] or "none: the first answer stood"] += 1
         for language in LANGUAGES:
-            counts = {state: row[f"{state}_sentences_{language}"] for state in STATES}
-            if all(count is not None for count in counts.values()):
-                for state, count in counts.items():
-                    self.sentences[language, state] += count
-                kind = "some unread" if counts["unread"] else "all proved"
-                kind = "a contradicted one" if counts["contradicted"] else kind
-                self.whole[language, kind] += 1
+            self.sentences.update((language, state) for state in row[f"sentence_states_{language}"] or ())
             for name in FIELDS[:2]:
                 length = len(row[f"caption_{language}_{name}"] or "")
                 self.lengths[language, name].add(length)

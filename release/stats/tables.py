@@ -25,8 +25,6 @@ Rows = list[list[Cell]]
 Plot = Literal["bars", "stacked", "heat"]
 REVIEW_BELOW = 0.5  # of the smoothness score (sec:step6)
 VERDICTS = ("CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN")
-MOST_LOOKS = 40
-WHOLE = ("all proved", "a contradicted one", "some unread")  # what the sentences of a caption are together
 
 
 class Table(BaseModel):
@@ -84,7 +82,6 @@ SHAPES: dict[str, tuple[str, str, str, Plot | None]] = {  # of each table: title
     "repairs": ("Repairs", "fig:regen_strategy", "strategy|captions|%", "bars"),
     "teachers": ("Teachers", "tab:caption_pipeline", "|number", None),
     "evidence": ("Evidence of sentences", "", "language|" + "|".join(STATES), "stacked"),
-    "evidence_captions": ("Evidence of captions", "", "language|" + "|".join(WHOLE), "stacked"),
     "text_lengths": ("Length of the texts", "fig:coc_lengths", SPREAD.replace("axis", "text") + "|floor", None),
     **{
         f"lengths_{language}_{name}": (f"{LANGUAGE_NAMES[language]}, {name.replace('_', ' ')}: characters",
@@ -98,11 +95,8 @@ SHAPES: dict[str, tuple[str, str, str, Plot | None]] = {  # of each table: title
                   "height, px|visibility, %|IoU", None),
     "fovs": ("Fields of view", "tab:zoom_config, sec:exp_release", "degrees|trajectories|frames", "bars"),
     "weather": ("Weather and time of day", "tab:weather_coverage", "preset", "heat"),
-    "looks": ("Sun and air", "", "look|frames", None),
     "augmentation_states": ("Perturbation", "tab:augmentation_states", "state|frames|%", "bars"),
-    "offsets": ("Size of the offsets", "", SPREAD, None),
     "events": ("What became of each perturbation", "sec:exp_zoom", "track|event|outcome|frames", None),
-    "files": ("Bytes", "", "|bytes|a frame", None),
     "depth": ("Depth, percentiles", "sec:step6", "pixels nearer than|m", None),
     "semantics": ("Kinds in the pictures", "sec:step6", "kind|% of pixels|% of frames", "bars"),
 }  # fmt: skip
@@ -117,7 +111,7 @@ def make_stats(record: ReleaseRecord, counts: Counts, pixels: Pixels | None) -> 
     tables = [
         _release(record, counts), _quality(record, counts), _dist(record, counts), _frames(counts),
         *_captions(record, counts), _annotations(record, counts), _towns(record, counts), _splits(record),
-        _zoom(counts), _fovs(counts), *weather(counts), *_perturbation(counts), _files(record), *_pixels(pixels),
+        _zoom(counts), _fovs(counts), *weather(counts), *_perturbation(counts), *_pixels(pixels),
     ]  # fmt: skip
     return Stats(
         name=record.name, runs=[source.run for source in record.provenance.sources], tables=tables,
@@ -319,14 +313,8 @@ def _evidence(counts: Counts) -> list[Table]:
     if not counts.sentences:
         return []
 
-    def rows(counted: Counter[tuple[str, str]], kinds: Iterable[str]) -> Rows:
-        return [[LANGUAGE_NAMES[name], *(counted[name, kind] for kind in kinds)] for name in LANGUAGES]
-
-    note = "Sentences of the captions against the geometry of their flight."
-    return [
-        _table("evidence", rows(counts.sentences, STATES), note),
-        _table("evidence_captions", rows(counts.whole, WHOLE)),
-    ]
+    rows: Rows = [[LANGUAGE_NAMES[name], *(counts.sentences[name, state] for state in STATES)] for name in LANGUAGES]
+    return [_table("evidence", rows, "Sentences of the captions against the geometry of their flight.")]
 
 
 def _lengths(counts: Counts) -> list[Table]:
@@ -409,7 +397,7 @@ def _fov_of(flight: FlightSums) -> float:
 
 
 def weather(counts: Counts) -> list[Table]:
-    """Frames by preset and time of day where a frame names one, and sun and air where the frames tell these."""
+    """Return frames by preset and time of day, where a frame names one."""
     tables = []
     named = Counter({(_token(a), _token(b)): n for (a, b), n in counts.weather.items() if (a, b) != (None, None)})
     if named:
@@ -418,9 +406,6 @@ def weather(counts: Counts) -> list[Table]:
         rows: Rows = [[preset, *(named[preset, time] for time in times)] for preset in presets]
         pairs = f"{len(named)} of {len(presets) * len(times)} pairs are in this release."
         tables += [_table("weather", rows, f"Frames. Presets of the paper are all listed; {pairs}", times)]
-    if counts.looks:
-        looks = _pairs("", counts.looks.most_common(MOST_LOOKS))
-        tables += [_table("looks", looks, "Of the renderer's own settings.")]
     return tables
 
 
@@ -435,20 +420,10 @@ def _perturbation(counts: Counts) -> list[Table]:
         rows: Rows = _shares(((state, counts.states[state]) for state in order), total)
         note = "Frames of perturbed flights by what of their recorded offsets is not zero: after fallbacks, so fewer "
         tables += [_table("augmentation_states", rows, note + "are perturbed than were drawn.")]
-        sizes = {name: values for name, values in counts.over_frames.items() if name.endswith((", m", ", deg"))}
-        rows = [_spread_row(name, values.spread()) for name, values in sizes.items()]
-        tables += [_table("offsets", rows, "Where they are not zero.")]
     if counts.events:
         events: Rows = [[*names, count] for names, count in sorted(counts.events.items())]
         tables += [_table("events", events)]
     return tables
-
-
-def _files(record: ReleaseRecord) -> Table:
-    files, frames = record.numbers.files, max(1, record.numbers.frames)
-    sizes = {**files.bytes_by_modality, "all shards": files.bytes}
-    rows: Rows = [[name, size, round(size / frames, 1)] for name, size in sizes.items()]
-    return _table("files", rows, f"{files.shards} shards.")
 
 
 def _pixels(pixels: Pixels | None) -> list[Table]:

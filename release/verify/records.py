@@ -80,6 +80,8 @@ def _splits(record: ReleaseRecord) -> Iterator[Comparison]:
         yield "split", f"splits.{name}", told.get(name), counted.get(name)
         frames = told[name].frames if name in told else 0
         yield "split", f"splits.{name}.frames", frames, sum(s.rows for s in record.shards if s.split == name)
+    for town in sorted(set(record.numbers.frames_by.town) - {one.town for one in record.maps}):
+        yield "licence", f"maps: {town}", None, "name, licence and credits of the town's map"
     total = sum(split.captions for split in record.splits.splits.values())
     yield "split", "splits: captions", total, record.numbers.captions.frames_with
 
