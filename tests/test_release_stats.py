@@ -136,7 +136,7 @@ def test_captions_are_counted_by_what_they_say():
     assert counts.labels == {"ascend": 1, "none": 1}
     assert counts.confusion == {("ascend", "hover"): 1, ("none", "hover"): 1}
     assert counts.repairs["cascade"] == 1
-    assert counts.sentences == {("en", "proved"): 3, ("en", "unread"): 1}
+    assert counts.sentences == {("en", "proved"): 4, ("en", "unread"): 2}
     assert counts.lengths["en", "reasoning_trace"].spread().max == 60.0
     assert counts.length_bins["en", "reasoning_trace", 2] == 1
 
