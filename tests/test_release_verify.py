@@ -347,7 +347,7 @@ def test_the_command_tells_people_and_machines(honest, tmp_path):
 def test_a_frame_that_is_missing_in_a_tree_is_found(honest_run, tmp_path):
     tree = shutil.copytree(honest_run / "render", tmp_path / "tree")
     (find_flights(tree)[0] / "frames_playback/frame_00003/rgb.png").unlink()
-    assert {"missing", "picture"} <= set(errors_in(tree))
+    assert {"unreadable", "picture"} <= set(errors_in(tree))
 
 
 # --- trees --
