@@ -29,16 +29,6 @@ _OF_LEROBOT = (
 # LeRobot's own pins ask for another torch; what reads data sets works with ours, so the packages are named one by one.
 LEROBOT = ("lerobot==0.4.4", "datasets==4.4.1", "av==15.1.0", *_LIGHT.split(), *_OF_LEROBOT.split())
 
-# An S3 server, and what fsspec opens s3:// with; of the server only what its S3 part asks for.
-S3 = (
-    "s3fs==2026.9.0", "fsspec==2026.9.0", "aiobotocore==3.10.0", "aioitertools==0.13.0", "botocore==1.43.117",
-    "boto3==1.43.117", "s3transfer==0.19.3", "jmespath==1.1.0", "wrapt==2.5.2", "aiohttp==3.14.5",
-    "multidict==7.2.1", "yarl==1.25.1", "frozenlist==1.8.0", "aiosignal==1.4.0", "aiohappyeyeballs==2.7.1",
-    "propcache==0.5.4", "attrs==26.1.0", "moto==5.2.5", "Werkzeug==3.1.9", "Flask==3.1.3", "flask-cors==6.0.5",
-    "blinker==1.9.0", "itsdangerous==2.2.0", "xmltodict==1.0.4", "responses==0.26.3", "py-partiql-parser==0.6.3",
-    "cryptography==50.0.2", "cffi==2.1.1",
-)  # fmt: skip
-
 
 def python_with(pins: tuple[str, ...]) -> Path:
     """Give the interpreter of an environment with these packages; skips the test only where no registry can be

@@ -34,7 +34,7 @@ from cosfly.work.stage_events import (
 )
 from cosfly.work.stage_folder import Failed
 from cosfly.work.worker import signals_held_back
-from cosfly.work.worker_pool import WorkerPool, limit_s
+from cosfly.work.worker_pool import limit_s
 
 # Stands still after 2 s, and a while before its item has taken too long, or chance would say which of them it was.
 QUICK = Watch(item_limit_s=3.2, heartbeat_s=0.1, check_s=0.4, probe_s=0.3, failed_checks=5)
@@ -210,30 +210,6 @@ def test_progress_is_told_in_steps_where_all_items_know_theirs(tmp_path, monkeyp
     assert done + sum(moves) == total
     if workers and expected == 21:
         assert -7 in moves, "begun again"
-
-
-def test_a_message_of_one_worker_is_no_reason_to_look_at_all(tmp_path, monkeypatch):
-    """Twelve thousand workers tell every two seconds that they live."""
-    looked_at, hand_out = list[int](), WorkerPool._hand_out
-
-    def watched(pool: WorkerPool, places: range) -> None:
-        looked_at.append(len(places))
-        hand_out(pool, places)
-
-    monkeypatch.setattr(WorkerPool, "_hand_out", watched)
-    watch = Watch(heartbeat_s=0.02, probe_s=60.0, check_s=60.0)
-    found = run_items(
-        stage_in(tmp_path),
-        [Item(f"{k}") for k in range(200)],
-        make_counting_worker,
-        (tmp_path,),
-        workers=4,
-        watch=watch,
-    )
-    assert found.tally.kept == 200
-    assert looked_at[0] == 4
-    assert looked_at.count(4) <= 3  # and at a probe or a check
-    assert looked_at.count(1) >= 200
 
 
 # --- events -----------------------------------------------------------------------------------------------------------

@@ -14,12 +14,12 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
-from pydantic import BeforeValidator, Field, ValidationInfo, WrapSerializer, field_validator, model_validator
+from pydantic import BeforeValidator, Field, WrapSerializer, field_validator, model_validator
 
 from cosfly.errors import ConfigError, InputError, nearest
 from cosfly.reading.documents import FileFormat, read_model
 from cosfly.reading.files import read_bytes
-from cosfly.work.config import LEFT_OUT, Config, build, read_yaml
+from cosfly.work.config import Config, build, read_yaml
 from cosfly.work.store import write_bytes, write_model
 
 ACTIONS_FILE = Path(__file__).with_name("actions.yaml")
@@ -131,8 +131,8 @@ class Rule(Config):
         return texts
 
     @model_validator(mode="after")
-    def _says_something(self, info: ValidationInfo) -> Self:
-        if not (self.size or self.where or self.unless) and info.context != LEFT_OUT:
+    def _says_something(self) -> Self:
+        if not (self.size or self.where or self.unless):
             raise ValueError("a rule needs a size, where or unless")
         return self
 

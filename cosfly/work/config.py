@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import importlib.resources
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
@@ -18,7 +18,6 @@ MOST_LISTED = 15  # names of settings in a message
 MOST_ELSEWHERE = 3  # places of an unknown name, as in "did you mean plan.x or render.x"
 MOST_PARTS = 32  # of a setting's name
 # What validators are given as context where wrong values were left out: then what is lacking is nobody's mistake.
-LEFT_OUT = {"wrong values": "left out"}
 
 T = TypeVar("T")
 
@@ -95,43 +94,10 @@ def build(model: type[C], data: dict, source: str | Path) -> C:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        details = error.errors()
-        problems = [_problem(model, detail) for detail in details] + _hidden(model, data, details)
+        problems = [_problem(model, detail) for detail in error.errors()]
         raise ConfigError(
             "; ".join(problems), where=source, fix=f"{len(problems)} to mend" if len(problems) > 1 else None
         ) from None
-
-
-def _hidden(model: type[BaseModel], data: dict, details: Sequence[Any]) -> list[str]:
-    """Give what is wrong across settings, which pydantic asks only where each is right: what is not is left out.
-
-    Nothing is said across a group of which a wrong value was left out: its default there is nobody's choice.
-    """
-    data, wrong = copy.deepcopy(data), set[tuple]()
-    unknown: dict[tuple, str] = {}
-    for detail in details:
-        *above, last = detail["loc"] or ("",)
-        group: Any = data
-        for part in above:
-            group = group[part] if isinstance(group, dict) and part in group else None
-        if not isinstance(group, dict) or last not in group:
-            continue  # missing, in a list, or the tag of a union
-        del group[last]
-        if detail["type"] == "extra_forbidden":
-            unknown[tuple(above)] = ".".join(map(str, detail["loc"]))
-        else:
-            wrong.add(tuple(above))
-    if not unknown and not wrong:
-        return []
-    try:
-        model.model_validate(data, context=LEFT_OUT)
-    except ValidationError as error:
-        known = {detail["loc"] for detail in details}
-        across = [d for d in error.errors() if d["type"] == "value_error" and d["loc"] not in known | wrong]
-        return [_problem(model, d) + (f" (without {unknown[d['loc']]})" if d["loc"] in unknown else "") for d in across]
-    except ConfigError as error:  # of a town
-        return [f"{error.where}: {error.what}"]
-    return []
 
 
 def load(model: type[C], path: Path | None, overrides: Iterable[str] = ()) -> C:

@@ -17,7 +17,7 @@ import statistics
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from multiprocessing import resource_tracker
@@ -197,17 +197,12 @@ class WorkerPool:
         self.events.tell("began", workers=self.num_workers)
         self._fresh, self._num_fresh = enumerate(items), len(items)
         next_check_s, next_probe_s = time.monotonic() + self.watch.check_s, time.monotonic()
-        places = everywhere = range(self.num_workers)
         try:
             while self._num_fresh or self._again or self._alone or self._busy():
-                self._hand_out(places)
-                places = everywhere
+                self._hand_out()
                 for worker, message in self._told(min(next_check_s, next_probe_s)):
                     yield from self._hear(worker, message)
-                    if message is not None:  # of thousands who tell that they live, none but this one can be free now
-                        places = range(worker.place, worker.place + 1)
                 if (now_s := time.monotonic()) >= next_probe_s:
-                    places = everywhere
                     next_probe_s = now_s + self.watch.probe_s
                     self.events.probe(
                         {w.place: seen for w in self._workers.values() if w.post.pid and (seen := w.post.look())}
@@ -226,9 +221,9 @@ class WorkerPool:
     def _busy(self) -> list[_Worker]:
         return [worker for worker in self._workers.values() if worker.attempt is not None]
 
-    def _hand_out(self, places: Iterable[int]) -> None:
-        """Give every free worker of these places an item, and start those that are missing."""
-        for place in places:
+    def _hand_out(self) -> None:
+        """Give every free worker an item, and start those that are missing."""
+        for place in range(self.num_workers):
             worker = self._workers.get(place) or (self._start(place) if self._is_short() else None)
             if worker is None or worker.attempt is not None or worker.post.pid is None:
                 continue
