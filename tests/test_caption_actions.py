@@ -6,7 +6,6 @@ import dataclasses
 from itertools import pairwise
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from specimens_captions import ACTION_TABLE
@@ -99,15 +98,6 @@ def test_label_of_a_known_future(motion, label):
     assert ACTION_TABLE.label_of(measure(future(**motion))) == label
 
 
-@pytest.mark.parametrize("order", ["break_off", "return_to_home"])
-@pytest.mark.parametrize("motion", [{"forward": 3.0}, {"forward": -4.0}, {"visible": 0}])
-def test_an_order_is_the_label_whatever_is_flown(order, motion):
-    ordered = measure(dataclasses.replace(future(**motion), order=order))
-    assert ACTION_TABLE.label_of(ordered) == order
-    assert not ACTION_TABLE.is_contradicted(order, ordered)
-    assert ACTION_TABLE.label_of(measure(future(**motion))) != order
-
-
 STEADY = {"forward": 3.0, "target_step": (0.6, 0.0)}  # straight and level behind a walker
 
 HARD = [  # the opposite, then what is plainly not there
@@ -148,35 +138,6 @@ def test_contradiction_of_each_action(decision, motion):
     assert ACTION_TABLE.verdict_of(decision, measured, ACTION_TABLE.label_of(measured)) == "HARD_CONFLICT"
 
 
-def test_soft_and_abstain_and_consistent():
-    straight = measure(future(forward=3.0, target_step=(0.6, 0.0)))
-    assert ACTION_TABLE.verdict_of("track_straight", straight, "track_straight") == "CONSISTENT"
-    assert ACTION_TABLE.verdict_of("yaw_left_to_follow", straight, "track_straight") == "SOFT_CONFLICT"
-    vague = measure(future(left=0.4, forward=0.3, up=0.6))
-    assert ACTION_TABLE.label_of(vague) is None
-    assert ACTION_TABLE.verdict_of("yaw_left_to_follow", vague, None) == "ABSTAIN"
-    assert ACTION_TABLE.verdict_of("descend", vague, None) == "HARD_CONFLICT"  # a contradiction needs no label
-
-
-SOFT = [
-    ("yaw_left_to_follow", STEADY),  # the paper's example: a small correction that the flight did not make
-    ("yaw_right_to_follow", {**STEADY, "turn_deg": 2.9}),
-    ("track_straight", {"up": 2.0}),
-    ("hover", {"forward": 1.0}),
-    ("ascend", {**STEADY, "up": 0.26}),
-    ("strafe_left", {**STEADY, "left": 0.26}),
-    ("speed_up", {"left": -2.5, "before_mps": 0.0}),  # it does gain speed
-    ("circle_left", {"left": 2.0, "turn_deg": -6.0, "target_step": (0.5, 0.0)}),
-    ("move_forward", STEADY),
-]
-
-
-@each(("decision", "motion"), SOFT)
-def test_another_decision_of_which_there_is_something_is_a_soft_conflict(decision, motion):
-    measured = measure(future(**motion))
-    assert ACTION_TABLE.verdict_of(decision, measured, ACTION_TABLE.label_of(measured)) == "SOFT_CONFLICT"
-
-
 def test_share_zero_leaves_only_the_opposite_as_a_contradiction():
     lenient = LabelConfig(absent_share=0.0)
     for up, verdict in ((0.1, "SOFT_CONFLICT"), (-0.1, "HARD_CONFLICT")):
@@ -192,13 +153,6 @@ def test_share_zero_leaves_only_the_opposite_as_a_contradiction():
         table_of(shipped_actions(), lenient).verdict_of("hover", measure(future(**STEADY)), "track_straight")
         == "HARD_CONFLICT"
     )
-
-
-def test_unknown_target_leaves_the_other_labels_alone():
-    base = future(forward=3.0, turn_deg=5.0)
-    blind = dataclasses.replace(base, targets_m=np.full((6, 3), np.nan))
-    assert ACTION_TABLE.label_of(measure(blind)) == "yaw_left_to_follow"
-    assert ACTION_TABLE.label_of(measure(dataclasses.replace(blind, yaw_deg=np.zeros(6)))) == "track_straight"
 
 
 # --- properties -------------------------------------------------------------------------------------------------------
@@ -286,13 +240,3 @@ def test_what_is_implied_is_never_contradicted(drawn):
     if label is not None:
         assert not ACTION_TABLE.is_contradicted(label, motion)
         assert ACTION_TABLE.shown[label][0](motion) >= 1.0
-
-
-@given(futures())
-def test_geometry_never_orders_a_mission(drawn):
-    assert ACTION_TABLE.label_of(measure(drawn)) not in ("break_off", "return_to_home")
-
-
-def test_thresholds_that_contradict_each_other_are_refused():
-    with pytest.raises(ValueError, match="hover would contradict itself"):
-        LabelConfig(hover_mps=2.0)

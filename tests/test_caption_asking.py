@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import errno
-import io
 import json
-import logging
 import random
 import subprocess
 import sys
@@ -15,18 +12,14 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 from specimens_captions import deciding, report_of, settings
 from teacher_server import is_mirror, kept_answers
 
-from caption.run.progress import Display
 from caption.run.stage import run
-from cosfly.chat import answers, client
-from cosfly.chat.answers import Answer, AnswerBook, journal_name
-from cosfly.chat.budget import Budget, BudgetConfig, BudgetSpent
-from cosfly.chat.protocol import encode_body
-from cosfly.errors import InputError, TeacherError
-from cosfly.products.captions import Usage, read_captions
+from cosfly.chat import client
+from cosfly.chat.answers import Answer, AnswerBook
+from cosfly.errors import TeacherError
+from cosfly.products.captions import read_captions
 from cosfly.work.journal import Journal
 from specimens import make_playback_tree
 
@@ -99,50 +92,6 @@ def test_a_budget_stops_the_run_before_it_is_passed_and_a_larger_one_goes_on(tre
     assert len(server.bodies) == 44
 
 
-def test_a_budget_needs_a_server_that_counts_and_a_price():
-    with pytest.raises(ValueError, match="needs price"):
-        BudgetConfig(max_cost=1.0)
-    budget = Budget(BudgetConfig(max_tokens=10), Counter(), first_prompt=4, first_completion=1)
-    assert asyncio.run(num_at_once(budget, [0] * 5)) == 2
-    with pytest.raises(TeacherError, match="reports no token usage"):
-        budget.note(None, "http://x")
-
-
-async def num_at_once(budget: Budget, nums_pictures: list[int]) -> int:
-    """Give how many requests are let through at once; the others wait, and follow."""
-    held, most = 0, 0
-
-    async def hold(num_pictures: int) -> None:
-        nonlocal held, most
-        async with budget.request(num_pictures):
-            held, most = held + 1, max(most, held + 1)
-            await asyncio.sleep(0.01)
-            held -= 1
-
-    await asyncio.gather(*map(hold, nums_pictures))
-    return most
-
-
-def test_a_request_that_would_not_fit_alone_ends_the_budget_and_one_that_would_waits():
-    used = Counter(prompt_tokens=6)
-    budget = Budget(BudgetConfig(max_tokens=10), used, first_prompt=4, first_completion=1)
-    with pytest.raises(BudgetSpent, match="6 of at most 10"):
-        asyncio.run(num_at_once(budget, [0]))
-    used.clear()
-    assert asyncio.run(num_at_once(budget, [0] * 5)) == 2
-
-
-def test_what_a_judge_took_is_no_measure_of_a_request_with_pictures():
-    """After a restart the first answer may be a judge's, all before it being known."""
-    used = Counter()
-    budget = Budget(BudgetConfig(max_tokens=1500), used, first_prompt=900, first_completion=100)
-    assert asyncio.run(num_at_once(budget, [0])) == 1
-    budget.note(Usage(prompt_tokens=10, completion_tokens=5), "http://x")
-    assert asyncio.run(num_at_once(budget, [15, 15])) == 1
-    budget.note(Usage(prompt_tokens=400, completion_tokens=50), "http://x", 15)
-    assert asyncio.run(num_at_once(budget, [15, 0, 15])) == 3  # now both kinds are known
-
-
 # --- what failed ------------------------------------------------------------------------------------------------------
 
 
@@ -172,28 +121,6 @@ def test_the_quarantine_is_replayed_alone(tree, tmp_path, whole):
     assert (out / "manifest.json").exists()
 
 
-def test_retry_failed_leaves_alone_what_was_never_asked(tree, tmp_path, whole):
-    out = tmp_path / "out"
-    state = {"on": True}
-
-    def fault(number, body):
-        return "500" if state["on"] and number >= 12 else None
-
-    with deciding(fault=fault) as server:
-        endpoint = {"stop_after_failures": 2, "concurrency": 1}
-        with pytest.raises(TeacherError, match="in a row"):
-            run(settings(server.url, endpoint=endpoint), tree, out)
-        held = [json.loads(line)["id"] for line in (out / "quarantine.jsonl").read_text().splitlines()]
-        answered = {record["sample_id"] for record in kept_answers(out)}
-        assert 2 <= len(held) <= 4
-        state["on"] = False
-        run(settings(server.url), tree, out, retry_failed=True)
-        now = {record["sample_id"] for record in kept_answers(out)}
-        assert now == answered | set(held)
-        assert not (out / "manifest.json").exists()
-        assert run(settings(server.url), tree, out).read_bytes() == whole
-
-
 def test_the_total_timeout_bounds_all_tries(tree, tmp_path, monkeypatch):
     monkeypatch.setattr(client, "FIRST_PAUSE_S", 0.3)
     monkeypatch.setattr(client, "LONGEST_PAUSE_S", 0.3)
@@ -206,59 +133,10 @@ def test_the_total_timeout_bounds_all_tries(tree, tmp_path, monkeypatch):
         assert 1 <= len(server.bodies) <= 4
 
 
-ANSWER = {
-    "key": "k", "sample_id": "a_ORI_frame_00004", "purpose": "free/0", "model": "m", "text": "t",
-    "usage": {"prompt_tokens": 10, "completion_tokens": 2},
-    "structured": "plain", "finish_reason": "stop", "latency_s": 1.0, "time": 5.0,
-}  # fmt: skip
-
-
 # --- the request ------------------------------------------------------------------------------------------------------
 
 
-def test_a_body_is_the_json_that_it_stands_for():
-    url = "data:image/png;base64," + "QUJD" * 50
-    parts = [
-        {"type": "text", "text": 'quote " backslash \\ 中文 and \x00 0'},
-        {"type": "image_url", "image_url": {"url": url}, "uuid": "u"},
-        {"type": "image_url", "image_url": {"url": "https://example.org/a.png"}},
-        {"type": "image_url", "image_url": {"url": url + "RA=="}},
-    ]
-    body = {"model": "m", "messages": [{"role": "system", "content": "s"}, {"role": "user", "content": parts}], "n": 1}
-    assert json.loads(encode_body(body)) == body
-
-
 # --- the display ------------------------------------------------------------------------------------------------------
-
-
-def test_log_lines_stand_in_for_the_display(tree, tmp_path, caplog, monkeypatch):
-    monkeypatch.setattr("caption.run.progress.SECONDS_BETWEEN_LINES", 0.0)
-    caplog.set_level(logging.INFO, "caption.run.progress")
-    with deciding() as server:
-        run(settings(server.url, budget={"price_prompt": 10.0}), tree, tmp_path / "out")
-    last = [record.message for record in caplog.records if record.name == "caption.run.progress"][-1]
-    assert "22 of 22 windows; accepted 22 (repaired 0), dropped 0, no answer 0" in last
-    assert "tokens 44,000 in 4,400 out, cost 0.44" in last
-
-
-def test_the_panel_shows_the_bar_and_every_figure_on_lines_of_their_own():
-    used = Counter()
-    budget = Budget(BudgetConfig(price_prompt=2.0), used, first_prompt=1, first_completion=1)
-    display = Display(100, budget, lambda: 5.0)
-    display.num_accepted, display.num_repaired = 40, 3
-    display.dropped.update(structure_cut_short=2, bilingual_number=1)
-    used.update(prompt_tokens=100_000, completion_tokens=9_000, answers=88)
-    for renderable in (display.panel(), display.closing_table()):
-        file = io.StringIO()
-        Console(file=file, width=100).print(renderable)
-        text = file.getvalue()
-        for words in ("40", "structure_cut_short", "100,000 in", "9,000 out", "0.20", "windows/s"):
-            assert words in text, text
-    file = io.StringIO()
-    Console(file=file, width=100).print(display.panel())
-    lines = file.getvalue().splitlines()
-    assert "caption" not in lines[0]
-    assert lines[1].strip() == "caption: 43 of 100 windows"
 
 
 # --- the book of answers ----------------------------------------------------------------------------------------------
@@ -320,22 +198,6 @@ def test_a_start_reads_the_last_line_of_finished_flights(tmp_path, monkeypatch):
         assert book.get(flight_name(99), "no such key") is None
 
 
-@pytest.mark.parametrize(
-    ("record", "field"),
-    [
-        (ANSWER | {"usage": {"prompt_tokens": 10, "completion_tokens": 10**30}}, "usage.completion_tokens"),
-        ({name: value for name, value in ANSWER.items() if name != "key"}, "key"),
-        ({"totals": {"answers": 2, "prompt_tokens": -1, "completion_tokens": 4}}, "totals.prompt_tokens"),
-    ],
-)
-def test_a_line_that_cannot_be_used_is_named(tmp_path, record, field):
-    with Journal(tmp_path / "a_ORI.jsonl") as journal:
-        for line in (ANSWER, record, ANSWER | {"key": "l"}):
-            journal.append(line)
-    with pytest.raises(InputError, match=f"a_ORI.jsonl:2: .*{field}"):
-        AnswerBook(tmp_path)
-
-
 def test_only_flights_that_are_worked_on_are_in_memory(tmp_path):
     fill(tmp_path, 3, 4, unfinished=set())
 
@@ -352,53 +214,6 @@ def test_only_flights_that_are_worked_on_are_in_memory(tmp_path):
     asyncio.run(go_on())
     with AnswerBook(tmp_path) as book:
         assert book.totals["answers"] == 15
-
-
-def test_a_disk_that_fails_in_its_own_way_holds_nobody_up(tmp_path, monkeypatch):
-    def fails(_) -> None:
-        raise OSError(errno.ESTALE, "stale file handle")
-
-    async def put() -> None:
-        async with asyncio.timeout(30):
-            with AnswerBook(tmp_path) as book:
-                await book.put(flight_name(0), record(0, 0))
-
-    monkeypatch.setattr(Journal, "sync", fails)
-    with pytest.raises(OSError, match="stale file handle"):
-        asyncio.run(put())
-
-
-def test_many_flights_at_once_do_not_use_up_the_open_files(tmp_path, monkeypatch):
-    monkeypatch.setattr(answers, "MOST_OPEN_FILES", 4)
-
-    async def write() -> int:
-        with AnswerBook(tmp_path) as book:
-            for window in range(3):
-                await asyncio.gather(*(book.put(flight_name(flight), record(flight, window)) for flight in range(40)))
-            return sum(opened.journal._file is not None for opened in book._flights.values())
-
-    assert asyncio.run(write()) <= 4
-    with AnswerBook(tmp_path) as book:
-        assert book.totals["answers"] == 120
-        assert book.get(flight_name(39), record(39, 2).key) == record(39, 2)
-
-
-@pytest.mark.parametrize(
-    "flight", ["..", ".hidden", "a/b", "../../etc/passwd", "", "x" * 300, "nul\0", "~", "飞" * 90, "-rf"]
-)
-def test_any_flight_has_a_journal_inside_its_folder(tmp_path, flight):
-    assert (tmp_path / journal_name(flight)).resolve().parent == tmp_path.resolve()
-    assert not journal_name(flight).startswith((".", "-"))
-    assert len(journal_name(flight).encode()) < 250
-    assert journal_name("trajectory_1_ORI") == "trajectory_1_ORI.jsonl"
-
-    async def write() -> None:
-        with AnswerBook(tmp_path) as book:
-            await book.put(flight, record(0, 0))
-
-    asyncio.run(write())
-    with AnswerBook(tmp_path) as book:
-        assert book.get(flight, record(0, 0).key) == record(0, 0)
 
 
 # --- the disk ---------------------------------------------------------------------------------------------------------

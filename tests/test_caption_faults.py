@@ -6,24 +6,17 @@ one window is kept in the server's words, and asked again by `--retry-failed`.
 
 from __future__ import annotations
 
-import asyncio
 import json
-import logging
-import re
-import shutil
 import threading
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from commands import invoke
-from specimens_captions import QUICK, deciding, report_of, settings
+from specimens_captions import deciding, report_of, settings
 from teacher_server import MODEL, TeacherServer, is_mirror, refusal
 
 from caption.run.stage import run
-from cosfly.chat.client import ChatClient, EndpointConfig
-from cosfly.chat.contract import NoAnswer, Reply, started
-from cosfly.errors import ResumeError, TeacherError
+from cosfly.errors import TeacherError
 from cosfly.products.captions import read_captions
 from specimens import make_playback_tree
 
@@ -191,16 +184,6 @@ def test_retry_failed_asks_about_what_was_refused_and_nothing_else(tree, tmp_pat
     assert (out / "manifest.json").exists()
 
 
-def test_a_retry_with_a_smaller_limit_is_refused_and_leaves_the_folder_complete(tree, tmp_path, whole):
-    out = tmp_path / "out"
-    with hovering(Picky(400, FILTERED, whole.seeds[:1])) as server:
-        run(settings(server.url), tree, out)
-        before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-        with pytest.raises(ResumeError, match="more windows than the limit allows"):
-            run(settings(server.url, limit=3), tree, out, retry_failed=True)
-    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
-
-
 # --- the schema -------------------------------------------------------------------------------------------------------
 
 # How a server that takes no schema says so, and how many requests with one it is sent, one at a time.
@@ -251,82 +234,7 @@ def test_an_answer_that_the_server_had_no_room_for_is_named_and_not_asked_for_th
     assert path.read_bytes() == whole.product
 
 
-def ask(url: str, num_times: int = 1, **changes) -> Reply | NoAnswer:
-    """Ask the same, one after the other; gives what the last comes to."""
-    cfg = EndpointConfig(**{**QUICK, **changes})
-    messages = [{"role": "user", "content": [{"type": "text", "text": "t"}]}]
-    request, one = cfg.request(messages, ["digest"], {"type": "object"}, 0), ChatClient(url, cfg)
-
-    async def asked() -> Reply | NoAnswer:
-        async with started(one):
-            for _ in range(num_times):
-                try:
-                    found: Reply | NoAnswer = await one.answer(request)
-                except NoAnswer as error:
-                    found = error
-            return found
-
-    return asyncio.run(asked())
-
-
-def test_null_in_extra_body_leaves_a_field_out():
-    with hovering() as server:
-        ask(server.url, extra_body={"temperature": None, "max_completion_tokens": 9})
-    body = json.loads(server.bodies[0])
-    assert "temperature" not in body
-    assert body["max_completion_tokens"] == 9
-
-
 # --- outages ----------------------------------------------------------------------------------------------------------
 
 
-def test_an_outage_is_shown_with_the_servers_last_word(tree, tmp_path, caplog, monkeypatch):
-    monkeypatch.setattr("caption.run.asking.SECONDS_BETWEEN_LINES", 0.05)
-    monkeypatch.setattr("caption.run.progress.SECONDS_BETWEEN_LINES", 0.05)
-    caplog.set_level(logging.INFO)
-    with hovering() as server:
-        server.respond = lambda body: refusal(503, "Loading model") if len(server.bodies) <= 24 else None
-        endpoint = {"max_tries": 100}
-        monkeypatch.setattr("cosfly.chat.client.FIRST_PAUSE_S", 0.1)
-        monkeypatch.setattr("cosfly.chat.client.LONGEST_PAUSE_S", 0.1)
-        run(settings(server.url, limit=3, endpoint=endpoint), tree, tmp_path / "out")
-    lines = [line for line in caplog.messages if "failed tries" in line]
-    assert any(re.search(r"no answer for \d s, the last: HTTP 503 Loading model", line) for line in lines)
-    assert "the last" not in lines[-1]  # it is over
-    # One line for many tries.
-    assert [line for line in caplog.messages if "trying again" in line] == [
-        f"{server.url}: HTTP 503 Loading model; trying again, failed tries so far: 1"
-    ]
-
-
 # --- again ------------------------------------------------------------------------------------------------------------
-
-
-def test_retry_failed_leaves_a_folder_complete_in_which_a_flight_cannot_be_read(tree, tmp_path):
-    tree = shutil.copytree(tree, tmp_path / "tree")
-    broken = sorted(tree.rglob("trajectory.json"))[-1]
-    broken.write_text("{")
-    out = tmp_path / "out"
-    seeds: list[int] = []
-
-    def stop_the_first(body):
-        seeds.append(body.get("seed", 0))
-        return refusal(400, FILTERED) if seeds[-1] == seeds[0] else None
-
-    with hovering(stop_the_first) as server:
-        run(settings(server.url), tree, out)
-        failed = (out / "failures.jsonl").read_text()
-        assert "trajectory.json" in failed
-        server.respond = None
-        run(settings(server.url), tree, out, retry_failed=True)
-    assert (out / "manifest.json").exists()
-    assert (out / "failures.jsonl").read_text() == failed
-    assert report_of(out)["windows"]["dropped"] == {}
-
-
-def test_retry_failed_on_the_command_line_says_what_was_refused(tree, tmp_path, whole):
-    with hovering(Picky(400, "[bold]no[/bold] [/] " + FILTERED, whole.seeds[:1])) as server:
-        words = ["--data", tree, "--out", tmp_path / "out", "--set", "caption.repair.hard_conflict=keep"]
-        for more in ("", "--retry-failed"):
-            result = invoke("caption --no-check --set caption.image.max_side_px=32 --teacher", server.url, words, more)
-            assert result.exit_code == 0, result.output

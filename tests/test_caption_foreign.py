@@ -13,8 +13,8 @@ from teacher_server import MODEL, TeacherServer
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig
-from caption.teachers.foreign import read_foreign, read_student
-from cosfly.errors import InputError, NothingKept
+from caption.teachers.foreign import read_foreign
+from cosfly.errors import InputError
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.settings import InspectConfig
 from cosfly.products.actions import shipped_actions
@@ -98,14 +98,6 @@ def test_a_contradiction_is_on_record_and_drops_its_window_where_the_settings_sa
     assert [caption.drop_reason for caption in dropped[:2]] == ["evidence", None]
 
 
-def test_english_alone_is_judged_and_kept(tree, rules, tmp_path):
-    found = captions_of([line(caption, zh=None) for caption in rules], tree, tmp_path / "a")
-    assert {caption.status for caption in found} == {"accepted"}
-    assert {caption.zh for caption in found} == {None}
-    assert {caption.checks.bilingual for caption in found} == {"no_chinese"}
-    assert set(found[0].checks.sentences or {}) == {"en"}
-
-
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
@@ -123,18 +115,6 @@ def test_what_is_wrong_with_a_caption_drops_its_window(tree, rules, tmp_path, ch
     assert found[0].status == "dropped"
     assert (found[0].drop_reason or "").startswith(reason)
     assert {caption.status for caption in found[1:]} == {"accepted"}
-
-
-def test_a_hard_conflict_cannot_be_repaired(tree, rules, tmp_path):
-    contradicted = {caption.sample_id: (caption.checks.contradicted or [])[0] for caption in rules}
-    lines = [line(caption, decision=contradicted[caption.sample_id]) for caption in rules]
-    with pytest.raises(NothingKept, match="conflict_not_repairable"):
-        captions_of(lines, tree, tmp_path / "a")
-    dropped = list(read_captions(tmp_path / "a/out/captions.jsonl"))
-    assert len(dropped) == len(lines)
-    assert all(caption.en and (caption.checks.sentences or {}).keys() == {"en"} for caption in dropped)
-    kept = captions_of(lines, tree, tmp_path / "b", repair={"hard_conflict": "keep"})
-    assert {caption.verdict for caption in kept} == {"HARD_CONFLICT"}
 
 
 BAD = [
@@ -156,23 +136,6 @@ def test_a_bad_line_names_file_line_and_field(tmp_path, text, field):
         read_foreign(path)
     assert f"{path}:2" in str(caught.value)
     assert field in str(caught.value)
-
-
-@pytest.mark.parametrize("content", [None, "", b"\xff\xfe\x00"], ids=["missing", "empty", "binary"])
-def test_no_file_is_an_error_of_one_line(tree, tmp_path, content):
-    path = tmp_path / "theirs.jsonl"
-    if content is not None:
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    result = invoke("caption --teacher", f"file:{path}", "--data", tree, "--out", tmp_path / "out")
-    assert isinstance(result.exception, InputError)
-    assert "theirs.jsonl" in str(result.exception)
-    assert not (tmp_path / "out").exists()
-
-
-def test_captions_of_no_window_are_told(tree, rules, tmp_path, caplog):
-    lines = [line(caption) for caption in rules] + [{**line(rules[0]), "sample_id": "elsewhere"}]
-    captions_of(lines, tree, tmp_path / "a")
-    assert "1 captions of" in caplog.text
 
 
 # --- a student's predictions ------------------------------------------------------------------------------------------
@@ -238,32 +201,6 @@ def test_what_is_wrong_with_a_students_answer_drops_its_window(tree, rules, tmp_
     assert not isinstance(sample, str)
     failed = SampleOutcome(sample, Failed(id=sample.key, code="oom", message="no"))
     assert prediction_of(failed, "test", shipped_actions()).reason == "failed_oom"
-
-
-def test_predictions_of_before_and_of_nothing(tmp_path, rules):
-    path = tmp_path / "predictions.jsonl"
-    path.write_text("")
-    with pytest.raises(InputError, match="no prediction"):
-        read_student(path)
-    line = json.loads(predicted(rules[0], "en").model_dump_json())
-    del line["model"]
-    path.write_text(json.dumps(line))
-    (prediction,) = read_student(path).values()
-    assert prediction.model is None
-
-
-def test_predictions_for_several_trees_are_taken_for_the_one_that_is_named(tmp_path, rules):
-    path = tmp_path / "predictions.jsonl"
-    made = [
-        predicted(rules[0], "en").model_copy(update={"sample_id": f"{run}_x", "run": run, "window_id": "x"})
-        for run in ("north", "south")
-    ]
-    path.write_text("".join(prediction.model_dump_json() + "\n" for prediction in made))
-    with pytest.raises(InputError, match=r"several trees.*north, south"):
-        read_student(path)
-    assert read_student(path, "south")["x/en"].sample_id == "south_x"
-    with pytest.raises(InputError, match=r"no prediction.*west.*north, south"):
-        read_student(path, "west")
 
 
 def test_from_a_students_answers_to_a_release(tree, rules, tmp_path):

@@ -72,25 +72,6 @@ def test_a_hard_conflict_stays_one_whatever_the_judge_says(tree, tmp_path):
     assert len(server.bodies) == len(hard) + len(soft)  # consistent answers are not judged
 
 
-def test_what_cannot_be_read_is_never_an_acceptance(tree, tmp_path):
-    captions, report, _ = judged(tree, tmp_path / "out", lambda body: '{"verdict": "ACCEPT_ALTERNATIVE"}')
-    asked = [c for c in captions if c.judge]
-    assert {c.judge.verdict for c in asked} == {UNJUDGED}
-    assert all(c.repair and c.repair.rung == "anchored" and c.verdict == "CONSISTENT" for c in asked)
-    assert report["judgements"] == {UNJUDGED: len(asked)}
-
-
-def test_a_judge_that_does_not_answer_leaves_conflicts_unjudged(tree, tmp_path, monkeypatch):
-    monkeypatch.setattr("caption.teachers.judge.MAX_TRIES", 1)
-    with TeacherServer(lambda number, body: "500") as server:
-        cfg = CaptionConfig.model_validate({"judge": {"url": server.url}, "limit": 9})
-        captions = list(read_captions(run(cfg, tree, tmp_path / "out")))
-    asked = [c for c in captions if c.judge]
-    assert asked
-    assert all(c.judge.verdict == UNJUDGED and "http_500" in c.judge.reason for c in asked)
-    assert all(c.verdict == "CONSISTENT" for c in asked)
-
-
 def test_a_label_is_not_put_under_a_text_that_states_another_decision(tree, tmp_path):
     fix = '{"verdict": "FIX_LABEL", "reason": "replace it"}'
     captions, _, _ = judged(tree, tmp_path / "out", lambda body: fix)
@@ -112,18 +93,6 @@ def test_a_label_is_put_in_where_the_text_allows_it(tree, tmp_path):
         assert caption.repair.asks == 0
         assert caption.repair.first_decision == "hover"
         assert caption.en.flight_decision == caption.zh.flight_decision == caption.label
-
-
-def test_judgements_are_kept_and_not_asked_again(tree, tmp_path):
-    reject = '{"verdict": "REJECT_REGEN", "reason": "no"}'
-    with judging_server(lambda body: reject) as server:
-        cfg = CaptionConfig.model_validate({"judge": {"url": server.url}})
-        first = run(cfg, tree, tmp_path / "out").read_bytes()
-        asked = len(server.bodies)
-        assert asked > 0
-        (tmp_path / "out" / "manifest.json").unlink()
-        assert run(cfg, tree, tmp_path / "out").read_bytes() == first
-        assert len(server.bodies) == asked
 
 
 def test_a_judges_tokens_count_in_the_budget_and_are_shown(tree, tmp_path):
@@ -167,12 +136,6 @@ def gold_answers():
     return {judge_messages(case, VOCABULARY)[1]["content"]: right for case, right in gold_conflicts()}
 
 
-def options(body):
-    """The options in the order in which this request names them."""
-    system = body["messages"][0]["content"]
-    return sorted(JUDGEMENTS, key=lambda name: system.index(f"- {name}"))
-
-
 def say(verdict):
     return json.dumps({"verdict": verdict, "reason": "because"})
 
@@ -189,15 +152,3 @@ def test_a_perfect_judge():
     found = checked(lambda body: say(known[body["messages"][1]["content"]]))
     assert (found.agreement, found.num_unjudged, found.num_moved) == (1.0, 0, 0)
     assert found.first_share == pytest.approx(1 / 3)
-
-
-def test_a_judge_that_takes_the_first_option_is_found_out():
-    found = checked(lambda body: say(options(body)[0]))
-    assert found.first_share == 1.0
-    assert found.num_moved == found.num_cases == 36
-    assert found.agreement == pytest.approx(1 / 3)
-
-
-def test_a_judge_that_cannot_be_read_is_counted_and_agrees_with_nothing():
-    found = checked(lambda body: "yes, fine")
-    assert (found.agreement, found.num_unjudged) == (0.0, 108)

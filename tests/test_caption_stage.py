@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import re
 import shutil
 from collections import Counter
-from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
 from specimens_captions import ACTION_TABLE, VOCABULARY
 
 from caption.run import stage
-from caption.run.flights import allot, named_flights
 from caption.run.ledger import NUM_CARDS, CaptionReport
 from caption.run.report import page_html
 from caption.run.stage import run
 from caption.run.windows import cut_windows
-from caption.schema import CaptionConfig, ImageConfig
-from caption.teachers.prompts import Correction, make_question
-from caption.teachers.teacher import RuleTeacher
+from caption.schema import CaptionConfig
 from caption.truth.actions import measure
 from cosfly.chat.budget import BudgetConfig
-from cosfly.errors import InputError, NothingKept, ResumeError
+from cosfly.errors import NothingKept, ResumeError
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight, write_flight
@@ -39,16 +34,6 @@ def tree(tmp_path_factory):
 @pytest.fixture(scope="module")
 def done(tree, tmp_path_factory):
     return run(CaptionConfig(), tree, tmp_path_factory.mktemp("done") / "caption").parent
-
-
-def test_windows_prepared_a_few_at_a_time_give_the_same_bytes(tree, done, tmp_path, monkeypatch):
-    monkeypatch.setattr(stage, "WINDOWS_AT_ONCE", 4)  # of nine
-    cfg, found = CaptionConfig(), b""
-    for flight in allot(named_flights(tree), cfg, VOCABULARY)[0]:
-        part = tmp_path / flight.name
-        asyncio.run(stage.caption_in_order(flight.windows(cfg, VOCABULARY), RuleTeacher(0), cfg, VOCABULARY, part))
-        found += part.read_bytes()
-    assert found == (done / "captions.jsonl").read_bytes()
 
 
 def test_every_window_is_one_line_sorted_and_labelled_from_geometry(tree, done):
@@ -113,14 +98,6 @@ def test_who_cannot_be_made_out_changes_what_is_said_to_be_seen_and_no_decision(
         assert other.checks.evidence == "ok"
 
 
-def test_another_seed_changes_the_wording_only(tree, done, tmp_path):
-    other = list(read_captions(run(CaptionConfig(), tree, tmp_path / "other", seed=1)))
-    base = list(read_captions(done / "captions.jsonl"))
-    assert [c.label for c in other] == [c.label for c in base]
-    assert [c.en.flight_decision for c in other] == [c.en.flight_decision for c in base]
-    assert [c.en.critical_components for c in other] != [c.en.critical_components for c in base]
-
-
 def test_a_product_never_loses_captions(tmp_path):
     tree, out = make_playback_tree(tmp_path / "tree", 3, 18), tmp_path / "caption"
     run(CaptionConfig(), tree, out)
@@ -139,14 +116,6 @@ def test_captions_of_another_prompt_are_refused_by_name(tree, tmp_path, monkeypa
     monkeypatch.setitem(stage.PACKAGE_FILES, name, changed)
     with pytest.raises(ResumeError, match=f"the {name} changed"):
         run(CaptionConfig(), tree, tmp_path / "out")
-
-
-def test_limit_does_not_depend_on_workers(tree, tmp_path):
-    cfg = CaptionConfig(limit=13)
-    one = run(cfg, tree, tmp_path / "one")
-    two = run(cfg, tree, tmp_path / "two", workers=2)
-    assert len(one.read_text().splitlines()) == 13
-    assert one.read_bytes() == two.read_bytes()
 
 
 def test_bad_flights_are_counted_and_the_others_captioned(tree, tmp_path):
@@ -173,36 +142,6 @@ def test_bad_flights_are_counted_and_the_others_captioned(tree, tmp_path):
     assert "not valid JSON" in failures
 
 
-@pytest.mark.parametrize("num_points", [4, 9])
-def test_no_window_at_all_is_one_clear_error(tmp_path, num_points):
-    root = make_playback_tree(tmp_path / "tree", 1, num_points, with_images=False)
-    with pytest.raises(NothingKept, match=r"kept nothing.*too_short 2.*at least 10 frames"):
-        run(CaptionConfig(), root, tmp_path / "out")
-
-
-def test_flights_of_one_name_have_their_town_in_front(tmp_path):
-    root = make_playback_tree(tmp_path / "tree", 1, 12)
-    shutil.copytree(root / "Town01", root / "Town02")
-    found = list(read_captions(run(CaptionConfig(), root, tmp_path / "out")))
-    assert len({caption.sample_id for caption in found}) == len(found) == 4 * 3
-    assert [caption.sample_id for caption in found] == sorted(caption.sample_id for caption in found)
-    assert {(caption.town, caption.sample_id.partition("_")[0]) for caption in found} == {
-        ("Town01", "Town01"),
-        ("Town02", "Town02"),
-    }
-    shutil.copytree(root, tmp_path / "deep/a")
-    shutil.copytree(root, tmp_path / "deep/b")
-    with pytest.raises(InputError, match="two flights have one name"):
-        run(CaptionConfig(), tmp_path / "deep", tmp_path / "out2")
-
-
-def test_evidence_can_be_made_a_reason_to_drop(tree, tmp_path):
-    strict = {"drop": True, "tolerance_m": 0, "tolerance_mps": 0, "tolerance_px": 0, "tolerance_deg": 0, "relative": 0}
-    cfg = CaptionConfig.model_validate({"evidence": strict})
-    report = json.loads((run(cfg, tree, tmp_path / "out").parent / "caption_report.json").read_text())
-    assert report["windows"]["kept"] == 54  # the rule teacher's numbers are the measured ones
-
-
 def test_a_perturbed_flight_waits_for_a_clean_one_that_cannot_be_read(tmp_path):
     tree = make_playback_tree(tmp_path / "tree", 1, 14)
     clean = next(tree.rglob("ORI")) / "trajectory.json"
@@ -213,16 +152,6 @@ def test_a_perturbed_flight_waits_for_a_clean_one_that_cannot_be_read(tmp_path):
     clean.write_bytes(whole)
     found = list(read_captions(run(CaptionConfig(), tree, tmp_path / "again")))
     assert Counter(caption.label_from for caption in found) == {"flight": 5, "twin": 5}
-
-
-def test_the_rule_teachers_mirror_is_of_its_answer_to_a_correction_too(tree):
-    """The mirror is asked with the question alone; other slots in both languages dropped 2 of quickstart's windows."""
-    flight = allot(named_flights(tree), CaptionConfig(), VOCABULARY)[0][0]
-    window = next(flight.windows(CaptionConfig(), VOCABULARY)).observed
-    question = make_question(window, ImageConfig(), "slots", VOCABULARY)
-    corrected = replace(question, correction=Correction("", "", 1))
-    texts = [asyncio.run(RuleTeacher(0).ask(one)).text for one in (question, corrected)]
-    assert texts[0] == texts[1]
 
 
 # --- the page of a captioning run -------------------------------------------------------------------------------------
@@ -269,39 +198,6 @@ def test_the_page_is_whole_self_contained_and_small(done):
 
 def report_of(done):
     return CaptionReport.model_validate_json((done / "caption_report.json").read_text())
-
-
-def test_its_numbers_are_the_reports(done):
-    report = json.loads((done / "caption_report.json").read_text())
-    text = (done / "report.html").read_text(encoding="utf-8")
-    assert f"<b>{report['windows']['input']}</b>windows" in text
-    first = report["verdicts_of_first_answers"]
-    share = f"{first['HARD_CONFLICT']} ({100 * first['HARD_CONFLICT'] / sum(first.values()):.1f} %)"
-    assert share in text
-    captions = list(read_captions(done / "captions.jsonl"))
-    lengths = report["lengths"]["en"]["reasoning_trace"]
-    assert sum(lengths["counts"]) == len(captions)
-    longest = max(len(caption.en.reasoning_trace) for caption in captions)
-    assert len(lengths["counts"]) == longest // lengths["bin_characters"] + 1
-    assert sum(report["repair"]["outcomes_by_strategy"]["anchored"].values()) == report["repair"]["rejected"]
-
-
-def test_text_of_a_teacher_cannot_become_markup(done):
-    report = report_of(done)
-    caption = next(read_captions(done / "captions.jsonl"))
-    evil = caption.en.model_copy(update={"reasoning_trace": "<script>alert(1)</script> & so on"})
-    page = page_html(report, VOCABULARY.actions, [caption.model_copy(update={"en": evil})], {}, BudgetConfig(), "x")
-    assert "<script" not in page
-    assert "&lt;script&gt;" in page
-    assert page.count(">no picture<") == 5
-
-
-def test_cost_is_told_when_there_are_prices(done):
-    used = {"prompt_tokens": 2_000_000, "completion_tokens": 100_000}
-    report = report_of(done).model_copy(update={"tokens": used})
-    page = page_html(report, VOCABULARY.actions, [], {}, BudgetConfig(price_prompt=0.5, price_completion=3.0), "x")
-    assert ">1.30<" in page
-    assert "no prices set" in page_html(report, VOCABULARY.actions, [], {}, BudgetConfig(), "x")
 
 
 def test_sentences_are_marked_by_what_was_read_of_them(done):

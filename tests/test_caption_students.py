@@ -19,7 +19,7 @@ from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.students import as_taught
 from cosfly.chat.student_chat import TAUGHT, read_taught, write_taught
-from cosfly.errors import ConfigError, InputError, NothingKept, ResumeError, TeacherError
+from cosfly.errors import ConfigError, NothingKept, ResumeError
 from cosfly.products.captions import Caption, read_captions
 from distill.inference import stage as infer
 from distill.schema import Sample, open_split
@@ -139,52 +139,6 @@ def test_unlabelled_flights_are_captioned_and_marked(place, tmp_path):
     assert str(place) not in json.dumps(json.loads(told)["config"])
 
 
-def test_a_conflict_is_repaired_and_marked(place, tmp_path):
-    """A student that is wrong at first and follows when it is told the decision."""
-    decide = label_of(place)
-    opposite = {"yaw_left_to_follow": "yaw_right_to_follow", "yaw_right_to_follow": "yaw_left_to_follow"}
-
-    def wrong_first(body: dict) -> str:
-        label = decide(body)
-        is_told = (
-            label.replace("_", " ") in body["messages"][0]["content"].partition("flight_decision")[2].partition("\n")[2]
-        )
-        return label if is_told else opposite.get(label, label)
-
-    with TeacherServer(decision=wrong_first) as server:
-        captions = captions_of(
-            place, tmp_path / "out", server.url, student={"folder": place / "trained", "constrained": True}
-        )
-    repaired = [caption for caption in captions if caption.repair is not None]
-    assert repaired
-    for caption in repaired:
-        assert caption.repair.strategy == "anchored"
-        assert caption.repair.first_verdict == "HARD_CONFLICT"
-        assert caption.repair.outcome == "repaired"
-        assert caption.en.flight_decision == caption.label
-        assert caption.zh is None or caption.zh.flight_decision == caption.label
-    untouched = [caption for caption in captions if caption.repair is None and caption.status == "accepted"]
-    assert untouched
-
-
-def test_two_languages_that_disagree_are_dropped(place, tmp_path):
-    decide = label_of(place)
-
-    def torn(body: dict) -> str:
-        return decide(body) if body["messages"][0]["content"].isascii() else "return_to_home"
-
-    with TeacherServer(decision=torn) as server:
-        with pytest.raises(NothingKept, match="bilingual_decision"):
-            captions_of(place, tmp_path / "out", server.url)
-        asked = [json.loads(body)["messages"][0]["content"].isascii() for body in server.bodies]
-    captions = list(read_captions(tmp_path / "out" / "captions.jsonl"))
-    assert {caption.drop_reason for caption in captions if caption.checks.bilingual is not None} == {
-        "bilingual_decision"
-    }
-    assert {caption.status for caption in captions} == {"dropped"}
-    assert 0 < asked.count(False) <= len(captions)  # once each: asked again it would answer the same
-
-
 def taught_otherwise(place: Path, folder: Path, **changes: Any) -> Path:
     folder.mkdir()
     value = json.loads((place / "trained" / "adapter" / TAUGHT).read_text())
@@ -210,33 +164,6 @@ def test_another_version_of_the_prompt_is_refused(place, tmp_path):
     folder = taught_otherwise(place, tmp_path / "zh", prompts={"zh": taught["prompts"]["zh"]})
     with pytest.raises(ConfigError, match="taught no English"):
         as_taught(settings("http://127.0.0.1:1/v1", folder), VOCABULARY)
-
-
-def test_a_student_without_chinese_gives_english_captions(place, tmp_path):
-    taught = json.loads((place / "trained" / "adapter" / TAUGHT).read_text())
-    folder = taught_otherwise(place, tmp_path / "en", prompts={"en": taught["prompts"]["en"]})
-    with TeacherServer(decision=label_of(place)) as server:
-        captions = list(read_captions(run(settings(server.url, folder), place / "tree", tmp_path / "out")))
-    accepted = [caption for caption in captions if caption.status == "accepted"]
-    assert accepted
-    assert all(caption.zh is None and caption.checks.bilingual == "no_chinese" for caption in accepted)
-
-
-def test_a_tree_with_other_pictures_is_refused(place, tmp_path):
-    tree = shutil.copytree(place / "tree", tmp_path / "tree")
-    for path in tree.rglob("depth.npy"):
-        path.unlink()
-    with TeacherServer() as server:
-        with pytest.raises(TeacherError, match=r"taught with other pictures.*got rgb of.*expected rgb, depth of"):
-            run(settings(server.url, place / "trained"), tree, tmp_path / "out")
-        assert not server.bodies
-
-
-def test_a_folder_that_says_nothing_is_refused(place, tmp_path):
-    with pytest.raises(InputError, match="nothing here says what the student was taught"):
-        as_taught(settings("http://127.0.0.1:1/v1", tmp_path), VOCABULARY)
-    with pytest.raises(ValueError, match=r"student.folder needs a teacher that is asked"):
-        CaptionConfig.model_validate({"student": {"folder": place / "trained"}})
 
 
 def test_a_folder_holds_the_captions_of_one_student(place, tmp_path):

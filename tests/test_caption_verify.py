@@ -69,22 +69,6 @@ def altered(coc: Coc, old: str, new: str) -> Coc:
     return Coc(**changed, flight_decision=coc.flight_decision)
 
 
-@each(
-    ("old", "new", "reason"),
-    [
-        ("20.6", "26.0", "number"),
-        ("34 × 59", "34 × 95", "number"),
-        ("1.4 米", "1.5 米", "number"),
-        ("21.4 米", "24.1 米", "number"),
-        ("1.00 米/秒", "1.20 米/秒", "number"),
-        ("增加", "减少", "polarity_trend"),
-        ("慢于", "快于", "polarity_pace"),
-    ],
-)
-def test_a_planted_contradiction_in_the_papers_chinese_fails(old, new, reason):
-    assert check_mirror(PAPER_EN, altered(PAPER_ZH, old, new), FLIGHT) == reason
-
-
 def pair(en: str, zh: str) -> tuple[Coc, Coc]:
     filler_en, filler_zh = "The pedestrian is on the road here.", "行人此刻在道路上行走着。"
     return (
@@ -187,28 +171,3 @@ def test_the_rule_teacher_justifies_any_given_decision_without_contradiction(dec
         assert check_prose(chinese, facts, "zh") == []
         assert check_mirror(english, chinese, flight_numbers(facts)) is None
         assert VOCABULARY.names[decision]["zh"] in chinese.reasoning_trace
-
-
-def test_the_rule_teacher_decides_from_what_it_sees():
-    from caption.teachers.rules import decide
-
-    base = dataclasses.replace(PAPER_FACTS, altitude_m=(20.6,) * 5, yaw_deg=(0.0,) * 5, distance_m=(20.0,) * 5)
-    cases = {
-        "track_straight": {},
-        "search_to_reacquire_target": {"visibility": ("visible",) * 4 + ("occluded",)},
-        "yaw_left_to_follow": {"offset_x_px": (0, -40, -80, -120, -160)},
-        "yaw_right_to_follow": {"yaw_deg": (0.0, -1.0, -2.0, -3.0, -4.0)},
-        "ascend": {"altitude_m": (20.0, 20.4, 20.8, 21.2, 21.6)},
-        "descend": {"altitude_m": (20.0, 19.6, 19.2, 18.8, 18.4)},
-        "speed_up": {"distance_m": (20.0, 20.5, 21.0, 21.5, 22.0), "target_speed_mps": 2.0},
-        "slow_down": {"distance_m": (22.0, 21.5, 21.0, 20.5, 20.0), "target_speed_mps": 0.5},
-        "hover": {"speed_mps": (None, 0.1, 0.1, 0.1, 0.1), "target_speed_mps": 0.0},
-    }
-    for expected, change in cases.items():
-        assert decide(dataclasses.replace(base, **change)) == expected
-    # A shaken camera is up and away in some frames: no climb, no gap, whatever the line through them says.
-    for change in (
-        {"altitude_m": (20.0, 20.4, 20.2, 22.2, 22.6)},
-        {"distance_m": (20.0, 21.0, 19.0, 23.0, 22.0), "target_speed_mps": 2.0},
-    ):
-        assert decide(dataclasses.replace(base, **change)) == "track_straight"

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 import dataclasses
 import json
 import shutil
-from collections import Counter
 
 import cv2
 import numpy as np
@@ -27,11 +25,9 @@ from caption.schema import (
     observed_frames,
 )
 from caption.teachers.images import FrameEncoder
-from caption.teachers.prompts import make_question, question_messages, system_prompt
+from caption.teachers.prompts import make_question, question_messages
 from caption.truth.actions import measure
 from caption.truth.facts import measure_facts
-from cosfly.products.actions import shipped_actions
-from cosfly.products.answer_text import answer_schema
 from cosfly.products.boxes import MapHeader, make_box_map
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights, read_twin
@@ -196,43 +192,6 @@ def test_facts_of_a_hand_made_window(tree):
     assert "Velocity: [0.0, 4.47, 4.47, 4.47, 4.47] m/s" in doubled["en"].user
 
 
-def test_a_walker_who_turns_left_does_so_in_the_facts(tree):
-    """East for two steps, then north: in a mirrored world it would be to the right."""
-    window = next(cut_windows(flight_in(tree), WindowConfig(), ACTION_TABLE)).observed
-    ways = [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 1.0), (2.0, 2.0)]
-    frames = zip(window.frames, ways, strict=True)
-    window = dataclasses.replace(
-        window, frames=tuple(dataclasses.replace(frame, target_m=(*way, 0.9)) for frame, way in frames)
-    )
-    facts = measure_facts(window)
-    assert facts.target_headings_deg == (None, 0.0, 0.0, 90.0, 90.0)
-    assert facts.target_turn_deg == 90.0
-
-
-def test_the_box_is_that_of_what_is_seen(tree):
-    """Where a tree tells the box of the person's pixels, texts measure that one; hidden from view, it has none."""
-    flight = flight_in(tree)
-    seen = np.tile([340.0, 160.0, 360.0, 220.0], (len(flight), 1)) / 10.0
-    seen[4] = np.nan
-    told = next(cut_windows(dataclasses.replace(flight, target_mask_bbox=seen), WindowConfig(), ACTION_TABLE)).observed
-    facts = measure_facts(told)
-    assert facts.box_width_px == (2, 2, 2, 2, None)
-    assert facts.box_height_px == (6, 6, 6, 6, None)
-    assert facts.offset_x_px[:4] == (3, 3, 3, 3)  # 35 of 64 px across
-    assert facts.offset_x_px[4] == round(flight.target_uv[4, 0] - 32)
-    untold = next(cut_windows(flight, WindowConfig(), ACTION_TABLE)).observed
-    assert np.array_equal([frame.target_bbox for frame in untold.frames], flight.target_bbox[:5])
-
-
-def test_prompts_name_the_closed_set_and_the_shape():
-    for language in ("en", "zh"):
-        text = system_prompt(language, VOCABULARY)
-        assert all(token in text for token in shipped_actions().tokens)
-        assert all(name in text for name in ("critical_components", "reasoning_trace", "flight_decision"))
-    assert answer_schema(shipped_actions())["properties"]["flight_decision"]["enum"] == list(shipped_actions().tokens)
-    assert answer_schema(shipped_actions(), "hover", "zh")["properties"]["flight_decision"]["enum"] == ["hover"]
-
-
 def test_a_foreign_tree_without_boxes_scores_depth_and_meta(tmp_path):
     """Older public trees: bbox null, no visibility, no meta.json, RGBA pictures, no depth."""
     root = make_playback_tree(tmp_path / "tree", 1, 12, with_augmented=False)
@@ -258,21 +217,6 @@ def test_a_foreign_tree_without_boxes_scores_depth_and_meta(tmp_path):
     assert len(digests) == 10
     path = run(CaptionConfig(), root, tmp_path / "out")
     assert len(path.read_text().splitlines()) == 3
-
-
-@pytest.mark.parametrize(("layout", "num_images", "width_px"), [("separate", 15, 32), ("tiled", 5, 96)])
-def test_pictures_are_bounded_and_encoded_once_per_frame(tree, layout, num_images, width_px):
-    cfg = ImageConfig(layout=layout, max_side_px=32, encoding="png")
-    encoder = FrameEncoder(cfg)
-    for sample in list(cut_windows(flight_in(tree), WindowConfig(), ACTION_TABLE))[:4]:
-        question = make_question(sample.observed, cfg, "prose", VOCABULARY)
-        messages, digests = question_messages(question, encoder)
-        assert len(digests) == num_images
-    assert encoder.num_encoded == 8  # four windows over frames 0..7
-    url = messages[1]["content"][1]["image_url"]["url"]
-    assert url.startswith("data:image/png;base64,")
-    image = cv2.imdecode(np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8), cv2.IMREAD_COLOR)
-    assert image.shape == (18, width_px, 3)
 
 
 # --- labels of perturbed flights --------------------------------------------------------------------------------------
@@ -344,95 +288,6 @@ def test_both_tracks_have_the_same_labels_where_the_same_was_visible(two_tracks,
     assert np.mean([a != b for (a, _, _), b in zip(pairs, raw, strict=True)]) > 0.2
 
 
-def test_what_is_observed_stays_perturbed(two_tracks):
-    clean, perturbed = flights_of(two_tracks)
-    one, two = (next(cut_windows(flight, NO_IMAGES, ACTION_TABLE)) for flight in (clean, perturbed))
-    assert not np.allclose(*[[frame.position_m for frame in own.observed.frames] for own in (one, two)])
-
-
-def test_keyframes_are_chosen_by_the_same_labels(two_tracks):
-    clean, perturbed = flights_of(two_tracks)
-    visible = dataclasses.replace(perturbed, target_visible=clean.target_visible)
-    cfg = WindowConfig(require_images=False, keyframes=True)
-    chosen = [[w.observed.indices for w in cut_windows(flight, cfg, ACTION_TABLE)] for flight in (clean, visible)]
-    assert chosen[0] == chosen[1]
-    assert len(chosen[0]) < NUM_POINTS - 9
-
-
-def without_offsets(root) -> None:
-    """Make the perturbed flight say what public files say: that there was a shift or a turn, not which."""
-    path = find_flights(root)[1] / "trajectory.json"
-    raw = json.loads(path.read_text())
-    for point in raw["points"]:
-        point["perturbation"] = {"drone_position": point["is_perturbed"], "drone_rotation": point["is_perturbed"]}
-    path.write_text(json.dumps(raw))
-
-
-def cut_short(raw) -> None:
-    raw["points"] = raw["points"][:-1]
-    raw["points"][-1]["nav_waypoint"]["t1_world"] = None
-
-
-def begin_later(raw) -> None:
-    for point in raw["points"]:
-        point["timing"]["trace_timestamp"] += 0.5
-
-
-def change_twin(change):
-    def on_disk(root) -> None:
-        path = find_flights(root)[0] / "trajectory.json"
-        raw = json.loads(path.read_text())
-        change(raw)
-        path.write_text(json.dumps(raw))
-
-    return on_disk
-
-
-@pytest.mark.parametrize(
-    ("spoil", "log_words"),
-    [
-        (lambda root: shutil.rmtree(find_flights(root)[0]), None),
-        (change_twin(cut_short), "159 points"),
-        (change_twin(begin_later), "from 0.500"),
-        (change_twin(lambda raw: raw["augmentation"].update(is_original=False)), "is_original False"),
-    ],
-    ids=["missing", "shorter", "later", "no original"],
-)
-def test_a_twin_that_cannot_be_used_is_none_and_counted(two_tracks, tmp_path, caplog, spoil, log_words):
-    root = tmp_path / "tree"
-    shutil.copytree(two_tracks, root)
-    spoil(root)
-    path = run(CaptionConfig(window=NO_IMAGES), root, tmp_path / "out")
-    captions = list(read_captions(path))
-    counts = json.loads((path.parent / "caption_report.json").read_text())["label_from"]
-    assert counts == Counter(c.label_from for c in captions)
-    assert [c.label_from for c in captions if c.variant == "aug_001"] == ["offsets"] * (NUM_POINTS - 9)
-    assert (log_words or "") in caplog.text
-
-
-def test_a_label_that_cannot_be_cleaned_says_so(two_tracks, tmp_path):
-    root = tmp_path / "tree"
-    shutil.copytree(two_tracks, root)
-    without_offsets(root)
-    _, perturbed = flights_of(root)
-    assert {
-        w.future.label_from for w in cut_windows(perturbed, NO_IMAGES, ACTION_TABLE, twin=read_twin(perturbed))
-    } == {"twin"}
-    shutil.rmtree(find_flights(root)[0])
-    path = run(CaptionConfig(window=NO_IMAGES), root, tmp_path / "out")
-    assert {c.label_from for c in read_captions(path)} == {"perturbed"}
-    # A window that no offset reaches is clean without a record.
-    still = dataclasses.replace(perturbed, drone_offsets_m=perturbed.drone_offsets_m.copy())
-    assert np.isnan(still.drone_offsets_m).any()
-    for name in ("drone_offsets_m", "rotation_offsets_deg", "target_offsets_m"):
-        values = getattr(perturbed, name).copy()
-        values[:20] = 0.0
-        still = dataclasses.replace(still, **{name: values})
-    sources = [w.future.label_from for w in cut_windows(still, NO_IMAGES, ACTION_TABLE)]
-    assert sources[:11] == ["offsets"] * 11
-    assert set(sources[11:]) == {"perturbed"}
-
-
 # --- orders of a mission in captions ----------------------------------------------------------------------------------
 
 
@@ -498,19 +353,6 @@ def test_the_rule_teacher_obeys_an_order(ordered, tmp_path):
 LABELS = st.lists(st.sampled_from(["track_straight", "hover", None]), max_size=60)
 
 
-def test_a_hand_made_flight():
-    labels = ["a", "a", "a", "b", "b", "b", "b", "b", "a", None, None]
-    found = choose_keyframes(labels, 3)
-    assert {i: keyframe.model_dump() for i, keyframe in found.items()} == {
-        0: {"reason": "start", "skipped": 2, "missed": 0},
-        3: {"reason": "change", "skipped": 2, "missed": 0},
-        6: {"reason": "stride", "skipped": 1, "missed": 0},
-        8: {"reason": "change", "skipped": 0, "missed": 0},
-        9: {"reason": "change", "skipped": 1, "missed": 0},
-    }
-    assert choose_keyframes([], 3) == {}
-
-
 @given(LABELS, st.integers(1, 12))
 def test_no_change_is_missed_and_every_window_is_taken_or_counted(labels, stride):
     chosen = choose_keyframes(labels, stride)
@@ -520,11 +362,6 @@ def test_no_change_is_missed_and_every_window_is_taken_or_counted(labels, stride
     # Whoever gives each window the label of the keyframe before it gets the flight's labels back.
     spread = [labels[max(k for k in chosen if k <= i)] for i in range(len(labels))]
     assert spread == labels
-
-
-def test_the_count_of_missed_changes_can_fail():
-    assert missed_changes(["a", "b", "b", "a"], {0, 3}) == [1]
-    assert choose_keyframes(["a"] * 8, 20)[0].skipped == 7
 
 
 def test_a_run_reports_what_it_saved(tmp_path):

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from test_products_pursuits import frame, pursuit
 
-from cosfly.closed_loop.measures import MEASURES, measure, score_flights, score_pursuits
-from cosfly.errors import InputError
-from cosfly.products.flight_scores import SCORE, SCORE_FORMAT, Score, read_score
+from cosfly.closed_loop.measures import MEASURES, measure, score_pursuits
+from cosfly.products.flight_scores import SCORE, SCORE_FORMAT, read_score
 from cosfly.work.store import write_model
 
 
@@ -89,29 +88,3 @@ def test_a_score_adds_up_is_read_as_written_and_marks_towns_that_were_trained_on
     assert set(score.figures) == set(MEASURES)
     write_model(tmp_path / SCORE, score, SCORE_FORMAT)
     assert read_score(tmp_path) == score
-
-
-def test_walks_are_drawn_and_not_flights():
-    """Nine flights of one walk tell no more than one: the interval is as wide as of two walks."""
-    one, other = flight("1111", walk="a"), flight("10000", walk="b")
-    scored = [measure(one)] + [measure(other).model_copy(update={"episode": f"b{k}"}) for k in range(9)]
-    found = score_flights(scored, "s", "rules", "0" * 64).figures["success"]
-    assert (found.low, found.high, found.value, found.count) == (0.0, 1.0, 0.1, 10)
-
-
-def test_flights_of_two_students_or_an_episode_twice_are_refused():
-    one = flight("11")
-    with pytest.raises(InputError, match="one student"):
-        score_pursuits([one, one.model_copy(update={"student": "other", "episode": "b"})])
-    with pytest.raises(InputError, match="no flight"):
-        score_pursuits([])
-    with pytest.raises(ValueError, match="twice"):
-        score_pursuits([one, one])
-    assert Score.model_fields["flights"].is_required()
-
-
-def test_what_no_student_decides_names_the_episodes():
-    one, other = flight("1111"), flight("1000")
-    a, b = score_pursuits([one]), score_pursuits([other.model_copy(update={"student": "other"})])
-    assert a.episodes_sha256 == b.episodes_sha256
-    assert a.episodes_sha256 != score_pursuits([one.model_copy(update={"map_sha256": "cd" * 32})]).episodes_sha256

@@ -51,13 +51,6 @@ def test_the_same_commands_give_the_same_flight_and_the_same_pictures_whatever_w
         assert one.target == two.target
 
 
-def test_it_begins_with_the_plan_and_the_person_in_view(airspace, planned):
-    lead = ClosedLoopFlight(airspace, planned).reset()
-    assert [m.index for m in lead] == [0, 1, 2, 3, 4]
-    assert np.array_equal(lead[-1].position_m, planned.positions_m[4])
-    assert all(m.target.in_view and m.target.visible and m.target.num_pixels > 0 for m in lead)
-
-
 def test_a_held_command_is_reached_as_fast_as_the_drone_can_and_no_faster(airspace, planned):
     drone = Drone(accel_max_mps2=2.0, yaw_accel_max_degps2=20.0)
     flight = ClosedLoopFlight(airspace, planned, drone=drone)
@@ -100,20 +93,3 @@ def test_who_leaves_the_person_is_lost_and_who_leaves_the_map_has_left(airspace,
     finally:
         small.airspace.bounds_m = kept
     assert small.ended == "left"
-
-
-@pytest.mark.parametrize(
-    ("command", "words"),
-    [
-        ((11, 0, 0, 0, 0), "forward_mps 11 is outside -10 to 10"),
-        ((8, 8, 0, 0, 0), "11.3"),
-        ((0, 0, 0, np.nan, 0), "finite"),
-        ((0, 0, 0), "5 finite numbers"),
-        ((0, 0, 0, 0, 45), "gimbal_pitch_deg"),
-    ],
-)
-def test_a_command_beyond_the_bounds_is_none(airspace, planned, command, words):
-    flight = ClosedLoopFlight(airspace, planned)
-    assert words in flight.drone.problem_of(np.array(command, dtype=float))
-    with pytest.raises(ValueError, match=words):
-        flight.step(np.array(command, dtype=float))

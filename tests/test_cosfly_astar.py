@@ -64,29 +64,6 @@ def test_costs_by_hand():
         assert problems(free, route) == []
 
 
-def test_bad_ends_and_grids_are_value_errors():
-    for start, goal, words in (
-        ((1, 0), (2, 0), "start.*not a free"),
-        ((0, 0), (1, 0), "goal.*not a free"),
-        ((-1, 0), (2, 0), "start.*off the grid"),
-        ((0, 0), (3, 0), "goal.*off the grid"),
-        ((0, 0), (0, 1), "goal.*off the grid"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            find_route(free_cells(".#."), start, goal)
-    for free in (np.ones((4, 4)), np.ones(4, dtype=bool), np.ones((4, 4), dtype=bool).T[::2]):
-        with pytest.raises(ValueError, match="contiguous"):
-            find_route(free, (0, 0), (1, 1))
-
-
-def test_the_checker_finds_planted_faults():
-    free = free_cells("... .#. ...")
-    assert problems(free, np.array([[0, 0], [0, 1], [0, 2], [1, 2]])) == []
-    assert problems(free, np.array([[0, 0], [2, 0]])) == ["not neighbours: (0, 0) (2, 0)"]
-    assert problems(free, np.array([[0, 1], [1, 2]])) == ["cuts a corner: (0, 1) (1, 2)"]
-    assert "blocked: (1, 1)" in problems(free, np.array([[0, 1], [1, 1]]))
-
-
 @settings(max_examples=60)
 @given(st.integers(0, 10**9), st.integers(1, 24), st.integers(1, 24), st.floats(0.0, 0.55))
 def test_costs_are_the_optimum_of_another_library(seed, num_x, num_y, density):
@@ -139,11 +116,3 @@ def test_costs_by_class_and_axis_are_the_optimum_of_another_library(seed, num_x,
     of_cells = costs[classes[route[:, 1], route[:, 0]]]
     each = (of_cells[np.arange(len(axes)), axes] + of_cells[np.arange(1, len(route)), axes]) / 2
     assert (each * np.linalg.norm(steps, axis=1)).sum() == pytest.approx(optimum, abs=1e-9)
-
-
-def test_classes_that_cost_alike_change_no_route():
-    rng = np.random.default_rng(3)
-    free, classes = rng.random((40, 40)) >= 0.15, rng.integers(0, 2, (40, 40)).astype(np.uint8)
-    free[0, 0] = free[39, 39] = True
-    plain, equal = (find_route(free, (0, 0), (39, 39), *more) for more in ((), (classes, np.full((2, 4), 7))))
-    assert (plain == equal).all()

@@ -1,19 +1,14 @@
 """The command line: what a person reads when something is wrong, and the exit codes."""
 
 import logging
-import re
-import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from cosfly import cli
 from cosfly.app import doctor
@@ -49,20 +44,6 @@ def test_what_an_option_does_not_take_is_told_in_words_for_people(capfd, monkeyp
         assert end.value.code == 2
         assert told in error
         assert "Value error" not in error
-
-
-def test_an_option_that_is_short_for_a_setting_sets_it(monkeypatch, tmp_path):
-    found = []
-    stage = SimpleNamespace(run=lambda cfg, *inputs, **manner: found.append((cfg, manner)) or tmp_path)
-    monkeypatch.setattr("caption.run.stage.run", stage.run)
-    monkeypatch.setattr(Job, "finish", lambda *_: None)
-    words = (
-        "caption --data t --out o --limit 3 --flights a --flights b --tracks clean --workers 2 --seed 5 --resume never"
-    )
-    assert CliRunner().invoke(cli.app, words.split()).exit_code == 0
-    cfg, manner = found[0]
-    assert (cfg.limit, cfg.flights.match, cfg.flights.tracks) == (3, ("a", "b"), ("clean",))
-    assert (manner["workers"], manner["seed"], manner["resume"]) == (2, 5, "never")
 
 
 def answer(capfd, monkeypatch, *words: str) -> tuple[int, str]:
@@ -108,22 +89,6 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, subtests):
             assert [part for part in parts if part not in line] == []
 
 
-@pytest.mark.slow
-def test_an_output_that_is_full_or_closed_is_no_bug(tmp_path):
-    full = "error: cannot write the output; got No space left on device"
-    for words, redirect, status, told in (
-        ("config show quickstart", "> /dev/full", 1, full),
-        ("list .", "> /dev/full", 1, full),
-        ("list .", ">&-", 0, ""),
-        ("config show quickstart", "2>&-", 0, ""),
-    ):
-        command = f"{sys.executable} -m cosfly {words} {redirect}"
-        done = subprocess.run(["bash", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == status, command
-        assert done.stderr.startswith(told)
-        assert "Traceback" not in done.stderr
-
-
 STAND_IN = """
 import sys, time
 from cosfly import cli
@@ -150,35 +115,11 @@ def test_options_of_all_commands_may_stand_anywhere(subtests):
             assert cli.options_first(words) == moved
 
 
-def test_no_command_has_an_option_of_all():
-    def options(command: Any) -> set[str]:
-        below = getattr(command, "commands", {}).values()
-        return {name for child in below for name in options(child) | {o for p in child.params for o in p.opts}}
-
-    assert not options(typer.main.get_command(cli.app)) & {*cli.FLAGS, "--log-file"}
-
-
 def told(*words: str) -> tuple[str, str]:
     """What a command says on the error stream, which is a pipe, and in its log file."""
     done = subprocess.run([sys.executable, "-m", "cosfly", *words], capture_output=True, text=True, check=True)
     file = Path(words[words.index("--log-file") + 1]) if "--log-file" in words else None
     return done.stderr, file.read_text() if file else ""
-
-
-def test_more_or_less_is_told_and_a_file_holds_all(tmp_path):
-    out, log = tmp_path / "maps", tmp_path / "log.txt"
-    shown, kept = told("maps", "--out", str(out), "-q", "--log-file", str(log))
-    assert shown == ""
-    line = r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d{4} (DEBUG|INFO) +\S"
-    assert re.search(line.replace("(DEBUG|INFO)", "INFO"), kept, re.MULTILINE)
-    assert re.search("DEBUG +cosfly [0-9.]+, Python", kept)
-    shown, _ = told("maps", "--out", str(out), "--verbose")
-    assert re.search(line, shown, re.MULTILINE)
-    assert "complete for the same settings" in shown
-    command = [sys.executable, "-m", "cosfly", "maps", "--out", str(out), "--log-file", "/dev/full"]
-    shown = subprocess.run(command, capture_output=True, text=True, check=True).stderr
-    assert shown.count("/dev/full cannot be written any more: [Errno 28]") == 1, "a disk that gets full is told once"
-    assert "Traceback" not in shown
 
 
 IMPORTING = """
@@ -242,13 +183,3 @@ def test_the_doctor_asks_for_the_models_where_captions_do_or_says_what_is_wrong(
         assert found.state == "ok"
         assert found.detail.endswith(": one, two")
     assert urls == list(asked.values())
-
-
-def test_the_doctor_tells_how_many_frames_the_disk_takes(tmp_path, monkeypatch):
-    usage = shutil.disk_usage(tmp_path)
-    for free_gib, state in ((3, "missing"), (30, "ok")):
-        monkeypatch.setattr(shutil, "disk_usage", lambda folder, free=free_gib: usage._replace(free=free * 2**30))
-        disk = {check.name: check for check in doctor.examine(tmp_path / "not" / "there")}["disk"]
-        assert disk.state == state
-        assert f"about {free_gib * 200:,} frames" in disk.detail
-        assert ("free some space" in disk.detail) == (state == "missing")

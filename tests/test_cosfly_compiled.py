@@ -1,6 +1,5 @@
 """The cache of compiled functions: never stale, never in the way."""
 
-import logging
 import os
 import shutil
 import subprocess
@@ -10,9 +9,6 @@ from pathlib import Path
 import pytest
 
 import cosfly
-from cosfly.work import compiled
-
-DAY_S = 86400.0
 
 
 def make_package(root: Path) -> Path:
@@ -65,56 +61,3 @@ def test_compiling_is_told_once_and_loading_is_not(tmp_path):
     ]
     assert said[0].count("compiling kernels, once") == 1
     assert said[1] == ""
-
-
-def test_a_process_tells_once_of_what_its_workers_compile(monkeypatch, caplog):
-    monkeypatch.setattr(compiled.log, "filters", [compiled.FirstRecord()])
-    for pid in range(3):
-        record = logging.makeLogRecord({"name": compiled.log.name, "msg": f"of worker {pid}", "levelno": logging.INFO})
-        compiled.log.handle(record)
-    assert caplog.messages == ["of worker 0"]
-
-
-def test_old_caches_go_and_the_present_one_stays(tmp_path, monkeypatch):
-    monkeypatch.setattr(compiled.numba.config, "CACHE_DIR", compiled.numba.config.CACHE_DIR)
-    for name in ("old", "young", "own"):
-        (tmp_path / name).mkdir()
-        os.utime(tmp_path / name, (0.0, 0.0 if name != "young" else 20 * DAY_S))
-    compiled.use_own_cache(tmp_path, "own", 40 * DAY_S)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["own", "young"]
-    assert str(tmp_path / "own") == compiled.numba.config.CACHE_DIR
-
-
-def test_where_no_folder_can_be_made_numba_is_left_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(compiled.numba.config, "CACHE_DIR", "as it was")
-    (tmp_path / "file").touch()
-    compiled.use_own_cache(tmp_path / "file", "own", 0.0)
-    assert compiled.numba.config.CACHE_DIR == "as it was"
-
-
-COUNT = """
-import sys, time
-from numba.core import event
-class Compiled(event.Listener):
-    def on_start(self, e): print("compiles", e.data["dispatcher"].py_func.__name__)
-    def on_end(self, e): time.sleep(1.0)  # so that the other process comes meanwhile
-event.register("numba:compile", Compiled())
-from cosfly.upper import g
-print(g(7))
-"""
-
-
-@pytest.mark.slow
-def test_of_two_processes_one_compiles_and_the_other_loads(tmp_path):
-    package = make_package(tmp_path)
-    (package / "upper.py").write_text(
-        "from cosfly.work.compiled import njit\n\n\n@njit(cache=True)\ndef f(x):\n    return 2 * x\n\n\n"
-        "@njit(cache=True)\ndef g(x):\n    return f(x)\n"
-    )
-    env = os.environ | {"PYTHONPATH": str(package.parent), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    both = [
-        subprocess.Popen([sys.executable, "-c", COUNT], env=env, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
-        for _ in range(2)
-    ]
-    printed = [process.communicate()[0].splitlines() for process in both]
-    assert sorted(line for lines in printed for line in lines) == ["14", "14", "compiles f", "compiles g"]

@@ -2,13 +2,11 @@
 
 import pytest
 from pydantic import BaseModel, Field
-from typer.testing import CliRunner
 
 from cosfly.app.settings import RunConfig
-from cosfly.app.settings_guide import explain, nested, with_words
-from cosfly.cli import app
+from cosfly.app.settings_guide import explain, nested
 from cosfly.errors import ConfigError
-from cosfly.work.config import Config, apply_overrides, load
+from cosfly.work.config import Config, load
 
 
 class Inner(Config):
@@ -70,12 +68,6 @@ def test_bad_overrides_and_files(tmp_path):
         load(Outer, tmp_path / "nowhere.yaml")
 
 
-def test_overrides_do_not_touch_their_input():
-    data = {"plan": {"altitude_m": 1}}
-    assert apply_overrides(data, ["plan.altitude_m=2"]) == {"plan": {"altitude_m": 2}}
-    assert data == {"plan": {"altitude_m": 1}}
-
-
 def test_a_setting_that_is_not_there_is_told_its_place_or_its_neighbours():
     for given, words in (
         ("altitude_max_m=40", r"altitude_max_m: unknown setting \(did you mean 'plan\.altitude_max_m'\?\)"),
@@ -113,50 +105,3 @@ def test_every_setting_is_explained_once_with_its_value():
     assert [setting.name for setting in explained] == names(cfg, "")
     assert all(setting.meaning for setting in explained)
     assert nested(explained) == cfg.model_dump(mode="json")
-
-
-def test_what_a_setting_may_be_is_said_in_words():
-    kinds = {
-        "seed": "whole number",
-        "workers": "whole number >= 0",
-        "item_limit_s": "number >= 0, or null",
-        "roi": "path, or null",
-        "maps.source": "one of synthetic, simworld, cityjson, boxes, carla, unrealcv",
-        "render.fovs_deg": "list of: number",
-        "plan.muco": "",
-    }
-    assert {name: explain(RunConfig(), name)[0].kind for name in kinds} == kinds
-
-
-ALLOWED_VALUES = {
-    "dust_haze": "render.weather_name",
-    "stop_and_look": "pedestrians.pace",
-    "trail": "plan.styles",
-    "pyrender": "render.backend",
-    "multi_sample": "caption.repair.strategy",
-}
-
-
-def test_settings_are_found_by_words_of_theirs_and_by_values_that_they_may_have():
-    shown = CliRunner().invoke(app, ["config", "show", "--find", "ALTITUDE", "--find", "preferred"])
-    assert shown.exit_code == 0
-    assert "plan.altitude_preferred_m = 20.0" in shown.output
-    assert "altitude_max_m = " not in shown.output
-    assert [one.name for one in with_words(explain(RunConfig()), ["num_paths"])] == ["pedestrians.num_paths"]
-    found = {word: [one.name for one in with_words(explain(RunConfig()), [word])] for word in ALLOWED_VALUES}
-    assert {word: names[0] for word, names in found.items()} == ALLOWED_VALUES
-    with pytest.raises(ConfigError, match="no setting has these words; got altitude and zebra"):
-        with_words(explain(RunConfig()), ["altitude", "zebra"])
-
-
-def test_a_section_is_shown_alone():
-    for words, told in (
-        (("plan.muco",), "track_distance_m: 28.0"),
-        (("quickstart", "pedestrians"), "num_paths: "),
-        (("--describe", "render.fovs_deg"), "one is drawn for each walk"),
-        (("delft", "--changed"), "name: delft maps: source: cityjson"),
-    ):
-        result = CliRunner().invoke(app, ["config", "show", *words])
-        assert result.exit_code == 0
-        assert told in " ".join(result.output.split())
-        assert "caption" not in result.output

@@ -1,15 +1,12 @@
 """cosfly/pedestrians/crossings.py: what is under the feet, what a crossing is, and that walkers keep to it."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from cosfly.app.settings import RunConfig
-from cosfly.errors import NoPathError
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.stage import load_map
-from cosfly.pedestrians.crossings import CROSSING, OPEN, PAVED, ROAD, where_walked
+from cosfly.pedestrians.crossings import CROSSING, ROAD, where_walked
 from cosfly.pedestrians.others import company_of
 from cosfly.pedestrians.stage import make_walk
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
@@ -20,7 +17,6 @@ from cosfly.work.chance import rng_for
 from cosfly.work.config import load, shipped
 
 CFG = PedestriansConfig(road_cost=20, open_cost=3, min_component_cells=100, min_distance_m=20)
-ALONG_X, ALONG_Y = ROAD + 1, ROAD + 2
 
 
 def street(*, marked: bool = False) -> BoxList:
@@ -46,20 +42,6 @@ def footing_at(boxes: BoxList, *points) -> list[int]:
     return ground.footing[y, x].tolist()
 
 
-def test_the_topmost_ground_counts_and_of_one_plane_the_higher_layer():
-    boxes = street()
-    assert footing_at(boxes, (20, 20), (20, 6), (2, 2)) == [OPEN, PAVED, ROAD]
-    boxes.add("Roads", (20, 6), (4, 2), -0.1, 0.0)  # in the pavement's plane: renderers show the pavement
-    boxes.add("Terrain", (30, 6), (4, 2), -0.1, 0.1)  # earth heaped on it
-    boxes.add("Roads", (6, 30), (4, 2), 3.0, 3.2)  # a flyover
-    assert footing_at(boxes, (20, 6), (30, 6), (6, 30)) == [PAVED, OPEN, PAVED]
-
-
-def test_unmarked_streets_are_crossed_straight_and_junctions_nowhere():
-    places = (20.2, 0.2), (0.2, 20.2), (0.2, 0.2), (3.2, 3.2)
-    assert footing_at(street(), *places) == [ALONG_Y, ALONG_X, ROAD, ROAD]
-
-
 def test_where_stripes_are_only_they_are_crossings_from_kerb_to_kerb_and_dashes_are_none():
     places = (10.2, 0.2), (10.2, 3.7), (10.2, -3.7), (16.2, 0.2), (0.2, 20.2), (0.2, 0.2), (14.2, 2.2)
     assert footing_at(street(marked=True), *places) == [CROSSING] * 3 + [ROAD] * 4
@@ -83,16 +65,6 @@ def test_points_are_counted_by_where_they_are_and_which_way_they_go(way, marked,
     walk = Walk("p", places, np.arange(len(places)) * 0.5, np.pad(places, ((0, 0), (0, 1))), np.ones(len(places)))
     ground = walkable_ground(street(marked=marked).box_map(), CFG)
     assert where_walked(walk, ground.footing, ground.grid) == counts
-
-
-def test_ends_lie_off_the_carriageway_or_nowhere():
-    ground = walkable_ground(street(marked=True).box_map(), CFG)
-    assert set(np.unique(ground.footing[ground.may_end])) == {PAVED, OPEN}
-    assert walkable_ground(street().box_map(), PedestriansConfig(min_component_cells=100)).may_end.sum() == 160 * 160
-    boxes = BoxList()
-    boxes.add_span("Roads", (0, 0), (80, 80), -0.3, 0.0)
-    with pytest.raises(NoPathError, match=r"all walkable ground is carriageway.*road_cost"):
-        walkable_ground(boxes.box_map(), CFG)
 
 
 def shares(cfg: RunConfig, name: str, num_others: int = 0) -> tuple[float, float]:
@@ -122,19 +94,6 @@ def test_at_most_a_twentieth_of_the_walked_points_of_shipped_towns_is_on_the_roa
     assert on_crossings > 0.05  # people do cross
     paper, _ = shares(load(RunConfig, shipped("diverse.yaml"), ["pedestrians.road_cost=1"]), name)
     assert paper > 0.1
-
-
-def test_others_keep_to_pavements_as_well():
-    away, _ = shares(load(RunConfig, shipped("diverse.yaml")), "market", num_others=3)
-    assert away <= 0.05
-
-
-def test_people_of_a_foreign_city_without_marked_crossings_cross_straight(shared_data: Path):
-    world = shared_data / "simworld-progen/progen_world.json"
-    city = f"towns.city={{maps: {{source: simworld, simworld: {{world: {world}}}}}}}"
-    away, on_crossings = shares(load(RunConfig, shipped("diverse.yaml"), [city]), "city")
-    assert away <= 0.05
-    assert on_crossings > 0.05
 
 
 @pytest.mark.parametrize("name", ["old_town", "market"])

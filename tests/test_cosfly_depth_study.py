@@ -11,20 +11,14 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.errors import InputError
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import frame_name
 from cosfly.reading.documents import read_json
 from cosfly.studies.depth import (
     BITS,
-    ENTROPY_BINS,
-    PROFILE_STEPS,
     Study,
-    edge_correlation,
-    entropy_bits,
     quantised,
     run,
-    steady_stretch,
 )
 from specimens import make_playback_tree
 
@@ -99,57 +93,6 @@ def test_a_frame_of_the_tree_is_studied_with_its_picture(tmp_path):
     assert picture.std() > 20
 
 
-def test_what_cannot_hold_the_depths_is_named(tmp_path):
-    np.save(tmp_path / "depth.npy", (ramp(np.float32) * 10).astype(np.float32))
-    study = run(tmp_path / "depth.npy", tmp_path / "out")
-    assert study.left_out == {"16-bit PNG of millimetres": "depths beyond 65.5 m"}
-    np.save(tmp_path / "depth.npy", (ramp(np.float32) * 1e6).astype(np.float32))
-    assert run(tmp_path / "depth.npy", tmp_path / "out").left_out["16-bit float"] == "depths beyond 65504 m"
-
-
-@pytest.mark.filterwarnings("error")
-def test_pixels_without_depth_of_others_are_invalid_ones(tmp_path):
-    """Their figures are those of a frame whose invalid pixels are 0, in every coding."""
-    values = ramp(np.float64)
-    studies = []
-    for number, hole in enumerate((0.0, np.nan, np.inf, -np.inf)):
-        values[:, :7] = hole
-        np.save(tmp_path / "depth.npy", values)
-        studies.append(run(tmp_path / "depth.npy", tmp_path / str(number)))
-    for theirs in studies:
-        assert theirs.rows == studies[0].rows
-        assert theirs.left_out == {}
-        assert theirs.share_measured == 1 - 7 / 128
-
-
-def test_the_profile_is_where_steps_are_seen():
-    """A floor that rises by 20 steps of 8 bits over a row, in a frame with a far wall; noise above, a hole beside."""
-    truth = np.tile(np.linspace(10.0, 10.0 + 20 * 90 / 255, 160), (60, 1))
-    truth[:20] = np.random.default_rng(0).uniform(10, 100, (20, 160))
-    truth[20:40, 80] = 0.0
-    truth[59] = 100.0
-    row, first, length = steady_stretch(truth, truth > 0)
-    part = truth[row, first : first + length]
-    assert row >= 20
-    assert 0 not in part
-    assert PROFILE_STEPS / 2 < abs(part[-1] - part[0]) / (90 / 255) < PROFILE_STEPS * 2
-
-
-def test_a_frame_without_anything_to_study_is_one_error(tmp_path):
-    path, shape = tmp_path / "depth.npy", (4, 5)
-    sky, negative = np.full(shape, 1000, np.float32), np.linspace(-1, 1, 20, dtype=np.float32).reshape(shape)
-    for values in (np.full(shape, 7, np.float32), sky, np.full(shape, np.nan, np.float32), negative):
-        np.save(path, values)
-        with pytest.raises(InputError, match="depth"):
-            run(path, tmp_path / "out")
-    with pytest.raises(InputError):
-        run(tmp_path / "no such frame", tmp_path / "out")
-    np.save(path, (ramp(np.float64) * 1000).astype(np.uint16))
-    with pytest.raises(InputError, match=r"unit.*uint16.*metres as float32 or float64.*/ 1000") as caught:
-        run(path, tmp_path / "out")
-    assert caught.value.where == path
-
-
 @given(st.sampled_from(BITS), st.integers(0, 2**31))
 def test_codes_are_within_half_a_step(bits, seed):
     truth = np.random.default_rng(seed).uniform(1, 90, (5, 7)).astype(np.float32)
@@ -158,18 +101,3 @@ def test_codes_are_within_half_a_step(bits, seed):
     step = (float(truth.max()) - float(truth.min())) / (2**bits - 1)
     assert np.abs(values - truth).max() <= step / 2 * 1.0001 + 1e-6
     assert (codes.min(), codes.max()) == (0, 2**bits - 1)
-
-
-def test_entropy_and_edges_of_known_images():
-    even = np.repeat((np.arange(ENTROPY_BINS) + 0.5) / ENTROPY_BINS, 2)
-    assert entropy_bits(even, 0, 1) == pytest.approx(13.0)
-    assert entropy_bits(np.full(9, 0.5), 0, 1) == 0.0
-    slope = np.add.outer(np.arange(20.0) ** 2, np.arange(30.0))
-    everywhere = np.ones(slope.shape, dtype=bool)
-    assert edge_correlation(3 * slope, slope, everywhere) == pytest.approx(1.0)
-    hole = everywhere.copy()
-    hole[5, 5] = False
-    broken = slope.copy()
-    broken[5, 5] = 1e6
-    assert edge_correlation(broken, slope, hole) == pytest.approx(1.0), "what is not measured has no edge"
-    assert edge_correlation(np.random.default_rng(0).normal(size=slope.shape), slope, everywhere) < 0.5

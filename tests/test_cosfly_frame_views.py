@@ -2,7 +2,6 @@
 
 import asyncio
 import base64
-import dataclasses
 import io
 import re
 
@@ -18,17 +17,16 @@ from caption.teachers.images import FrameEncoder, pictures_of
 from caption.teachers.prompts import make_question, prompt_hash, question_messages
 from caption.teachers.teacher import RuleTeacher
 from cosfly.errors import InputError
-from cosfly.look.frame_views import PEDESTRIAN_RGB, Pictures, depth_colors, segmentation_colors, thumbnail
+from cosfly.look.frame_views import PEDESTRIAN_RGB, Pictures
 from cosfly.products.actions import shipped_actions
 from cosfly.products.captions import PICTURES_MARK, Language
 from cosfly.products.flights import find_flights
-from cosfly.products.kinds import KINDS
 from cosfly.products.playback import read_flight
 from distill.inference.stage import InferConfig, make_request
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample
 from distill.student.encoding import load_pictures
-from specimens import PERSON_ID, make_playback_tree
+from specimens import make_playback_tree
 
 
 @pytest.fixture(scope="module")
@@ -39,22 +37,6 @@ def tree(tmp_path_factory):
 @pytest.fixture(scope="module")
 def frame(tree):
     return read_flight(find_flights(tree)[0]).frame_folder(1)
-
-
-def test_depth_colors_near_is_bright_and_sky_and_no_depth_are_dark():
-    colors = depth_colors(np.array([[0.5, 50.0, 99.9, 1000.0, 0.0, 100.0]], dtype=np.float32), 100.0)[0]
-    brightness = colors.sum(axis=1)
-    assert brightness[0] > brightness[1] > brightness[2] >= brightness[5]
-    assert (colors[3:5] == colors[5]).all()
-
-
-def test_only_the_pedestrian_is_vivid():
-    kinds = np.array([[KINDS["Buildings"], KINDS["Pedestrians"], KINDS["Sky"]]], dtype=np.uint8)
-    ids = np.array([[3, PERSON_ID, 0]], dtype=np.uint16)
-    colors = segmentation_colors(kinds, ids)[0].astype(int)
-    spread = colors.max(axis=1) - colors.min(axis=1)
-    assert spread[1] > 200
-    assert max(spread[0], spread[2]) < 80
 
 
 def test_the_middle_is_cut_out_wherever_the_person_is(tmp_path):
@@ -174,14 +156,6 @@ def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, 
             assert np.array_equal(picture, wanted)
 
 
-def test_without_pictures_pixels_are_the_cameras(window):
-    blind = dataclasses.replace(window.observed, width_px=1280, height_px=720, frame_files=(frozenset(),) * 5)
-    question = make_question(blind, ImageConfig(), "prose", VOCABULARY)
-    assert "No pictures are given. Pixel values refer to pictures of 1280 x 720 px." in question.asked["en"].user
-    assert "未提供图像。像素值以 1280 × 720 像素的图像为准。" in question.asked["zh"].user
-    assert (question.facts.width_px, question.facts.height_px) == (1280, 720)
-
-
 def test_the_hash_is_of_what_was_asked(window):
     few, many = (
         make_question(window.observed, ImageConfig(modalities=views), "prose", VOCABULARY)
@@ -189,14 +163,6 @@ def test_the_hash_is_of_what_was_asked(window):
     )
     assert few.prompts == many.prompts
     assert prompt_hash(few) != prompt_hash(many)
-
-
-def test_a_picture_of_another_shape_is_refused(frame):
-    with pytest.raises(InputError, match=r"rgb\.png: .*another size.*64 x 36.*expected 64 x 40"):
-        Pictures(("rgb",), (64, 40)).read(frame)
-    with pytest.raises(InputError, match="another size"):
-        Pictures(("rgb",), (128, 72)).read(frame)  # smaller than the prompt says
-    assert Pictures(("rgb",), (32, 18)).read(frame)[0].shape == (18, 32, 3)
 
 
 # --- pixels ---
@@ -229,9 +195,3 @@ def test_a_size_read_off_the_picture_is_the_measured_one(large, max_side_px):
         assert (top + bottom) / 2 - picture.shape[0] / 2 == pytest.approx(facts.offset_y_px[i], abs=2)
         compared += 1
     assert compared >= 3
-
-
-def test_a_thumbnail_is_a_small_jpeg_or_nothing(frame, tmp_path):
-    small = Image.open(io.BytesIO(base64.b64decode(thumbnail(frame, 20))))
-    assert (small.format, small.width) == ("JPEG", 20)
-    assert thumbnail(tmp_path, 20) is None

@@ -1,13 +1,11 @@
 import itertools
 
 import numpy as np
-import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from cosfly.errors import InputError
 from cosfly.geometry import rotation_matrix
 from cosfly.products.boxes import make_box_map
 from cosfly.products.kinds import KINDS
@@ -15,9 +13,7 @@ from cosfly.products.roi import Roi
 from cosfly.space.grid import (
     OccupancyGrid,
     blocks_walking,
-    compare,
     connected_parts,
-    empty_grid,
     inflate,
     occupancy,
     roi_mask,
@@ -42,39 +38,6 @@ def one_box(center, half_extents, rotation_deg=(0, 0, 0), kind=BUILDINGS):
 
 
 # --- cells and metres -------------------------------------------------------------------------------------------------
-
-
-def test_world_to_cell_is_the_floor_of_the_papers_map():
-    points = np.array([(-10.0, 5.0), (-9.51, 5.49), (-9.5, 5.5), (0.0, 0.0)])
-    assert free_grid(40, 40, 0.5, -10.0, 5.0).cells_at(points).tolist() == [[0, 0], [0, 0], [1, 1], [20, -10]]
-
-
-@given(st.integers(-50, 50), st.integers(-50, 50), st.floats(0.1, 3.0), st.floats(-500, 500))
-def test_a_cells_center_lies_in_the_cell(x, y, resolution_m, x_min_m):
-    grid = free_grid(10, 20, resolution_m, x_min_m, -7.25)
-    assert tuple(grid.cells_at(grid.centers_of(np.array([x, y])))) == (x, y)
-
-
-def test_empty_grid_covers_the_bounds_and_no_more():
-    box_map = make_box_map([[0, 0, 0], [10, 5, 1]], [[2, 1, 0.1], [2, 1, 1]], np.zeros((2, 3)), [ROADS, BUILDINGS])
-    grid = empty_grid(box_map)
-    assert (grid.x_min_m, grid.y_min_m, grid.size) == (-2.0, -1.0, (28, 14))
-    assert not grid.occupied.any()
-
-
-def test_a_stray_box_and_bad_arguments_are_errors():
-    box_map = make_box_map([[0, 0, 0], [1e9, 1e9, 0]], np.ones((2, 3)), np.zeros((2, 3)), [BUILDINGS] * 2)
-    with pytest.raises(InputError, match=r"too wide.*coarser resolution_m"):
-        empty_grid(box_map)
-    with pytest.raises(ValueError, match="resolution_m"):
-        empty_grid(box_map, 0.0)
-    with pytest.raises(ValueError, match="at least one box"):
-        empty_grid(box_map.select(np.zeros(2, dtype=bool)))
-    with pytest.raises(ValueError, match="radius_m"):
-        inflate(free_grid(2, 2), -1.0)
-    for other in (free_grid(3, 2), free_grid(2, 2, 0.5), free_grid(2, 2, 1.0, 0.5)):
-        with pytest.raises(ValueError, match="same cells"):
-            compare(free_grid(2, 2), other)
 
 
 # --- which boxes, which cells -----------------------------------------------------------------------------------------
@@ -154,13 +117,6 @@ def test_surfaces_near_the_ground_count_and_a_flyover_does_not():
 
 
 # --- comparing --------------------------------------------------------------------------------------------------------
-
-
-def test_compare_by_hand():
-    cell_agreement, iou = compare(grid_of("##. ..."), grid_of("#.# ..."))
-    assert cell_agreement == pytest.approx(4 / 6)
-    assert iou == pytest.approx(1 / 3)
-    assert compare(free_grid(3, 3), free_grid(3, 3))[1] == 1.0
 
 
 # --- growing, cutting out, connecting ---------------------------------------------------------------------------------

@@ -12,16 +12,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
-from cosfly.errors import InputError, NothingKept
-from cosfly.geometry import box_iou, mask_box
+from cosfly.errors import NothingKept
+from cosfly.geometry import mask_box
 from cosfly.inspection import frames
 from cosfly.inspection.files import check_recorded
-from cosfly.inspection.flight import check_motion, check_plan, check_poses, is_shifted
-from cosfly.inspection.frames import Jumps, check_others, choose_frames, others_told, pedestrian_region, pixels_iou
-from cosfly.inspection.pixels import Picture, look_at, unpack
+from cosfly.inspection.flight import check_plan, is_shifted
+from cosfly.inspection.frames import check_others, pedestrian_region
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
 from cosfly.products.boxes import make_box_map, read_boxes, write_boxes
@@ -33,21 +31,19 @@ from cosfly.products.frames import (
     frame_name,
     read_depth,
     read_instance,
-    read_meta,
     tree_position,
 )
 from cosfly.products.inspection import read_inspection
-from cosfly.products.issues import Issue, Report
+from cosfly.products.issues import Report
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import read_flight, write_flight
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.reading.documents import read_json
 from cosfly.reading.files import sha256_file
 from cosfly.space.kernels import obstacle_index, signed_distances
-from cosfly.work.journal import Journal
 from cosfly.work.store import CHECKSUMS, write_checksums, write_json
 from release.verify.verify import verify
-from specimens import make_playback_tree, pack_depth
+from specimens import make_playback_tree
 
 NUM_POINTS = 10
 
@@ -141,69 +137,6 @@ def test_what_a_tree_was_never_to_have_is_not_missing(workplace):
     found = inspect(workplace)
     assert codes_of(found, lost)["missing_file"] == "error"
     assert codes_of(found, never) == {"not_in_this_tree": "note"}
-
-
-def test_packed_depth_is_judged_as_any_other(workplace):
-    tree = workplace / "tree"
-    pack_depth(tree)
-    good, wrong, cut = find_flights(tree)[:3]
-    name, data = depth_file(far_away(read_depth(wrong / FRAME)), "png")
-    (wrong / FRAME / name).write_bytes(data)
-    (cut / FRAME / name).write_bytes((cut / FRAME / name).read_bytes()[:-20])
-    list_files(tree)
-    found = inspect(workplace)
-    assert codes_of(found, good) == {}
-    assert codes_of(found, wrong)["depth_disagrees"] == "error"
-    assert codes_of(found, cut)["broken_image"] == "error"
-    where = {issue.where for flight in found.flights for issue in flight.issues if issue.severity == "error"}
-    assert where == {f"{FRAME}/{name}"}
-
-
-FORGED = {
-    "a script for a picture": lambda r: r["view"].update(pictures=['" onerror="alert(1)', None, None]),
-    "two pictures": lambda r: r["view"]["pictures"].pop(),
-    "a curve cut short": lambda r: r["view"]["curves"]["speed_mps"].pop(),
-    "times cut short": lambda r: r["view"]["time_s"].pop(),
-    "bins cut short": lambda r: r["coverage"]["bins"]["height_m"].pop(),
-    "an axis less": lambda r: r["coverage"]["bins"].pop("height_m"),
-    "a figure that is no number": lambda r: r["record"]["metrics"].update(frames_full="many"),
-}
-
-
-def test_a_forged_line_of_the_journal_is_one_error(workplace, subtests):
-    """Of an inspection that was killed before its product: it goes on with the lines that are there."""
-    inspect(workplace)
-    (workplace / "out/manifest.json").unlink()
-    journal = workplace / "out/items.jsonl"
-    honest = list(Journal(journal).read())
-    for name, forge in FORGED.items():
-        with subtests.test(name):
-            journal.unlink()
-            with Journal(journal) as written:
-                for k, line in enumerate(honest):
-                    line = json.loads(json.dumps(line))
-                    if k == 1:
-                        forge(line["result"])
-                    written.append(line)
-            with pytest.raises(InputError, match=r"items\.jsonl: .*: result"):
-                inspect(workplace)
-
-
-def test_what_nothing_lists_is_not_asked_for(workplace):
-    """A flight of cosfly's whose own files somebody took away, as one of somebody else has none: annotations,
-    checksums, fields of ours."""
-    tree = workplace / "tree"
-    for path in [*tree.rglob("meta.json"), *tree.rglob(CHECKSUMS)]:
-        path.unlink()
-    for folder in find_flights(tree):
-        edit(folder, lambda t: [t.pop(name, None) for name in ("source", "coordinates", "augmentation")])
-    found = read_inspection(run(CFG, None, None, tree, workplace / "out"))
-    for flight in found.flights:
-        assert (flight.result, {issue.severity for issue in flight.issues}) == ("accepted", {"note"}), flight.issues
-    assert codes_of(found, first_flight(workplace)) == {"no_checksums": "note", "not_in_this_tree": "note"}
-    (first_flight(workplace) / frame_name(3) / "rgb.png").unlink()
-    again = read_inspection(run(CFG, None, None, tree, workplace / "again"))
-    assert codes_of(again, first_flight(workplace))["missing_file"] == "error"
 
 
 def test_checksums_that_the_tree_lists_cannot_be_taken_away(workplace):
@@ -486,16 +419,6 @@ def let_fight(folder: Path) -> None:
     edit_image(folder / FRAME / "instance.png", change)
 
 
-@pytest.mark.parametrize(("number", "is_found"), [(0, False), (5, True)])
-def test_narrow_stripes_of_far_fields_do_not_fight(number, is_found):
-    """Beyond the map nothing has an id: fields are kinds that alternate. Of a thing of the map it is Z-fighting."""
-    instance = np.zeros((36, 64, 3), np.uint8)
-    instance[..., 0] = KINDS["Terrain"]
-    instance[::2] = (KINDS["Roads"], number, 0)
-    picture = Picture(instance * 9, np.full((36, 64), 20.0, np.float32), instance)
-    assert (look_at(picture, np.zeros(1 << 16, np.bool_), 0.9).fighting > 0.5) == is_found
-
-
 def at_upper_left(values: np.ndarray, metres: float) -> np.ndarray:
     """Depth with a part that lies farther off: what stood there is gone."""
     values = values.copy()
@@ -551,45 +474,6 @@ def test_far_is_far(workplace, form):
     assert read_depth(folder / FRAME).max() == 1000.0
     list_files(workplace / "tree")
     assert not [one for one in verify(workplace / "tree").issues if one.code in ("depth_range", "sky")]
-
-
-@pytest.mark.parametrize("width_px", [160, 256, 640, 1280])
-def test_track_quality_is_that_of_any_size(width_px):
-    """A person who fills 0.7 of the width of its box, seen at the middles of pixels, in a picture 40 m wide."""
-    rng, px_per_m, ious = np.random.default_rng(0), width_px / 40.0, []
-    for x, y in rng.uniform(10.0, 11.0, (400, 2)):
-        box = np.array([x, y, x + 0.6 * px_per_m, y + 1.8 * px_per_m])
-        middle, half = (box[0] + box[2]) / 2.0, 0.21 * px_per_m
-        pixels = np.mgrid[0:100, 0:100] + 0.5
-        is_person = (np.abs(pixels[1] - middle) < half) & (pixels[0] > box[1]) & (pixels[0] < box[3])
-        ious.append(pixels_iou(box, mask_box(is_person)) if is_person.any() else 0.0)
-    assert np.mean(ious) > 0.65
-    beside = box + np.array([0.0, 0.8, 0.0, 0.8]) * (box[3] - box[1])
-    assert pixels_iou(box, beside) < 0.25
-
-
-def test_colours_hold_no_flight_back(workplace):
-    """Night falls and rain sets in from frame to frame: depth, ids and poses are those of one world."""
-    flight, rng = read_flight(first_flight(workplace)), np.random.default_rng(0)
-    jumps, report = Jumps(flight), Report()
-    for i in range(4):
-        names = ("rgb.png", "depth.npy", "instance.png")
-        picture = unpack({name: (flight.frame_folder(i) / name).read_bytes() for name in names}, Path("frame"))
-        dark = picture.colours // (1 + 3 * (i % 2)) + rng.integers(0, 60, picture.colours.shape, dtype=np.uint8)
-        jumps.see(i, replace(picture, colours=dark))
-    assert jumps.judge(CFG, report) == 3
-    assert report.issues == []
-
-
-def test_a_time_that_nobody_planned(workplace):
-    folder = first_flight(workplace)
-    late_s = read_flight(folder).time_s.copy()
-    late_s[3] += 0.1
-    report = Report()
-    check_poses(replace(read_flight(folder), time_s=late_s), plan_of(folder), CFG, report)
-    assert [(i.code, i.where) for i in report.issues] == [
-        ("pose_differs", "trajectory.json: points[3].timing.trace_timestamp")
-    ]
 
 
 def test_a_flight_that_its_tree_does_not_list(workplace):
@@ -660,12 +544,6 @@ def test_every_check_has_a_planted_defect():
     assert codes == planted | elsewhere
 
 
-def test_recorded_boxes_of_the_pixels_are_accepted(workplace):
-    flight = first_flight(workplace)
-    record_masks(flight, {})
-    assert set(codes_of(inspect(workplace), flight)) == {"checksum"}  # of the edited file
-
-
 def other_at(place_m, kind: str = "Pedestrians", number: int = 7) -> OtherMeta:
     return OtherMeta(
         instance_id=number, semantic_id=KINDS[kind], world_location=tree_position(np.asarray(place_m, float)), yaw=0.0,
@@ -698,23 +576,6 @@ def test_others_keep_clear_of_drone_and_person(workplace, beside, shift_m, codes
     )
 
 
-def test_a_flight_without_others_has_no_figures_of_them(workplace):
-    flight, report, metrics = read_flight(first_flight(workplace)), Report(), {}
-    assert others_told(flight, {i: read_meta(flight.frame_folder(i)) for i in range(len(flight))}) == {}
-    check_others(flight, {}, 2.5, report, metrics)
-    assert (metrics, report.issues) == ({}, [])
-
-
-def test_teleport_of_drone_and_person(workplace):
-    flight = read_flight(first_flight(workplace))
-    for name, shift_m in (("positions_m", 30.0), ("targets_m", 9.0)):
-        moved = getattr(flight, name).copy()
-        moved[5:, 0] += shift_m
-        report = Report()
-        check_motion(replace(flight, **{name: moved}), InspectConfig(), report)
-        assert [(i.code, "points[5]" in i.where) for i in report.issues] == [("teleport", True)]
-
-
 def test_an_unreadable_flight_is_a_counted_failure_while_others_go_on(workplace):
     broken, twin = first_flight(workplace), first_flight(workplace, "aug_001")
     edit(broken, at_point("drone_pose", "x", "oops"))
@@ -728,17 +589,6 @@ def test_an_unreadable_flight_is_a_counted_failure_while_others_go_on(workplace)
     assert manifest["counts"] == {"input": 4, "kept": 2, "dropped": {}, "failed": {"input": 2}}
     assert "trajectory.json" in (workplace / "out" / "failures.jsonl").read_text()
     assert found.funnel.trajectories.rejected == 1  # counted with its twin's trajectory
-
-
-def test_a_mended_clean_flight_mends_the_record_of_its_perturbed_one(workplace):
-    whole = (trajectory := first_flight(workplace) / "trajectory.json").read_bytes()
-    # As a stage of ours leaves it, so that a mended file is no other input.
-    write_json(workplace / "tree/manifest.json", {"schema": "cosfly.manifest", "schema_version": "1.0", "outputs": []})
-    expected = inspect(workplace, out="never broken")
-    trajectory.write_bytes(whole[: len(whole) // 2])
-    assert [f.result for f in inspect(workplace).flights].count("rejected") == 2
-    trajectory.write_bytes(whole)
-    assert inspect(workplace) == expected
 
 
 def test_a_clean_flight_of_other_frames_leaves_the_perturbed_one_to_a_person(workplace):
@@ -759,29 +609,10 @@ def test_the_funnel_counts_prefiltered_and_unrendered_plans(workplace):
     assert funnel.dropped == {"five_ray_visibility": 1, "smoothness": 1}
 
 
-def test_pixels_can_be_sampled_or_left_out(workplace):
-    broken = first_flight(workplace)
-    flip_byte(broken / FRAME / "rgb.png", 200)
-    (broken / "checksums.sha256").unlink()
-    nothing = inspect(workplace, CFG.model_copy(update={"check_pixels": "none"}), "none")
-    assert "broken_image" not in codes_of(nothing, broken)
-    assert codes_of(nothing, broken)["no_checksums"] == "note"
-    some = inspect(workplace, CFG.model_copy(update={"check_pixels": "sample", "pixel_sample": 4}), "some")
-    assert some.flights[0].metrics["num_frames_checked"] == (3 if "broken_image" in codes_of(some, broken) else 4)
-
-
 # --- kernels ----------------------------------------------------------------------------------------------------------
 
 
 boxes = st.tuples(*[st.integers(0, 12)] * 4).map(lambda v: np.array([v[0], v[1], v[0] + v[2], v[1] + v[3]], float))
-
-
-@given(boxes, boxes)
-def test_box_iou_counts_pixels(one, two):
-    """Oracle: integer boxes as sets of pixels."""
-    sets = [{(x, y) for x in range(int(b[0]), int(b[2])) for y in range(int(b[1]), int(b[3]))} for b in (one, two)]
-    union = len(sets[0] | sets[1])
-    assert box_iou(one, two) == pytest.approx(len(sets[0] & sets[1]) / union if union else 0.0)
 
 
 def test_the_region_is_the_one_at_the_target():
@@ -792,26 +623,6 @@ def test_the_region_is_the_one_at_the_target():
     assert mask_box(region).tolist() == [12, 10, 15, 18]
     assert np.isnan(mask_box(np.zeros_like(region))).all()
     assert pedestrian_region(kinds, np.array([6.0, 6.0, 9.0, 9.0])) is None
-
-
-@given(st.lists(st.integers(), max_size=30), st.integers(1, 40))
-def test_a_sample_has_both_ends_and_its_size(indices, count):
-    chosen = choose_frames(indices, "sample", count)
-    assert len(chosen) == min(count, len(indices))
-    if indices and count > 1:
-        assert (chosen[0], chosen[-1]) == (indices[0], indices[-1])
-    assert choose_frames(indices, "none", count) == []
-
-
-def test_reports_sort_and_merge():
-    report = Report()
-    report.add("note", "z", "b", 1, "2")
-    report.error("y", "c", 1, "2")
-    report.error("y", "d", 1, "2")
-    assert not report.is_ok
-    assert [(i.code, i.where, i.count) for i in report.merged()] == [("y", "c", 2), ("z", "b", 1)]
-    assert str(report).splitlines()[-1] == "NOT OK: 2 errors, 0 warnings, 1 note"
-    assert isinstance(report.merged()[0], Issue)
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
@@ -857,22 +668,3 @@ def test_the_four_states_of_perturbed_frames_are_counted_beside_the_papers_share
         ("rotation only", "2", "10.0", "24"),
         ("full", "5", "25.0", "36"),
     ]
-
-
-def test_progress_is_told_by_frames(tmp_path, monkeypatch):
-    bars = []
-
-    @contextlib.contextmanager
-    def bar(label, total, done=0):
-        bars.append([label, total, done])
-
-        def advance(count, told=""):
-            bars[-1][2] += count
-            assert bars[-1][2] <= total
-
-        yield advance
-
-    monkeypatch.setattr("cosfly.work.runner.progress_bar", bar)
-    tree = make_playback_tree(tmp_path / "tree", 1, 7)
-    run(InspectConfig(), None, None, tree, tmp_path / "inspect")
-    assert bars == [["inspect: frames", 14, 14]]

@@ -4,9 +4,6 @@ import numpy as np
 import pytest
 
 from cosfly.geometry import rotation_matrices, rotation_matrix
-from cosfly.planners.muco.loss import window_rays
-from cosfly.products.boxes import make_box_map
-from cosfly.products.kinds import KINDS
 from cosfly.space import kernels
 
 NO_TURN = np.eye(3)[None]
@@ -150,20 +147,6 @@ def test_the_way_past_a_corner_by_hand():
     assert boxes.tolist() == [0, 0, 0, -1, -1]
 
 
-def test_segments_by_hand():
-    rows = [
-        ((-5, 0, 0), (5, 0, 0), True),
-        ((-5, 2, 0), (5, 2, 0), True),  # along a face
-        ((-5, 2.001, 0), (5, 2.001, 0), False),
-        ((0, 0, 0), (0.5, 0, 0), True),  # inside
-        ((2, 0, 0), (5, 0, 0), False),
-        ((1, 0, 0), (5, 0, 0), True),  # starts on a face
-        ((-5, 0, 0), (-1.5, 0, 0), False),  # ends before it
-    ]
-    starts, ends, hits = map(list, zip(*rows, strict=True))
-    assert kernels.segments_hit(one_box(), starts, ends).tolist() == hits
-
-
 def test_visibility_agrees_with_slow_rays():
     rng = np.random.default_rng(8)
     index = random_boxes(rng, 120, tilt=False)
@@ -183,51 +166,3 @@ def test_a_wall_hides_what_it_should():
     assert kernels.visibility(wall, [(20.0, 11.0, 0.0)], target)[0] == 1.0  # past its end
     index = one_box(half=(2, 2, 2))  # somebody inside a box is hidden from everywhere
     assert kernels.visibility(index, [(20.0, 0.0, 20.0), (-9.0, 3.0, 50.0)], [(0.0, 0.0, 0.9)] * 2).tolist() == [0, 0]
-
-
-def test_no_boxes_no_points():
-    empty = kernels.index_boxes(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
-    points = np.zeros((3, 3))
-    distances, boxes = kernels.signed_distances(empty, points)
-    assert np.isinf(distances).all()
-    assert (boxes == -1).all()
-    assert not kernels.segments_hit(empty, points, points + 1).any()
-    assert (kernels.visibility(empty, points, points + 1) == 1).all()
-    assert kernels.signed_distances(one_box(), np.empty((0, 3)))[0].shape == (0,)
-
-
-def test_bad_arguments_are_value_errors(subtests):
-    for call in [
-        lambda: kernels.index_boxes([(0, 0, 0)], [(1, -1, 1)], NO_TURN),
-        lambda: kernels.index_boxes([(0, 0, np.nan)], [(1, 1, 1)], NO_TURN),
-        lambda: kernels.index_boxes([(0, 0, 0)], [(1, 1, 1)], np.eye(3)),
-        lambda: kernels.signed_distances(one_box(), np.zeros(3)),
-        lambda: kernels.segments_hit(one_box(), np.zeros((2, 3)), np.zeros((3, 3))),
-    ]:
-        with subtests.test(call=call), pytest.raises(ValueError, match=r"must be|differ|starts for"):
-            call()
-
-
-def test_a_stray_box_far_away_does_not_fill_the_memory():
-    index = kernels.index_boxes([(0, 0, 0), (1e9, -1e9, 0)], [(1, 1, 1), (1, 1, 1)], np.repeat(NO_TURN, 2, axis=0))
-    assert len(index.starts) <= kernels.MAX_CELLS + 1
-    np.testing.assert_allclose(kernels.signed_distances(index, [(3, 0, 0), (1e9, -1e9, 6)])[0], [2, 5])
-
-
-def test_ground_and_water_are_no_obstacles():
-    kinds = [KINDS[name] for name in ("Roads", "Water", "Terrain", "Buildings", "Vegetation")]
-    box_map = make_box_map(np.zeros((5, 3)), np.ones((5, 3)), np.zeros((5, 3)), kinds)
-    assert kernels.obstacle_index(box_map).rows.shape[0] == 2
-
-
-def test_a_window_of_rays_is_seven_bundles():
-    rng = np.random.default_rng(2)
-    index, free = random_boxes(rng, 120, tilt=True), np.empty(7)
-    everything, seen = np.arange(120), set()
-    for _ in range(40):
-        point, target = rng.uniform(-40, 40, (2, 3))
-        window_rays(index.rows, everything, 120, *point, 0.5, *target, free)
-        moves = np.vstack([np.zeros(3), *([-axis, axis] for axis in 0.5 * np.eye(3))])
-        np.testing.assert_allclose(free, kernels.visibility(index, point + moves, np.repeat(target[None], 7, axis=0)))
-        seen.update(np.round(free, 1).tolist())
-    assert len(seen) > 3

@@ -18,7 +18,7 @@ from cosfly.pedestrians import stage as pedestrians_stage
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners import stage as plan_stage
 from cosfly.planners.contract import PLANNERS, PlanConfig
-from cosfly.products.boxes import BoxMap, write_boxes
+from cosfly.products.boxes import BoxMap
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.render.contract import PERSON_ID
 from cosfly.render.settings import RenderConfig
@@ -83,13 +83,6 @@ def test_a_pose_is_drawn_and_its_depth_is_the_distance(town, flight):
     assert abs(float(np.median(turned.depth[turned.ids == PERSON_ID])) - distance_m) < 0.5
     empty = cosfly.render_frames(town, flight.positions_m[i], flight.rotations_deg[i], size_px=(320, 180))[0]
     assert not (empty.ids == PERSON_ID).any()
-
-
-def test_files_and_sources_are_loaded(town, tmp_path):
-    write_boxes(tmp_path / "boxes_3d.json", town)
-    assert len(cosfly.load_map(tmp_path / "boxes_3d.json")) == len(town)
-    (tmp_path / "own.csv").write_text("type,x_m,y_m,length_m,width_m,height_m\nhouse,0,0,9,9,8\n")
-    assert cosfly.load_map(tmp_path / "own.csv", types={"house": "Buildings"}).counts() == {"Buildings": 1}
 
 
 def test_what_is_wrong_is_said_as_on_the_command_line(town):
@@ -172,15 +165,6 @@ def test_no_setting_is_ignored(town, monkeypatch, section):
     for name in model.model_fields.keys() - taken:
         with pytest.raises(ConfigError, match=f"{name}: changes nothing here"):
             calls[0](town, **{name: dict(model())[name]})
-
-
-def test_weather_is_drawn_as_asked(town):
-    def picture(**settings) -> np.ndarray:
-        return cosfly.render_frames(town, [0, 0, 60], **VIEW, **settings)[0].rgb
-
-    night, noon = picture(**FIXED), picture(**FIXED | {"tod_name": "noon"})
-    assert night.mean() < noon.mean() - 50
-    assert (picture(weather_mode="random_per_path", weather_seed=3) != picture(**FIXED)).any()
 
 
 def test_the_notebook_runs_and_its_numbers_fit():

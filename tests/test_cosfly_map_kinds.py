@@ -11,11 +11,9 @@ import pytest
 from numpy.testing import assert_allclose
 from specimens_slopes import CITY_EAST_M, CITY_NORTH_M, city_height_m, sloped_city
 
-from cosfly.errors import InputError
 from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.stage import MapsConfig, load_map
-from cosfly.pedestrians.stage import PedestriansConfig, walkable_ground
-from cosfly.products.boxes import BoxMap, make_box_map
+from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.space.grid import lies_off_ground
 
@@ -204,41 +202,10 @@ def test_every_form_of_a_city_model_gives_the_same_map(tmp_path: Path, subtests)
     assert "outline_of_parts" not in load(tmp_path, document(model)).header.dropped_objects, "parts are not in the file"
 
 
-def damaged(number: int, change: Callable[[dict], object]) -> bytes:
-    """The sequence with one of its lines changed."""
-    lines = [json.loads(line) for line in sequence(city()).splitlines()]
-    change(lines[number])
-    return b"\n".join(json.dumps(line).encode() for line in lines)
-
-
 def instance(change: Callable[[dict], object]) -> bytes:
     model = with_a_template(city(), "2.0")
     change(model["CityObjects"]["other"]["geometry"][0])
     return document(model)
-
-
-def test_a_malformed_sequence_or_template_names_the_line_and_the_field(tmp_path: Path, subtests):
-    for data, words in [
-        (sequence(city())[:-20], "model.city: line 4: .*not valid JSON"),
-        (b"\n".join(sequence(city()).splitlines()[1:]), "type: not a CityJSON file; got 'CityJSONFeature'.*first line"),
-        (damaged(2, lambda line: line.update(type="Feature")), "line 3: type: not a feature; got 'Feature'"),
-        (damaged(2, lambda line: line.pop("CityObjects")), "line 3: CityObjects: no city objects"),
-        (damaged(2, lambda line: line.update(vertices=[[0, 0]])), "line 3: vertices: not a list of vertices"),
-        (damaged(2, lambda line: line["vertices"].pop()), "line 3: CityObjects.other.geometry.*no such vertex; got 7"),
-        (damaged(0, lambda line: line.pop("transform")), "transform.scale: the field is missing"),
-        (damaged(0, lambda line: line.update(version="0.6")), "version: unknown version; got '0.6'"),
-        (document(city() | {"version": "3.0"}), "version: unknown version; got '3.0'"),
-        (document(city() | {"version": None}), "version: unknown version; got None"),
-        (document({k: v for k, v in city().items() if k != "transform"}), "transform.scale: the field is missing"),
-        (instance(lambda g: g.update(template=1)), r"other.geometry\[0\].template: no such template; got 1"),
-        (instance(lambda g: g.update(boundaries=[])), r"other.geometry\[0\].boundaries: no place for a template"),
-        (instance(lambda g: g.update(boundaries=[99])), r"other.geometry\[0\].boundaries: no place for a template"),
-        (instance(lambda g: g.update(transformationMatrix=[1, 2])), "transformationMatrix: not a matrix"),
-        (document(with_a_template(city(), "2.0") | {"geometry-templates": 3}), "geometry-templates.templates: no list"),
-        (document(with_a_template(city(), "2.0") | {"geometry-templates": {"templates": [3]}}), "vertices-templates"),
-    ]:
-        with subtests.test(words), pytest.raises(InputError, match=words):
-            load(tmp_path, data)
 
 
 @pytest.mark.slow
@@ -299,39 +266,3 @@ def test_the_ground_of_a_city_model_is_kept_where_it_slopes(tmp_path: Path, subt
             walls = box_map.select(box_map.kinds == KINDS["Walls"])
             over = walls.maxs[:, 2] - box_map.ground.height_at(walls.centers)
             assert_allclose(over, 1.5, atol=0.3)
-
-
-def test_a_slope_below_the_limit_is_made_flat_and_says_so(tmp_path: Path, caplog):
-    path = tmp_path / "city.json"
-    path.write_bytes(document(sloped_city()))
-    cfg = MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=path, flat_within_m=30.0))
-    assert load_map(cfg).ground.is_flat
-    assert "the ground rises by 1" in caplog.text
-    assert "made flat" in caplog.text
-
-
-def test_surfaces_off_the_ground_of_the_header_are_told(caplog):
-    """A map of boxes alone, as a simulator's exporter writes it: streets on a slope, and no heights in the header."""
-    x = np.arange(0.0, 200.0, 10.0)
-    centers = np.column_stack([x, np.zeros(len(x)), 0.1 * x - 0.1])
-    half = np.tile([5.0, 60.0, 0.1], (len(x), 1))
-    box_map = make_box_map(centers, half, np.zeros((len(x), 3)), [KINDS["Roads"]] * len(x))
-    walkable_ground(box_map, PedestriansConfig(min_component_cells=100))
-    assert "18 of 20 ground boxes lie more than 1 m over or under the ground" in caplog.text
-
-
-def test_feet_that_span_no_area_still_give_heights(tmp_path: Path, caplog, subtests):
-    """Houses in one row, each five metres over the one before: nothing tells how the ground tilts across."""
-    for num_houses in [2, 3]:
-        with subtests.test(num_houses=num_houses):
-            vertices, objects = [], {}
-            for number in range(num_houses):
-                house, shell = prism(100.0 + 30.0 * number, 50.0, 14.0)
-                objects[str(number)] = {
-                    "type": "Building",
-                    "geometry": [{"type": "Solid", "lod": "1", "boundaries": [counted_from(shell, len(vertices))]}],
-                }
-                vertices += [[x, y, z + 5000 * number] for x, y, z in house]
-            box_map = load(tmp_path, document(city() | {"vertices": vertices, "CityObjects": objects}))
-            assert np.ptp(box_map.ground.heights_m) == pytest.approx(5.0 * (num_houses - 1))
-            assert "span no area" in caplog.text

@@ -1,10 +1,6 @@
 """Step 1: the three sources, their conversions, their errors, and known answers on real maps."""
 
-import ast
-import copy
 import json
-import re
-import shlex
 from itertools import combinations
 from pathlib import Path
 
@@ -18,20 +14,15 @@ from test_cosfly_map_kinds import city as two_houses
 from test_cosfly_map_kinds import document, load
 
 from cosfly.errors import ConfigError, InputError, ResumeError
-from cosfly.look.topview import TopView, draw_map, draw_text
-from cosfly.maps.boxlist import BoxList
-from cosfly.maps.cityjson import CityJsonConfig, crowns
-from cosfly.maps.cityjson_file import rule_of
+from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.footprints import Rectangle, cover, oriented_rectangle, rectangle_polygon, united
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.stage import MapsConfig, load_map, run
-from cosfly.maps.synthetic import PRESETS
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.simplify.passes import SimplifyConfig, simplify
 from cosfly.simplify.stage import cross_validate
-from cosfly.unreal.assets import ASSETS, asset_of
-from cosfly.work.config import apply_overrides, build
+from cosfly.work.config import build
 
 
 def boxes_of(box_map: BoxMap, *kinds: str) -> BoxMap:
@@ -91,52 +82,6 @@ def test_surfaces_of_a_town_do_not_share_a_plane():
         assert abs(tops[0].max() - tops[1].max()) > 0.015
 
 
-@pytest.mark.parametrize(("size_m", "num_blocks"), [(110.0, 1), (420.0, 5)])
-def test_towns_of_other_sizes(size_m, num_blocks):
-    town = load_map(build(MapsConfig, {"synthetic": {"size_m": size_m, "num_blocks": num_blocks}}, "x"))
-    low, high = town.bounds()
-    np.testing.assert_allclose((high - low)[:2], size_m)
-    assert "Buildings" in town.counts()
-
-
-OTHER_TOWNS = sorted(set(PRESETS) - {"small_town"})
-HIGHEST_M = {"village": (5, 15), "park": (5, 15), "market": (9, 22), "old_town": (10, 20), "towers": (60, 125)}
-
-
-@pytest.mark.parametrize("preset", OTHER_TOWNS)
-def test_a_preset_is_a_town_to_walk_in(preset):
-    town = load_map(build(MapsConfig, {"synthetic": {"preset": preset}}, "x"), seed=1)
-    houses = boxes_of(town, "Buildings")
-    low_m, high_m = HIGHEST_M.get(preset, (12, 40))
-    assert low_m < houses.maxs[:, 2].max() < high_m
-    shapes = united([footprint(houses, row) for row in range(len(houses))])
-    vehicles = boxes_of(town, "Car", "Truck")
-    assert not any(footprint(vehicles, row).intersects(shapes) for row in range(len(vehicles)))
-    result = simplify(town, SimplifyConfig())
-    walkable = cross_validate(town, result.box_map)
-    assert walkable["simplified_largest_part_m2"] > 0.9 * walkable["simplified_walkable_m2"]  # a river has bridges
-    assert walkable["simplified_largest_part_m2"] > 20_000
-
-
-def test_presets_differ_in_plan_density_and_height():
-    shares, heights = {}, {}
-    for preset in OTHER_TOWNS:
-        town = load_map(build(MapsConfig, {"synthetic": {"preset": preset}}, "x"), seed=1)
-        houses = boxes_of(town, "Buildings")
-        built_m2 = united([footprint(houses, row) for row in range(len(houses))]).area
-        low, high = town.bounds()
-        shares[preset], heights[preset] = built_m2 / np.prod((high - low)[:2]), houses.maxs[:, 2].max()
-    assert max(shares.values()) > 4 * min(shares.values())
-    assert max(heights.values()) > 4 * min(heights.values())
-    assert len({round(share, 2) for share in shares.values()}) >= len(OTHER_TOWNS) - 2
-
-
-def test_what_is_given_wins_over_the_preset():
-    cfg = build(MapsConfig, {"synthetic": {"preset": "river", "river_m": 30, "num_blocks": 3}}, "x").synthetic
-    assert (cfg.river_m, cfg.num_blocks, cfg.street_m) == (30, 3, PRESETS["river"]["street_m"])
-    assert build(MapsConfig, {"synthetic": cfg.model_dump(mode="json")}, "x").synthetic == cfg  # as `run.yaml` is read
-
-
 @each(
     ("given", "words"),
     [({"preset": "rivers"}, "did you mean 'river'"), ({"blocks": {"markt": 1}}, "did you mean 'market'"),
@@ -169,40 +114,6 @@ def write_world(folder: Path, *nodes: dict, sizes: dict | None = None) -> SimWor
     (folder / "world.json").write_text(json.dumps({"base_map": "x", "nodes": list(nodes)}))
     (folder / "Bbox.json").write_text(json.dumps(groups))
     return SimWorldConfig(world=folder / "world.json")
-
-
-def test_a_world_without_a_size_table_says_which_setting_names_one(tmp_path: Path):
-    cfg = write_world(tmp_path, node("BP_Tree1_C", 0, 0))
-    (tmp_path / "Bbox.json").unlink()
-    with pytest.raises(InputError, match="a folder, not a world"):
-        SimWorldConfig(world=tmp_path).inputs()
-    with pytest.raises(InputError, match=r"Bbox\.json: there is no asset size table.*--set maps\.simworld\.sizes=FILE"):
-        simworld(cfg)
-
-
-def test_one_path_of_a_size_table_is_enough(tmp_path: Path):
-    cfg = write_world(tmp_path, node("BP_Tree1_C", 0, 0))
-    (tmp_path / "Bbox.json").rename(tmp_path / "sizes.json")
-    one = apply_overrides({}, [f"maps.simworld.world={cfg.world}", f"maps.simworld.sizes={tmp_path / 'sizes.json'}"])
-    assert simworld(MapsConfig.model_validate(one["maps"]).simworld).counts()["Vegetation"] == 1
-
-
-def test_cures_of_messages_can_be_pasted_into_a_shell():
-    """A setting in a message of steps 1 to 4 stands behind --set, in quotes where a shell needs them."""
-    found = 0
-    rooms = [Path(__file__).parents[1] / "cosfly" / room for room in ("maps", "simplify", "pedestrians", "planners")]
-    for path in [path for room in rooms for path in room.rglob("*.py")]:
-        for part in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(part, ast.JoinedStr):
-                text = "".join(str(v.value) if isinstance(v, ast.Constant) else "1" for v in part.values)
-            else:
-                text = part.value if isinstance(part, ast.Constant) and isinstance(part.value, str) else ""
-            for match in re.finditer(r"(?:maps|simplify|pedestrians|plan)\.[a-z_.]+=", text):
-                words = shlex.split(text[max(0, match.start() - len("--set '")) :].partition("--set")[2])
-                apply_overrides({}, [words[0]])
-                assert words[0].startswith(match.group()), text
-                found += 1
-    assert found >= 8
 
 
 def simworld(cfg: SimWorldConfig) -> BoxMap:
@@ -241,36 +152,6 @@ def test_roads_take_their_width_from_what_stands_beside_them(tmp_path: Path):
     assert pavements.maxs[:, 2].max() <= 0
 
 
-def broken_worlds() -> list:
-    good = node("BP_Building_01_C", 0, 0)
-    cases = []
-    for field, change in {
-        "nodes[0] (GEN_BP_Building_01_C): properties.location.x": lambda n: n["properties"]["location"].update(x="far"),
-        "nodes[0] (GEN_BP_Building_01_C): properties.scale": lambda n: n["properties"]["scale"].update(x=-1.0),
-        "nodes[0] (GEN_BP_Building_01_C): properties.orientation.yaw": lambda n: n["properties"]["orientation"].pop(
-            "yaw"
-        ),
-        "nodes[0] (GEN_BP_Building_01_C): properties.orientation": lambda n: n["properties"]["orientation"].update(
-            roll=9
-        ),
-        "world.json: GEN_BP_Building_01_C": lambda n: n["properties"]["scale"].update(x=5e-324),
-        "GEN_BP_Building_01_C.instance_name": lambda n: n.update(instance_name="BP_Spaceship_C"),
-    }.items():
-        bad = copy.deepcopy(good)
-        change(bad)
-        cases.append(pytest.param(bad, field, id=field))
-    return cases
-
-
-@pytest.mark.parametrize(("bad", "field"), broken_worlds())
-def test_malformed_worlds_name_the_node_and_the_field(tmp_path: Path, bad: dict, field: str):
-    cfg = write_world(tmp_path, bad)
-    with pytest.raises(InputError) as caught:
-        simworld(cfg)
-    assert str(caught.value.where).endswith(field)
-    assert "\n" not in str(caught.value)
-
-
 def test_an_asset_without_a_size_is_an_error_or_counted(tmp_path: Path):
     cfg = write_world(tmp_path, node("BP_Building_01_C", 0, 0), node("BP_Building_99_C", 9000, 0))
     with pytest.raises(InputError, match=r"without a size.*BP_Building_99_C.*unknown=drop"):
@@ -280,24 +161,6 @@ def test_an_asset_without_a_size_is_an_error_or_counted(tmp_path: Path):
     run(MapsConfig(source="simworld", simworld=cfg), tmp_path / "out")
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
     assert manifest["counts"] == {"input": 2, "kept": 1, "dropped": {"unknown_asset": 1}, "failed": {}}
-
-
-def test_the_asset_table_tells_road_furniture_from_roads():
-    names = {
-        "BP_Road1_C": "Roads",
-        "BP_RoadCone_C": "Static",
-        "BP_RoadBlocker_C": "Static",
-        "BP_Scooter_02_C": "Motorcycle",
-    }
-    assert {name: asset_of(name).kind for name in names} == names
-    assert asset_of("Zeppelin") is None
-    assert {asset.kind for asset in ASSETS} <= set(KINDS)
-
-
-def test_a_source_without_a_file_is_a_config_error():
-    for source in ("simworld", "cityjson"):
-        with pytest.raises(ConfigError, match=f"maps.{source}"):
-            load_map(MapsConfig(source=source))
 
 
 def overlapping_pairs(buildings: BoxMap, *, with_yaw: bool) -> int:
@@ -332,15 +195,6 @@ def test_known_answers_of_the_robotics_worlds(shared_data: Path, world: str, pai
     assert overlapping_pairs(buildings, with_yaw=False) == pairs
 
 
-def test_the_real_city_stays_walkable(shared_data: Path):
-    city = progen_city(shared_data)
-    walkable = cross_validate(city, simplify(city, SimplifyConfig()).box_map)
-    assert walkable["simplified_largest_part_m2"] > 0.99 * walkable["simplified_walkable_m2"]
-    assert walkable["simplified_walkable_m2"] > 400_000
-    paper = simplify(city, SimplifyConfig(min_fill=0.0, min_canopy_fill=0.0, trunk="full")).box_map
-    assert cross_validate(city, paper)["simplified_walkable_m2"] < 0.75 * walkable["simplified_walkable_m2"]
-
-
 # --- footprints -------------------------------------------------------------------------------------------------------
 
 
@@ -361,12 +215,6 @@ def test_covers_hold_the_polygon_and_leave_courtyards_free(shares):
     assert union.area < 1.2 * ring.area
     assert not union.contains(Point(0, 0))
     assert max(max(r.size) for r in rectangles) < 100  # a single box would be 200 m wide
-
-
-def test_covers_cut_what_is_too_long():
-    rectangles = cover(box(0, 0, 300, 4), min_fill=0.8, min_size_m=2.0, max_size_m=60.0)
-    assert max(max(r.size) for r in rectangles) <= 60
-    assert sum(np.prod(r.size) for r in rectangles) == pytest.approx(1200)
 
 
 # --- cityjson ---------------------------------------------------------------------------------------------------------
@@ -405,13 +253,6 @@ def test_a_city_model_becomes_boxes_round_the_origin(tmp_path: Path):
     assert boxes.header.num_objects == 5
 
 
-def test_a_surface_of_too_many_vertices_is_refused_by_name(tmp_path: Path):
-    (tmp_path / "city.json").write_text(json.dumps(city_model()))
-    cfg = MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=tmp_path / "city.json", polygon_vertices=3))
-    with pytest.raises(InputError, match=r"CityObjects\.part: .*; got a surface of 4 vertices; .*polygon_vertices"):
-        load_map(cfg)
-
-
 def test_courtyards_stay_open(tmp_path: Path):
     model = city_model()
     outer = [[0, 0], [40, 0], [40, 40], [0, 40]]
@@ -429,61 +270,6 @@ def test_courtyards_stay_open(tmp_path: Path):
     court = Point(20 - boxes.header.offset_m["x"], 20 - boxes.header.offset_m["y"])
     assert union.distance(court) > 7  # 10 m, less what a fill of 0.9 may take
     assert 1319.9 < union.area < 1320 / 0.9
-
-
-def change(model: dict, path: str, value) -> None:
-    *parents, last = path.split("/")
-    for key in parents:
-        model = model[int(key) if isinstance(model, list) else key]
-    model[int(last) if isinstance(model, list) else last] = value
-
-
-@pytest.mark.parametrize(
-    ("path", "value", "words"),
-    [
-        ("type", "FeatureCollection", "type: not a CityJSON file"),
-        ("version", "0.7", "version: unknown version; got '0.7'"),
-        ("CityObjects", {}, "CityObjects: no city objects"),
-        ("vertices", [[0, 0, "high"]], "vertices"),
-        ("CityObjects/house", 3, "CityObjects.house.type"),
-        ("CityObjects", {"a": {"type": "Road", "geometry": [{"type": ["MultiSurface"]}]}}, "'no_geometry': 1"),
-        ("CityObjects/house/geometry", 3, "CityObjects.house.geometry: not a list of geometries"),
-        ("CityObjects/part/geometry/0/boundaries", [[[["a"]]]], "part.geometry[0].boundaries surface 0: not a ring"),
-        ("CityObjects/road/geometry/0/boundaries", [[[8, 9, 99]]],
-         "road.geometry[0].boundaries surface 0: no such vertex; got 99"),
-        ("CityObjects/road/geometry/0/boundaries", 5, "road.geometry[0].boundaries: not nested as its type says"),
-        ("vertices/8", [10**9, 0, 0], "vertices: the map is too wide"),
-        ("vertices/8", [10**400, 0, 0], "vertices[8][0]: the city model holds a number"),
-        ("transform/translate", [0.0, 1e308, 0.0], "transform.translate: not a vector"),
-    ],
-)  # fmt: skip
-def test_malformed_city_models_name_the_object_and_the_field(tmp_path: Path, path: str, value, words: str):
-    model = city_model()
-    change(model, path, value)
-    with pytest.raises(InputError) as caught:
-        city(tmp_path, model)
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_rules_go_by_type_and_attribute():
-    assert rule_of("Road", {"function": "voetpad op trap"}).kind == "Sidewalks"
-    assert rule_of("Road", {"function": "rijbaan lokale weg"}).kind == "Roads"
-    assert rule_of("GenericCityObject", {"bgt_type": "muur"}).kind == "Walls"
-    assert rule_of("+GenericCityObject", {}).kind == "Static"
-    assert rule_of("CityObjectGroup", {}) is None
-
-
-def test_crowns_take_every_cell_once():
-    rng = np.random.default_rng(0)
-    heights = rng.uniform(0, 8, (17, 23))
-    taken = np.zeros(heights.shape, dtype=int)
-    for x0, y0, x1, y1, top in crowns(heights, 3.0, 3):
-        taken[x0:x1, y0:y1] += 1
-        assert x1 - x0 <= 3
-        assert y1 - y0 <= 3
-        assert top == heights[x0:x1, y0:y1].max()
-    np.testing.assert_array_equal(taken, (heights > 3.0).astype(int))
 
 
 @pytest.fixture(scope="module")
@@ -510,15 +296,6 @@ def test_delft_is_cut_up(delft: BoxMap):
     np.testing.assert_allclose(sum(delft.bounds())[:2], 0, atol=25)
 
 
-@pytest.mark.slow
-def test_delft_stays_walkable(delft: BoxMap):
-    walkable = cross_validate(delft, simplify(delft, SimplifyConfig()).box_map)
-    assert walkable["simplified_largest_part_m2"] > 0.9 * walkable["simplified_walkable_m2"]
-    assert walkable["iou"] > 0.9
-    paper = simplify(delft, SimplifyConfig(min_fill=0.0)).box_map
-    assert boxes_of(paper, "Buildings").half_extents.max() > 80, "the rule that the guard is for"
-
-
 # --- the stage --------------------------------------------------------------------------------------------------------
 
 
@@ -535,27 +312,3 @@ def test_stage_writes_the_same_bytes_and_resumes(tmp_path: Path):
     with pytest.raises(ResumeError, match="seed was 5, is 6"):
         run(MapsConfig(), tmp_path / "one", seed=6)
     assert read_boxes(product).header.source.seed == 5
-
-
-def test_the_overview_is_north_up():
-    boxes = BoxList()
-    boxes.add_span("Terrain", (0, 0), (100, 100), -1, 0)
-    boxes.add_span("Water", (60, 80), (100, 100), -1, 0.1)
-    box_map = boxes.box_map()
-    picture = draw_map(box_map, TopView.around(np.stack(box_map.bounds()), 104)).astype(int)
-    assert picture[12, 90, 2] > picture[12, 90, 0] + 50  # blue, top right
-    assert picture[90, 90, 1] > picture[90, 90, 2] + 20  # green, bottom right
-
-
-@pytest.mark.parametrize("text", ["t = 106.5 s", "segmentation"])
-def test_a_halo_lies_round_the_letters(text):
-    """Thicker strokes are a wider font in OpenCV 5: a halo of them stood beside its letters."""
-
-    def columns(halo) -> np.ndarray:
-        picture = np.full((40, 240, 3), 128, np.uint8)
-        draw_text(picture, text, 20, 25, 0.42, (255, 255, 255), halo=halo)
-        return np.flatnonzero((picture != 128).any(axis=(0, 2)))
-
-    letters, with_halo = columns(None), columns((0, 0, 0))
-    assert letters[0] - 1 <= with_halo[0] <= letters[0]
-    assert letters[-1] <= with_halo[-1] <= letters[-1] + 1

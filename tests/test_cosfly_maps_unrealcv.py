@@ -6,7 +6,6 @@ import contextlib
 import json
 import socket
 import threading
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from test_renderers_contract import street
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.errors import ConfigError, EnvironmentMissing, InputError
+from cosfly.errors import EnvironmentMissing, InputError
 from cosfly.maps import unrealcv_export
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
@@ -82,26 +81,6 @@ def test_a_served_town_comes_back_as_it_is(tmp_path):
     assert {"boxes_meta.json", "boxes.html"} <= {one["path"] for one in manifest["outputs"]}
 
 
-def test_sizes_that_nobody_tells_are_counted_and_fail_the_export(tmp_path):
-    """Boxes of no size stand for assets of which the engine knows no bounds."""
-    whole = street()
-    half_m = whole.half_extents.copy()
-    half_m[:2] = 0.0
-    broken = replace(whole, half_extents=half_m)
-    with beside(broken) as port:
-        found = unrealcv_export.load(UnrealCvMapConfig(port=port), 0)
-        words = ["maps", "unrealcv", "--port", str(port), "--out", str(tmp_path / "out"), "--most-default", "0.1"]
-        failed = CliRunner().invoke(app, words)
-    assert found.header.extent_sources["default"] == 2
-    assert [row[2] for row in found.objects].count("default") == 2
-    assert failed.exit_code == 1
-    assert isinstance(failed.exception, InputError)
-    share = f"{2 / len(whole):.1%}"
-    for word in (f"127.0.0.1:{port} (UnrealCV 1.1.0), street", "default size", share, "at most 10.0%", "most_default"):
-        assert word in str(failed.exception)
-    assert not (tmp_path / "out/boxes_3d.json").exists()
-
-
 def test_a_server_that_is_not_there_silent_old_or_another_is_named(monkeypatch):
     port = free_port()
     with pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port} \(UnrealCV unknown\): no UnrealCV.*refused"):
@@ -119,28 +98,6 @@ def test_a_server_that_is_not_there_silent_old_or_another_is_named(monkeypatch):
             pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port}.*{version}.*0\.4\.0"),
         ):
             unrealcv_export.load(UnrealCvMapConfig(port=port), 0)
-
-
-def test_a_level_that_is_not_there_is_named_with_the_one_that_is():
-    with beside(street()) as port:
-        assert unrealcv_export.load(UnrealCvMapConfig(port=port, level="street"), 0).name == "street"
-        expected = rf"127\.0\.0\.1:{port} \(UnrealCV 1\.1\.0\), street: the server has no such level; got Downtown"
-        with pytest.raises(ConfigError, match=expected):
-            unrealcv_export.load(UnrealCvMapConfig(port=port, level="Downtown"), 0)
-
-
-def test_a_server_that_dies_in_the_middle_ends_in_an_error(tmp_path, monkeypatch):
-    with beside(street()) as port:
-        ask = unrealcv_export.UnrealCvConnection.ask
-
-        def late(connection, *commands):
-            if commands[0] == "vget /objects":
-                connection._client.sock.shutdown(socket.SHUT_RDWR)
-            return ask(connection, *commands)
-
-        monkeypatch.setattr(unrealcv_export.UnrealCvConnection, "ask", late)
-        with pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port} \(UnrealCV 1\.1\.0\), street.*not given"):
-            unrealcv_export.load(UnrealCvMapConfig(port=port, timeout_s=2.0), 0)
 
 
 def told(class_name: str, bounds_m=None, yaw: float = 0.0, at_m=(0.0, 0.0, 0.0), scale=(1.0, 1.0, 1.0)):

@@ -48,16 +48,6 @@ def motion_of(time_s, poses, between=None) -> PlannedMotion:
     )  # fmt: skip
 
 
-def test_an_action_is_in_the_drones_own_level_axes():
-    north = motion_of([0, 0.5, 1], [[0, 0, 10, -20, 90, 0], [0, 2, 11, -25, -175, 0], [0, 2, 11, -25, -175, 0]])
-    assert_allclose(north.action[:2], [[4, 0, 2, 190, -25], [0, 0, 0, 0, -25]], atol=1e-9)
-    assert np.isnan(north.action[2]).all()
-    west = motion_of([0, 0.5], [[0, 0, 0, 0, 180, 0], [0, 3, 0, 0, 180, 0]])
-    assert_allclose(west.action[0], [0, -6, 0, 0, 0], atol=1e-9)  # looking west, north is on the right
-    assert_allclose(west.body_waypoints(0), [[0, -3, 0, 0]], atol=1e-9)
-    assert west.body_waypoints(1).shape == (0, 4)
-
-
 def test_the_known_answer_of_the_public_release_as_an_action():
     """Points 0 to 1 of trajectory_1777083733: (-3.123, -2.072, -1.6) m/s and -3.13 degrees in 0.5 s, CARLA's axes."""
     x, y, z = np.array([-3.123, 2.072, -1.6]) * 0.5
@@ -91,14 +81,6 @@ def test_a_perturbed_frames_waypoints_lead_back_to_the_plan(tree):
         assert len(ahead) == min(10, len(clean.time_s) - 1 - i)
         yaw = np.radians([[0.0, moved.yaw_deg[i], 0.0]])
         assert_allclose(moved.positions_m[i] + ahead[:, :3] @ rotation_matrices(yaw)[0].T, clean.waypoints(i)[:, :3])
-
-
-def test_an_offset_that_nobody_knows_gives_no_action(tree):
-    flight = read_flight(find_flights(tree)[1])
-    offsets = flight.drone_offsets_m.copy()
-    offsets[5] = np.nan
-    action = replace(flight, drone_offsets_m=offsets).motion.action
-    assert np.flatnonzero(np.isnan(action).any(axis=1)).tolist() == [4, 5, len(flight) - 1]
 
 
 def test_frames_at_a_fifth_of_the_plans_rate(tree, tmp_path):

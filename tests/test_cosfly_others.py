@@ -1,6 +1,5 @@
 """Who else moves: the product, lanes of a map, and the placing of people and cars about a walk."""
 
-import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -12,12 +11,11 @@ from hypothesis import strategies as st
 
 from cosfly.errors import InputError
 from cosfly.pedestrians.lanes import lanes_of
-from cosfly.pedestrians.others import CAR_FORWARD_MPS2, PASS_M, Trip, and_back, braked, company_of
+from cosfly.pedestrians.others import PASS_M, company_of
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, run, walkable_ground
-from cosfly.pedestrians.walking import PACES, speeds_at, take_pace
 from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, write_boxes
 from cosfly.products.kinds import KINDS
-from cosfly.products.others import BUILDS, Company, Other, distances_to_boxes_m, gaps_m, read_others, write_others
+from cosfly.products.others import Company, Other, gaps_m, read_others, write_others
 from cosfly.products.walks import read_paths
 from cosfly.work.chance import rng_for
 from cosfly.work.store import dump_json
@@ -51,40 +49,7 @@ def going(kind: str, start, end, n: int = 2) -> Other:
     return Other(kind, places, np.full(n, np.arctan2(*(end - start)[1::-1])))
 
 
-def test_who_walks_there_and_back_gets_on_between_any_two_stops():
-    """A stop of the pace may be the waypoint before the end, where one stands before walking back."""
-    for name, num_waypoints, seed in itertools.product(PACES, (2, 3, 6, 120), range(60)):
-        line, rng = (
-            np.column_stack([0.5 * np.arange(num_waypoints), np.zeros(num_waypoints)]),
-            np.random.default_rng(seed),
-        )
-        way = take_pace(line, PACES[name], rng)
-        course = Trip(PERSON, way, speeds_at(way, PACES[name], PedestriansConfig(), rng))
-        for _ in range(3):
-            course = and_back(course)
-            along_m = course.along_m(np.linspace(0.0, 3000.0, 50))
-            assert along_m[-1] == pytest.approx(course.way.along_m[-1])
-            end = len(course.way.stops_s) // 2
-            assert course.way.stops_s[end - 1 : end + 1].sum() >= 1.0  # seconds
-
-
 # --- the product ------------------------------------------------------------------------------------------------------
-
-
-def test_gaps_by_hand():
-    through = going(PERSON, (-5, 0), (5, 0))
-    for one, two, gap_m in (
-        (standing(PERSON, 0, 0), standing(PERSON, 1, 0), 0.4),
-        (standing(PERSON, 0, 0), standing(PERSON, 0.5, 0), -0.1),
-        (through, standing(PERSON, 0, 2), 1.4),  # nearest between the two times
-        (through, going(PERSON, (5, 0), (-5, 0)), -0.6),  # through each other
-        (standing(CAR, 0, 0), standing(PERSON, 0, 2), 0.5),
-        (standing(CAR, 0, 0), standing(PERSON, 3.45, 0), 0.5),
-        (standing(CAR, 0, 0, np.pi / 2), standing(PERSON, 0, 3.45), 0.5),
-        (standing(CAR, 0, 0), standing(CAR, 0, 3), 0.6),
-    ):
-        assert gaps_m(one, two).tolist() == pytest.approx([gap_m])
-        assert gaps_m(two, one).tolist() == pytest.approx([gap_m])
 
 
 @settings(max_examples=30)
@@ -101,22 +66,6 @@ def test_gaps_agree_with_many_small_steps(seed):
             for who in (one, two)
         )
         assert gap == pytest.approx(np.linalg.norm(a - b, axis=1).min() - 0.6, abs=2e-3)
-
-
-def test_discs_cover_the_box_of_each_kind():
-    for kind, shape in BUILDS.items():
-        x, y = np.meshgrid(*(np.linspace(-half, half, 81) for half in shape.half_extents_m[:2]))
-        ground = np.column_stack([x.ravel(), y.ravel()])
-        nearest = np.min([np.linalg.norm(ground - [offset, 0.0], axis=1) for offset in shape.disc_offsets_m], axis=0)
-        slack_m = 0.13 if kind == PERSON else 0.0  # the corners of a person's box are air
-        assert nearest.max() <= shape.disc_radius_m + slack_m, kind
-
-
-def test_distance_to_a_turned_box():
-    car = standing(CAR, 1.0, 2.0, np.pi / 2, n=1)
-    assert distances_to_boxes_m(np.array([[1.0, 2.0, 9.5]]), car).tolist() == pytest.approx([8.0])
-    assert distances_to_boxes_m(np.array([[1.0, 5.2, 0.7]]), car).tolist() == pytest.approx([1.0])
-    assert distances_to_boxes_m(np.array([[2.9, 2.0, 0.7]]), car).tolist() == pytest.approx([1.0])
 
 
 def test_others_round_trip_and_bad_files(tmp_path):
@@ -177,37 +126,6 @@ def test_a_crossing_has_two_lanes_an_arm_on_the_right_and_three_ways_on():
             steps = np.diff(line, axis=0)
             turns = np.degrees(np.abs(np.diff(np.unwrap(np.arctan2(steps[:, 1], steps[:, 0])))))
             assert turns.max() < 40.0, "no corners"
-
-
-def test_lanes_keep_off_what_stands_there():
-    parked = ("Car", (-40, -3, 0.75), (2.2, 0.9, 0.75))
-    shifted = lanes_of(crossing_town(parked))
-    assert len(shifted) == 8
-    ways = [lane.points_m for lane in shifted]
-    (way,) = (p for p in ways if np.ptp(p[:, 1]) < 1e-9 and p[0, 0] < p[-1, 0] < 0)  # to the east
-    assert -1.3 < way[0, 1] < -0.6, "nearer to the middle line, where a parked car stands"
-    blocked = lanes_of(crossing_town(("Walls", (-40, 0, 1.0), (0.2, 4, 1.0))))
-    assert len(blocked) == 6
-
-
-def test_lanes_need_straight_roads_and_go_on_where_road_lies_between():
-    for kind in ("Terrain", "Ground", "Roads"):  # a square of road has no direction
-        assert lanes_of(make_box_map([[0, 0, -0.1]], [[50, 50, 0.1]], np.zeros((1, 3)), [KINDS[kind]])) == []
-    pieces = [((-25, 0, -0.1), (20, 4, 0.1)), ((25, 0, -0.1), (20, 4, 0.1)), ((0, 0, -0.1), (5, 4, 0.1))]
-    box_map = make_box_map(*zip(*pieces, strict=True), np.zeros((3, 3)), [KINDS["Roads"]] * 3)
-    assert sum(len(lane.onward) for lane in lanes_of(box_map)) == 2
-
-
-@settings(max_examples=40)
-@given(st.integers(0, 10**6))
-def test_braked_speeds_ask_for_no_more_than_a_car_gives(seed):
-    rng = np.random.default_rng(seed)
-    along = np.cumsum(rng.uniform(0.3, 2.0, 30))
-    limits = rng.uniform(0.0, 9.0, 30)
-    speeds = braked(limits, along)
-    assert (speeds <= limits).all()
-    assert (np.abs(np.diff(speeds**2)) <= 2.0 * CAR_FORWARD_MPS2 * np.diff(along) + 1e-9).all()
-    assert speeds.max() == limits.max() or (speeds < limits).any()
 
 
 # --- placing ----------------------------------------------------------------------------------------------------------
@@ -276,11 +194,6 @@ def test_people_pass_the_walker_and_look_alikes_are_among_them(placed):
     assert np.median(starts_m) < PASS_M[1] + 1.5
 
 
-def test_more_look_alikes_than_others_are_refused():
-    with pytest.raises(ValueError, match="look_alikes 3 is above others 2"):
-        PedestriansConfig(others=2, look_alikes=3)
-
-
 def test_the_same_numbers_give_the_same_company_and_more_keep_the_first(placed):
     _, ground, lanes, made = placed
     walk, company = made[0]
@@ -293,16 +206,6 @@ def test_the_same_numbers_give_the_same_company_and_more_keep_the_first(placed):
     )
     assert [o.as_json() for o in fewer.others] == [o.as_json() for o in company.others[:2]]
     assert {o.kind for o in company_of(walk, ground, [], CFG, np.random.default_rng(0)).others} == {PERSON}, "no road"
-
-
-def test_who_finds_no_place_is_left_out():
-    """A corridor two cells wide, walked by everybody: nobody can pass the walker who comes towards them."""
-    walls = [("Walls", (0, sign * 41, 1.0), (80, 39.5, 1.0)) for sign in (-1, 1)]
-    box_map = crossing_town(*walls)
-    cfg = CFG.model_copy(update={"others": 12, "traffic": 0, "min_component_cells": 50, "num_retries": 1})
-    ground = walkable_ground(box_map, cfg)
-    walk = make_walk("p", ground, cfg, rng_for(0, "pedestrians", "0")).walk
-    assert len(company_of(walk, ground, [], cfg, np.random.default_rng(0)).others) < 12
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
@@ -326,12 +229,3 @@ def test_the_stage_writes_others_only_where_they_are_wanted(tmp_path: Path, capl
     counts = json.loads((tmp_path / "one/pedestrians_report.json").read_text())["others"]
     placed = [sum(other.kind == kind for company in companies for other in company.others) for kind in (PERSON, CAR)]
     assert counts == {PERSON: {"wanted": 9, "placed": placed[0]}, CAR: {"wanted": 6, "placed": placed[1]}}
-
-
-def test_a_map_without_roads_says_how_many_cars_are_missing(tmp_path, caplog):
-    lawn = make_box_map([[0, 0, -0.1]], [[80, 80, 0.1]], np.zeros((1, 3)), [KINDS["Ground"]])
-    write_boxes(tmp_path / "map.json", lawn)
-    run(PedestriansConfig(num_paths=2, traffic=4), tmp_path / "map.json", tmp_path / "out")
-    counts = json.loads((tmp_path / "out/pedestrians_report.json").read_text())["others"]
-    assert counts["Car"] == {"wanted": 8, "placed": 0}
-    assert "0 of 8 others of kind Car found a place" in caplog.text

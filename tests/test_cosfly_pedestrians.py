@@ -4,11 +4,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tables import each
 
-from cosfly.errors import ConfigError, NoPathError, NothingKept
 from cosfly.geometry import DT_S
-from cosfly.pedestrians.astar import find_route
 from cosfly.pedestrians.crossings import costs_of
 from cosfly.pedestrians.stage import (
     PedestriansConfig,
@@ -26,7 +23,6 @@ from cosfly.products.roi import Roi
 from cosfly.products.walks import paces_of, read_paths
 from cosfly.space.grid import OccupancyGrid
 from cosfly.work.chance import rng_for
-from cosfly.work.config import build
 from cosfly.work.store import dump_json
 
 BUILDINGS, ROADS, WATER = KINDS["Buildings"], KINDS["Roads"], KINDS["Water"]
@@ -108,12 +104,6 @@ def test_goals_are_all_cells_of_the_part_at_the_wanted_distance(start):
     assert abs(counts - 200).max() < 75  # 5 standard deviations
 
 
-def test_no_goal_is_none():
-    ground = ground_of("1111 2222")
-    assert sample_goal(ground, (0, 0), 3.5, 9.0, np.random.default_rng(0)) is None
-    assert sample_goal(ground, (0, 0), 3.0, 9.0, np.random.default_rng(0)) == (3, 0)
-
-
 # --- the ground -------------------------------------------------------------------------------------------------------
 
 
@@ -133,18 +123,6 @@ def test_counts_add_up_and_small_components_are_left_out():
     assert not ground.parts[:, :43].any()
 
 
-def test_areas_that_touch_by_a_corner_are_one_component_but_two_parts():
-    # Two walls, one row of cells each, that meet in a corner at x = 19.5: so do the free areas on either side.
-    box_map = plain(40.0, ((9.75, 20.25, 1), (9.75, 0.25, 1)), ((29.75, 20.75, 1), (10.25, 0.25, 1)))
-    ground = walkable_ground(box_map, PedestriansConfig(safety_radius_m=0.0))
-    assert (ground.counts["components"], ground.counts["parts"]) == (1, 2)
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        start = sample_start(ground, rng)
-        goal = sample_goal(ground, start, 20.0, 60.0, rng)
-        assert find_route(ground.walkable, start, goal) is not None
-
-
 def test_the_region_of_interest_bounds_every_walk():
     roi = Roi(
         points_world=[(10, 10), (150, 10), (150, 150), (10, 150)], holes=[[(60, 60), (100, 60), (100, 100), (60, 100)]]
@@ -156,13 +134,6 @@ def test_the_region_of_interest_bounds_every_walk():
         assert (xy > 10).all()
         assert (xy < 150).all()
         assert not ((xy > 60) & (xy < 100)).all()
-
-
-def test_water_is_no_ground():
-    box_map = plain(100.0, ((50, 50, -3), (30, 30, 0.5)))
-    box_map.kinds[1] = WATER
-    ground = walkable_ground(box_map, PedestriansConfig())
-    assert not ground.parts[40:160, 40:160].any()
 
 
 @pytest.mark.parametrize(("ground", "columns"), [("anywhere", 300), ("surfaces", 240), ("paved", 160)])
@@ -178,74 +149,6 @@ def test_people_walk_where_the_settings_say(ground, columns):
     found = walkable_ground(box_map, PedestriansConfig(ground=ground))
     assert np.count_nonzero(found.parts) == columns * 200
     assert not found.parts[:, columns:].any()
-
-
-@pytest.mark.parametrize(
-    ("kind", "half_m", "used"),
-    [
-        (
-            "Terrain",
-            20.0,
-            "anywhere",
-        ),  # lawns between streets that the map does not name, as the paper's categories have it
-        ("RailTrack", 20.0, "anywhere"),
-        ("Terrain", 48.0, "surfaces"),  # a terrain under nearly everything does say where the ground is
-        ("Ground", 20.0, "surfaces"),
-    ],
-)
-def test_a_map_without_streets_and_little_ground_does_not_say_where_the_ground_is(kind, half_m, used, caplog):
-    box_map = make_box_map(
-        [[0, 0, -0.1], [-50, 0, 5], [50, 0, 5]],
-        [[half_m, half_m, 0.1], [0.1, 50, 5], [0.1, 50, 5]],
-        np.zeros((3, 3)),
-        [KINDS[kind], BUILDINGS, BUILDINGS],
-    )
-    counts = walkable_ground(box_map, PedestriansConfig()).counts
-    assert counts["ground"] == used
-    assert (counts["cells_walkable"] == counts["cells_free"]) == (used == "anywhere")
-    assert ("no boxes of Roads, Sidewalks or Ground" in caplog.text) == (used == "anywhere")
-
-
-def test_a_map_without_ground_boxes_does_not_say_where_the_ground_is():
-    box_map = make_box_map([[0, 0, 1], [60, 60, 1]], np.ones((2, 3)), np.zeros((2, 3)), [BUILDINGS] * 2)
-    counts = walkable_ground(box_map, PedestriansConfig()).counts
-    assert counts["cells_with_surface"] is None
-    assert counts["cells_walkable"] == counts["cells_free"]
-
-
-@each(
-    ("box_map", "settings", "roi", "words"),
-    [
-        (plain(30.0, ((15, 15, 1), (15, 15, 1))), {}, None, "the map leaves no walkable cell.*1 boxes.*ground type"),
-        (plain(60.0), {}, [(100, 100), (120, 100), (120, 120)], "region of interest leaves no walkable cell.*got 0 of"),
-        (plain(30.0, ((15, 15, 1), (15, 15, 1))), {"safety_radius_m": 0.0}, None, "1 boxes"),
-        (plain(60.0, ((30, 30, 1), (30, 30, 1))), {"ground": "paved", "safety_radius_m": 0}, None, "the map leaves no"),
-        (lawn(60.0), {"ground": "paved"}, None, "ground that the settings want.*0 cells with.*set ground to surfaces"),
-        (plain(25.0), {}, None, "large enough.*2500 cells.*at least 4000 cells.*lower min_component_cells"),
-        (plain(60.0), {}, [(5, 5), (15, 5), (15, 15), (5, 15)], "large enough.*400 cells.*widen the region"),
-    ],
-)
-def test_no_ground_says_what_to_change(box_map, settings, roi, words):
-    with pytest.raises(NoPathError, match=words) as caught:
-        walkable_ground(
-            box_map,
-            PedestriansConfig(**settings),
-            roi and Roi(points_world=roi),
-            where="map.json",
-            roi_where="roi.json",
-        )
-    assert caught.value.where == ("roi.json" if roi else "map.json")
-
-
-def test_a_region_that_lies_beside_the_map_is_told_and_whether_its_axes_are_swapped(caplog):
-    long = make_box_map([[100, 0, -0.5]], [[100, 20, 0.5]], np.zeros((1, 3)), [ROADS])
-    region = [(0, 0), (0, 150), (10, 150), (10, 0)]  # x and y changed over
-    walkable_ground(long, PedestriansConfig(min_component_cells=10), Roi(points_world=region), roi_where="roi.json")
-    assert (
-        "roi.json: 87 % of the region of interest lies outside the map; with x and y changed over, 100%" in caplog.text
-    )
-    with pytest.raises(NoPathError, match="in the map's world metres; with x and y changed over, 100% of it would lie"):
-        walkable_ground(long, PedestriansConfig(), Roi(points_world=[(0, 50), (0, 150), (10, 150), (10, 50)]))
 
 
 # --- one walk ---------------------------------------------------------------------------------------------------------
@@ -288,44 +191,6 @@ def test_paces_have_their_shares_whatever_the_seed_and_stay_where_walks_are_adde
         assert drawn[:7] == paces_of(7, shares, seed)
 
 
-def test_shares_of_paces_move_no_route_and_the_plain_one_is_the_default():
-    ground = walkable_ground(town(), PedestriansConfig())
-
-    def walks(**settings):
-        cfg = PedestriansConfig(**settings)
-        return [make_walk("p", ground, cfg, rng_for(0, "pedestrians", str(k))).walk for k in range(12)]
-
-    plain, mixed = walks(), walks(pace={"walk": 1, "stop_and_look": 1, "hurry": 1, "turn_back": 1})
-    assert {walk.pace for walk in plain} == {"walk"}
-    assert "pace" not in plain[0].as_json()
-    assert {walk.pace for walk in mixed} == {"walk", "stop_and_look", "hurry", "turn_back"}
-    for before, after in zip(plain, mixed, strict=True):
-        same = before.as_json() == after.as_json()
-        assert same == (after.pace == "walk")
-        if after.pace != "turn_back":
-            np.testing.assert_array_equal(before.polyline_m, after.polyline_m)
-        if after.pace == "hurry":
-            assert after.speeds_mps.mean() > 1.15 * before.speeds_mps.mean()
-            assert after.speeds_mps.max() <= 1.6
-        if after.pace == "stop_and_look":
-            assert (np.diff(after.positions_m[:, :2], axis=0) == 0).all(axis=1).sum() >= 8, "4 s at least"
-
-
-def test_who_hurries_may_run():
-    cfg = PedestriansConfig(pace={"hurry": 1}, hurry_speed_mps=3.0)
-    walk = make_walk("p", walkable_ground(town(), cfg), cfg, rng_for(0, "pedestrians", "a")).walk
-    assert 2.5 < walk.speeds_mps.max() <= 3.0
-
-
-def test_a_start_without_a_goal_is_given_up_and_counted():
-    # The yard on the left measures 35 m from corner to corner; every start in the field has a goal 40 m off.
-    ground = ground_of("\n".join(["1" * 20 + "0" + "2" * 84] * 30))
-    cfg = PedestriansConfig(resolution_m=1.0, min_distance_m=40, max_distance_m=50)
-    walks = [make_walk("p", ground, cfg, np.random.default_rng(k)) for k in range(100)]
-    assert min(w.walk.polyline_m[:, 0].min() for w in walks) > 21
-    assert 0.08 < np.mean([w.retries["no_goal"] > 0 for w in walks]) < 0.32  # 20 of 104 columns
-
-
 def test_a_detour_is_given_up_and_counted():
     # A wall of 90 m with a way round it at one end only: near the other end, 10 m across are 150 m on foot.
     ground = ground_of("\n".join(["1" * 100] * 5 + ["0" * 95 + "1" * 5] + ["1" * 100] * 5))
@@ -344,40 +209,6 @@ def test_a_detour_is_given_up_and_counted():
     assert worst(walks) <= 2.0 < worst(free_walks)
     assert sum(w.retries["detour"] for w in walks) > 0
     assert sum(w.retries["detour"] for w in free_walks) == 0
-
-
-def test_no_goal_for_any_start_is_an_error_that_names_the_path():
-    ground = ground_of("\n".join(["1" * 40] * 40))
-    with pytest.raises(
-        NoPathError, match=r"6 starts without a goal, 0 detours.*60 to 70 m.*lower min_distance_m"
-    ) as caught:
-        make_walk(
-            "path_00007",
-            ground,
-            PedestriansConfig(resolution_m=1.0, min_distance_m=60, max_distance_m=70),
-            np.random.default_rng(0),
-        )
-    assert caught.value.where == "path_00007"
-
-
-@each(
-    ("settings", "words"),
-    [
-        ({"min_distance_m": 100.0}, "min_distance_m 100.0 is not below"),
-        ({"min_speed_mps": 2.0}, "min_speed_mps 2.0 is above"),
-        ({"num_path": 3}, "num_path: unknown setting .did you mean 'num_paths'"),
-        ({"resolution_m": 0}, "resolution_m"),
-        ({"speed_jitter": 1.0}, "speed_jitter"),
-        ({"max_detour": 0.5}, "max_detour 0.5 is below 1"),
-        ({"pace": {"hury": 1}}, "pace: .*'hury' is no pace .did you mean 'hurry'"),
-        ({"pace": {"walk": 0, "hurry": 0}}, "pace: .*add up to something positive"),
-        ({"pace": {}}, "pace: .*add up to something positive"),
-        ({"pace": {"walk": 2, "hurry": -1}}, "pace: .*share of hurry is -1"),
-    ],
-)
-def test_bad_settings_are_config_errors(settings, words):
-    with pytest.raises(ConfigError, match=words):
-        build(PedestriansConfig, settings, "test.yaml")
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
@@ -421,14 +252,6 @@ def test_a_path_that_fails_is_counted_and_the_others_go_on(tmp_path):
     failures = [json.loads(line) for line in (tmp_path / "out" / "failures.jsonl").read_text().splitlines()]
     assert len(failures) == counts["failed"]["no_path"]
     assert json.loads((tmp_path / "out" / "pedestrians_report.json").read_text())["failed"] == counts["failed"]
-
-
-def test_no_path_at_all_is_an_error_after_the_records_are_written(tmp_path):
-    write_boxes(tmp_path / "map.json", plain(40.0))
-    with pytest.raises(NothingKept, match=r"kept nothing.*no_path 3.*path_00000"):
-        run(PedestriansConfig(num_paths=3, min_distance_m=60), tmp_path / "map.json", tmp_path / "out")
-    assert len((tmp_path / "out" / "failures.jsonl").read_text().splitlines()) == 3
-    assert not (tmp_path / "out" / "manifest.json").exists()
 
 
 def test_simworld_gives_twenty_of_twenty(shared_data, tmp_path):

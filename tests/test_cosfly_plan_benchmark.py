@@ -6,10 +6,8 @@ import json
 import numpy as np
 import pytest
 from specimens_planning import WORLDS, walk_along
-from typer.testing import CliRunner
 
-from cosfly.cli import app
-from cosfly.errors import EnvironmentMissing, InputError
+from cosfly.errors import EnvironmentMissing
 from cosfly.planners import benchmark
 from cosfly.planners.benchmark import CRITERIA, PAPER, WEIGHTS, BenchmarkConfig, read_benchmark, read_scenarios
 from cosfly.planners.contract import ALL_PLANNERS
@@ -49,16 +47,6 @@ def test_the_papers_means_are_normalised_as_the_paper_does():
 def test_every_planner_has_its_group_and_every_one_of_the_papers_its_row():
     assert sorted(benchmark.GROUP_OF) == sorted(ALL_PLANNERS)
     assert set(ALL_PLANNERS) - set(PAPER) == {"foresight"}
-
-
-def test_who_flies_nothing_is_the_worst_and_every_number_is_finite():
-    rows = np.array([[0.5] * len(benchmark.NAMES)] * 3)
-    nothing = np.array([benchmark._row(None)] * 3)
-    means = benchmark._means({"a": rows, "b": nothing}, np.arange(3))
-    assert benchmark._normalized(means)[1].max() == 0.0
-    scores = benchmark.compare.axis_scores(means)
-    assert scores["b"]["mean"] == 0.0
-    assert scores["a"]["path_efficiency"] == 1.0
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
@@ -124,12 +112,6 @@ def test_the_tables_are_those_of_the_raw_records(made):
     assert pair.figures["five_ray_mean"] == pytest.approx(mean, abs=1e-4)
 
 
-def test_the_same_bytes_again_and_with_two_workers(inputs, made, tmp_path):
-    benchmark.run(BenchmarkConfig(planners=FEW, scenarios=2), *inputs, tmp_path / "two", workers=2)
-    for entry in json.loads((made / "manifest.json").read_text())["outputs"]:
-        assert (tmp_path / "two" / entry["path"]).read_bytes() == (made / entry["path"]).read_bytes(), entry["path"]
-
-
 def test_without_ompl_a_line_names_the_extra_and_the_others_fly(inputs, tmp_path, monkeypatch, caplog):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "ompl" else find(name, *rest))
@@ -142,29 +124,3 @@ def test_without_ompl_a_line_names_the_extra_and_the_others_fly(inputs, tmp_path
     assert [r.message for r in caplog.records if "OMPL" in r.message] == [
         'OMPL is not installed; left out: prm, rrt_star; pip install "cosfly[ompl]"'
     ]
-
-
-def test_without_matplotlib_a_line_says_so_and_the_tables_are_made(made, monkeypatch, caplog):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    records = read_scenarios(made / "scenarios.jsonl")
-    assert benchmark._pictures(read_benchmark(made / "benchmark.json"), records, WORLDS["corner"][0]) == {}
-    assert "cosfly[ompl]" in caplog.text
-
-
-def test_a_damaged_record_is_named(made, tmp_path):
-    path = tmp_path / "scenarios.jsonl"
-    path.write_text((made / "scenarios.jsonl").read_text().replace('"id"', '"di"', 1))
-    with pytest.raises(InputError, match=r"scenarios.jsonl:1: id"):
-        read_scenarios(path)
-
-
-def test_the_command_shows_the_axes_and_writes_all_tables(inputs, tmp_path):
-    words = ["plan", "benchmark", *map(str, inputs), "--out", str(tmp_path / "out"), "--scenarios", "1"]
-    result = CliRunner().invoke(app, [*words, *(f"--planner={name}" for name in ("track_astar", "muco"))])
-    assert result.exit_code == 0, result.output
-    assert "TA* + Smooth" in result.output
-    assert "0.782" in result.output
-    page = (tmp_path / "out/benchmark.md").read_text()
-    for title in ("Four axes", "less MuCO", "against MuCO", "Weighted score", "Feasibility", "Groups"):
-        assert title in page
-    assert CliRunner().invoke(app, [*words, "--planner", "musco", "--planner", "prm"]).exit_code == 1

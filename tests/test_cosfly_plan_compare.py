@@ -2,17 +2,13 @@
 
 import json
 
-import cv2
 import numpy as np
 import pytest
 from specimens_planning import CANYON, town_of, walk_along
-from typer.testing import CliRunner
 
-from cosfly.cli import app
-from cosfly.errors import ConfigError, NoPathError, NothingKept, ResumeError
+from cosfly.errors import NoPathError
 from cosfly.planners import compare
-from cosfly.planners.compare import CompareConfig, text_tables
-from cosfly.planners.contract import ALL_PLANNERS, PLANNERS
+from cosfly.planners.compare import CompareConfig
 from cosfly.products.boxes import write_boxes
 from cosfly.products.traces import read_traces
 from cosfly.products.walks import write_paths
@@ -57,13 +53,6 @@ def test_a_planner_that_collides_does_not_set_the_shortest_path_and_is_less_safe
     assert scores["jerk"]["safety"] == pytest.approx(0.227, abs=1e-3)
 
 
-def test_clearance_counts_up_to_five_metres_and_not_below_zero():
-    scores = compare.axis_scores(
-        {"a": figures(length_m=1.0, clearance_min_m=50.0), "b": figures(length_m=1.0, clearance_min_m=-2.0)}
-    )
-    assert (scores["a"]["safety"], scores["b"]["safety"]) == (1.0, 0.0)
-
-
 def test_deltas_are_the_papers():
     table = compare.deltas(figures(**PAPER["track_astar"]), figures(**PAPER["muco"]))
     assert table["length_m"] == {"delta": -4.359, "relative_percent": pytest.approx(-4.005, abs=1e-3)}
@@ -80,14 +69,6 @@ def test_win_rates_count_strict_wins():
         "visibility_higher": 1, "path_shorter": 3, "jerk_lower": 0, "clearance_larger": 0, "both_collision_free": 2
     }  # fmt: skip
     assert rates["visibility_higher"]["rate"] == pytest.approx(1 / 3, abs=1e-4)
-
-
-@pytest.mark.parametrize(("low", "high"), [(0, 1), (0, 93), (18, 60), (-0.03, 1.05), (0, 0.5)])
-def test_ticks_are_few_and_round(low, high):
-    ticks = compare._ticks(low, high)
-    assert 3 <= len(ticks) <= 8
-    assert low - 1e-9 <= ticks[0]
-    assert ticks[-1] <= high + 1e-9
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
@@ -130,21 +111,6 @@ def test_the_record_is_what_the_flights_are(made):
     assert record["win_rates"]["muco"]["both_collision_free"] == {"count": 2, "of": 2, "rate": 1.0}
 
 
-def test_pictures_hold_both_colors(made):
-    for name in ("compare_overlay.png", "compare_series.png", "compare_radar.png"):
-        picture = cv2.imread(str(made / name))[..., ::-1].reshape(-1, 3).astype(int)
-        for color in map(compare.color_of, PLANNERS):
-            assert (np.abs(picture - color).max(axis=1) <= 2).sum() > 100, name
-
-
-def test_same_bytes_again_and_with_two_workers(inputs, made, tmp_path):
-    compare.run(CFG, *inputs, tmp_path / "two", workers=2)
-    products = [entry["path"] for entry in json.loads((made / "manifest.json").read_text())["outputs"]]
-    assert len(products) == 4 + len(PLANNERS)
-    for name in products:
-        assert (tmp_path / "two" / name).read_bytes() == (made / name).read_bytes(), name
-
-
 def test_a_walk_that_one_planner_cannot_fly_is_counted(inputs, tmp_path, monkeypatch):
     real = compare.plan_flight
 
@@ -160,31 +126,7 @@ def test_a_walk_that_one_planner_cannot_fly_is_counted(inputs, tmp_path, monkeyp
     assert {(row["id"], row["planner"]) for row in record["left_out"]} == {("into_wall", "all"), ("b", "muco")}
 
 
-def test_nothing_to_compare_is_an_error(inputs, tmp_path):
-    write_paths(tmp_path / "hopeless.json", [walk_along("w", [(60, -50), (60, -30)])], {})
-    with pytest.raises(NothingKept, match="all planners"):
-        compare.run(CFG, inputs[0], tmp_path / "hopeless.json", tmp_path / "out")
-    assert not (tmp_path / "out/manifest.json").exists()
-
-
 # --- the command ------------------------------------------------------------------------------------------------------
-
-
-def test_the_command_prints_the_tables(inputs, made):
-    result = CliRunner().invoke(app, ["plan", "compare", *map(str, inputs), "--out", str(made)])
-    assert result.exit_code == 0, result.output
-    assert str(made / "compare.json") in result.output.replace("\n", "")
-
-
-def test_rows_for_the_terminal(made):
-    figures, axes, *against, _, wins = text_tables(made / "compare.json")
-    assert len(figures.rows) == len(compare.FIGURES) + 1
-    assert figures.columns[:4] == ["figure", "foresight", "TA* + Smooth", "MuCO"]
-    assert figures.columns[4:] == ["less TA* + Smooth", "%", "less MuCO", "%"]
-    assert ["both collision free", "2 of 2", "1.000"] in wins.rows
-    assert wins.title == "foresight against MuCO, walk by walk"
-    assert [table.columns for table in against] == [["axis", "difference", "from", "to"]] * 2
-    assert [row[0] for row in axes.rows] == ["visibility", "path efficiency", "smoothness", "safety", "mean"]
 
 
 def test_intervals_hold_the_difference_and_narrow_with_alike_walks():
@@ -201,38 +143,3 @@ def test_intervals_hold_the_difference_and_narrow_with_alike_walks():
     error = np.std([row["five_ray_mean"] for row in wild]) / np.sqrt(40)
     assert apart["high"] - apart["low"] == pytest.approx(2 * 1.96 * error, rel=0.15)
     assert found["steady"]["mean"]["difference"] == pytest.approx(expected / 4, abs=2e-4)
-
-
-def test_three_planners_and_another_order(inputs, tmp_path, monkeypatch):
-    monkeypatch.setitem(ALL_PLANNERS, "again", ALL_PLANNERS["muco"])
-    out = tmp_path / "three"
-    cfg = CompareConfig(planners=("muco", "again", "track_astar"))
-    record = json.loads(compare.run(cfg, *inputs, out).read_text())
-    assert list(record["planners"]) == list(record["means"]) == ["muco", "again", "track_astar"]
-    assert {row["delta"] for row in record["deltas"]["again"].values()} == {0.0}
-    assert record["deltas"]["track_astar"]["length_m"]["delta"] != 0
-    assert len(read_traces(out / "drone_trace_again.json")) == 2
-    tables = text_tables(out / "compare.json")
-    assert tables[0].columns == ["figure", "MuCO", "again", "TA* + Smooth", "less again", "%", "less TA* + Smooth", "%"]
-    assert {len(row) for row in tables[0].rows} == {8}
-    assert [table.title for table in tables[4:]] == [
-        "MuCO against again, walk by walk", "MuCO against TA* + Smooth, walk by walk"
-    ]  # fmt: skip
-    with pytest.raises(ResumeError):
-        compare.run(CFG, *inputs, out)
-
-
-@pytest.mark.parametrize(
-    ("names", "words"),
-    [
-        (["muco"], "at least 2"),
-        (["nope"], "no such planner"),
-        (["muco", "muco"], "named twice"),
-        (["muco", "track"], "did you mean 'track_astar'"),
-    ],
-)
-def test_what_is_no_comparison(inputs, tmp_path, names, words):
-    given = [word for name in names for word in ("--planner", name)]
-    result = CliRunner().invoke(app, ["plan", "compare", *map(str, inputs), "--out", str(tmp_path / "out"), *given])
-    assert isinstance(result.exception, ConfigError)
-    assert words in str(result.exception)

@@ -1,11 +1,9 @@
 """Stages on a Ray cluster of several processes: what is made is what the local engine makes, whatever is killed."""
 
 import contextlib
-import json
 import logging
 import os
 import re
-import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -15,22 +13,16 @@ from typing import Any
 
 import pytest
 from crashes import contents, differences
-from specimens_captions import settings
 from teacher_server import TeacherServer
 from toy_workers import make_talking_worker, make_worker, stage_in
 
-import cosfly
-from caption.run.stage import run as caption_tree
 from cosfly.app import pipeline
 from cosfly.app.settings import RunConfig
 from cosfly.errors import EnvironmentMissing
-from cosfly.products.captions import read_captions
-from cosfly.render.gl.programs import open_context
 from cosfly.work.config import load
 from cosfly.work.ray_engine import ALL_ROOM, ENVIRONMENT, STORE_BYTES, RayConfig
 from cosfly.work.runner import Item, Watch, run_items
 from cosfly.work.stage_events import LOSSES, read_events
-from specimens import make_playback_tree
 
 ray = pytest.importorskip("ray")
 os.environ |= ENVIRONMENT
@@ -161,16 +153,6 @@ def test_a_run_has_the_bytes_of_the_local_engine_though_workers_and_nodes_are_lo
     assert differences(products(tmp_path / "cluster"), products(tmp_path / "local")) == []
 
 
-@pytest.mark.slow
-def test_a_server_is_asked_by_the_command_itself_and_a_lost_node_costs_no_question(tmp_path, nodes):
-    tree, node = make_playback_tree(tmp_path / "tree", 2, 18), nodes.add()
-    with TeacherServer(fault=lambda number, _: nodes.kill(node) if number == 3 else None) as server:
-        for _ in range(2):
-            caption_tree(settings(server.url), tree, tmp_path / "caption", workers=1, watch=quick(nodes))
-        asked = server.bodies
-    assert len(asked) == len(set(asked)) >= len(list(read_captions(tmp_path / "caption/captions.jsonl"))) > 3
-
-
 # --- what will not do -------------------------------------------------------------------------------------------------
 
 
@@ -179,51 +161,6 @@ def refused(tmp_path: Path, words: str, watch: Watch, make: Any = make_worker) -
         run_items(stage_in(tmp_path), items_of("nothing"), make, (tmp_path / "s",), workers=1, watch=watch)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "s/manifest.json").exists()
-
-
-def make_windowless(_: Path) -> Any:
-    return open_context()
-
-
-@pytest.mark.slow
-def test_a_node_that_will_not_do_is_named_and_what_to_do_is_said(tmp_path, nodes, monkeypatch, subtests):
-    def on(node_settings: dict[str, str], words: str, folder: Path = tmp_path, make: Any = make_worker) -> None:
-        node = nodes.add(env_vars=node_settings)
-        refused(folder, rf"^node {socket.gethostname()}.*{words}", quick(nodes), make)
-        nodes.kill(node)
-
-    monkeypatch.chdir(tmp_path)  # Ray lets nodes import from where the command runs
-    planted = tmp_path / "planted/cosfly"
-    planted.mkdir(parents=True)
-    with subtests.test("another cosfly"):
-        (planted / "__init__.py").write_text("__version__ = '0.0.9'")
-        expected = rf"another cosfly; got 0\.0\.9 .*expected {cosfly.__version__}; install the same on every node"
-        on({"PYTHONPATH": str(planted.parent)}, expected)
-    with subtests.test("no cosfly"):
-        (planted / "__init__.py").write_text("raise ModuleNotFoundError('No module named cosfly')")
-        on({"PYTHONPATH": str(planted.parent)}, "cosfly is not there; got No module named cosfly.*install cosfly")
-    with subtests.test("no GL"):
-        no_driver = {"__EGL_VENDOR_LIBRARY_FILENAMES": str(tmp_path / "none.json")}
-        on(no_driver, r"no OpenGL without a window \(EGL\).*apt-get install", make=make_windowless)
-    with subtests.test("no shared folder"):
-        opened = os.open(tmp_path, os.O_RDONLY)
-        ours = Path(f"/proc/self/fd/{opened}")  # a path that leads here in this process only
-        on({}, "the stage's folder is not there; got no .*have run folder and inputs on storage", ours)
-        os.close(opened)
-
-
-@pytest.mark.slow
-def test_a_cluster_that_will_not_do_is_named_and_what_to_do_is_said(tmp_path, nodes, subtests):
-    with subtests.test("no room"):
-        watch = Watch(RayConfig(address=nodes.address, worker_gpus=0.5))
-        refused(tmp_path, r"no node has room.*0 GPUs; expected 1 CPUs and 0\.5 GPUs; lower", watch)
-    with subtests.test("other versions"):
-        others = json.dumps({"ray_version": "2.9.0", "python_version": "3.8.1"})
-        ray.experimental.internal_kv._internal_kv_put("CLUSTER_METADATA", others, True, namespace="cluster")
-        ray.shutdown()
-        refused(
-            tmp_path, r"of other versions; got Ray 2\.9\.0 on Python 3\.8\.1; expected Ray .*the same", quick(nodes)
-        )
 
 
 def test_where_no_cluster_answers_one_line_says_so(tmp_path, monkeypatch):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from cosfly.app.reproduce import OF_BENCHMARK, OF_RELEASE, MissingFile, Paper, Places, Printed, part, read_paper
+from cosfly.app.reproduce import OF_BENCHMARK, OF_RELEASE, MissingFile, Paper, Places, read_paper
 from cosfly.errors import InputError
 from cosfly.work.journal import Journal
 from cosfly.work.store import write_json
@@ -125,13 +125,6 @@ def test_every_table_and_figure_of_the_paper_is_told_or_left_out_with_why(paper)
 OURS = ["tab:beam", "tab:trunks"]  # the paper tells these in words
 
 
-def test_rows_are_as_wide_as_their_heads(paper):
-    for label, table in paper.tables.items():
-        for row in table.paper.values():
-            width = len(row) if isinstance(row, list) else 1
-            assert width == table.head.count("|") - ("|here|" in table.head), label
-
-
 def test_figures_are_found_by_keys_numbers_ids_and_stars(tmp_path):
     write_json(tmp_path / "a.json", {"many": [{"id": "x", "ms": 1}, {"id": "y", "ms": 3}, {"id": "z"}], "none": {}})
     with Journal(tmp_path / "items.jsonl") as journal:
@@ -148,22 +141,3 @@ def test_figures_are_found_by_keys_numbers_ids_and_stars(tmp_path):
         places.figures("b.json:many")
     with pytest.raises(InputError, match=r"a.json: many.\*.id"):
         places.figures("a.json:many.*.id|mean")
-
-
-def test_ours_and_the_papers_stand_beside_or_below_each_other(tmp_path):
-    places = Places([tmp_path], {"one": {"a": 1, "new": 2}, "two": {"a": [1, 0.123456]}})
-    single = part(
-        "tab:x",
-        Printed(title="t", head="|here|paper", here={"*": "work:one"}, paper={"a": 7, "old": 8}),
-        places,
-        tmp_path,
-    )
-    assert single.rows == [["a", 1, 7], ["new", 2, None], ["old", None, 8]]
-    printed = Printed(title="t", head="|v|w", why="they do", here={"*": "work:two"}, paper={"a": [7, 8]})
-    double = part("tab:x", printed, places, tmp_path)
-    assert double.rows == [["a", "here", 1, 0.1235], ["", "paper", 7, 8]]
-    assert (double.note, double.source) == ("Differs: they do. ", "recorded")
-    (tmp_path / "new").mkdir()
-    write_json(tmp_path / "new/c.json", {"v": 1})
-    measured = part("tab:x", Printed(title="t", head="|v", here={"a": "new/c.json:v"}), places, tmp_path / "run")
-    assert measured.source == "measured anew"

@@ -7,23 +7,18 @@ import re
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 from browser import browser
-from test_cosfly_inspection import CFG, first_flight, plan_of, write_map
+from test_cosfly_inspection import CFG, plan_of, write_map
 from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.errors import InputError
 from cosfly.inspection import review
-from cosfly.inspection.report import cards, report_html
 from cosfly.inspection.stage import run
-from cosfly.inspection.view import PLOTS, draw_plan, in_question
-from cosfly.products.flights import find_flights, read_tracks_beside
+from cosfly.products.flights import find_flights
 from cosfly.products.inspection import read_inspection
-from cosfly.products.issues import Issue
-from cosfly.products.playback import read_flight
-from cosfly.products.review import REVIEW, Choice, add_decisions, read_decisions, read_settled, undecided
+from cosfly.products.review import REVIEW, Choice, add_decisions, read_decisions, read_settled
 from cosfly.products.traces import write_traces
 from cosfly.reading.files import sha256_file
 from release.package.sources import Source, gather
@@ -99,36 +94,6 @@ def test_the_release_takes_what_was_accepted(product, inspected, monkeypatch):
     )
 
 
-def test_a_decision_on_another_inspection_is_refused(product):
-    decide(product, "accepted", folders_of(product)[0])
-    product.write_text(product.read_text().replace('"smoothness_min": 1.0', '"smoothness_min": 0.9'))
-    for use in (read_decisions, read_settled, lambda path: decide(path, "accepted", folders_of(path)[0])):
-        with pytest.raises(InputError, match="another inspection"):
-            use(product)
-
-
-@pytest.mark.parametrize(
-    "change", [lambda t: t.replace("accepted", "rejected"), lambda t: t[:-20] + "\n", lambda t: "\n" + t]
-)
-def test_a_changed_decision_is_refused(product, change):
-    decide(product, "accepted", folders_of(product)[0])
-    path = product.with_name(REVIEW)
-    path.write_text(change(path.read_text()))
-    with pytest.raises(InputError, match="that was changed"):
-        read_decisions(product)
-
-
-def test_what_cannot_be_decided(product):
-    with pytest.raises(InputError, match="no such flight"):
-        decide(product, "accepted", folders_of(product)[0], "Town01/nobody/ORI")
-    assert not product.with_name(REVIEW).exists(), "all or none"
-    value = json.loads(product.read_text())
-    value["flights"][0]["result"] = "rejected"
-    product.write_text(json.dumps(value))
-    with pytest.raises(InputError, match="breaks a rule"):
-        decide(product, "accepted", value["flights"][0]["folder"])
-
-
 def test_the_command_decides_and_says_what_is_open(product):
     first, second, third, _ = folders_of(product)
     command = ["inspect", "review", "--inspect", str(product.parent)]
@@ -171,27 +136,6 @@ def test_a_trajectory_stands_for_its_flights(product):
         decide(product, "accepted", trajectory.rpartition("/")[0])
 
 
-def test_flights_that_wait_are_told_with_the_way_out(inspected, product, caplog):
-    tree = inspected.parent.parent / "tree"
-    files = (inspected.parent.parent / "map.json", inspected.parent.parent / "drone_trace.json", tree)
-    with caplog.at_level("WARNING"):
-        run(QUEUE, *files, product.parent / "again")
-    assert (
-        f"4 of 4 flights wait for a person (smoothness 4): cosfly inspect review --inspect {product.parent / 'again'}"
-        in caplog.text
-    )
-    assert undecided(product) == folders_of(product)
-    decide(product, "accepted", folders_of(product)[1])
-    assert len(undecided(product)) == 3
-    (product.parent.parent / "run.yaml").write_text("{}\n")
-    shown = CliRunner().invoke(app, ["show", str(product.parent.parent)])
-    assert re.search(r"3 flights wait for a person: cosfly inspect review --inspect \S+/inspect ", shown.output), (
-        shown.output
-    )
-    decide(product, "accepted", *folders_of(product))
-    assert "wait for" not in CliRunner().invoke(app, ["show", str(product.parent.parent)]).output
-
-
 @pytest.mark.slow
 def test_what_the_page_saves_is_what_the_command_takes(product):
     """A person fills it in: one accepted, one rejected with markup in the reason, one without a reason, which stops
@@ -220,96 +164,3 @@ def test_what_the_page_saves_is_what_the_command_takes(product):
     again = review.page_html(product)
     assert again.count(" checked") == 3
     assert "<b>bad" not in again
-
-
-@pytest.mark.slow
-def test_a_flight_is_decided_by_a_key(product):
-    """J and K go, A and R decide: the first time a reason is asked for, then the last one of its kind is taken."""
-    flights = folders_of(product)
-    with browser(product.parent / "profile") as page:
-        page.open(review.write_page(product))
-        here = lambda: page.run("document.querySelector('.here .choice').dataset.folder")  # noqa: E731
-        assert here() == flights[0]
-        page.press("a")
-        page.send("Input.insertText", text="steady")
-        page.press("Enter")
-        assert here() == flights[1]
-        page.press("j")
-        page.press("k")
-        page.press("a")
-        assert here() == flights[2], "the last reason is taken, and the next flight shown"
-        page.press("r")
-        page.send("Input.insertText", text="a jump")
-        page.press("Enter")
-        page.press("r")
-        page.press("u")
-        page.press("s")
-        assert "who decides" in page.run("document.getElementById('state').textContent")
-        page.run("document.getElementById('by').value = 'Eve'; document.activeElement.blur()")
-        page.press("s")
-        form = json.loads(page.run("document.getElementById('text').value"))
-        assert not page.said
-    assert [(one["folder"], one["verdict"], one["reason"]) for one in form["choices"]] == [
-        (flights[0], "accepted", "steady"), (flights[1], "accepted", "steady"), (flights[2], "rejected", "a jump"),
-    ]  # fmt: skip
-
-
-@pytest.mark.slow
-def test_the_pages_do_not_scroll_sideways(product):
-    """Neither on a desk nor on a phone, with every flight open."""
-    pages = (product.with_name("report.html"), review.write_page(product))
-    with browser(product.parent / "profile") as tab:
-        for path in pages:
-            for width in (1400, 390):
-                tab.open(path, width=width)
-                tab.run("document.querySelectorAll('details').forEach(one => { one.open = true; })")
-                assert tab.run("document.querySelectorAll('details[open]').length") == 4
-                assert tab.run("document.documentElement.scrollWidth") <= width, (path.name, width)
-
-
-def test_the_page_shows_plots_and_a_map_of_every_flight(product):
-    page = product.with_name("report.html").read_text(encoding="utf-8")
-    flights = len(folders_of(product))
-    assert page.count('class="plan"') == flights
-    for title, _, _ in PLOTS.values():
-        assert page.count(f"<figcaption>{title} ") == flights
-    assert " , mean" not in page, "visibility has no unit"
-
-
-def test_a_page_of_hundreds_of_flights_is_bounded(product):
-    """The worst keep their pictures; what is left out is said."""
-    inspection, views = read_inspection(product), review._views(product)
-    one = inspection.flights[0]
-    many = [
-        one.model_copy(update={"folder": f"Town/t{i}/ORI", "result": "review" if i < 5 else "accepted"})
-        for i in range(300)
-    ]
-    shown = {flight.folder: views[one.folder] for flight in many}
-    page = report_html("x", inspection.model_copy(update={"flights": many}), shown, page_mb=1.0)
-    assert len(page) < 1.6e6
-    kept = page.count('class="look"')
-    assert 5 <= kept < 300
-    assert f"{300 - kept} are without pictures" in page
-    assert cards(many, shown, 1000.0)["left_out"] == 0
-
-
-def test_frames_in_question_are_shown():
-    places = (
-        ("warning", "temporal_jump", "frames_playback/frame_00031/depth.npy"),
-        ("warning", "never_visible", "trajectory.json: points[].target.visible"),
-        ("note", "not_in_this_tree", "frames_playback/frame_00002"),
-        ("error", "projection_differs", "trajectory.json: points[7].target.depth"),
-        ("warning", "stray_frame", "frames_playback/frame_00099"),
-    )
-    issues = [Issue(severity=how, code=code, where=where, got="", expected="") for how, code, where in places]
-    assert in_question(issues, 40) == [7, 30, 31]  # type: ignore[arg-type]
-    assert in_question([], 40) == []
-
-
-def test_the_map_shows_both_ways(inspected):
-    """Of a flight whose person nobody knows, the drone's alone."""
-    flight = read_flight(first_flight(inspected.parent.parent))
-    both = draw_plan(flight, None)
-    assert draw_plan(flight, None, read_tracks_beside(flight)) != both, "and the other track of the trajectory"
-    flight.targets_m[:] = np.nan
-    assert draw_plan(flight, None) != both

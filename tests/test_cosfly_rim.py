@@ -17,9 +17,8 @@ from cosfly.maps.stage import load_map as load_source
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import KINDS
 from cosfly.products.traces import DroneTrace
-from cosfly.render.contract import GROUND_PLANE_DROP_M, NO_INSTANCE, instance_ids, plane_z_m
+from cosfly.render.contract import NO_INSTANCE, instance_ids
 from cosfly.render.rim import FLIGHTS_TO_M, REACH_M, SOLIDS_FROM_M, check_outside_rim, rim_of
-from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer
 from cosfly.work.config import build
 
@@ -62,35 +61,6 @@ def test_what_stands_begins_where_no_flight_comes_and_fields_cover_the_ground(bo
     assert not ((roads.mins < high) & (roads.maxs > low))[:, :2].all(axis=1).any()  # none on the map
 
 
-def test_it_lies_at_the_height_of_the_ground_plane_or_the_slopes(box_map: BoxMap):
-    rim = rim_of(box_map, 0)
-    flat = np.isin(rim.kinds, FLAT)
-    ground_m = box_map.ground.height_at(rim.centers)
-    if box_map.ground.is_flat:
-        ground_m[:] = plane_z_m(box_map) - GROUND_PLANE_DROP_M
-    assert rim.maxs[flat, 2] == pytest.approx(ground_m[flat])
-    assert (rim.mins[~flat, 2] < ground_m[~flat] + 1e-6).all()  # nothing hangs in the air
-
-
-def test_the_same_seed_gives_the_same_rim_and_ids_of_its_own(box_map: BoxMap):
-    rim, again, other = (rim_of(box_map, seed) for seed in (0, 0, 1))
-    assert np.array_equal(rim.centers, again.centers)
-    assert np.array_equal(rim.ids, again.ids)
-    assert len(other) != len(rim) or not np.array_equal(other.centers, rim.centers)
-    assert len(np.unique(np.concatenate([rim.ids, box_map.ids]))) == len(rim) + len(box_map)
-
-
-def test_roads_leave_in_line_with_the_streets_of_a_town():
-    box_map = town()
-    streets = box_map.select(box_map.kinds == KINDS["Roads"])
-    rim = rim_of(box_map, 0)
-    roads = rim.select(rim.kinds == KINDS["Roads"])
-    for axis in (0, 1):
-        leaving = roads.centers[(roads.half_extents[:, axis] > 400.0) & (np.abs(roads.centers[:, axis]) > 300.0)]
-        assert len(leaving) == 4
-        assert np.abs(leaving[:, None, 1 - axis] - streets.centers[:, 1 - axis]).min(axis=1).max() < 0.1
-
-
 def test_a_flight_that_comes_there_is_refused():
     box_map = town("village")
     east = box_map.bounds()[1][0]
@@ -101,11 +71,6 @@ def test_a_flight_that_comes_there_is_refused():
     with pytest.raises(RenderError, match=r"path_004.*72 m") as error:
         check_outside_rim(replace(trace, positions_m=places + np.array([3.0, 0.0, 0.0])), box_map)
     assert "render.rim" in str(error.value.fix)
-
-
-def test_it_is_off_unless_asked_for_and_then_on_record():
-    assert "rim" not in RenderConfig().recorded()
-    assert RenderConfig(rim=True).recorded()["rim"] is True
 
 
 @pytest.mark.parametrize("name", ["gl", pytest.param("pyrender", marks=pytest.mark.slow)])
@@ -132,23 +97,3 @@ def test_pixels_of_the_map_stay_what_they_are_and_those_of_the_rim_are_nobodys(n
     assert set(np.unique(frame.kinds[nobodys])) == seen
     on_ground = (frame.kinds == KINDS["Terrain"]) & nobodys & (bare.depth < 300.0)
     assert np.abs(frame.depth - bare.depth)[on_ground].max() < 1e-3 * 300.0
-
-
-def test_both_renderers_draw_it_in_the_same_places():
-    box_map = town("village")
-    rim, frames = rim_of(box_map, 0), []
-    pose = world_from_camera(np.array([140.0, 30.0, 40.0]), np.array([-15.0, 0.0, 0.0]))
-    rim = rim.select(rim.kinds != KINDS["Vegetation"])  # whose round parts differ
-    for name in ("gl", "pyrender"):
-        try:
-            renderer = open_renderer(name, box_map, 320, 180, rim=rim)
-        except EnvironmentMissing as error:
-            pytest.skip(str(error))
-        frames.append(renderer.render(pose, intrinsic_matrix(320, 180, 75.0), None))
-        renderer.close()
-    one, two = frames
-    nobodys = (one.ids == NO_INSTANCE) & (two.ids == NO_INSTANCE)
-    assert nobodys.mean() > 0.9
-    assert (one.kinds == two.kinds)[nobodys].mean() > 0.995
-    same = nobodys & (one.kinds == two.kinds) & (one.depth < 600.0)
-    assert (np.abs(one.depth - two.depth)[same] < 1e-4 * one.depth[same]).mean() > 0.99

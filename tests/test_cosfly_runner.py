@@ -2,16 +2,12 @@
 
 import os
 import signal
-import tracemalloc
-from collections import Counter
-from itertools import islice, pairwise
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from cosfly.errors import EnvironmentMissing, InputError, StorageError
-from cosfly.work.chance import BLOCK, draw_by_share, draw_to_quota, draws_for, rng_for
+from cosfly.work.chance import draws_for, rng_for
 from cosfly.work.config import Config
 from cosfly.work.runner import Item, Outcome, run_items
 from cosfly.work.stage_folder import Failed, Kept, StageFolder
@@ -40,10 +36,6 @@ def make_worker(log: Path):
     return work
 
 
-def make_wordy_worker(num_bytes: int):
-    return lambda item: Outcome({"words": num_bytes * "x"})
-
-
 def _stage(path: Path) -> StageFolder:
     return StageFolder.open(path, "demo", config=Config(), inputs={}, seed=0)
 
@@ -67,20 +59,6 @@ def test_everything_is_counted(tmp_path):
     failures = (tmp_path / "s/failures.jsonl").read_text()
     assert "got x" in failures
     assert "KeyError" in failures
-
-
-@pytest.mark.parametrize("workers", [0, 1])
-def test_results_are_not_held(tmp_path, workers):
-    """A driver of a hundred thousand items has the memory for one."""
-    num, megabyte = 40, 1_000_000
-    tracemalloc.start()
-    items = [Item(f"i{k}", k) for k in range(num)]
-    finished = run_items(_stage(tmp_path / "s"), items, make_wordy_worker, (megabyte,), workers=workers)
-    assert [len(record.result["words"]) for record in finished.kept] == [megabyte] * num
-    assert [record.id for record in finished.records] == [item.item_id for item in items]
-    _, peak_bytes = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak_bytes < 15 * megabyte
 
 
 def test_a_record_is_the_last_of_its_item_and_a_failure_undoes_nothing(tmp_path):
@@ -154,42 +132,3 @@ def test_rng_depends_on_all_three_and_zero_is_a_seed():
     assert len(draws) == 4
     assert rng_for(0, "a", "x").random() == rng_for(0, "a", "x").random()
     assert len({draws_for(*key) for key in ((0, "a", "x"), (1, "a", "x"), (0, "b", "x"), (0, "a", "y"))}) == 4
-
-
-def test_an_item_is_named_once_in_the_log(tmp_path, caplog):
-    run_items(_stage(tmp_path / "s"), _items(("fail", "x"), ("bug", "y")), make_worker, (tmp_path / "log",))
-    assert "demo: i0: broken" in caplog.text
-    assert "demo: i1: KeyError" in caplog.text
-
-
-def test_names_are_drawn_by_their_shares():
-    shares = {"b": 3.0, "none": 0.0, "a": 1.0}
-    rng = np.random.default_rng(0)
-    drawn = [draw_by_share(shares, rng) for _ in range(4000)]
-    assert set(drawn) == {"a", "b"}
-    assert 0.22 < drawn.count("a") / 4000 < 0.28
-    turned = dict(reversed(shares.items()))
-    assert [draw_by_share(turned, np.random.default_rng(k)) for k in range(20)] == [
-        draw_by_share(shares, np.random.default_rng(k)) for k in range(20)
-    ]
-    assert draw_by_share({"a": 0.0, "b": 1.0, "c": 0.0}, rng) == "b"
-
-
-def test_what_is_drawn_to_a_quota_has_its_share_of_any_number():
-    shares = {"a": 5.0, "b": 3.0, "c": 1.0, "d": 1.0, "e": 0.0}
-    for seed in range(30):
-        drawn = list(islice(draw_to_quota(shares, np.random.default_rng(seed)), 200))
-        for num in range(1, 201):
-            counts = Counter(drawn[:num])
-            off = max(abs(counts[name] - num * share / 10) for name, share in shares.items())
-            assert off < (3.5 if num % BLOCK else 2.5)
-        assert drawn[:50] == list(islice(draw_to_quota(shares, np.random.default_rng(seed)), 50))
-    assert len(set(pairwise(drawn))) > 10  # in random order
-    with pytest.raises(ValueError, match="something positive"):
-        next(draw_to_quota({"a": 0.0}, np.random.default_rng(0)))
-
-
-@pytest.mark.parametrize("shares", [{}, {"a": 0.0}, {"a": 2.0, "b": -1.0}], ids=["none", "zero", "negative"])
-def test_shares_that_add_up_to_nothing_are_a_value_error(shares):
-    with pytest.raises(ValueError, match="shares"):
-        draw_by_share(shares, np.random.default_rng(0))

@@ -14,10 +14,9 @@ from browser import browser
 from commands import invoke
 from test_cosfly_inspection import plan_of
 
-from cosfly.errors import InputError
 from cosfly.geometry import box_corners
 from cosfly.look.scene_page import run
-from cosfly.products.boxes import MapHeader, make_box_map, read_boxes, write_boxes
+from cosfly.products.boxes import MapHeader, make_box_map, write_boxes
 from cosfly.products.flights import find_flights
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import read_flight
@@ -79,31 +78,6 @@ def test_what_is_packed_is_what_was_read(place, tmp_path):
     assert len({track["kind"] for track in data["tracks"]}) == 4
 
 
-def test_flights_of_other_towns_stay_out(place, tmp_path):
-    """Where any is of the map's; walks of two towns have the same names."""
-    tree = make_playback_tree(tmp_path / "tree", 2, 8, width_px=96, height_px=54, towns=("Town01", "Town02"))
-    town = read_boxes(place / "map.json")
-    write_boxes(tmp_path / "map.json", replace(town, header=town.header.model_copy(update={"name": "Town02"})))
-    page = run(tmp_path / "map.json", tmp_path / "scene.html", data=tree)
-    own = [flight for flight in map(read_flight, find_flights(tree)) if flight.town == "Town02"]
-    assert len(data_of(page)["tracks"]) == len(own) == 2
-    assert "2 flights are of other towns" in page.read_text()
-
-
-def test_frames_are_left_out_to_keep_the_size(place, tmp_path):
-    whole = run(place / "map.json", tmp_path / "whole.html", data=place / "tree")
-    bare = run(place / "map.json", tmp_path / "bare.html", traces=planners(place))
-    middle = (whole.stat().st_size + bare.stat().st_size) / 2 / 2**20
-    small = run(place / "map.json", tmp_path / "small.html", data=place / "tree", max_mb=middle)
-    assert small.stat().st_size < whole.stat().st_size
-    assert "frames have their picture here" in small.read_text()
-    with pytest.raises(InputError, match="the page is too large"):
-        run(place / "map.json", tmp_path / "none.html", data=place / "tree", max_mb=0.001)
-    assert not (tmp_path / "none.html").exists()
-    one = run(place / "map.json", tmp_path / "one.html", data=place / "tree", most_paths=1)
-    assert "1 of 2 paths are shown" in one.read_text()
-
-
 @pytest.mark.slow
 def test_the_page_works_offline_in_a_browser(place, tmp_path):
     """Kinds, paths and planners on and off; played back; frames and figures of the chosen path; nothing foreign runs."""
@@ -140,21 +114,3 @@ def test_the_page_works_offline_in_a_browser(place, tmp_path):
         assert page.run("typeof window.hacked") == "undefined"
         assert [said for said in page.said if '"warning"' not in said] == []
         assert all(address.startswith(("file:", "data:")) for address in page.requests)
-
-
-@pytest.mark.slow
-def test_as_many_boxes_as_the_paper_s_town(tmp_path):
-    """65,614: the file, and that it opens; docs/performance.md has how fast."""
-    count, rng = 65_614, np.random.default_rng(1)
-    rows = np.column_stack([rng.uniform(0, 619, count), rng.uniform(0, 506, count), rng.uniform(1, 9, count)])
-    kinds = np.where(np.arange(count) < 3_033, KINDS["Buildings"], KINDS["Vegetation"])
-    write_boxes(
-        tmp_path / "map.json",
-        make_box_map(rows, np.full((count, 3), 0.6), np.zeros((count, 3)), kinds, header=MapHeader(ground_z_m=0.0)),
-    )
-    page = run(tmp_path / "map.json", tmp_path / "scene.html")
-    assert page.stat().st_size < 25e6
-    with browser(tmp_path / "profile") as tab:
-        tab.open(page)
-        tab.wait("document.body.dataset.ready === 'yes'")
-        assert tab.run("window.scene.kinds.reduce((sum, kind) => sum + kind.count, 0)") == count

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tables import each
 
-from cosfly.errors import InputError, ResumeError
+from cosfly.errors import ResumeError
 from cosfly.products.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.simplify.passes import (
@@ -24,7 +24,6 @@ from cosfly.simplify.passes import (
     simplify,
 )
 from cosfly.simplify.stage import cross_validate, run
-from cosfly.work.config import build
 
 VEGETATION, BUILDINGS, STATIC, ROADS = (KINDS[name] for name in ("Vegetation", "Buildings", "Static", "Roads"))
 PAPER = {"min_fill": 0.0, "min_canopy_fill": 0.0, "trunk": "full"}
@@ -80,12 +79,6 @@ def test_merge_follows_the_gap_rule(kind, gap, count):
         np.testing.assert_allclose(merged.maxs[0], np.maximum(1, shift + 1))
 
 
-def test_merge_keeps_the_rotation_of_what_stands_alone():
-    lone = box_map(("Buildings", (0, 0, 0), (9, 4, 5), 30.0), ("Buildings", (50, 0, 0), (59, 4, 5), 10.0))
-    merged = simplify(lone, only("merge")).box_map
-    assert merged.rotations_deg[:, 1].tolist() == [30.0, 10.0]
-
-
 def test_kinds_never_merge_with_each_other():
     touching = box_map(("Buildings", (0, 0, 0), (4, 4, 5)), ("Vegetation", (4, 0, 0), (8, 4, 5)))
     assert len(simplify(touching, only("merge", min_fill=0.0, min_canopy_fill=0.0)).box_map) == 2
@@ -108,13 +101,6 @@ def slow_clusters(mins, maxs, gap_m):
 def test_clusters_equal_the_slow_version(seed, count, gap_m):
     boxes = random_map(seed, count, 60.0)
     np.testing.assert_array_equal(clusters(boxes.mins, boxes.maxs, gap_m), slow_clusters(boxes.mins, boxes.maxs, gap_m))
-
-
-def test_clusters_reject_bad_arguments():
-    with pytest.raises(ValueError, match="gap_m"):
-        clusters(np.zeros((1, 3)), np.ones((1, 3)), -1.0)
-    with pytest.raises(ValueError, match="mins and maxs"):
-        clusters(np.zeros((1, 2)), np.ones((1, 2)), 1.0)
 
 
 @settings(max_examples=25)
@@ -144,24 +130,6 @@ def test_the_guard_keeps_a_street_between_two_askew_rows_and_the_papers_rule_doe
     walkable = [cross_validate(street, m)["simplified_walkable_m2"] for m in (plain, guarded)]
     assert walkable[0] == 0.0
     assert walkable[1] > 0.9 * cross_validate(street, street)["raw_walkable_m2"]
-
-
-def test_the_parts_of_one_round_crown_become_one_box():
-    rng = np.random.default_rng(0)
-    angles, radii = rng.uniform(0, 2 * np.pi, 60), 3.0 * np.sqrt(rng.uniform(0, 1, 60))
-    parts = [
-        ("Vegetation", (x - 0.4, y - 0.4, z), (x + 0.4, y + 0.4, z + 0.8))
-        for x, y, z in zip(radii * np.cos(angles), radii * np.sin(angles), rng.uniform(3, 7, 60), strict=True)
-    ]
-    assert len(simplify(box_map(*parts), only("merge")).box_map) == 1
-
-
-def test_a_long_askew_row_of_trees_does_not():
-    row = [("Vegetation", (k, k, 0), (k + 4, k + 4, 8)) for k in range(0, 100, 5)]
-    merged = simplify(box_map(*row), only("merge")).box_map
-    assert len(merged) > 1
-    covered = sum(np.prod(4 * size[:2] * size[:2]) ** 0.5 for size in merged.half_extents)
-    assert covered < 0.5 * 104**2
 
 
 @pytest.mark.parametrize(
@@ -198,41 +166,6 @@ def test_stems_let_people_walk_below_trees():
     assert area[0] > area[1] + 20.0
 
 
-def test_what_does_not_span_the_cut_stays():
-    plants = box_map(("Vegetation", (0, 0, 0), (4, 1, 1.2)), ("Vegetation", (9, 9, 4), (12, 12, 9)))
-    cropped = simplify(plants, only("crop_tree")).box_map
-    np.testing.assert_array_equal(cropped.centers, plants.centers)
-    np.testing.assert_array_equal(cropped.half_extents, plants.half_extents)
-
-
-def test_a_hedge_beside_a_tree_is_still_an_obstacle():
-    garden = box_map(("Vegetation", (0, 0, 0), (4, 4, 8)), ("Vegetation", (5, 0, 0), (15, 0.8, 1.0)))
-    result = simplify(garden, SimplifyConfig()).box_map
-    assert ((result.mins <= (5, 0, 0)) & (result.maxs >= (15, 0.8, 1.0))).all(axis=1).any()
-
-
-def test_crops_are_done_once():
-    boxes = random_map(3, 80)
-    once = simplify(boxes, only("crop_tree", trunk="full")).box_map
-    twice = simplify(once, only("crop_tree", trunk="full")).box_map
-    np.testing.assert_array_equal(once.centers, twice.centers)
-    assert once.ids.tolist() == twice.ids.tolist()
-
-
-def test_new_ids_never_repeat_one_of_64_bits():
-    tree = box_map(("Vegetation", (0, 0, 0), (4, 4, 9)), ("Static", (9, 9, 0), (10, 10, 1)), ids=[2**64 - 1, 1])
-    assert sorted(simplify(tree, SimplifyConfig()).box_map.ids.tolist()) == [1, 2, 2**64 - 1]
-
-
-def test_centres_near_each_other_make_neighbours_whatever_their_faces():
-    row = [("Vegetation", (x, 0, 0), (x + 0.2, 0.2, 0.2)) for x in (0.0, 2.0, 4.0, 6.01)]
-    near = box_map(*row)
-    assert len(simplify(near, only("merge", merge_by="center", min_canopy_fill=0.0)).box_map) == 2
-    wide = box_map(("Vegetation", (0, 0, 0), (9, 9, 9)), ("Vegetation", (7, 7, 7), (8, 8, 8)))  # one inside the other
-    assert len(simplify(wide, only("merge", merge_by="center", min_canopy_fill=0.0)).box_map) == 2
-    assert len(simplify(wide, only("merge", min_canopy_fill=0.0)).box_map) == 1
-
-
 def test_adaptive_cropping_cuts_tall_trees_into_a_stem_and_low_pieces():
     plants = box_map(
         ("Vegetation", (0, 0, 0), (4, 6, 13)),  # stem and two pieces
@@ -247,21 +180,6 @@ def test_adaptive_cropping_cuts_tall_trees_into_a_stem_and_low_pieces():
     np.testing.assert_allclose(result.maxs[2:], [(2.25, 3.25, 5), (4, 6, 9), (4, 6, 13), (24, 4, 5), (24, 4, 9)])
     again = simplify(result, only("crop_tree", crop_strategy="adaptive")).box_map
     assert sorted(again.ids.tolist()) == sorted(result.ids.tolist())
-
-
-@settings(max_examples=25)
-@given(seed=st.integers(0, 10**6))
-def test_adaptive_cropping_keeps_heights_and_leaves_nothing_high(seed):
-    boxes = random_map(seed, 60)
-    boxes = replace(boxes, half_extents=boxes.half_extents * [1, 1, 4])
-    result = simplify(boxes, only("crop_tree", crop_strategy="adaptive")).box_map
-    plants = result.select(result.kinds == VEGETATION)
-    over_ground = plants.maxs[:, 2] - np.maximum(plants.mins[:, 2], 0)
-    assert over_ground.max() <= 5.0 + 1e-9
-    raw = boxes.select(boxes.kinds == VEGETATION)
-    heights = (plants.half_extents[:, 2].sum(), raw.half_extents[:, 2].sum())
-    assert heights[0] == pytest.approx(heights[1])
-    assert len(set(result.ids.tolist())) == len(result)
 
 
 def test_the_simworld_variants_work_together():
@@ -322,13 +240,6 @@ def test_nested_boxes_of_one_kind_go(inner, kind, kept):
     assert prune_nested(boxes, 0.01).ids.tolist() == kept
 
 
-def test_the_empty_corner_of_a_turned_box_holds_nothing():
-    corner = box_map(("Buildings", (-10, -10, 0), (10, 10, 10), 45.0), ("Buildings", (11, 11, 0), (12, 12, 5)))
-    assert len(prune_nested(corner, 0.01)) == 2
-    middle = box_map(("Buildings", (-10, -10, 0), (10, 10, 10), 45.0), ("Buildings", (5, 5, 0), (6, 6, 5)))
-    assert len(prune_nested(middle, 0.01)) == 1
-
-
 @settings(max_examples=40)
 @given(seed=st.integers(0, 10**6), count=st.integers(1, 60))
 def test_pruning_equals_the_slow_rule_on_unturned_boxes(seed, count):
@@ -369,12 +280,6 @@ def test_the_whole_keeps_its_books(seed, paper):
     assert after_ground <= after_crop
 
 
-def test_a_kind_is_not_merged_when_its_gap_is_null():
-    pair = box_map(("Buildings", (0, 0, 0), (1, 1, 1)), ("Buildings", (1, 0, 0), (2, 1, 1)))
-    cfg = build(SimplifyConfig, {"merge_gap_m": {"Buildings": None}}, "x")
-    assert len(simplify(pair, cfg).box_map) == 2
-
-
 # --- the stage --------------------------------------------------------------------------------------------------------
 
 
@@ -406,11 +311,3 @@ def test_stage_writes_map_report_and_picture(tmp_path: Path):
     assert (tmp_path / "again/step2_simplified.json").read_bytes() == written
     with pytest.raises(ResumeError, match="trunk was 'stem', is 'full'"):
         run(SimplifyConfig(trunk="full"), source, tmp_path / "out")
-
-
-def test_a_map_below_the_ground_is_an_error(tmp_path: Path):
-    source = tmp_path / "boxes_3d.json"
-    write_boxes(source, box_map(("Static", (0, 0, -3), (1, 1, -1))))
-    with pytest.raises(InputError, match="below the ground") as caught:
-        run(SimplifyConfig(), source, tmp_path / "out")
-    assert caught.value.where == source

@@ -9,25 +9,19 @@ from numpy.testing import assert_allclose
 from specimens_slopes import CELL_M, SHAPES, TILT, flat_town, on_ground, plane_m, sampled, sloped_town
 from test_renderers_contract import NAMES
 
-from cosfly.errors import InputError
 from cosfly.geometry import DT_S, intrinsic_matrix, world_from_camera
-from cosfly.pedestrians.stage import PedestriansConfig, make_walk, walkable_ground
+from cosfly.pedestrians.stage import PedestriansConfig, walkable_ground
 from cosfly.planners.contract import PLANNERS, PlanConfig
 from cosfly.planners.stage import plan_flight
-from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
+from cosfly.products.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.products.ground import Ground
 from cosfly.products.kinds import GROUND_KINDS, KINDS
-from cosfly.products.walks import TARGET_HEIGHT_M, Walk
-from cosfly.render.contract import GROUND_PLANE_DROP_M, instance_ids
+from cosfly.products.walks import Walk
 from cosfly.render.draping import BARE_GROUND, drape, is_draped
-from cosfly.render.perturbation import Surroundings
 from cosfly.render.stage import open_renderer
 from cosfly.simplify.passes import SimplifyConfig, simplify
 from cosfly.space.grid import blocks_walking
-from cosfly.space.kernels import index_boxes, obstacle_index, segments_hit, signed_distances, visibility
-from cosfly.work.chance import rng_for
-
-WALKS = PedestriansConfig(min_distance_m=20.0, max_distance_m=60.0, min_component_cells=400)
+from cosfly.space.kernels import index_boxes, obstacle_index, signed_distances
 
 
 @pytest.fixture(scope="module", params=SHAPES)
@@ -49,17 +43,6 @@ def test_heights_are_those_of_the_triangles_and_go_on_beyond_the_border():
     assert (normals[:, 2] > 0).all()  # counter-clockwise from above
     slopes = np.linalg.norm(normals[:, :2], axis=1) / normals[:, 2]
     assert_allclose(ground.slope_at(triangles.mean(axis=1)), slopes, atol=1e-9)
-
-
-def test_a_tilted_plane_and_a_flat_one_are_known_everywhere():
-    ground, rng = sampled("plane"), np.random.default_rng(1)
-    places = rng.uniform(-150.0, 150.0, (500, 2))
-    assert_allclose(ground.height_at(places), plane_m(places), atol=2e-3)  # heights are kept to a millimetre
-    assert_allclose(ground.slope_at(places), np.linalg.norm(TILT), atol=1e-3)
-    flat = Ground.flat(1.1)
-    assert flat.is_flat
-    assert (flat.height_at(places) == 1.1).all()
-    assert (flat.slope_at(places) == 0.0).all()
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -85,22 +68,6 @@ def test_a_sloped_map_survives_its_file_and_a_flat_one_says_nothing_of_it(tmp_pa
     assert back.header == town.header
     write_boxes(tmp_path / "flat.json", flat_town())
     assert "ground" not in json.loads((tmp_path / "flat.json").read_text())
-
-
-def test_a_malformed_ground_is_named(tmp_path: Path):
-    write_boxes(tmp_path / "map.json", sloped_town("hill"))
-    value = json.loads((tmp_path / "map.json").read_text())
-    for change, words in (
-        ({"cell_m": 0.0}, "ground.cell_m"),
-        ({"heights_m": [[0.0, 1.0]]}, "ground.heights_m"),
-        ({"heights_m": [[0.0, 1.0], [0.0]]}, "not of one length"),
-        ({"heights_m": [[0.0], [0.0]]}, "at least two"),
-        ({"heights_m": [[0.0, "up"], [0.0, 1.0]]}, r"ground.heights_m\[0\]\[1\]"),
-        ({"bilinear": True}, "ground.bilinear"),
-    ):
-        (tmp_path / "map.json").write_text(json.dumps(value | {"ground": value["ground"] | change}))
-        with pytest.raises(InputError, match=words):
-            read_boxes(tmp_path / "map.json")
 
 
 # --- simplify and walk ---
@@ -130,16 +97,6 @@ def test_what_stands_on_a_slope_is_in_the_way_and_what_hangs_over_it_is_not(town
     )
     assert blocks_walking(lifted).all()
     assert tilted.height_at(np.zeros((1, 2)))[0] == pytest.approx(30.0)
-
-
-def test_feet_are_on_the_ground(town: BoxMap):
-    simplified = simplify(town, SimplifyConfig()).box_map
-    ground = walkable_ground(simplified, WALKS)
-    assert ground.counts["cells_steep"] == 0
-    for number in range(3):
-        walk = make_walk("p", ground, WALKS, rng_for(number, "pedestrians", "p")).walk
-        assert_allclose(walk.positions_m[:, 2], town.ground.height_at(walk.positions_m), atol=1e-9)
-        assert np.ptp(walk.positions_m[:, 2]) > 0.3
 
 
 def test_nobody_walks_on_ground_as_steep_as_a_roof():
@@ -190,19 +147,6 @@ def test_flights_count_their_altitude_from_the_ground_under_the_walker(shape: st
     assert (trace.visibility == 1.0).all()
 
 
-def test_a_hilltop_hides_who_stands_behind_it():
-    box_map = bare("hill")
-    index = obstacle_index(box_map)
-    hips = np.array([[-90.0, 0.0], [90.0, 0.0]])
-    hips = np.column_stack([hips, box_map.ground.height_at(hips) + TARGET_HEIGHT_M])
-    low_eye, high_eye = (np.array([[-95.0, 0.0, z]]) for z in (9.0, 45.0))
-    assert visibility(index, low_eye, hips[:1]) == 1.0
-    assert visibility(index, low_eye, hips[1:]) == 0.0
-    assert visibility(index, high_eye, hips[1:]) == 1.0
-    through = np.array([[-90.0, 0.0, 10.0]]), np.array([[90.0, 0.0, 10.0]])
-    assert segments_hit(index, *through).all()
-
-
 # --- draw ---
 
 
@@ -219,12 +163,6 @@ def test_draped_surfaces_lie_on_the_ground_and_keep_their_areas(town: BoxMap):
     sums = np.bincount(draped.rows[is_box], areas[is_box], len(town))
     expected = np.where(lies, 4.0 * town.half_extents[:, 0] * town.half_extents[:, 1], 0.0)
     assert_allclose(sums, expected, rtol=1e-6, atol=1e-6)
-
-
-def test_a_flyover_is_not_laid_on_the_ground():
-    decks = make_box_map([[0, 0, 0], [0, 40, 7]], [[20, 5, 0.2], [20, 5, 0.2]], np.zeros((2, 3)), [KINDS["Roads"]] * 2)
-    assert is_draped(on_ground(decks, sampled("plane"))).tolist() == [True, False]
-    assert not is_draped(decks).any()
 
 
 def rays(camera_pose: np.ndarray, intrinsic: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -258,54 +196,3 @@ def test_the_depth_of_a_tilted_plane_is_that_of_the_analytic_ray(renderer_name: 
     assert np.abs(frame.depth - depth)[on_grid].max() < 0.02
     assert (frame.kinds[on_grid] == KINDS["Terrain"]).all()
     assert (frame.ids[on_grid] == 0).all()
-
-
-def test_the_depth_of_a_hill_is_on_its_ground(renderer_name: str):
-    box_map, size = bare("hill"), (96, 54)
-    renderer = open_renderer(renderer_name, box_map, *size)
-    pose = world_from_camera(np.array([-70.0, 10.0, 30.0]), np.array([-20.0, 5.0, 0.0]))
-    intrinsic = intrinsic_matrix(*size, 80.0)
-    depth = renderer.render(pose, intrinsic, None).depth
-    renderer.close()
-    origin, directions = rays(pose, intrinsic, size)
-    hit = (origin + depth[..., None].astype(np.float64) * directions).reshape(-1, 3)
-    on_grid = (np.abs(hit[:, :2]) < 130.0).all(axis=1)
-    assert on_grid.mean() > 0.4
-    assert np.abs(hit[:, 2] - box_map.ground.height_at(hit))[on_grid].max() < 0.01
-    assert np.abs(hit[:, 2] - SHAPES["hill"](hit))[on_grid].max() < 0.03  # of the triangles, 4 m wide
-
-
-def test_a_map_without_ground_boxes_has_its_plane_at_the_headers_height():
-    header = MapHeader(name="bare", ground_z_m=2.0)
-    bare = make_box_map([[0, 0, 5]], np.ones((1, 3)), np.zeros((1, 3)), [KINDS["Buildings"]], header=header)
-    assert (bare.ground.height_at(np.zeros((3, 2))) == 2.0).all()
-    renderer = open_renderer("gl", bare, 32, 32)
-    down = world_from_camera(np.array([500.0, 500.0, 12.0]), np.array([-90.0, 0.0, 0.0]))
-    depth = renderer.render(down, intrinsic_matrix(32, 32, 20.0), None).depth
-    renderer.close()
-    assert_allclose(depth, 12.0 - 2.0 + GROUND_PLANE_DROP_M, atol=1e-3)
-
-
-def test_surfaces_are_seen_on_a_slope_as_on_a_plain(renderer_name: str):
-    """From straight above and far, about the same share of each kind is seen, however the ground tilts."""
-    flat = flat_town()
-    surfaces = flat.select(flat.is_any_of(GROUND_KINDS))
-    seen = {}
-    for name, box_map in (("flat", surfaces), ("plane", on_ground(surfaces, sampled("plane")))):
-        renderer = open_renderer(renderer_name, box_map, 120, 120)
-        height = float(box_map.ground.height_at(np.array([[3.0, 2.0]]))[0]) + 400.0
-        down = world_from_camera(np.array([3.0, 2.0, height]), np.array([-90.0, 0.0, 0.0]))
-        seen[name] = renderer.render(down, intrinsic_matrix(120, 120, 20.0), None)
-        renderer.close()
-    assert len(np.unique(seen["flat"].kinds)) > 3
-    for kind in np.unique(seen["flat"].kinds):
-        shares = [(frame.kinds == kind).mean() for frame in seen.values()]
-        assert shares[1] == pytest.approx(shares[0], abs=0.03)
-    assert set(np.unique(seen["plane"].ids)) <= set(instance_ids(surfaces)) | {0}
-
-
-def test_a_shifted_person_stands_on_the_slope():
-    surroundings, ground = Surroundings(sloped_town("plane")), sampled("plane")
-    for x, y in ((0.0, 0.0), (31.0, -17.0)):
-        height = float(ground.height_at(np.array([[x, y]]))[0])
-        assert surroundings.surface_z_m(x, y, height + 0.4) == pytest.approx(height)

@@ -89,53 +89,6 @@ def test_walks_that_cross_or_follow_or_begin_together_are_two():
     assert groups(course("there", there), course("back", back)) == [{"back"}, {"there"}]
 
 
-def test_flights_that_begin_later_or_are_shorter_are_of_the_walk():
-    points = walk(80)
-    late, short = course("late", points, part=slice(31, None)), course("short", points, part=slice(0, 9))
-    assert groups(course("whole", points), late, short) == [{"late", "short", "whole"}]
-    assert groups(late, short) == [{"late"}, {"short"}]  # nothing shared: only the whole one joins them
-
-
-def test_points_between_full_seconds_and_gaps_do_not_matter():
-    points = walk(80)
-    between = (points[0][:-1] + 0.2, points[1][:-1] + np.array([0.28, 0, 0]))  # the same walk, sampled elsewhere
-    torn = np.r_[0:10, 40:80]
-    assert groups(course("a", points), course("b", between), course("c", points, part=torn)) == [{"a", "b", "c"}]
-    other_middle = walk(80)[1].copy()
-    other_middle[10:40] += [0, 40.0, 0]
-    assert len(groups(course("c", points, part=torn), course("d", (points[0], other_middle)))) == 1
-
-
-def test_one_name_is_one_walk_whatever_is_known_of_it():
-    points = walk(20)
-    unknown = (points[0], np.full_like(points[1], np.nan))
-    away = walk(20, begin=(500.0, 0.0))
-    found = groups(
-        course("a", points), course("a", unknown), course("b", unknown), course("c", away), course("a", away)
-    )
-    assert found == [{"a", "c"}, {"b"}]
-
-
-def test_times_far_apart_cost_nothing():
-    points = np.array([0.0, 0.5, 1e12]), np.zeros((3, 3))
-    assert groups(course("a", points), course("b", walk(4, speed_mps=0.0))) == [{"a", "b"}]
-    assert walks_of([]) == {}
-
-
-@given(st.randoms(use_true_random=False), st.integers(0, 3))
-def test_walks_do_not_depend_on_the_order_and_bear_a_name_of_theirs(random, seed):
-    rng = np.random.default_rng(seed)
-    courses = []
-    for number in range(6):
-        points = walk(30, begin=tuple(rng.uniform(0, 3, 2)), heading_deg=float(rng.uniform(0, 360)))
-        courses += [course(f"{kind}{number}", points, part=slice(number, 30 - k)) for k, kind in enumerate("xyz")]
-    expected = walks_of(courses)
-    random.shuffle(courses)
-    assert walks_of(iter(courses)) == expected
-    assert all(walk_id == min(name for name, of in expected.items() if of == walk_id) for walk_id in expected.values())
-    assert all(len({expected[f"{kind}{number}"] for kind in "xyz"}) == 1 for number in range(6))
-
-
 def test_walks_agree_with_a_slow_plain_comparison():
     rng = np.random.default_rng(5)
     courses = [

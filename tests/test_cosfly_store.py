@@ -2,7 +2,6 @@
 
 import errno
 import os
-import shutil
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,6 @@ from cosfly.errors import InputError, NothingKept, ResumeError, StorageError, Ve
 from cosfly.reading.documents import read_json
 from cosfly.work import store
 from cosfly.work.config import Config, MayDiffer
-from cosfly.work.folder_lock import LOCK, give_up, hold_folder, is_held
 from cosfly.work.journal import Journal
 from cosfly.work.stage_folder import Failed, StageFolder, Tally, read_manifest, write_failures
 from cosfly.work.store import inside, write_bytes, write_json
@@ -32,14 +30,6 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         write_json(path, {"new": 2})
     assert read_json(path) == {"old": 1}
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]  # no litter
-
-
-def test_a_folder_in_the_place_of_a_file_is_one_error(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "there").mkdir()
-    for place in (".", "/", "there"):
-        with pytest.raises(StorageError, match="where a folder is"):
-            write_json(Path(place), {})
 
 
 def test_nan_is_never_a_value(tmp_path):
@@ -87,12 +77,6 @@ def test_a_damaged_line_is_counted(tmp_path):
     journal = Journal(path)
     assert list(journal.read()) == [{"i": 0}, {"i": 2}]
     assert journal.num_damaged == 1
-
-
-def test_a_tally_that_does_not_add_up_is_a_bug():
-    Tally(input=3, kept=1, dropped={"short": 1}, failed={"input": 1}).check()
-    with pytest.raises(AssertionError, match="2 outcomes for 3 items"):
-        Tally(input=3, kept=1, dropped={"short": 1}).check()
 
 
 class Demo(Config):
@@ -149,22 +133,6 @@ def test_other_settings_and_inputs_are_named(tmp_path):
         _open(out, inputs=inputs)
 
 
-def test_a_command_that_is_refused_before_it_did_anything_leaves_nothing(tmp_path):
-    (tmp_path / "mine").mkdir()
-    for out in (tmp_path / "new/deep", tmp_path / "mine"):
-        stage = _open(out)
-        give_up(tmp_path)
-        assert not stage.path.exists() or list(stage.path.iterdir()) == []
-    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
-    stage = _open(tmp_path / "new")
-    stage.journal.append({"id": "a", "status": "kept"})
-    give_up(tmp_path)
-    assert sorted(path.name for path in stage.path.iterdir()) == ["items.jsonl", "stage.json"]
-    shutil.rmtree(_open(tmp_path / "out").path)  # by somebody, meanwhile
-    give_up(tmp_path)
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_stage_that_kept_nothing_is_one_error_and_not_complete(tmp_path):
     stage = _open(tmp_path / "out")
     write_failures(stage.path / "failures.jsonl", [Failed(id="i7", code="input", message="the disk is round")])
@@ -173,27 +141,10 @@ def test_a_stage_that_kept_nothing_is_one_error_and_not_complete(tmp_path):
     assert not (tmp_path / "out/manifest.json").exists()
 
 
-def test_an_attempt_without_finished_work_binds_nobody(tmp_path):
-    stage = _open(tmp_path / "out")
-    stage.journal.append({"id": "a", "status": "failed", "code": "input", "message": "x"})
-    (stage.path / "failures.jsonl").write_text("{}")
-    (stage.path / "Town").mkdir()
-    again = _open(tmp_path / "out", config=Demo(a={"b": 2}))
-    assert list(again.journal.read()) == []
-    (again.path / "product.json").write_text("{}")
-    with pytest.raises(ResumeError, match=r"a\.b was 2, is 3"):
-        _open(tmp_path / "out", config=Demo(a={"b": 3}))
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_full_disk_under_a_journal_is_one_error():
     with pytest.raises(StorageError, match="No space left"), Journal(Path("/dev/full")) as journal:
         journal.append({"id": "a"})
-
-
-def test_a_missing_input_is_not_taken_for_a_full_disk(tmp_path):
-    with pytest.raises(FileNotFoundError), store.storage_errors(tmp_path / "out"):
-        (tmp_path / "input").read_bytes()
 
 
 def test_foreign_files_are_not_touched(tmp_path):
@@ -212,55 +163,6 @@ def test_a_folder_in_which_another_process_works_is_refused(tmp_path, held_by_an
             _open(out)
         assert (out / ".lock").exists()
     assert not _open(out).is_complete  # the other was killed: what it left behind holds nobody up
-
-
-def test_a_finished_folder_needs_no_lock_and_holds_none(tmp_path, held_by_another):
-    out = tmp_path / "out"
-    _finished(out)
-    assert not (out / ".lock").exists()
-    with held_by_another(out):
-        assert _open(out).is_complete
-        with pytest.raises(ResumeError, match="seed was 0"):
-            _open(out, seed=1)
-    assert (out / "manifest.json").exists()
-    (out / ".lock").write_text("{}")  # a kill left it
-    assert _open(out).is_complete
-    assert not (out / ".lock").exists()
-
-
-def test_what_a_kill_left_of_a_file_or_folder_goes_when_it_is_written_again(tmp_path):
-    others = (".a.json.b.999999999.partial", f".a.json.{os.getppid()}.partial", ".a.json.mine.partial")
-    for other in others:
-        (tmp_path / other).write_text("of another file, of a process that lives, of nobody")
-    for pid in (os.getpid(), 999_999_999):  # a container gives the same ids again
-        (tmp_path / f".a.json.{pid}.partial").write_text("half")
-        (tmp_path / f".f.{pid}.partial/b").mkdir(parents=True)
-        write_json(tmp_path / "a.json", 1)
-        with store.atomic_folder(tmp_path / "f") as folder:
-            (folder / "c").write_text("c")
-        assert {path.name for path in tmp_path.iterdir()} == {*others, "a.json", "f"}
-        shutil.rmtree(tmp_path / "f")
-
-
-def test_what_a_kill_left_is_found_without_a_look_at_every_frame(tmp_path, monkeypatch):
-    """A million flights have a folder for each of their hundred frames; the workers' losses are cleared away at the end
-    of the stage, and when it is taken up again."""
-    whole, scanned, scandir = tmp_path / "Town/trajectory_1/ORI", [], os.scandir
-    for frame in range(20):
-        (whole / f"frames/{frame}").mkdir(parents=True)
-    (whole / store.CHECKSUMS).write_text("")
-    left = [tmp_path / "Town/trajectory_1/.aug_001.7.partial/frames/0", tmp_path / "Town/trajectory_2/.ORI.7.partial"]
-    for folder in left:
-        folder.mkdir(parents=True)
-        (folder / "rgb.png").write_text("half")
-    (tmp_path / ".town_map.json.7.partial").write_text("half")
-    (tmp_path / "Town/.away.7.partial").symlink_to(tmp_path)
-    monkeypatch.setattr(os, "scandir", lambda path: scanned.append(str(path)) or scandir(path))
-    store.remove_partials(tmp_path)
-    monkeypatch.undo()
-    assert not list(tmp_path.rglob("*.partial"))
-    assert len(list(whole.rglob("*"))) == 22
-    assert not [path for path in scanned if f"{whole}/" in path]
 
 
 def test_a_lock_leads_nowhere_else(tmp_path):
@@ -289,13 +191,6 @@ def test_a_stage_writes_through_no_link_in_its_folder(tmp_path):
     assert (private / "ORI/mine").read_text() == "mine"
 
 
-def test_the_output_folder_itself_may_be_a_link(tmp_path):
-    (tmp_path / "disk").mkdir()
-    (tmp_path / "out").symlink_to(tmp_path / "disk")
-    _finished(tmp_path / "out")
-    assert (tmp_path / "disk/manifest.json").exists()
-
-
 def test_nothing_is_written_in_the_place_of_a_link(tmp_path):
     (tmp_path / "private").mkdir()
     (tmp_path / "private/mine").write_text("mine")
@@ -310,24 +205,6 @@ def test_nothing_is_written_in_the_place_of_a_link(tmp_path):
     write_bytes(tmp_path / "new", b"other")
     assert (tmp_path / "private/mine").read_text() == "mine"
     assert (tmp_path / "folder").is_symlink()
-
-
-def test_where_the_system_has_no_locks_work_goes_on_and_leaves_none(tmp_path, monkeypatch, caplog):
-    def flock(*_):
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    monkeypatch.setattr("cosfly.work.folder_lock.fcntl.flock", flock)
-    assert not _open(tmp_path / "out").is_complete
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["stage.json"]
-    assert "no lock against a second run" in caplog.text
-
-
-@pytest.mark.timeout(20)
-def test_a_pipe_in_the_place_of_a_lock_holds_nobody_up(tmp_path):
-    os.mkfifo(tmp_path / LOCK)
-    assert not is_held(tmp_path)
-    with pytest.raises(StorageError, match=r"\.lock: cannot lock the folder; got no regular file"):
-        hold_folder(tmp_path)
 
 
 def test_atomic_folder(tmp_path):

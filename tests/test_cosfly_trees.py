@@ -28,7 +28,6 @@ from cosfly.inspection.settings import InspectConfig
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights, read_twin
 from cosfly.products.inspection import read_inspection
-from cosfly.products.places import Place, flight_ids, town_folder
 from cosfly.products.playback import read_flight, write_flight
 from cosfly.reading.documents import read_json
 from cosfly.work.stage_folder import read_failures
@@ -74,12 +73,6 @@ def copied(tree: Path, target: Path) -> Path:
     return target
 
 
-def test_the_strictest_public_reader_takes_ours_and_theirs(ours, foreign):
-    for tree in (ours, foreign):
-        (traces,) = read_public(tree).values()
-        assert traces.keys() == {"ORI", "aug_001"}
-
-
 def first_waypoint(change: Callable[[dict], object]) -> Callable[[dict], object]:
     return lambda value: change(value["points"][0]["nav_waypoint"])
 
@@ -116,24 +109,6 @@ def test_the_public_reader_can_refuse(ours, tmp_path, subtests):
 
 # --- names
 # --------------------------------------------------------------------------------------------------------------
-
-
-def test_town_folders():
-    folders = {"Town03": "Town03", "Town03_Opt": "Town03_Opt", "delft": "Town_delft", "my map": "Town_my_map"}
-    folders |= {"town01": "Town_town01", "../x": "Town__x", "": "Town_map"}
-    assert {name: town_folder(name) for name in folders} == folders
-
-
-def test_ids_are_plain_where_they_can_be_and_longer_where_they_must():
-    one, two = Place("a", "Town01", "trajectory_1", "ORI"), Place("a", "Town02", "trajectory_1", "ORI")
-    other, again = Place("b", "Town01", "trajectory_1", "ORI"), Place("b", "Town01", "trajectory_2", "ORI")
-    assert flight_ids([one, again]) == {one: "trajectory_1_ORI", again: "trajectory_2_ORI"}
-    assert list(flight_ids([one, two]).values()) == ["Town01_trajectory_1_ORI", "Town02_trajectory_1_ORI"]
-    assert flight_ids([two, one, other])[one] == "a_Town01_trajectory_1_ORI"
-    shaken = Place("a", "Town01", "trajectory_1", "aug_001")
-    assert flight_ids([one, two, shaken])[shaken] == "Town01_trajectory_1_aug_001", "as the clean flight beside it"
-    with pytest.raises(InputError, match="two flights have one name"):
-        flight_ids([one, one])
 
 
 # --- quirks of trees
@@ -326,18 +301,6 @@ def test_without_twins_perturbed_labels_say_that_they_hold_noise(tmp_path):
     assert {caption.label_from for caption in found} == {"perturbed"}
 
 
-# Of the others the columns of the flight are the same, which the test before shows.
-@pytest.mark.parametrize("name", ["targets left out", "waypoints and flat times", "unknown keys"])
-def test_a_quirk_never_ends_in_a_traceback_or_a_loss(tmp_path, name):
-    tree = write_foreign_tree(tmp_path / "tree", num_points=11)
-    for folder in find_flights(tree):
-        change_file(folder, QUIRKS[name].change)
-    found = list(read_captions(caption_stage.run(CaptionConfig(), tree, tmp_path / "caption")))
-    assert len(found) == 2 * 2
-    has_target = "target" not in name
-    assert {caption.status for caption in found} == {"accepted"} or not has_target
-
-
 def test_a_tree_of_pictures_alone_is_released_without_depth(tmp_path):
     tree = write_foreign_tree(tmp_path / "tree", num_points=11, files=("rgb.png",))
     inspected = inspection.run(InspectConfig(), None, None, tree, tmp_path / "inspect")
@@ -395,10 +358,3 @@ def test_of_a_foreign_tree_what_was_inspected_is_released_and_nothing_else(tmp_p
     write_json(alone / "inspect.json", value)
     with pytest.raises(InputError, match="the record of one flight has the folder of another"):
         failed("c", replace(source, inspect=alone / "inspect.json"))
-
-
-def test_trajectories_of_one_name_in_several_runs_are_several(tmp_path):
-    for run in ("one", "two"):
-        write_foreign_tree(tmp_path / "tree" / run, num_points=11)
-    found = read_inspection(inspection.run(InspectConfig(), None, None, tmp_path / "tree", tmp_path / "inspect"))
-    assert (found.funnel.trajectories.planned, found.funnel.trajectories.accepted) == (2, 2)

@@ -6,7 +6,6 @@ from hypothesis import strategies as st
 from cosfly.pedestrians.walking import (
     PACES,
     SLOWEST_SPEED_MPS,
-    Pace,
     arrival_times,
     menger_curvature,
     resample,
@@ -37,14 +36,6 @@ def test_curvature_by_hand():
         assert menger_curvature(np.ones((count, 2))).tolist() == [0.0] * count
 
 
-@given(st.floats(0.5, 200), st.floats(0.01, 1.0), st.floats(-100, 100))
-def test_points_on_a_circle_have_its_curvature(radius_m, step_rad, turn_rad):
-    angles = turn_rad + step_rad * np.arange(6)
-    circle = radius_m * np.column_stack([np.cos(angles), np.sin(angles)])
-    if radius_m * step_rad > 0.05:
-        np.testing.assert_allclose(menger_curvature(circle)[1:-1], 1 / radius_m, rtol=1e-5)
-
-
 # --- speed ------------------------------------------------------------------------------------------------------------
 
 
@@ -56,27 +47,7 @@ def test_speeds_by_hand():
     assert calm([1e9]).tolist() == [SLOWEST_SPEED_MPS], "nobody stands still for ever"
 
 
-def test_the_guard_changes_nothing_at_the_sharpest_grid_corner_and_the_papers_settings():
-    sharpest = 2 * np.sqrt(2)
-    speeds = speed_profile(np.full(10_000, sharpest), np.random.default_rng(1))
-    assert speeds.min() > SLOWEST_SPEED_MPS
-
-
-def test_jitter_is_even_within_its_share():
-    speeds = speed_profile(np.zeros(20_000), np.random.default_rng(2), jitter=0.15)
-    assert 1.2 * 0.85 <= speeds.min() < 1.2 * 0.852
-    assert 1.2 * 1.148 < speeds.max() <= 1.2 * 1.15
-    assert speeds.mean() == pytest.approx(1.2, abs=0.005)
-
-
 # --- time -------------------------------------------------------------------------------------------------------------
-
-
-def test_times_by_hand():
-    polyline = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 4.0]])
-    np.testing.assert_allclose(arrival_times(polyline, np.array([1.0, 0.5, 1.5])), [0.0, 4.0, 8.0])
-    with pytest.raises(ValueError, match="for ever"):
-        arrival_times(np.array([[0.0, 0.0], [1.0, 0.0]]), np.zeros(2))
 
 
 def test_even_speed_gives_even_steps_and_ends_at_the_goal():
@@ -143,32 +114,6 @@ def test_stops_change_when_a_place_is_reached_and_not_which(seed, count):
 
 # --- paces ------------------------------------------------------------------------------------------------------------
 
-ROUTE = np.column_stack([0.5 * np.arange(201), np.zeros(201)])  # 100 m
-
-
-def test_stops_lie_as_far_apart_and_last_as_long_as_the_row_says():
-    row = PACES["stop_and_look"]
-    for seed in range(30):
-        way = take_pace(ROUTE, row, np.random.default_rng(seed))
-        at = np.flatnonzero(way.stops_s)
-        gaps_m = np.diff(np.concatenate([[0.0], way.polyline_m[at, 0]]))
-        assert 2 <= len(at) <= 6
-        assert gaps_m.min() >= row.stop_every_m[0] - 0.5
-        assert gaps_m.max() <= row.stop_every_m[1] + 0.5
-        assert row.stop_s[0] <= way.stops_s[at].min() <= way.stops_s[at].max() <= row.stop_s[1]
-        assert way.stops_s[[0, -1]].tolist() == [0.0, 0.0]
-
-
-def test_who_turns_back_stands_at_the_turn_and_walks_the_same_way():
-    for seed in range(30):
-        way = take_pace(ROUTE, PACES["turn_back"], np.random.default_rng(seed))
-        (turn,) = np.flatnonzero(way.stops_s)
-        x = way.polyline_m[:, 0]
-        assert 45.0 <= x[turn] <= 75.0
-        assert turn == np.argmax(x)
-        np.testing.assert_allclose(np.abs(np.diff(x)), 0.5)
-        assert 0.49 <= (x[turn] - x[-1]) / x[turn] <= 0.91
-
 
 @settings(max_examples=60)
 @given(st.integers(0, 10**6), st.integers(1, 30), st.sampled_from(sorted(PACES)), st.floats(0.5, 20.0))
@@ -179,9 +124,3 @@ def test_every_way_arrives(seed, count, name, cell_m):
     speeds = np.where(way.stops_s > 0, 0.0, 1.2)
     assert np.isfinite(arrival_times(way.polyline_m, speeds)).all()
     np.testing.assert_array_equal(way.polyline_m[0], route[0])
-
-
-def test_a_pace_may_stop_at_every_other_waypoint():
-    row = Pace(stop_every_m=(0.1, 0.1), stop_s=(1.0, 1.0))
-    way = take_pace(ROUTE[:8], row, np.random.default_rng(0))
-    assert way.stops_s.tolist() == [0, 1, 0, 1, 0, 1, 0, 0]

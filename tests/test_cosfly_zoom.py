@@ -9,31 +9,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from test_cosfly_render import needs_gl
-from test_renderers_contract import circling, street, write_inputs
+from test_renderers_contract import circling, write_inputs
 
-from cosfly.errors import ConfigError, InputError, NothingKept, RenderError
+from cosfly.errors import ConfigError, InputError
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.flight import InspectConfig
-from cosfly.maps.stage import MapsConfig
-from cosfly.maps.stage import run as make_map
-from cosfly.products.boxes import MapHeader, check_ground, write_boxes
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import level_name, read_meta
 from cosfly.products.inspection import read_inspection
 from cosfly.products.playback import read_flight, write_flight
 from cosfly.products.segments import Segment
 from cosfly.products.traces import DroneTrace
-from cosfly.render.flight import check_flight
 from cosfly.render.lens import ZoomConfig, cameras_of, zoomed_deg
-from cosfly.render.perturbation import Surroundings
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
-from cosfly.studies import weather
 from cosfly.work.config import build
-from cosfly.work.stage_folder import read_failures, read_manifest
 from release.columns import INTRINSICS, Placement, matrices_of, scalar_row
 from specimens import make_flight
 
@@ -84,24 +75,6 @@ def test_a_flight_goes_from_level_to_level():
     assert fovs[24] != pytest.approx(fovs[44])
     focal = 1.0 / np.tan(np.radians(fovs) / 2.0)
     assert focal[22] == pytest.approx(np.sqrt(focal[20] * focal[24])), "halfway the picture is halfway larger"
-
-
-def test_levels_change_where_segments_begin():
-    parts = (Segment("follow", 0, 10), Segment("orbit", 10, 30), Segment("follow", 30, 40))
-    fovs = zoomed(40, segments=parts, ramp_s=1.0)
-    changes = np.flatnonzero(np.abs(np.diff(fovs)) > 1e-9)
-    assert set(changes) == {10, 11, 30, 31}
-
-
-@given(st.integers(2, 120), st.floats(1, 60), st.floats(0, 20), st.integers(0, 5))
-def test_every_frame_stays_between_the_levels(num_frames, part_s, ramp_s, seed):
-    fovs = zoomed(num_frames, seed, part_s=part_s, ramp_s=ramp_s)
-    assert len(fovs) == num_frames
-    assert fovs.min() >= min(LEVELS) - 1e-9
-    assert fovs.max() <= max(LEVELS) + 1e-9
-    assert fovs[0] == pytest.approx(110.0)
-    zoom = ZoomConfig(mode="dynamic", part_s=part_s, ramp_s=ramp_s)
-    assert np.allclose(zoomed_deg(60.0, (60.0,), zoom, np.arange(30) * 0.5, (), np.random.default_rng(seed)), 60.0)
 
 
 # --- trajectory.json --------------------------------------------------------------------------------------------------
@@ -195,48 +168,3 @@ def moved(trace: DroneTrace, name: str, frame: int, place: tuple[float, float, f
 
 
 IN_THE_WALL = moved(circling(4, "path_001"), "positions_m", 2, (-6.0, -16.0, 0.5))
-UNDER_GROUND = moved(circling(4, "path_002"), "targets_m", 1, (-7.0, -9.0, -3.0))
-IN_A_SLAB = moved(circling(4, "path_003"), "targets_m", 1, (0.0, 0.0, 0.05))
-
-
-def test_what_cannot_be_drawn_is_named():
-    for trace, words in (
-        (IN_THE_WALL, r"path_001: frame 2: a camera inside a box.*1 of 4 frames"),
-        (UNDER_GROUND, r"path_002: frame 1: a target under ground.*feet 3\.\d+ m below"),
-        (IN_A_SLAB, r"path_003: frame 1: a target under ground.*feet 0\.\d+ m below"),
-    ):
-        with pytest.raises(RenderError, match=words):
-            check_flight(trace, Surroundings(street()))
-    check_flight(circling(20), Surroundings(street()))
-
-
-@needs_gl
-def test_a_bad_flight_stops_no_other(tmp_path):
-    inputs = write_inputs(tmp_path / "inputs", [circling(3), IN_THE_WALL, UNDER_GROUND, circling(3, "path_009")])
-    tree = run(RenderConfig.model_validate({**SMALL, "tracks": ["clean"]}), *inputs, tmp_path / "render")
-    counts = read_manifest(tree).counts
-    assert (counts.input, counts.kept, counts.failed.total()) == (4, 2, 2)
-    told = {failure.id: failure.message for failure in read_failures(tree / "failures.jsonl")}
-    assert "a camera inside a box" in told["path_001/ORI"]
-    assert "a target under ground" in told["path_002/ORI"]
-    assert [folder.parent.name for folder in find_flights(tree)] == ["trajectory_1776000000", "trajectory_1776000003"]
-    alone = write_inputs(tmp_path / "alone", [IN_THE_WALL])
-    with pytest.raises(NothingKept, match="a camera inside a box"):
-        run(RenderConfig.model_validate(SMALL), *alone, tmp_path / "none")
-
-
-def test_a_map_without_ground_is_an_error(tmp_path):
-    walls = street()
-    walls = replace(walls.select(np.isin(walls.kinds, [3, 4])), header=MapHeader(name="walls"))
-    inputs = write_inputs(tmp_path / "inputs", [circling(3)])
-    write_boxes(inputs[0], walls)
-    of_these_boxes = MapsConfig.model_validate({"source": "boxes", "boxes": {"path": inputs[0]}})
-    for begin in (
-        lambda: make_map(of_these_boxes, tmp_path / "maps"),  # before anybody walks or flies there
-        lambda: run(RenderConfig.model_validate(SMALL), *inputs, tmp_path / "render"),
-        lambda: weather.run(RenderConfig(), inputs[0], inputs[2], tmp_path / "gallery"),
-    ):
-        with pytest.raises(InputError, match=r"boxes_3d\.json: the map has no ground.*ground_z_m"):
-            begin()
-    check_ground(replace(walls, header=MapHeader(name="walls", ground_z_m=0.0)), inputs[0])
-    check_ground(street(), inputs[0])

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from specimens_distill import make_caption, make_captions, prepared
 from specimens_foreign import write_foreign_tree
 
-from cosfly.errors import InputError, NothingKept, ResumeError, VerifyError
+from cosfly.errors import ResumeError, VerifyError
 from cosfly.products.actions import shipped_actions
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import write_captions
@@ -80,14 +80,6 @@ def test_sample_holds_what_the_student_needs():
     assert parse_answer(sample.answer, shipped_actions()).recovered == ()
     assert json.loads(sample.answer)["flight_decision"] == sample.decision
     assert "行人" in sample_of(language="zh").answer  # not escaped: escapes would cost tokens
-
-
-def test_a_prompt_without_a_place_for_the_pictures_is_refused(tree, tmp_path):
-    caption = make_caption("Town01", "trajectory_1", "ORI", 4)
-    prompts = {language: prompt.told("Each frame is given as: RGB.") for language, prompt in caption.prompt.items()}
-    write_captions(tmp_path / "captions.jsonl", [caption.model_copy(update={"prompt": prompts})])
-    with pytest.raises(InputError, match=r"trajectory_1_ORI_frame_00004: prompt\.en: .*no place.*cosfly caption anew"):
-        prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
 
 
 def test_which_captions_teach_and_how_much():
@@ -216,45 +208,6 @@ def test_run_counts_what_it_leaves_out(tree, tmp_path):
     assert counts["input"] == counts["kept"] + 5
 
 
-def test_a_balanced_run_thins_train_alone_and_says_what_it_cost(tree, tmp_path, caplog):
-    records = make_captions(tmp_path / "captions.jsonl", tree)
-    mixed = [  # every window of straight tracking is judged by its English, whatever the Chinese says
-        record.model_copy(update={"zh": record.zh.model_copy(update={"flight_decision": "hover"})})
-        if record.frame_index == 5 and record.en.flight_decision == "track_straight"
-        else record
-        for record in records
-    ]
-    write_captions(tmp_path / "captions.jsonl", mixed)
-    plain = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "plain")
-    write_captions(tmp_path / "captions.jsonl", mixed[::-1])
-    caplog.set_level("INFO", logger="distill")
-    out = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "balanced", balance="decisions")
-
-    keys = {(folder, split): {s.key for s in open_split(folder, split)} for folder in (plain, out) for split in SPLITS}
-    assert all(keys[plain, split] == keys[out, split] for split in ("val", "test"))
-    assert keys[out, "train"] < keys[plain, "train"]
-    languages = Counter(sample.sample_id for sample in open_split(out, "train"))
-    assert set(languages.values()) == {2}
-    english = Counter(sample.decision for sample in open_split(out, "train") if sample.language == "en")
-    assert english == {"track_straight": 8, "yaw_left_to_follow": 6, "slow_down": 6}  # of 12, 6, 6: an equal share is 8
-
-    manifest = json.loads((out / "manifest.json").read_text())
-    counts, cost = manifest["counts"], manifest["splits"]["train"]["balance"]
-    assert counts["dropped"] == {"balance": 4 * 2}
-    assert counts["kept"] + 8 == counts["input"] == json.loads((plain / "manifest.json").read_text())["counts"]["input"]
-    assert (sum(cost["windows"].values()), cost["windows_left_out"]) == (24, {"track_straight": 4})
-    assert cost["samples_left_out"] == 8
-    assert manifest["splits"]["train"]["samples"] == 40
-    assert "balance of train: " in caplog.text
-    assert "windows_left_out {'track_straight': 4}, samples_left_out 8" in caplog.text
-
-
-def test_run_refuses_a_tree_without_the_images(captions, tree, tmp_path):
-    bare = make_playback_tree(tmp_path / "bare", num_flights=1, num_points=6, with_images=False)
-    with pytest.raises(NothingKept, match=r"kept nothing.*missing_image 80.*--data"):
-        prepared(bare, captions, tmp_path / "set")
-
-
 def test_the_walk_of_a_flight_decides_its_split_and_not_its_name(tmp_path):
     """The same walks under other timestamps, in another build of the town and in another run."""
     runs = []
@@ -283,53 +236,9 @@ def test_the_walk_of_a_flight_decides_its_split_and_not_its_name(tmp_path):
         assert all((trees[sample.run] / image).is_file() for image in sample.images)
 
 
-def test_trees_that_a_set_was_not_made_of_are_refused_by_name(tree, captions, tmp_path):
-    out = prepared(tree, captions, tmp_path / "set")
-    other = make_playback_tree(tmp_path / "other", 5, 8, seed=1, with_images=False)
-    with pytest.raises(InputError, match=rf"not made of this playback tree.*{tree.parent.name}"):
-        resolve_trees(out, [other])
-    with pytest.raises(InputError, match=rf"is not given.*{tree.parent.name}"):
-        resolve_trees(out, [])
-
-
 def test_captions_that_no_record_binds_to_their_tree_are_refused(tree, captions, tmp_path):
     with pytest.raises(VerifyError, match=r"no record says of which playback tree.*unbound=accept"):
         stage.run(PrepareConfig(), [RunSource.of_files(tree, captions)], tmp_path / "set")
-
-
-def test_frames_of_another_size_than_the_captions_say_are_left_out(tree, tmp_path):
-    records = make_captions(tmp_path / "captions.jsonl", tree)
-    records[0] = records[0].model_copy(update={"picture_px": (64, 40)})
-    write_captions(tmp_path / "captions.jsonl", records)
-    out = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
-    assert json.loads((out / "manifest.json").read_text())["counts"]["dropped"] == {"picture_of_another_size": 2}
-
-
-def test_a_limit_is_kept_and_counted(tree, captions, tmp_path):
-    out = prepared(tree, captions, tmp_path / "set", limit=13)
-    counts = json.loads((out / "manifest.json").read_text())["counts"]
-    samples = [sample for split in SPLITS for sample in open_split(out, split)]
-    assert len({sample.sample_id for sample in samples}) == 13
-    assert len(samples) == counts["kept"] == 26
-    assert counts["dropped"] == {"limit": counts["input"] - 26}
-
-
-def test_decisions_that_train_does_not_have_are_told(tree, tmp_path, caplog):
-    records = make_captions(tmp_path / "captions.jsonl", tree)
-    plain = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "plain")
-    tested = {sample.sample_id for sample in open_split(plain, "test")}
-    odd = [
-        record.model_copy(update={
-            name: getattr(record, name).model_copy(update={"flight_decision": "ascend"}) for name in ("en", "zh")
-        }) if record.sample_id in tested else record
-        for record in records
-    ]  # fmt: skip
-    write_captions(tmp_path / "captions.jsonl", odd)
-    out = prepared(tree, tmp_path / "captions.jsonl", tmp_path / "set")
-    facts = json.loads((out / "manifest.json").read_text())["splits"]
-    assert facts["test"]["not_in_train"] == {"ascend": facts["test"]["samples"]}
-    assert facts["val"]["not_in_train"] == {}
-    assert "decisions of test that train does not have: {'ascend'" in caplog.text
 
 
 def _keys(samples) -> list[str]:
@@ -401,23 +310,6 @@ def test_each_decision_keeps_what_it_has_up_to_the_bound_in_any_order(counts, se
     most = max(1, len(windows) // len(counts))
     assert Counter(decision for decision, _ in found) == {name: min(count, most) for name, count in counts.items()}
     assert set(balanced(windows[::-1], seed)) == set(found)
-
-
-def test_stray_decisions_do_not_take_the_others_with_them():
-    counts = {"track_straight": 600, "yaw_left_to_follow": 390, "hover": 4, "slow_down": 3, "ascend": 2, "descend": 1}
-    assert len(balanced(windows_of(counts))) == 166 + 166 + 10
-
-
-def test_the_cost_by_hand():
-    windows = windows_of({"track_straight": 8, "hover": 2, "slow_down": 2})
-    cost = balance_of(ranked([("group", *window) for window in windows]), ["group"]).cost(12, shipped_actions())
-    # Effective decisions before: 1.5 ** (2 / 3) * 6 ** (1 / 3), then 2 ** (1 / 2) * 4 ** (1 / 2).
-    assert cost.pop("effective_decisions") == [pytest.approx(2.38, abs=0.01), pytest.approx(2.83, abs=0.01)]
-    assert set(cost.pop("absent")) == set(shipped_actions().tokens) - {"track_straight", "hover", "slow_down"}
-    assert cost == {
-        "most_windows": 4, "windows": {"hover": 2, "slow_down": 2, "track_straight": 8},
-        "windows_left_out": {"track_straight": 4}, "samples_left_out": 12,
-    }  # fmt: skip
 
 
 @given(

@@ -261,26 +261,6 @@ def test_a_recorded_step_gives_the_same_tokens(student, rows, recorder):
     assert recorder.played == MOST - 2
 
 
-def test_rows_that_leave_have_the_step_recorded_anew(student, rows, recorder, monkeypatch):
-    monkeypatch.setattr(decoding, "LEAVING_SHARE_RECORDED", 1e-9)  # each at once
-    ending = ending_at(student, rows)
-    expected = generated(ending, rows)
-    assert decode(ending, rows, max_tokens=MOST) == expected
-    assert recorder.recordings >= 2
-    own = EvenTokens(ending.end_token_id, len(rows))
-    assert decode(ending, rows, max_tokens=MOST, constraint=own) == decode(
-        ending, rows, max_tokens=MOST, is_recorded=False, constraint=EvenTokens(ending.end_token_id, len(rows))
-    )
-
-
-def test_a_step_that_cannot_be_recorded_is_computed(student, rows, monkeypatch):
-    asked, real = [], decoding.recorder_for
-    monkeypatch.setattr(decoding, "recorder_for", lambda student: asked.append)  # gives None, as record_graph does
-    assert decode(student, rows, max_tokens=MOST) == generated(student, rows)
-    assert len(asked) == 1
-    assert real(student) is None  # nothing records on a CPU
-
-
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an accelerator")
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from tables import each
 
-from cosfly.products.playback import STATES, read_flight
+from cosfly.products.playback import read_flight
 from cosfly.products.splits import SPLITS
 from cosfly.work.stage_folder import read_failures, read_manifest
 from distill.prepare import dual_track
 from distill.prepare.dual_track import DualTrackConfig, TrackSample, read_track_samples, read_track_set, windows_of
-from specimens import make_flight, make_playback_tree
+from specimens import make_playback_tree
 
 NUM_POINTS = 24
 
@@ -81,21 +81,6 @@ def test_no_walk_is_in_two_splits(dataset):
     assert all(walks)
     assert sum(map(len, walks)) == len(set.union(*walks)) == 4
     assert read_track_set(dataset).samples == {split: len(found) for split, found in samples(dataset).items()}
-
-
-def test_the_same_again_and_other_settings(tree, dataset, tmp_path):
-    again = dual_track.run(DualTrackConfig(val_fraction=0.25, test_fraction=0.25), [tree], tmp_path / "again")
-    assert (again / "train.parquet").read_bytes() == (dataset / "train.parquet").read_bytes()
-    short = run(tree, tmp_path / "short", observed=3, predicted=0, stride=1)
-    one = next(read_track_samples(short, "train"))
-    assert (len(one.observed_position_m), one.future, one.future_position_m) == (3, (), ())
-
-
-def test_the_four_states_of_a_flight():
-    flight, _ = make_flight(4, variant="aug_001")
-    flight.drone_offsets_m[:] = [[0, 0, 0], [1, 0, 0], [0, 0, 0], [1, 0, 0]]
-    flight.rotation_offsets_deg[:] = [[0, 0, 0], [0, 0, 0], [0, 1, 0], [0, 1, 0]]
-    assert flight.states == list(STATES) == ["unperturbed", "position only", "rotation only", "full"]
 
 
 def test_a_bad_flight_stops_no_other(own_tree, tmp_path):

@@ -11,36 +11,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import invoke
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from specimens_distill import make_caption, write_set
 
-from cosfly.chat.answers import AnswerBook
-from cosfly.errors import ConfigError, InputError
+from cosfly.errors import InputError
 from cosfly.products.actions import shipped_actions
-from cosfly.products.captions import write_captions
 from cosfly.products.figures import draw_walks
-from cosfly.products.flights import find_flights
 from cosfly.products.predictions import Prediction, read_predictions
 from cosfly.space.blind import LEAST_WINDOWS
-from cosfly.work.journal import Journal
-from cosfly.work.stage_folder import StageFolder, Tally
 from cosfly.work.store import dump_json
 from distill.evaluation import compare
 from distill.evaluation.bertscore import BertScoreConfig, Scorer
-from distill.evaluation.floors import Floors, coc_of, majority, shuffled_groups, shuffled_places
+from distill.evaluation.floors import Floors, coc_of, majority
 from distill.evaluation.measure import (
     STUDENT,
-    Evaluation,
     measure,
     pair_up,
-    read_judged,
     read_report,
-    speed_of,
     text_of,
 )
 from distill.evaluation.scores import (
-    COLUMNS,
     STATES,
     VERDICTS,
     ScoredAnswer,
@@ -48,15 +37,12 @@ from distill.evaluation.scores import (
     differences_of,
     figures_of,
     macro_f1,
-    read_scores,
     score_answers,
-    write_scores,
 )
 from distill.evaluation.stage import EvaluateConfig, run
 from distill.inference.outcome import failed_prediction, make_prediction
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample, open_split
-from specimens import make_playback_tree
 
 
 def sample_of(frame: int, language: str = "en") -> Sample:
@@ -230,27 +216,6 @@ def test_paired_differences(samples):
     assert compared(replace(one, key=one.key + "x"), 200)[0] == 0
 
 
-def test_scores_survive_the_disk(tmp_path, samples):
-    texts = np.random.default_rng(0).random((8, 3))
-    scores = scores_of(samples, texts=texts, judged={samples[0].key: ["proved"]})
-    write_scores(tmp_path / "scores.parquet", scores)
-    again = read_scores(tmp_path / "scores.parquet", shipped_actions())
-    for name in COLUMNS:
-        found, wanted = getattr(again, name), getattr(scores, name)
-        assert np.array_equal(found, wanted, equal_nan=name in (*STATES, "drawn_ahead")), name
-        assert found.dtype == wanted.dtype
-
-
-@given(st.integers(2, 5000), st.integers(0, 10))
-@settings(max_examples=30)
-def test_shuffling_leaves_nothing_in_its_place(count, seed):
-    groups = shuffled_groups(count, np.random.default_rng(seed))
-    places = shuffled_places(groups)
-    assert sorted(places.tolist()) == list(range(count))
-    assert (places != np.arange(count)).all()
-    assert max(map(len, groups)) <= 2048
-
-
 def test_floors_by_hand(samples):
     train = [sample.model_copy(update={"decision": "hover"}) for sample in samples[:3]] + samples[3:5]
     answers = Floors(train, "en", 0, shipped_actions()).answers(samples, [coc_of(sample) for sample in samples])
@@ -343,100 +308,6 @@ def test_without_a_model_the_report_says_so_and_gives_no_number(place):
         assert (again.parent / name).read_bytes() == (path.parent / name).read_bytes()
 
 
-def test_the_page_opens_with_what_a_person_asks_first(place):
-    """How much, how good, a picture; the confusion has a column for what does not parse, in table and picture alike."""
-    (place / "run").mkdir()
-    tree = make_playback_tree(place / "run" / "tree", 1, 12, with_augmented=False)
-    flight = find_flights(tree)[0]
-    samples = [
-        sample.model_copy(update={"run": "run", "town": flight.parts[-3], "trajectory": flight.parts[-2]})
-        for sample in open_split(place / "set", "test")
-    ]
-    write_set(place / "own", {"train": samples, "test": samples}, [tree])
-    run(CFG, place / "predictions.jsonl", place / "own", place / "out", data=[tree])
-    html = (place / "out" / "evaluation.html").read_text()
-    assert "<h1>unknown <small>evaluation on test</small></h1>" in html
-    marks = ['<div class="tile"><b>16</b>samples', "decisions right", "the most frequent", "of the teacher", "<img",
-             "<svg", "<table", "samples side by side", "How it was measured"]  # fmt: skip
-    assert [html.index(mark) for mark in marks] == sorted(html.index(mark) for mark in marks)
-    assert html.count("<img") == 5 * (12 + 1)  # of each sample shown, and of the first once more
-    assert html.count("<svg") == 6
-    assert "track_straight answered as (unparsed): 2 of 8" in html
-    assert not re.search(r"(src|href)=.http", html)
-    run(CFG, place / "predictions.jsonl", place / "own", place / "bare")
-    assert "Their pictures are shown with --data" in (place / "bare" / "evaluation.html").read_text()
-
-
-def test_foreign_text_shows_as_text(place, samples):
-    records = read_predictions(place / "predictions.jsonl")
-    records[4] = records[4].model_copy(update={"raw": "<script>alert(1)</script>", "model": "<b>x</b>|y"})
-    write_predictions(place, records)
-    run(CFG, place / "predictions.jsonl", place / "set", place / "out")
-    html = (place / "out" / "evaluation.html").read_text()
-    assert "<script>" not in html
-    assert "<b>x</b>" not in html
-    assert "<b>x" not in (place / "out" / "evaluation.md").read_text()
-
-
-def test_samples_that_were_not_asked_are_counted_apart(place, samples):
-    write_predictions(place, read_predictions(place / "predictions.jsonl")[:4], "few.jsonl")
-    run(CFG, place / "few.jsonl", place / "set", place / "out")
-    report = read_report(place / "out")
-    assert report.not_asked == 12
-    assert report.all.who[STUDENT].figures["parsed"].value == 3 / 4
-    with pytest.raises(InputError, match="does not have"):
-        pair_up(samples[:-1], predictions_of(samples))
-
-
-def test_what_a_verifier_found_in_the_answers_is_read(place, samples):
-    caption = make_caption("Town01", "trajectory_1", "ORI", 4, checks={"sentences": {"en": ["proved", "unread"]}})
-    student = caption.model_copy(update={"teacher": caption.teacher.model_copy(update={"kind": "student"})})
-    write_captions(place / "judged.jsonl", [student])
-    run(CFG, place / "predictions.jsonl", place / "set", place / "out", judged=[place / "judged.jsonl"])
-    figures = read_report(place / "out").all.who[STUDENT].figures
-    assert (figures["proved"].value, figures["proved"].count) == (0.5, 2)
-    write_captions(place / "rules.jsonl", [caption])
-    with pytest.raises(InputError, match="no captions of a student"):
-        run(CFG, place / "predictions.jsonl", place / "set", place / "x", judged=[place / "rules.jsonl"])
-
-
-def test_what_was_judged_tree_by_tree_finds_its_samples(place, samples):
-    one = samples[0]
-    both = [one.model_copy(update={"run": run, "sample_id": f"{run}_{one.sample_id}"}) for run in ("north", "south")]
-    caption = make_caption("Town01", "trajectory_1", "ORI", 4, checks={"sentences": {"en": ["proved"]}})
-    assert one.window_id == caption.sample_id
-
-    def judged(run):
-        teacher = caption.teacher.model_copy(update={"kind": "student", "run": run})
-        write_captions(place / f"{run}.jsonl", [caption.model_copy(update={"teacher": teacher})])
-        return read_judged([place / f"{run}.jsonl"], both)
-
-    assert judged("south") == {both[1].key: ["proved"]}
-    assert judged("west") == {}
-    with pytest.raises(InputError, match=r"several trees.*north, south"):
-        judged(None)
-
-
-def test_speed_comes_from_what_stands_beside_the_predictions(place):
-    assert speed_of(place / "predictions.jsonl", []).model_dump(exclude_none=True) == {}
-    journal = {"key": "k", "sample_id": "s", "purpose": "en", "text": "", "usage": {}}
-    with AnswerBook(place / "answers"):
-        pass
-    with Journal(place / "answers" / "flight.jsonl") as written:
-        for latency_s in (1.0, 3.0):
-            written.append(journal | {"latency_s": latency_s})
-    found = speed_of(place / "predictions.jsonl", read_predictions(place / "predictions.jsonl"))
-    assert found.latency_s == {"mean": 2.0, "median": 2.0, "p95": pytest.approx(2.9)}
-    assert found.mean_tokens == 9.0
-    assert found.samples_per_s is None
-    folder = StageFolder.open(place / "infer", "distill.infer", config=CFG, inputs={}, seed=0)
-    (place / "infer" / "predictions.jsonl").write_bytes((place / "predictions.jsonl").read_bytes())
-    # A start that went on, loaded for long and made three answers of all.
-    folder.finish([], Tally(input=9, kept=9), speed={"loading_s": 90.0, "seconds": 6.0, "answers": 3})
-    found = speed_of(place / "infer" / "predictions.jsonl", read_predictions(place / "predictions.jsonl"))
-    assert (found.seconds, found.samples_per_s) == (6.0, 0.5)
-
-
 def test_students_side_by_side(place):
     predictions = read_predictions(place / "predictions.jsonl")
     samples = {sample.key: sample for sample in open_split(place / "set", "test")}
@@ -459,25 +330,6 @@ def test_students_side_by_side(place):
     assert (place / "table" / "comparison.html").read_text().count("<svg") == 3
     with pytest.raises(InputError, match="one name"):
         compare.run(compare.ReportConfig(), [folders[0], folders[0]], place / "x")
-
-
-def test_students_of_other_references_are_not_compared(place):
-    """Two sets of other captions call their samples alike. What was asked may differ: another prompt is an ablation."""
-    samples = list(open_split(place / "set", "test"))
-    predictions = [make_prediction(samples[0], "test", samples[0].answer, 5, True, shipped_actions())]
-    coc = coc_of(samples[0])
-    other = dump_json(coc.model_copy(update={"reasoning_trace": coc.reasoning_trace + " So it is."}).model_dump())
-    blind = {"prompt": samples[0].prompt.model_copy(update={"user": "Nothing is given."})}
-    kinds = {"first": {}, "blind": blind, "foreign": {"answer": other}}
-    for name, changes in kinds.items():
-        changed = [sample.model_copy(update=changes if sample.key == samples[0].key else {}) for sample in samples]
-        write_set(place / f"set_{name}", {"train": changed, "test": changed})
-        write_predictions(place, predictions, f"{name}.jsonl")
-        run(CFG, place / f"{name}.jsonl", place / f"set_{name}", place / "strangers" / name)
-    folders = {name: place / "strangers" / name for name in kinds}
-    compare.run(compare.ReportConfig(), [folders["first"], folders["blind"]], place / "ablation")
-    with pytest.raises(InputError, match=r"first and foreign.*different references.*1 samples"):
-        compare.run(compare.ReportConfig(), [folders["first"], folders["foreign"]], place / "strange")
 
 
 def make_encoder(folder: Path) -> Path:
@@ -512,36 +364,6 @@ def encoder(tmp_path_factory) -> Path:
     return make_encoder(tmp_path_factory.mktemp("bert") / "encoder")
 
 
-def evaluated(place: Path, encoder: Path, language: str = "en", **settings: object) -> Evaluation:
-    bertscore = {"device": "cpu", language: {"layer": 2, **settings}}
-    cfg = EvaluateConfig.model_validate({"resamples": 100, "bertscore": bertscore})
-    out = place / f"out_{len(list(place.iterdir()))}"
-    run(cfg, place / "predictions.jsonl", place / "set", out, bertscore_models={language: encoder})
-    return read_report(out)
-
-
-def test_identical_texts_score_one_shuffled_less_and_unparsed_zero(place, encoder):
-    language = "zh"
-    report = evaluated(place, encoder, language)
-    who = report.languages[language].who
-    scores = {name: own.figures for name, own in who.items()}
-    # Four of the six parsed answers are the reference itself, the other two differ in the decision alone.
-    parsed = scores[STUDENT]["bertscore_f1_parsed"].value
-    assert 0.9 < parsed < 1.0
-    assert scores[STUDENT]["bertscore_f1"].value == pytest.approx(parsed * 6 / 8)
-    assert scores["shuffled"]["bertscore_f1"].value < parsed
-    assert scores["constant"]["bertscore_f1"].value < parsed
-    assert scores["majority"]["bertscore_f1"].value is None
-    assert sum(report.languages[language].histogram_f1) == 6
-    metric = report.metrics[language]
-    assert (metric.layer, metric.baseline_sha256) == (2, None)
-    assert set(metric.versions) == {"bert-score", "transformers", "torch"}
-    assert {"model.safetensors", "config.json", "tokenizer.json"} <= set(metric.sha256)
-    other = {"en": "zh", "zh": "en"}[language]
-    assert report.metrics[other] is None
-    assert report.languages[other].who[STUDENT].figures["bertscore_f1"].value is None
-
-
 def test_scores_are_those_of_the_library(encoder):
     """Texts of very different lengths, doubles, one longer than the model reads."""
     import bert_score
@@ -561,26 +383,3 @@ def test_scores_are_those_of_the_library(encoder):
     alone = own.score([(candidates[3], texts[3])])
     assert np.abs(alone - found[3]).max() < 1e-5
     assert own.score([("", texts[0]), (" ", "")]).tolist() == [[0, 0, 0], [0, 0, 0]]
-
-
-def test_rescaling_uses_the_baseline_file(place, encoder):
-    (place / "baseline.tsv").write_text("LAYER,P,R,F\n0,0.1,0.1,0.1\n1,0.2,0.2,0.2\n2,0.5,0.5,0.5\n", encoding="utf-8")
-    plain, scaled = (
-        evaluated(place, encoder, **more).languages["en"].who[STUDENT].figures["bertscore_f1_parsed"].value
-        for more in ({}, {"baseline": str(place / "baseline.tsv")})
-    )
-    assert scaled == pytest.approx((plain - 0.5) / (1 - 0.5), abs=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"layer": 17}, r"bertscore\.en\.layer: .*fewer layers.*17.*<= 3"),
-        ({"baseline": "nowhere.tsv"}, "no such baseline file"),
-    ],
-)
-def test_settings_that_do_not_fit_the_encoder(place, encoder, settings, words):
-    with pytest.raises(ConfigError, match=words):
-        evaluated(place, encoder, **settings)
-    with pytest.raises(InputError, match="BERTScore model"):
-        evaluated(place, place / "nothing")

@@ -7,7 +7,6 @@ import base64
 import io
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from commands import invoke
@@ -15,9 +14,8 @@ from PIL import Image
 from specimens_distill import make_captions, prepared
 from teacher_server import TeacherServer, kept_answers
 
-from cosfly.errors import ConfigError, ResumeError, TeacherError
+from cosfly.errors import ResumeError, TeacherError
 from cosfly.products.predictions import read_predictions
-from distill.inference import outcome
 from distill.inference import stage as infer
 from distill.schema import open_split
 from specimens import make_playback_tree
@@ -123,39 +121,3 @@ def test_a_folder_answers_for_one_student(place, tmp_path):
     told = (tmp_path / "out" / "stage.json").read_text() + (tmp_path / "out" / "manifest.json").read_text()
     assert "127.0.0.1" not in told
     assert num_asked == 3
-
-
-def test_how_long_answers_took_is_known(place, tmp_path):
-    with TeacherServer() as server:
-        path = infer_with(settings(), place, server.url, tmp_path / "out")
-    predictions, kept = read_predictions(path), kept_answers(tmp_path / "out")
-    assert sorted((line["sample_id"], line["purpose"]) for line in kept) == sorted(
-        (p.sample_id, p.language) for p in predictions
-    )
-    assert all(line["latency_s"] > 0 and line["usage"]["completion_tokens"] == 100 for line in kept)
-    speed = json.loads((tmp_path / "out" / "manifest.json").read_text())["speed"]
-    assert speed["answers"] == len(predictions)
-    assert speed["completion_tokens"] == 100 * len(predictions)
-    assert speed["seconds"] > 0
-
-
-def test_flights_that_nobody_asks_about_are_forgotten(monkeypatch):
-    monkeypatch.setattr(outcome, "MOST_FLIGHTS", 2)
-    forgotten: list[str] = []
-    flights = outcome.OpenFlights(SimpleNamespace(forget=forgotten.append))
-    samples = [SimpleNamespace(sample_id=f"flight_{k}_frame_00001") for k in (1, 1, 2, 3, 1, 4, 5)]
-    names = [flights.begun(sample) for sample in samples]
-    for sample in samples:
-        flights.done(sample)
-    assert forgotten == [names[2], names[3], names[0]]  # idle longest; the first was worked on for longer
-
-
-def test_an_answer_that_filled_the_context_is_not_finished(place, tmp_path):
-    with TeacherServer(lambda number, body: "no_room" if number == 0 else None) as server:
-        path = infer_with(settings(), place, server.url, tmp_path / "out")
-    assert [p.reason for p in read_predictions(path) if not p.is_finished] == ["cut_short"]
-
-
-def test_an_adapter_needs_transformers(place, tmp_path):
-    with pytest.raises(ConfigError, match="read by transformers alone"):
-        infer_with(settings(), place, "http://127.0.0.1:1", tmp_path / "out", adapter=tmp_path)

@@ -17,7 +17,6 @@ torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
 from cosfly.chat.student_chat import TAUGHT  # noqa: E402
-from cosfly.errors import ConfigError  # noqa: E402
 from cosfly.products.predictions import Prediction, read_predictions  # noqa: E402
 from distill.inference import merge  # noqa: E402
 from distill.inference import stage as infer  # noqa: E402
@@ -128,28 +127,6 @@ def test_each_picture_is_looked_at_once_and_rows_of_like_length_go_together(plac
     assert len(set(together)) > 1
 
 
-def test_the_size_of_batches_changes_no_answer(place, clean, tmp_path):
-    assert told(read_predictions(answer(place, tmp_path / "out", batch_size=64))) == told(read_predictions(clean))
-
-
-def test_interrupted_and_continued_is_the_same(place, clean, tmp_path, monkeypatch):
-    calls: list[int] = []
-
-    def stopping(student: Any, rows: Any, features: Any, **more: Any) -> Any:
-        calls.append(len(rows))
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-        return decode(student, rows, features, **more)
-
-    monkeypatch.setattr("distill.inference.local.decode", stopping)
-    with pytest.raises(KeyboardInterrupt):
-        answer(place, tmp_path / "out")
-    assert not (tmp_path / "out" / "predictions.jsonl").exists()
-    assert len(kept_answers(tmp_path / "out")) == sum(calls[:2])
-    assert answer(place, tmp_path / "out").read_bytes() == clean.read_bytes()
-    assert sum(calls) - calls[2] == len(samples_of(place))  # nothing twice but the batch that was broken off
-
-
 def test_one_bad_picture_costs_its_samples_only(place, clean, tmp_path):
     tree = shutil.copytree(place / "tree", tmp_path / "tree")
     samples = samples_of(place)
@@ -203,12 +180,6 @@ def test_a_full_memory_halves_the_batch(place, clean, tmp_path, monkeypatch, cap
     assert [size for size in sizes if size > 3] == [12, 6]  # each once: what did not fit is not tried again
     assert max(sizes[2:]) == 3
     assert caplog.text.count("the memory is full") == 2
-
-
-def test_a_memory_too_small_for_one_is_one_clear_line(place, tmp_path, monkeypatch):
-    monkeypatch.setattr(infer, "load_student", with_room_for(0, []))
-    with pytest.raises(ConfigError, match=r"does not hold one sample.*CUDA out of memory.*max_pixels"):
-        answer(place, tmp_path / "out")
 
 
 @pytest.mark.slow

@@ -87,15 +87,6 @@ def installed(monkeypatch):
     return install
 
 
-def test_float32_has_no_fast_kernels_and_a_cpu_is_let_alone(installed):
-    installed("fla", "causal_conv1d")
-    kernels.use_kernels_for(torch.float32, "cpu")
-    kernels.use_kernels_for(torch.bfloat16, "cuda")
-    assert not {"fla", "causal_conv1d"} & sys.modules.keys()  # both are there: transformers takes them itself
-    kernels.use_kernels_for(torch.float32, "cuda")
-    assert sys.modules["fla"] is None is sys.modules["causal_conv1d"]
-
-
 def test_the_convolution_of_linear_attention_stands_in(installed):
     """Held against the library's own function, through a stand-in written from what flash-linear-attention documents: x
     is (b, t, d)."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import shutil
 from pathlib import Path
@@ -16,15 +15,13 @@ pytest.importorskip("peft", reason="needs the extra distill")
 
 from specimens_students import FAST, MAX_PIXELS, begun, inputs_of, load, log_of, run, samples_of, trees_of  # noqa: E402
 
-from cosfly.errors import ConfigError, EnvironmentMissing, InputError  # noqa: E402
 from cosfly.products.predictions import read_predictions  # noqa: E402
 from distill.inference import stage as infer  # noqa: E402
 from distill.student import model as student  # noqa: E402
 from distill.student.checkpoint import load_checkpoint  # noqa: E402
 from distill.student.encoding import IGNORED, encode_text, load_pictures, padded, prompt_batch  # noqa: E402
-from distill.student.random_student import make_tiny_student  # noqa: E402
 from distill.training import stage as train  # noqa: E402
-from distill.training.settings import Steps, TrainConfig, learning_rate_at, share_of  # noqa: E402
+from distill.training.settings import Steps, TrainConfig  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -35,19 +32,6 @@ def trained(place, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("trained")
     run(place, out)
     return out
-
-
-def test_tiny_student_is_tiny_and_the_same_each_time(place, tmp_path):
-    again = make_tiny_student(tmp_path / "again")
-    other = make_tiny_student(tmp_path / "other", seed=1)
-    names = {path.name for path in again.iterdir()}
-    assert {"config.json", "model.safetensors", "tokenizer.json", "preprocessor_config.json"} <= names
-    for name in names:
-        assert (again / name).read_bytes() == (place / "student" / name).read_bytes(), name
-    assert (other / "model.safetensors").read_bytes() != (again / "model.safetensors").read_bytes()
-    assert sum(p.numel() for p in load(place).model.parameters()) < 500_000
-    with pytest.raises(InputError, match="not empty"):
-        make_tiny_student(again)
 
 
 def test_processor_agrees_with_the_library_one(place):
@@ -77,30 +61,6 @@ def test_processor_agrees_with_the_library_one(place):
     found = inputs_of(own, [sample], trees_of(place))
     for name in ("input_ids", "pixel_values", "image_grid_thw"):
         assert torch.equal(found[name], wanted[name]), name
-
-
-@pytest.mark.parametrize(
-    ("damage", "words"),
-    [
-        (lambda folder: (folder / "config.json").unlink(), "student model"),
-        (lambda folder: (folder / "config.json").write_text('{"model_type": "llama"}'), "model_type.*qwen3_5"),
-        (lambda folder: (folder / "model.safetensors").unlink(), "no weights"),
-        (lambda folder: (folder / "model.safetensors").write_bytes(b"junk" * 9), "does not load"),
-        (lambda folder: (folder / "preprocessor_config.json").unlink(), "processor does not load"),
-        (lambda folder: (folder / "chat_template.jinja").unlink(), "no chat template"),
-    ],
-)
-def test_a_broken_model_folder_is_named(place, tmp_path, damage, words):
-    shutil.copytree(place / "student", tmp_path / "broken")
-    damage(tmp_path / "broken")
-    with pytest.raises(InputError, match=words) as caught:
-        student.load_student(tmp_path / "broken", device="cpu", max_pixels=MAX_PIXELS)
-    assert "broken" in str(caught.value)
-
-
-def test_a_missing_package_gives_the_install_line():
-    with pytest.raises(EnvironmentMissing, match=r'no_such_package.*pip install "cosfly\[distill\]"'):
-        student.require("json", "no_such_package")
 
 
 def test_mask_covers_exactly_the_answer(place):
@@ -133,12 +93,6 @@ def test_positions_are_the_librarys(place):
         assert np.array_equal(found, wanted[:, 0].numpy())
 
 
-def test_pictures_keep_all_pixels_unless_told(place, tmp_path):
-    run(place, tmp_path / "out", max_pixels=0, max_steps=1)
-    facts = json.loads((tmp_path / "out" / "adapter" / "cosfly_adapter.json").read_text())
-    assert facts["max_pixels"] == 64 * 36
-
-
 def test_each_epoch_sees_each_sample_once():
     cfg = TrainConfig(samples_per_step=4, epochs=3)
     steps = Steps.make(cfg, num_samples=10, seed=4)
@@ -148,35 +102,6 @@ def test_each_epoch_sees_each_sample_once():
         assert sorted(seen) == list(range(10))
     assert steps.samples_of(0) != steps.samples_of(3)
     assert Steps.make(TrainConfig(max_steps=2), 100, 0).num_steps == 2
-
-
-def test_shares_are_dealt_out_by_length():
-    lengths = np.array([5, 9, 1, 7, 7, 3])
-    shares = [share_of([0, 1, 2, 3, 4, 5], lengths, rank, 2) for rank in range(2)]
-    assert shares == [[1, 4, 5], [3, 0, 2]]
-    assert share_of([2, 0, 1], lengths, 0, 1) == [1, 0, 2]
-    assert share_of([2], lengths, 1, 2) == []
-
-
-def test_learning_rate_rises_and_falls():
-    cfg = TrainConfig(learning_rate=1.0, warmup_fraction=0.2)
-    rates = [learning_rate_at(cfg, step, 10) for step in range(10)]
-    assert rates[:3] == pytest.approx([0.5, 1.0, 1.0])
-    assert rates[6] == pytest.approx(0.5)
-    assert all(a > b for a, b in itertools.pairwise(rates[2:]))
-
-
-def test_no_matching_layer_is_an_error(place):
-    with pytest.raises(ConfigError, match="target_modules"):
-        train.add_adapter(load(place), TrainConfig(target_modules="nothing"), 0)
-
-
-def test_adapter_covers_all_language_layers_and_nothing_else(place):
-    own = train.add_adapter(load(place), TrainConfig(), 0)
-    names = [name for name, p in own.model.named_parameters() if p.requires_grad]
-    assert all("lora_" in name and "language_model" in name for name in names)
-    # 3 linear-attention layers of 5, one full-attention layer of 4, an MLP of 3 in each of 4 layers; two matrices each
-    assert len(names) == 2 * (3 * 5 + 4 + 4 * 3)
 
 
 def test_loss_falls_and_the_log_tells_how_fast(trained):
@@ -234,11 +159,6 @@ def test_stopped_and_continued_is_the_same(place, tmp_path):
     assert log_of(out, "validation") == log_of(whole, "validation")
     name = "adapter/adapter_model.safetensors"
     assert (out / name).read_bytes() == (whole / name).read_bytes()
-
-
-def test_a_learning_rate_that_explodes_stops_with_a_clear_error(place, tmp_path):
-    with pytest.raises(ConfigError, match=r"not finite.*lower learning_rate"):
-        run(place, tmp_path / "out", learning_rate=1e30, max_steps=5, samples_per_step=1)
 
 
 @pytest.mark.slow

@@ -5,29 +5,25 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from specimens_distill import prepared
 
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
 from safetensors.torch import load_file  # noqa: E402
-from specimens_students import FAST, MAX_PIXELS, inputs_of, load, log_of, losses_of, run, samples_of, trees_of  # noqa: E402
+from specimens_students import MAX_PIXELS, inputs_of, load, log_of, losses_of, run, samples_of, trees_of  # noqa: E402
 
-from cosfly.errors import InputError, ResumeError  # noqa: E402
+from cosfly.errors import InputError  # noqa: E402
 from cosfly.products.actions import shipped_actions  # noqa: E402
 from distill.schema import Sample  # noqa: E402
 from distill.student.checkpoint import Progress  # noqa: E402
 from distill.student.decoding import Completion  # noqa: E402
 from distill.student.model import load_student  # noqa: E402
-from distill.training import fit, preflight  # noqa: E402
-from distill.training import stage as train  # noqa: E402
+from distill.training import fit  # noqa: E402
 from distill.training.fit import Validation, judged  # noqa: E402
 from distill.training.loading import choose_over_all  # noqa: E402
-from distill.training.preflight import estimate, saved_bytes_per_token, used_gb  # noqa: E402
 from distill.training.settings import TrainConfig  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -55,14 +51,6 @@ def test_a_model_trained_in_full_is_a_whole_folder(place, tmp_path):
     assert (folder / "cosfly_student.json").exists()
 
 
-def test_the_tower_learns_when_it_is_told_to(place, tmp_path):
-    folder = run(place, tmp_path / "out", method="full", train_vision=True, max_steps=2, learning_rate=1e-3)
-    before, after = load(place).core.state_dict(), load_file(folder / "model.safetensors")
-    assert any("visual" in name and not torch.equal(before[name], after[name]) for name in after)
-    with pytest.raises(ValueError, match="train_vision needs method=full"):
-        TrainConfig(train_vision=True)
-
-
 @pytest.mark.slow
 def test_bfloat16_computes_with_float32_weights_that_learn(place, tmp_path):
     settings = {"method": "full", "max_steps": 4, "learning_rate": 1e-3, "validation_answers": True}
@@ -73,34 +61,6 @@ def test_bfloat16_computes_with_float32_weights_that_learn(place, tmp_path):
     assert found != wanted
     newest = sorted((tmp_path / "bfloat16" / "checkpoints").iterdir())[-1]
     assert {tensor.dtype for tensor in load_file(newest / "weights.safetensors").values()} == {torch.float32}
-
-
-@pytest.mark.slow
-def test_a_tiny_student_has_a_tokenizer_of_the_data(place, tmp_path):
-    """Its pieces are those of the samples: fewer tokens than those of a tokenizer trained on a few lines; and it is in
-    the folder."""
-    run(place, tmp_path / "out", "tiny", max_steps=2)
-    own = load_student(tmp_path / "out" / "student", device="cpu", max_pixels=MAX_PIXELS)
-    sample = samples_of(place)[0]
-    assert len(own.tokenizer(sample.answer)["input_ids"]) < len(load(place).tokenizer(sample.answer)["input_ids"])
-    facts = json.loads((tmp_path / "out" / "adapter" / "cosfly_adapter.json").read_text())
-    assert list(facts["base_sha256"]) == ["model.safetensors"]
-    (tmp_path / "out" / "manifest.json").unlink()
-    with pytest.raises(ResumeError, match=r"random_student\.width"):
-        run(place, tmp_path / "out", "tiny:small", max_steps=2)
-    settings = {"width": 96, "layers": 8, "vision_layers": 1}
-    run(place, tmp_path / "own", "random", max_steps=1, random_student=settings, method="full")
-    config = load_student(tmp_path / "own" / "model", device="cpu", max_pixels=MAX_PIXELS).core.config
-    text = config.text_config
-    assert (text.hidden_size, text.num_hidden_layers, config.vision_config.depth) == (96, 8, 1)
-
-
-def test_a_student_of_texts_alone_learns(place, tmp_path):
-    dataset = prepared(place / "tree", place / "captions.jsonl", tmp_path / "set", modalities=())
-    run(place, tmp_path / "out", dataset=dataset, max_steps=6, validation_answers=True, max_new_tokens=4)
-    found = losses_of(tmp_path / "out")
-    assert found[-1] < found[0]
-    assert "the student sees texts only" in (tmp_path / "out" / "preflight.json").read_text()
 
 
 def sample_like(base: Sample, flight: int, frame: int, decision: str) -> Sample:
@@ -179,39 +139,3 @@ def test_training_ends_early_and_keeps_the_best_weights(place, tmp_path):
     weights.write_bytes(weights.read_bytes()[:-7])
     with pytest.raises(InputError, match=r"best validation is damaged.*weights\.safetensors"):
         run(place, out, **settings)
-
-
-def test_the_list_before_the_first_step(place, tmp_path):
-    run(place, tmp_path / "out", max_steps=1)
-    found = json.loads((tmp_path / "out" / "preflight.json").read_text())
-    topics = [finding["topic"] for finding in found]
-    assert topics == ["samples", "steps", "validation", "decisions", "chat template", "memory", "pictures", "kernels"]
-    texts = {finding["topic"]: finding["text"] for finding in found}
-    assert texts["samples"].startswith("12 of 12; ")
-    assert "28, features 0.000 GB" in texts["pictures"]
-    assert "batch_size 2" in texts["memory"]
-
-
-def test_missing_fast_kernels_are_named_where_they_matter(place):
-    own = load(place)
-    assert [f.level for f in preflight._about_kernels(own)] == ["fact"]
-    found = preflight._about_kernels(replace(own, device="cuda"))
-    assert [f.level for f in found] == ["warning"] * 3
-    assert "pip install flash-linear-attention" in found[0].text
-    assert "tilelang" in found[1].text
-    assert "causal-conv1d" in found[2].text
-
-
-def test_what_is_kept_for_the_backward_pass_is_measured(place):
-    """It grows with the batch, and recomputing keeps far less; freezing everything but the adapter keeps less than
-    learning in full."""
-    cfg = TrainConfig(**FAST)
-    lora = train.add_adapter(load(place), cfg, 0)
-    kept = saved_bytes_per_token(lora, cfg)
-    lora.model.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
-    assert 0 < saved_bytes_per_token(lora, cfg) < kept / 3
-    full = train.free_weights(load(place), TrainConfig(**FAST, method="full"))
-    one, four = (estimate(full, cfg.model_copy(update={"batch_size": size}), 300, 1e5) for size in (1, 4))
-    assert four.activations == pytest.approx(4 * one.activations, rel=1e-6)  # each is measured anew
-    assert one.optimizer == 2 * one.gradients > 0
-    assert used_gb("cpu") * 1e9 <= one.needed < one.available  # the process itself is in it

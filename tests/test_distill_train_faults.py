@@ -4,12 +4,10 @@ stays."""
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import shutil
 import subprocess
 import sys
-import time
 
 import pytest
 from processes import is_running, wait_until
@@ -18,11 +16,11 @@ from specimens_distill import write_set
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
-from specimens_students import FAST, MAX_PIXELS, TWELVE, begun, load, log_of, run, samples_of  # noqa: E402
+from specimens_students import FAST, TWELVE, begun, load, log_of, run, samples_of  # noqa: E402
 
-from cosfly.errors import ConfigError, EnvironmentMissing, InputError, NothingKept  # noqa: E402
+from cosfly.errors import ConfigError, InputError  # noqa: E402
 from distill.student.checkpoint import load_checkpoint, newest_checkpoint  # noqa: E402
-from distill.student.model import load_student, student_folder  # noqa: E402
+from distill.student.model import student_folder  # noqa: E402
 from distill.training import fit  # noqa: E402
 from distill.training import stage as train  # noqa: E402
 from distill.training.settings import TrainConfig  # noqa: E402
@@ -49,17 +47,6 @@ def test_samples_are_left_out_with_a_reason_and_counted(place, tmp_path):
     assert "at most 4096" in told
 
 
-def test_nothing_to_learn_from_is_an_error_with_the_counts(place, tmp_path):
-    """And the folder, where no training had begun, takes other settings: of the random student that stands in it,
-    too."""
-    with pytest.raises(NothingKept, match="too_long 12"):
-        run(place, tmp_path / "out", "tiny", max_tokens=32)
-    assert not (tmp_path / "out" / "manifest.json").exists()
-    assert (tmp_path / "out" / "student" / "config.json").exists()
-    run(place, tmp_path / "out", "random", max_steps=1, random_student={"width": 32})
-    assert '"hidden_size": 32' in (tmp_path / "out" / "student" / "config.json").read_text()
-
-
 def test_a_picture_that_does_not_decode_costs_its_samples(place, tmp_path):
     """Its header is right, so only the step that needs it finds out; the others are learnt from, and once more the
     same."""
@@ -79,33 +66,6 @@ def test_a_picture_that_does_not_decode_costs_its_samples(place, tmp_path):
     assert log == log_of(tmp_path / "two")
 
 
-def test_a_decision_that_train_never_shows_is_told(place, tmp_path):
-    asked = [s.model_copy(update={"decision": "hover"}) for s in samples_of(place, "val")]
-    dataset = write_set(tmp_path / "set", {"train": samples_of(place), "val": asked}, [place / "tree"])
-    run(place, tmp_path / "out", dataset=dataset, max_steps=1)
-    assert "val asks for what train never shows" in (tmp_path / "out" / "preflight.json").read_text()
-    assert "will be wrong: hover" in (tmp_path / "out" / "preflight.json").read_text()
-
-
-def test_a_tokenizer_without_a_needed_token_is_named(place, tmp_path):
-    folder = shutil.copytree(place / "student", tmp_path / "student")
-    for name in ("tokenizer.json", "tokenizer_config.json"):
-        path = folder / name
-        path.write_text(path.read_text().replace("<|vision_start|>", "<|vision_begin|>"))
-    with pytest.raises(InputError, match=r"lacks tokens.*<\|vision_start\|>"):
-        run(place, tmp_path / "out", folder)
-
-
-def test_a_tokenizer_of_another_model_is_named(place, tmp_path):
-    from distill.student.random_student import RandomStudent, make_random_student
-
-    folder = shutil.copytree(place / "student", tmp_path / "student")
-    other = make_random_student(tmp_path / "other", RandomStudent(vocabulary=1200), 0, ["one two three " * 50])
-    shutil.copy(other / "tokenizer.json", folder / "tokenizer.json")
-    with pytest.raises(InputError, match=r"knows more tokens than the model|call .* differently"):
-        load_student(folder, device="cpu", max_pixels=MAX_PIXELS)
-
-
 def test_a_repository_that_cannot_be_had_is_one_line(monkeypatch):
     import huggingface_hub.constants
 
@@ -123,31 +83,6 @@ def test_a_checkpoint_of_another_student_is_refused(place, tmp_path):
         load_checkpoint(newest, other)
 
 
-def test_presets_and_other_names(place, tmp_path):
-    with pytest.raises(InputError, match=r"no such student.*tiny:small"):
-        run(place, tmp_path / "out", "tiny:huge")
-    with pytest.raises(InputError, match="student model"):
-        run(place, tmp_path / "out", tmp_path / "nowhere")
-
-
-@pytest.mark.slow
-def test_full_memory_gives_advice_that_is_taken(place, tmp_path, monkeypatch):
-    real, checkpoints = fit.answer_loss, tmp_path / "out" / "checkpoints"
-
-    def full(*args):
-        if newest_checkpoint(checkpoints) is not None:
-            raise torch.OutOfMemoryError("tried to allocate 3 GiB")
-        return real(*args)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(fit, "answer_loss", full)
-        with pytest.raises(ConfigError, match=r"memory is full.*batch_size=1.*goes on from the last checkpoint"):
-            run(place, tmp_path / "out")
-    assert newest_checkpoint(checkpoints) is not None
-    run(place, tmp_path / "out", batch_size=1)
-    assert len(log_of(tmp_path / "out")) == 12
-
-
 def test_a_loss_that_is_no_number_leaves_the_last_good_checkpoint(place, tmp_path, monkeypatch):
     real, calls = fit.answer_loss, []
 
@@ -163,19 +98,6 @@ def test_a_loss_that_is_no_number_leaves_the_last_good_checkpoint(place, tmp_pat
     newest = newest_checkpoint(tmp_path / "out" / "checkpoints")
     assert newest is not None
     assert newest.name == "step_00000006"
-
-
-def test_a_reader_that_is_killed_in_the_middle_of_a_step_is_one_error(place, tmp_path, monkeypatch):
-    def meanwhile(*args):
-        readers = multiprocessing.active_children()
-        assert readers
-        for reader in readers:
-            reader.kill()
-        time.sleep(30)  # torch's handler of SIGCHLD raises here
-
-    monkeypatch.setattr(fit, "answer_loss", meanwhile)
-    with pytest.raises(EnvironmentMissing, match=r"ended by the system.*run the same command again"):
-        run(place, tmp_path / "out", data_workers=1, validation_samples=0)
 
 
 WORKERS = """

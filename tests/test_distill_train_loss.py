@@ -3,10 +3,8 @@ none kept."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,14 +14,11 @@ pytest.importorskip("peft", reason="needs the extra distill")
 
 from specimens_students import FAST, features_of, inputs_of, load, losses_of, run, samples_of, trees_of  # noqa: E402
 
-from cosfly.errors import ConfigError  # noqa: E402
 from distill.student.encoding import EncodedSample, encode_text, padded  # noqa: E402
-from distill.student.features import FramePicture, PictureData, PictureReader, VisionFeatures, pictures_of  # noqa: E402
 from distill.student.model import Student  # noqa: E402
 from distill.training import stage as train  # noqa: E402
-from distill.training.loading import Maker, Order  # noqa: E402
-from distill.training.loss import answer_loss, chunked_loss, output_head  # noqa: E402
-from distill.training.settings import TARGET_MODULES, TrainConfig  # noqa: E402
+from distill.training.loss import answer_loss, chunked_loss  # noqa: E402
+from distill.training.settings import TrainConfig  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -55,17 +50,6 @@ def test_the_chunked_loss_is_the_plain_one_with_its_gradients(chunk):
     assert float(total.detach()) == pytest.approx(float((plain * weights).sum().detach()), rel=1e-6)
     assert torch.allclose(found[0], hidden.grad, atol=1e-5)
     assert torch.allclose(found[1], head.grad, atol=1e-5)
-
-
-def test_a_frozen_head_gets_no_gradient_and_no_tokens_no_loss():
-    hidden, head = torch.randn(3, 4, requires_grad=True), torch.randn(9, 4)
-    total, _ = chunked_loss(hidden, head, torch.tensor([1, 2, 3]), torch.ones(3), chunk=2, dtype=torch.float32)
-    total.backward()
-    assert head.grad is None
-    none = chunked_loss(
-        hidden[:0], head, torch.zeros(0, dtype=torch.int64), torch.zeros(0), chunk=2, dtype=torch.float32
-    )
-    assert float(none[0].detach()) == 0.0
 
 
 def test_loss_and_gradients_are_those_of_the_library(place):
@@ -109,77 +93,6 @@ def test_a_sample_in_a_batch_has_its_loss_alone(place):
     for row, found, (total, nats) in zip(rows, together.tolist(), alone, strict=True):
         assert found == pytest.approx(float(nats[0]), rel=1e-5)
         assert float(total) == pytest.approx(row.weight * float(nats[0]), rel=1e-6)
-
-
-def test_a_sample_without_pictures_has_a_loss(place):
-    own = load(place)
-    row = encode_text(own, samples_of(place)[0])
-    words = row.prompt_ids[row.prompt_ids != own.image_token_id]
-    text = replace(row, prompt_ids=words, image_grids=np.zeros((0, 3), np.int64))
-    with torch.no_grad():
-        total, _ = answer_loss(own, [text], torch.zeros((0, 64)), 16)
-    assert np.isfinite(float(total))
-
-
-def test_an_adapted_head_is_refused(place):
-    own = train.add_adapter(load(place), TrainConfig(**FAST, target_modules=f"{TARGET_MODULES}|.*lm_head"), 0)
-    with pytest.raises(ConfigError, match="head cannot be adapted"):
-        output_head(own)
-
-
-def test_adapted_layers_keep_no_copy_of_what_they_are_given(place):
-    own = train.add_adapter(load(place), TrainConfig(**FAST), 0)
-    found = [m.cast_input_dtype_enabled for m in own.model.modules() if hasattr(m, "cast_input_dtype_enabled")]
-    assert found
-    assert not any(found)
-
-
-def fed(features: VisionFeatures, reader: PictureReader, pictures: Sequence) -> list:
-    """Take a step's pictures; gives those that had to be read."""
-    plan = features.plan()
-    wanted = features.wanted(plan, pictures)
-    features.take([reader.read(picture) for picture in wanted])
-    return wanted
-
-
-def test_features_are_the_towers_and_made_once(place):
-    own, sample = load(place), samples_of(place)[0]
-    features, reader = VisionFeatures(own, memory_bytes=10**9), PictureReader(own, trees_of(place), own.dtype)
-    pictures = pictures_of(sample)
-    assert len(fed(features, reader, [*pictures, *pictures])) == 5
-    found = features.of(pictures)
-    assert torch.allclose(found, features_of(own, inputs_of(own, [sample], trees_of(place))), atol=1e-5)
-    features.end_step()
-    assert fed(features, reader, pictures) == []
-    assert torch.equal(features.of(pictures), found)
-    assert features.num_encoded == 5
-    assert sum(map(features.bytes_of, pictures)) == found.numel() * found.element_size()
-
-
-def test_what_memory_has_no_room_for_is_looked_at_again(place):
-    own, pictures = load(place), pictures_of(samples_of(place)[0])
-    features = VisionFeatures(own, memory_bytes=2 * VisionFeatures(own).bytes_of(pictures[0]))
-    reader = PictureReader(own, trees_of(place), own.dtype)
-    fed(features, reader, pictures)
-    found = features.of(pictures)
-    features.end_step()
-    assert len(fed(features, reader, pictures)) == 3
-    assert features.num_encoded == 8
-    assert torch.equal(features.of(pictures), found)
-
-
-def test_pictures_go_from_process_to_process_as_one_tensor():
-    """However many they are: each tensor on its way holds a file open."""
-    pictures = [FramePicture("run", str(number), "rgb", (64, 64), 100.0) for number in range(40)]
-    loaded = [PictureData(picture, torch.rand(number % 5, 6)) for number, picture in enumerate(pictures)]
-    reader = SimpleNamespace(processor=None, read={item.picture: item for item in loaded}.__getitem__)
-    for chosen in (pictures, pictures[:1], []):
-        made = Maker([], reader)(Order(0, [], chosen))
-        assert not any(isinstance(value, torch.Tensor) for facts in made.pictures for value in facts)
-        for item, wanted in zip(made.loaded(), loaded, strict=False):
-            assert item.picture == wanted.picture
-            assert torch.equal(item.patches, wanted.patches)
-        assert len(made.loaded()) == len(chosen)
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from simulator_serving import free_port  # noqa: E402
 from specimens_students import TWELVE, log_of, losses_of  # noqa: E402
 
 from cosfly.errors import ConfigError, InputError  # noqa: E402
-from distill.training.ranks import Ranks, _buckets, joined  # noqa: E402
+from distill.training.ranks import Ranks, joined  # noqa: E402
 
 # A usual rate: with one that makes a student learn in 12 steps, rounding grows beyond 1e-5 within few of them.
 COSFLY = (sys.executable, "-m", "cosfly")
@@ -80,13 +80,6 @@ def test_one_process_needs_no_group(monkeypatch):
         pass
 
 
-def test_gradients_are_added_up_in_bounded_pieces(monkeypatch):
-    monkeypatch.setattr("distill.training.ranks.BUCKET_NUMBERS", 10)
-    gradients = [torch.zeros(n) for n in (4, 4, 4, 30, 1)] + [torch.zeros(1, dtype=torch.float64)]
-    found = [[g.numel() for g in bucket] for bucket in _buckets(gradients)]
-    assert found == [[4, 4], [4], [30], [1], [1]]
-
-
 @pytest.mark.slow
 def test_two_processes_give_what_one_gives(place, alone, tmp_path):
     assert finish(start(place, tmp_path / "out", 2)) == [0, 0]
@@ -114,23 +107,3 @@ def test_when_one_dies_all_end_and_one_process_goes_on(place, alone, tmp_path):
     assert not (out / "manifest.json").exists()
     assert finish(start(place, out, 1)) == [0]
     assert losses_of(out) == pytest.approx(losses_of(alone), rel=1e-5)
-
-
-@pytest.mark.slow
-def test_a_launcher_starts_them(place, tmp_path):
-    """`torchrun` on the command itself: one folder, one log, status 0; and status 1 where a setting is wrong."""
-    settings = ["max_steps=2", "device=cpu", "data_workers=0", "validation_samples=2", "max_new_tokens=2"]
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2"]
-    command = [*launcher, "--master-port", str(free_port())]
-    command += ["-m", "cosfly", "distill", "train", "--student", "tiny", "--out", str(tmp_path / "out")]
-    command += ["--dataset", str(place / "set"), "--data", str(place / "tree")]
-    command += [word for text in settings for word in ("--set", f"distill.train.{text}")]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=180, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert len(losses_of(tmp_path / "out")) == 2
-    wrong = [*command[:-1], "distill.train.max_tokens=16"]
-    wrong[wrong.index(str(tmp_path / "out"))] = str(tmp_path / "other")
-    done = subprocess.run(wrong, env=environment, capture_output=True, text=True, timeout=180, check=False)
-    assert done.returncode == 1
-    assert "kept nothing" in done.stderr

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from specimens_release import CFG, build, make_caption, make_inspection
 
-from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import write_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import frame_name, read_rgb
@@ -98,39 +97,3 @@ def test_pytorch_loads_them_with_two_workers(place, source):
         assert batch["facts"]["target"].shape[1:] == (5, 3)
         seen += batch["sample_id"]
     assert seen == [windows[i]["sample_id"] for i in range(len(windows))]
-
-
-def test_without_torch_nothing_of_it_is_loaded():
-    import subprocess
-    import sys
-
-    code = "import sys, distill.windows; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-@pytest.mark.parametrize(
-    ("source", "options", "error", "words"),
-    [
-        ("release", {"split": "trian"}, ConfigError, "did you mean 'train'"),
-        ("release", {"language": "de"}, ConfigError, "en, zh"),
-        ("release", {"max_side_px": 0}, ConfigError, "max_side_px"),
-        ("tree", {}, InputError, "Windows(tree, captions)"),
-        ("tree", {"split": "train"}, ConfigError, "release build"),
-        ("nowhere", {}, InputError, "neither a release nor a run folder"),
-    ],
-)
-def test_what_cannot_be_opened_says_why(place, source, options, error, words):
-    with pytest.raises(error) as caught:
-        Windows(place / source, **options)
-    assert words in str(caught.value)
-
-
-def test_a_missing_picture_leaves_its_windows_out(place, tmp_path):
-    import shutil
-
-    tree = shutil.copytree(place / "tree", tmp_path / "tree")
-    folder = find_flights(tree)[0]
-    (folder / frame_name(4) / "rgb.png").unlink()
-    windows = Windows(tree, place / "captions.jsonl")
-    assert windows.left_out["missing_frame"] == NUM_POINTS - 6
-    assert len(windows) == 5 * (NUM_POINTS - 6)

@@ -3,12 +3,10 @@ get."""
 
 from __future__ import annotations
 
-import io
 import json
 import shutil
 import struct
 import zlib
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,20 +17,16 @@ import pytest
 from PIL import Image
 from specimens_foreign import write_foreign_tree
 from specimens_release import FREE, all_bytes, make_caption, make_inspection, rewrite_captions, source_of
-from tables import each
 
 from caption.run import stage as caption_stage
 from caption.schema import CaptionConfig
-from cosfly.errors import InputError, ResumeError, VerifyError
-from cosfly.escaping import published, published_name
-from cosfly.products import review
-from cosfly.products.captions import read_captions, write_captions
+from cosfly.errors import InputError, VerifyError
+from cosfly.products.captions import write_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import depth_bytes, read_depth
 from cosfly.products.inspection import write_inspection
-from cosfly.products.playback import read_flight, write_flight
+from cosfly.products.playback import read_flight
 from cosfly.reading.arrays import parse_picture
-from cosfly.reading.files import sha256_file
 from release.package.config import ReleaseConfig
 from release.package.sources import Source
 from release.package.stage import run
@@ -105,26 +99,6 @@ def test_splits_share_no_walk_and_no_twins(material, tmp_path):
         assert f"data/{shard.split}-{record.content_digest[:12]}-" in shard.path
 
 
-def test_splits_by_town_keep_the_builds_of_a_town_together(material, tmp_path):
-    record = record_of(material, tmp_path / "r", split_cfg(split_by="town"))
-    towns = [{town.removesuffix("_Opt") for town in split.towns} for split in record.splits.splits.values()]
-    assert sum(map(len, towns)) == len(set.union(*towns)) == 3
-
-
-def test_a_tiny_release_has_as_many_splits_as_walks(material, tmp_path):
-    for count, names in ((1, ["train"]), (2, ["train", "validation"]), (3, ["train", "validation", "test"])):
-        root = tmp_path / str(count)
-        shutil.copytree(material, root)
-        for folder in sorted((root / "tree").glob("*/*"))[count:]:
-            shutil.rmtree(folder)
-        write_inspection(root / "inspect.json", make_inspection(root / "tree", {}))
-        kept = {folder.parent.name for folder in find_flights(root / "tree")}
-        write_captions(
-            root / "captions.jsonl", [c for c in read_captions(root / "captions.jsonl") if c.trajectory in kept]
-        )
-        assert list(record_of(root, tmp_path / f"r{count}", split_cfg()).splits.splits) == names
-
-
 def test_neither_twin_goes_without_the_other_unless_asked(copy, tmp_path):
     names = [folder.relative_to(copy / "tree").as_posix() for folder in find_flights(copy / "tree")]
     write_inspection(copy / "inspect.json", make_inspection(copy / "tree", {names[0]: ("rejected", "jerk")}))
@@ -137,16 +111,6 @@ def test_neither_twin_goes_without_the_other_unless_asked(copy, tmp_path):
     clean = record_of(copy, tmp_path / "clean", split_cfg(tracks=("clean",)))
     assert len(clean.flights) == 1
     assert {flight.pair for flight in clean.flights} == {None}
-
-
-def test_what_people_decided_has_its_digest(copy, tmp_path):
-    assert record_of(copy, tmp_path / "before").provenance.sources[0].review_sha256 is None
-    first = find_flights(copy / "tree")[0].relative_to(copy / "tree").as_posix()
-    choice = {"folder": first, "verdict": "rejected", "reason": "blurred"}
-    review.add_decisions(copy / "inspect.json", [review.Choice.model_validate(choice)], "Ann")
-    record = record_of(copy, tmp_path / "after")
-    assert record.provenance.sources[0].review_sha256 == sha256_file(copy / review.REVIEW)
-    assert record.history.flights.left_out == {"its twin is not released": 1, "rejected: review": 1}
 
 
 def test_every_released_caption_has_its_whole_window(tmp_path):
@@ -215,20 +179,6 @@ def test_the_record_says_where_it_comes_from_and_nothing_of_this_machine(copy, t
     assert {row["teacher_model"] for row in table_of(tmp_path / "r/dataset", ["teacher_model"])} == {"teacher-7", None}
 
 
-@each(
-    ("text", "public"),
-    [
-        ("/data/models/Qwen", "Qwen"), ("vllm:/data/models/Qwen", "vllm:Qwen"), ("Qwen/Qwen3.5-2B", "Qwen/Qwen3.5-2B"),
-        ("http://10.0.0.3:8000/v1", "an address"), ("C:\\Users\\me\\map.json", "map.json"), ("~/maps/town", "town"),
-        ("/home/John Doe/my map", "my map"), ("../up/map.json", "map.json"), ("a/b/c", "c"), ("base+/a/b", "base+b"),
-        ("and/or", "and/or"), ("rules-5", "rules-5"), ("/", "a path"),
-    ],
-)  # fmt: skip
-def test_published_names(text, public):
-    assert published_name(text) == public
-    assert published({"x": [text, 1, None]}) == {"x": [public, 1, None]}
-
-
 def test_depth_is_lossless_in_either_form_of_the_tree(material, tmp_path):
     folder = run(split_cfg(), [source_of(material)], tmp_path / "r")
     row = table_of(folder, ["town", "trajectory", "variant", "frame_index", "depth"])[3]
@@ -279,13 +229,6 @@ def interlaced(pixels: np.ndarray) -> bytes:
     chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
     packed = (struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in chunks)
     return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
-
-
-def test_the_interlaced_picture_is_one():
-    pixels = np.random.default_rng(0).integers(0, 256, (13, 21, 3)).astype(np.uint8)
-    picture = Image.open(io.BytesIO(interlaced(pixels)))
-    assert picture.info["interlace"] == 1
-    np.testing.assert_array_equal(np.asarray(picture), pixels)
 
 
 def other_kind(frame_file: str, kind: str):
@@ -379,36 +322,9 @@ def test_material_that_cannot_be_released_is_refused_by_name(copy, tmp_path, dam
     assert not (tmp_path / "r/manifest.json").exists()
 
 
-def test_all_that_is_wrong_is_listed(copy, tmp_path):
-    for folder in find_flights(copy / "tree")[:3]:
-        (folder / "frames_playback/frame_00005/rgb.png").unlink()
-    rewrite_captions(copy, lambda lines: None)
-    with pytest.raises(InputError, match="nothing is released: 3 things are wrong") as caught:
-        run(split_cfg(), [source_of(copy)], tmp_path / "r")
-    assert str(caught.value).count("rgb.png: a frame's file is missing") == 3
-    assert len((tmp_path / "r/failures.jsonl").read_text().splitlines()) == 3
-
-
 def test_captions_that_nothing_binds_to_the_tree_are_refused(few, tmp_path):
     with pytest.raises(InputError, match=r"no record says of which tree.*release\.unbound=accept"):
         run(split_cfg(unbound="refuse"), [source_of(few)], tmp_path / "r")
-
-
-def test_a_folder_that_holds_something_else_is_left_alone(few, tmp_path):
-    (tmp_path / "r/dataset").mkdir(parents=True)
-    (tmp_path / "r/dataset/README.md").write_text("mine")
-    with pytest.raises(ResumeError, match="not cosfly's"):
-        run(split_cfg(), [source_of(few)], tmp_path / "r")
-    record_of(few, tmp_path / "one")
-    with pytest.raises(ResumeError, match="other settings"):
-        record_of(few, tmp_path / "one", split_cfg(num_frames=6))
-    assert (tmp_path / "r/dataset/README.md").read_text() == "mine"
-    assert (tmp_path / "one/dataset/release.json").is_file()
-
-
-def test_splits_of_nothing_are_refused():
-    with pytest.raises(ValueError, match="nothing is left to train on"):
-        ReleaseConfig(validation_fraction=0.5, test_fraction=0.5)
 
 
 # --- kills, and a second run ------------------------------------------------------------------------------------------
@@ -442,29 +358,3 @@ def test_after_a_failed_flight_the_finished_shards_are_not_done_again(tmp_path, 
 
 
 # --- its readers ------------------------------------------------------------------------------------------------------
-
-
-def test_two_releases_opened_one_after_another_give_each_its_own_rows(tmp_path):
-    """The library's cache goes by the name of the folder and the card's pattern: a digest in these tells releases
-    apart."""
-    datasets = pytest.importorskip("datasets")
-    material = make_material(tmp_path / "material", 3)
-    copy = shutil.copytree(material, tmp_path / "copy")
-    flight = read_flight(first_flight(copy))
-    write_flight(first_flight(copy), replace(flight, time_s=flight.time_s + 0.25))
-    place, found = tmp_path / "dataset", []
-    for root in (material, copy):
-        shutil.rmtree(place, ignore_errors=True)
-        shutil.copytree(run(split_cfg(), [source_of(root)], tmp_path / f"r{len(found)}"), place)
-        parts = datasets.load_dataset(str(place), cache_dir=str(tmp_path / "cache"))
-        assert sorted(parts) == ["test", "train", "validation"]
-        rows = [row for name in parts for row in parts[name].remove_columns(["image", "instance", "depth"])]
-        truth = table_of(place, ["sample_id", "time_s"])
-        assert {row["sample_id"]: row["time_s"] for row in rows} == {row["sample_id"]: row["time_s"] for row in truth}
-        found.append(sorted((row["sample_id"], row["time_s"]) for row in rows))
-        for split in parts:  # row by row, without the whole
-            streamed = datasets.load_dataset(str(place), split=split, streaming=True, cache_dir=str(tmp_path / "cache"))
-            seen = list(streamed)
-            assert [row["sample_id"] for row in seen] == parts[split]["sample_id"][:]
-            assert np.asarray(seen[0]["image"]).shape == (27, 48, 3)
-    assert found[0] != found[1]

@@ -7,19 +7,14 @@ from pathlib import Path
 
 import pytest
 from commands import invoke
-from hypothesis import given
-from hypothesis import strategies as st
 from specimens_release import CFG, build, make_caption, make_inspection
 
-from cosfly.errors import InputError, NothingKept, StorageError
-from cosfly.products.captions import Coc, Prompt, read_captions, write_captions
+from cosfly.errors import InputError, StorageError
+from cosfly.products.captions import Coc, read_captions, write_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.inspection import write_inspection
 from cosfly.products.playback import read_flight
-from cosfly.work.config import build as build_config
-from release.export import stage
-from release.export.captions import FORMULA, cell, export, read_lines
-from release.export.contract import ExportConfig
+from release.export.captions import FORMULA, export
 from specimens import make_playback_tree
 
 NUM_POINTS = 9
@@ -70,13 +65,6 @@ def test_a_table_keeps_every_text_and_holds_no_formula(run, tmp_path):
         assert not any(value.startswith(FORMULA) for value in row.values())
 
 
-@given(st.text())
-def test_no_cell_begins_as_a_formula_does(text):
-    shown = cell(text)
-    assert not shown.lstrip(" ").startswith(FORMULA)
-    assert shown.removeprefix("'") in (text, text.removeprefix("'"))
-
-
 def test_json_lines_open_with_datasets(run, tmp_path, monkeypatch):
     datasets = pytest.importorskip("datasets")
     export(run, tmp_path / "c.jsonl", "jsonl")
@@ -113,17 +101,6 @@ def test_conversations_are_what_their_loaders_ask_for(run, tmp_path, format, ima
     assert (format, shown) != ("llava", "last") or isinstance(first["image"], str)
 
 
-def test_pictures_of_a_release_are_those_of_the_tree_that_it_is_exported_to(run, tmp_path):
-    tree = stage.run(build_config(ExportConfig, {"format": "tree"}, "test"), run / "release", tmp_path / "export")
-    export(run / "release", tmp_path / "c.json", "sharegpt", languages=["zh"])
-    samples = json.loads((tmp_path / "c.json").read_text(encoding="utf-8"))
-    check_loader_takes(samples, tree, "images")
-    assert len(samples) == len(accepted(run))
-    export(run, tmp_path / "d.json", "sharegpt", languages=["zh"])
-    theirs = {s["id"]: s for s in json.loads((tmp_path / "d.json").read_text(encoding="utf-8"))}
-    assert {s["id"]: s["conversations"] for s in samples} == {k: s["conversations"] for k, s in theirs.items()}
-
-
 def test_conversations_of_a_release_are_of_one_split(dataset, tmp_path):
     with pytest.raises(InputError, match=r"captions of several splits; got train, validation; .*--split"):
         export(dataset, tmp_path / "c.json", "llava")
@@ -136,41 +113,6 @@ def test_conversations_of_a_release_are_of_one_split(dataset, tmp_path):
         assert done.exit_code == 0, done.output
         found = [sample["id"] for sample in json.loads((tmp_path / f"{split}.json").read_text(encoding="utf-8"))]
         assert found == [f"{line['sample_id']}_en" for line in lines if line["split"] == split] != []
-
-
-def test_a_text_with_a_mark_for_pictures_is_left_out(run, tmp_path):
-    captions = accepted(run)
-    prompt = captions[0].prompt["en"]
-    captions[0].prompt["en"] = Prompt(system=prompt.system, user=f"{prompt.user} <image>")
-    write_captions(tmp_path / "captions.jsonl", captions)
-    told = export(tmp_path / "captions.jsonl", tmp_path / "c.json", "llava")
-    assert told.left_out == {"text_with_a_mark_for_pictures": 1}
-    assert told.written == 2 * len(captions) - 1
-
-
-def test_what_cannot_be_exported_says_why_and_leaves_nothing(run, tmp_path):
-    with pytest.raises(InputError, match="run folder"):
-        export(tmp_path, tmp_path / "c.csv", "csv")
-    write_captions(tmp_path / "captions.jsonl", [])
-    with pytest.raises(NothingKept):
-        export(tmp_path / "captions.jsonl", tmp_path / "c.csv", "csv")
-    with pytest.raises(StorageError, match="folder"):
-        export(run, tmp_path, "csv")
-    assert [path.name for path in tmp_path.iterdir()] == ["captions.jsonl"]
-
-
-def test_the_command_tells_what_it_wrote(run, tmp_path):
-    done = invoke("release export", run, "--format csv --out", tmp_path / "c.csv")
-    assert done.exit_code == 0, done.output
-    assert f"{len(accepted(run))} written; left out: dropped_hard_conflict 4" in done.output
-
-
-def test_the_folder_of_a_captions_file_is_as_good_as_the_file(run, tmp_path):
-    found = {
-        name: [line.sample_id for line in read_lines(run / "caption" / name, Counter())]
-        for name in ("", "captions.jsonl")
-    }
-    assert found[""] == found["captions.jsonl"] != []
 
 
 def test_a_file_that_is_there_stays_unless_it_may_go(run, tmp_path):

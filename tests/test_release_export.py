@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import shutil
 import tarfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from commands import invoke
 from hypothesis import given
 from hypothesis import strategies as st
 from public_reader import read_public
@@ -28,7 +25,7 @@ from specimens_release import (
     rows_by_id,
 )
 
-from cosfly.errors import InputError, ResumeError
+from cosfly.errors import InputError
 from cosfly.products.captions import write_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import depth_bytes
@@ -40,9 +37,9 @@ from cosfly.reading.files import sha256_file
 from cosfly.work.config import build as build_config
 from cosfly.work.store import CHECKSUMS, read_checksums
 from release.columns import POSE
-from release.export.contract import FORMATS, ExportConfig, ExportUnit, Files, FormatFacts
+from release.export.contract import FORMATS, ExportConfig, ExportUnit
 from release.export.lerobot import merged, runs_of, states, summarize, tiff_of_depth
-from release.export.source import ReleasedRows, Span, open_release, rows_of_flight, scan
+from release.export.source import ReleasedRows, Span, open_release, scan
 from release.export.stage import read_export
 from release.export.stage import run as export
 from release.package import stage as package
@@ -110,17 +107,6 @@ def test_tree_to_release_to_tree_loses_nothing(whole, dataset, tmp_path):
     assert read_town_map(product / "Town01").licence == about.maps[0].licence
 
 
-def test_a_tree_of_chosen_frames_says_which_they_were(whole, spread, tmp_path):
-    """Every second frame or so: counted anew from 0, uneven steps told."""
-    product = export(config("tree"), spread, tmp_path / "out")
-    frames = [flight.frame_index.tolist() for flight in scan(open_release(spread))]
-    for a, b, kept in zip(find_flights(whole / "tree"), find_flights(product), frames, strict=True):
-        assert len(kept) == 8
-        assert_same_flight(b, a, kept)
-    read_public(product)
-    assert any("6 of 6 flights are parts" in note for note in read_export(product / "export.json").notes)
-
-
 def test_a_second_release_of_the_exported_tree_has_the_same_rows(whole, dataset, tmp_path):
     """tree -> release -> tree -> release: pictures, poses, and all that follows from them."""
     product = export(config("tree"), dataset, tmp_path / "out")
@@ -139,22 +125,6 @@ def test_a_second_release_of_the_exported_tree_has_the_same_rows(whole, dataset,
         for column in row.keys() - told_elsewhere:
             if "sentence" not in column:
                 assert row[column] == second[name][column], (name, column)
-
-
-def test_a_tree_needs_colour_and_names_of_the_layout(dataset, tmp_path):
-    release = open_release(dataset)
-    bare = replace(
-        release,
-        record=release.record.model_copy(
-            update={"settings": release.record.settings.model_copy(update={"modalities": ["depth"]})}
-        ),
-    )
-    flights = scan(release)
-    flights[0].town = "Delft"
-    from release.export import tree
-
-    with pytest.raises(InputError, match=r"colour pictures.*Delft"):
-        tree.plan(bare, flights, config("tree"))
 
 
 # --- WebDataset -------------------------------------------------------------------------------------------------------
@@ -230,14 +200,6 @@ def flight_of(frames: list[int]) -> ReleasedRows:
     return flight
 
 
-@pytest.mark.parametrize(
-    ("frames", "runs"),
-    [([0, 1, 2], [(0, 3)]), ([0, 2, 3, 7], [(0, 1), (1, 3), (3, 4)]), ([5], [(0, 1)])],
-)
-def test_an_episode_has_no_gap(frames, runs):
-    assert runs_of(flight_of(frames)) == runs
-
-
 def test_a_state_is_the_motion_that_led_to_a_frame():
     rows = [
         {"time_s": 0.5 * i, "pose": dict(zip(POSE, pose, strict=True))}
@@ -266,11 +228,6 @@ def test_merged_statistics_are_those_of_all_values(groups):
     assert found["max"] == [values.max()]
     assert found["mean"] == pytest.approx([values.mean()], abs=1e-6)
     assert found["std"] == pytest.approx([values.std()], abs=1e-3)
-
-
-def test_statistics_leave_out_what_is_unknown():
-    assert summarize(np.array([[1.0, np.nan], [3.0, np.nan]]), 2)["mean"] == [2.0, 0.0]
-    assert summarize(np.array([[np.nan]]), 1)["count"] == [0]
 
 
 def test_a_flight_with_gaps_is_several_episodes(spread, tmp_path):
@@ -324,33 +281,9 @@ def test_an_export_says_where_it_came_from_and_whose_it_is(format, dataset, tmp_
     assert about.coordinates["handedness"] in readme
 
 
-def test_a_folder_of_something_else_is_refused(dataset, tmp_path):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out/notes.txt").write_text("mine")
-    with pytest.raises(ResumeError, match="not cosfly's"):
-        export(config("tree"), dataset, tmp_path / "out")
-    export(config("webdataset"), dataset, tmp_path / "two")
-    with pytest.raises(ResumeError, match="other settings"):
-        export(config("tree"), dataset, tmp_path / "two")
-
-
 def plan(release, flights, cfg):
     """A toy format, as docs/extending.md describes it: the poses of each flight as CSV."""
     return [ExportUnit(flight.name, len(flight), flights=(flight,)) for flight in flights]
-
-
-def write(release, unit, folder, cfg):
-    files, (flight,) = Files(folder), unit.flights
-    poses = [row["pose"] for row in rows_of_flight(release, flight, ["pose"])]
-    lines = [",".join(repr(value) for value in pose.values()) for pose in poses]
-    files.put(f"{unit.name.replace('/', '__')}.csv", "\n".join(lines).encode())
-    return files.written(lines=len(lines))
-
-
-def finish(release, units, written, folder, cfg):
-    files = Files(folder)
-    files.put("lines.txt", str(sum(one.facts["lines"] for one in written)).encode())
-    return FormatFacts(version="1", codings={"pose": "CSV"}, how_to_open="open(...)", files=files.digests)
 
 
 def test_a_format_of_your_own_takes_three_functions(dataset, tmp_path, monkeypatch):
@@ -406,22 +339,6 @@ def tell_size(folder: Path, path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda rows: rows[0].update(town="../../Town01"), "not names of folders"),
-        (lambda rows: rows[0].update(trajectory=".."), "not names of folders"),
-        (lambda rows: rows[1].update(frame_index=0), "do not rise"),
-        (lambda rows: rows[1].update(time_s=None), "without index or time"),
-    ],
-)
-def test_rows_that_cannot_be_are_refused_before_anything_is_written(broken, tmp_path, change, words):
-    rewrite(broken, change)
-    with pytest.raises(InputError, match=words):
-        export(config("webdataset"), broken, tmp_path / "out")
-    assert not list((tmp_path / "out").rglob("*.tar"))
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
         (lambda rows: rows[3].update(image=None), "a frame without its picture"),
         (lambda rows: rows[3]["image"].update(bytes=b"GIF89a"), "no PNG"),
         (lambda rows: rows[3].update(depth=None), "a frame without its picture"),
@@ -441,87 +358,7 @@ def test_a_unit_that_fails_publishes_nothing(broken, tmp_path, change, words):
     assert not (tmp_path / "out/webdataset").exists()
 
 
-def test_a_unit_that_failed_is_done_again_alone(broken, dataset, tmp_path):
-    path = next((broken / "data").glob("train-*.parquet"))
-    good = path.read_bytes()
-    path.write_bytes(good.replace(b"\x89PNG", b"\x89GIF", 1))
-    with pytest.raises(InputError, match="1 failed"):
-        export(config("webdataset"), broken, tmp_path / "out")
-    path.write_bytes(good)
-    product = export(config("webdataset"), broken, tmp_path / "out")
-    assert all_bytes(product) == all_bytes(export(config("webdataset"), dataset, tmp_path / "other"))
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda rows: rows[3].update(pose=None), "pose: a row without a value"),
-        (lambda rows: rows[3].update(width_px=97), "pictures of one size; got 2 sizes"),
-    ],
-)
-def test_a_flight_of_two_sizes_or_without_a_pose_is_no_tree(broken, tmp_path, change, words):
-    rewrite(broken, change)
-    with pytest.raises(InputError, match="could not be exported"):
-        export(config("tree"), broken, tmp_path / "out")
-    told = (tmp_path / "out/failures.jsonl").read_text()
-    assert words in told
-
-
-def test_a_shard_of_another_version_is_refused(broken, tmp_path):
-    path = next((broken / "data").glob("*.parquet"))
-    pq.write_table(pq.read_table(path).drop_columns(["style"]), path)
-    tell_size(broken, path)
-    with pytest.raises(InputError, match=r"not a shard of this version.*style"):
-        export(config("webdataset"), broken, tmp_path / "out")
-
-
-def test_a_shard_of_another_size_than_its_record_says_is_refused(broken, tmp_path):
-    path = next((broken / "data").glob("*.parquet"))
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(InputError, match=r"not a whole release.*bytes and not"):
-        export(config("webdataset"), broken, tmp_path / "out")
-
-
-def test_lerobot_has_one_size_of_picture(broken, tmp_path):
-    change_record(broken, lambda record: record["numbers"]["frames_by"].update(image_px={"96 x 54": 1, "64 x 36": 1}))
-    with pytest.raises(InputError, match="one size"):
-        export(config("lerobot"), broken, tmp_path / "out")
-
-
 # --- the command ------------------------------------------------------------------------------------------------------
-
-
-def test_the_command(dataset, tmp_path):
-    done = invoke("release export", dataset, "--format webdataset --out", tmp_path / "out", "--workers 0")
-    assert done.exit_code == 0, done.output
-    assert str(tmp_path / "out/webdataset") in done.output
-    done = invoke("release export", tmp_path, "--format tree --out", tmp_path / "x")
-    assert done.exit_code == 1
-    assert "Traceback" not in done.output
-
-
-def test_digests_of_bytes_do_not_depend_on_the_folder(dataset, tmp_path):
-    moved = shutil.copytree(dataset, tmp_path / "moved")
-    a = export(config("webdataset"), dataset, tmp_path / "a")
-    b = export(config("webdataset"), moved, tmp_path / "b")
-    digest = [hashlib.sha256((p / "train-00000.tar").read_bytes()).hexdigest() for p in (a, b)]
-    assert digest[0] == digest[1]
-
-
-@pytest.mark.parametrize("below", ["", "dataset", "release/dataset"])
-def test_a_release_is_found_from_its_stage_and_from_its_run(below, dataset, tmp_path):
-    shutil.copytree(dataset, tmp_path / "run" / below)
-    (tmp_path / "run/render").mkdir()  # a run has its tree beside the release, and it is the release that is asked for
-    assert open_release(tmp_path / "run").folder == tmp_path / "run" / below
-    assert "by their record" in str(verify(tmp_path / "run", level="structure"))
-
-
-@pytest.mark.parametrize("words", ["stats --out x", "export --format tree --out x"])
-def test_where_there_is_no_release_that_is_said(words, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    done = invoke("release", words, ".")
-    assert "there is no release" in str(done.exception)
-    assert "a run that has one" in str(done.exception)
 
 
 # --- verified ---------------------------------------------------------------------------------------------------------

@@ -15,32 +15,24 @@ import pytest
 from commands import invoke
 from hypothesis import given
 from hypothesis import strategies as st
-from specimens_release import CFG, FREE, NUM_POINTS, all_bytes, build, make_inspection, rewrite_captions, source_of
+from specimens_release import CFG, all_bytes, build, make_inspection, rewrite_captions, source_of
 
-from cosfly.errors import ConfigError, InputError, NothingKept
+from cosfly.errors import ConfigError, InputError
 from cosfly.products.boxes import MapHeader
-from cosfly.products.flights import find_flights
 from cosfly.products.frames import read_depth, read_instance, read_rgb
 from cosfly.products.inspection import (
     write_inspection,
 )
-from cosfly.products.places import sample_id
 from cosfly.products.playback import read_flight
-from cosfly.products.review import Choice, add_decisions
 from cosfly.products.town import write_town_map
 from cosfly.reading.documents import read_json
-from cosfly.work.store import write_json
-from release.card.render import render_card, size_category
-from release.columns import SCALARS, Placement
-from release.package.config import ReleaseConfig
+from release.card.render import render_card
 from release.package.plan import plan_shards
 from release.package.sources import Source
 from release.package.stage import run
 from release.record import ReleaseRecord, read_record
 from release.verify.verify import verify
-from specimens import make_flight
 
-PLACED = Placement("a walk", "train")
 UNLICENSED = CFG.model_copy(update={"licence": None})
 
 
@@ -104,23 +96,6 @@ def test_load_dataset_gives_pictures_poses_and_both_languages(loaded, release_in
     assert bare[0]["caption_window"] is bare[0]["caption_picture_px"] is bare[0]["target_mask_bbox"] is None
 
 
-def test_the_box_of_the_pixels_reaches_its_row():
-    flight = replace(make_flight(3)[0], target_mask_bbox=np.array([[1.0, 2.0, 3.0, 4.0], [np.nan] * 4, [5.0] * 4]))
-    column = next(column for column in SCALARS if column.name == "target_mask_bbox")
-    assert column.cell(flight, 0, None, PLACED) == {"xmin_px": 1.0, "ymin_px": 2.0, "xmax_px": 3.0, "ymax_px": 4.0}
-    assert column.cell(flight, 1, None, PLACED) is None
-
-
-def test_what_became_of_a_frames_perturbation_reaches_its_row():
-    told = {"position": "fallback: drone clearance", "rotation": "applied"}
-    flight = replace(
-        make_flight(3)[0], raw={"points": [{"perturbation": told}, {"perturbation": {"drone_position": True}}, {}]}
-    )
-    column = next(column for column in SCALARS if column.name == "perturbation")
-    assert [column.cell(flight, i, None, PLACED) for i in range(3)] == [told, None, None]
-    assert column.cell(replace(flight, raw={}), 0, None, PLACED) is None
-
-
 def test_numbers_against_a_slow_oracle(loaded, built):
     """The record's numbers, counted again from what `datasets` gives."""
     numbers = read_json(built / "release.json")["numbers"]
@@ -158,15 +133,6 @@ def test_the_account_names_every_flight_and_caption(built):
     assert captions["frame_not_selected"] == 4
 
 
-def test_short_flights_are_kept_whole_and_recorded(release_inputs, tmp_path):
-    folder = build(release_inputs, tmp_path / "r", ReleaseConfig(num_frames=400, modalities=("rgb",), **FREE))
-    record = read_json(folder / "release.json")
-    assert [flight["frames"] for flight in record["flights"]] == [NUM_POINTS] * 4
-    assert record["numbers"]["flights_shorter_than_num_frames"] == 4
-    assert set(pq.read_schema(folder / record["shards"][0]["path"]).names) & {"image", "depth", "instance"} == {"image"}
-    assert verify(folder).is_ok
-
-
 def test_the_papers_stride_is_a_setting_and_leaves_no_window_whole(release_inputs, tmp_path):
     folder = build(release_inputs, tmp_path / "r", CFG.model_copy(update={"uniform_stride": True, "num_frames": 6}))
     assert verify(folder).is_ok
@@ -176,13 +142,6 @@ def test_the_papers_stride_is_a_setting_and_leaves_no_window_whole(release_input
     assert record.settings.window_frames == 5
     assert record.history.captions.released == 0
     assert record.history.captions.window_not_whole == 4 * 3
-
-
-def test_tracks_and_review_are_settings(release_inputs, tmp_path):
-    cfg = CFG.model_copy(update={"tracks": ("clean",), "include_review": True, "modalities": ("depth",)})
-    record = read_json(build(release_inputs, tmp_path / "r", cfg) / "release.json")
-    assert record["numbers"]["flights_by_track"] == {"clean": 3}
-    assert sum(record["history"]["flights"]["left_out"].values()) == 3
 
 
 def test_shards_hold_whole_row_groups_in_order(built):
@@ -238,23 +197,6 @@ def test_a_release_without_a_licence_is_refused(release_inputs, tmp_path, licenc
     assert not (tmp_path / "r" / "dataset").exists()
 
 
-def test_a_tree_may_stand_deeper_and_a_town_twice_in_it(release_inputs, tmp_path):
-    """Two maps of one town's name are two maps: the licence of neither is lost."""
-    for name, licence in (("a", "mit"), ("b", "cc0-1.0")):
-        shutil.copytree(release_inputs / "tree", tmp_path / "in" / "tree" / name)
-        for town in ("Town01", "Town02"):
-            write_town_map(tmp_path / "in" / "tree" / name / town, MapHeader(licence=licence))
-    (tmp_path / "in/captions.jsonl").write_text("")
-    write_inspection(tmp_path / "in" / "inspect.json", make_inspection(tmp_path / "in" / "tree", {}))
-    with pytest.raises(ConfigError, match=r"Town01: cc0-1\.0, Town01: mit, Town02: cc0-1\.0, Town02: mit"):
-        build(tmp_path / "in", tmp_path / "r", UNLICENSED)
-    shutil.rmtree(tmp_path / "in" / "tree" / "b")
-    write_inspection(tmp_path / "in" / "inspect.json", make_inspection(tmp_path / "in" / "tree", {}))
-    folder = build(tmp_path / "in", tmp_path / "r2", UNLICENSED)
-    assert read_json(folder / "release.json")["flights"][0]["flight"].startswith("one_a/Town01/")
-    assert verify(folder).is_ok
-
-
 # --- several runs -----------------------------------------------------------------------------------------------------
 
 
@@ -304,18 +246,6 @@ def test_runs_of_other_towns_go_into_one_release_under_ids_of_their_own(release_
     assert {one.flight.partition("/")[0] for one in record.flights} == {"one_tree", "one_second"}
 
 
-def test_runs_of_the_same_town_are_told_apart_by_their_names(release_inputs, tmp_path):
-    other = other_run(release_inputs, tmp_path / "in", {})
-    folder, record = joined(tmp_path / "r", source_of(release_inputs), source_of(other, "two"))
-    assert {i.partition("_Town")[0] for i in ids_of(folder)} == {"one", "two"}
-    assert record.numbers.flights == 4 + 6
-
-
-def test_one_run_keeps_the_ids_of_its_tree(release_inputs, built):
-    flights = [read_flight(folder) for folder in find_flights(release_inputs / "tree")]
-    assert set(ids_of(built)) < {sample_id(flight.flight_id, i) for flight in flights for i in range(NUM_POINTS)}
-
-
 def test_runs_are_given_as_folders_or_file_by_file(release_inputs, tmp_path):
     for name in ("a", "b"):
         place = tmp_path / "runs" / name
@@ -348,13 +278,6 @@ def test_shards_lose_nothing_and_keep_the_order(sizes, target):
         assert sum(sizes[i] for i in group[:-1]) < target
 
 
-@pytest.mark.parametrize(
-    ("frames", "name"), [(0, "n<1K"), (999, "n<1K"), (1000, "1K<n<10K"), (100_000, "100K<n<1M"), (10**8, "n>10M")]
-)
-def test_size_category(frames, name):
-    assert size_category(frames) == name
-
-
 # --- the stage --------------------------------------------------------------------------------------------------------
 
 
@@ -362,45 +285,7 @@ def test_same_bytes_with_two_workers(release_inputs, built, tmp_path):
     assert all_bytes(build(release_inputs, tmp_path / "two", workers=2)) == all_bytes(built)
 
 
-def test_a_second_run_has_nothing_to_do(release_inputs, built):
-    before = {path: path.stat().st_mtime_ns for path in built.parent.rglob("*")}
-    assert build(release_inputs, built.parent) == built
-    assert {path: path.stat().st_mtime_ns for path in built.parent.rglob("*")} == before
-    assert not (built.parent / "parts").exists()
-
-
-def test_no_accepted_flight_is_one_clear_error(release_inputs, tmp_path):
-    names = [folder.relative_to(release_inputs / "tree").as_posix() for folder in find_flights(release_inputs / "tree")]
-    everything = make_inspection(release_inputs / "tree", dict.fromkeys(names, ("rejected", "jerk")))
-    write_inspection(tmp_path / "inspect.json", everything)
-    with pytest.raises(NothingKept, match="release kept nothing") as caught:
-        run(CFG, [replace(source_of(release_inputs), inspect=tmp_path / "inspect.json")], tmp_path / "r")
-    assert "jerk 6" in str(caught.value)
-    assert caught.value.where == tmp_path
-    assert str(tmp_path / "report.html") in str(caught.value)
-
-
-def test_flights_left_for_review_are_told_with_the_way_out(release_inputs, tmp_path):
-    names = [folder.relative_to(release_inputs / "tree").as_posix() for folder in find_flights(release_inputs / "tree")]
-    (tmp_path / "inspect").mkdir()
-    product = tmp_path / "inspect/inspect.json"
-    write_inspection(product, make_inspection(release_inputs / "tree", dict.fromkeys(names, ("review", "z_fighting"))))
-    source = replace(source_of(release_inputs), inspect=product)
-    with pytest.raises(
-        NothingKept,
-        match=r"review: z_fighting 6.*--inspect \S+/inspect .*--accept FLIGHT --by NAME.*include_review=true",
-    ) as caught:
-        run(CFG, [source], tmp_path / "r")
-    assert caught.value.where == product.parent
-    add_decisions(product, [Choice(folder=name, verdict="accepted", reason="seen") for name in names], "Ann")
-    assert run(CFG, [source], tmp_path / "r").is_dir(), "the same command again"
-
-
 # --- verify -----------------------------------------------------------------------------------------------------------
-
-
-def codes(folder: Path) -> set[str]:
-    return {issue.code for issue in verify(folder).issues}
 
 
 def test_one_changed_digit_of_the_card_fails_wherever_it_stands(dataset):
@@ -415,53 +300,3 @@ def test_one_changed_digit_of_the_card_fails_wherever_it_stands(dataset):
         report = verify(dataset, level="rows")
         line = text[:place].count("\n") + 1
         assert [i.where for i in report.issues if i.code == "card"] == [f"README.md:{line}"]
-
-
-def forget_a_flight(folder: Path) -> None:
-    record = read_json(folder / "release.json")
-    record["flights"].pop()
-    write_json(folder / "release.json", record)
-
-
-def flip_a_byte(folder: Path) -> None:
-    shard = sorted((folder / "data").iterdir())[0]
-    data = bytearray(shard.read_bytes())
-    data[len(data) // 3] ^= 1
-    shard.write_bytes(data)
-
-
-DAMAGES = {
-    "missing": lambda d: (d / "checksums.sha256").unlink(),
-    "size": lambda d: next((d / "data").iterdir()).write_bytes(b"PAR1"),
-    "record": lambda d: (d / "release.json").write_text("{}"),
-    "flight": forget_a_flight,
-    "checksum": flip_a_byte,
-}
-
-
-@pytest.mark.parametrize("code", DAMAGES)
-def test_damage_is_called_by_its_code(dataset, code):
-    DAMAGES[code](dataset)
-    assert code in codes(dataset)
-
-
-def test_no_folder_is_a_finding_not_a_traceback(tmp_path):
-    assert codes(tmp_path / "nowhere") == {"missing"}
-    assert codes(tmp_path) == {"missing"}
-
-
-def test_every_flight_can_be_its_own_shard_linked_or_copied(release_inputs, tmp_path, monkeypatch):
-    """Parts that fill a shard are linked; the rows and their order are those of the copied shards of another disk."""
-    from release.package import config
-
-    def refuse(*args):
-        raise OSError("no links here")
-
-    monkeypatch.setattr(config, "MB", 1000)  # so that the specimen's small flights pass shard_mb
-    folder = build(release_inputs, tmp_path / "linked")
-    record = read_record(folder / "release.json")
-    assert len(record.shards) == 4
-    assert [flight.frames for flight in record.flights] == [entry.rows for entry in record.shards]
-    assert verify(folder).is_ok
-    monkeypatch.setattr(os, "link", refuse)
-    assert all_bytes(build(release_inputs, tmp_path / "copied")) == all_bytes(folder)

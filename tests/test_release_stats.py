@@ -5,9 +5,7 @@ from __future__ import annotations
 
 import gc
 import math
-import shutil
 import tracemalloc
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,23 +15,17 @@ from hypothesis import strategies as st
 from specimens_release import build, make_inputs
 from specimens_rows import make_row
 
-from cosfly.errors import InputError
-from cosfly.products.coverage import Coverage, default_coverage
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
 from cosfly.products.inspection import read_inspection, write_inspection
 from cosfly.products.kinds import KINDS
 from cosfly.reading.documents import read_json
 from cosfly.space.flight_metrics import accel_rms, jerk_rms, length_m
-from release.columns import BOX, POINT, POSE
+from release.columns import POINT, POSE
 from release.record import read_record
 from release.stats.counting import Counts, overlap
 from release.stats.pixels import BIN_M, Pixels
-from release.stats.stats import markdown, page_html, run
-from release.stats.tables import Absent, Stats, Table, weather
-from specimens import make_flight
-
-BIG = dict(zip(BOX, (10.0, 10.0, 20.0, 30.0), strict=True))
-SMALL = dict(zip(BOX, (10.0, 10.0, 20.0, 20.0), strict=True))
+from release.stats.stats import run
+from release.stats.tables import Stats
 
 
 def counted(rows: list[dict]) -> Counts:
@@ -94,36 +86,6 @@ def test_overlap(a, b, share):
     assert overlap(list(b), list(a)) == pytest.approx(share)
 
 
-def test_sizes_count_where_the_person_is_seen():
-    rows = [make_row(i, target_bbox=BIG, target_mask_bbox=SMALL, visibility=0.0 if i == 1 else 0.5) for i in range(3)]
-    (flight,) = counted(rows).flights.values()
-    assert (flight.width_px.spread().mean, flight.height_px.spread().mean, flight.iou.spread().mean) == (
-        10.0,
-        20.0,
-        0.5,
-    )
-    assert (flight.width_px.count, flight.visibility.count) == (2, 3)
-
-
-def test_what_became_of_the_perturbation():
-    turned = dict.fromkeys(POSE, 0.0) | {"yaw_deg": 3.0}
-    told = {"position": "applied", "rotation": "fallback: target hidden"}
-    rows = [
-        make_row(0),
-        make_row(0, "aug_001"),
-        make_row(1, "aug_001", drone_offset=turned),
-        make_row(2, "aug_001", drone_offset=turned | {"x_m": 2.0}, perturbation=told),
-    ]
-    rows.append(make_row(3, "aug_001", drone_offset=dict.fromkeys(POSE, 0.0)))
-    rows.append(make_row(4, "aug_001", drone_offset=None))
-    counts = counted(rows)
-    assert counts.states == {"position only": 1, "rotation only": 1, "full": 1, "unperturbed": 1}
-    assert counts.events == {
-        ("perturbed", "position", "applied"): 1,
-        ("perturbed", "rotation", "fallback: target hidden"): 1,
-    }
-
-
 def test_captions_are_counted_by_what_they_say():
     states = {"sentence_states_en": ["proved", "unread", "proved", "proved"]}
     rows = [
@@ -165,31 +127,6 @@ def test_kinds_are_shares_of_pixels_and_of_frames():
 
 
 # --- pages ------------------------------------------------------------------------------------------------------------
-
-
-def test_pages_show_foreign_text_as_text():
-    evil = "<script>alert(1)</script>|`x`\u202e\n# head"
-    rows: list = [[evil, 3, 1.5], ["b", None, 0]]
-    tables = [
-        Table(key=evil, title=evil, paper=evil, note=evil, head=["a", evil, "c"], rows=rows, plot=plot)
-        for plot in (None, "bars", "stacked", "heat")
-    ]
-    stats = Stats(
-        name=evil, runs=[evil], content_digest="0" * 64, tables=tables, absent=[Absent(what=evil, paper=evil, why=evil)]
-    )
-    page, text = page_html(stats, default_coverage()), markdown(stats)
-    assert "<script" not in page
-    assert "<script" not in text
-    assert "\u202e" not in page + text
-    assert "\n# head" not in text
-    assert all(line.count(" | ") <= 3 for line in text.splitlines() if line.startswith("|"))
-
-
-def test_an_empty_table_is_drawn():
-    empty = [
-        Table(key="x", title="x", head=["a", "b"], rows=[], plot=plot) for plot in (None, "bars", "stacked", "heat")
-    ]
-    assert "<table>" in page_html(Stats(name="x", runs=[], content_digest="", tables=empty, absent=[]), Coverage())
 
 
 @pytest.mark.slow
@@ -256,21 +193,6 @@ def test_a_release_is_counted_again(built, tmp_path):
     assert places == sorted(places)  # how much, how good, a picture, tables, formulas
 
 
-@pytest.mark.parametrize(
-    ("told", "preset", "time"),
-    [
-        ({"weather_name": "heavy rain", "tod_name": "noon", "mode": "fixed"}, "heavy rain", "noon"),
-        ("mist", "mist", None),
-        (None, None, None),
-        ({"params": {}}, None, None),
-    ],
-)
-def test_the_record_of_a_flights_weather_is_read(told, preset, time):
-    """The names of its fields are those of tab:weather_meta."""
-    flight = replace(make_flight(3)[0], raw={"weather": told})
-    assert flight.weather == {"weather": preset, "time_of_day": time}
-
-
 def test_five_ray_visibility_is_what_the_inspection_measured(tmp_path):
     inputs = make_inputs(tmp_path / "inputs")
     inspected = read_inspection(inputs / "inspect.json")
@@ -288,25 +210,3 @@ def test_five_ray_visibility_is_what_the_inspection_measured(tmp_path):
     assert rows["five-ray visibility, as inspected"][0] == pytest.approx(np.mean(clean), abs=1e-4)
     assert rows["five-ray visibility, as inspected"][-1] == len(clean)
     assert "five-ray visibility of the planner" not in {one["what"] for one in written["absent"]}
-
-
-def test_weather_is_counted_where_frames_name_it():
-    rows = [make_row(i, weather="heavy rain" if i < 3 else "green sky", time_of_day="noon") for i in range(5)]
-    (table,) = [table for table in weather(counted(rows)) if table.key == "weather"]
-    grid = {row[0]: row[1:] for row in table.rows}
-    assert table.head == ["preset", "morning", "noon", "dusk", "night"]
-    assert len(grid) == 15 + 1
-    assert grid["heavy_rain"] == [0, 3, 0, 0]
-    assert grid["green_sky"] == [0, 2, 0, 0]
-    assert grid["clear"] == [0, 0, 0, 0]
-
-
-def test_damage_is_one_error(built, tmp_path):
-    broken = shutil.copytree(built, tmp_path / "dataset")
-    shard = next((broken / "data").glob("*.parquet"))
-    shard.write_bytes(shard.read_bytes()[:-40])
-    with pytest.raises(InputError):
-        run(broken, tmp_path / "stats")
-    assert not (tmp_path / "stats").exists()
-    with pytest.raises(InputError):
-        run(tmp_path / "nothing", tmp_path / "stats")

@@ -24,7 +24,6 @@ from specimens_release import run_here
 
 from caption.run.released import read_released
 from cosfly.errors import InputError
-from cosfly.products.flights import find_flights
 from cosfly.products.frames import instance_bytes
 from cosfly.reading.documents import read_json
 from cosfly.work.store import write_bytes
@@ -35,7 +34,6 @@ from release.package import stage as package
 from release.package.config import ReleaseConfig
 from release.package.sources import Source
 from release.rules import split_groups
-from release.verify.findings import EXAMPLES, Findings
 from release.verify.verify import verify
 
 TINY = [
@@ -86,18 +84,6 @@ def test_processes_find_what_one_finds(honest, tmp_path):
     one, two = (verify(forged, workers=workers, reader=read_released) for workers in (0, 2))
     assert not one.is_ok
     assert str(one) == str(two)
-
-
-@pytest.mark.parametrize(("name", "is_found"), [("LICENSE", False), (".gitattributes", False), ("notes.txt", True)])
-def test_a_file_that_no_record_knows_is_told_but_for_a_licence_and_what_the_hub_adds(honest, tmp_path, name, is_found):
-    folder = shutil.copytree(honest, tmp_path / "release")
-    (folder / name).write_text("words")
-    assert errors_in(folder, "structure") == ({"unexpected": 1} if is_found else {})
-
-
-def test_an_empty_folder_is_seen(dataset):
-    (dataset / "data/more/inner").mkdir(parents=True)
-    assert errors_in(dataset, "structure") == {"unexpected": 1}
 
 
 @pytest.mark.parametrize(
@@ -171,12 +157,6 @@ def _seed_of_other_splits(record: dict) -> int:
 def test_a_lie_of_the_record_is_found(honest, tmp_path, name):
     forged = forge(honest, tmp_path / "forged", change_record=RECORD_LIES[name])
     assert errors_in(forged, "rows"), name
-
-
-def test_towns_in_two_splits_are_a_leak_where_splits_are_by_town(honest, tmp_path):
-    splits = {flight["split"] for flight in read_json(honest / "release.json")["flights"]}
-    forged = forge(honest, tmp_path / "forged", change_record=RECORD_LIES["splits by town"])
-    assert ("leak" in errors_in(forged, "rows")) == (len(splits) > 1)
 
 
 # --- hostile files ----------------------------------------------------------------------------------------------------
@@ -317,19 +297,6 @@ def _rows_alone(honest: Path, out: Path, change) -> Path:
 # --- what it tells ----------------------------------------------------------------------------------------------------
 
 
-def test_one_line_a_kind_with_count_and_first_places():
-    findings = Findings()
-    for number in range(1000):
-        findings.error("kind", f"row {number}", number, "nothing")
-    findings.warn("other", "row 7", "a\nline", "none")
-    report = findings.report()
-    lines = str(report).splitlines()
-    assert len(lines) == 3
-    assert "kind: 1,000 times: row 0: got 0" in lines[0]
-    assert all(f"row {number}" in lines[0] for number in range(EXAMPLES))
-    assert report.num("error") == 1000
-
-
 def test_the_command_tells_people_and_machines(honest, tmp_path):
     forged = forge(honest, tmp_path / "forged", LIES["visibility_above_one"][0])
     before = {path: path.read_bytes() for path in forged.rglob("*") if path.is_file()}
@@ -342,12 +309,6 @@ def test_the_command_tells_people_and_machines(honest, tmp_path):
     assert {path: path.read_bytes() for path in forged.rglob("*") if path.is_file()} == before
     assert invoke("release verify", honest, "--level structure").exit_code == 0
     assert invoke("release verify", honest, "--level all").exit_code == 2
-
-
-def test_a_frame_that_is_missing_in_a_tree_is_found(honest_run, tmp_path):
-    tree = shutil.copytree(honest_run / "render", tmp_path / "tree")
-    (find_flights(tree)[0] / "frames_playback/frame_00003/rgb.png").unlink()
-    assert {"unreadable", "picture"} <= set(errors_in(tree))
 
 
 # --- trees --

@@ -12,14 +12,10 @@ import cv2
 import numpy as np
 import pytest
 from browser import browser
-from commands import invoke
-from hypothesis import given
-from hypothesis import strategies as st
 from release_tampering import forge
 from specimens_distill import WINDOW, make_caption
 from specimens_foreign import hub_snapshot
 
-from cosfly.errors import InputError
 from cosfly.look.frame_views import read_view
 from cosfly.products.boxes import make_box_map, write_boxes
 from cosfly.products.captions import write_captions
@@ -31,17 +27,10 @@ from release.columns import PLACE, POINT
 from release.record import read_record
 from release.stats import stats
 from release.viewer.content import (
-    PATH_POINTS,
     ViewerConfig,
-    ViewerPage,
-    boxes_of,
-    choose_flights,
-    choose_frames,
-    path_of,
-    spread,
 )
 from release.viewer.of_release import VIEW_OF, picture
-from release.viewer.page import page_html, run
+from release.viewer.page import run
 from specimens import make_playback_tree
 
 NUM_POINTS = 24
@@ -98,61 +87,6 @@ def data_of(text: str) -> dict:
 
 
 # --- what goes in -----------------------------------------------------------------------------------------------------
-
-
-@given(count=st.integers(0, 300), most=st.integers(0, 40))
-def test_a_spread_holds_both_ends_and_no_more_than_asked(count, most):
-    chosen = spread(count, most)
-    assert len(chosen) == min(count, most)
-    assert chosen == sorted(set(chosen))
-    assert not chosen or chosen[0] == 0
-    assert len(chosen) < 2 or chosen[-1] == count - 1
-
-
-@given(groups=st.lists(st.integers(0, 9), max_size=30), most=st.integers(1, 30))
-def test_the_tracks_of_a_trajectory_are_chosen_together(groups, most):
-    flights = list(range(len(groups)))
-    chosen = choose_flights(flights, groups, most)
-    taken = {groups[one] for one in chosen}
-    assert sorted(chosen) == [one for one in flights if groups[one] in taken]
-    assert len(chosen) <= most or len(taken) == 1
-    assert bool(chosen) == bool(groups)
-
-
-@given(num=st.integers(1, 80), captioned=st.sets(st.integers(0, 79)), most=st.integers(1, 20))
-def test_each_verdict_is_among_the_frames_while_there_is_room(num, captioned, most):
-    frames = list(range(0, 2 * num, 2))
-    kinds = {frame: frame % 3 for frame in frames if frame in captioned}
-    chosen = choose_frames(frames, kinds, most)
-    assert chosen == sorted(set(chosen))
-    assert set(chosen) <= set(frames)
-    assert len(chosen) == min(most, num)
-    assert len(set(chosen) & set(kinds)) == min(most, len(kinds))
-    if most >= 6:
-        assert {kinds[frame] for frame in chosen if frame in kinds} == set(kinds.values())
-
-
-def test_a_path_is_thinned_and_unknown_places_are_left_out():
-    points = np.arange(3_000.0).reshape(-1, 3)
-    points[5] = np.nan
-    path = path_of(points)
-    assert len(path) == PATH_POINTS
-    assert (path[0], path[-1]) == ((0.0, 1.0), (2997.0, 2998.0))
-    assert path_of(np.full((4, 2), np.nan)) == []
-
-
-def test_boxes_near_the_flights_are_drawn_ground_first():
-    rows = [[0, 0, 9], [0, 0, 0], [500, 0, 1], [20, 0, 1]]
-    town = make_box_map(
-        rows,
-        [[1, 2, 1]] * 4,
-        [[0, 90, 0]] + [[0, 0, 0]] * 3,
-        [KINDS["Buildings"], KINDS["Roads"], 3, KINDS["Vegetation"]],
-    )
-    shown = boxes_of(town, [(0.0, 0.0), (10.0, 0.0)])
-    assert [box.kind for box in shown] == ["Roads", "Vegetation", "Buildings"]
-    assert sorted(shown[2].corners) == [(-2.0, -1.0), (-2.0, 1.0), (2.0, -1.0), (2.0, 1.0)]  # turned by a quarter
-    assert boxes_of(town, []) == []
 
 
 def test_a_run_is_shown_as_it_is(page):
@@ -275,46 +209,6 @@ def test_a_page_keeps_its_size(run_folder, tmp_path):
     assert [len(flight["frames"]) for flight in data["flights"]] == [24]
 
 
-def test_what_cannot_be_read_is_said(run_folder, tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 2, 6)
-    first, *_, last = find_flights(tree)
-    (first / "trajectory.json").write_text("{", encoding="utf-8")
-    (last / "frames_playback/frame_00003/rgb.png").write_bytes(b"no picture")
-    (last / "frames_playback/frame_00004/depth.npy").unlink()
-    data = data_of(run(tree, tmp_path / "page.html", ViewerConfig()).read_text(encoding="utf-8"))
-    assert len(data["flights"]) == 3
-    assert any(note.startswith("not shown") for note in data["notes"])
-    assert "of 1 frames a picture cannot be read" in data["notes"]
-    frames = data["flights"][-1]["frames"]
-    assert set(frames[3]["pictures"]) == {"depth", "segmentation"}
-    assert set(frames[4]["pictures"]) == {"rgb", "segmentation"}
-
-
-def test_bad_folders_are_refused(tmp_path):
-    with pytest.raises(InputError):
-        run(tmp_path / "nothing", tmp_path / "page.html", ViewerConfig())
-    (tmp_path / "release.json").write_text("[]", encoding="utf-8")
-    with pytest.raises(InputError):
-        run(tmp_path, tmp_path / "page.html", ViewerConfig())
-    assert not (tmp_path / "page.html").exists()
-    result = invoke("view", tmp_path, "--out", tmp_path / "p.html", "--picture-px 0")
-    assert result.exit_code == 2
-
-
-def test_the_command_tells_the_size(run_folder, tmp_path):
-    result = invoke("view", run_folder, "--out", tmp_path / "p.html")
-    assert result.exit_code == 0, result.output
-    assert re.search(r"p\.html: 0\.\d MB", result.output)
-
-
-@given(st.text(max_size=60))
-def test_no_text_ends_the_data(text):
-    shown = ViewerPage(title=text, kind="run", notes=[text], maps={}, flights=[])
-    page = page_html(shown)
-    assert len(re.findall(r"<script", page)) == 2
-    assert data_of(page)["kind"] == "run"
-
-
 # --- in a browser -----------------------------------------------------------------------------------------------------
 
 
@@ -327,22 +221,6 @@ def tab(tmp_path_factory):
 
 
 COUNT = "document.getElementById('count').textContent"
-WHERE = "document.getElementById('where').textContent + ' ' + document.querySelector('.facts li').textContent"
-
-
-def values_of(tab, name: str) -> list[str]:
-    return tab.run(
-        f"[...document.querySelector('select[name={name}]').options].map((one) => one.value).filter(Boolean)"
-    )
-
-
-def set_filter(tab, name: str, value: str) -> None:
-    tab.run(
-        f"(() => {{ const one = document.querySelector('[name={name}]'); one.value = {json.dumps(value)};"
-        f" one.dispatchEvent(new Event(one.tagName === 'INPUT' ? 'input' : 'change')); }})()"
-    )
-
-
 # How many pixels of the map have a colour of the page's style.
 PIXELS = """(name) => {
   const pen = new OffscreenCanvas(1, 1).getContext("2d"), plan = document.getElementById("plan");
@@ -377,55 +255,6 @@ def test_the_page_opens_offline_and_shows_pictures_map_and_captions(tab, page):
 
 
 @pytest.mark.slow
-def test_filters_and_the_address_agree(tab, page):
-    tab.open(page)
-    assert set(values_of(tab, "verdict")) == {"ABSTAIN", "CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT"}
-    assert set(values_of(tab, "town")) == {"Town01", "Town02"}
-    assert set(values_of(tab, "evidence")) == {"contradicted", "not judged"}
-    set_filter(tab, "verdict", "HARD_CONFLICT")
-    assert tab.run(COUNT) == "4 of 48 frames"
-    assert tab.run("document.querySelector('.tag').textContent") == "HARD CONFLICT"
-    assert tab.run("document.querySelectorAll('.sentence.contradicted').length") == 2  # the Chinese one, and the key
-    set_filter(tab, "town", "Town02")
-    assert tab.run(COUNT) == "2 of 48 frames"
-    address = tab.run("location.hash")
-    tab.open(page, address)
-    assert tab.run(COUNT) == "2 of 48 frames"
-    assert tab.run("document.querySelector('select[name=town]').value") == "Town02"
-    set_filter(tab, "q", "frame 7")
-    assert tab.run(COUNT) == "2 of 48 frames"
-    set_filter(tab, "q", "nobody says this")
-    assert tab.run(COUNT) == "0 of 48 frames"
-    assert "Nothing matches" in tab.run("document.getElementById('flights').textContent")
-    tab.run("document.querySelector('#filters button').click()")
-    assert tab.run(COUNT) == "48 of 48 frames"
-    tab.open(page, "#repair=yes")
-    assert "repair: anchored, first hover" in tab.run("document.querySelector('.tags').textContent")
-
-
-@pytest.mark.slow
-def test_keys_and_the_slider_move_in_time(tab, page):
-    tab.open(page)
-    first = tab.run(WHERE)
-    tab.press("ArrowRight")
-    second = tab.run(WHERE)
-    assert second != first
-    tab.press("ArrowLeft")
-    assert tab.run(WHERE) == first
-    tab.press("ArrowLeft")  # the first frame stays
-    assert tab.run(WHERE) == first
-    tab.press("ArrowDown")
-    assert "aug_001" in tab.run(WHERE)
-    tab.press("ArrowUp")
-    tab.run(
-        "(() => { const one = document.getElementById('time'); one.value = one.max; "
-        "one.dispatchEvent(new Event('input')); })()"
-    )
-    assert f"frame {NUM_POINTS - 2}" in tab.run(WHERE)
-    assert f"frame={NUM_POINTS - 2}" in tab.run("location.hash")
-
-
-@pytest.mark.slow
 def test_hostile_text_is_text(tab, page):
     tab.said.clear()
     tab.open(page, "#q=window.hacked")
@@ -439,15 +268,3 @@ def test_hostile_text_is_text(tab, page):
     tab.open(page, "#town=%3Cimg%20src%3Dx%3E&flight=%22&frame=NaN&q=%00%3C")
     assert tab.run("document.body.dataset.ready") == "yes"
     assert tab.said == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("width", "dark"), [(1400, False), (1400, True), (390, False), (390, True)])
-def test_nothing_leaves_the_window(tab, page, width, dark):
-    tab.open(page, width=width, height=900, dark=dark)
-    assert tab.run("document.documentElement.scrollWidth") <= width
-    ink, paper = tab.run(
-        "(() => { const one = getComputedStyle(document.body); return [one.color, one.backgroundColor]; })()"
-    )
-    brightness = [sum(map(int, re.findall(r"\d+", color)[:3])) for color in (ink, paper)]
-    assert (brightness[0] > brightness[1]) is dark

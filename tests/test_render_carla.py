@@ -11,15 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulator_serving import as_client, command, free_port, listening, serving
+from simulator_serving import as_client, command, free_port, serving
 from simulators.scene import clothes_of
 from test_renderers_contract import circling, street, write_inputs
 
-from cosfly.errors import ConfigError, EnvironmentMissing, InputError, RenderError
+from cosfly.errors import EnvironmentMissing, RenderError
 from cosfly.geometry import intrinsic_matrix, world_from_camera
-from cosfly.maps import carla_export
-from cosfly.maps.carla_export import CarlaMapConfig
-from cosfly.products.boxes import BoxMap, write_boxes
+from cosfly.products.boxes import write_boxes
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.kinds import KINDS
@@ -31,7 +29,6 @@ from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.unreal.conventions import DEPTH_STEP_M
 from cosfly.work.config import build
-from cosfly.work.runner import Watch
 
 pytest.importorskip("carla")
 FRAMES = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0], "town": "Street", "first_timestamp": 1776000000}
@@ -104,20 +101,6 @@ def test_a_tree_is_the_embedded_renderers_frame_by_frame(tmp_path):
         assert ours["camera"] == theirs["camera"]
     for ours, theirs in zip(pictures_of(tree), pictures_of(reference), strict=True):
         _same_but_for_the_person(ours, theirs, exact=ours[0] == "ORI")
-
-
-@pytest.mark.slow
-def test_a_flight_zooms_by_other_cameras(tmp_path):
-    inputs = flown(tmp_path / "in", 1, 8)
-    zoom = {"fovs_deg": [60.0, 30.0], "zoom": {"mode": "dynamic", "part_s": 1.0, "ramp_s": 0.5}}
-    reference = run(build(RenderConfig, CLEAN | zoom, "test"), *inputs, tmp_path / "gl", seed=5)
-    with serving(street(), tmp_path / "town") as port:
-        tree = run(config(port, CLEAN | zoom), *inputs, tmp_path / "carla", seed=5, workers=1)
-    frames = list(zip(pictures_of(tree), pictures_of(reference), strict=True))
-    assert {frame[0][-1].camera.fov_deg for frame in frames} == {30.0, 60.0}
-    for ours, theirs in frames:
-        assert ours[-1].camera == theirs[-1].camera
-        _same_but_for_the_person(ours, theirs, exact=False)
 
 
 def _same_but_for_the_person(ours: tuple, theirs: tuple, *, exact: bool) -> None:
@@ -231,57 +214,6 @@ def test_a_server_that_we_start_is_started_again(tmp_path):
         )
 
 
-@pytest.mark.slow
-def test_a_server_that_we_start_and_that_hangs_is_ended_and_started_again(tmp_path):
-    """By the health checks, long before its client gives up."""
-    inputs = flown(tmp_path / "in", 1, 5)
-    write_boxes(tmp_path / "boxes_3d.json", street())
-    plain = " ".join(command(tmp_path / "boxes_3d.json", 0)).replace(" 0", " {port}")
-    start = f"sh -c 'mkdir {tmp_path}/first 2>/dev/null && exec {plain} --fault hang@7; exec {plain}'"
-    cfg = config(free_port(), timeout_s=300.0, server_command=start, health_check_s=2.0)
-    begin_s = time.monotonic()
-    tree = run(cfg, *inputs, tmp_path / "tree", workers=1, watch=Watch(heartbeat_s=0.5, check_s=1.0))
-    assert time.monotonic() - begin_s < 200.0
-    assert len(find_flights(tree)) == 1
-    assert (tree / "events.jsonl").read_text().count('"worker_died"') == 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("fault", ["malformed:depth@7", "hang@7"])
-def test_a_worker_whose_client_crashes_or_whose_server_hangs_is_replaced(fault, tmp_path):
-    inputs = flown(tmp_path / "in", 1, 5)
-    with serving(street(), tmp_path / "town", fault) as port:
-        cfg = config(port, timeout_s=8.0, health_check_s=0.5)
-        if fault.startswith("hang"):
-            with pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port}"):
-                run(cfg, *inputs, tmp_path / "tree", workers=1, watch=Watch(heartbeat_s=0.5, check_s=1.0))
-        else:
-            assert (
-                len(
-                    find_flights(
-                        run(cfg, *inputs, tmp_path / "tree", workers=1, watch=Watch(heartbeat_s=0.5, check_s=1.0))
-                    )
-                )
-                == 1
-            )
-    events = (tmp_path / "tree/events.jsonl").read_text()
-    assert '"worker_died"' in events
-    assert '"restarted"' in events
-
-
-def test_settings_and_maps_that_cannot_be_are_told(tmp_path):
-    with pytest.raises(ConfigError, match="a sun, an air and a horizon of its own"):
-        config(2000, {**CLEAN, "look": {"haze_m": 10.0}})
-    elsewhere = street((500.0, 0.0, 0.0))
-    expected = r"127\.0\.0\.1:\d+ \(CARLA 0\.9\.16\), street.*no box of the map"
-    with serving(street(), tmp_path / "town") as port, pytest.raises(InputError, match=expected):
-        as_client(_open, elsewhere, port)
-
-
-def _open(box_map: BoxMap, port: int) -> None:
-    open_renderer("carla", box_map, 160, 90, settings=build(CarlaRenderConfig, {"port": port, **QUICK}, "test"))
-
-
 def _in_weather(port: int) -> tuple:
     """A picture in a night of rain by CARLA and by the embedded renderer, one in the found weather, and knobs read
     back."""
@@ -344,20 +276,3 @@ def test_a_killed_client_leaves_the_world_as_it_was_found(tmp_path):
         while (found := as_client(found_settings, port)) != (False, 0, 5.0) and time.monotonic() < until_s:
             time.sleep(0.5)
     assert found == (False, 0, 5.0)
-
-
-def test_a_server_of_another_version_is_refused_by_name(tmp_path):
-    write_boxes(tmp_path / "boxes_3d.json", street())
-    port = free_port()
-    old = (
-        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); from simulators import carla_server; "
-        "carla_server.CARLA_VERSION = '0.9.15'; from simulators.__main__ import main; main()"
-    )
-    words = command(tmp_path / "boxes_3d.json", port)
-    told = rf"127\.0\.0\.1:{port}: a CARLA server of another version; got 0\.9\.15; expected 0\.9\.16"
-    cfg = build(CarlaRenderConfig, {"port": port, **QUICK}, "test")
-    with listening([sys.executable, "-c", old, *words[2:]]):
-        with pytest.raises(EnvironmentMissing, match=told):
-            open_renderer("carla", street(), 160, 90, settings=cfg)
-        with pytest.raises(EnvironmentMissing, match=told):
-            carla_export.load(CarlaMapConfig(port=port), 0)

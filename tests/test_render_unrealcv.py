@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import random
-import re
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from simulator_serving import command, free_port, serving
+from simulator_serving import serving
 from simulators.scene import clothes_of
 from simulators.unrealcv_server import UnrealCvServer
 from test_cosfly_maps_unrealcv import beside
@@ -20,7 +17,7 @@ from test_renderers_contract import street
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.errors import ConfigError, CosflyError, EnvironmentMissing, InputError, RenderError
+from cosfly.errors import EnvironmentMissing, RenderError
 from cosfly.geometry import intrinsic_matrix, world_from_camera
 from cosfly.maps import unrealcv_export
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig
@@ -31,7 +28,6 @@ from cosfly.render.contract import PERSON_ID, PosedCar, PosedOther, PosedPerson,
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.render.unrealcv_backend import UnrealCvRenderConfig
-from cosfly.unreal.assets import id_of
 from cosfly.unreal.unrealcv_client import UnrealCvConfig, connect
 from cosfly.work.config import build
 
@@ -146,24 +142,6 @@ def test_people_and_cars_stand_where_they_are_and_the_lens_changes():
     assert not (near.ids == other_id(0)).any(), "who is gone is taken away"
 
 
-def test_a_level_of_another_scale_is_found_before_a_frame_is_drawn():
-    """The pitfall: metres taken for centimetres park the camera at ground level, and pictures show legs."""
-    with beside(street()) as port:
-        for own, told in (
-            ({"coord_scale": 1.0}, r"coord_scale 1, .*expected coord_scale 100, coord_z_offset -?0\.00.*--coord-scale"),
-            (
-                {"coord_z_offset": 7.0},
-                r"coord_z_offset 7: objects are 7\.0 m.*expected coord_scale 100, coord_z_offset",
-            ),
-        ):
-            with pytest.raises(
-                ConfigError, match=rf"127\.0\.0\.1:{port} \(UnrealCV 1\.1\.0\), street.*ground level.*{told}"
-            ):
-                opened(port, exported(), **own)
-        with pytest.raises(InputError, match=rf"127\.0\.0\.1:{port}.*no box of the map is in the level"):
-            opened(port, street())
-
-
 def test_a_camera_that_falls_is_found(monkeypatch):
     done = UnrealCvServer._done
 
@@ -187,28 +165,6 @@ def test_a_camera_that_falls_is_found(monkeypatch):
 # --- what goes wrong --------------------------------------------------------------------------------------------------
 
 
-GARBAGE = (
-    b"", b"error", b"nan nan nan", b"1e400 0 0 0 0 0", b"-1 -1 -1 -2 -2 -2", b"0 0 0 1e11 1e11 1e11", b"(R=999,G=1,B=1",
-    b"\x89PNG\r\n\x1a\n" + b"x" * 50, b"\x93NUMPY\x01\x00", b"\xff\xfe\x00", b"a\nb\nc", b"\x1b[31m", b"x" * 100_000,
-)  # fmt: skip
-
-
-@pytest.mark.parametrize("share", [0.05, 0.2, 1.0])
-def test_garbage_in_place_of_answers_is_an_error_of_ours(share, monkeypatch):
-    given, rng, done = exported(), random.Random(1), UnrealCvServer._done
-    pose = world_from_camera(np.array([-1.0, -9.5, 5.5]), np.array([-32.5, 60.0, 0.0]))
-    monkeypatch.setattr(
-        UnrealCvServer,
-        "_done",
-        lambda server, text: rng.choice(GARBAGE) if rng.random() < share else done(server, text),
-    )
-    for _ in range(6):
-        with beside(street()) as port, contextlib.suppress(CosflyError):
-            unrealcv_export.load(UnrealCvMapConfig(port=port, timeout_s=2.0), 0)
-        with beside(street()) as port, contextlib.suppress(CosflyError):
-            opened(port, given, timeout_s=2.0, retries=1).render(pose, intrinsic_matrix(160, 90, 60.0), None)
-
-
 @pytest.mark.slow
 def test_lost_late_double_and_broken_pictures_are_asked_again(tmp_path):
     given = inputs(tmp_path / "in", 1, 5)
@@ -219,17 +175,6 @@ def test_lost_late_double_and_broken_pictures_are_asked_again(tmp_path):
             cfg = config(port, timeout_s=3.0, animate=False)
             trees.append(run(cfg, *given, tmp_path / f"tree_{name}", workers=1))
     assert files_of(trees[0]) == files_of(trees[1])
-
-
-@pytest.mark.slow
-def test_a_silent_camera_fails_the_flight_with_its_name_and_keeps_the_finished_ones(tmp_path):
-    given = inputs(tmp_path / "in", 2, 4)
-    with serving(street(), tmp_path / "town", "drop:depth@6+", protocol="unrealcv") as port:
-        tree = run(config(port, timeout_s=2.0, retries=1), *given, tmp_path / "tree", workers=1)
-    (failure,) = [json.loads(line) for line in (tree / "failures.jsonl").read_text().splitlines()]
-    told = rf"UnrealCV 1\.1\.0 at 127\.0\.0\.1:{port}, street: a camera sends no picture.*camera 0: no answer in 2 s"
-    assert re.search(told, failure["message"]), failure
-    assert len(find_flights(tree)) == 1
 
 
 @pytest.mark.slow
@@ -247,20 +192,6 @@ def test_a_server_that_ends_is_named_and_the_run_goes_on_with_the_next(fault, to
         files = files_of(run(config(port), *given, tmp_path / "tree", workers=1))
     assert len(find_flights(tmp_path / "tree")) == 2
     assert {name: files[name] for name in kept} == kept
-
-
-@pytest.mark.slow
-def test_a_server_that_we_start_is_started_again(tmp_path):
-    """The first dies after some frames; two workers have ports of their own, one after the other."""
-    given = inputs(tmp_path / "in", 2, 4)
-    write_boxes(tmp_path / "boxes_3d.json", street())
-    port = free_port()
-    plain = " ".join(command(tmp_path / "boxes_3d.json", 0, protocol="unrealcv")).replace(" 0 ", " {port} ")
-    start = f"sh -c 'mkdir {tmp_path}/{{port}} 2>/dev/null && exec {plain} --fault die@3; exec {plain}'"
-    tree = run(config(port, timeout_s=20.0, server_command=start), *given, tmp_path / "tree", workers=2)
-    assert len(find_flights(tree)) == 2
-    assert (tmp_path / str(port)).is_dir()
-    assert (tmp_path / str(port + 1)).is_dir()
 
 
 @pytest.mark.slow
@@ -289,16 +220,3 @@ def test_the_papers_options(tmp_path):
         assert (gif.n_frames, gif.info["duration"]) == (3, 120)
     assert "render.path_index: no such flight; got 7; expected below 2" in str(other.exception)
     assert not (tmp_path / "other").exists()
-
-
-def test_a_level_that_is_not_there_and_nobody_there_are_told(tmp_path):
-    port = free_port()
-    with pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port} \(UnrealCV unknown\): no UnrealCV server"):
-        opened(port, street())
-    with beside(street()) as port, pytest.raises(ConfigError, match=rf"127\.0\.0\.1:{port}.*no such level; got Town99"):
-        opened(port, street(), level="Town99")
-    with pytest.raises(ConfigError, match="a sun, an air and a horizon of its own"):
-        config(9000, {**CLEAN, "look": {"haze_m": 10.0}})
-    with pytest.raises(ConfigError, match="draws no weather"):
-        config(9000, {**CLEAN, "weather_mode": "random_per_path"})
-    assert id_of("Walls_55") in exported().ids.tolist()
