@@ -82,7 +82,6 @@ SMALL = {
         *("render.width_px=160", "render.height_px=90", "render.fovs_deg=[60]"),
     ),
     "run quickstart --out runs/five": _set("pedestrians.num_paths=2"),
-    "run runs/five --set": _set("pedestrians.num_paths=3"),
     "bench": ["--workers", "2"],
     "reproduce": ["--walks", "1", "--workers", "1"],
     "distill train": _set(

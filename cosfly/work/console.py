@@ -92,7 +92,7 @@ def set_levels(level: int) -> None:
     """Let our own log lines of a level through; of libraries, which log how they work, warnings only."""
     logging.getLogger().setLevel(level)
     # Of those that speak to servers some log requests whole, with the key in them.
-    noisy_ones = "httpx httpcore httpx2 httpcore2 huggingface_hub urllib3 botocore aiobotocore s3fs fsspec"
+    noisy_ones = "httpx httpcore httpx2 httpcore2 huggingface_hub urllib3"
     for noisy in (*noisy_ones.split(), "numba", "PIL", "asyncio"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
 
