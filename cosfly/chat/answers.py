@@ -49,8 +49,7 @@ Count = Annotated[int, Field(strict=True, ge=0, le=10**15)]  # of all runs into 
 class Answer(BaseModel):
     """A line of a journal: what an engine answered.
 
-    usage: empty where a server does not count. served_by: the model that answered, where the server names another one
-    than was asked for.
+    usage: empty where a server does not count.
     """
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
@@ -63,15 +62,13 @@ class Answer(BaseModel):
     usage: dict[CountName, Annotated[Count, Field(le=MOST_TOKENS)]]
     structured: str = ""
     finish_reason: str | None = None
-    served_by: str | None = Field(None, exclude_if=lambda name: name is None)
     latency_s: float = Field(0.0, ge=0)
     time: float = 0.0
 
     @property
     def reply(self) -> Reply:
         usage = Usage(**self.usage) if self.usage else None
-        who = self.served_by or self.model
-        return Reply(self.text, usage, self.structured, self.finish_reason, who, is_kept=True)
+        return Reply(self.text, usage, self.structured, self.finish_reason, is_kept=True)
 
 
 class Totals(BaseModel):
@@ -276,7 +273,6 @@ class KeptAnswers:
                 usage=reply.usage.model_dump() if reply.usage else {},
                 structured=reply.structured,
                 finish_reason=reply.finish_reason,
-                served_by=None if reply.model == self.engine.model else reply.model,
                 latency_s=round(time.monotonic() - start_s, 3),
                 time=round(time.time(), 3),
             )

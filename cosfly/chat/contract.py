@@ -35,15 +35,14 @@ class Request:
 class Reply:
     """One answer. `structured` says how its shape was enforced: json_schema, plain, or native (written by rules).
 
-    usage: None where the server does not tell. finish_reason: the server's word, or CONTEXT_FULL. model: who answered,
-    as the server says. is_kept: it was given before, and kept.
+    usage: None where the server does not tell. finish_reason: the server's word, or CONTEXT_FULL. is_kept: it was given
+    before, and kept.
     """
 
     text: str
     usage: Usage | None
     structured: str
     finish_reason: str | None = None
-    model: str | None = field(default=None, compare=False)
     is_kept: bool = field(default=False, compare=False)
 
 

@@ -116,7 +116,7 @@ def read_completion(response: Response, structured: str) -> Reply | str:
         return f"{ERROR_INSTEAD}: {error_words(choice) if choice.get('error') else finish_reason}"
     if text is None:
         return "no text in the message"
-    return Reply(text, _usage(value.get("usage")), structured, _name(finish_reason), _name(value.get("model")))
+    return Reply(text, _usage(value.get("usage")), structured, _name(finish_reason))
 
 
 def _name(value: Any) -> str | None:
