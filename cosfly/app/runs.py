@@ -96,15 +96,13 @@ class RunLook:
         return {folder: count for folder, count in counts.items() if count}
 
 
-def look(run: Path, cfg: RunConfig | None = None) -> RunLook:
-    """Look at a run folder.
+def look(run: Path) -> RunLook:
+    """Return what is in a run folder.
 
-    Args:
-        cfg: its settings, where they are known: then it need not be there yet.
     Raises:
         InputError: it is none. ConfigError: its `run.yaml` is not of this version.
     """
-    if cfg is None and not (run / "run.yaml").is_file():
+    if not (run / "run.yaml").is_file():
         raise InputError(
             "not a run folder",
             where=run,
@@ -112,7 +110,7 @@ def look(run: Path, cfg: RunConfig | None = None) -> RunLook:
             expected="a folder that `cosfly run` made",
             fix="cosfly list DIR finds them",
         )
-    cfg = cfg or load(RunConfig, run / "run.yaml")
+    cfg = load(RunConfig, run / "run.yaml")
     folders = [(f"{town}/{name}", run / town / name) for town in cfg.towns for name in STAGES[:-1]]
     folders = [*folders, ("release", run / "release")] if cfg.towns else [(name, run / name) for name in STAGES]
     found = [run / name for name in TO_LOOK_AT if (run / name).exists()]
