@@ -238,8 +238,11 @@ def two_tracks(tmp_path_factory):
         MapHeader(ground_z_m=0.0),
     )
     planned = Poses(clean.positions_m, clean.rotations_deg, clean.targets_m, np.full(NUM_POINTS, 5.0))
-    cfg = PerturbationConfig(frame_margin=0.0)
-    shaken = perturb(planned, [clean.camera] * len(clean), Surroundings(boxes), cfg, np.random.default_rng(3))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PerturbationConfig, "frame_margin", 0.0)
+        shaken = perturb(
+            planned, [clean.camera] * len(clean), Surroundings(boxes), PerturbationConfig(), np.random.default_rng(3)
+        )
     hidden = np.zeros(NUM_POINTS, dtype=bool)
     hidden[60:66] = True
     perturbed = dataclasses.replace(

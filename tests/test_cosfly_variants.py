@@ -20,8 +20,8 @@ def flown(value, reason=None):
 
 
 def test_a_change_that_cannot_be_is_named():
-    cfg = VariantsConfig(variants={"wrong": ("muco.weight_jerks=2",)})
-    with pytest.raises(ConfigError, match=r"the variant wrong.*weight_jerk"):
+    cfg = VariantsConfig(variants={"wrong": ("track_astar.beams=2",)})
+    with pytest.raises(ConfigError, match=r"the variant wrong.*beam"):
         cfg.of("wrong")
 
 

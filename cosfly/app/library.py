@@ -35,11 +35,9 @@ from cosfly.work.config import build
 __all__ = ["BoxMap", "DroneTrace", "Frame", "load_map", "plan", "read_captions", "render_frames"]
 
 # Settings that a function makes something of; it refuses the others of the section.
-OF_WALK = PedestriansConfig.model_fields.keys() - {
-    *("num_paths", "others", "look_alikes", "traffic", "others_reach_m", "roi_vertices")
-}
+OF_WALK = PedestriansConfig.model_fields.keys() - {*("num_paths", "others", "look_alikes", "traffic", "roi_vertices")}
 OF_PACE = {
-    "cruise_speed_mps", "curvature_gain_m", "speed_jitter", "min_speed_mps", "max_speed_mps", "pace", "hurry_speed_mps",
+    "cruise_speed_mps", "curvature_gain_m", "speed_jitter", "min_speed_mps", "pace", "hurry_speed_mps",
     "dt_s",
 }  # fmt: skip
 OF_PICTURE = {"backend", "look", "rim", *WeatherConfig.model_fields}

@@ -320,7 +320,7 @@ def run(
         NoPathError: nothing is walkable. NothingKept: not one walk could be made; a walk that fails alone is counted.
     """
     inputs = {"map": simplified_map} | ({"roi": roi} if roi else {})
-    settings = cfg.model_dump(mode="json")
+    settings = cfg.all_values()
     stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
     product = out / "path.json"
     if stage.is_complete:

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import shapely
@@ -58,7 +58,7 @@ class PedestriansConfig(Config):
 
     num_paths: int = Field(20, ge=1, le=100_000, description="walks to make")
     resolution_m: float = Field(0.5, gt=0, le=10, description="side of a grid cell, m")
-    human_height_m: float = Field(2.0, gt=0, description="boxes that reach between the ground and this height block, m")
+    human_height_m: ClassVar[float] = 2.0  # boxes that reach between the ground and this height block, m
     safety_radius_m: float = Field(0.5, ge=0, le=50, description="how far walkers stay off obstacles, m; 0 is off")
     min_distance_m: float = Field(50.0, gt=0, description="least straight distance from start to goal, m")
     max_distance_m: float = Field(100.0, gt=0, le=2000, description="greatest straight distance from start to goal, m")
@@ -86,7 +86,7 @@ class PedestriansConfig(Config):
     curvature_gain_m: float = Field(5.0, ge=0, description="alpha of eq:speed, m: how much corners slow; 0 is off")
     speed_jitter: float = Field(0.15, ge=0, lt=1, description="beta of eq:speed: random share of speed; 0 is off")
     min_speed_mps: float = Field(0.0, ge=0, description="speeds are raised to this, m/s (never below 0.05)")
-    max_speed_mps: float = Field(1.6, ge=SLOWEST_SPEED_MPS, description="speeds are cut to this, m/s")
+    max_speed_mps: ClassVar[float] = 1.6  # speeds are cut to this, m/s
     pace: dict[str, float] = Field(
         {PLAIN_PACE: 1.0}, description=f"share of the walks at each pace, drawn to a quota: {', '.join(PACES)}"
     )
@@ -106,7 +106,7 @@ class PedestriansConfig(Config):
     roi_vertices: MayDiffer[int] = Field(
         MOST_VERTICES, ge=3, description="most vertices of a region of interest; more are refused"
     )
-    others_reach_m: float = Field(40.0, gt=0, le=500, description="how near to a walk its others keep, m")
+    others_reach_m: ClassVar[float] = 40.0  # how near to a walk its others keep, m
     dt_s: float = Field(
         DT_S,
         ge=0.05,

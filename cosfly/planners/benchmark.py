@@ -163,7 +163,7 @@ def run(
     flown = {record.id: result_of(record, compare.FlightsOfWalk) for record in done.kept}
     lines = [ScenarioRecord(id=name, flights=f.flights, infeasible=f.errors) for name, f in flown.items()]
     write_bytes(raw, "".join(dump_json(line.model_dump()) + "\n" for line in lines).encode())
-    header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.model_dump(mode="json")}
+    header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.all_values()}
     summary = summarize(read_scenarios(raw), cfg.planners, rng_for(seed, "plan_benchmark", "intervals"))
     found = Benchmark(**header, **summary)
     write_model(product, found, FORMAT)

@@ -254,7 +254,7 @@ def run(
         raise stage.nothing_kept(finished.tally, expected="a walk that all planners fly")
     shared = {record.id: result_of(record, FlightsOfWalk) for record in finished.kept}
     flights = {name: _flights_of(name, shared, out) for name in cfg.planners}
-    header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.model_dump(mode="json")}
+    header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.all_values()}
     named = {name: ALL_PLANNERS[name] for name in flights}
     summary = {
         "planners": named,

@@ -14,7 +14,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -93,28 +93,24 @@ class MucoConfig(Config):
         description="wanted slant distance to the target, through the air, m; of muco alone: foresight keeps "
         "plan.behind_distance_m over ground and plan.altitude_preferred_m",
     )
-    weight_tracking: float = Field(2.0, ge=0, description="weight of (distance - track_distance_m)^2")
-    weight_smoothness: float = Field(4.0, ge=0, description="weight of the squared second difference")
-    weight_jerk: float = Field(3.0, ge=0, description="weight of the squared third difference")
-    weight_safety: float = Field(2.0, ge=0, description="weight of half the squared intrusion into influence_m")
+    weight_tracking: ClassVar[float] = 2.0  # weight of (distance - track_distance_m)^2
+    weight_smoothness: ClassVar[float] = 4.0  # weight of the squared second difference
+    weight_jerk: ClassVar[float] = 3.0  # weight of the squared third difference
+    weight_safety: ClassVar[float] = 2.0  # weight of half the squared intrusion into influence_m
     weight_visibility: float = Field(2.0, ge=0, description="weight of (1 - five-ray visibility)^2")
-    weight_view_angle: float = Field(1.0, ge=0, description="weight of squared pitch and azimuth deviation, per rad^2")
-    weight_path_length: float = Field(2.0, ge=0, description="weight of a tenth of the path length")
-    weight_below: float = Field(50.0, ge=0, description="weight of squared altitude below altitude_min_m")
-    weight_above: float = Field(20.0, ge=0, description="weight of squared altitude above altitude_preferred_m")
-    weight_oscillation: float = Field(8.0, ge=0, description="weight of the squared change of altitude per step")
-    weight_bearing: float = Field(
-        40.0, ge=0, description="weight of squared azimuth deviation of styles other than follow, per rad^2"
-    )
-    weight_beneath: float = Field(
-        2.0, ge=0, description="weight of squared altitude beneath the wished one of styles other than follow"
-    )
-    weight_pitch: float = Field(
-        20.0, ge=0, description="weight of squared pitch outside pitch_band_deg, per rad^2 (the paper names none)"
-    )
-    influence_m: float = Field(8.0, gt=0, description="obstacles nearer than this add to the safety term, m")
+    weight_view_angle: ClassVar[float] = 1.0  # weight of squared pitch and azimuth deviation, per rad^2
+    weight_path_length: ClassVar[float] = 2.0  # weight of a tenth of the path length
+    weight_below: ClassVar[float] = 50.0  # weight of squared altitude below altitude_min_m
+    weight_above: ClassVar[float] = 20.0  # weight of squared altitude above altitude_preferred_m
+    weight_oscillation: ClassVar[float] = 8.0  # weight of the squared change of altitude per step
+    weight_bearing: ClassVar[float] = 40.0  # weight of squared azimuth deviation of styles other than follow, per rad^2
+    # weight of squared altitude beneath the wished one of styles other than follow
+    weight_beneath: ClassVar[float] = 2.0
+    # weight of squared pitch outside pitch_band_deg, per rad^2 (the paper names none)
+    weight_pitch: ClassVar[float] = 20.0
+    influence_m: ClassVar[float] = 8.0  # obstacles nearer than this add to the safety term, m
     pitch_deg: float = Field(45.0, gt=0, lt=90, description="wanted downward pitch of the camera, degrees")
-    pitch_band_deg: tuple[float, float] = Field((30.0, 60.0), description="pitch outside costs extra, degrees")
+    pitch_band_deg: ClassVar[tuple[float, float]] = (30.0, 60.0)  # pitch outside costs extra, degrees
     low_visibility: float = Field(0.3, ge=0, le=1, description="visibility below this is low")
     low_visibility_frames: int = Field(
         20, ge=1, description="so many low frames in a row take visibility and view angle out of the gradient"
@@ -124,39 +120,30 @@ class MucoConfig(Config):
         description="newton: band-matrix step, shortened until the loss falls; paper: the paper's optimizer as it is "
         "printed, plain steps along finite differences whatever the loss does",
     )
-    difference_m: float = Field(0.5, gt=0, description="half width of the difference window, m")
+    difference_m: ClassVar[float] = 0.5  # half width of the difference window, m
     learning_rate: float = Field(0.05, gt=0, description="of the paper's step; the newton step has none")
     step_cap_m: float = Field(0.5, gt=0, description="longest move of a waypoint in one iteration, m")
     iterations_max: int = Field(1500, ge=0, description="iterations at most")
     tolerance: float = Field(
         1e-5, gt=0, description="converged when the loss changes by less: a part of it (newton), or as it is (paper)"
     )
-    pushes_max: int = Field(10, ge=1, description="pushes out of obstacles per waypoint and projection, at most")
-    start_visibility: float = Field(
-        0.95, ge=0, le=1, description="search for a better start when flying plainly behind sees less; 0: never"
-    )
-
-    @model_validator(mode="after")
-    def _check(self) -> MucoConfig:
-        low, high = self.pitch_band_deg
-        if not 0 <= low < high <= 90:
-            raise ValueError("pitch_band_deg must be two angles from 0 to 90, the lower one first")
-        return self
+    pushes_max: ClassVar[int] = 10  # pushes out of obstacles per waypoint and projection, at most
+    start_visibility: ClassVar[float] = 0.95  # search for a better start when flying plainly behind sees less; 0: never
 
 
 class TrackAStarConfig(Config):
     """Settings of TA*+Smooth (subsec:appendix_planner_tastar); what the terms are stands in track_astar.py."""
 
     voxel_m: float = Field(4.0, gt=0, description="voxel size in the plane, m")
-    voxel_height_m: float = Field(4.0, gt=0, description="voxel height, m")
+    voxel_height_m: ClassVar[float] = 4.0  # voxel height, m
     corridor_m: float = Field(45.0, gt=0, description="horizontal margin of the grid round the walk, m")
     beam: int = Field(2048, ge=1, description="places kept per time layer")
-    weight_tracking: float = Field(2.0, ge=0, description="weight of the distance to the preferred ring, in voxels")
+    weight_tracking: ClassVar[float] = 2.0  # weight of the distance to the preferred ring, in voxels
     weight_visibility: float = Field(18.0, ge=0, description="weight of the blocked part of the five rays")
-    weight_path: float = Field(1.0, ge=0, description="weight of the way, in voxels")
-    weight_safety: float = Field(8.0, ge=0, description="weight of the squared intrusion into influence_m")
-    weight_smoothness: float = Field(0.15, ge=0, description="weight of the squared change of the move, in voxels")
-    influence_m: float = Field(8.0, gt=0, description="obstacles nearer than this add to the safety term, m")
+    weight_path: ClassVar[float] = 1.0  # weight of the way, in voxels
+    weight_safety: ClassVar[float] = 8.0  # weight of the squared intrusion into influence_m
+    weight_smoothness: ClassVar[float] = 0.15  # weight of the squared change of the move, in voxels
+    influence_m: ClassVar[float] = 8.0  # obstacles nearer than this add to the safety term, m
 
 
 class PlanConfig(Config):
@@ -178,9 +165,8 @@ class PlanConfig(Config):
     accel_max_mps2: float = Field(
         5.0, gt=0, description="greatest change of speed from a step to the next, m/s^2; muco.step: paper knows none"
     )
-    heading_smoothing_s: float = Field(
-        4.0, ge=0, description="standard deviation of the smoothing of the walking direction, s; 0: none"
-    )
+    # standard deviation of the smoothing of the walking direction, s; 0: none
+    heading_smoothing_s: ClassVar[float] = 4.0
     five_ray_mean_min: float = Field(
         FIVE_RAY_MEAN_MIN, ge=0, le=1, description="drop a flight whose mean five-ray visibility is lower; 0: never"
     )

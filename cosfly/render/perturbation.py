@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -61,9 +61,7 @@ class PerturbationConfig(Config):
         description="distance that a shifted drone keeps from obstacles, m; where the plan is nearer, as far as the "
         "plan",
     )
-    frame_margin: float = Field(
-        0.02, ge=0, lt=0.5, description="share of the image at each border where the person may not be"
-    )
+    frame_margin: ClassVar[float] = 0.02  # share of the image at each border where the person may not be
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from cosfly.render.lens import ZoomConfig
 from cosfly.render.perturbation import PerturbationConfig
 from cosfly.render.unrealcv_backend import UnrealCvRenderConfig
 from cosfly.render.weather import WeatherConfig
-from cosfly.work.config import Config, MayDiffer
+from cosfly.work.config import Config
 
 ENGINES = ("carla", "unrealcv")  # renderers that are running somewhere
 
@@ -86,9 +86,6 @@ class RenderConfig(WeatherConfig):
         ge=0,
         lt=1,
         description="a target is visible if more than this share of its box is seen and one pixel of it drawn",
-    )
-    encoder_threads: MayDiffer[int] = Field(
-        2, ge=1, le=64, description="threads that encode and write beside the drawing"
     )
 
     @property

@@ -53,6 +53,7 @@ RENDERERS = {
 VARIANTS = {"clean": "ORI", "perturbed": PERTURBED}
 TRAJECTORY = "trajectory_"
 FIRST_S, SPAN_S = 1_000_000_000, 999_000_000  # seconds of ten digits, as those of the public release
+ENCODER_THREADS = 2  # of each worker, next to the drawing
 FROM_ONE_RUN = "give the others.json that was written beside the walks' path.json"
 
 
@@ -376,7 +377,7 @@ def make_worker(
         script = script_flight(trace, number, track, town, surroundings, cfg, seed, others, weather)
         folder = out / town / script.trajectory / script.variant
         with atomic_folder(folder) as unfinished:
-            flight = render_flight(renderer, script, unfinished, writing, cfg.encoder_threads)
+            flight = render_flight(renderer, script, unfinished, writing, ENCODER_THREADS)
         return Outcome(
             {
                 "folder": str(folder.relative_to(out)),

@@ -16,6 +16,7 @@ import re
 import time
 import weakref
 from collections.abc import Sequence
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -52,7 +53,6 @@ log = logging.getLogger(__name__)
 MOST_CHECKED = 200  # objects that are held against the map
 SAME_BOX_M, SAME_PLACE_M = 1.0, 0.1
 COLORS = 1 << 24
-ASSET = r"^[\w/.-]+$"
 
 
 class UnrealCvRenderConfig(UnrealCvConfig):
@@ -62,14 +62,9 @@ class UnrealCvRenderConfig(UnrealCvConfig):
     settle_delay_s: float = Field(0.1, ge=0, description="how long the engine goes on after a pose, s")
     camera: int = Field(0, ge=0, description="number of the camera, of `vget /cameras`")
     animate: bool = Field(True, description="people walk while the engine settles; false: they are only placed")
-    person_asset: str = Field(
-        "/Game/TrafficSystem/Pedestrian/Base_User_Agent.Base_User_Agent_C",
-        pattern=ASSET,
-        description="blueprint of people",
-    )
-    car_asset: str = Field(
-        "/Game/TrafficSystem/Vehicle/Vehicle1.Vehicle1_C", pattern=ASSET, description="blueprint of cars"
-    )
+    # blueprint of people
+    person_asset: ClassVar[str] = "/Game/TrafficSystem/Pedestrian/Base_User_Agent.Base_User_Agent_C"
+    car_asset: ClassVar[str] = "/Game/TrafficSystem/Vehicle/Vehicle1.Vehicle1_C"  # blueprint of cars
     server_command: MayDiffer[str] = Field(
         "",
         description="starts a server, with {port} in it; it is started again when it dies; empty: servers run already",

@@ -15,7 +15,7 @@ The paper's SimWorld runs simplify otherwise (app:simworld:step3); its variants 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 import shapely
@@ -225,9 +225,9 @@ class MergeGaps(Config):
 
     Vegetation: float | None = Field(2.0, ge=0.0, description="canopy parts of simulators stand closer than this, m")
     Buildings: float | None = Field(5.0, ge=0.0, description="wall segments of one building stand closer than this, m")
-    Walls: float | None = Field(None, ge=0.0, description="free-standing walls, m; null: not merged")
-    Fences: float | None = Field(None, ge=0.0, description="fences, m; null: not merged")
-    Static: float | None = Field(None, ge=0.0, description="street furniture, m; null: not merged")
+    Walls: ClassVar[float | None] = None  # free-standing walls, m; null: not merged
+    Fences: ClassVar[float | None] = None  # fences, m; null: not merged
+    Static: ClassVar[float | None] = None  # street furniture, m; null: not merged
 
 
 class SimplifyConfig(Config):
@@ -251,7 +251,7 @@ class SimplifyConfig(Config):
     cut_height_m: float = Field(2.0, gt=0.0, description="height over the ground of the split, m")
     lift_m: float = Field(0.5, ge=0.0, description="how far the canopy is lifted over the cut, m")
     trunk: Literal["stem", "full"] = Field("stem", description="below the cut: stems, or full footprints (paper)")
-    stem_radius_m: float = Field(0.25, gt=0.0, description="half width of a stem, m")
+    stem_radius_m: ClassVar[float] = 0.25  # half width of a stem, m
     split_z_m: float = Field(5.0, gt=0.0, description="adaptive: height over the ground of the lowest cut, m")
     adaptive_height_m: float = Field(5.0, gt=0.0, description="adaptive: vegetation higher than this is cut, m")
     cell_size_m: float = Field(0.5, gt=0.0, description="adaptive: width of what stands below the lowest cut, m")
@@ -297,14 +297,14 @@ def simplify(box_map: BoxMap, cfg: SimplifyConfig) -> Simplification:
         passes.append(("prune_nested", result.counts()))
     told = {
         "passes": [SimplifyPass(name=name, counts=counts) for name, counts in passes],
-        "simplify": cfg.model_dump(mode="json", exclude={"picture_px"}),
+        "simplify": {name: value for name, value in cfg.all_values().items() if name != "picture_px"},
     }
     header = box_map.header.model_copy(update=told)
     return Simplification(replace(result, header=header, meshes=Meshes()), passes)
 
 
 def _merge_rules(cfg: SimplifyConfig) -> dict[int, MergeRule]:
-    gaps = {KINDS[name]: gap for name, gap in cfg.merge_gap_m.model_dump().items() if gap is not None}
+    gaps = {KINDS[name]: gap for name, gap in cfg.merge_gap_m.all_values().items() if gap is not None}
     return {
         kind: MergeRule(gap, cfg.min_canopy_fill if kind == VEGETATION else cfg.min_fill) for kind, gap in gaps.items()
     }

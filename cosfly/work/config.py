@@ -5,10 +5,12 @@ from __future__ import annotations
 import copy
 import importlib.resources
 from collections.abc import Iterable, Iterator
+from inspect import get_annotations
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import to_jsonable_python
 
 from cosfly.errors import ConfigError, InputError, nearest, plain
 from cosfly.reading.files import read_text
@@ -33,10 +35,26 @@ class Config(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     def recorded(self) -> dict[str, Any]:
-        """Give the settings that decide what a stage makes, JSON-able: all but those that are MayDiffer."""
-        fields = {name for name, field in type(self).model_fields.items() if _MAY_DIFFER not in field.metadata}
-        groups = {name: getattr(self, name) for name in fields if isinstance(getattr(self, name), Config)}
-        return self.model_dump(mode="json", include=fields) | {name: group.recorded() for name, group in groups.items()}
+        """Return the settings and constants that decide what a stage makes, JSON-able: all but those of MayDiffer."""
+        values = {name: getattr(self, name) for name in self._names() if not self._may_differ(name)}
+        groups = {name: value.recorded() for name, value in values.items() if isinstance(value, Config)}
+        return to_jsonable_python(values) | groups
+
+    def all_values(self) -> dict[str, Any]:
+        """Return all settings and constants, JSON-able."""
+        values = {name: getattr(self, name) for name in self._names()}
+        groups = {name: value.all_values() for name, value in values.items() if isinstance(value, Config)}
+        return to_jsonable_python(values) | groups
+
+    @classmethod
+    def _names(cls) -> list[str]:
+        """Return the names of settings and constants (ClassVar) in the order of their declaration."""
+        names = (name for base in reversed(cls.__mro__) if issubclass(base, Config) for name in get_annotations(base))
+        return [name for name in dict.fromkeys(names) if name in cls.model_fields or name in cls.__class_vars__]
+
+    @classmethod
+    def _may_differ(cls, name: str) -> bool:
+        return name in cls.model_fields and _MAY_DIFFER in cls.model_fields[name].metadata
 
 
 C = TypeVar("C", bound=BaseModel)
