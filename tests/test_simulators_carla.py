@@ -9,6 +9,7 @@ from concurrent.futures.process import BrokenProcessPool
 import numpy as np
 import pytest
 from simulator_serving import as_client, serving
+from simulators.carla_server import depth_picture
 from test_renderers_contract import street
 
 from cosfly.geometry import intrinsic_matrix, world_from_camera
@@ -18,7 +19,6 @@ from cosfly.unreal.conventions import (
     DEPTH_STEP_M,
     camera_rotation_deg,
     depth_of,
-    depth_picture,
     tags_of,
     unreal_pose,
     world_pose,

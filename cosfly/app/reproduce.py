@@ -291,7 +291,7 @@ def _jpeg(path: Path) -> str:
 
 def settings(cfg: RunConfig, printed: Paper) -> Part:
     """Set the settings of the run beside what the paper prints."""
-    data, rows = cfg.model_dump(mode="json"), Rows()
+    data, rows = cfg.all_values(), Rows()
     for label, wanted in printed.settings.items():
         for name, theirs in wanted.items():
             own = _at(data, name.split("."))

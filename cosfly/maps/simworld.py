@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import logging
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, field_validator
@@ -55,7 +55,7 @@ class SimWorldConfig(Config):
     tool: str = Field("SimWorld city generator", description="tool and version that made the world, for the records")
     licence: LicenceId = Field("apache-2.0", description="licence, as the hub spells it; goes into every release")
     credits: str = Field("SimWorld, maitrix-org and contributors", description="who must be named: the world's makers")
-    road_length_m: float = Field(200.0, gt=0.0, description="length of a road piece, m: the generator's default")
+    road_length_m: ClassVar[float] = 200.0  # length of a road piece, m: the generator's default
     unknown: Literal["error", "drop"] = Field(
         "error", description="what an asset without a kind or a size is: an error, or left out and counted"
     )

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -45,9 +46,8 @@ class UnrealCvMapConfig(UnrealCvConfig):
     credits: str = Field("SimWorld, maitrix-org and contributors", description="who must be named: the level's makers")
     sizes: list[Path] = Field([], description="asset size tables of SimWorld, the first with an asset counts")
     ground_z_m: float | None = Field(None, description="height of the ground, m; null takes the roads' median top")
-    huge_m: float = Field(
-        150.0, gt=0, description="what is longer both ways and higher than 2 m is left out and counted, m: landscapes"
-    )
+    # what is longer both ways and higher than 2 m is left out and counted, m: landscapes
+    huge_m: ClassVar[float] = 150.0
     most_default: float | None = Field(
         None, ge=0, le=1, description="largest share of boxes of a `default` size; more fail the export; null: any"
     )

@@ -32,7 +32,7 @@ from cosfly.pedestrians.walkable import (
     ROI_SHARE_MIN,
     PedestriansConfig,
     WalkableGround,
-    shares_on_map,
+    share_on_map,
     walkable_ground,
 )
 from cosfly.products.backdrop import Backdrop
@@ -208,10 +208,9 @@ class Editor:
         """Read a file's bytes; gives the region and its cells."""
         roi = parse_roi(data, where, self.cfg.roi_vertices)
         roi.check_map(self.box_map, where)
-        inside, turned = shares_on_map(roi, self.box_map)
+        inside = share_on_map(roi, self.box_map)
         if inside < ROI_SHARE_MIN:
             what, got = "a region of interest of another map, or of other axes", f"{inside:.0%} of it on this map"
-            got += f", {turned:.0%} with x and y changed over" if turned > inside else ""
             raise InputError(what, where=where, got=got, expected=f"at least {ROI_SHARE_MIN:.0%}")
         return {"roi": roi.model_dump(), **self.cells(roi, where)}
 

@@ -230,7 +230,8 @@ def walkable_ground(
     with clock("project"):
         grid = occupancy(box_map, height_m=cfg.human_height_m, like=empty)
         is_in_roi = None if roi is None else roi_mask(grid, roi)
-    turned = "" if roi is None else _check_roi(roi, box_map, roi_where)
+    if roi is not None:
+        _check_roi(roi, box_map, roi_where)
     with clock("inflate"):
         inflated = inflate(grid, cfg.safety_radius_m)
         free = ~inflated.occupied
@@ -254,7 +255,7 @@ def walkable_ground(
         **({} if is_steep is None else {"cells_steep": _count(is_steep)}),
         "cells_walkable": _count(free),
     }
-    _check_walkable(counts, where, roi_where, turned)
+    _check_walkable(counts, where, roi_where)
     with clock("connectivity"):
         place = where if roi is None else roi_where
         parts = _parts_of_large_components(free, cfg.min_component_cells, counts, place)
@@ -347,28 +348,22 @@ def _parts_of_large_components(
     return parts
 
 
-def shares_on_map(roi: Roi, box_map: BoxMap) -> tuple[float, float]:
-    """Give the share of a region that lies within a map's bounds, and that with x and y changed over."""
+def share_on_map(roi: Roi, box_map: BoxMap) -> float:
+    """Return the share of a region that lies within a map's bounds."""
     low, high = box_map.bounds()
-    region, bounds = roi.region(), shapely.box(*low[:2], *high[:2])
-    inside, turned = (
-        shapely.intersection(area, bounds).area / max(region.area, 1e-9)
-        for area in (region, shapely.transform(region, lambda points: points[:, ::-1]))
-    )
-    return inside, turned
+    region = roi.region()
+    return shapely.intersection(region, shapely.box(*low[:2], *high[:2])).area / max(region.area, 1e-9)
 
 
-def _check_roi(roi: Roi, box_map: BoxMap, where: str | Path) -> str:
-    """Warn if most of a region lies outside the map; gives a remark if x and y look changed over."""
+def _check_roi(roi: Roi, box_map: BoxMap, where: str | Path) -> None:
+    """Warn if most of a region lies outside the map."""
     roi.check_map(box_map, where)
-    inside, turned = shares_on_map(roi, box_map)
-    remark = f"; with x and y changed over, {turned:.0%} of it would lie inside: are they?" if turned > inside else ""
+    inside = share_on_map(roi, box_map)
     if 0.0 < inside < ROI_SHARE_MIN:
-        log.warning("%s: %.0f %% of the region of interest lies outside the map%s", where, 100 * (1 - inside), remark)
-    return remark
+        log.warning("%s: %.0f %% of the region of interest lies outside the map", where, 100 * (1 - inside))
 
 
-def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | Path, turned: str) -> None:
+def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | Path) -> None:
     if counts["cells_walkable"]:
         return
     if counts["cells_free"] and counts["cells_in_roi"] is None:
@@ -383,7 +378,7 @@ def _check_walkable(counts: dict[str, Any], where: str | Path, roi_where: str | 
             "the region of interest leaves no walkable cell",
             where=roi_where,
             got=f"{counts['cells_in_roi']} of the map's {counts['cells']} cells inside, none of them free ground",
-            fix=f"draw it over free ground of this map, in the map's world metres{turned}",
+            fix="draw it over free ground of this map, in the map's world metres",
         )
     raise NoPathError(
         "the map leaves no walkable cell",

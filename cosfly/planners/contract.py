@@ -112,9 +112,8 @@ class MucoConfig(Config):
     pitch_deg: float = Field(45.0, gt=0, lt=90, description="wanted downward pitch of the camera, degrees")
     pitch_band_deg: ClassVar[tuple[float, float]] = (30.0, 60.0)  # pitch outside costs extra, degrees
     low_visibility: float = Field(0.3, ge=0, le=1, description="visibility below this is low")
-    low_visibility_frames: int = Field(
-        20, ge=1, description="so many low frames in a row take visibility and view angle out of the gradient"
-    )
+    # so many low frames in a row take visibility and view angle out of the gradient
+    low_visibility_frames: ClassVar[int] = 20
     step: Literal["newton", "paper"] = Field(
         "newton",
         description="newton: band-matrix step, shortened until the loss falls; paper: the paper's optimizer as it is "

@@ -248,7 +248,7 @@ class SimplifyConfig(Config):
     crop_strategy: Literal["fixed", "adaptive"] = Field(
         "fixed", description="fixed: split at cut_height_m; adaptive: cut tall vegetation into low pieces (SimWorld)"
     )
-    cut_height_m: float = Field(2.0, gt=0.0, description="height over the ground of the split, m")
+    cut_height_m: ClassVar[float] = 2.0  # height over the ground of the split, m
     lift_m: float = Field(0.5, ge=0.0, description="how far the canopy is lifted over the cut, m")
     trunk: Literal["stem", "full"] = Field("stem", description="below the cut: stems, or full footprints (paper)")
     stem_radius_m: ClassVar[float] = 0.25  # half width of a stem, m

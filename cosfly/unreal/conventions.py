@@ -41,24 +41,10 @@ def camera_rotation_deg(camera_pose: np.ndarray) -> np.ndarray:
     return np.degrees([pitch, np.arctan2(turn[1, 0], turn[0, 0]), np.arctan2(turn[2, 1], turn[2, 2])])
 
 
-def depth_picture(depth_m: np.ndarray) -> np.ndarray:
-    """Encode z-depth, (h, w) m, as BGRA, (h, w, 4) uint8; to the nearest DEPTH_STEP_M, what is farther as 1000 m."""
-    steps = np.round(np.clip(depth_m.astype(np.float64) / DEPTH_RANGE_M, 0.0, 1.0) * DEPTH_STEPS).astype("<u4")
-    picture = steps[..., None].view(np.uint8)[..., [2, 1, 0, 3]]
-    picture[..., 3] = 255
-    return picture
-
-
 def depth_of(picture: np.ndarray) -> np.ndarray:
     """Decode z-depth, (h, w) float32 m, from BGRA."""
     blue, green, red = (picture[..., k].astype(np.uint32) for k in range(3))
     return ((red | green << 8 | blue << 16) * (DEPTH_RANGE_M / DEPTH_STEPS)).astype(np.float32)
-
-
-def tags_picture(kinds: np.ndarray, actors: np.ndarray) -> np.ndarray:
-    """Encode semantic numbers and actors' numbers, (h, w) each, as BGRA; of an actor's number 16 bits are left."""
-    low, high = actors & 0xFF, actors >> 8 & 0xFF
-    return np.stack([high, low, kinds, np.full_like(kinds, 255)], axis=-1).astype(np.uint8)
 
 
 def tags_of(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -27,9 +27,9 @@ from cosfly.products.weather import WeatherParams
 from cosfly.unreal.conventions import (
     ACTOR_BITS,
     CARLA_VERSION,
+    DEPTH_RANGE_M,
+    DEPTH_STEPS,
     SIMULATED_STEP_S,
-    depth_picture,
-    tags_picture,
     unreal_pose,
 )
 from simulators.scene import Fault, Mover, ServedScene, due, listen, send
@@ -289,6 +289,20 @@ class CarlaServer:
                 owners = numbers[self._scene.owners(frame.ids, self._movers())]
                 picture = tags_picture(frame.kinds, owners & ACTOR_BITS)
         return struct.pack("<IIf", *size, fov_deg) + picture.tobytes()
+
+
+def depth_picture(depth_m: np.ndarray) -> np.ndarray:
+    """Encode z-depth, (h, w) m, as BGRA, (h, w, 4) uint8; to the nearest DEPTH_STEP_M, what is farther as 1000 m."""
+    steps = np.round(np.clip(depth_m.astype(np.float64) / DEPTH_RANGE_M, 0.0, 1.0) * DEPTH_STEPS).astype("<u4")
+    picture = steps[..., None].view(np.uint8)[..., [2, 1, 0, 3]]
+    picture[..., 3] = 255
+    return picture
+
+
+def tags_picture(kinds: np.ndarray, actors: np.ndarray) -> np.ndarray:
+    """Encode semantic numbers and actors' numbers, (h, w) each, as BGRA; of an actor's number 16 bits are left."""
+    low, high = actors & 0xFF, actors >> 8 & 0xFF
+    return np.stack([high, low, kinds, np.full_like(kinds, 255)], axis=-1).astype(np.uint8)
 
 
 def _definitions() -> list:
