@@ -117,14 +117,12 @@ class Splits(Strict):
 
 
 class MadeBy(Strict):
-    """One stage of one source: its settings, seed, version, and the sha256 of what it read. Paths and addresses are
-    left out."""
+    """One stage of one source: its settings, seed and version. Paths and addresses are left out."""
 
     stage: str
     code_version: str
     seed: int
     config: dict[str, Any]
-    inputs: dict[str, str]
 
 
 class SourceRecord(Strict):
@@ -153,13 +151,11 @@ class ReleasedTeacher(Strict):
 
 
 class Repairs(Strict):
-    """Of the accepted captions, those whose first answer stood and those that a repair made, by rung; shares of all
-    accepted ones."""
+    """Of the accepted captions, those whose first answer stood and those that a repair made, by rung."""
 
     accepted: int
     first_answers: int
     repaired_by_rung: Counts
-    shares: dict[str, float]
 
 
 class Ceilings(Strict):

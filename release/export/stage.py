@@ -23,7 +23,7 @@ from cosfly.work.stage_folder import Resume, StageFolder, result_of
 from cosfly.work.store import CHECKSUMS, dump_json, inside, sha256_bytes, storage_errors, write_bytes, write_checksums
 from release.export.contract import ExportConfig, ExportUnit, FormatFacts, UnitFiles, format_of
 from release.export.source import Release, open_release, scan
-from release.record import ReleasedMap, StoredDepth, Strict
+from release.record import ReleasedMap, Strict
 
 EXPORT_FORMAT = FileFormat("cosfly.export", "1.1", "record of an export")
 
@@ -38,7 +38,7 @@ class SourceRelease(Strict):
 
 
 class ExportRecord(Strict):
-    """`export.json`. depth: how the release codes it; null where it has none. actions, prompts: the closed set of
+    """`export.json`. actions, prompts: the closed set of
     decisions (null: the one that ships) and the questions, as the release's record has them."""
 
     format: str
@@ -51,9 +51,7 @@ class ExportRecord(Strict):
     coordinates: dict[str, Any]
     actions: RecordedActions = Field(default_factory=shipped_actions)
     prompts: dict[str, dict[str, str]] = Field(default_factory=dict)
-    settings: dict[str, Any]
     codings: dict[str, str]
-    depth: StoredDepth | None
     notes: list[str]
     how_to_open: str
     frames: int
@@ -76,9 +74,7 @@ def describe(release: Release, facts: FormatFacts, cfg: ExportConfig, *, frames:
         coordinates=facts.coordinates or record.coordinates,
         actions=record.actions,
         prompts=record.prompts,
-        settings=cfg.recorded(),
         codings=facts.codings,
-        depth=record.depth,
         notes=facts.notes,
         how_to_open=facts.how_to_open,
         frames=frames,

@@ -50,8 +50,6 @@ from release.record import (
 )
 from release.rules import RULE, SPLIT_RULE
 
-DIGITS = 4  # of shares
-
 
 def provenance_of(sources: list[Source], inputs: Mapping[str, StageInput], account: CaptionAccount) -> Provenance:
     """Give what the record says of the sources and of all their captions.
@@ -61,7 +59,6 @@ def provenance_of(sources: list[Source], inputs: Mapping[str, StageInput], accou
     """
     repaired = dict(sorted(account.repairs.items()))
     first = account.accepted - sum(repaired.values())
-    parts = {"first_answers": first, **{f"repaired: {rung}": count for rung, count in repaired.items()}}
     return Provenance(
         versions={
             "cosfly": cosfly.__version__,
@@ -78,7 +75,6 @@ def provenance_of(sources: list[Source], inputs: Mapping[str, StageInput], accou
             accepted=account.accepted,
             first_answers=first,
             repaired_by_rung=repaired,
-            shares={name: round(count / account.accepted, DIGITS) for name, count in parts.items() if account.accepted},
         ),
         tokens=dict(sorted(account.tokens.items())),
         asks=account.asks,
@@ -99,7 +95,6 @@ def _source(source: Source, names: dict[str, str], inputs: Mapping[str, StageInp
                 code_version=record.code_version,
                 seed=record.seed,
                 config=published(record.config),
-                inputs={name: made_of.sha256 for name, made_of in record.inputs.items()},
             )
             for record in stages_behind(source.files.values())
         ],

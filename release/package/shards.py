@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import struct
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -28,7 +27,8 @@ from cosfly.products.frames import (
     tree_of,
 )
 from cosfly.products.playback import TARGET_FILE, Flight
-from cosfly.reading.arrays import PNG_HEADER_BYTES, PNG_SIGNATURE, png_size
+from cosfly.products.png import parse_png
+from cosfly.reading.arrays import PNG_HEADER_BYTES, png_size
 from cosfly.reading.files import check_stays_below, read_bytes, sha256_file
 from cosfly.work.items import advance
 from cosfly.work.provenance import FLIGHT, digest_of, folder_digests
@@ -41,7 +41,6 @@ from release.package.sources import Candidate
 from release.package.survey import look_of, open_flight
 from release.rules import is_whole, select_frames
 
-CHUNK_FRAME_BYTES = 12  # of a PNG's chunk: length, name, checksum
 # Bits a channel; colour type, RGB or RGBA; interlacing: bytes 24, 25 and 28 of a PNG. What the readers of a release
 # take.
 KIND = struct.Struct(">BBxxB")
@@ -72,10 +71,8 @@ def check_picture(file: FrameFile, data: bytes, size_px: tuple[int, int], where:
         got = f"{bits} bits, colour type {colour_type}{', interlaced' if interlace else ''}"
         expected = "8 bits, RGB or RGBA (2 or 6), not interlaced"
         raise InputError("a PNG of another kind", where=where, got=got, expected=expected, fix=CONVERT)
-    if not is_known and (chunk := next(_broken_chunks(data), None)):
-        raise InputError(
-            "a picture is damaged", where=where, got=f"chunk {chunk} does not have its checksum", fix=RENDER
-        )
+    if not is_known:
+        parse_png(data, where)
 
 
 def _check_depth(values: np.ndarray, size_px: tuple[int, int], where: Path) -> None:
@@ -91,19 +88,6 @@ def _check_depth(values: np.ndarray, size_px: tuple[int, int], where: Path) -> N
             expected=f"0 to {SKY_DEPTH_M:g} m",
             fix=RENDER,
         )
-
-
-def _broken_chunks(view: bytes) -> Iterator[str]:
-    """Name the chunks of a PNG whose bytes are not those of their checksums."""
-    at = len(PNG_SIGNATURE)
-    while at + CHUNK_FRAME_BYTES <= len(view):
-        end = at + CHUNK_FRAME_BYTES + int.from_bytes(view[at : at + 4], "big")
-        name = view[at + 4 : at + 8]
-        if end > len(view) or zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
-            yield repr(name.decode("latin-1"))
-        at = end
-    if at != len(view):
-        yield "after the last"
 
 
 MOST_TOLD = 20  # problems of one shard: after so many the others need not be looked for
