@@ -42,9 +42,6 @@ class Findings(Report):
         kind = Kind(severity=severity, code=code, where=place, got=cut(str(got)), expected=expected, examples=[place])
         self._merge(kind)
 
-    def note(self, code: str, where: object, got: object, expected: str) -> None:
-        self.add("note", code, where, got, expected)
-
     def judge(self, flight: FlightRows, rules: Iterable[tuple[str, str, np.ndarray, Words, Words]]) -> None:
         """Add an error for each row that is wrong. rules: code, column, which rows are wrong (n,) bool, what was found,
         what was expected."""

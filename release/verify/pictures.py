@@ -126,9 +126,8 @@ def _check_person_depth(
 
 
 class Survey(NamedTuple):
-    """A frame's mask and depth. low_m, high_m: least and greatest depth, NaN where one is not finite; num_odd_sky:
-    pixels of sky by one of depth and kind alone; num_person: of the person; num_odd_person: of the person's id with
-    another kind; most_kind: the greatest there is; box: (4,) of the person's pixels, edges at pixel borders."""
+    """A frame's depth, (least, greatest), NaN where not finite; counts of pixels: sky by one of depth and kind alone, of
+    the person, of the person's id with another kind; the greatest kind; box (4,) of the person, edges at borders."""
 
     low_m: float
     high_m: float
@@ -140,11 +139,7 @@ class Survey(NamedTuple):
 
 
 def survey(depth: np.ndarray, instance: np.ndarray) -> Survey:
-    """Look at every pixel of a frame once.
-
-    Args:
-        depth: (h, w) float32, or (0, 0) where there is none; instance: (h, w, 3) uint8, or (0, 0, 3).
-    """
+    """Look at every pixel once. depth: (h, w) float32, or (0, 0); instance: (h, w, 3) uint8, or (0, 0, 3)."""
     limits = np.array([depth.min(initial=np.inf), depth.max(initial=-np.inf)]) if depth.size else np.zeros(2)
     low, high = limits.tolist() if np.isfinite(limits).all() else (np.nan, np.nan)
     counts, box = _survey(depth, np.ascontiguousarray(instance))

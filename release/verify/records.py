@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from cosfly.errors import InputError
 from cosfly.products.splits import town_family
@@ -12,6 +13,7 @@ from cosfly.reading.files import read_bytes
 from cosfly.reading.tables import open_table
 from cosfly.work.stage_folder import flattened
 from release import columns
+from release.card.ceilings import ceilings_of
 from release.card.croissant import CROISSANT, render_croissant
 from release.card.numbers import compute_numbers
 from release.card.render import render_card
@@ -21,6 +23,7 @@ from release.rules import RULE, SPLIT_RULE, select_frames, split_groups
 from release.verify.across import Summary, frames_digest
 from release.verify.findings import Findings
 
+CEILINGS_DIFFER = 0.03  # another machine rounds otherwise, and a network's fit goes another way
 MOST_FRAMES = 2**31  # of a flight: their indices are int32
 
 
@@ -153,7 +156,16 @@ def check_numbers(folder: Path, record: ReleaseRecord, findings: Findings) -> No
     for name in sorted(computed.keys() | written.keys()):
         if computed.get(name) != written.get(name):
             findings.error("number", f"release.json: numbers.{name}", written.get(name), f"{computed.get(name)}")
+    if record.ceilings is not None:
+        told, again = (one.model_dump() for one in (record.ceilings, ceilings_of(folder, record)))
+        for name in (n for n in told if not _is_near(told[n], again[n])):
+            findings.error("number", f"release.json: ceilings.{name}", told[name], f"{again[name]}")
     findings.facts.append(f"{len(computed):,} numbers computed again from {len(paths):,} shards")
+
+
+def _is_near(told: Any, again: Any) -> bool:
+    are_shares = isinstance(told, float) and isinstance(again, float)
+    return told == again or (are_shares and abs(told - again) <= CEILINGS_DIFFER)
 
 
 def check_flights(record: ReleaseRecord, flights: list[Summary], findings: Findings) -> None:

@@ -21,9 +21,8 @@ NEAR_FRAMES = 2  # farther apart, more is hidden behind other things
 GONE_MOST = 0.02  # points before what the other frame draws: honest 0.001
 ERROR_MOST = 2e-4  # of planes; honest below 1e-5
 SAME_LEAST = 0.95  # of the instances, of ground the kinds; honest 0.985
-# Of the medians of a flight, as float32: ground and what stands on it. Honest 7e-7 and 4e-7; depth that is 0.3 m off
-# 8e-5 and more of ground, depth that is scaled by 2 % 1.8e-4 and more of what stands. What is round is no plane: of
-# pixels of a metre on a tower 1e-4 at most.
+# Of the medians of a flight: ground and what stands on it. Honest 7e-7 and 4e-7; depth that is 0.3 m off 8e-5 and more
+# of ground, depth that is scaled by 2 % 1.8e-4 and more of what stands; pixels of a metre on a round tower 1e-4 at most.
 FLAT_MOST, STANDING_MOST = 2e-5, 1e-4
 LEAST_FRAMES = 5  # for a median
 
@@ -53,8 +52,7 @@ def check_pictures(flight: FlightRows, pictures: Iterator[Pictures], findings: F
 
 
 def _judge_scale(flight: FlightRows, pairs: list[Pair], findings: Findings) -> None:
-    """Planes keep their place through all frames to the rounding of float32; those of a depth that is scaled or set off
-    move with the camera."""
+    """Find depth that is scaled or set off: its planes move with the camera."""
     for what, most, errors in (
         ("ground", FLAT_MOST, [pair.error_flat for *_, pair in pairs]),
         ("what stands on it", STANDING_MOST, [pair.error_standing for *_, pair in pairs]),

@@ -42,9 +42,8 @@ class Entry:
 
 def with_ids(entries: list[Entry]) -> list[Entry]:
     """Return the entries with what their sample ids must begin with; None where two flights have one name."""
-    places = [entry.place for entry in entries]
     try:
-        ids = flight_ids(places)
+        ids = flight_ids([entry.place for entry in entries])
     except (InputError, TypeError):
         return entries
     return [replace(entry, given_id=ids[entry.place]) for entry in entries]

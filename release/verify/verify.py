@@ -93,7 +93,7 @@ def _verify_release(folder: Path, how: _How, findings: Findings) -> None:
     records.check_card(folder, record, findings)
     findings.facts.append(f"structure: {len(record.shards):,} shards, {record.numbers.frames:,} frames by their record")
     if how.level != "structure" and len(readable) < len(record.shards):
-        findings.note("not_checked", "data", "shards that are missing or of other columns", "rows of all shards")
+        findings.add("note", "not_checked", "data", "shards that are missing or of other columns", "rows of all shards")
     elif how.level != "structure":
         _verify_rows(folder, record, how, findings)
     if how.level == "pixels":
@@ -155,7 +155,7 @@ def _verify_tree(folder: Path, how: _How, findings: Findings) -> None:
 def _check_all(
     source: FlightSource, entries: list[Entry], context: Context, how: _How, findings: Findings
 ) -> list[Summary]:
-    """Check every flight, by several processes, and all of them against each other; gives what was kept of each."""
+    """Check every flight by several processes, then all against each other; return a summary of each."""
     clean = {e.name.rpartition("/")[0]: e for e in entries if e.name.rpartition("/")[2] == ORIGINAL}
     items = []
     for entry in entries:
