@@ -22,7 +22,7 @@ GONE_MOST = 0.02  # points before what the other frame draws: honest 0.001
 ERROR_MOST = 2e-4  # of planes; honest below 1e-5
 SAME_LEAST = 0.95  # of the instances, of ground the kinds; honest 0.985
 # Of the medians of a flight: ground and what stands on it. Honest 7e-7 and 4e-7; depth that is 0.3 m off 8e-5 and more
-# of ground, depth that is scaled by 2 % 1.8e-4 and more of what stands; pixels of a metre on a round tower 1e-4 at most.
+# of ground; depth that is scaled by 2 % 1.8e-4 and more of what stands; pixels on a round tower 1e-4 at most.
 FLAT_MOST, STANDING_MOST = 2e-5, 1e-4
 LEAST_FRAMES = 5  # for a median
 

@@ -54,12 +54,8 @@ def verify(
     reader: CaptionReader | None = None,
     watch: Watch = Watch(),
 ) -> Verified:
-    """Check a release (also of a release stage or a run) or a playback tree.
-
-    Args:
-        level: each level does what the ones before it do. workers: processes; 0 works in this one. reader: recomputes
-        labels and verdicts; None: they are not recomputed. watch: when a worker counts as stalled.
-    """
+    """Check a release (also of a release stage or a run) or a playback tree. workers: processes; 0 works in this one.
+    reader: recomputes labels and verdicts; None: they are not recomputed."""
     findings, how = Findings(), _How(level, reader, workers, watch)
     folder = release_folder(folder)
     is_release = (folder / RECORD).is_file()
