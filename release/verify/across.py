@@ -32,10 +32,6 @@ class Summary:
     def trajectory(self) -> str:
         return self.name.rpartition("/")[0]
 
-    @property
-    def run(self) -> str:
-        return self.name.partition("/")[0]
-
 
 def summary_of(flight: FlightRows) -> Summary:
     """Return what is compared of a flight."""
@@ -75,10 +71,10 @@ def _check_pairs(flights: Mapping[str, Summary], both: bool, findings: Findings)
     """Check that twins name each other; where both tracks are wanted, that each flight of a run of both has one."""
     tracks: dict[str, set[str | None]] = defaultdict(set)
     for flight in flights.values():
-        tracks[flight.run].add(flight.track)
+        tracks[flight.name.partition("/")[0]].add(flight.track)
     for flight in flights.values():
-        twin = flights.get(flight.pair or "")
-        if flight.pair is None and flight.split is not None and both and len(tracks[flight.run]) > 1:
+        twin, num_tracks = flights.get(flight.pair or ""), len(tracks[flight.name.partition("/")[0]])
+        if flight.pair is None and flight.split is not None and both and num_tracks > 1:
             findings.error("pair", flight.name, "no twin", "both tracks, as settings.pairs says")
         elif flight.pair is not None and (
             twin is None

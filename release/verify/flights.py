@@ -55,33 +55,25 @@ class Context:
         return self.captions[max(runs, key=len)] if runs else {}
 
 
-@dataclass(frozen=True)
-class FlightJob:
-    """One flight to check, and for a perturbed one its clean flight."""
-
-    entry: Entry
-    twin: Entry | None = None
-
-
 def make_worker(
     source: FlightSource, level: Level, context: Context, reader: CaptionReader | None
 ) -> Callable[[Item], Outcome]:
     """Worker factory: return the function that checks one flight and returns its summary, None if it is unreadable."""
 
     def work(item: Item) -> Outcome:
-        findings, job = Findings(), item.payload
-        summary = None
+        findings, summary = Findings(), None
+        entry, clean = item.payload  # the clean flight of a perturbed one
         try:
-            flight = flight_rows(source, job.entry)
-            twin = flight_rows(source, job.twin) if job.twin is not None else None
+            flight = flight_rows(source, entry)
+            twin = flight_rows(source, clean) if clean is not None else None
             if not len(flight):
                 raise InputError("no rows", got="0")
-            _check_flight(flight, twin, source, job.entry, level, context, reader, findings)
+            _check_flight(flight, twin, source, entry, level, context, reader, findings)
             summary = vars(summary_of(flight))
         except InputError as error:
-            findings.error("unreadable", job.entry.name, f"{error.what}: {error.got}", "a flight that can be read")
+            findings.error("unreadable", entry.name, f"{error.what}: {error.got}", "a flight that can be read")
         except SENSELESS as error:
-            findings.error("senseless", job.entry.name, f"{type(error).__name__}: {error}", "rows that can be read")
+            findings.error("senseless", entry.name, f"{type(error).__name__}: {error}", "rows that can be read")
         return Outcome({"findings": findings.dumped(), "summary": summary})
 
     return work

@@ -8,12 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.geometry import BODY_FROM_CAMERA
 from cosfly.products.frames import SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.products.kinds import KINDS
 from cosfly.products.png import parse_png
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
-from cosfly.space.reprojection import View, median_of
+from cosfly.space.reprojection import COLUMNS, GRID_ROWS, SHARED_ID, median_of
 from cosfly.work.compiled import njit
 from release.columns import PICTURES
 from release.flight_rows import FlightRows
@@ -22,6 +21,7 @@ from release.verify.sources import Pictures
 
 SURFACE_M = PERSON_HALF_EXTENTS_M[2] + 0.3  # between the hip and the visible surface of a person along the optical axis
 PERSON, SKY, MOST_KIND = KINDS["Pedestrians"], KINDS["Sky"], max(KINDS.values())
+NUM_IDS = 65536
 NOTHING = np.empty((0, 0), np.float32)
 NOTHING.flags.writeable = False
 NO_IDS = np.empty((0, 0, 3), np.uint8)
@@ -62,29 +62,19 @@ def _colours(data: bytes | memoryview, where: str) -> tuple[np.ndarray, tuple[in
     return np.ascontiguousarray(png.pixels()[..., :3]), (png.width_px, png.height_px)
 
 
-def view_of(flight: FlightRows, i: int, decoded: Decoded) -> View:
-    depth, instance = decoded
-    rotation = flight.rotations[i] @ BODY_FROM_CAMERA
-    return View(depth, instance, np.ascontiguousarray(rotation), flight.pose[i, :3].copy())
-
-
 def check_picture(flight: FlightRows, i: int, decoded: Decoded, findings: Findings) -> bool:
     """Check depth and mask of a row with each other and with the row; False where the depth is no depth."""
     depth, instance = decoded
     found = survey(depth, instance)
-    good = not depth.size or _check_depth(flight.where(i, "depth"), found.low_m, found.high_m, findings)
+    good = not depth.size or 0.0 <= found.low_m < found.high_m
+    if not good:
+        got, expected = f"{found.low_m:.3f} to {found.high_m:.3f} m", f"a range within 0 to {SKY_DEPTH_M:g} m"
+        findings.error("depth_range", flight.where(i, "depth"), got, expected)
     if instance.size:
         if not flight.is_foreign:
             _check_instance(flight, i, found, bool(depth.size), findings)
         if depth.size and good:
             _check_person_depth(flight, i, instance, depth, findings)
-    return good
-
-
-def _check_depth(where: str, low: float, high: float, findings: Findings) -> bool:
-    good = 0.0 <= low < high
-    if not good:
-        findings.error("depth_range", where, f"{low:.3f} to {high:.3f} m", f"a range within 0 to {SKY_DEPTH_M:g} m")
     return good
 
 
@@ -126,8 +116,8 @@ def _check_person_depth(
 
 
 class Survey(NamedTuple):
-    """A frame's depth, (least, greatest), NaN where not finite; counts of pixels: sky by one of depth and kind alone, of
-    the person, of the person's id with another kind; the greatest kind; box (4,) of the person, edges at borders."""
+    """Least and greatest depth of a frame, NaN where one is not finite; pixels that are sky by one of depth and kind
+    alone, of the person, of its id with another kind; the greatest kind; box (4,) of the person, edges at borders."""
 
     low_m: float
     high_m: float
@@ -145,6 +135,18 @@ def survey(depth: np.ndarray, instance: np.ndarray) -> Survey:
     counts, box = _survey(depth, np.ascontiguousarray(instance))
     num_odd_sky, num_person, num_odd_person, most_kind = counts.tolist()
     return Survey(low, high, num_odd_sky, num_person, num_odd_person, most_kind, box)
+
+
+def new_kinds(instance: np.ndarray, known: np.ndarray) -> list[int]:
+    """Return id * 256 + kind of things at the grid's points that have another kind than is known of them, each once.
+    known: (NUM_IDS,) int16, -1: not seen yet."""
+    height, width = instance.shape[:2]
+    rows = ((np.arange(GRID_ROWS) + 0.5) * height / GRID_ROWS).astype(int)
+    columns = ((np.arange(COLUMNS) + 0.5) * width / COLUMNS).astype(int)
+    kinds, low, high = np.moveaxis(instance[np.ix_(rows, columns)].astype(np.int64), 2, 0)
+    ids = low | high << 8
+    is_new = (ids != 0) & (ids != SHARED_ID) & (known[ids] != kinds)
+    return np.unique((ids << 8 | kinds)[is_new]).tolist()
 
 
 def depths_of_person(depth: np.ndarray, instance: np.ndarray, box: np.ndarray, is_ours: bool) -> np.ndarray:

@@ -173,9 +173,8 @@ def check_flights(record: ReleaseRecord, flights: list[Summary], findings: Findi
     listed, found = {entry.flight: entry for entry in record.flights}, {flight.name: flight for flight in flights}
     for name in sorted(listed.keys() ^ found.keys()):
         findings.error("flight", name, "only in one of release.json and the shards", "the same flights in both")
-    asked = record.settings
     for name in sorted(listed.keys() & found.keys()):
-        entry, flight = listed[name], found[name]
+        entry, flight, asked = listed[name], found[name], record.settings
         for key in ("split", "walk", "pair"):
             got, told = getattr(flight, key), getattr(entry, key)
             if got != told:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
 
 from release.columns import CAPTION, CAPTION_NAMES, LANGUAGES, WINDOW
 from release.flight_rows import FlightRows, Row
@@ -19,7 +19,10 @@ def check_captions(flight: FlightRows, window_frames: int | None, findings: Find
     """
     released = set(flight.index.tolist())
     for i, row in enumerate(flight.rows):
-        tell = partial(_tell, flight, i, findings)
+
+        def tell(code: str, column: str, got: object, expected: str, i: int = i) -> None:
+            findings.error(code, flight.where(i, column), got, expected)
+
         if not row.get("has_caption"):
             if present := [name for name in CAPTION_NAMES if row.get(name) is not None]:
                 tell("caption", present[0], "a value", "null: has_caption is false")
@@ -30,11 +33,7 @@ def check_captions(flight: FlightRows, window_frames: int | None, findings: Find
             _check_decision(row, tell)
 
 
-def _tell(flight: FlightRows, i: int, findings: Findings, code: str, column: str, got: object, expected: str) -> None:
-    findings.error(code, flight.where(i, column), got, expected)
-
-
-def _check_window(row: Row, released: set[int], window_frames: int | None, tell: partial[None]) -> None:
+def _check_window(row: Row, released: set[int], window_frames: int | None, tell: Callable[..., None]) -> None:
     window, index = row[WINDOW], row["frame_index"]
     if any(frame is None or frame > index for frame in window):
         tell("window", WINDOW, window, f"nothing after frame {index}, which is the current one")
@@ -46,7 +45,7 @@ def _check_window(row: Row, released: set[int], window_frames: int | None, tell:
         tell("window", WINDOW, f"frame {min(set(window) - released)} is not in the rows", "windows that are whole")
 
 
-def _check_decision(row: Row, tell: partial[None]) -> None:
+def _check_decision(row: Row, tell: Callable[..., None]) -> None:
     """One decision, and a verdict that follows from it and the label."""
     decision, label, verdict = row["decision"], row["label"], row["verdict"]
     decisions = {decision, *(row[f"caption_{language}_flight_decision"] for language in LANGUAGES)}

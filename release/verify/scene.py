@@ -8,12 +8,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from cosfly.geometry import BODY_FROM_CAMERA
 from cosfly.space.reprojection import LEAST_SEEN, Agreement, View, compare_views
 from cosfly.work.items import advance
 from release.flight_rows import FlightRows
 from release.verify.findings import Findings
 from release.verify.goal import check_goal
-from release.verify.pictures import check_picture, decode, view_of
+from release.verify.pictures import NUM_IDS, check_picture, decode, new_kinds
 from release.verify.sources import Pictures
 
 LEAST_AGREE = 100  # points, for a share to mean something
@@ -25,14 +26,12 @@ SAME_LEAST = 0.95  # of the instances, of ground the kinds; honest 0.985
 # of ground; depth that is scaled by 2 % 1.8e-4 and more of what stands; pixels on a round tower 1e-4 at most.
 FLAT_MOST, STANDING_MOST = 2e-5, 1e-4
 LEAST_FRAMES = 5  # for a median
-
-
 Pair = tuple[int, int, Agreement]  # of neighbouring frames: row of the later one, frames between them
 
 
 def check_pictures(flight: FlightRows, pictures: Iterator[Pictures], findings: Findings) -> None:
     """Check all pictures of a flight, one after the other; memory holds two frames."""
-    pairs = list[Pair]()
+    pairs, kinds = list[Pair](), np.full(NUM_IDS, -1, np.int16)
     before: tuple[int, View] | None = None
     for i, files in enumerate(pictures):
         advance()
@@ -40,8 +39,11 @@ def check_pictures(flight: FlightRows, pictures: Iterator[Pictures], findings: F
         if decoded is None or not check_picture(flight, i, decoded, findings):
             before = None
             continue
+        if decoded[1].size and not flight.is_foreign:
+            _check_kinds(flight, i, decoded[1], kinds, findings)
         check_goal(flight, i, decoded, files.get("rgb"), findings)
-        view = view_of(flight, i, decoded)
+        rotation = np.ascontiguousarray(flight.rotations[i] @ BODY_FROM_CAMERA)
+        view = View(*decoded, rotation, flight.pose[i, :3].copy())
         if decoded[0].size and before is not None:
             k, previous = before
             agreement = compare_views(previous, view, flight.intrinsics[k], flight.intrinsics[i])
@@ -49,6 +51,18 @@ def check_pictures(flight: FlightRows, pictures: Iterator[Pictures], findings: F
         before = (i, view)
     if pairs and not flight.is_foreign:  # depth of others may be rough
         _judge_pairs(flight, pairs, findings)
+
+
+def _check_kinds(flight: FlightRows, i: int, instance: np.ndarray, kinds: np.ndarray, findings: Findings) -> None:
+    """Check that an instance is of one kind in all frames. kinds: (NUM_IDS,) as in the frames before; what is new is
+    added."""
+    for code in new_kinds(instance, kinds):
+        own, kind = code >> 8, code & 255
+        if kinds[own] >= 0:
+            got = f"instance {own} of kind {kind}"
+            findings.error("instance_kind", flight.where(i, "instance"), got, f"kind {kinds[own]}, as before")
+        else:
+            kinds[own] = kind
 
 
 def _judge_scale(flight: FlightRows, pairs: list[Pair], findings: Findings) -> None:

@@ -27,7 +27,7 @@ from release.record import RECORD, ReleaseRecord, read_record, release_folder
 from release.verify import records
 from release.verify.across import Summary, check_across
 from release.verify.findings import Findings, Verified
-from release.verify.flights import SENSELESS, Context, FlightJob, Level, make_worker
+from release.verify.flights import SENSELESS, Context, Level, make_worker
 from release.verify.folder import SMALL_BYTES, check_digests, check_names, read_digests
 from release.verify.sources import Entry, FlightSource, Shards, TreeFlights
 
@@ -98,13 +98,11 @@ def _verify_release(folder: Path, how: _How, findings: Findings) -> None:
 
 def _check_lists(record: ReleaseRecord, digests: dict[str, str], findings: Findings) -> None:
     """The list of checksums and release.json name the same files with the same digests."""
-    listed = {shard.path: shard.sha256 for shard in record.shards}
-    for name in sorted({*listed, *RECORDS} - {CHECKSUMS} ^ set(digests)):
-        place = "only in release.json" if name in listed else "only in one of the lists"
-        findings.error("checksum", f"{CHECKSUMS}: {name}", place, "one line per file")
-    for name, digest in listed.items():
-        if digests.get(name, digest) != digest:
-            findings.error("checksum", f"release.json: shards: {name}", digest, digests[name])
+    listed = dict.fromkeys(set(RECORDS) - {CHECKSUMS}) | {shard.path: shard.sha256 for shard in record.shards}
+    for name in sorted(listed.keys() | digests.keys()):
+        if name not in listed or digests.get(name) != (listed[name] or digests.get(name, "")):
+            got = f"{digests.get(name)} there, {listed.get(name)} in release.json"
+            findings.error("checksum", f"{CHECKSUMS}: {name}", got, "one line per file, the same digest in both")
 
 
 def _verify_rows(folder: Path, record: ReleaseRecord, how: _How, findings: Findings) -> None:
@@ -156,7 +154,7 @@ def _check_all(
     items = []
     for entry in entries:
         twin = clean.get(entry.name.rpartition("/")[0])
-        job = FlightJob(entry, None if twin is entry else twin)
+        job = (entry, None if twin is entry else twin)
         items.append(Item(entry.name, job, entry.num_rows if how.level == "pixels" and entry.num_rows else None))
     flights = []
     with tempfile.TemporaryDirectory(prefix="cosfly-verify-") as place:
