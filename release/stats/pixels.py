@@ -3,13 +3,17 @@ over the whole release."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
+from cosfly.errors import InputError
+from cosfly.look.frame_views import small_jpeg
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.products.kinds import KIND_NAMES
 from cosfly.reading.arrays import parse_picture
@@ -20,6 +24,7 @@ from release.columns import PICTURES
 from release.record import ReleaseRecord
 
 BIN_M, MOST_M = 0.25, 1000.0  # bins of the depth histogram; percentiles are to a bin
+PICTURE_PX, JPEG_QUALITY = 640, 80
 SHARES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
 
@@ -79,6 +84,20 @@ def look_at(dataset: Path, record: ReleaseRecord, most: int) -> Pixels:
                     pixels.add_kinds(parse_picture((cell or {}).get("bytes") or b"", where)[..., 2])
             advance(1)
     return pixels
+
+
+def middle_picture(dataset: Path, record: ReleaseRecord) -> str | None:
+    """Give the colour picture of the middle frame, JPEG in base64; None where there is none, or it cannot be read."""
+    if "rgb" not in record.settings.modalities:
+        return None
+    total = sum(shard.rows for shard in record.shards)
+    for row in _rows(dataset, record, ["rgb"], {total // 2}):
+        with contextlib.suppress(InputError):
+            data = (row[PICTURES["rgb"].name] or {}).get("bytes") or b""
+            return small_jpeg(
+                cv2.cvtColor(parse_picture(data, row["sample_id"]), cv2.COLOR_BGR2RGB), PICTURE_PX, JPEG_QUALITY
+            )
+    return None
 
 
 def _rows(

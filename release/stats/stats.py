@@ -16,7 +16,7 @@ from release.card.numbers import RowCounts, check_rows, row_lists
 from release.columns import SHORT_NAMES
 from release.record import ReleaseRecord, read_record, release_folder
 from release.stats.counting import Counts
-from release.stats.pixels import look_at
+from release.stats.pixels import look_at, middle_picture
 from release.stats.tables import Cell, Stats, Table, make_stats
 
 
@@ -44,7 +44,7 @@ def run(dataset: Path, out: Path, *, pixels: int = 200) -> Path:
     stats = make_stats(record, counts, looked)
     write_json(out / "stats.json", {**stats.model_dump(mode="json"), "coverage": card.coverage.model_dump(mode="json")})
     write_bytes(out / "stats.md", markdown(stats).encode())
-    text = page_html(stats, card.coverage, tiles_of(record, stats))
+    text = page_html(stats, card.coverage, tiles_of(record, stats), middle_picture(dataset, record))
     write_bytes(out / "stats.html", text.encode())
     return out / "stats.html"
 
@@ -53,15 +53,21 @@ def run(dataset: Path, out: Path, *, pixels: int = 200) -> Path:
 
 STYLE = """
 .tables { columns: 560px 2; column-gap: 12px; } .tables .panel { break-inside: avoid; }
-.tables .wide { column-span: all; margin-top: 12px; }
+.tables .wide { column-span: all; margin-top: 12px; } figure.first img { max-width: 100%; border-radius: 8px; }
 """
 
 
-def page_html(stats: Stats, coverage: Coverage, tiles: Sequence[tuple[str, str]] = ()) -> str:
-    """Return the page's text. tiles: what a person asks first, how much and how good."""
+def page_html(
+    stats: Stats, coverage: Coverage, tiles: Sequence[tuple[str, str]] = (), picture: str | None = None
+) -> str:
+    """Give the page's text.
+
+    Args:
+        tiles: what a person asks first, how much and how good. picture: of one frame, JPEG in base64.
+    """
     return page(
         "release/stats/page.html", title=", ".join(stats.runs) or stats.name, style=STYLE, stats=stats, tiles=tiles,
-        coverage=coverage_html(coverage), look=TABLE_LOOK,
+        picture=picture, coverage=coverage_html(coverage), look=TABLE_LOOK,
     )  # fmt: skip
 
 
