@@ -165,48 +165,9 @@ class ImageConfig(Config):
     )
     depth_range_m: float = Field(DEPTH_RANGE_M, gt=0, description="depth at the dark end of the pseudo-colour")
     encoding: Literal["jpeg", "png"] = Field("jpeg", description="encoding of the pictures in a request")
-    jpeg_quality: int = Field(90, ge=1, le=100, description="JPEG quality")
-    cache_frames: int = Field(256, ge=8, description="encoded frames kept in memory for the windows that share them")
-
-
-class LabelConfig(Config):
-    """Thresholds of the table in actions.py, over the whole future (2.5 s by default)."""
-
-    yaw_deg: float = Field(3.0, gt=0, description="yaw change that makes a turn")
-    hard_turn_deg: float = Field(10.0, gt=0, description="yaw change that contradicts track_straight")
-    altitude_m: float = Field(1.0, gt=0, description="altitude change that makes a climb or descent")
-    speed_change_mps: float = Field(0.8, gt=0, description="mean future speed less current speed that counts")
-    hover_mps: float = Field(0.3, gt=0, description="mean speed below which the drone hovers")
-    moving_mps: float = Field(0.5, gt=0, description="mean speed that contradicts hover")
-    forward_m: float = Field(0.5, gt=0, description="body-frame forward or backward displacement that counts")
-    lateral_m: float = Field(1.0, gt=0, description="body-frame lateral displacement that counts")
-    approach_m: float = Field(1.0, gt=0, description="change of the horizontal distance to the target that counts")
-    circle_deg: float = Field(15.0, gt=0, description="angle swept round the target that makes a circle")
-    absent_share: float = Field(
-        0.25,
-        ge=0,
-        lt=1,
-        description="a decision of which the flight shows less than this share of its threshold is contradicted "
-        "(turns: only by a turn to the other side); 0: only by the opposite motion",
-    )
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.moving_mps <= self.hover_mps:
-            raise ValueError("moving_mps must be larger than hover_mps, else hover would contradict itself")
-        if self.hard_turn_deg <= self.yaw_deg:
-            raise ValueError("hard_turn_deg must be larger than yaw_deg, else track_straight would contradict itself")
-        return self
 
 
 class EvidenceConfig(Config):
-    """How far a number in a caption may lie from the measured one before it counts as a contradiction."""
-
-    tolerance_m: float = Field(0.3, ge=0, description="metres")
-    tolerance_mps: float = Field(0.15, ge=0, description="metres per second")
-    tolerance_deg: float = Field(1.0, ge=0, description="degrees")
-    tolerance_px: float = Field(3.0, ge=0, description="pixels")
-    relative: float = Field(0.02, ge=0, le=1, description="share of the measured value, where that is more")
     drop: bool | None = Field(
         None,
         description="drop a sample whose text contradicts a measured value; empty: where slots say what it states",
@@ -292,16 +253,9 @@ class CaptionConfig(Config):
         description="folder with prompts of yours in the place of those that ship; `cosfly caption prompts --export "
         "DIR` writes one to begin with",
     )
-    actions: Path | None = Field(
-        None,
-        description="file with a closed set of actions of yours in the place of the one that ships: tokens, names in "
-        "both languages, what the "
-        "motion implies and contradicts; `cosfly caption actions --export FILE` writes one to begin with",
-    )
     flights: FlightChoice = Field(FlightChoice(), description="which flights of the tree")
     window: WindowConfig = Field(WindowConfig(), description="windows")
     image: ImageConfig = Field(ImageConfig(), description="pictures in a request")
-    label: LabelConfig = Field(LabelConfig(), description="thresholds of label and verdict")
     evidence: EvidenceConfig = Field(EvidenceConfig(), description="check of numbers against the flight")
     endpoint: EndpointConfig = Field(EndpointConfig(), description="how an endpoint is asked")
     student: StudentConfig = Field(StudentConfig(), description="a teacher that is a student, asked as it was taught")
@@ -381,5 +335,5 @@ class CaptionConfig(Config):
     def recorded(self) -> dict[str, Any]:
         """Where a teacher is asked does not decide what it says, so its kind is put on record; of own files their
         digests stand beside."""
-        own = {name: "own" if getattr(self, name) else None for name in ("prompts", "actions")}
-        return super().recorded() | {"teacher": self.teacher_kind} | own
+        own = "own" if self.prompts else None
+        return super().recorded() | {"teacher": self.teacher_kind, "prompts": own}

@@ -15,11 +15,10 @@ from typing import Any, Literal, Self, get_args, get_origin, overload
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict
 
 from cosfly.errors import InputError
 from cosfly.look.frame_views import VIEW_FILES, Pictures, View
-from cosfly.products.actions import ActionSet, RecordedActions, shipped_actions
 from cosfly.products.captions import Language, Prompt
 from cosfly.products.frames import frame_name
 from cosfly.products.splits import SPLITS, Split
@@ -107,16 +106,12 @@ class SourceTree(_Strict):
 
 
 class TrainingSet(_Strict):
-    """`training_set.json`. samples: of each split. systems: the system prompts, which samples name by their place.
-
-    actions: the closed set of the answers' decisions.
-    """
+    """`training_set.json`. samples: of each split. systems: the system prompts, which samples name by their place."""
 
     split_by: Literal["walk", "town"]
     trees: list[SourceTree]
     samples: dict[Split, int]
     systems: list[str]
-    actions: RecordedActions = Field(default_factory=shipped_actions)
 
 
 def read_training_set(dataset: Path) -> TrainingSet:
@@ -183,7 +178,7 @@ class Samples(Sequence[Sample]):
 
     def __init__(self, dataset: Path, split: Split) -> None:
         record = read_training_set(dataset)
-        self.path, self._systems, self.actions = split_path(dataset, split), record.systems, record.actions
+        self.path, self._systems = split_path(dataset, split), record.systems
         self._rows = TableRows(self.path, COLUMNS.names) if record.samples.get(split) else None
 
     def __len__(self) -> int:
@@ -270,14 +265,13 @@ class TrainingSetWriter(SplitFiles):
         row["prompt"] = sample.prompt.user
         self.add(split, row)
 
-    def finish(self, split_by: Literal["walk", "town"], trees: Iterable[SourceTree], actions: ActionSet) -> TrainingSet:
+    def finish(self, split_by: Literal["walk", "town"], trees: Iterable[SourceTree]) -> TrainingSet:
         """Write the record and the page, after the block ended and the splits stand."""
         record = TrainingSet(
             split_by=split_by,
             trees=list(trees),
             samples=self.counts,
             systems=list(self._systems),
-            actions=actions,
         )
         write_model(self.out / RECORD, record, RECORD_FORMAT)
         write_bytes(self.out / PAGE, _page(record))

@@ -10,7 +10,6 @@ from typing import Any, get_args
 import numpy as np
 
 from cosfly.geometry import BODY_FROM_CAMERA, CORNER_SIGNS, rotation_matrices
-from cosfly.products.actions import ActionSet
 from cosfly.products.captions import Language
 from cosfly.products.frames import Camera
 from cosfly.products.goals import Goal
@@ -161,12 +160,12 @@ class FlightRows:
             else np.stack([self.numbers(name) for name in COMPANY_COLUMNS], axis=1),
         )  # fmt: skip
 
-    def shown(self, twin: FlightRows | None, actions: ActionSet, settings: dict[str, Any]) -> ShownFlight:
-        """Return what a reader of captions gets. actions, settings: of the captions, as the record has them."""
+    def shown(self, twin: FlightRows | None, settings: dict[str, Any]) -> ShownFlight:
+        """Return what a reader of captions gets. settings: of the captions, as the record has them."""
         captions = [shown_caption(row) for row in self.rows if row.get("has_caption")]
         same = twin is not None and np.array_equal(twin.index, self.index)
         other = twin.flight if twin is not None and same else None
-        return ShownFlight(self.flight, self.index, captions, actions, other, settings)
+        return ShownFlight(self.flight, self.index, captions, other, settings)
 
 
 def shown_caption(row: Row) -> ShownCaption:

@@ -10,7 +10,6 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from cosfly.errors import InputError
-from cosfly.products.actions import RecordedActions, shipped_actions
 from cosfly.products.coverage import Coverage
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile
 from cosfly.products.inspection import TrajectoryFunnel
@@ -286,7 +285,7 @@ class History(Strict):
 
 
 class ReleaseRecord(Strict):
-    """The whole file. actions: the closed set of decisions, null for the one that ships. prompts: by run the questions
+    """The whole file. prompts: by run the questions
     (`user_en`, `user_zh`) of captions that were asked with prompts of their own."""
 
     name: str
@@ -298,7 +297,6 @@ class ReleaseRecord(Strict):
     frame_selection: str
     depth: StoredDepth | None  # null: without depth
     coordinates: dict[str, Any]
-    actions: RecordedActions = Field(default_factory=shipped_actions)
     prompts: dict[str, dict[str, str]] = Field(default_factory=dict)
     splits: Splits
     numbers: Numbers

@@ -241,7 +241,6 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "caption, served": ["caption --data {tree} --out {out} {asked}"],
     "caption, judged": ["caption --data {tree} --out {out} {asked} --judge {judge} --set caption.judge.concurrency=1"],
     "caption prompts": ["caption prompts --export {out}/prompts"],
-    "caption actions": ["caption actions --export {out}/actions.yaml"],
     "compare-strategies": [
         "caption compare-strategies --data {tree} --out {out} --teacher {teacher} --conflicts 2 {tiny}"
     ],

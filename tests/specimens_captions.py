@@ -11,17 +11,15 @@ from pathlib import Path
 import numpy as np
 from teacher_server import TeacherServer
 
-from caption.run.own_files import vocabulary_of
-from caption.schema import CaptionConfig, LabelConfig
+from caption.schema import CaptionConfig
+from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.rules import write_templates
-from caption.truth.actions import table_of
 from caption.truth.facts import Facts
 from caption.writing.contract import Draft, way_of
 from cosfly.products.answer_text import Parsed
 from cosfly.products.captions import Coc
 
 VOCABULARY = vocabulary_of(CaptionConfig())  # what ships
-ACTION_TABLE = table_of(VOCABULARY.actions, LabelConfig())
 WAY = way_of("slots", VOCABULARY)
 # A drone that climbs, speeds up and turns right; the walker is hidden once.
 FACTS = Facts(
@@ -58,7 +56,7 @@ FOLLOW = Facts(
 
 def write_answers(facts: Facts, rng: np.random.Generator, decision: str | None = None) -> tuple[Coc, Coc]:
     """Give the rule teacher's English and Chinese answer as plain text."""
-    english, chinese = (Coc(**answer) for answer in write_templates(facts, rng.bytes(32), VOCABULARY.actions, decision))
+    english, chinese = (Coc(**answer) for answer in write_templates(facts, rng.bytes(32), decision))
     first = WAY.read(Parsed(english, therefore=english.flight_decision), facts)
     assert isinstance(first, Draft), first
     second = WAY.read_mirror(Parsed(chinese), first, facts)

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.chat.student_chat import FrameLook, Taught, write_taught
-from cosfly.products.actions import shipped_actions
 from cosfly.products.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.places import sample_id
@@ -89,7 +88,7 @@ def write_set(out: Path, splits: Mapping[Split, Iterable[Sample]], trees: Iterab
             for sample in samples:
                 writer.add_sample(split, sample)
     sources = [SourceTree(run=tree.parent.name, sha256=fingerprint(tree)) for tree in trees]
-    writer.finish("walk", sources, shipped_actions())
+    writer.finish("walk", sources)
     return out
 
 

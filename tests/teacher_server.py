@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from cosfly.chat import client
-from cosfly.products.actions import shipped_actions
+from cosfly.products.actions import TOKENS
 from cosfly.work.journal import Journal
 
 client.FIRST_PAUSE_S, client.LONGEST_PAUSE_S = 0.01, 0.02  # no test waits for a server that fails
@@ -153,7 +153,7 @@ def is_mirror(body: dict) -> bool:
 
 
 def _decision_by_seed(body: dict) -> str:
-    return shipped_actions().tokens[body.get("seed", 0) % len(shipped_actions().tokens)]
+    return TOKENS[body.get("seed", 0) % len(TOKENS)]
 
 
 def obedient_answer(server: TeacherServer, body: dict, fault: str | None = None) -> dict:
@@ -166,7 +166,7 @@ def obedient_answer(server: TeacherServer, body: dict, fault: str | None = None)
             reasons = reasons.replace("。", "，距离为 77.7 米。")
         return {**CHINESE, "reasoning_trace": reasons, "flight_decision": decision}
     schema = body.get("response_format", {}).get("json_schema", {}).get("schema", {})
-    allowed = schema.get("properties", {}).get("flight_decision", {}).get("enum", shipped_actions().tokens)
+    allowed = schema.get("properties", {}).get("flight_decision", {}).get("enum", TOKENS)
     decision = server.decision(body)
     if len(allowed) == 1 and fault != "schema_ignored":
         decision = allowed[0]

@@ -8,18 +8,16 @@ from itertools import pairwise
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from specimens_captions import ACTION_TABLE
 from tables import each
 
-from caption.schema import FutureMotion, LabelConfig
-from caption.truth.actions import measure, table_of
-from cosfly.products.actions import shipped_actions
+from caption.schema import FutureMotion
+from caption.truth.actions import TABLE, ActionTable, Thresholds, measure
 
-CFG = LabelConfig()
+THRESHOLDS = Thresholds()
 
 MIRRORED = {
     token: token.replace("left", "right") if "left" in token else token.replace("right", "left")
-    for token in ACTION_TABLE.shown
+    for token in TABLE.shown
 }
 
 
@@ -95,7 +93,7 @@ LABELS = [
 
 @each(("motion", "label"), LABELS)
 def test_label_of_a_known_future(motion, label):
-    assert ACTION_TABLE.label_of(measure(future(**motion))) == label
+    assert TABLE.label_of(measure(future(**motion))) == label
 
 
 STEADY = {"forward": 3.0, "target_step": (0.6, 0.0)}  # straight and level behind a walker
@@ -135,24 +133,16 @@ HARD = [  # the opposite, then what is plainly not there
 @each(("decision", "motion"), HARD)
 def test_contradiction_of_each_action(decision, motion):
     measured = measure(future(**motion))
-    assert ACTION_TABLE.verdict_of(decision, measured, ACTION_TABLE.label_of(measured)) == "HARD_CONFLICT"
+    assert TABLE.verdict_of(decision, measured, TABLE.label_of(measured)) == "HARD_CONFLICT"
 
 
 def test_share_zero_leaves_only_the_opposite_as_a_contradiction():
-    lenient = LabelConfig(absent_share=0.0)
+    lenient = ActionTable(Thresholds(absent_share=0.0))
     for up, verdict in ((0.1, "SOFT_CONFLICT"), (-0.1, "HARD_CONFLICT")):
         motion = measure(future(**STEADY, up=up))
-        assert (
-            table_of(shipped_actions(), lenient).verdict_of(
-                "ascend", motion, table_of(shipped_actions(), lenient).label_of(motion)
-            )
-            == verdict
-        )
-        assert ACTION_TABLE.verdict_of("ascend", motion, ACTION_TABLE.label_of(motion)) == "HARD_CONFLICT"
-    assert (
-        table_of(shipped_actions(), lenient).verdict_of("hover", measure(future(**STEADY)), "track_straight")
-        == "HARD_CONFLICT"
-    )
+        assert lenient.verdict_of("ascend", motion, lenient.label_of(motion)) == verdict
+        assert TABLE.verdict_of("ascend", motion, TABLE.label_of(motion)) == "HARD_CONFLICT"
+    assert lenient.verdict_of("hover", measure(future(**STEADY)), "track_straight") == "HARD_CONFLICT"
 
 
 # --- properties -------------------------------------------------------------------------------------------------------
@@ -177,26 +167,26 @@ def futures(draw) -> FutureMotion:
 
 
 def judged(motion) -> tuple[str | None, dict[str, str]]:
-    label = ACTION_TABLE.label_of(motion)
-    return label, {token: ACTION_TABLE.verdict_of(token, motion, label) for token in ACTION_TABLE.shown}
+    label = TABLE.label_of(motion)
+    return label, {token: TABLE.verdict_of(token, motion, label) for token in TABLE.shown}
 
 
 def is_near_a_threshold(motion) -> bool:
     """Rounding may move a value that sits on a threshold; such draws say nothing about invariance."""
     values = dataclasses.asdict(motion)
-    limits = [*list(CFG.model_dump().values()), 0.0]
+    limits = [*list(vars(THRESHOLDS).values()), 0.0]
     numbers = [v for v in values.values() if isinstance(v, float)] + [0.5 * abs(motion.left_m) - motion.target_path_m]
     numbers += [abs(motion.left_m) - abs(motion.forward_m)]
     if any(abs(abs(number) - limit) < 1e-6 for number in numbers for limit in limits if limit or number):
         return True
-    for group in ACTION_TABLE.implied:
-        shown = [ACTION_TABLE.shown[token][0](motion) for token, _ in group]
+    for group in TABLE.implied:
+        shown = [TABLE.shown[token][0](motion) for token, _ in group]
         implied = [size(motion) for _, size in group]
         ranks = sorted(size for size in implied if size >= 0.99)
         if any(
             abs(size - limit) < 1e-6
             for size in [*shown, *implied]
-            for limit in (CFG.absent_share, 1.0, -1.0)
+            for limit in (THRESHOLDS.absent_share, 1.0, -1.0)
             if abs(size) != 1.0
         ):
             return True
@@ -236,7 +226,7 @@ def test_moving_the_world_and_the_clock_changes_nothing(drawn, turn_deg, shift, 
 @given(futures())
 def test_what_is_implied_is_never_contradicted(drawn):
     motion = measure(drawn)
-    label = ACTION_TABLE.label_of(motion)
+    label = TABLE.label_of(motion)
     if label is not None:
-        assert not ACTION_TABLE.is_contradicted(label, motion)
-        assert ACTION_TABLE.shown[label][0](motion) >= 1.0
+        assert not TABLE.is_contradicted(label, motion)
+        assert TABLE.shown[label][0](motion) >= 1.0

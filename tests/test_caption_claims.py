@@ -10,12 +10,11 @@ import pytest
 from specimens_captions import FACTS
 from tables import each
 
-from caption.schema import EvidenceConfig, Judged
+from caption.schema import Judged
 from caption.truth.claims import judge_sentence
 from caption.truth.facts import Facts
 from caption.truth.numerals import chinese_number, english_number, read_numerals
 from caption.truth.stated import read_stated
-from cosfly.products.actions import shipped_actions
 from cosfly.products.captions import Claim, Language
 
 
@@ -35,7 +34,7 @@ def claims_of(told: str) -> list[Claim]:
 def judged(
     text: str, claims: list[Claim], language: Language = "en", decision: str = "hover", facts: Facts = FACTS
 ) -> Judged:
-    return judge_sentence("C1", text, claims, decision, facts, EvidenceConfig(), language, shipped_actions())
+    return judge_sentence("C1", text, claims, decision, facts, language)
 
 
 DISTANCE = claim("distance@t4=18.0 m")

@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 
 import pytest
-from specimens_captions import ACTION_TABLE, VOCABULARY
+from specimens_captions import VOCABULARY
 from teacher_server import TeacherServer
 
 from caption.run.compare import STRATEGIES, compare, run
@@ -26,7 +26,7 @@ CFG = CaptionConfig(window=WindowConfig(require_images=False))
 @pytest.mark.parametrize("treatment", ["keep", "repair", "drop"])
 def test_what_becomes_of_a_soft_conflict(treatment):
     flight = dataclasses.replace(make_flight(60)[0], folder=Path("nowhere"))
-    windows = list(cut_windows(flight, CFG.window, ACTION_TABLE))
+    windows = list(cut_windows(flight, CFG.window))
 
     def captioned(repair: RepairConfig) -> list[Caption]:
         cfg = CFG.model_copy(update={"repair": repair})

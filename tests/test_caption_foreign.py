@@ -17,7 +17,6 @@ from caption.teachers.foreign import read_foreign
 from cosfly.errors import InputError
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.settings import InspectConfig
-from cosfly.products.actions import shipped_actions
 from cosfly.products.captions import Caption, Language, read_captions, write_captions
 from cosfly.products.places import town_folder
 from cosfly.products.predictions import Prediction
@@ -143,10 +142,10 @@ def test_a_bad_line_names_file_line_and_field(tmp_path, text, field):
 
 def predicted(caption: Caption, language: Language, text: str | None = None, *, is_finished: bool = True) -> Prediction:
     """What `distill infer` writes of a sample: the caption's own answer, or another text."""
-    sample = make_sample(caption, language, PrepareConfig(), shipped_actions())
+    sample = make_sample(caption, language, PrepareConfig())
     assert not isinstance(sample, str), sample
     text = sample.answer if text is None else text
-    answer = make_prediction(sample, "test", text, 99, is_finished, shipped_actions())
+    answer = make_prediction(sample, "test", text, 99, is_finished)
     return answer.model_copy(update={"model": "base+mine"})
 
 
@@ -170,7 +169,7 @@ def test_a_students_answers_are_judged_marked_and_released(tree, rules, tmp_path
     flight = town_folder(found[0].town), found[0].trajectory, found[0].variant
     problems: list[object] = []
     by_flight, account = index_captions(
-        tmp_path / "out/captions.jsonl", {flight: 100}, set(), shipped_actions(), lambda *told: problems.append(told)
+        tmp_path / "out/captions.jsonl", {flight: 100}, set(), lambda *told: problems.append(told)
     )
     assert problems == []
     rows = [caption_values(caption) for caption in by_flight[flight].read()]
@@ -197,10 +196,10 @@ def test_what_is_wrong_with_a_students_answer_drops_its_window(tree, rules, tmp_
         "structure_broken_json", "structure_cut_short", "failed_oom", "bilingual_structure_no_json_object", "evidence",
         "conflict_not_repairable", "not_in_file", None,
     ]  # fmt: skip
-    sample = make_sample(rules[2], "en", PrepareConfig(), shipped_actions())
+    sample = make_sample(rules[2], "en", PrepareConfig())
     assert not isinstance(sample, str)
     failed = SampleOutcome(sample, Failed(id=sample.key, code="oom", message="no"))
-    assert prediction_of(failed, "test", shipped_actions()).reason == "failed_oom"
+    assert prediction_of(failed, "test").reason == "failed_oom"
 
 
 def test_from_a_students_answers_to_a_release(tree, rules, tmp_path):

@@ -7,16 +7,14 @@ import numpy as np
 import pytest
 
 from caption.run.windows import cut_windows
-from caption.schema import LabelConfig, WindowConfig
+from caption.schema import WindowConfig
 from caption.teachers.prompt_files import shipped_prompts
 from caption.teachers.prompts import user_prompts
 from caption.teachers.statements import describe
-from caption.truth.actions import table_of
 from caption.truth.facts import measure_facts
 from caption.truth.references import find_fact, number_holds, parse_reference
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import way_of
-from cosfly.products.actions import shipped_actions
 from cosfly.products.answer_text import Parsed
 from cosfly.products.captions import Coc, Prompt
 from cosfly.products.flights import find_flights
@@ -37,13 +35,11 @@ def flight(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def vocabulary():
-    return Vocabulary(shipped_actions(), shipped_prompts())
+    return Vocabulary(shipped_prompts())
 
 
 def window_of(flight):
-    return next(
-        cut_windows(flight, WindowConfig(require_images=False), table_of(shipped_actions(), LabelConfig()))
-    ).observed
+    return next(cut_windows(flight, WindowConfig(require_images=False))).observed
 
 
 def in_company(flight):

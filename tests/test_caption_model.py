@@ -16,7 +16,6 @@ from caption.schema import CaptionConfig
 from caption.teachers.doctor import examine_endpoint
 from caption.writing.contract import way_of
 from cosfly.errors import NothingKept
-from cosfly.products.actions import shipped_actions
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import read_captions
 from distill.student.random_student import make_tiny_student
@@ -55,7 +54,7 @@ def test_every_answer_parses_and_every_window_is_accounted_for(server, tmp_path)
         assert answer["structured"] == "json_schema"
         is_mirror = answer["purpose"].startswith("mirror")
         language, more = ("zh", ()) if is_mirror else ("en", ("therefore",))
-        parsed = parse_answer(answer["text"], shipped_actions(), language, (*optional, *more), optional=optional)
+        parsed = parse_answer(answer["text"], language, (*optional, *more), optional=optional)
         # No schema keeps a random model from other alphabets, or from a claim of 1e999.
         noise = ("wrong_language", "unreadable_character", "not_finite")
         is_noise = parsed.reason is not None and parsed.reason.endswith(noise)

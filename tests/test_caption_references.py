@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 
 import pytest
-from specimens_captions import ACTION_TABLE, GAP
+from specimens_captions import GAP
 from tables import each
 
 from caption.run.windows import cut_windows
@@ -142,7 +142,7 @@ def test_sentences_of_both_languages():
 
 def test_measured_series_agree_with_each_other():
     flight = dataclasses.replace(make_flight(40)[0], folder=Path("nowhere"))
-    for window in cut_windows(flight, WindowConfig(require_images=False), ACTION_TABLE):
+    for window in cut_windows(flight, WindowConfig(require_images=False)):
         facts = measure_facts(window.observed)
         series = [getattr(facts, field.name) for field in dataclasses.fields(facts)]
         assert {len(values) for values in series if isinstance(values, tuple)} == {len(facts)}

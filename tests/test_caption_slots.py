@@ -14,13 +14,13 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from specimens_captions import ACTION_TABLE, FOLLOW, GAP, VOCABULARY, WAY, report_of, saying, settings
+from specimens_captions import FOLLOW, GAP, WAY, report_of, saying, settings
 from tables import each
 from teacher_server import CHINESE, ENGLISH, TeacherServer, is_mirror
 
 from caption.run.stage import run
 from caption.run.windows import cut_windows
-from caption.schema import EvidenceConfig, WindowConfig
+from caption.schema import WindowConfig
 from caption.teachers.statements import describe
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.mirror import check_translation
@@ -30,6 +30,7 @@ from caption.writing.filling import Filler
 from caption.writing.slots import fact_table
 from caption.writing.templates import Sentence, read_sentence
 from cosfly.errors import NothingKept
+from cosfly.products.actions import TOKENS
 from cosfly.products.answer_text import Parsed
 from cosfly.products.captions import Coc, Language, read_captions
 from specimens import make_flight
@@ -40,8 +41,8 @@ FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, -6.0, -10.0), offset_x_
 def filled(
     text: str, language: Language = "en", facts: Facts = FACTS, decision: str = "yaw_right_to_follow"
 ) -> str | Refused:
-    sentence = read_sentence(text, language, len(facts), facts.step_s, VOCABULARY)
-    return sentence if isinstance(sentence, Refused) else Filler(facts, decision, language, VOCABULARY).fill(sentence)
+    sentence = read_sentence(text, language, len(facts), facts.step_s)
+    return sentence if isinstance(sentence, Refused) else Filler(facts, decision, language).fill(sentence)
 
 
 @each(
@@ -142,7 +143,7 @@ def windows_of(num_flights: int) -> list[Facts]:
     found = []
     for seed in range(num_flights):
         flight = dataclasses.replace(make_flight(30, seed=seed, width_px=640, height_px=360)[0], folder=Path("nowhere"))
-        samples = cut_windows(flight, WindowConfig(require_images=False, stride=4), ACTION_TABLE)
+        samples = cut_windows(flight, WindowConfig(require_images=False, stride=4))
         found += [measure_facts(sample.observed, (640, 360)) for sample in samples]
     return found
 
@@ -163,9 +164,7 @@ def earned_texts() -> dict[str, list[str]]:
 def test_natural_templates_are_not_refused(language):
     """What a careful writer puts down who has read the prompt; written before the checks were tried on them."""
     texts = earned_texts()[f"natural {language}"]
-    refused = {
-        text: found for text in texts if isinstance(found := read_sentence(text, language, 5, 0.5, VOCABULARY), Refused)
-    }
+    refused = {text: found for text in texts if isinstance(found := read_sentence(text, language, 5, 0.5), Refused)}
     assert len(texts) >= 30
     assert len(refused) <= 0.05 * len(texts), refused
 
@@ -281,11 +280,11 @@ def test_a_translation_has_the_same_sentences_and_the_glossarys_words():
         critical_components="The drone climbs. The target walks.", reasoning_trace="So be it.", flight_decision="hover"
     )
     chinese = Coc(critical_components="无人机爬升。目标行走。", reasoning_trace="如此。", flight_decision="hover")
-    assert check_translation(english, chinese, VOCABULARY) is None
+    assert check_translation(english, chinese) is None
     one = chinese.model_copy(update={"critical_components": "无人机爬升，目标行走。"})
-    assert check_translation(english, one, VOCABULARY)[0] == "sentences"
+    assert check_translation(english, one)[0] == "sentences"
     other = chinese.model_copy(update={"critical_components": "飞行器爬升。目标行走。"})
-    assert check_translation(english, other, VOCABULARY) == ("glossary", 'write "无人机" for "drone"')
+    assert check_translation(english, other) == ("glossary", 'write "无人机" for "drone"')
 
 
 @each(
@@ -312,10 +311,10 @@ def test_a_sentence_is_proved_only_where_its_words_are_true_with_its_slots():
     texts = earned_texts()
     for language in ("en", "zh"):
         for text in texts[f"false {language}"]:
-            found = read_sentence(text, language, 5, 0.5, VOCABULARY)
+            found = read_sentence(text, language, 5, 0.5)
             assert isinstance(found, Refused) or found.state == "unread", text
         for text in texts[f"true {language}"]:
-            found = read_sentence(text, language, 5, 0.5, VOCABULARY)
+            found = read_sentence(text, language, 5, 0.5)
             assert isinstance(found, Sentence), (text, found)
             assert found.state == "proved", text
 
@@ -380,7 +379,7 @@ def test_a_word_beside_slots_needs_a_claim_that_holds(language, reasons, claims,
         first = WAY.read(Parsed(english, therefore="hover"), FACTS)
         found = WAY.read_mirror(Parsed(coc, more={"claims": claims}), first, FACTS)
     assert isinstance(found, Draft), found
-    [_, judged] = WAY.judge(found, FACTS, EvidenceConfig(), language)
+    [_, judged] = WAY.judge(found, FACTS, language)
     assert judged.state == state
     assert (state == "contradicted") == bool(judged.problems)
     asked_again = isinstance(claims, list) and len(found.template.claims or ()) > 0 and state == "unread"
@@ -427,7 +426,7 @@ def test_a_measurable_word_that_no_slot_says_is_asked_for_once_and_then_left_unr
         assert sum(not is_mirror(json.loads(body)) for body in server.bodies) == 4
 
 
-def test_claims_beside_slots_stand_in_record_report_and_evidence_and_are_judged_again_from_a_release(tree, tmp_path):
+def test_claims_beside_slots_are_recorded_in_the_caption_and_its_evidence(tree, tmp_path):
     """The distance of these flights is steady; the Chinese claim comes with the mirror."""
 
     def text(body: dict) -> str:
@@ -448,10 +447,6 @@ def test_claims_beside_slots_stand_in_record_report_and_evidence_and_are_judged_
 
     with saying(text) as server:
         captions = list(read_captions(run(settings(server.url, limit=2), tree, tmp_path / "out")))
-    report = report_of(tmp_path / "out")
-    assert report["proved_by_claims"] == {"en": 2, "zh": 2}
-    page = (tmp_path / "out" / "report.html").read_text()
-    assert "proved by slots 0 (0.0 %), proved by claims 2 (50.0 %)" in page
     for caption in captions:
         assert caption.checks.sentences["en"] == ["unread", "proved"]
         assert [claim.quote for claim in caption.evidence.slots["zh"].claims] == ["保持稳定"]
@@ -490,7 +485,7 @@ def test_an_answer_that_stays_wrong_drops_its_window_for_that_reason(tree, tmp_p
 
 
 def test_the_question_shows_what_is_known_by_its_slot(tree, tmp_path):
-    table = fact_table(FACTS, VOCABULARY)
+    table = fact_table(FACTS)
     assert (
         "{distance@t0} to {distance@t4}: 20.0, 20.5, 21.0, -, 18.0 m; {change:distance} -2.0 m; {trend:distance} "
         "decreases" in table
@@ -507,19 +502,17 @@ def test_the_question_shows_what_is_known_by_its_slot(tree, tmp_path):
 
 def test_every_slot_of_the_table_can_be_written():
     for facts in [FACTS, *WINDOWS[:4]]:
-        for address, text in re.findall(
-            r"\{([a-z_:@0-9]+)\} ([^;\n]+)", fact_table(facts, VOCABULARY).partition("\n")[2]
-        ):
+        for address, text in re.findall(r"\{([a-z_:@0-9]+)\} ([^;\n]+)", fact_table(facts).partition("\n")[2]):
             if text != "to":
                 found = filled(f"it {{{address}}} it", "en", facts)
                 assert found == f"it {text} it" or text.startswith("to {"), address
 
 
 def test_actions_named_in_words_are_those_of_the_answer():
-    for action in VOCABULARY.actions.tokens:
-        sentence = read_sentence("So the drone should {decision} now.", "en", 5, 0.5, VOCABULARY)
+    for action in TOKENS:
+        sentence = read_sentence("So the drone should {decision} now.", "en", 5, 0.5)
         assert isinstance(sentence, Sentence)
-        assert isinstance(Filler(FACTS, action, "en", VOCABULARY).fill(sentence), str)
+        assert isinstance(Filler(FACTS, action, "en").fill(sentence), str)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ from collections import Counter
 from html.parser import HTMLParser
 
 import pytest
-from specimens_captions import ACTION_TABLE, VOCABULARY
 
 from caption.run import stage
 from caption.run.ledger import NUM_CARDS, CaptionReport
@@ -17,7 +16,7 @@ from caption.run.report import page_html
 from caption.run.stage import run
 from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig
-from caption.truth.actions import measure
+from caption.truth.actions import TABLE, measure
 from cosfly.chat.budget import BudgetConfig
 from cosfly.errors import NothingKept, ResumeError
 from cosfly.products.captions import read_captions
@@ -40,8 +39,8 @@ def test_every_window_is_one_line_sorted_and_labelled_from_geometry(tree, done):
     captions = list(read_captions(done / "captions.jsonl"))
     expected = {}
     for folder in find_flights(tree):
-        for sample in cut_windows(read_flight(folder), CaptionConfig().window, ACTION_TABLE):
-            expected[sample.observed.sample_id] = ACTION_TABLE.label_of(measure(sample.future))
+        for sample in cut_windows(read_flight(folder), CaptionConfig().window):
+            expected[sample.observed.sample_id] = TABLE.label_of(measure(sample.future))
     assert [caption.sample_id for caption in captions] == sorted(expected)
     assert {caption.sample_id: caption.label for caption in captions} == expected
     assert len(captions) == 6 * 9
@@ -208,7 +207,6 @@ def test_sentences_are_marked_by_what_was_read_of_them(done):
     checks = caption.checks.model_copy(update={"sentences": {"en": ["proved", "unread", "contradicted"]}})
     page = page_html(
         report_of(done),
-        VOCABULARY.actions,
         [caption.model_copy(update={"en": answer, "checks": checks})],
         {},
         BudgetConfig(),

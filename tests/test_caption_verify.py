@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from specimens_captions import ACTION_TABLE, VOCABULARY, write_answers
+from specimens_captions import write_answers
 from tables import each
 
 from caption.run.windows import cut_windows
@@ -17,6 +17,7 @@ from caption.schema import WindowConfig
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.prose import check_prose, judge_prose
+from cosfly.products.actions import ACTIONS, TOKENS
 from cosfly.products.captions import Coc
 from specimens import make_flight
 
@@ -140,7 +141,7 @@ def clean_captions(num_flights: int) -> list[tuple[Facts, Coc, Coc]]:
         for variant in ("ORI", "aug_001"):
             flight, _ = make_flight(30, seed=seed, variant=variant, width_px=640, height_px=360)
             flight = dataclasses.replace(flight, folder=Path("nowhere"))
-            for sample in cut_windows(flight, WindowConfig(require_images=False, stride=2), ACTION_TABLE):
+            for sample in cut_windows(flight, WindowConfig(require_images=False, stride=2)):
                 facts = measure_facts(sample.observed)
                 captions.append((facts, *write_answers(facts, np.random.default_rng([seed, len(captions)]))))
     return captions
@@ -162,7 +163,7 @@ def test_rule_captions_are_one_record_in_two_languages():
 # --- the rule teacher -------------------------------------------------------------------------------------------------
 
 
-@each("decision", VOCABULARY.actions.tokens)
+@each("decision", TOKENS)
 def test_the_rule_teacher_justifies_any_given_decision_without_contradiction(decision):
     for facts, _, _ in clean_captions(2)[::7]:
         english, chinese = write_answers(facts, np.random.default_rng(3), decision)
@@ -170,4 +171,4 @@ def test_the_rule_teacher_justifies_any_given_decision_without_contradiction(dec
         assert check_prose(english, facts, "en") == []
         assert check_prose(chinese, facts, "zh") == []
         assert check_mirror(english, chinese, flight_numbers(facts)) is None
-        assert VOCABULARY.names[decision]["zh"] in chinese.reasoning_trace
+        assert ACTIONS[decision].zh in chinese.reasoning_trace

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from specimens_captions import ACTION_TABLE, VOCABULARY
+from specimens_captions import VOCABULARY
 from teacher_server import TeacherServer
 
 from caption.run.stage import run
@@ -26,7 +26,7 @@ from caption.schema import (
 )
 from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import make_question, question_messages
-from caption.truth.actions import measure
+from caption.truth.actions import TABLE, measure
 from caption.truth.facts import measure_facts
 from cosfly.products.boxes import MapHeader, make_box_map
 from cosfly.products.captions import read_captions
@@ -58,7 +58,7 @@ def test_current_frames_have_a_whole_past_and_future(num_points, stride, expecte
 
 def test_the_observed_type_has_no_future_and_shares_no_memory_with_it(tree):
     flight = flight_in(tree)
-    sample = next(cut_windows(flight, WindowConfig(), ACTION_TABLE))
+    sample = next(cut_windows(flight, WindowConfig()))
     assert not any(field.type == FutureMotion.__name__ for field in dataclasses.fields(ObservedWindow))
     assert [frame.time_s for frame in sample.observed.frames] == flight.time_s[:5].tolist()
     values = [
@@ -125,9 +125,7 @@ def test_changing_all_future_frames_leaves_prompts_and_pictures_identical(tree, 
     cfg = ImageConfig(layout=layout)
     found = []
     for root in (tree, spoiled):
-        sample = next(
-            s for s in cut_windows(flight_in(root), NO_IMAGES, ACTION_TABLE) if s.observed.indices[-1] == current
-        )
+        sample = next(s for s in cut_windows(flight_in(root), NO_IMAGES) if s.observed.indices[-1] == current)
         question = make_question(sample.observed, cfg, "prose", VOCABULARY)
         messages, digests = question_messages(question, FrameEncoder(cfg))
         found.append((question.asked, json.dumps(messages), digests))
@@ -136,14 +134,14 @@ def test_changing_all_future_frames_leaves_prompts_and_pictures_identical(tree, 
     changed = [
         make_question(s.observed, cfg, "prose", VOCABULARY).prompts
         for root in (tree, spoiled)
-        for s in cut_windows(flight_in(root), NO_IMAGES, ACTION_TABLE)
+        for s in cut_windows(flight_in(root), NO_IMAGES)
         if s.observed.indices[-1] == current + 1
     ]
     assert changed[0] != changed[1]
 
 
 def test_facts_of_a_hand_made_window(tree):
-    window = next(cut_windows(flight_in(tree), WindowConfig(), ACTION_TABLE)).observed
+    window = next(cut_windows(flight_in(tree), WindowConfig())).observed
     x = np.arange(5.0)
     window = dataclasses.replace(
         window,
@@ -207,7 +205,7 @@ def test_a_foreign_tree_without_boxes_scores_depth_and_meta(tmp_path):
         (frame / "depth.npy").unlink()
         rgb = cv2.imread(str(frame / "rgb.png"))
         cv2.imwrite(str(frame / "rgb.png"), cv2.cvtColor(rgb, cv2.COLOR_BGR2BGRA))
-    sample = next(cut_windows(flight_in(root), WindowConfig(), ACTION_TABLE))
+    sample = next(cut_windows(flight_in(root), WindowConfig()))
     facts = measure_facts(sample.observed)
     assert facts.box_width_px == (None,) * 5
     assert facts.offset_x_px[-1] is not None  # from image_uv
@@ -264,15 +262,15 @@ def flights_of(root) -> tuple[Flight, Flight]:
 
 
 def labels_of(windows) -> list[str | None]:
-    return [ACTION_TABLE.label_of(measure(window.future)) for window in windows]
+    return [TABLE.label_of(measure(window.future)) for window in windows]
 
 
 @pytest.mark.parametrize("label_from", ["twin", "offsets"])
 def test_both_tracks_have_the_same_labels_where_the_same_was_visible(two_tracks, label_from):
     clean, perturbed = flights_of(two_tracks)
     twin = read_twin(perturbed) if label_from == "twin" else None
-    expected = list(cut_windows(clean, NO_IMAGES, ACTION_TABLE))
-    found = list(cut_windows(perturbed, NO_IMAGES, ACTION_TABLE, twin=twin))
+    expected = list(cut_windows(clean, NO_IMAGES))
+    found = list(cut_windows(perturbed, NO_IMAGES, twin=twin))
     assert {w.future.label_from for w in expected} == {"flight"}
     assert {w.future.label_from for w in found} == {label_from}
     saw_the_same = [bool((a.future.visible == b.future.visible).all()) for a, b in zip(expected, found, strict=True)]
@@ -287,7 +285,7 @@ def test_both_tracks_have_the_same_labels_where_the_same_was_visible(two_tracks,
         assert a.future.speed_before_mps == pytest.approx(b.future.speed_before_mps)
     # What is compared is not the same from the start: as flown, a good part of the labels is another.
     flown = as_flown(perturbed, "perturbed")
-    raw = [ACTION_TABLE.label_of(measure(cut_future(perturbed, flown, i, 5))) for i in range(4, NUM_POINTS - 5)]
+    raw = [TABLE.label_of(measure(cut_future(perturbed, flown, i, 5))) for i in range(4, NUM_POINTS - 5)]
     assert np.mean([a != b for (a, _, _), b in zip(pairs, raw, strict=True)]) > 0.2
 
 
@@ -307,21 +305,18 @@ def ordered(tree, tmp_path_factory):
 
 
 def test_a_mission_gives_labels_and_is_known_from_its_first_frame_on(tree, ordered):
-    windows = list(cut_windows(flight_in(ordered), NO_IMAGES, ACTION_TABLE))
+    windows = list(cut_windows(flight_in(ordered), NO_IMAGES))
     currents = [w.observed.indices[-1] for w in windows]
     assert currents == list(range(4, 11))
-    plain = {
-        w.observed.indices[-1]: ACTION_TABLE.label_of(measure(w.future))
-        for w in cut_windows(flight_in(tree), NO_IMAGES, ACTION_TABLE)
-    }
+    plain = {w.observed.indices[-1]: TABLE.label_of(measure(w.future)) for w in cut_windows(flight_in(tree), NO_IMAGES)}
     for now, window in zip(currents, windows, strict=True):
-        label, known = ACTION_TABLE.label_of(measure(window.future)), window.observed.mission
+        label, known = TABLE.label_of(measure(window.future)), window.observed.mission
         assert (label, known) == ((plain[now], None) if now < 8 else ("break_off", "battery"))
 
 
 def test_no_label_comes_from_an_order_that_nobody_knows_yet(ordered):
     """The turn for home, seen from before the order, would be a turn after the walker."""
-    windows = list(cut_windows(flight_in(ordered), WindowConfig(require_images=False, future_frames=3), ACTION_TABLE))
+    windows = list(cut_windows(flight_in(ordered), WindowConfig(require_images=False, future_frames=3)))
     problems = {w.observed.indices[-1]: w.problem for w in windows}
     assert problems == {now: "order_to_come" if now in (5, 6, 7) else None for now in range(4, 13)}
 
@@ -330,7 +325,7 @@ def test_a_mission_reaches_no_request_before_its_order_stands(tree, ordered):
     def users(root):
         asked = [
             make_question(w.observed, ImageConfig(), "slots", VOCABULARY).asked
-            for w in cut_windows(flight_in(root), NO_IMAGES, ACTION_TABLE)
+            for w in cut_windows(flight_in(root), NO_IMAGES)
         ]
         return [(prompts["en"].user, prompts["zh"].user) for prompts in asked]
 
@@ -383,8 +378,8 @@ def test_a_run_reports_what_it_saved(tmp_path):
     ids = {caption.sample_id for caption in taken}
     cfg = CaptionConfig.model_validate({"window": window})
     for folder in find_flights(tree):
-        samples = list(cut_windows(read_flight(folder), cfg.window, ACTION_TABLE))
-        labels = [ACTION_TABLE.label_of(measure(sample.future)) for sample in samples]
+        samples = list(cut_windows(read_flight(folder), cfg.window))
+        labels = [TABLE.label_of(measure(sample.future)) for sample in samples]
         for before, after, sample in zip(labels, labels[1:], samples[1:], strict=False):
             assert before == after or sample.observed.sample_id in ids
     # The window itself is the same one: only the mark is added.

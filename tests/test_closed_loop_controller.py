@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from specimens_planning import town_of, walk_along
 
-from caption.schema import FutureMotion, LabelConfig
-from caption.truth.actions import Motion, measure, table_of
+from caption.schema import FutureMotion
+from caption.truth.actions import TABLE, Motion, Thresholds, measure
 from cosfly.closed_loop.controller import Controller, read_controls
 from cosfly.closed_loop.pilots import PilotAnswer
 from cosfly.closed_loop.settings import CONTROLLER_FILE, Drone
@@ -16,11 +16,11 @@ from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight
 from cosfly.errors import ConfigError
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_flight
-from cosfly.products.actions import shipped_actions
+from cosfly.products.actions import TOKENS
 from cosfly.render.settings import RenderConfig
 
-TOKENS = shipped_actions().tokens
-LABELS = table_of(shipped_actions(), LabelConfig())
+TOKENS = TOKENS
+LABELS = TABLE
 CONTROLS = read_controls(CONTROLLER_FILE, TOKENS)
 HORIZON = 5  # decisions, 2.5 s, as labels look ahead
 
@@ -63,7 +63,7 @@ def flown(begin, *tokens) -> tuple[list, Motion, Controller]:
 def test_a_decision_that_is_flown_for_its_horizon_shows_what_its_own_rule_asks_for(begin, token):
     _, motion, _ = flown(begin, *[token] * HORIZON)
     if token in ("break_off", "return_to_home"):  # orders of a mission; who leaves without one leaves the person
-        assert motion.approach_m <= -LabelConfig().approach_m
+        assert motion.approach_m <= -Thresholds().approach_m
         return
     shown, _ = LABELS.shown[token]
     assert shown(motion) >= 1.0, (token, shown(motion), motion)

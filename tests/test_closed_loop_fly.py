@@ -12,7 +12,6 @@ from teacher_server import TeacherServer
 from caption.run.stage import run as caption_tree
 from caption.schema import CaptionConfig
 from cosfly.chat.student_chat import write_taught
-from cosfly.products.actions import shipped_actions
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight
@@ -187,6 +186,6 @@ def test_a_student_is_asked_with_the_very_prompts_that_it_was_taught_with(town, 
     captions = caption_tree(CaptionConfig(), tmp_path / "render", tmp_path / "captions")
     every: tuple = ("CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN")
     cfg = PrepareConfig(modalities=("rgb",), contradicted="keep", verdicts=every)
-    samples = [make_sample(caption, "en", cfg, shipped_actions()) for caption in read_captions(captions)]
+    samples = [make_sample(caption, "en", cfg) for caption in read_captions(captions)]
     taught = {(one.prompt.system, one.prompt.user) for one in samples if isinstance(one, Sample)}
     assert len(taught & asked) == 12  # of each flight the first four: the others have no future there, and no caption

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from cosfly.chat.contract import Reply
 from cosfly.chat.protocol import error_words, read_body, read_completion, read_models
 from cosfly.chat.wire import Response
-from cosfly.products.actions import shipped_actions
 from cosfly.products.answer_text import normalize_action, parse_answer
 from cosfly.products.captions import Coc
 from cosfly.reading.objects import find_object
@@ -346,7 +345,7 @@ TEXTS: list[tuple[str, str, tuple[str, ...] | str]] = [
 def test_texts(subtests):
     for name, text, outcome in TEXTS:
         with subtests.test(name=name):
-            parsed = parse_answer(text, shipped_actions())
+            parsed = parse_answer(text)
             if isinstance(outcome, tuple):
                 assert parsed.coc == Coc(**GOOD) or "control_characters" in outcome, parsed
                 assert parsed.recovered == outcome
@@ -376,7 +375,7 @@ CHINESE_TEXTS: list[tuple[str, str, str | None]] = [
     ("text", "outcome"), [case[1:] for case in CHINESE_TEXTS], ids=[case[0] for case in CHINESE_TEXTS]
 )
 def test_chinese_texts(text, outcome):
-    parsed = parse_answer(text, shipped_actions(), "zh")
+    parsed = parse_answer(text, "zh")
     if parsed.coc is None:
         assert parsed.reason == outcome
     else:
@@ -411,7 +410,7 @@ DECISIONS: list[tuple[str, str | None]] = [
 def test_decisions(subtests):
     for text, token in DECISIONS:
         with subtests.test(text=text):
-            assert normalize_action(text, shipped_actions()) == token
+            assert normalize_action(text) == token
 
 
 # Why the server says that the text ended; what comes of it.
@@ -433,7 +432,7 @@ CUT = [
 
 @pytest.mark.parametrize(("text", "finish_reason", "reason"), CUT, ids=range(len(CUT)))
 def test_an_answer_that_was_cut_off_is_no_draft(text, finish_reason, reason):
-    assert parse_answer(text, shipped_actions(), finish_reason=finish_reason).reason == reason
+    assert parse_answer(text, finish_reason=finish_reason).reason == reason
 
 
 # --- properties -------------------------------------------------------------------------------------------------------

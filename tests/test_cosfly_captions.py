@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from specimens_distill import make_caption
 
 from cosfly.errors import InputError
-from cosfly.products.actions import shipped_actions
+from cosfly.products.actions import TOKENS
 from cosfly.products.answer_text import answer_schema, is_in_script, normalize_action, parse_answer
 from cosfly.products.captions import Caption, Coc, read_captions, write_captions
 from cosfly.products.sentences import END, cut_sentences
@@ -24,8 +24,8 @@ GOOD = {
 
 @given(st.text(max_size=30))
 def test_nothing_else_is_an_action(text):
-    assert normalize_action(text, shipped_actions()) in (None, *shipped_actions().tokens)
-    assert normalize_action(text + " quickly", shipped_actions()) is None
+    assert normalize_action(text) in (None, *TOKENS)
+    assert normalize_action(text + " quickly") is None
 
 
 def changed(**fields):
@@ -33,7 +33,7 @@ def changed(**fields):
 
 
 def test_what_the_reasoning_leads_to_stands_before_the_decision():
-    schema = answer_schema(shipped_actions(), "hover", more={"therefore": {"enum": list(shipped_actions().tokens)}})
+    schema = answer_schema("hover", more={"therefore": {"enum": list(TOKENS)}})
     assert list(schema["properties"]) == schema["required"] == [*list(GOOD)[:2], "therefore", "flight_decision"]
     assert schema["properties"]["flight_decision"]["enum"] == ["hover"]
     assert len(schema["properties"]["therefore"]["enum"]) == 17
@@ -50,9 +50,9 @@ def test_what_the_reasoning_leads_to_stands_before_the_decision():
     ],
 )
 def test_further_fields_are_those_that_were_asked_for(fields, outcome):
-    parsed = parse_answer(changed(**fields), shipped_actions(), more=("therefore",))
+    parsed = parse_answer(changed(**fields), more=("therefore",))
     assert outcome == (parsed.therefore if parsed.coc else parsed.reason)
-    assert parse_answer(changed(**fields), shipped_actions()).coc is None or not fields
+    assert parse_answer(changed(**fields)).coc is None or not fields
 
 
 def a_caption(number):

@@ -25,7 +25,6 @@ from cosfly.errors import InputError
 from cosfly.escaping import LONGEST, for_markdown, for_terminal
 from cosfly.inspection.report import report_html
 from cosfly.inspection.stage import run as inspect
-from cosfly.products.actions import shipped_actions
 from cosfly.products.captions import Caption, read_captions
 from cosfly.products.inspection import Inspection, read_inspection
 from cosfly.reading.documents import read_json
@@ -169,7 +168,7 @@ def test_the_page_of_a_captioning_run_shows_forged_captions(tree, tmp_path):
     value = read_json(done / "caption_report.json")
     report = CaptionReport.model_validate({k: v for k, v in value.items() if k not in ("schema", "schema_version")})
     cards = [forged(Caption, card, 8) for card in list(read_captions(done / "captions.jsonl"))[:3]]
-    page = page_html(forged(CaptionReport, report, 1), shipped_actions(), cards, {}, BudgetConfig(), HOSTILE)
+    page = page_html(forged(CaptionReport, report, 1), cards, {}, BudgetConfig(), HOSTILE)
     check_page(page, (done / "report.html").read_text(encoding="utf-8") + '<div class="gone"></div>')
 
 

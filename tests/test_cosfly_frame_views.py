@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 from PIL import Image
-from specimens_captions import ACTION_TABLE, VOCABULARY
+from specimens_captions import VOCABULARY
 
 from caption.run.window_loop import caption_window
 from caption.run.windows import cut_windows
@@ -18,7 +18,6 @@ from caption.teachers.prompts import make_question, prompt_hash, question_messag
 from caption.teachers.teacher import RuleTeacher
 from cosfly.errors import InputError
 from cosfly.look.frame_views import PEDESTRIAN_RGB, Pictures
-from cosfly.products.actions import shipped_actions
 from cosfly.products.captions import PICTURES_MARK, Language
 from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight
@@ -99,7 +98,7 @@ def sent_pictures(messages: list[dict]) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def window(tree) -> Window:
-    return next(cut_windows(read_flight(find_flights(tree)[0]), WindowConfig(), ACTION_TABLE))
+    return next(cut_windows(read_flight(find_flights(tree)[0]), WindowConfig()))
 
 
 def ask(window: Window, cfg: ImageConfig) -> tuple[dict[Language, str], list[np.ndarray]]:
@@ -136,7 +135,7 @@ def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, 
     teachers = [dict(zip(cfg.image.modalities, shown[3 * i : 3 * i + 3], strict=True)) for i in range(5)]
     assert caption.status == "accepted"
     for language in ("en", "zh"):
-        sample = make_sample(caption, language, PrepareConfig(modalities=views), shipped_actions())
+        sample = make_sample(caption, language, PrepareConfig(modalities=views))
         assert isinstance(sample, Sample)
         text, pictures = sample.prompt.user, load_pictures(sample, {"": tree})
         assert PICTURES_MARK not in text
@@ -147,9 +146,7 @@ def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, 
         expected = [teachers[i][view] for i in range(5) for view in views]
         for picture, wanted in zip(pictures, expected, strict=True):
             assert np.array_equal(picture, wanted)
-        request = make_request(
-            sample, {"": tree}, InferConfig().sampling, 0, shipped_actions()
-        )  # engines `endpoint` and `vllm`
+        request = make_request(sample, {"": tree}, InferConfig().sampling, 0)  # engines `endpoint` and `vllm`
         kinds = [part.get("text", "picture") for part in request.messages[1]["content"]]
         assert kinds == [word for i in range(5) for word in (f"t{i}:", *["picture"] * len(views))] + [text]
         for picture, wanted in zip(sent_pictures(request.messages), expected, strict=True):
@@ -173,7 +170,7 @@ def large(tmp_path_factory):
     """A window of a flight in pictures of 640 x 360."""
     root = tmp_path_factory.mktemp("large")
     make_playback_tree(root, 1, 10, seed=1, width_px=640, height_px=360, with_augmented=False)
-    return next(cut_windows(read_flight(find_flights(root)[0]), WindowConfig(), ACTION_TABLE)).observed
+    return next(cut_windows(read_flight(find_flights(root)[0]), WindowConfig())).observed
 
 
 @pytest.mark.parametrize("max_side_px", [640, 500])

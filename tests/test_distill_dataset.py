@@ -20,7 +20,7 @@ from specimens_distill import make_caption, make_captions, prepared
 from specimens_foreign import write_foreign_tree
 
 from cosfly.errors import ResumeError, VerifyError
-from cosfly.products.actions import shipped_actions
+from cosfly.products.actions import TOKENS
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import write_captions
 from cosfly.products.playback import read_flight
@@ -50,7 +50,7 @@ def captions(tree, tmp_path_factory) -> Path:
 
 def sample_of(trajectory="trajectory_1", variant="ORI", frame=4, town="Town01", language="en") -> Sample:
     caption = make_caption(town, trajectory, variant, frame)
-    sample = make_sample(caption, language, PrepareConfig(), shipped_actions(), run="run", walk=f"{town}/{trajectory}")
+    sample = make_sample(caption, language, PrepareConfig(), run="run", walk=f"{town}/{trajectory}")
     assert isinstance(sample, Sample)
     return sample
 
@@ -76,8 +76,8 @@ def test_sample_holds_what_the_student_needs():
     sample = sample_of(frame=6)
     assert sample.key == "trajectory_1_ORI_frame_00006/en"
     assert sample.images == [f"Town01/trajectory_1/ORI/frames_playback/frame_{i:05d}/rgb.png" for i in (2, 3, 4, 5, 6)]
-    assert parse_answer(sample.answer, shipped_actions()).coc is not None
-    assert parse_answer(sample.answer, shipped_actions()).recovered == ()
+    assert parse_answer(sample.answer).coc is not None
+    assert parse_answer(sample.answer).recovered == ()
     assert json.loads(sample.answer)["flight_decision"] == sample.decision
     assert "行人" in sample_of(language="zh").answer  # not escaped: escapes would cost tokens
 
@@ -88,7 +88,7 @@ def test_which_captions_teach_and_how_much():
 
     def made(changes: dict, language: str = "en", variant: str = "ORI", **settings) -> Sample | str:
         caption = make_caption("Town01", "trajectory_1", variant, 4, **changes)
-        return make_sample(caption, language, PrepareConfig(**settings), shipped_actions())
+        return make_sample(caption, language, PrepareConfig(**settings))
 
     for changes, language, settings, reason in (
         ({"status": "dropped", "drop_reason": "hard_conflict"}, "en", {}, "dropped_hard_conflict"),
@@ -130,7 +130,7 @@ def asked(tmp_path_factory):
 @pytest.mark.parametrize("language", ["en", "zh"])
 def test_a_student_may_get_text_alone_or_pictures_alone(asked, language):
     both, text, pictures = (
-        make_sample(asked, language, PrepareConfig(modalities=views, text_state=state), shipped_actions())
+        make_sample(asked, language, PrepareConfig(modalities=views, text_state=state))
         for views, state in ((("rgb",), True), ((), True), (("rgb",), False))
     )
     told = {"en": "No pictures are given.", "zh": "未提供图像。"}[language]
@@ -300,7 +300,7 @@ def balanced(windows: list[tuple[str, str]], seed: int = 0) -> list[tuple[str, s
 
 
 @given(
-    counts=st.dictionaries(st.sampled_from(shipped_actions().tokens), st.integers(1, 60), min_size=1),
+    counts=st.dictionaries(st.sampled_from(TOKENS), st.integers(1, 60), min_size=1),
     seed=st.integers(0, 3),
 )
 @bounded(max_examples=40)
@@ -313,7 +313,7 @@ def test_each_decision_keeps_what_it_has_up_to_the_bound_in_any_order(counts, se
 
 
 @given(
-    counts=st.dictionaries(st.sampled_from(shipped_actions().tokens), st.integers(1, 60), min_size=1),
+    counts=st.dictionaries(st.sampled_from(TOKENS), st.integers(1, 60), min_size=1),
     part=st.floats(0.0, 1.2),
     seed=st.integers(0, 2),
     is_balanced=st.booleans(),

@@ -14,7 +14,7 @@ from commands import invoke
 from specimens_distill import make_caption, write_set
 
 from cosfly.errors import InputError
-from cosfly.products.actions import shipped_actions
+from cosfly.products.actions import TOKENS
 from cosfly.products.figures import draw_walks
 from cosfly.products.predictions import Prediction, read_predictions
 from cosfly.space.blind import LEAST_WINDOWS
@@ -46,9 +46,7 @@ from distill.schema import Sample, open_split
 
 
 def sample_of(frame: int, language: str = "en") -> Sample:
-    return make_sample(
-        make_caption("Town01", "trajectory_1", "ORI", frame), language, PrepareConfig(), shipped_actions()
-    )
+    return make_sample(make_caption("Town01", "trajectory_1", "ORI", frame), language, PrepareConfig())
 
 
 # Frames 4..11 have the decisions slow_down, track, yaw_left, track, slow_down, track, yaw_left, track (see
@@ -70,10 +68,7 @@ def predictions_of(samples: list[Sample]) -> list[Prediction]:
     texts[3] = texts[3][:40]
     texts[4] = "I would slow down."
     texts[5] = f"```json\n{texts[5]}\n```"
-    return [
-        make_prediction(sample, "test", text, 9, True, shipped_actions())
-        for sample, text in zip(samples, texts, strict=True)
-    ]
+    return [make_prediction(sample, "test", text, 9, True) for sample, text in zip(samples, texts, strict=True)]
 
 
 @pytest.fixture
@@ -86,7 +81,7 @@ def samples() -> list[Sample]:
 def scores_of(samples, predictions=None, **more) -> Scores:
     pairs = pair_up(samples, predictions or predictions_of(samples))
     answers = [ScoredAnswer.of(prediction) for _, prediction in pairs]
-    return score_answers([sample for sample, _ in pairs], answers, shipped_actions(), **more)
+    return score_answers([sample for sample, _ in pairs], answers, **more)
 
 
 def figures(scores: Scores, resamples: int = 200, confidence: float = 0.95):
@@ -123,7 +118,7 @@ def test_measured_numbers_by_hand(samples):
 
 def test_failures_are_no_wrong_answers(samples):
     predictions = predictions_of(samples)
-    predictions[7] = failed_prediction(samples[7], "test", "damaged_picture", shipped_actions())  # was right
+    predictions[7] = failed_prediction(samples[7], "test", "damaged_picture")  # was right
     found, _ = figures(scores_of(samples, predictions))
     assert (found["answered"].value, found["answered"].count) == (7 / 8, 8)
     assert (found["accuracy"].value, found["accuracy"].count) == (3 / 7, 7)
@@ -176,7 +171,7 @@ def made_up(num_walks: int, rng: np.random.Generator, *, size: int = 6, skill: f
     flags = {name: np.ones(count, dtype=bool) for name in ("answered", "unmended")}
     answer, tokens = np.where(right, reference, 5).astype(np.int8), np.zeros(count, dtype=np.int64)
     known = {"reference": reference, "answer": answer, "num_tokens": tokens}
-    return Scores(shipped_actions(), **known, **texts, **unknown, **codes, **flags)
+    return Scores(**known, **texts, **unknown, **codes, **flags)
 
 
 def test_intervals_agree_with_the_bootstrap_of_scipy():
@@ -218,15 +213,13 @@ def test_paired_differences(samples):
 
 def test_floors_by_hand(samples):
     train = [sample.model_copy(update={"decision": "hover"}) for sample in samples[:3]] + samples[3:5]
-    answers = Floors(train, "en", 0, shipped_actions()).answers(samples, [coc_of(sample) for sample in samples])
+    answers = Floors(train, "en", 0).answers(samples, [coc_of(sample) for sample in samples])
     decisions = {name: [answer.coc.flight_decision for answer in own] for name, own in answers.items()}
     assert set(decisions["majority"]) == {"hover"}
     assert sorted(decisions["shuffled"]) == sorted(DECISIONS)
     assert len({answer.coc.reasoning_trace for answer in answers["constant"]}) == 1
-    assert list(Floors([], "en", 0, shipped_actions()).answers(samples[:1], [coc_of(samples[0])])) == ["teacher"]
-    assert (
-        majority(["slow_down", "track_straight"], shipped_actions()) == "track_straight"
-    )  # a tie goes to the first of the action table
+    assert list(Floors([], "en", 0).answers(samples[:1], [coc_of(samples[0])])) == ["teacher"]
+    assert majority(["slow_down", "track_straight"]) == "track_straight"  # a tie goes to the first of the action table
 
 
 def test_a_rule_and_a_network_that_see_no_picture_beat_the_majority(samples):
@@ -242,7 +235,7 @@ def test_a_rule_and_a_network_that_see_no_picture_beat_the_majority(samples):
             found.append(samples[0].model_copy(update={"past": past, "decision": decision}))
         return found
 
-    floors, asked = Floors(told(400), "en", 0, shipped_actions()), told(100)
+    floors, asked = Floors(told(400), "en", 0), told(100)
     answers = floors.answers(asked, [coc_of(sample) for sample in asked])
     decisions = {name: np.array([answer.coc.flight_decision for answer in own]) for name, own in answers.items()}
     wanted = np.array([sample.decision for sample in asked])
@@ -251,7 +244,7 @@ def test_a_rule_and_a_network_that_see_no_picture_beat_the_majority(samples):
     assert (decisions["majority"] == wanted).sum() < 60
     few, mixed = told(LEAST_WINDOWS - 1), [*told(400), samples[0]]
     for train, left_out in ((few, {"blind"}), (mixed, {"rule", "blind"}), (samples, {"rule", "blind"})):
-        found = Floors(train, "en", 0, shipped_actions()).answers(asked, [coc_of(sample) for sample in asked])
+        found = Floors(train, "en", 0).answers(asked, [coc_of(sample) for sample in asked])
         assert answers.keys() - found.keys() == left_out
 
 
@@ -260,13 +253,13 @@ def test_what_was_drawn_after_the_window_is_counted_apart(samples):
     ahead = [None, True, True, True, True, False, False, False]
     wrong = [sample.model_copy(update={"drawn_ahead": a}) for sample, a in zip(samples, ahead, strict=True)]
     answers = [ScoredAnswer(coc_of(sample)) for sample in wrong]
-    other = next(token for token in shipped_actions().tokens if token not in DECISIONS)
+    other = next(token for token in TOKENS if token not in DECISIONS)
     for place in (1, 2, 3):
         answers[place] = ScoredAnswer(answers[place].coc.model_copy(update={"flight_decision": other}))
-    figures, _ = figures_of(score_answers(wrong, answers, shipped_actions()), np.ones((1, 1)), confidence=0.9)
+    figures, _ = figures_of(score_answers(wrong, answers), np.ones((1, 1)), confidence=0.9)
     assert (figures["drawn_ahead"].value, figures["drawn_ahead"].count) == (4 / 7, 7)
     assert (figures["accuracy_settled"].value, figures["accuracy_settled"].count) == (1.0, 3)
-    figures, _ = figures_of(score_answers(samples, answers, shipped_actions()), np.ones((1, 1)), confidence=0.9)
+    figures, _ = figures_of(score_answers(samples, answers), np.ones((1, 1)), confidence=0.9)
     assert figures["drawn_ahead"].value is figures["accuracy_settled"].value is None
 
 
@@ -311,9 +304,7 @@ def test_without_a_model_the_report_says_so_and_gives_no_number(place):
 def test_students_side_by_side(place):
     predictions = read_predictions(place / "predictions.jsonl")
     samples = {sample.key: sample for sample in open_split(place / "set", "test")}
-    right = [
-        make_prediction(samples[p.key], "test", samples[p.key].answer, 5, True, shipped_actions()) for p in predictions
-    ]
+    right = [make_prediction(samples[p.key], "test", samples[p.key].answer, 5, True) for p in predictions]
     write_predictions(place, right, "right.jsonl")
     for name in ("predictions", "right"):
         run(CFG, place / f"{name}.jsonl", place / "set", place / "students" / name)

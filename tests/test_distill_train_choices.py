@@ -16,7 +16,6 @@ from safetensors.torch import load_file  # noqa: E402
 from specimens_students import MAX_PIXELS, inputs_of, load, log_of, losses_of, run, samples_of, trees_of  # noqa: E402
 
 from cosfly.errors import InputError  # noqa: E402
-from cosfly.products.actions import shipped_actions  # noqa: E402
 from distill.schema import Sample  # noqa: E402
 from distill.student.checkpoint import Progress  # noqa: E402
 from distill.student.decoding import Completion  # noqa: E402
@@ -104,9 +103,7 @@ def test_an_answer_is_judged_by_the_teacher_and_by_the_future(place):
 
     def counts(changes: dict, **future: object) -> list[float]:
         answer = json.dumps({**json.loads(sample.answer), **changes})
-        return fit._judged_answer(
-            sample.model_copy(update=future), Completion(answer, 9, True), shipped_actions()
-        ).tolist()
+        return fit._judged_answer(sample.model_copy(update=future), Completion(answer, 9, True)).tolist()
 
     assert sample.decision != "hover"
     assert counts({}) == [1, 1, 1, 0]

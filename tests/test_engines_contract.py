@@ -31,7 +31,6 @@ from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import NoAnswer, Reply, Request, started
 from cosfly.chat.vllm_engine import VllmEngine
 from cosfly.errors import ConfigError, EnvironmentMissing, TeacherError
-from cosfly.products.actions import shipped_actions
 from cosfly.products.answer_text import answer_schema, parse_answer
 from cosfly.products.captions import Usage, read_captions
 from cosfly.products.predictions import read_predictions
@@ -86,9 +85,7 @@ ENGINES = {"endpoint": endpoint, "plain": plain}  # vLLM has tests of its own be
 
 
 def request_of(text: str, seed: int = 0) -> Request:
-    return SAMPLING.request(
-        [{"role": "user", "content": [{"type": "text", "text": text}]}], [], answer_schema(shipped_actions()), seed
-    )
+    return SAMPLING.request([{"role": "user", "content": [{"type": "text", "text": text}]}], [], answer_schema(), seed)
 
 
 @pytest.mark.parametrize("name", ENGINES)
@@ -101,7 +98,7 @@ def test_many_requests_at_once_are_answered_each_by_its_own(name):
     with ENGINES[name]() as engine:
         replies = asyncio.run(ask(engine))
     assert len(replies) == 12
-    assert all(parse_answer(reply.text, shipped_actions()).coc is not None for reply in replies)
+    assert all(parse_answer(reply.text).coc is not None for reply in replies)
     assert all(reply.usage == Usage(prompt_tokens=1000, completion_tokens=100) for reply in replies)
     assert all(reply.structured in ("json_schema", "plain") and reply.finish_reason == "stop" for reply in replies)
 

@@ -16,7 +16,6 @@ from specimens_release import build, make_inputs
 
 from cosfly.errors import CosflyError
 from cosfly.maps import boxfile, cityjson, simworld
-from cosfly.products.actions import shipped_actions
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.boxes import MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.products.captions import read_captions
@@ -85,7 +84,7 @@ READERS = {
     "shard": Reader("release/dataset/data/*.parquet", lambda path: list(rows_of(path))),
     "checksums": Reader(f"release/dataset/{CHECKSUMS}", lambda path: read_checksums(path.parent)),
     "manifest": Reader("release/manifest.json", lambda path: read_manifest(path.parent)),
-    "answer": Reader("answer.txt", lambda path: parse_answer(path.read_text(errors="ignore"), shipped_actions())),
+    "answer": Reader("answer.txt", lambda path: parse_answer(path.read_text(errors="ignore"))),
 }
 
 

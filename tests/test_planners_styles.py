@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from specimens_captions import ACTION_TABLE
 from specimens_planning import WORLDS, assert_safe, town_of, walk_along
 
 from caption.schema import FutureMotion
+from caption.truth.actions import TABLE as ACTION_TABLE
 from caption.truth.actions import measure
 from cosfly.app.settings import RunConfig
 from cosfly.errors import NoPathError
@@ -25,7 +25,7 @@ from cosfly.planners.intent import draw_intent, draw_styles
 from cosfly.planners.reacquire import finds_again, screens_of
 from cosfly.planners.stage import draw_styles_of, make_scenario, plan_flight, run, style_rng
 from cosfly.planners.styles import FOLLOW, NAMES, OTHER_SIDE, REACQUIRE, RETURN_HOME, TABLE
-from cosfly.products.actions import shipped_actions
+from cosfly.products.actions import TOKENS
 from cosfly.products.boxes import write_boxes
 from cosfly.products.frames import LEGIBLE_HEIGHT_PX, Camera
 from cosfly.products.traces import DroneTrace, read_traces
@@ -232,7 +232,7 @@ def test_diverse_shows_each_decision_and_all_heights_and_distances_whatever_the_
     kept = [trace for trace in flights if trace.drop_reason is None]
     assert len(kept) >= 78
     labels = sum(map(labels_of, kept), Counter())
-    for name in shipped_actions().actions.keys() - ORDERS:
+    for name in set(TOKENS) - ORDERS:
         assert labels[name] >= DECISIONS_LEAST * labels.total(), (name, labels)
     for over, low_m, high_m in ((2, 10, 50), (3, 12, 50)):
         away = np.concatenate([trace.positions_m - trace.targets_m for trace in kept])

@@ -103,7 +103,7 @@ class Asking:
         self.books = tuple(AnswerBook(self.stage.path / name) for name in (ANSWERS, JUDGEMENTS))
         answers, judgements = self.books
         budget, troubles = first_budget(self.cfg, *(book.totals for book in self.books)), Troubles()
-        display = Display(sum(guesses.values()), budget, of_judge=judgements.totals, troubles=troubles)
+        display = Display(sum(guesses.values()), budget, troubles=troubles)
         try:
             with answers, judgements, display as self.display:
                 async with (
@@ -166,7 +166,7 @@ class Asking:
         flight, tally = _OpenFlight(allotted), self.asked.flights
         num_windows = 0
         try:
-            for window in allotted.windows(self.cfg, self.vocabulary):
+            for window in allotted.windows(self.cfg):
                 num_windows += 1
                 flight.pending += 1
                 running.add(asyncio.create_task(self._one(flight, window, teacher)))

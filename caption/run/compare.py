@@ -19,9 +19,9 @@ from rich.table import Table
 
 from caption.run.asking import ANSWERS
 from caption.run.flights import allot, named_flights
-from caption.run.own_files import vocabulary_of
 from caption.run.window_loop import Trial, try_strategy
 from caption.schema import CaptionConfig, Strategy, Window
+from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
 from caption.truth.vocabulary import Vocabulary
 from cosfly.chat.answers import AnswerBook
@@ -107,7 +107,7 @@ async def _try_all(
     num_windows = 0
     with AnswerBook(out / ANSWERS) as book:  # the first answer is asked once for all strategies
         async with open_teacher(cfg, book, seed, first_budget(cfg, book.totals)) as teacher:
-            windows = iter(_windows(cfg, vocabulary, data))
+            windows = iter(_windows(cfg, data))
             while batch := list(itertools.islice(windows, cfg.most_in_flight)):
                 num_windows += len(batch)
                 for tried in await asyncio.gather(*(_try_each(window, teacher, cfg, vocabulary) for window in batch)):
@@ -135,9 +135,9 @@ async def _try_each(
     return found
 
 
-def _windows(cfg: CaptionConfig, vocabulary: Vocabulary, data: Path) -> Iterable[Window]:
-    for flight in allot(named_flights(data, cfg.flights), cfg, vocabulary)[0]:
-        yield from (window for window in flight.windows(cfg, vocabulary) if window.problem is None)
+def _windows(cfg: CaptionConfig, data: Path) -> Iterable[Window]:
+    for flight in allot(named_flights(data, cfg.flights), cfg)[0]:
+        yield from (window for window in flight.windows(cfg) if window.problem is None)
 
 
 def comparison_table(comparisons: list[Comparison]) -> Table:

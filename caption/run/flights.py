@@ -14,8 +14,6 @@ from pathlib import Path
 
 from caption.run.windows import current_frames, cut_windows
 from caption.schema import CaptionConfig, Window, WindowConfig
-from caption.truth.actions import table_of
-from caption.truth.vocabulary import Vocabulary
 from cosfly.errors import InputError, VerifyError
 from cosfly.products.captions import caption_lines, write_caption_lines
 from cosfly.products.flights import find_flights, read_twin
@@ -46,14 +44,14 @@ class Allotted:
     def item_id(self) -> str:
         return self.name if self.most is None else f"{self.name}[:{self.most}]"
 
-    def windows(self, cfg: CaptionConfig, vocabulary: Vocabulary) -> Iterator[Window]:
+    def windows(self, cfg: CaptionConfig) -> Iterator[Window]:
         """Yield its windows in order of time.
 
         Raises:
             InputError: it, or the clean flight beside it, cannot be read.
         """
         flight = replace(read_flight(self.folder, strict=False), given_id=self.name)
-        for number, window in enumerate(_cut(flight, cfg, vocabulary)):
+        for number, window in enumerate(_cut(flight, cfg)):
             if number == self.most:
                 return
             yield window
@@ -66,8 +64,8 @@ class Allotted:
         return count if self.most is None else min(count, self.most)
 
 
-def _cut(flight: Flight, cfg: CaptionConfig, vocabulary: Vocabulary) -> Iterator[Window]:
-    return cut_windows(flight, cfg.window, table_of(vocabulary.actions, cfg.label), _twin_of(flight))
+def _cut(flight: Flight, cfg: CaptionConfig) -> Iterator[Window]:
+    return cut_windows(flight, cfg.window, _twin_of(flight))
 
 
 def _twin_of(flight: Flight) -> Flight | None:
@@ -87,7 +85,7 @@ def named_flights(data: Path, choice: FlightChoice = ALL_FLIGHTS) -> list[tuple[
     return sorted(named, key=lambda pair: f"{pair[0]}_frame_")  # the order of their sample ids
 
 
-def allot(flights: list[tuple[str, Path]], cfg: CaptionConfig, vocabulary: Vocabulary) -> tuple[list[Allotted], bool]:
+def allot(flights: list[tuple[str, Path]], cfg: CaptionConfig) -> tuple[list[Allotted], bool]:
     """Say which windows of each flight `limit` leaves, independent of the order of work; and whether it leaves any
     out."""
     if cfg.limit is None:
@@ -97,7 +95,7 @@ def allot(flights: list[tuple[str, Path]], cfg: CaptionConfig, vocabulary: Vocab
     for name, folder in flights:
         try:
             flight = read_flight(folder, strict=False)
-            count = sum(1 for _ in _cut(flight, cfg, vocabulary))
+            count = sum(1 for _ in _cut(flight, cfg))
         except InputError:
             count = 0  # the work itself records the failure
         if left == 0 and count > 0:

@@ -12,11 +12,11 @@ from pathlib import Path
 
 from caption.run.asking import ANSWERS
 from caption.run.flights import allot, named_flights
-from caption.run.own_files import vocabulary_of
 from caption.run.progress import duration
 from caption.run.stage import open_stage
 from caption.run.window_loop import caption_window
 from caption.schema import CaptionConfig
+from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import first_budget, open_teacher
 from cosfly.chat.answers import AnswerBook
@@ -38,7 +38,7 @@ def make_forecast(
     vocabulary = vocabulary_of(cfg)
     cfg = as_taught(cfg, vocabulary)
     stage = open_stage(cfg, data, out, seed, resume)
-    allotted, _ = allot(named_flights(data, cfg.flights), cfg, vocabulary)
+    allotted, _ = allot(named_flights(data, cfg.flights), cfg)
     guesses = {flight.name: flight.guess_num_windows(cfg.window) for flight in allotted}
     left = [f for f in allotted if guesses[f.name] and not stage.is_complete and not f.part(out).exists()]
     num_windows = sum(guesses[flight.name] for flight in left)
@@ -46,7 +46,7 @@ def make_forecast(
         raise InputError("no window to plan for", where=data, got=f"{len(left)} flights to do")
     chosen = [left[number * len(left) // TRIAL_WINDOWS] for number in range(TRIAL_WINDOWS)]
     counts = {flight.name: chosen.count(flight) for flight in chosen}
-    windows = [w for f in dict.fromkeys(chosen) for w in islice(f.windows(cfg, vocabulary), counts[f.name])]
+    windows = [w for f in dict.fromkeys(chosen) for w in islice(f.windows(cfg), counts[f.name])]
 
     async def ask() -> tuple[list[Caption | BaseException], float]:
         with AnswerBook(out / ANSWERS) as book:

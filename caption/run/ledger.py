@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from cosfly.products.actions import ActionSet, shipped_actions
-from cosfly.products.captions import Caption, Language, SentenceState, TeacherRecord, Usage
-from cosfly.products.sentences import sentences_of
+from cosfly.products.actions import TOKENS
+from cosfly.products.captions import Caption, TeacherRecord, Usage
 from cosfly.work.stage_folder import Tally
 from cosfly.work.store import sha256_bytes
 
-TEXT_FIELDS = ("critical_components", "reasoning_trace")
-BIN_CHARACTERS = {"en": 25, "zh": 10}  # a Chinese character carries about as much as two or three Latin letters
 NUM_CARDS = 24
 # Fields of the report that count captions by a word.
 WORDS = (
@@ -39,13 +36,6 @@ class RepairCounts(_Record):
     rungs: dict[str, int]
     outcomes_by_strategy: dict[str, dict[str, int]]
     asks: dict[str, int]
-
-
-class Histogram(_Record):
-    """Lengths of texts: `counts` of bins of so many characters, from length 0 on."""
-
-    bin_characters: int
-    counts: list[int]
 
 
 class KeyframeCounts(_Record):
@@ -78,33 +68,23 @@ class CaptionReport(_Record):
     label_from: dict[str, int]
     confusion: dict[str, dict[str, int]] = Field(alias="confusion_label_to_first_decision")
     repair: RepairCounts
-    lengths: dict[str, dict[str, Histogram]]  # language -> field
     judgements: dict[str, int]
     keyframes: KeyframeCounts | None  # None: all windows were taken
     bilingual: dict[str, int]
     writing: dict[str, int]  # of accepted captions: how the texts were made
     sentences: dict[str, dict[str, int]]  # of accepted captions: language -> proved, contradicted, unread
-    proved_by_claims: dict[str, int] = {}  # of the proved sentences those that slots alone do not prove, by language
     evidence_contradictions: dict[str, int]
     recovered: dict[str, int]
     refusals: dict[str, str] = {}  # of dropped windows: reason -> what the server said last
     judge_tokens: Usage | None = None
 
-    def warnings(self, actions: ActionSet) -> list[str]:
-        """Give what a person must know before the captions are used. actions: that they were made with."""
-        refused = [
+    def warnings(self) -> list[str]:
+        """Return what a person must know before the captions are used."""
+        return [
             f"{self.windows.dropped[reason]} windows were dropped: {reason} ({words}); --retry-failed asks about them "
             f"again"
             for reason, words in self.refusals.items()
         ]
-        own = set(actions.tokens) - set(shipped_actions().tokens)
-        never = [
-            f"{token}, an action of yours, was the label of no window; `cosfly caption actions --check FILE` may tell "
-            f"why"
-            for token in sorted(own)
-            if self.labels and token not in self.labels
-        ]
-        return refused + never
 
     def as_json(self) -> dict:
         left_out = {"judge_tokens"} if self.judge_tokens is None else set()
@@ -142,8 +122,7 @@ class Shelf:
 class Ledger:
     """Counts captions one by one; memory does not grow with them."""
 
-    def __init__(self, actions: ActionSet) -> None:
-        self.actions = actions
+    def __init__(self) -> None:
         self.windows = Tally()
         self.num_asks = self.num_skipped = self.num_missed = 0
         self.teacher: TeacherRecord | None = None
@@ -152,13 +131,11 @@ class Ledger:
         self.keyframes: Counter[str] = Counter()
         self.repairs: Counter[str] = Counter()
         self.sentences: Counter[tuple[str, str]] = Counter()  # language, state
-        self.proved_by_claims: Counter[str] = Counter()
         self.refusals: dict[str, str] = {}
         self.tokens: Counter[str] = Counter()
         self.repair_asks: Counter[int] = Counter()
         self.confusion: Counter[tuple[str, str]] = Counter()  # label, first decision
         self.outcomes: Counter[tuple[str, str]] = Counter()  # strategy, rung or why there is none
-        self.lengths: Counter[tuple[str, str, int]] = Counter()  # language, field, bin
 
     def add(self, caption: Caption) -> None:
         self.windows.input += 1
@@ -173,7 +150,6 @@ class Ledger:
             self.words["writing"][caption.writing] += 1
             for language, states in (caption.checks.sentences or {}).items():
                 self.sentences.update((language, state) for state in states)
-                self.proved_by_claims[language] += _proved_by_claims(caption, language, states)
         else:
             self.windows.dropped[str(caption.drop_reason)] += 1
             if caption.checks.refusal is not None:
@@ -188,10 +164,6 @@ class Ledger:
             self.repairs[became] += 1
             self.repair_asks[repair.asks] += 1
             self.outcomes[repair.strategy, became] += 1
-        for language, coc in (("en", caption.en), ("zh", caption.zh)):
-            if coc is not None and caption.status == "accepted":
-                for field in TEXT_FIELDS:
-                    self.lengths[language, field, len(getattr(coc, field)) // BIN_CHARACTERS[language]] += 1
         self.shelf.add(caption)
         if caption.judge:
             self.words["judgements"][caption.judge.verdict] += 1
@@ -222,7 +194,7 @@ class Ledger:
         return tally
 
     def report(self, flights: Tally, windows: Tally, judge_tokens: Usage | None) -> CaptionReport:
-        order = {token: i for i, token in enumerate((*self.actions.tokens, "none"))}
+        order = {token: i for i, token in enumerate((*TOKENS, "none"))}
         confusion = _nested(self.confusion, lambda pair: (order[pair[0]], order[pair[1]]))
         return CaptionReport(
             teacher=self.teacher,
@@ -238,22 +210,11 @@ class Ledger:
                 outcomes_by_strategy=_nested(self.outcomes),
                 asks={str(asks): count for asks, count in sorted(self.repair_asks.items())},
             ),
-            lengths=self._lengths(),
             keyframes=self._keyframes(),
             sentences=_nested(self.sentences),
-            proved_by_claims={language: count for language, count in sorted(self.proved_by_claims.items()) if count},
             refusals=dict(sorted(self.refusals.items())),
             judge_tokens=judge_tokens,
         )
-
-    def _lengths(self) -> dict[str, dict[str, Histogram]]:
-        found: dict[str, dict[str, Histogram]] = {}
-        for language, width in BIN_CHARACTERS.items():
-            for field in TEXT_FIELDS:
-                bins = {b: n for (lang, name, b), n in self.lengths.items() if (lang, name) == (language, field)}
-                counts = [bins.get(b, 0) for b in range(max(bins, default=-1) + 1)]
-                found.setdefault(language, {})[field] = Histogram(bin_characters=width, counts=counts)
-        return found
 
     def _keyframes(self) -> KeyframeCounts | None:
         taken = self.keyframes.total()
@@ -279,13 +240,3 @@ def _nested(
 
 def _sorted(counts: Counter[str]) -> dict[str, int]:
     return dict(sorted(counts.items(), key=lambda pair: (-pair[1], pair[0])))
-
-
-def _proved_by_claims(caption: Caption, language: Language, states: Sequence[SentenceState]) -> int:
-    """Count the proved sentences of a text that its claims prove; a template holds those of such sentences alone."""
-    template = (caption.slots or {}).get(language)
-    coc = caption.en if language == "en" else caption.zh
-    if template is None or not template.claims or coc is None:
-        return 0
-    claimed = {claim.sentence for claim in template.claims}
-    return sum(s == "proved" and name in claimed for (name, _), s in zip(sentences_of(coc), states, strict=True))

@@ -1,4 +1,4 @@
-"""What an endpoint run shows while it works: windows by outcome, tokens, cost, rate, time left; and a closing table.
+"""What an endpoint run shows while it works: windows by outcome, tokens, cost, rate, time left.
 
 On a terminal a live panel on the shared console, elsewhere a log line every few seconds.
 """
@@ -37,17 +37,14 @@ class Display:
         budget: Budget,
         clock: Callable[[], float] = time.monotonic,
         *,
-        of_judge: Counter[str] | None = None,
         troubles: Troubles | None = None,
     ) -> None:
         """
         Args:
             total: windows of the run, as far as known; `correct_total` mends it.
-            of_judge: the judge's share of `budget.totals`. troubles: what the server fails at.
+            troubles: what the server fails at.
         """
         self.total, self.budget, self.troubles = total, budget, troubles or Troubles()
-        self._of_judge = Counter() if of_judge is None else of_judge
-        self._of_judge_before = Counter(self._of_judge)
         self.num_before = 0  # windows of flights that were finished earlier
         self.num_accepted = self.num_repaired = self.num_unanswered = 0
         self.dropped: Counter[str] = Counter()
@@ -124,10 +121,7 @@ class Display:
 
     def tokens(self) -> tuple[int, int]:
         """Give the prompt and answer tokens of this run."""
-        return self._of_this_run(self.budget.totals, self._answers_before)
-
-    @staticmethod
-    def _of_this_run(now: Counter[str], before: Counter[str]) -> tuple[int, int]:
+        now, before = self.budget.totals, self._answers_before
         return now["prompt_tokens"] - before["prompt_tokens"], now["completion_tokens"] - before["completion_tokens"]
 
     def line(self) -> str:
@@ -174,30 +168,6 @@ class Display:
             grid.add_row(part)
         return grid
 
-    def closing_table(self) -> Table:
-        """Give what this run did, for the end of it."""
-        table = Table(title="What the teacher did in this run", title_justify="left", show_header=False)
-        prompt, completion = self.tokens()
-        table.add_row("windows", f"{self.num_now:,} now, {self.num_before:,} before, {self.total:,} in all")
-        table.add_row("accepted", f"{self.num_accepted:,}, of these repaired {self.num_repaired:,}")
-        for reason, count in self.dropped.most_common():
-            table.add_row("dropped", f"{count:,} {reason}")
-        if self.num_unanswered:
-            table.add_row("no answer", f"{self.num_unanswered:,}")
-        num_answers = self.budget.totals["answers"] - self._answers_before["answers"]
-        table.add_row("answers", f"{num_answers:,}")
-        if self.troubles.num:
-            table.add_row("failed tries", f"{self.troubles.num:,}")
-        table.add_row("tokens", f"{prompt:,} in, {completion:,} out")
-        if self._of_judge["answers"]:
-            prompt, completion = self._of_this_run(self._of_judge, self._of_judge_before)
-            table.add_row("of these the judge's", f"{prompt:,} in, {completion:,} out")
-        if self._is_priced:
-            spent = self.budget.spent
-            table.add_row("cost", f"{spent - self._spent_before:.4f} now, {spent:.4f} in this folder so far")
-        table.add_row("time", f"{duration(self._clock() - self._start_s)}, {self.rate_per_s:.2f} windows/s")
-        return table
-
     def __enter__(self) -> Display:
         if console.is_terminal:
             self._live = Live(
@@ -209,8 +179,7 @@ class Display:
     def __exit__(self, *exc: object) -> None:
         if self._live is not None:
             self._live.stop()
-            console.print(self.closing_table())
-        elif self.num_now or self.troubles.num:
+        if self.num_now or self.troubles.num:
             log.info("%s", self.line())
 
 

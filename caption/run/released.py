@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 
 from caption.run.windows import LabelMotion, cut_future, label_motion
-from caption.schema import FutureMotion, LabelConfig
+from caption.schema import FutureMotion
 from caption.teachers.prompts import mission_lines
-from caption.truth.actions import Motion, measure, table_of
-from cosfly.products.actions import ActionSet
+from caption.truth.actions import TABLE, ActionTable, Motion, Thresholds, measure
+from cosfly.products.actions import ORDERS
 from cosfly.products.shown_captions import Lie, ShownCaption, ShownFlight
 
 NUDGE = 1e-9  # of a threshold: rounding error of subtracting the offsets again
@@ -39,39 +39,35 @@ def _has_order(caption: ShownCaption) -> bool:
 def _label_lies(shown: ShownFlight, motion: LabelMotion, caption: ShownCaption, rows: dict[int, int]) -> list[Lie]:
     """Compare label and verdict with the frames after the window, where these are released."""
     where = f"{caption.sample_id}: label"
-    action = shown.actions.actions.get(caption.label or "")
-    is_order = action is not None and action.is_order
+    is_order = caption.label in ORDERS
     has_order = _has_order(caption)
     if caption.prompts and is_order != has_order:
         got = f"{caption.label}, and {'an order' if has_order else 'no order'} in the prompt"
         return [Lie("label", where, got, "an order as label exactly where the prompt tells of one")]
-    settings = shown.settings
-    label_cfg = LabelConfig.model_validate(settings.get("label", {}))
-    num_future = int(settings.get("window", {}).get("future_frames", 5))
+    num_future = int(shown.settings.get("window", {}).get("future_frames", 5))
     future = _future(shown, motion, caption, rows, num_future)
     if future is None:
         return []
     if has_order:
         future = replace(future, order=caption.label)
     measured = measure(future)
-    table = table_of(shown.actions, label_cfg)
-    label = table.label_of(measured)
-    if label != caption.label and caption.label not in _nearly(measured, shown.actions, label_cfg):
+    label = TABLE.label_of(measured)
+    if label != caption.label and caption.label not in _nearly(measured):
         return [Lie("label", where, str(caption.label), f"{label}, which the frames after the window show")]
     if caption.verdict is None:
         return []
-    verdict = table.verdict_of(caption.decision, measured, caption.label)
+    verdict = TABLE.verdict_of(caption.decision, measured, caption.label)
     if verdict != caption.verdict:
         got = f"{caption.verdict} for {caption.decision} (label {caption.label})"
         return [Lie("verdict", f"{caption.sample_id}: verdict", got, f"{verdict}, by the frames after the window")]
     return []
 
 
-def _nearly(measured: Motion, actions: ActionSet, cfg: LabelConfig) -> set[str | None]:
+def _nearly(measured: Motion) -> set[str | None]:
     """Return the labels of thresholds a nudge away: a value may lie on one."""
-    numbers = {name: value for name, value in cfg.model_dump().items() if name != "absent_share"}
-    scaled = [cfg.model_copy(update={n: v * (1.0 + side * NUDGE) for n, v in numbers.items()}) for side in (-1, 1)]
-    return {table_of(actions, one).label_of(measured) for one in scaled}
+    numbers = {name: value for name, value in vars(Thresholds()).items() if name != "absent_share"}
+    scaled = [Thresholds(**{n: v * (1.0 + side * NUDGE) for n, v in numbers.items()}) for side in (-1, 1)]
+    return {ActionTable(one).label_of(measured) for one in scaled}
 
 
 def _future(

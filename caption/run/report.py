@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from caption.run.ledger import CaptionReport, Histogram
+from caption.run.ledger import CaptionReport
 from cosfly.chat.budget import BudgetConfig
 from cosfly.look.frame_views import thumbnail
 from cosfly.look.page import page, run_name
-from cosfly.products.actions import ActionSet
+from cosfly.products.actions import TOKENS
 from cosfly.products.captions import Caption, Language
 from cosfly.products.frames import frame_name
 from cosfly.products.places import flight_of
@@ -34,7 +34,6 @@ STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))
 def write_page(
     path: Path,
     report: CaptionReport,
-    actions: ActionSet,
     cards: Sequence[Caption],
     folders: Mapping[str, Path],
     budget: BudgetConfig,
@@ -42,15 +41,14 @@ def write_page(
     """Write the page.
 
     Args:
-        report: `caption_report.json`. actions: that the captions were made with. cards: captions to show. folders:
+        report: `caption_report.json`. cards: captions to show. folders:
             flight id -> its folder, for the pictures.
     """
-    write_bytes(path, page_html(report, actions, cards, folders, budget, run_name(path.parent)).encode())
+    write_bytes(path, page_html(report, cards, folders, budget, run_name(path.parent)).encode())
 
 
 def page_html(
     report: CaptionReport,
-    actions: ActionSet,
     cards: Sequence[Caption],
     folders: Mapping[str, Path],
     budget: BudgetConfig,
@@ -63,11 +61,10 @@ def page_html(
         "caption/run/report.html", title=name, style=STYLE, report=report, meanings=VERDICTS, states=STATES,
         who=f"teacher: {teacher.kind}, model {teacher.model}" if teacher else "teacher: none, model unknown",
         is_rules=teacher is not None and teacher.kind == "rules", tiles=_tiles(report), verdicts=verdicts, share=_share,
-        proved_by=_proved_by(report), language_names=LANGUAGE_NAMES,
-        confusion=_confusion(report.confusion, actions.tokens), warnings=report.warnings(actions),
+        language_names=LANGUAGE_NAMES,
+        confusion=_confusion(report.confusion, TOKENS), warnings=report.warnings(),
         repairs=_repairs(report), checks=_checks(report),
         cost=_cost(report, budget),
-        lengths=[_histogram(language, *one) for language, fields in report.lengths.items() for one in fields.items()],
         cards=[_card(caption, folders) for caption in cards],
     )  # fmt: skip
 
@@ -92,46 +89,11 @@ def _share(counts: Mapping[str, int], name: str) -> str:
     return f"{counts.get(name, 0):,} ({100 * counts.get(name, 0) / total:.1f} %)" if total else "-"
 
 
-def _proved_by(report: CaptionReport) -> dict[str, str]:
-    """Say of the proved sentences of each language whether slots alone prove them or claims."""
-    found = {}
-    for language, counts in report.sentences.items():
-        total, count = sum(counts.values()), report.proved_by_claims.get(language, 0)
-        parts = (("slots", counts.get("proved", 0) - count), ("claims", count))
-        found[language] = ", ".join(f"proved by {name} {n:,} ({100 * n / total:.1f} %)" for name, n in parts)
-    return found
-
-
 def _confusion(confusion: Mapping[str, Mapping[str, int]], tokens: Sequence[str]) -> dict[str, list[str]]:
     return {
         "labels": [name for name in (*tokens, "none") if name in confusion],
         "decisions": [name for name in tokens if any(name in row for row in confusion.values())],
     }
-
-
-def _histogram(language: str, field: str, histogram: Histogram) -> dict[str, Any]:
-    counts, width = histogram.counts, histogram.bin_characters
-    total = sum(counts)
-    plot: dict[str, Any] = {"language": language, "field": field, "total": total}
-    if not total:
-        return plot
-    first = next(i for i, count in enumerate(counts) if count)
-    shown = counts[first:]
-    # Never fewer than eight bins, else a single one fills the picture.
-    step = 280.0 / max(8, len(shown))
-    bars = [
-        {
-            "x": round(i * step, 1), "y": round(100 - 92 * count / max(shown), 1),
-            "width": round(max(1.0, step - 1.5), 1), "height": round(92 * count / max(shown), 1),
-            "title": f"{(first + i) * width} to {(first + i + 1) * width - 1} characters: {count}",
-        }
-        for i, count in enumerate(shown)
-    ]  # fmt: skip
-    middle = next(i for i in range(len(counts)) if 2 * sum(counts[: i + 1]) >= total)
-    return plot | {
-        "bars": bars, "low": first * width, "high": len(counts) * width, "end_x": round(len(shown) * step),
-        "median": f"{middle * width} to {(middle + 1) * width - 1}",
-    }  # fmt: skip
 
 
 Rows = list[tuple[str, str]]

@@ -16,12 +16,12 @@ from pathlib import Path
 from caption.run.asking import ANSWERS, Asked, Asking, common_causes, read_quarantine
 from caption.run.flights import PARTS, Allotted, allot, named_flights, parts_of, restore_parts
 from caption.run.ledger import Ledger
-from caption.run.own_files import keep_own_files, package_files, vocabulary_of
 from caption.run.reasons import explained
 from caption.run.report import write_page
 from caption.run.window_loop import caption_prepared, prepare
 from caption.schema import CaptionConfig, Window
 from caption.teachers.foreign import given_samples
+from caption.teachers.prompt_files import PROMPTS, keep_own_prompts, vocabulary_of
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import EMBEDDED, Teacher, embedded_teacher
 from caption.truth.glossary import GLOSSARY_FILE
@@ -38,8 +38,7 @@ from cosfly.work.store import write_json
 log = logging.getLogger(__name__)
 
 PRODUCT, REPORT, PAGE = "captions.jsonl", "caption_report.json", "report.html"
-# One folder never holds captions of two glossaries, nor of two prompts or sets of actions (own_files.py).
-PACKAGE_FILES = {"glossary": GLOSSARY_FILE}
+PACKAGE_FILES = {"glossary": GLOSSARY_FILE}  # one folder never holds captions of two glossaries, nor of two prompts
 WINDOWS_AT_ONCE = 128  # that are prepared for a teacher that asks nobody
 
 
@@ -83,7 +82,7 @@ def run(
         if read_manifest(out).facts.get("limit") is None:
             shutil.rmtree(out / PARTS, ignore_errors=True)  # a kill came before they were gone
         return out / PRODUCT
-    allotted, is_cut = allot(named_flights(data, cfg.flights), cfg, vocabulary)
+    allotted, is_cut = allot(named_flights(data, cfg.flights), cfg)
     restore_parts(stage.path, out / PRODUCT, allotted)
     if cfg.teacher_kind in EMBEDDED and cfg.judge.url is None:
         items = [Item(flight.item_id, flight) for flight in allotted]
@@ -103,7 +102,7 @@ def _publish(
 ) -> Path:  # fmt: skip
     """Put what was answered together, with report and page; the stage is finished where no window is left."""
     out = stage.path
-    ledger = Ledger(vocabulary.actions)
+    ledger = Ledger()
     _merge(stage, ledger, allotted, foreign, with_gaps=bool(asked.unanswered))
     tally = ledger.tally(len(asked.unanswered))
     is_whole = not (asked.unanswered or asked.num_flights_left)
@@ -112,12 +111,12 @@ def _publish(
         raise stage.nothing_kept(asked.flights, expected=f"a flight of at least {num_frames} frames")
     report = ledger.report(asked.flights, tally, asked.judge_usage)
     write_json(stage.path / REPORT, report.as_json())
-    for warning in report.warnings(vocabulary.actions):
+    for warning in report.warnings():
         log.warning("caption: %s", warning)
     if foreign and not is_cut:
         log.warning("caption: %d captions of %s are of no window of this tree", len(foreign), cfg.caption_file)
     folders = {flight.name: flight.folder for flight in allotted}
-    write_page(stage.path / PAGE, report, vocabulary.actions, ledger.shelf.cards(), folders, cfg.budget)
+    write_page(stage.path / PAGE, report, ledger.shelf.cards(), folders, cfg.budget)
     if not is_whole:
         _tell_what_is_left(cfg, asked, tally)
         return out / PRODUCT
@@ -125,7 +124,7 @@ def _publish(
         fix = f"mend what is dropped ({explained(tally.dropped)}), or change the settings and choose another --out"
         raise stage.nothing_kept(tally, where=out / PRODUCT, fix=fix)
     outputs = [out / PRODUCT, out / REPORT, out / PAGE, *sorted((out / ANSWERS).glob("*.jsonl"))]
-    outputs += keep_own_files(out, vocabulary)
+    outputs += keep_own_prompts(out, vocabulary)
     stage.finish(outputs, tally, flights=asked.flights.model_dump(), limit=cfg.limit if is_cut else None)
     if not is_cut:
         shutil.rmtree(out / PARTS, ignore_errors=True)  # a cut run keeps them, for the next with a larger limit
@@ -144,7 +143,7 @@ def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Res
         inputs=inputs,
         seed=seed,
         resume=resume,
-        package_files=PACKAGE_FILES | package_files(cfg),
+        package_files=PACKAGE_FILES | {"prompts": cfg.prompts or PROMPTS},
     )
 
 
@@ -209,7 +208,7 @@ def make_worker(cfg: CaptionConfig, vocabulary: Vocabulary, stage_path: Path, se
 
     def work(item: Item) -> Outcome:
         flight: Allotted = item.payload
-        windows, part = flight.windows(cfg, vocabulary), flight.part(stage_path)
+        windows, part = flight.windows(cfg), flight.part(stage_path)
         num_windows = asyncio.run(caption_in_order(windows, teacher, cfg, vocabulary, part))
         if num_windows == 0:
             return Outcome({}, drop_reason="too_short")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import repeat
 from typing import Any, NamedTuple
 
 from caption.schema import CaptionConfig, Judged, Strategy, Window
@@ -17,7 +16,7 @@ from caption.teachers.foreign import Terms
 from caption.teachers.judge import Case, Judge
 from caption.teachers.prompts import Correction, Question, make_question, prompt_hash
 from caption.teachers.teacher import Teacher, terms_of
-from caption.truth.actions import ActionTable, Motion, measure, table_of
+from caption.truth.actions import TABLE, Motion, measure
 from caption.truth.facts import Facts
 from caption.truth.mirror import check_translation
 from caption.truth.references import measured_series
@@ -25,6 +24,7 @@ from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft, Refused, refuse_decision
 from cosfly.chat.contract import NoAnswer, Reply
 from cosfly.errors import InputError, RenderError
+from cosfly.products.actions import ACTIONS
 from cosfly.products.answer_text import Parsed, parse_answer
 from cosfly.products.captions import (
     Caption,
@@ -50,7 +50,6 @@ class Prepared(NamedTuple):
     question: Question
     prompt_hash: str
     motion: Motion
-    labels: ActionTable
     label: str | None
     contradicted: list[str]
 
@@ -64,10 +63,9 @@ def prepare(windows: Sequence[Window], teacher: Teacher, cfg: CaptionConfig, voc
     ]
     hashes = [prompt_hash(question) for question in questions]
     motions = [measure(window.future) for window in windows]
-    table = table_of(vocabulary.actions, cfg.label)
-    labels = [table.label_of(motion) for motion in motions]
-    contradicted = [table.contradicted_by(m, label) for m, label in zip(motions, labels, strict=True)]
-    return list(map(Prepared, windows, terms, questions, hashes, motions, repeat(table), labels, contradicted))
+    labels = [TABLE.label_of(motion) for motion in motions]
+    contradicted = [TABLE.contradicted_by(m, label) for m, label in zip(motions, labels, strict=True)]
+    return list(map(Prepared, windows, terms, questions, hashes, motions, labels, contradicted))
 
 
 async def caption_window(
@@ -192,7 +190,7 @@ class _Loop:
         once = {"structure_asks": 1, "correction_asks": 0, "mirror_asks": 1}
         self.cfg = cfg.model_copy(update=once) if terms.is_given else cfg
         self.teacher, self.terms, self.judge = teacher, terms, judge
-        self.motion, self.labels, self.label = prepared.motion, prepared.labels, prepared.label
+        self.motion, self.label = prepared.motion, prepared.label
         self.way = prepared.question.way
         self.english: Draft | None = None
         self.chinese: Draft | None = None
@@ -339,9 +337,9 @@ class _Loop:
     def _states_decision(self, fixed: Draft, before: Coc, facts: Facts) -> bool:
         """Tell whether the text states the decision that it was written for, so that another one would make it a
         lie."""
-        if self.way.vocabulary.names[before.flight_decision]["en"] in before.reasoning_trace.lower():
+        if ACTIONS[before.flight_decision].en in before.reasoning_trace.lower():
             return True
-        judged = self.way.judge(fixed, facts, self.cfg.evidence, "en")
+        judged = self.way.judge(fixed, facts, "en")
         return any(problem.startswith("decision:") for sentence in judged for problem in sentence.problems)
 
     def _repair(self, strategy: str) -> RepairRecord:
@@ -367,7 +365,7 @@ class _Loop:
             if isinstance(answer, Refused) or (asked.decision and answer.coc.flight_decision != asked.decision):
                 continue
             decision = answer.coc.flight_decision
-            verdict = self.labels.verdict_of(decision, self.motion, self.label)
+            verdict = TABLE.verdict_of(decision, self.motion, self.label)
             is_enough = (
                 verdict == "CONSISTENT" or self.cfg.repair.strategy != "cascade"
             )  # which has surer rungs to come
@@ -413,7 +411,7 @@ class _Loop:
         nobody's translation."""
         if self.terms.is_given or not self.terms.is_translated or chinese.template is not None:
             return chinese
-        found = check_translation(english.coc, chinese.coc, self.way.vocabulary)
+        found = check_translation(english.coc, chinese.coc)
         return Refused(*found, chinese) if found else chinese
 
     def _check_evidence(self, question: Question) -> str | None:
@@ -423,8 +421,7 @@ class _Loop:
         if self.chinese is not None:
             drafts["zh"] = self.chinese
         judged: dict[Language, list[Judged]] = {
-            language: self.way.judge(draft, question.facts, self.cfg.evidence, language)
-            for language, draft in drafts.items()
+            language: self.way.judge(draft, question.facts, language) for language, draft in drafts.items()
         }
         self.checks["sentences"] = {
             language: [sentence.state for sentence in sentences] for language, sentences in judged.items()
@@ -445,8 +442,7 @@ class _Loop:
             self.usage += reply.usage
         self.structured = reply.structured
         more = self.terms.fields if language == "en" else tuple(self.way.optional)
-        actions = self.way.vocabulary.actions
-        parsed = parse_answer(reply.text, actions, language, more, reply.finish_reason, self.way.optional)
+        parsed = parse_answer(reply.text, language, more, reply.finish_reason, self.way.optional)
         if parsed.reason == CONTEXT_FULL:
             usage = reply.usage or Usage()
             self.checks["refusal"] = (
@@ -457,4 +453,4 @@ class _Loop:
 
     def _accept(self, draft: Draft, question: Question) -> None:
         self.english, self.answered = draft, question
-        self.verdict = self.labels.verdict_of(draft.coc.flight_decision, self.motion, self.label)
+        self.verdict = TABLE.verdict_of(draft.coc.flight_decision, self.motion, self.label)

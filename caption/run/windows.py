@@ -21,7 +21,7 @@ from caption.schema import (
     WindowConfig,
     observed_frames,
 )
-from caption.truth.actions import ActionTable, measure
+from caption.truth.actions import TABLE, measure
 from cosfly.products.captions import KeyframeRecord, LabelFrom, Language
 from cosfly.products.frames import files_in
 from cosfly.products.places import sample_id
@@ -34,11 +34,10 @@ def current_frames(num_points: int, cfg: WindowConfig) -> range:
     return range(cfg.num_frames - 1, num_points - cfg.future_frames, cfg.stride)
 
 
-def cut_windows(flight: Flight, cfg: WindowConfig, labels: ActionTable, twin: Flight | None = None) -> Iterator[Window]:
+def cut_windows(flight: Flight, cfg: WindowConfig, twin: Flight | None = None) -> Iterator[Window]:
     """Yield a flight's windows in order of time. A flight shorter than a window gives none.
 
     Args:
-        labels: by which keyframes are chosen; the choice takes windows, it shows a teacher nothing.
         twin: the clean flight beside a perturbed one; futures are cut from it.
     """
     motion, frames = label_motion(flight, twin), frames_of(flight)
@@ -49,7 +48,7 @@ def cut_windows(flight: Flight, cfg: WindowConfig, labels: ActionTable, twin: Fl
     keyframes: list[KeyframeRecord | None] = [None] * len(currents)
     if cfg.keyframes:
         futures = (cut_future(flight, motion, i, cfg.future_frames) for i in currents)
-        chosen = choose_keyframes([labels.label_of(measure(future)) for future in futures], cfg.keyframe_stride)
+        chosen = choose_keyframes([TABLE.label_of(measure(future)) for future in futures], cfg.keyframe_stride)
         currents, keyframes = [currents[i] for i in chosen], list(chosen.values())
     for current, keyframe in zip(currents, keyframes, strict=True):
         observed = _observe(flight, frames, slice(current - cfg.num_frames + 1, current + 1), folders, files)

@@ -179,7 +179,7 @@ class _Examination:
         limit, length = self.cfg.endpoint.max_tokens, self.client.context
         messages = largest_messages(self.cfg, self.vocabulary, self._pictures())
         more = more_fields(way_of(self.cfg.writing, self.vocabulary))
-        schema = answer_schema(self.vocabulary.actions, more=more) if self.takes_schema else None
+        schema = answer_schema(more=more) if self.takes_schema else None
         probe = await self._ask(messages, limit, schema)
         known = f" of {length} that the model holds" if length else ""
         if probe.reply is None:

@@ -16,6 +16,9 @@ import numpy as np
 from caption.schema import ImageConfig, ObservedWindow
 from cosfly.look.frame_views import VIEW_FILES, Pictures, encode_picture, scaled_size
 
+CACHE_FRAMES = 256  # encoded ones kept in memory for the windows that share them
+JPEG_QUALITY = 90
+
 
 @dataclass(frozen=True)
 class EncodedImage:
@@ -43,7 +46,7 @@ def pictures_of(window: ObservedWindow, cfg: ImageConfig) -> Pictures:
 
 
 class FrameEncoder:
-    """Reads and encodes frames; keeps the last `cache_frames` of them."""
+    """Reads and encodes frames; keeps the last CACHE_FRAMES of them."""
 
     def __init__(self, cfg: ImageConfig, encode: Callable[[np.ndarray], EncodedImage] | None = None) -> None:
         """
@@ -75,13 +78,13 @@ class FrameEncoder:
         with self._lock:
             self.num_encoded += 1
             self._cache[key] = images
-            while len(self._cache) > self.cfg.cache_frames:
+            while len(self._cache) > CACHE_FRAMES:
                 self._cache.popitem(last=False)
         return images
 
 
 def encode_image(rgb: np.ndarray, cfg: ImageConfig) -> EncodedImage:
     """Encode a picture, (h, w, 3) uint8 RGB, as the data URL of a request, with the sha256 of its bytes."""
-    data = encode_picture(rgb, cfg.encoding, cfg.jpeg_quality)
+    data = encode_picture(rgb, cfg.encoding, JPEG_QUALITY)
     url = f"data:image/{cfg.encoding};base64,{base64.b64encode(data).decode('ascii')}"
     return EncodedImage(url, hashlib.sha256(data).hexdigest())

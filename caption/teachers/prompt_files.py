@@ -12,8 +12,10 @@ from functools import cache, lru_cache
 from pathlib import Path
 from string import Template
 
+from caption.schema import CaptionConfig
 from caption.truth.vocabulary import Vocabulary
 from cosfly.errors import ConfigError, InputError, nearest
+from cosfly.products.captions import OWN_PROMPTS
 from cosfly.reading.files import read_text
 from cosfly.work.store import refuse_links, storage_errors, write_bytes
 
@@ -121,3 +123,19 @@ def _is_another(path: Path, text: str) -> bool:
     """Tell whether something else stands where a text is to be written; the text itself may, of an export that was
     killed."""
     return path.exists() and not (path.is_file() and read_text(path) == text)
+
+
+def vocabulary_of(cfg: CaptionConfig) -> Vocabulary:
+    """Read the prompts that the settings name."""
+    return Vocabulary(shipped_prompts() if cfg.prompts is None else own_prompts(cfg.prompts))
+
+
+def keep_own_prompts(out: Path, vocabulary: Vocabulary) -> list[Path]:
+    """Copy prompts that do not ship next to the captions, so that readers know them; return what was written."""
+    texts = {} if vocabulary.prompts == shipped_prompts() else vocabulary.prompts
+    paths = [out / OWN_PROMPTS / f"{name}{SUFFIX}" for name in texts]
+    if paths:
+        (out / OWN_PROMPTS).mkdir(exist_ok=True)
+    for path, text in zip(paths, texts.values(), strict=True):
+        write_bytes(path, text.encode())
+    return paths

@@ -17,6 +17,7 @@ from caption.truth.glossary import load_glossary
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft, WayOfWriting, way_of
 from cosfly.look.frame_views import Pictures, frame_label
+from cosfly.products.actions import ACTIONS, TOKENS
 from cosfly.products.captions import GOAL_WORDS, PICTURES_MARK, Language, Prompt, Writing
 from cosfly.products.segments import MISSION_KINDS
 from cosfly.work.store import dump_json, sha256_bytes
@@ -68,7 +69,7 @@ class Question:
 
 @lru_cache
 def _with_actions(name: str, vocabulary: Vocabulary) -> str:
-    return vocabulary.templates[name].substitute(actions=", ".join(vocabulary.actions.tokens))
+    return vocabulary.templates[name].substitute(actions=", ".join(TOKENS))
 
 
 def system_prompt(language: Language, vocabulary: Vocabulary) -> str:
@@ -84,7 +85,7 @@ def way_prompt(way: WayOfWriting, decision: str | None = None) -> str:
 
 def decision_words(decision: str, vocabulary: Vocabulary) -> str:
     """Give the words that tie an answer to a decision."""
-    words = vocabulary.names[decision]["en"]
+    words = ACTIONS[decision].en
     return vocabulary.templates["anchored_en"].substitute(decision=decision, decision_words=words)
 
 

@@ -12,7 +12,6 @@ from functools import cache, partial
 
 from caption.teachers.statements import BEND_DEG, CENTERED_SHARE, Both, describe, word_of
 from caption.truth.facts import Facts
-from cosfly.products.actions import ActionSet
 
 MODEL = "rules-7"  # its name in the records; counts changes of decisions and wording
 STEPS_AHEAD = 5.0  # the observed trend is taken to hold for the next 2.5 s
@@ -69,14 +68,6 @@ def _slope_weights(count: int) -> tuple[list[float], float]:
     return weights, sum(w * w for w in weights)
 
 
-# What it decides by itself. Others it justifies where they are given.
-DECIDES = (
-    "return_to_home", "break_off", "search_to_reacquire_target", "hover", "yaw_left_to_follow", "yaw_right_to_follow",
-    "ascend", "descend",
-    "speed_up", "slow_down", "track_straight",
-)  # fmt: skip
-
-
 def decide(facts: Facts) -> str:
     """Choose an action from the observed frames alone."""
     return _decided(facts, find_cues(facts))
@@ -109,13 +100,11 @@ def _goes_one_way(values: Sequence[float | None]) -> bool:
     return len(known) == len(values) and known in (sorted(known), sorted(known, reverse=True))
 
 
-def write_templates(
-    facts: Facts, draws: bytes, actions: ActionSet, decision: str | None = None
-) -> tuple[dict[str, str], dict[str, str]]:
+def write_templates(facts: Facts, draws: bytes, decision: str | None = None) -> tuple[dict[str, str], dict[str, str]]:
     """Write the English and the Chinese answer, with slots for the facts.
 
     Args:
-        draws: random, one for each sentence (draws_for). actions: that have the general reasons.
+        draws: random, one for each sentence (draws_for).
         decision: the decision to justify (anchored); None decides freely.
     """
     cues = find_cues(facts)
@@ -123,7 +112,7 @@ def write_templates(
     *statements, conclusion = [
         options[draw % len(options)] for options, draw in zip([*describe(facts), _CONCLUSIONS], draws, strict=False)
     ]
-    causes = [*_causes(facts, cues, token, actions), conclusion]
+    causes = [*_causes(facts, cues, token), conclusion]
     texts = [(" ".join([en for en, _ in both]), "".join([zh for _, zh in both])) for both in (statements, causes)]
     english, chinese = [
         {"critical_components": critical, "reasoning_trace": reasons, "flight_decision": token}
@@ -142,12 +131,28 @@ _CONCLUSIONS: tuple[Both, ...] = (
 # --- causes -----------------------------------------------------------------------------------------------------------
 
 
-def _causes(f: Facts, cues: Cues, token: str, actions: ActionSet) -> list[Both]:
+def _causes(f: Facts, cues: Cues, token: str) -> list[Both]:
     """Give the reasons for a decision that the facts hold, else its general reason, which claims nothing measurable."""
     found = [wording for wording in (cause(f, cues) for cause in _EVIDENCE.get(token, ())) if wording]
-    general = actions.actions[token].reason
-    return found[:2] or [(general.en, general.zh)]
+    return found[:2] or [_GENERAL[token]]
 
+
+# Of a decision for which the facts hold no reason; claims nothing measurable.
+_GENERAL: dict[str, Both] = {
+    "track_straight": ("The present course keeps the target in frame.", "当前航向可使目标保持在画面内。"),
+    **dict.fromkeys(("yaw_left_to_follow", "yaw_right_to_follow"), ("The line of sight to the target calls for a correction of the heading.", "对准目标的视线需要修正航向。")),
+    **dict.fromkeys(("circle_left", "circle_right"), ("A view from another side of the target keeps it well in frame.", "换一侧观察目标有利于将其保持在画面内。")),
+    "ascend": ("A higher viewpoint keeps a free line of sight to the target.", "更高的视点可保持对目标的通畅视线。"),
+    "descend": ("A lower viewpoint shows the target at a better scale.", "更低的视点可让目标尺度更合适。"),
+    "move_forward": ("Closing in keeps the target at a useful scale.", "靠近目标可保持合适的尺度。"),
+    "move_backward": ("More room keeps the target and its surroundings in frame.", "留出更多空间可将目标与周围环境保持在画面内。"),
+    **dict.fromkeys(("strafe_left", "strafe_right"), ("A sideways shift keeps the target framed without a turn.", "侧向移动可在不转向的情况下保持目标构图。")),
+    **dict.fromkeys(("slow_down", "speed_up"), ("The pace has to fit that of the target.", "飞行节奏需要与目标相适应。")),
+    "search_to_reacquire_target": ("Contact with the target has to be secured.", "需要确保与目标保持联系。"),
+    "hover": ("Holding the present position keeps the target in frame.", "保持当前位置可使目标留在画面内。"),
+    "break_off": ("The mission ends the pursuit here.", "任务要求在此结束跟踪。"),
+    "return_to_home": ("The mission calls the drone back.", "任务要求无人机返回。"),
+}  # fmt: skip
 
 Cause = Callable[[Facts, Cues], Both | None]
 _TREND = {1: "increasing", -1: "decreasing"}

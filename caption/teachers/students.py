@@ -143,7 +143,7 @@ class TaughtStudent:
     def request(self, question: Question, frames: Sequence[Sequence[EncodedImage]], seed: int) -> Request:
         """Give the English question."""
         prompt = self._reworked(question.asked["en"], question)
-        return self._request(prompt, frames, answer_schema(question.way.vocabulary.actions, question.decision), seed)
+        return self._request(prompt, frames, answer_schema(question.decision), seed)
 
     def mirror_request(
         self, question: Question, english: Draft, frames: Sequence[Sequence[EncodedImage]], seed: int
@@ -153,7 +153,7 @@ class TaughtStudent:
         The Chinese of an answer whose decision was given must hold that decision.
         """
         decision = english.coc.flight_decision if question.decision else None
-        schema = answer_schema(question.way.vocabulary.actions, decision, "zh")
+        schema = answer_schema(decision, "zh")
         return self._request(question.asked["zh"], frames, schema, seed)
 
     def _reworked(self, prompt: Prompt, question: Question) -> Prompt:

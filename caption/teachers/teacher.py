@@ -72,7 +72,7 @@ class RuleTeacher:
             draws = draws_for(self.seed, "caption", key)
             self._last = (
                 key,
-                write_templates(question.facts, draws, question.way.vocabulary.actions, question.decision),
+                write_templates(question.facts, draws, question.decision),
             )
         return self._last[1]
 
@@ -192,7 +192,7 @@ class AskingTeacher:
         else:
             optional = question.way.optional.items()
             more = {name: schema for name, schema in optional if name in english.written}
-            schema = answer_schema(question.way.vocabulary.actions, english.coc.flight_decision, "zh", more)
+            schema = answer_schema(english.coc.flight_decision, "zh", more)
             messages = mirror_messages(english, question.way, complaint)
             request = self.cfg.request(messages, [], schema, sampling_seed(self.seed, sample_id, purpose))
         return await self._kept_answer(question, request, purpose)
@@ -212,8 +212,7 @@ class AskingTeacher:
             return self.student.request(question, await self.frames.pictures(question), question.ask)
         messages, digests = await self.frames.messages(question)
         seed = sampling_seed(self.seed, question.window.sample_id, question.purpose)
-        actions = question.way.vocabulary.actions
-        schema = answer_schema(actions, question.decision, more=more_fields(question.way))
+        schema = answer_schema(question.decision, more=more_fields(question.way))
         return self.cfg.request(messages, digests, schema, seed)
 
 

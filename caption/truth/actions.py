@@ -1,25 +1,38 @@
-"""The actions against geometry: how much of each a motion shows, by the rules of the set in use
-(cosfly/products/actions.yaml).
+"""The actions against geometry: how much of each a motion shows, in units of its own threshold.
 
-The first line of its precedence in which an action is `implied` by the actual future gives the label: in it the action
-of which there is most, in units of its own threshold. A decision of which the future shows next to nothing is
-contradicted. `break_off` and
-`return_to_home` are orders of a mission: its metadata give them, geometry never does. Signs: left, up and forward are
-positive.
+The first group of `implied` in which an action reaches 1 gives the label: in it the action of which there is most. A
+decision of which the future shows next to nothing is contradicted. `break_off` and `return_to_home` are orders of a
+mission: its metadata give them, geometry never does. Signs: left, up and forward are positive.
 """
 
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, partial
 from itertools import pairwise
 
-from caption.schema import FutureMotion, LabelConfig
-from cosfly.products.actions import ActionSet, Condition, Rule, Size, Term
+from caption.schema import FutureMotion
+from cosfly.products.actions import TOKENS
 from cosfly.products.captions import Verdict
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Over the whole future (2.5 s by default). absent_share: a decision of which the flight shows less than this share
+    of its threshold is contradicted."""
+
+    yaw_deg: float = 3.0  # makes a turn
+    hard_turn_deg: float = 10.0  # contradicts track_straight
+    altitude_m: float = 1.0
+    speed_change_mps: float = 0.8
+    hover_mps: float = 0.3  # mean speed below which the drone hovers
+    moving_mps: float = 0.5  # mean speed that contradicts hover
+    forward_m: float = 0.5  # displacement in the body frame
+    lateral_m: float = 1.0
+    approach_m: float = 1.0  # change of the horizontal distance to the target
+    circle_deg: float = 15.0  # angle swept round the target
+    absent_share: float = 0.25
 
 
 @dataclass(frozen=True)
@@ -81,17 +94,114 @@ def measure(future: FutureMotion) -> Motion:
 Measure = Callable[[Motion], float]
 
 
-@dataclass(frozen=True)
+def _least(*sizes: float) -> float:
+    """Return the least size. One that cannot be measured (NaN, the angle round a target that nobody knows) is none."""
+    return min((size for size in sizes if size == size), default=math.nan)
+
+
+def _holds(fact: bool) -> float:
+    return 1.0 if fact else -1.0
+
+
+def _shown(t: Thresholds) -> dict[str, tuple[Measure, float]]:
+    """Return how much of each action a motion shows, negative for its opposite, and what it must not fall below: less
+    contradicts it."""
+
+    def leaves(token: str) -> Measure:
+        """Return the rule of an order: it was given, or the motion at least leaves the person."""
+        return lambda m: _holds(
+            m.order == token or not m.visible_now or m.visible_share < 1.0 or not m.approach_m > -t.approach_m
+        )
+
+    sizes: dict[str, Measure] = {
+        "track_straight": lambda m: _holds(abs(m.yaw_deg) < t.hard_turn_deg and m.forward_m > -t.forward_m),
+        "yaw_left_to_follow": lambda m: m.yaw_deg / t.yaw_deg,
+        "yaw_right_to_follow": lambda m: -m.yaw_deg / t.yaw_deg,
+        "circle_left": lambda m: _least(m.left_m / t.lateral_m, m.sweep_deg / t.circle_deg),
+        "circle_right": lambda m: _least(-m.left_m / t.lateral_m, -m.sweep_deg / t.circle_deg),
+        "ascend": lambda m: m.altitude_m / t.altitude_m,
+        "descend": lambda m: -m.altitude_m / t.altitude_m,
+        "move_forward": lambda m: m.forward_m / t.forward_m,
+        "move_backward": lambda m: -m.forward_m / t.forward_m,
+        "strafe_left": lambda m: m.left_m / t.lateral_m,
+        "strafe_right": lambda m: -m.left_m / t.lateral_m,
+        "slow_down": lambda m: -m.speed_change_mps / t.speed_change_mps,
+        "speed_up": lambda m: m.speed_change_mps / t.speed_change_mps,
+        "search_to_reacquire_target": lambda m: _holds(not (m.visible_now and m.visible_share >= 1.0)),
+        "hover": lambda m: _holds(m.mean_speed_mps < t.moving_mps),
+        "break_off": leaves("break_off"),
+        "return_to_home": leaves("return_to_home"),
+    }
+    # A turn that was not flown is the paper's example of a soft conflict: only a turn to the other side is a hard one.
+    limits = {"yaw_left_to_follow": -1.0, "yaw_right_to_follow": -1.0}
+    return {token: (sizes[token], limits.get(token, t.absent_share)) for token in TOKENS}
+
+
+def _implied(t: Thresholds) -> tuple[tuple[tuple[str, Measure], ...], ...]:
+    """Return how much there is of what makes each action the label, from 1 on, in groups in order of precedence:
+    orders, states, a manoeuvre that has the following ones as its parts, these, and the neutral one."""
+
+    def is_round(m: Motion) -> bool:
+        """Following a walker through a bend sweeps an angle too: a circle is flown round someone who moves less than
+        the drone."""
+        return abs(m.approach_m) < t.approach_m and m.target_path_m < 0.5 * abs(m.left_m)
+
+    def circles(side: int) -> Measure:
+        return lambda m: (
+            _least(m.left_m / (side * t.lateral_m), m.sweep_deg / (side * t.circle_deg)) if is_round(m) else 0.0
+        )
+
+    def closes_in(m: Motion) -> float:
+        """Of a gap that the person closes, only the drone's own part counts."""
+        if not m.forward_m >= t.forward_m:
+            return 0.0
+        return _least(m.approach_m / t.approach_m, m.closing_m / t.approach_m)
+
+    def backs_off(m: Motion) -> float:
+        if not abs(m.forward_m) >= abs(m.left_m):
+            return 0.0
+        return _least(-m.forward_m / t.forward_m, -m.closing_m / t.forward_m)
+
+    def strafes(side: int) -> Measure:
+        """A drone that swings round the person shifts to one side and turns to the other to keep its aim. That is one
+        motion, a turn to follow: which of its parts is more thresholds tells only the distance (1 m is 3 degrees at
+        19 m)."""
+        return lambda m: (
+            m.left_m / (side * t.lateral_m)
+            if abs(m.left_m) > abs(m.forward_m) and side * m.yaw_deg > -t.yaw_deg
+            else 0.0
+        )
+
+    return (
+        (
+            ("break_off", lambda m: _holds(m.order == "break_off")),
+            ("return_to_home", lambda m: _holds(m.order == "return_to_home")),
+        ),
+        (("search_to_reacquire_target", lambda m: _holds(not m.visible_now)),),
+        (("hover", lambda m: _holds(m.mean_speed_mps < t.hover_mps and abs(m.yaw_deg) < t.yaw_deg)),),
+        (("circle_left", circles(1)), ("circle_right", circles(-1))),
+        (
+            ("yaw_left_to_follow", lambda m: m.yaw_deg / t.yaw_deg),
+            ("yaw_right_to_follow", lambda m: -m.yaw_deg / t.yaw_deg),
+            ("ascend", lambda m: m.altitude_m / t.altitude_m),
+            ("descend", lambda m: -m.altitude_m / t.altitude_m),
+            # Who leaves a hover backwards, sideways or upwards gains speed too, but not on the way.
+            ("speed_up", lambda m: m.forward_gain_mps / t.speed_change_mps),
+            ("slow_down", lambda m: -m.speed_change_mps / t.speed_change_mps),
+            ("strafe_left", strafes(1)),
+            ("strafe_right", strafes(-1)),
+            ("move_backward", backs_off),
+            ("move_forward", closes_in),
+        ),
+        (("track_straight", lambda m: m.forward_m / t.forward_m),),
+    )
+
+
 class ActionTable:
-    """The rules of a set of actions with their thresholds put in.
+    """The rules of all actions with their thresholds put in: see `_implied` and `_shown`."""
 
-    implied: in order of precedence, groups of actions and how much there is of what makes each the label, from 1 on.
-    shown: how much of an
-    action a motion shows, negative for its opposite, and what it must not fall below: less contradicts it.
-    """
-
-    implied: tuple[tuple[tuple[str, Measure], ...], ...]
-    shown: dict[str, tuple[Measure, float]]
+    def __init__(self, thresholds: Thresholds = Thresholds()) -> None:
+        self.implied, self.shown = _implied(thresholds), _shown(thresholds)
 
     def label_of(self, motion: Motion) -> str | None:
         """Give the ground-truth decision, None where neither an order nor geometry tells."""
@@ -120,92 +230,4 @@ class ActionTable:
         return [token for token, (size, limit) in self.shown.items() if token != label and size(motion) < limit]
 
 
-@lru_cache(maxsize=16)
-def table_of(actions: ActionSet, cfg: LabelConfig) -> ActionTable:
-    """Give the rules of a set of actions."""
-    groups = [
-        [(token, _rule(rule, token, cfg)) for token in line if (rule := actions.actions[token].implied) is not None]
-        for line in actions.precedence
-    ]
-    shown = {
-        token: (
-            _rule(action.shown, token, cfg),
-            cfg.absent_share if (limit := action.contradicted_below) is None else limit,
-        )
-        for token, action in actions.actions.items()
-    }
-    return ActionTable(tuple(map(tuple, groups)), shown)
-
-
-_COMPARE = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
-
-
-def _rule(rule: Rule, token: str, cfg: LabelConfig) -> Measure:
-    sizes = [_size(Size(text), token, cfg) for text in rule.size]
-    where, unless = ([_condition(Condition(text), token, cfg) for text in texts] for texts in (rule.where, rule.unless))
-    size = None if not sizes else sizes[0] if len(sizes) == 1 else partial(_least, sizes)
-    if size is not None and not (where or unless):
-        return size
-
-    def measure_rule(motion: Motion) -> float:
-        for check in where:
-            if not check(motion):
-                return -1.0 if size is None else 0.0
-        for check in unless:
-            if not check(motion):
-                break
-        else:
-            if unless:
-                return -1.0 if size is None else 0.0
-        return 1.0 if size is None else size(motion)
-
-    return measure_rule
-
-
-def _least(sizes: list[Measure], motion: Motion) -> float:
-    """Give the least size; one that cannot be measured is none (the angle round a target that nobody knows)."""
-    least = math.nan
-    for size in sizes:
-        value = size(motion)
-        if value < least or least != least:
-            least = value
-    return least
-
-
-def _size(size: Size, token: str, cfg: LabelConfig) -> Measure:
-    term, unit = size.term, size.unit.factor * _setting(size.unit, cfg)
-    if term.name is None or term.setting is not None or term.is_size or abs(term.factor) != 1.0:
-        value = _term(term, token, cfg)
-        return lambda motion: value(motion) / unit
-    read, unit = _read(term.name, token), unit * term.factor  # the same to the last digit, and a call less
-    return lambda motion: read(motion) / unit
-
-
-def _condition(condition: Condition, token: str, cfg: LabelConfig) -> Callable[[Motion], bool]:
-    """A comparison does not hold where something cannot be measured."""
-    left, right = _term(condition.left, token, cfg), _term(condition.right, token, cfg)
-    compare = _COMPARE[condition.how]
-    if condition.right.name is None or condition.right.setting is not None:
-        limit = condition.right.factor * _setting(condition.right, cfg)
-        return lambda motion: compare(left(motion), limit)
-    return lambda motion: compare(left(motion), right(motion))
-
-
-def _term(term: Term, token: str, cfg: LabelConfig) -> Measure:
-    name, factor = term.name, term.factor
-    if name is None or term.setting is not None:
-        value = factor * _setting(term, cfg)
-        return lambda motion: value
-    read = _read(name, token)
-    if term.is_size:
-        return lambda motion: factor * abs(read(motion))
-    return read if factor == 1.0 else lambda motion: factor * read(motion)
-
-
-def _read(name: str, token: str) -> Measure:
-    """Give how a measure is read; `ordered` is of the action itself."""
-    return operator.attrgetter(name) if name != "ordered" else lambda motion: float(motion.order == token)
-
-
-def _setting(term: Term, cfg: LabelConfig) -> float:
-    return 1.0 if term.setting is None else float(getattr(cfg, term.setting))
+TABLE = ActionTable()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from caption.schema import EvidenceConfig, Judged
+from caption.schema import Judged
 from caption.truth.coverage import cover
 from caption.truth.facts import Facts
 from caption.truth.numerals import Numeral
@@ -29,9 +29,10 @@ from caption.truth.references import (
 from caption.truth.said import SCENE
 from caption.truth.sizes import BOUND_SHARE, RATIO_SLACK, about_share, numeral_of, written_digits
 from caption.truth.stated import read_stated
-from cosfly.products.actions import ActionSet
 from cosfly.products.answer_text import normalize_action
 from cosfly.products.captions import Claim, Language, SentenceState
+
+TOLERANCES = {"m": 0.3, "mps": 0.15, "px": 3.0}  # of a number that a sentence calls approximate
 
 
 def judge_sentence(
@@ -40,9 +41,7 @@ def judge_sentence(
     claims: Sequence[Claim],
     decision: str,
     facts: Facts,
-    cfg: EvidenceConfig,
     language: Language,
-    actions: ActionSet,
 ) -> Judged:
     """Judge one sentence by its claims.
 
@@ -50,15 +49,15 @@ def judge_sentence(
     alone. A numeral or a word of an opposite without a claim must be true of the window, and proves nothing
     (coverage.py).
     """
-    about = cfg if read_stated(text, language).is_approximate else None
+    is_about = read_stated(text, language).is_approximate
     problems, states = [], []
     for claim in claims:
         numeral = numeral_of(text, claim, language) if isinstance(claim.value, float) else None
-        state, problem = _compare(claim, decision, facts, about, numeral, actions)
+        state, problem = _compare(claim, decision, facts, is_about, numeral)
         states.append(state)
         if problem:
             problems.append(problem)
-    coverage = cover(text, claims, facts, language, actions)
+    coverage = cover(text, claims, facts, language)
     problems += coverage.problems
     if problems:
         return Judged(name, text, "contradicted", tuple(dict.fromkeys(problems)))
@@ -66,18 +65,16 @@ def judge_sentence(
     return Judged(name, text, "proved" if is_proved else "unread")
 
 
-def _compare(
-    claim: Claim, decision: str, facts: Facts, about: EvidenceConfig | None, numeral: Numeral | None, actions: ActionSet
-) -> tuple[str, str]:
+def _compare(claim: Claim, decision: str, facts: Facts, is_about: bool, numeral: Numeral | None) -> tuple[str, str]:
     """Give what became of a claim, proved | unread | contradicted | not_compared, and the problem, if it is one."""
     if claim.quantity == SCENE or claim.modality == "hypothetical":
         return "not_compared", ""
     if claim.quantity == "decision" or claim.modality == "predicted":
-        is_against = goes_against(claim, decision, actions)
+        is_against = goes_against(claim, decision)
         return (
             ("contradicted", f"decision: {claim_name(claim)}, not {decision}") if is_against else ("not_compared", "")
         )
-    state = judge_claim(claim, facts, about, numeral)
+    state = judge_claim(claim, facts, is_about, numeral)
     if state in ("proved", "unread"):
         return state, ""
     if state == "unknown_fact" and isinstance(claim.value, str):
@@ -115,20 +112,20 @@ def _is_of_span(reference: Reference) -> bool:
 
 
 def judge_claim(
-    claim: Claim, facts: Facts, about: EvidenceConfig | None = None, numeral: Numeral | None = None
+    claim: Claim, facts: Facts, is_about: bool = False, numeral: Numeral | None = None
 ) -> SentenceState | Missing:
     """Compare an observed claim with the facts, to the digits that it is written with; says why it cannot be compared.
 
     A value or a word of a span of frames is said of each of them.
 
     Args:
-        about: the tolerances where the sentence says that the number is approximate; None: it does not.
+        is_about: the sentence says that the number is approximate.
         numeral: how the sentence writes the number; None: as the claim has it.
     """
     references = references_of(claim)
     if not references:
         return "unknown_reference"
-    states = [_judge_at(reference, claim, facts, about, numeral) for reference in references]
+    states = [_judge_at(reference, claim, facts, is_about, numeral) for reference in references]
     for state in ("contradicted", "unobserved_frame", "unknown_fact", "unread"):
         if state in states:
             return state
@@ -136,7 +133,7 @@ def judge_claim(
 
 
 def _judge_at(
-    reference: Reference, claim: Claim, facts: Facts, about: EvidenceConfig | None, numeral: Numeral | None
+    reference: Reference, claim: Claim, facts: Facts, is_about: bool, numeral: Numeral | None
 ) -> SentenceState | Missing:
     fact = look_up(reference, facts)
     meant = facts_meant(reference, facts)
@@ -153,7 +150,7 @@ def _judge_at(
     digits = written_digits(claim.value) if numeral is None else numeral.digits
     if fact.unit == "times":
         digits = max(1, digits)  # "two times" is not true of 2.4
-    slack = _slack(claim.value, fact.unit, about)
+    slack = _slack(claim.value, fact.unit, is_about)
     if reference.aspect == "change":
         slack = max(slack, 10.0**-fact.digits)  # the difference of two rounded values is off by one of their last digit
     if numeral is not None and numeral.factor != 1.0:  # of feet or knots
@@ -165,16 +162,16 @@ def _judge_at(
     return "proved" if any(number_holds(claim.value, digits, one, slack) for one in meant) else "contradicted"
 
 
-def _slack(value: float, unit: str, about: EvidenceConfig | None) -> float:
+def _slack(value: float, unit: str, is_about: bool) -> float:
     """Give how far a number may lie from its fact beyond its own rounding."""
     if unit == "percent":  # of numbers that are rounded themselves
-        return 1.0 if about is None else 5.0
+        return 5.0 if is_about else 1.0
     if unit == "times":
-        return (0.02 if about is None else RATIO_SLACK) * abs(value)
-    if about is None:
+        return (RATIO_SLACK if is_about else 0.02) * abs(value)
+    if not is_about:
         return 0.0
-    size = {"m": about.tolerance_m, "mps": about.tolerance_mps, "px": about.tolerance_px}.get(unit, about.tolerance_deg)
-    return max(min(size, 0.1 * abs(value)), max(about.relative, about_share(abs(value))) * abs(value))
+    size = TOLERANCES.get(unit, 1.0)  # degrees
+    return max(min(size, 0.1 * abs(value)), about_share(abs(value)) * abs(value))
 
 
 # Words of a plan against the decision: quantity, value or sign -> decisions that it contradicts.
@@ -190,10 +187,10 @@ _AGAINST: dict[tuple[str, str], tuple[str, ...]] = {
 }
 
 
-def goes_against(claim: Claim, decision: str, actions: ActionSet) -> bool:
+def goes_against(claim: Claim, decision: str) -> bool:
     """Tell whether a predicted claim contradicts the decision."""
     if claim.quantity == "decision":
-        return claim.modality != "hypothetical" and normalize_action(str(claim.value), actions) != decision
+        return claim.modality != "hypothetical" and normalize_action(str(claim.value)) != decision
     aspect, _, name = claim.quantity.rpartition(":")
     word = claim.value
     if isinstance(word, float):
@@ -201,7 +198,7 @@ def goes_against(claim: Claim, decision: str, actions: ActionSet) -> bool:
             return False
         rises = word > 0
         word = ("left" if rises else "right") if name == "yaw" else ("increasing" if rises else "decreasing")
-    return actions.kin_of(decision) in _AGAINST.get((name, word), ())
+    return decision in _AGAINST.get((name, word), ())
 
 
 def claim_name(claim: Claim) -> str:

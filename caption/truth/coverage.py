@@ -20,7 +20,6 @@ from caption.truth.references import QUANTITIES
 from caption.truth.said import Said, frames_of
 from caption.truth.sizes import may_mean, same_size
 from caption.truth.stated import Pole, Stated, lexicon_of, read_stated
-from cosfly.products.actions import ActionSet
 from cosfly.products.captions import Claim, Language
 
 # Words, negated or not, that say that the person is seen, and that not all is.
@@ -47,7 +46,7 @@ class ClaimCoverage:
     is_whole: bool
 
 
-def cover(text: str, claims: Sequence[Claim], facts: Facts, language: Language, actions: ActionSet) -> ClaimCoverage:
+def cover(text: str, claims: Sequence[Claim], facts: Facts, language: Language) -> ClaimCoverage:
     """Say what of a sentence neither a claim covers nor the facts bear out, and which claims it says the opposite of.
 
     A word or a number without a claim is no problem where it is true of the window, unless a claim of its kind is
@@ -58,7 +57,7 @@ def cover(text: str, claims: Sequence[Claim], facts: Facts, language: Language, 
         text: a sentence. claims: all of it.
     """
     stated = read_stated(text, language)
-    said = Said(claims, facts, language, actions)
+    said = Said(claims, facts, language)
     uncovered = [numeral for numeral in stated.numerals if not said.covers_numeral(numeral, stated)]
     problems = [f"uncovered: {text}" for text in _wrong_numerals(stated, said, uncovered)]
     poles = list(_uncovered_poles(stated, said, facts, language))
@@ -250,7 +249,7 @@ def _denied_words(stated: Stated, said: Said) -> Iterator[str]:
             if "off_centre" in places and not _is_off_somewhere(said):
                 yield _name(claim)
         elif claim.quantity == "decision" and claim.modality == "predicted":
-            word = ACTION_WORDS.get(said.actions.kin_of(str(claim.value)))
+            word = ACTION_WORDS.get(str(claim.value))
             if stated.named and word not in stated.actions:
                 yield _name(claim)
 

@@ -14,7 +14,7 @@ from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
 from caption.truth.numerals import Numeral, read_numerals
 from caption.truth.references import Series
-from caption.truth.vocabulary import Vocabulary
+from caption.truth.vocabulary import terms_in
 from cosfly.products.answer_text import is_in_script
 from cosfly.products.captions import Coc, Language
 from cosfly.products.sentences import cut_sentences
@@ -98,14 +98,14 @@ def _is_shared(number: Numeral, theirs: list[Numeral], flight: dict[str, list[Se
     return False
 
 
-def check_translation(english: Coc, chinese: Coc, vocabulary: Vocabulary) -> tuple[str, str] | None:
+def check_translation(english: Coc, chinese: Coc) -> tuple[str, str] | None:
     """Compare a translation with what it was made of; gives reason and what is missing, None where they agree."""
     for name in TEXTS:
         ours, theirs = (len(cut_sentences(getattr(coc, name))) for coc in (english, chinese))
         if ours != theirs:
             return "sentences", f"{name} has {ours} sentences in English and {theirs} in Chinese; write one for each"
     text = " ".join(getattr(english, name) for name in TEXTS)
-    missing = lacking(vocabulary.terms_in(text), chinese)
+    missing = lacking(terms_in(text), chinese)
     return ("glossary", missing) if missing else None
 
 

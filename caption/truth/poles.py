@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 from caption.truth.references import TURNED
-from cosfly.products.actions import ActionSet
 from cosfly.products.captions import Claim
 
 Pair = tuple[str, str]  # dimension, value
@@ -48,12 +47,12 @@ ACTION_WORDS = {
 }  # fmt: skip
 
 
-def poles_of(claim: Claim, actions: ActionSet) -> set[Pair]:
+def poles_of(claim: Claim) -> set[Pair]:
     """Give the opposites that a claim stands for."""
     aspect, _, name = claim.quantity.rpartition(":")
     value = claim.value
     if name == "decision":
-        return set(_decision_poles(str(value), actions))
+        return set(_decision_poles(str(value)))
     if name == "framing":
         return {("centre", "centred" if value == "centred" else "off_centre")}
     if name == "walking":
@@ -88,8 +87,8 @@ def poles_of(claim: Claim, actions: ActionSet) -> set[Pair]:
     return number_poles(aspect, name, float(value)) if isinstance(value, float) else set()
 
 
-def _decision_poles(action: str, actions: ActionSet) -> Iterator[Pair]:
-    yield from _DECISIONS.get(actions.kin_of(action), ())
+def _decision_poles(action: str) -> Iterator[Pair]:
+    yield from _DECISIONS.get(action, ())
     for side in ("left", "right"):
         if side in action:
             yield "side", side

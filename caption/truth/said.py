@@ -14,7 +14,6 @@ from caption.truth.poles import Pair, poles_between, poles_of, side_word
 from caption.truth.references import QUANTITIES, TURNING, Fact, look_up, parse_reference
 from caption.truth.sizes import both_ways, is_share, same_size, ways
 from caption.truth.stated import Pole, Stated, read_stated
-from cosfly.products.actions import ActionSet
 from cosfly.products.captions import Claim, Language
 
 HOUR_DEG = 30.0
@@ -42,8 +41,8 @@ def _is_expected(claim: Claim, pole: Pair) -> bool:
 class Said:
     """The claims of one sentence: their numbers, and the opposites that they stand for."""
 
-    def __init__(self, claims: Sequence[Claim], facts: Facts, language: Language, actions: ActionSet) -> None:
-        self.facts, self.language, self.actions = facts, language, actions
+    def __init__(self, claims: Sequence[Claim], facts: Facts, language: Language) -> None:
+        self.facts, self.language = facts, language
         self.claims = [claim for claim in claims if claim.quantity != SCENE]
         self.scene = [str(claim.value) for claim in claims if claim.quantity == SCENE]
         self.numbers = [claim for claim in self.claims if isinstance(claim.value, float)]
@@ -68,7 +67,7 @@ class Said:
                 self.poles.update((pole.dimension, pole.value) for pole in read_stated(text, either).poles)
 
     def poles_of(self, claim: Claim) -> set[Pair]:
-        return poles_of(claim, self.actions)
+        return poles_of(claim)
 
     def names_frames(self, pole: Pole) -> bool:
         """Tell whether a claim of visibility is of a frame that stands beside a word of it."""

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Protocol
 
-from caption.schema import EvidenceConfig, Judged
+from caption.schema import Judged
 from caption.truth.facts import Facts
 from caption.truth.vocabulary import Vocabulary
+from cosfly.products.actions import TOKENS
 from cosfly.products.answer_text import Parsed
 from cosfly.products.captions import Coc, Language, Template, Writing
 
@@ -84,7 +85,7 @@ class WayOfWriting(Protocol):
     def read_mirror(self, answer: Parsed, english: Draft, facts: Facts) -> Draft | Refused:
         """Make the Chinese draft, and hold it against the English one."""
 
-    def judge(self, draft: Draft, facts: Facts, cfg: EvidenceConfig, language: Language) -> list[Judged]:
+    def judge(self, draft: Draft, facts: Facts, language: Language) -> list[Judged]:
         """Give the state of every sentence of both texts, in order."""
 
 
@@ -96,7 +97,7 @@ def way_of(name: Writing, vocabulary: Vocabulary) -> WayOfWriting:
 
 def more_fields(way: WayOfWriting) -> dict[str, dict]:
     """Give the fields of an answer beyond the paper's three. `therefore` is free even where the decision is given."""
-    return {**way.fields, **way.optional, "therefore": {"type": "string", "enum": list(way.vocabulary.actions.tokens)}}
+    return {**way.fields, **way.optional, "therefore": {"type": "string", "enum": list(TOKENS)}}
 
 
 def refuse_decision(answer: Parsed) -> Refused | None:

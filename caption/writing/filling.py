@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 
 from caption.truth.facts import Facts
 from caption.truth.references import QUANTITIES, Fact, Missing, Reference, find_fact, look_up, span_of
-from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import DECISION_REASON, Refused
 from caption.writing.templates import NEITHER, TURNS, Sentence, Slot, read_sentence, units_behind, words_of
+from cosfly.products.actions import ACTIONS
 from cosfly.products.captions import Language
 
 _DIRECTIONS = {
@@ -22,13 +22,13 @@ _VOWEL = re.compile(r"[aeio]|8|1[18]\b")
 class Filler:
     """Fills sentences of one language from the facts of one window; `{decision}` stands for the decision."""
 
-    def __init__(self, facts: Facts, decision: str, language: Language, vocabulary: Vocabulary) -> None:
-        self.facts, self.decision, self.language, self.vocabulary = facts, decision, language, vocabulary
-        self._found, self._units, self._forms = facts.found, units_behind(language), words_of(language, vocabulary)
+    def __init__(self, facts: Facts, decision: str, language: Language) -> None:
+        self.facts, self.decision, self.language = facts, decision, language
+        self._found, self._units, self._forms = facts.found, units_behind(language), words_of(language)
 
     def fill(self, sentence: Sentence, *, is_reasoning: bool = False) -> str | Refused:
         """Give the plain text of a sentence."""
-        if is_reasoning and self.vocabulary.actions.kin_of(self.decision) in sentence.opposed:
+        if is_reasoning and self.decision in sentence.opposed:
             complaint = (
                 f'it argues against {self.decision}, and "flight_decision" says {self.decision}; let the '
                 f"reasoning lead to it"
@@ -65,7 +65,7 @@ class Filler:
 
     def _check_decisions(self, sentence: Sentence) -> Refused | None:
         """Refuse a sentence that comes to another decision than its answer."""
-        own = (self.decision, self.vocabulary.names[self.decision]["en"])
+        own = (self.decision, ACTIONS[self.decision].en)
         other = next((words for words in sentence.decisions if words not in own), None)
         if other is None:
             return None
@@ -165,11 +165,11 @@ class Filler:
         return Fact(QUANTITIES[quantity].sides[0 if number.value > 0 else 1])
 
 
-def facts_of(facts: Facts, names: Sequence[str], vocabulary: Vocabulary) -> Iterator[tuple[str, str]]:
+def facts_of(facts: Facts, names: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Give (name, how it is filled in) of the slots among these whose fact is known."""
-    filler = Filler(facts, "", "en", vocabulary)
+    filler = Filler(facts, "", "en")
     for name in names:
-        sentence = read_sentence(f"it {{{name}}} it", "en", len(facts), facts.step_s, vocabulary)
+        sentence = read_sentence(f"it {{{name}}} it", "en", len(facts), facts.step_s)
         assert isinstance(sentence, Sentence)
         text = filler.fill(sentence)
         if isinstance(text, str):

@@ -11,8 +11,8 @@ from functools import lru_cache
 
 from caption.truth.glossary import load_glossary
 from caption.truth.numerals import read_numerals
-from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Refused
+from cosfly.products.actions import ACTIONS
 from cosfly.products.captions import Language
 
 SLOT_MARK = "¤"
@@ -119,15 +119,15 @@ def decisions_opposed(text: str) -> tuple[str, ...]:
     )
 
 
-def decisions_named(text: str, vocabulary: Vocabulary) -> tuple[str, ...]:
+def decisions_named(text: str) -> tuple[str, ...]:
     """Give the actions, in words or as tokens, that an English text says to take."""
-    return tuple((match["words"] or match["token"]).lower() for match in _named(vocabulary).finditer(text))
+    return tuple((match["words"] or match["token"]).lower() for match in _named().finditer(text))
 
 
 @lru_cache
-def _named(vocabulary: Vocabulary) -> re.Pattern[str]:
-    words = "|".join(re.escape(name["en"]) for name in vocabulary.names.values())
-    tokens = "|".join(token for token in vocabulary.actions.tokens if "_" in token)
+def _named() -> re.Pattern[str]:
+    words = "|".join(re.escape(action.en) for action in ACTIONS.values())
+    tokens = "|".join(token for token in ACTIONS if "_" in token)
     return re.compile(
         r"\b(?:should|must|shall|needs? to|has to|have to|best to|decision (?:is|that follows is)(?: to)?"
         r"|therefore,?)\s+(?:now\s+)?"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from caption.schema import EvidenceConfig, Judged
+from caption.schema import Judged
 from caption.truth.facts import Facts
 from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.prose import judge_prose
@@ -37,5 +37,5 @@ class Prose(WayOfWriting):
             return draft
         return Refused(problem, f"The Chinese text is not that of the English one: {problem}.", draft)
 
-    def judge(self, draft: Draft, facts: Facts, cfg: EvidenceConfig, language: Language) -> list[Judged]:
+    def judge(self, draft: Draft, facts: Facts, language: Language) -> list[Judged]:
         return judge_prose(draft.coc, facts, language)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any, get_args
 
-from caption.schema import EvidenceConfig, Judged
+from caption.schema import Judged
 from caption.truth.claims import judge_sentence
 from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
@@ -18,7 +18,6 @@ from caption.truth.mirror import TEXTS, lacking
 from caption.truth.quoted import QUOTED_SCHEMA, read_quoted
 from caption.truth.references import QUANTITIES
 from caption.truth.stated import Pole, read_stated
-from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft, Refused, WayOfWriting
 from caption.writing.earned import is_earned
 from caption.writing.filling import Filler, facts_of
@@ -49,11 +48,11 @@ class Slots(WayOfWriting):
     optional: Mapping[str, dict] = {"claims": QUOTED_SCHEMA}
 
     def table(self, facts: Facts) -> str:
-        return fact_table(facts, self.vocabulary)
+        return fact_table(facts)
 
     def read(self, answer: Parsed, facts: Facts) -> Draft | Refused:
         assert answer.coc is not None
-        filler = Filler(facts, answer.coc.flight_decision, "en", self.vocabulary)
+        filler = Filler(facts, answer.coc.flight_decision, "en")
         return _fill(answer.coc, filler, answer.more.get("claims"), answer.therefore)
 
     def read_mirror(self, answer: Parsed, english: Draft, facts: Facts) -> Draft | Refused:
@@ -61,26 +60,24 @@ class Slots(WayOfWriting):
         assert english.template is not None
         if answer.coc.flight_decision != english.coc.flight_decision:
             return Refused("decision", f'"flight_decision" must stay {english.coc.flight_decision}.')
-        problem = _compare(english.template, answer.coc, facts, self.vocabulary)
+        problem = _compare(english.template, answer.coc, facts)
         if problem is not None:
             return problem
-        filler = Filler(facts, answer.coc.flight_decision, "zh", self.vocabulary)
+        filler = Filler(facts, answer.coc.flight_decision, "zh")
         found = _fill(answer.coc, filler, answer.more.get("claims"))
         if isinstance(found, Refused):
             return found
-        missing = lacking(_terms(english.template, facts, self.vocabulary), found.coc)
+        missing = lacking(_terms(english.template, facts), found.coc)
         return Refused("glossary", missing, found) if missing else found
 
-    def judge(self, draft: Draft, facts: Facts, cfg: EvidenceConfig, language: Language) -> list[Judged]:
+    def judge(self, draft: Draft, facts: Facts, language: Language) -> list[Judged]:
         return list(draft.judged)
 
 
 @lru_cache(maxsize=64)  # an English text is read again when its mirror is held against it
-def read_text(
-    text: str, language: Language, num_frames: int, step_s: float, vocabulary: Vocabulary
-) -> tuple[Sentence | Refused, ...]:
+def read_text(text: str, language: Language, num_frames: int, step_s: float) -> tuple[Sentence | Refused, ...]:
     """Read the sentences of a text."""
-    return tuple([read_sentence(part, language, num_frames, step_s, vocabulary) for part in cut_sentences(text)])
+    return tuple([read_sentence(part, language, num_frames, step_s) for part in cut_sentences(text)])
 
 
 def _fill(written: Coc, filler: Filler, claimed: Any, therefore: str | None = None) -> Draft | Refused:
@@ -98,7 +95,7 @@ def _fill(written: Coc, filler: Filler, claimed: Any, therefore: str | None = No
     for name in TEXTS:
         filled: list[str] = []
         is_reasoning = name == "reasoning_trace"
-        sentences = read_text(getattr(written, name), language, num_frames, facts.step_s, filler.vocabulary)
+        sentences = read_text(getattr(written, name), language, num_frames, facts.step_s)
         for number, sentence in enumerate(sentences, 1):
             plain: str | Refused = (
                 sentence if isinstance(sentence, Refused) else filler.fill(sentence, is_reasoning=is_reasoning)
@@ -139,9 +136,9 @@ def _fill(written: Coc, filler: Filler, claimed: Any, therefore: str | None = No
 
 def _judge_beside(name: str, sentence: Sentence, claims: Sequence[Claim], filler: Filler) -> Judged:
     """Judge a sentence that its slots do not prove by claims of the words beside them."""
-    facts, language, actions = filler.facts, filler.language, filler.vocabulary.actions
+    facts, language = filler.facts, filler.language
     beside, references = sentence.beside, [place.slot.reference for place in sentence.places]
-    found = judge_sentence(name, beside, claims, filler.decision, facts, EvidenceConfig(), language, actions)
+    found = judge_sentence(name, beside, claims, filler.decision, facts, language)
     problems = tuple(one for one in found.problems if one.startswith(CONTRADICTIONS))
     if problems:
         return Judged(name, "", "contradicted", problems)
@@ -168,21 +165,21 @@ def _words_of(claim: Claim, beside: str, poles: Sequence[Pole]) -> list[Pole]:
     return own if SLOT_MARK not in quote and is_of_kind and is_stated else []
 
 
-def _terms(english: Template, facts: Facts, vocabulary: Vocabulary) -> list[tuple[str, str]]:
+def _terms(english: Template, facts: Facts) -> list[tuple[str, str]]:
     """Give the glossary's terms of an English template, slots aside: these are filled in from the glossary."""
     found: list[tuple[str, str]] = []
     for name in TEXTS:
-        for sentence in read_text(getattr(english, name), "en", len(facts), facts.step_s, vocabulary):
+        for sentence in read_text(getattr(english, name), "en", len(facts), facts.step_s):
             assert isinstance(sentence, Sentence)  # else there is no English draft
             found += sentence.terms
     return list(dict.fromkeys(found))  # in their order, so that a complaint is the same in every run
 
 
-def _compare(english: Template, chinese: Coc, facts: Facts, vocabulary: Vocabulary) -> Refused | None:
+def _compare(english: Template, chinese: Coc, facts: Facts) -> Refused | None:
     """Hold the Chinese template against the English one: sentence by sentence the same slots, each in its script."""
     for name in TEXTS:
-        ours = read_text(getattr(english, name), "en", len(facts), facts.step_s, vocabulary)
-        theirs = read_text(getattr(chinese, name), "zh", len(facts), facts.step_s, vocabulary)
+        ours = read_text(getattr(english, name), "en", len(facts), facts.step_s)
+        theirs = read_text(getattr(chinese, name), "zh", len(facts), facts.step_s)
         if len(ours) != len(theirs):
             words = f"{name} has {len(ours)} sentences in English and {len(theirs)} in Chinese; write one for each."
             return Refused("sentences", words)
@@ -218,25 +215,25 @@ _WORDS = (
 )  # fmt: skip
 
 
-def fact_table(facts: Facts, vocabulary: Vocabulary) -> str:
+def fact_table(facts: Facts) -> str:
     """Give the facts of a window with the names of their slots, as they are filled in; what is not known is left
     out."""
     last = len(facts) - 1
     lines = []
     for name in _SERIES:
-        values = dict(facts_of(facts, [f"{name}@t{i}" for i in range(last + 1)], vocabulary))
+        values = dict(facts_of(facts, [f"{name}@t{i}" for i in range(last + 1)]))
         if not values:
             continue
         unit = " " + load_glossary().written_units["en"][QUANTITIES[name].unit]
         series = ", ".join(values.get(f"{name}@t{i}", "-").removesuffix(unit) for i in range(last + 1))
         more = [f"change:{name}", f"trend:{name}"] if name in _SPANNED else []
-        lines.append(f"{{{name}@t0}} to {{{name}@t{last}}}: {series}{unit}{_listed(facts, more, vocabulary, '; ')}")
-    seen = ", ".join(text for _, text in facts_of(facts, [f"visibility@t{i}" for i in range(last + 1)], vocabulary))
+        lines.append(f"{{{name}@t0}} to {{{name}@t{last}}}: {series}{unit}{_listed(facts, more, '; ')}")
+    seen = ", ".join(text for _, text in facts_of(facts, [f"visibility@t{i}" for i in range(last + 1)]))
     lines.append(f"{{visibility@t0}} to {{visibility@t{last}}}: {seen}")
-    lines += [_listed(facts, names, vocabulary).removeprefix("; ") for names in (_NOW, _WORDS)]
+    lines += [_listed(facts, names).removeprefix("; ") for names in (_NOW, _WORDS)]
     return "Table of facts (- is not known; {decision} is there too):\n" + "\n".join(lines)
 
 
-def _listed(facts: Facts, names: Sequence[str], vocabulary: Vocabulary, before: str = "") -> str:
-    listed = "; ".join(f"{{{name}}} {text}" for name, text in facts_of(facts, names, vocabulary))
+def _listed(facts: Facts, names: Sequence[str], before: str = "") -> str:
+    listed = "; ".join(f"{{{name}}} {text}" for name, text in facts_of(facts, names))
     return before + listed if names else ""

@@ -20,11 +20,12 @@ from typing import Literal, NamedTuple
 from caption.truth.facts import Facts
 from caption.truth.glossary import load_glossary
 from caption.truth.references import ANGLES, MOTIONS, QUANTITIES, Quantity, Reference, Series, parse_reference
-from caption.truth.vocabulary import Vocabulary
+from caption.truth.vocabulary import terms_in
 from caption.writing.contract import Refused
 from caption.writing.earned import is_earned
 from caption.writing.outside import SLOT_MARK, check_outside, decisions_named, decisions_opposed, states_beside
 from cosfly.errors import nearest
+from cosfly.products.actions import ACTIONS
 from cosfly.products.answer_text import is_in_script
 from cosfly.products.captions import Language, SentenceState
 
@@ -154,9 +155,7 @@ class Sentence:
 
 
 @lru_cache(maxsize=32768)  # neighbouring windows share most sentences
-def read_sentence(
-    text: str, language: Language, num_frames: int, step_s: float, vocabulary: Vocabulary
-) -> Sentence | Refused:
+def read_sentence(text: str, language: Language, num_frames: int, step_s: float) -> Sentence | Refused:
     """Read a sentence, or say why it cannot be filled in any window of so many frames."""
     parts = _BRACES.split(text)
     texts, names = parts[::2], parts[1::2]
@@ -188,16 +187,16 @@ def read_sentence(
     return Sentence(
         pattern="%s".join(part.replace("%", "%%") for part in texts),
         beside=beside,
-        places=tuple(_place(slot, language, vocabulary) for slot in slots),
+        places=tuple(_place(slot, language) for slot in slots),
         names=tuple(sorted(slot.name for slot in slots)),
         sizes=tuple((slot, _words_of(slot, slots)) for slot in slots if slot.is_size and not slot.is_word),
         begins_with_slot=begins_with_slot,
         is_in_script=is_in_script(beside, language),
         state="proved" if is_earned(beside, [slot.reference for slot in slots], num_frames, language) else "unread",
         doubtful=states_beside(beside, language),
-        decisions=decisions_named(beside, vocabulary) if language == "en" else (),
+        decisions=decisions_named(beside) if language == "en" else (),
         opposed=decisions_opposed(beside) if language == "en" else (),
-        terms=vocabulary.terms_in(beside) if language == "en" else (),
+        terms=terms_in(beside) if language == "en" else (),
     )
 
 
@@ -210,14 +209,14 @@ def _with_article(slot: Slot, texts: list[str], number: int) -> Slot:
     return replace(slot, article=match[1])
 
 
-def _place(slot: Slot, language: Language, vocabulary: Vocabulary) -> SlotPlace:
+def _place(slot: Slot, language: Language) -> SlotPlace:
     quantity = slot.quantity
     if slot.article:
         return SlotPlace(slot.fact_key, slot)
     if quantity is None:
         if not slot.is_word:
             return SlotPlace(slot.fact_key, slot)
-        words = _words_written(language, slot.form, not (slot.is_size or slot.needs_side), vocabulary)
+        words = _words_written(language, slot.form, not (slot.is_size or slot.needs_side))
         return SlotPlace(slot.fact_key, slot, words=words)
     assert slot.reference is not None
     frame = -1 if slot.reference.first is None else slot.reference.first
@@ -226,21 +225,20 @@ def _place(slot: Slot, language: Language, vocabulary: Vocabulary) -> SlotPlace:
 
 
 @lru_cache
-def _words_written(
-    language: Language, form: Form, with_neither: bool, vocabulary: Vocabulary
-) -> dict[float | str, str]:
+def _words_written(language: Language, form: Form, with_neither: bool) -> dict[float | str, str]:
     """Give how words are written in a form; without those that are neither side where a side may be needed."""
     left_out = () if with_neither else NEITHER
-    words = {word: forms for word, forms in words_of(language, vocabulary).items() if word not in left_out}
+    words = {word: forms for word, forms in words_of(language).items() if word not in left_out}
     return {word: forms[min(form, len(forms) - 1)] for word, forms in words.items()}
 
 
 @lru_cache
-def words_of(language: Language, vocabulary: Vocabulary) -> dict[str, tuple[str, ...]]:
+def words_of(language: Language) -> dict[str, tuple[str, ...]]:
     """Give the forms of every word that is true somewhere: slot words, kinds of visibility, decisions."""
     glossary = load_glossary()
-    names = {name: (pair[language],) for name, pair in (glossary.visibility | vocabulary.names).items()}
-    return names | {name: forms[language] for name, forms in glossary.slot_words.items()}
+    seen = {name: (pair[language],) for name, pair in glossary.visibility.items()}
+    names = {token: (action.en if language == "en" else action.zh,) for token, action in ACTIONS.items()}
+    return seen | names | {name: forms[language] for name, forms in glossary.slot_words.items()}
 
 
 @cache

@@ -98,8 +98,8 @@ def caption_doctor(
 
 def _examine_endpoint(url: str, cfg: CaptionConfig) -> None:
     """Print a table of what works; exit 1 when the endpoint is unusable."""
-    from caption.run.own_files import vocabulary_of
     from caption.teachers.doctor import examine_endpoint
+    from caption.teachers.prompt_files import vocabulary_of
     from cosfly.work.console import console
 
     findings = examine_endpoint(url, cfg, vocabulary_of(cfg))
@@ -114,8 +114,7 @@ def caption_prompts(
     check: Annotated[Path | None, Option(help="Folder with prompts of yours: say what is missing or unknown.")] = None,
 ) -> None:
     """Write the prompts into a folder, or check a folder of yours; --set caption.prompts=DIR asks with it."""
-    from caption.run.own_files import vocabulary_of
-    from caption.teachers.prompt_files import export_prompts, own_prompts
+    from caption.teachers.prompt_files import export_prompts, own_prompts, vocabulary_of
 
     if (export is None) == (check is None):
         raise typer.BadParameter("give --export DIR or --check DIR")
@@ -124,30 +123,6 @@ def caption_prompts(
     elif export is not None:
         found = export_prompts(export, vocabulary_of(job.cfg.caption).prompts)
         typer.echo(f"{export}: {len(found)} prompts")
-
-
-@app.command("actions")
-def caption_actions(
-    export: Annotated[Path | None, Option(help="File to write the actions that ship to, to begin with.")] = None,
-    check: Annotated[Path | None, Option(help="File with actions of yours: say what is wrong with it.")] = None,
-) -> None:
-    """Write the closed set of actions into a file, or check one of yours, for --set caption.actions=FILE."""
-    import numpy as np
-
-    from caption.schema import LabelConfig
-    from caption.truth.reach import never_labels
-    from cosfly.products.actions import export_actions, read_actions
-
-    if (export is None) == (check is None):
-        raise typer.BadParameter("give --export FILE or --check FILE")
-    if check is not None:
-        actions = read_actions(check)
-        found = never_labels(actions, LabelConfig(), np.random.default_rng(0))
-        typer.echo("".join(f"warning: {line}\n" for line in found), nl=False)
-        typer.echo(f"{check}: {len(actions.tokens)} actions, nothing wrong{' but this' if found else ''}")
-    elif export is not None:
-        export_actions(export)
-        typer.echo(export)
 
 
 @app.command("judge-check")
@@ -162,8 +137,8 @@ def caption_judge_check(
     """Measure a judge on a small gold set: agreement, position bias, unparsable answers."""
     import asyncio
 
-    from caption.run.own_files import vocabulary_of
     from caption.teachers.judge import check_judge, gold_conflicts, judge_check_table
+    from caption.teachers.prompt_files import vocabulary_of
     from cosfly.work.console import console
 
     cfg, seed = job.cfg.caption, job.cfg.seed

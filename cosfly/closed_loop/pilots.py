@@ -18,8 +18,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from caption.run.own_files import vocabulary_of
 from caption.schema import CaptionConfig, ObservedWindow, observed_frames
+from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.prompts import Question, make_question
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import first_budget, open_teacher
@@ -32,7 +32,7 @@ from cosfly.closed_loop.settings import FLOORS, FlyConfig
 from cosfly.closed_loop.stepper import ClosedLoopFlight, Moment
 from cosfly.errors import CosflyError
 from cosfly.geometry import wrap_deg
-from cosfly.products.actions import ActionSet
+from cosfly.products.actions import TOKENS
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.frames import COMPANY, FILE_NAMES, depth_file, frame_name, instance_bytes, rgb_bytes
 from cosfly.products.motion import in_axes_of
@@ -81,11 +81,10 @@ def open_pilot(cfg: FlyConfig, caption: CaptionConfig, infer: InferConfig, seed:
     Raises:
         ConfigError, InputError, TeacherError, EnvironmentMissing: it cannot be used.
     """
-    actions = vocabulary_of(caption).actions
     if cfg.student == "planner":
         return Ceiling()
     if cfg.student in FLOORS:
-        return Floor(cfg.student, actions, seed)
+        return Floor(cfg.student, seed)
     if cfg.engine == "transformers":
         return LocalPilot(cfg, caption, infer, seed, answers)
     if cfg.engine == "policy":
@@ -100,14 +99,14 @@ class Floor:
 
     num_frames = 1
 
-    def __init__(self, name: str, actions: ActionSet, seed: int) -> None:
-        self.name, self._tokens, self._seed = name, actions.tokens, seed
+    def __init__(self, name: str, seed: int) -> None:
+        self.name, self._seed = name, seed
 
     def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
         if self.name != "random":
             return [PilotAnswer("ok", self.name)] * len(outlooks)
         items = (f"{outlook.episode}/{outlook.moments[-1].index}" for outlook in outlooks)
-        return [PilotAnswer("ok", str(rng_for(self._seed, "fly", item).choice(self._tokens))) for item in items]
+        return [PilotAnswer("ok", str(rng_for(self._seed, "fly", item).choice(TOKENS))) for item in items]
 
 
 class Ceiling:
@@ -172,9 +171,7 @@ class AskedPilot:
     def _read(self, text: str, question: Question, answer_s: float | None, finish_reason: str | None) -> PilotAnswer:
         """Make a decision of an answer: its words are the reasons with their slots filled, or the text as it came."""
         more = {} if self.cfg.student.folder is not None else more_fields(question.way)
-        parsed = parse_answer(
-            text, self.vocabulary.actions, more=tuple(more), finish_reason=finish_reason, optional=question.way.optional
-        )
+        parsed = parse_answer(text, more=tuple(more), finish_reason=finish_reason, optional=question.way.optional)
         if parsed.coc is None:
             return PilotAnswer(
                 "invalid" if parsed.reason == NO_SET else "unreadable", None, text[:MOST_WORDS], answer_s
@@ -236,7 +233,7 @@ class LocalPilot(AskedPilot):
 
     def _open(self, cfg: FlyConfig, infer: InferConfig, seed: int) -> None:
         model, trees = Path(cfg.student.partition(":")[2]), {"": Path(self._scratch.name)}
-        inputs = Inputs((), trees, model, cfg.adapter, self.vocabulary.actions)
+        inputs = Inputs((), trees, model, cfg.adapter)
         self._local, self.name = local_answers(infer, inputs, self._book), inputs.name
 
     async def _decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:

@@ -25,7 +25,7 @@ from cosfly.closed_loop.pilots import Outlook, PilotAnswer
 from cosfly.closed_loop.stepper import ClosedLoopFlight, Moment
 from cosfly.errors import InputError
 from cosfly.geometry import wrap_deg
-from cosfly.products.actions import shipped_actions
+from cosfly.products.actions import TOKENS
 from cosfly.products.goals import SLOTS, words_of
 from cosfly.products.motion import in_axes_of
 from cosfly.products.pursuits import MOST_WORDS, Answer
@@ -64,7 +64,7 @@ class Policy:
             spec: module:Class, found from the working directory.
         """
         self.name, self._limit_s, self._seed = spec, limit_s, seed
-        self._tokens, self._episode = shipped_actions().tokens, ""
+        self._episode = ""
         self._process: subprocess.Popen | None = None
         self._failure: PilotAnswer | None = None
         self._start()
@@ -120,10 +120,10 @@ class Policy:
         return self._read(said, outlook, answer_s)
 
     def _read(self, said: Any, outlook: Outlook, answer_s: float) -> PilotAnswer:
-        if isinstance(said, int) and 0 <= said < len(self._tokens):
-            said = self._tokens[said]
+        if isinstance(said, int) and 0 <= said < len(TOKENS):
+            said = TOKENS[said]
         if isinstance(said, str):
-            if said in self._tokens:
+            if said in TOKENS:
                 return PilotAnswer("ok", said, answer_s=answer_s)
         elif isinstance(said, list):
             command, drone = np.array(said), outlook.flight.drone

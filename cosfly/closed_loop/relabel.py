@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 
 from caption.run import stage as captioning
-from caption.run.own_files import vocabulary_of
 from caption.schema import FutureMotion
-from caption.truth.actions import measure, table_of
+from caption.truth.actions import TABLE, measure
 from cosfly.closed_loop.measures import LOSS_S
 from cosfly.closed_loop.pilots import Ceiling
 from cosfly.closed_loop.stage import PLAN, TRACES, TREE, FlightsConfig, flown_trace
@@ -106,7 +105,7 @@ def make_worker(cfg: FlightsConfig, flown: Path, boxes: Path, simplified: Path, 
     """Open a map in this process, and give the function that judges one window of a student's flight."""
     plans = {plan.path_id: (n, plan) for n, plan in enumerate(read_traces(flown / PLAN / TRACES))}
     space = Airspace(cfg.render, read_boxes(boxes), read_boxes(simplified), seed=seed)
-    table, fly, num = table_of(vocabulary_of(cfg.caption).actions, cfg.caption.label), cfg.fly, cfg.caption.window
+    fly, num = cfg.fly, cfg.caption.window
 
     def work(item: Item) -> Outcome:
         episode, i = item.payload
@@ -147,7 +146,7 @@ def make_worker(cfg: FlightsConfig, flown: Path, boxes: Path, simplified: Path, 
             speed_before_mps=float(np.linalg.norm(before_m)) / flight.dt_s,
         )
         motion = measure(future)
-        reasons = _reasons(pursuit, i, pursuit.frames[i].action, table.verdict_of, motion, table.label_of(motion))
+        reasons = _reasons(pursuit, i, pursuit.frames[i].action, TABLE.verdict_of, motion, TABLE.label_of(motion))
         if fly.relabel.mistakes_only and not reasons:
             return Outcome(drop_reason="no_mistake")
         solver = {"source": episode, "frame": i, "student": pursuit.student, "round": fly.relabel.round}

@@ -17,7 +17,6 @@ from typing import Any, Self
 
 import numpy as np
 
-from caption.run.own_files import vocabulary_of
 from caption.schema import CaptionConfig
 from cosfly.closed_loop.controller import Control, Controller, read_controls
 from cosfly.closed_loop.measures import score_pursuits
@@ -28,6 +27,7 @@ from cosfly.errors import ConfigError
 from cosfly.geometry import headings_of, step_s
 from cosfly.planners import stage as planning
 from cosfly.planners.contract import PlanConfig
+from cosfly.products.actions import TOKENS
 from cosfly.products.boxes import read_boxes
 from cosfly.products.flight_scores import SCORE, SCORE_FORMAT
 from cosfly.products.motion import PlannedMotion
@@ -128,7 +128,7 @@ class Fleet:
     ) -> None:
         os.environ.setdefault("LP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // num_workers)))
         self.out, self.student = out, open_pilot(cfg.fly, cfg.caption, cfg.infer, seed, out / ANSWERS)
-        self.controls = read_controls(cfg.fly.table, vocabulary_of(cfg.caption).actions.tokens)
+        self.controls = read_controls(cfg.fly.table, TOKENS)
         self.about = {
             "student": self.student.name, "engine": cfg.fly.engine, "seed": seed, "list_sha256": list_sha256,
             "controller_sha256": None if cfg.fly.engine == "planner" else sha256_file(cfg.fly.table),
@@ -174,7 +174,7 @@ def run(
     if cfg.render.frame_stride != 1:
         what, got = "a camera that cannot be flown with", "render.frame_stride beyond 1"
         raise ConfigError(what, where="render", got=got, fix="leave it out: every pose is drawn")
-    read_controls(cfg.fly.table, vocabulary_of(cfg.caption).actions.tokens)
+    read_controls(cfg.fly.table, TOKENS)
     how: dict[str, Any] = {"seed": seed, "workers": workers, "watch": watch, "resume": resume}
     inputs = {"boxes": boxes, "simplified": simplified, "paths": paths} | ({"others": others} if others else {})
     more: dict[str, Any] = {"package_files": {"controller": cfg.fly.table}, "begun": (PLAN, TREE)}

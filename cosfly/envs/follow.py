@@ -23,7 +23,7 @@ from cosfly.envs.episodes import (
     world_of,
 )
 from cosfly.errors import ConfigError, InputError
-from cosfly.products.actions import shipped_actions
+from cosfly.products.actions import TOKENS
 from cosfly.render.contract import FAR_M
 
 GOAL_CHARACTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ -,"
@@ -44,7 +44,7 @@ def reward_of(now: Moment, ended: str | None) -> float:
 class FollowEnv(gymnasium.Env):
     """One drone, one person, one time step of 0.5 s a step.
 
-    action: of `decisions` the number of one of the seventeen in the order of actions.yaml; of `velocities` (5,) as
+    action: of `decisions` the number of one of the seventeen in the order of the table; of `velocities` (5,) as
     ACTION, in the level axes of the drone; ground speeds beyond the drone's greatest are scaled down to it.
     """
 
@@ -71,7 +71,7 @@ class FollowEnv(gymnasium.Env):
             raise ConfigError("no such actions", where=task, got=actions, expected="decisions or velocities")
         self.task, self.size_px, self.has_depth, self.render_mode = task, (size_px[0], size_px[1]), depth, render_mode
         self.listed = None if episodes == "train" else read_list(f"{task}/{episodes}")[1]
-        self.drone, self.tokens = Drone(), shipped_actions().tokens
+        self.drone, self.tokens = Drone(), TOKENS
         self._controls = read_controls(CONTROLLER_FILE, self.tokens)
         low, high = (bound.astype(np.float32) for bound in self.drone.bounds)
         self.action_space = spaces.Discrete(len(self.tokens)) if actions == "decisions" else spaces.Box(low, high)

@@ -112,7 +112,7 @@ class PedestriansConfig(Config):
         ge=0.05,
         le=5,
         description="time step of walks, and with them of flights, frames and windows (dt), s; counts of frames "
-        "(caption.window, plan.muco.low_visibility_frames) and the thresholds of caption.label are for 0.5",
+        "(caption.window, plan.muco.low_visibility_frames) and the thresholds of labels are for 0.5",
     )
 
     @property

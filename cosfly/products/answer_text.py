@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from cosfly.products.actions import ActionSet
+from cosfly.products.actions import BY_LETTERS, TOKENS
 from cosfly.products.captions import FIELDS, Coc, Language
 from cosfly.reading.objects import find_object
 
@@ -26,20 +26,19 @@ MAX_DECISION_CHARACTERS = 100  # with all that may stand round a token
 MAX_CHARACTERS = {"critical_components": 1200, "reasoning_trace": 1600}  # bounded: a server may pad for ever
 
 
-def normalize_action(text: str, actions: ActionSet) -> str | None:
+def normalize_action(text: str) -> str | None:
     """Give the token for any spelling (spaces, hyphens, case; quotes, brackets; `Decision:` before it), else None."""
-    by_letters = actions.by_letters
-    if by_letters.get(text.replace("_", "")) == text:
+    if BY_LETTERS.get(text.replace("_", "")) == text:
         return text
     if len(text) > MAX_DECISION_CHARACTERS:
         return None
     plain = "".join(char for char in unicodedata.normalize("NFKC", text) if unicodedata.category(char) != "Cf")
     found = _DECISION.fullmatch(plain.lower())
-    return by_letters.get(re.sub(r"[\s_-]", "", found["action"])) if found else None
+    return BY_LETTERS.get(re.sub(r"[\s_-]", "", found["action"])) if found else None
 
 
 def answer_schema(
-    actions: ActionSet, decision: str | None = None, language: Language = "en", more: Mapping[str, dict] | None = None
+    decision: str | None = None, language: Language = "en", more: Mapping[str, dict] | None = None
 ) -> dict:
     """Give the JSON schema of an answer; a given decision is the enum's one value.
 
@@ -51,7 +50,7 @@ def answer_schema(
         for name, characters in (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS).items()
     }
     properties |= more or {}
-    properties["flight_decision"] = {"type": "string", "enum": [decision] if decision else list(actions.tokens)}
+    properties["flight_decision"] = {"type": "string", "enum": [decision] if decision else list(TOKENS)}
     return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
 
 
@@ -83,7 +82,6 @@ _OTHER_LETTER = re.compile(r"[^\W\d_a-zA-Z\u00c0-\u024f\u4e00-\u9fff]")
 
 def parse_answer(
     text: str,
-    actions: ActionSet,
     language: Language = "en",
     more: Collection[str] = (),
     finish_reason: str | None = None,
@@ -107,13 +105,11 @@ def parse_answer(
         parsed = Parsed(None, found.reason)
     else:
         names = tuple(name for name in names if name in found.value or name not in optional)
-        parsed = _checked(found.value, actions, language, names, recovered)
+        parsed = _checked(found.value, language, names, recovered)
     return replace(parsed, recovered=tuple(recovered)) if recovered else parsed
 
 
-def _checked(
-    value: dict[str, Any], actions: ActionSet, language: Language, names: Collection[str], recovered: list[str]
-) -> Parsed:
+def _checked(value: dict[str, Any], language: Language, names: Collection[str], recovered: list[str]) -> Parsed:
     if len(value) != len(names) or not all(map(value.__contains__, names)):
         return Parsed(None, "missing_field" if set(names) - value.keys() else "extra_field")
     cleaned: dict[str, str] = {}
@@ -131,11 +127,11 @@ def _checked(
         problem = _problem_of(cleaned[name], language, characters)
         if problem is not None:
             return Parsed(None, f"{name}_{problem}")
-    action = normalize_action(cleaned["flight_decision"], actions)
+    action = normalize_action(cleaned["flight_decision"])
     if action is None:
         return Parsed(None, "decision_not_in_closed_set")
     stated = value.get("therefore")
-    therefore = normalize_action(stated, actions) if isinstance(stated, str) else None
+    therefore = normalize_action(stated) if isinstance(stated, str) else None
     if therefore is None and "therefore" in names:
         return Parsed(None, "therefore_not_in_closed_set")
     others = {name: value[name] for name in names if name not in (*FIELDS, "therefore")}

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cosfly.products.actions import ActionSet
 from cosfly.products.captions import Language
 from cosfly.products.playback import Flight
 
@@ -33,14 +32,13 @@ class ShownCaption:
 class ShownFlight:
     """A flight as far as it is released. flight: of the frames `frame_indices` (n,), in order, which may have gaps.
 
-    actions: the closed set of their decisions. twin: the clean flight of a perturbed one, of the same frames; None
+    twin: the clean flight of a perturbed one, of the same frames; None
     where it is not released or shows others. settings: of the captions, as recorded; empty: the defaults.
     """
 
     flight: Flight
     frame_indices: np.ndarray
     captions: Sequence[ShownCaption]
-    actions: ActionSet
     twin: Flight | None
     settings: dict[str, Any]
 

@@ -15,7 +15,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from cosfly.errors import InputError
 from cosfly.escaping import for_markdown
 from cosfly.look.page import page
-from cosfly.products.actions import ActionSet, one_set
 from cosfly.reading.documents import FileFormat
 from cosfly.work.chance import rng_for
 from cosfly.work.config import Config
@@ -102,24 +101,21 @@ def run(cfg: ReportConfig, folders: Sequence[Path], out: Path, *, seed: int = 0,
         return path
     of_names = dict(zip(names, folders, strict=True))
     reports = {name: read_report(folder) for name, folder in of_names.items()}
-    actions = one_set((of_names[name], report.actions) for name, report in reports.items())
     splits = {report.split for report in reports.values()}
     if len(splits) > 1:
         raise InputError("evaluations of one split are needed", got=", ".join(sorted(splits)))
-    comparison = compare(cfg, reports, of_names, actions, seed)
+    comparison = compare(cfg, reports, of_names, seed)
     record, page = out / "comparison.json", out / "comparison.html"
     write_model(record, comparison, FileFormat("cosfly.distill_comparison", "1.0"))
     write_bytes(path, markdown_of(comparison, reports).encode())
-    write_bytes(page, page_of(comparison, reports, actions).encode())
+    write_bytes(page, page_of(comparison, reports).encode())
     stage.finish([record, path, page], Tally(input=len(reports), kept=len(reports)))
     return path
 
 
-def compare(
-    cfg: ReportConfig, reports: Names, folders: Mapping[str, Path], actions: ActionSet, seed: int
-) -> StudentComparison:
+def compare(cfg: ReportConfig, reports: Names, folders: Mapping[str, Path], seed: int) -> StudentComparison:
     """Put students side by side; of the floors those of the first."""
-    scores = {name: read_scores(folder / SCORES, actions) for name, folder in folders.items()}
+    scores = {name: read_scores(folder / SCORES) for name, folder in folders.items()}
     pairings, strangers = [], []
     for first, second in combinations(reports, 2):
         _check_references(first, scores[first], second, scores[second])
@@ -231,7 +227,7 @@ def _how(comparison: StudentComparison, pairing: Pairing) -> str:
     return f"On the {pairing.samples} samples that both were asked; {how}."
 
 
-def page_of(comparison: StudentComparison, reports: Names, actions: ActionSet) -> str:
+def page_of(comparison: StudentComparison, reports: Names) -> str:
     """Give the comparison as a page that needs nothing but itself."""
     header, rows = _rows(comparison, reports)
     charts = [("Accuracy by decision", decision_bars(comparison.students))]
@@ -239,9 +235,7 @@ def page_of(comparison: StudentComparison, reports: Names, actions: ActionSet) -
     if histograms:
         charts.append(("BERTScore F1 of parsed answers", histogram(histograms)))
         charts.append(("BERTScore, all answers", score_bars(comparison.students)))
-    charts += [
-        (f"{name}: reference against answer", heat_map(own, actions)) for name, own in comparison.students.items()
-    ]
+    charts += [(f"{name}: reference against answer", heat_map(own)) for name, own in comparison.students.items()]
     pairings = [
         {"title": f"{one.first} less {one.second}", "how": _how(comparison, one), "rows": _said(one)}
         for one in comparison.pairings

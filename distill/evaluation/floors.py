@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 
-from cosfly.products.actions import ActionSet
+from cosfly.products.actions import TOKENS
 from cosfly.products.captions import Coc, Language
 from cosfly.reading.documents import parse_document, validated
 from cosfly.space.blind import FITTED_ON, Decider, fit_deciders
@@ -34,10 +34,10 @@ def coc_of(sample: Sample) -> Coc:
     return validated(Coc, parse_document(sample.answer, sample.key, what="answer"), sample.key)
 
 
-def majority(decisions: Iterable[str], actions: ActionSet) -> str | None:
+def majority(decisions: Iterable[str]) -> str | None:
     """Give the most frequent decision; a tie goes to the first in the order of the action table."""
     counts = Counter(decisions)
-    return max(actions.tokens, key=lambda action: counts[action]) if counts else None
+    return max(TOKENS, key=lambda action: counts[action]) if counts else None
 
 
 def shuffled_groups(count: int, rng: np.random.Generator) -> list[np.ndarray]:
@@ -65,8 +65,8 @@ def _pasts(samples: Sequence[Sample]) -> np.ndarray | None:
 class Floors:
     """The floors of one language, from the training split."""
 
-    def __init__(self, train: Collection[Sample], language: Language, seed: int, actions: ActionSet) -> None:
-        self._seed, self.actions = seed, actions
+    def __init__(self, train: Collection[Sample], language: Language, seed: int) -> None:
+        self._seed = seed
         counts, typical, drawn = Counter[str](), dict[str, tuple[bytes, Sample]](), list[Sample]()
         share = FITTED_ON / max(1, len(train))
         for sample in train:
@@ -77,9 +77,9 @@ class Floors:
                     typical[sample.decision] = rank, sample
                 if int.from_bytes(rank[:8]) <= share * 2**64:
                     drawn.append(sample)
-        self.decision = majority(counts.elements(), actions)
+        self.decision = majority(counts.elements())
         self._constant = None if self.decision is None else coc_of(typical[self.decision][1])
-        self._labels = np.array([number_of(sample.decision, sample, actions) for sample in drawn], dtype=int)
+        self._labels = np.array([number_of(sample.decision, sample) for sample in drawn], dtype=int)
         self._pasts = _pasts(drawn)
 
     @cached_property
@@ -100,7 +100,7 @@ class Floors:
         if len(references) > 1:
             places = shuffled_places(self.groups(len(references))).tolist()
             found["shuffled"] = [ScoredAnswer(references[place]) for place in places]
-        bare, pasts = [_bare(token) for token in self.actions.tokens], _pasts(samples)
+        bare, pasts = [_bare(token) for token in TOKENS], _pasts(samples)
         if pasts is not None:
             found |= {name: [bare[k] for k in decide(pasts).tolist()] for name, decide in self.deciders.items()}
         return found

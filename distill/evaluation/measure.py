@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict
 
 from cosfly.chat.answers import Answer, read_line
 from cosfly.errors import InputError
-from cosfly.products.actions import RecordedActions, shipped_actions
+from cosfly.products.actions import TOKENS
 from cosfly.products.captions import FIELDS, Coc, Language, SentenceState, read_captions
 from cosfly.products.figures import Figure, draw_walks
 from cosfly.products.predictions import FAILED, Prediction
@@ -131,7 +131,6 @@ class Evaluation(_Strict):
     resamples: int
     seed: int
     not_asked: int
-    actions: RecordedActions = Field(default_factory=shipped_actions)  # the closed set
     metrics: dict[Language, Metric | None]  # None: BERTScore was not computed
     judged: bool  # whether the student's sentences were judged
     speed: Speed
@@ -213,7 +212,7 @@ def score_language(
         groups = floors.groups(len(samples))
         texts = score_beside_floors(scorer, groups, written, [text_of(c) for c in references], samples[0].language)
     return {
-        name: score_answers(samples, answers, floors.actions, texts.get(name), judged if name == STUDENT else None)
+        name: score_answers(samples, answers, texts.get(name), judged if name == STUDENT else None)
         for name, answers in who.items()
     }
 
@@ -244,7 +243,7 @@ def measure(
 
 
 def _confusion(scores: Scores) -> dict[str, dict[str, int]]:
-    names = {UNPARSED: UNPARSED_NAME, **dict(enumerate(scores.actions.tokens))}
+    names = {UNPARSED: UNPARSED_NAME, **dict(enumerate(TOKENS))}
     pairs = np.stack([scores.reference, scores.answer], axis=1)[scores.answered]
     cells = Counter(map(tuple, pairs.tolist()))
     found: dict[str, dict[str, int]] = {}

@@ -8,7 +8,7 @@ from typing import Any
 
 from cosfly.escaping import for_markdown
 from cosfly.look.page import page
-from cosfly.products.actions import ActionSet
+from cosfly.products.actions import TOKENS
 from cosfly.products.captions import FIELDS
 from cosfly.products.figures import Figure
 from cosfly.reading.files import read_text
@@ -135,7 +135,7 @@ def page_of(report: Evaluation, pictures: Mapping[str, Sequence[str]]) -> str:
         student = part.who[STUDENT]
         charts = [
             ("Accuracy by decision", decision_bars({STUDENT: student, **_beside(part, "majority", "blind")})),
-            ("Reference (rows) against answer", heat_map(student, report.actions)),
+            ("Reference (rows) against answer", heat_map(student)),
         ]
         if part.histogram_f1 is not None:
             beside = _beside(part, "shuffled", "constant")
@@ -251,11 +251,11 @@ def histogram(who: Mapping[str, Sequence[int]]) -> Chart:
     return {"names": list(who), "lines": [line], "rects": rects, "texts": texts, "view": "0 0 670 230", "width": 670}
 
 
-def heat_map(who: FigureSet, actions: ActionSet) -> Chart:
+def heat_map(who: FigureSet) -> Chart:
     """Give the confusion of decisions: rows are references, columns answers, colours the share of the row."""
-    rows = [token for token in actions.tokens if token in who.confusion]
+    rows = [token for token in TOKENS if token in who.confusion]
     answers = {name for row in rows for name in who.confusion[row]}
-    columns = [name for name in (*actions.tokens, UNPARSED_NAME) if name in rows or name in answers]
+    columns = [name for name in (*TOKENS, UNPARSED_NAME) if name in rows or name in answers]
     size, left, top = CELL_PX, 205, 160
     texts = [
         _shape(x=left + j * size + size / 2, y=top - 8, words=name, anchor="start", turned=-40)

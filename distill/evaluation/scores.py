@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict
 
 from cosfly.errors import InputError
-from cosfly.products.actions import ActionSet, not_in_set
+from cosfly.products.actions import TOKENS, not_in_set
 from cosfly.products.captions import Coc, SentenceState, Verdict, verdict_on
 from cosfly.products.figures import Figure, draw_walks, figure_of_draws, interval_of
 from cosfly.products.predictions import FAILED, Prediction
@@ -57,14 +57,13 @@ class ScoredAnswer:
 class Scores:
     """Columns over n samples.
 
-    actions: the set that numbers of decisions count. key, walk, language (n,) str; against (n,) str, a digest of what
+    key, walk, language (n,) str; against (n,) str, a digest of what
     the answer is held against; reference, answer, label (n,) int8 numbers of decisions, UNPARSED, NONE; answered,
     unmended (n,) bool; drawn_ahead (n,) 1, 0, or NaN where it is not known; verdict (n,) int8 number of VERDICTS or
     NONE; precision, recall, f1 (n,) of BERTScore, NaN where it was not computed; proved, contradicted, unread (n,)
     numbers of sentences, NaN where nobody judged them; num_tokens (n,).
     """
 
-    actions: ActionSet
     key: np.ndarray
     walk: np.ndarray
     language: np.ndarray
@@ -92,7 +91,7 @@ class Scores:
         return replace(self, **{name: getattr(self, name)[where] for name in COLUMNS})
 
 
-COLUMNS = tuple(field.name for field in fields(Scores) if field.name != "actions")
+COLUMNS = tuple(field.name for field in fields(Scores))
 
 
 def join(parts: Sequence[Mapping[str, Scores]]) -> dict[str, Scores]:
@@ -106,11 +105,11 @@ def join(parts: Sequence[Mapping[str, Scores]]) -> dict[str, Scores]:
     return {name: joined(own) for name, own in who.items()}
 
 
-def number_of(decision: str, sample: Sample, actions: ActionSet) -> int:
+def number_of(decision: str, sample: Sample) -> int:
     """Give the number of a decision."""
-    if decision not in actions.actions:
-        raise not_in_set(decision, sample.key, actions)
-    return actions.tokens.index(decision)
+    if decision not in TOKENS:
+        raise not_in_set(decision, sample.key)
+    return TOKENS.index(decision)
 
 
 def digest_of_reference(sample: Sample) -> str:
@@ -121,7 +120,6 @@ def digest_of_reference(sample: Sample) -> str:
 def score_answers(
     samples: Sequence[Sample],
     answers: Sequence[ScoredAnswer],
-    actions: ActionSet,
     texts: np.ndarray | None = None,
     judged: Mapping[str, Sequence[SentenceState]] | None = None,
 ) -> Scores:
@@ -138,7 +136,7 @@ def score_answers(
         else:
             verdicts.append(_VERDICT[verdict_on(answer.coc.flight_decision, sample.label, sample.contradicted)])
     both = zip(samples, answers, strict=True)
-    decisions = [number_of(a.coc.flight_decision, s, actions) if a.coc else UNPARSED for s, a in both]
+    decisions = [number_of(a.coc.flight_decision, s) if a.coc else UNPARSED for s, a in both]
     is_answered = np.array([answer.is_answered for answer in answers], dtype=bool)
     bert = np.where(is_answered[:, None], np.nan if texts is None else texts, np.nan) * np.ones((1, 3))
     found = [(judged or {}).get(sample.key) for sample in samples]
@@ -147,14 +145,13 @@ def score_answers(
         for state in STATES
     }
     return Scores(
-        actions=actions,
         key=np.array([sample.key for sample in samples], dtype=object),
         walk=np.array([sample.walk for sample in samples], dtype=object),
         language=np.array([sample.language for sample in samples], dtype=object),
         against=np.array([digest_of_reference(sample) for sample in samples], dtype=object),
-        reference=np.array([number_of(sample.decision, sample, actions) for sample in samples], dtype=np.int8),
+        reference=np.array([number_of(sample.decision, sample) for sample in samples], dtype=np.int8),
         answer=np.array(decisions, dtype=np.int8),
-        label=np.array([number_of(s.label, s, actions) if s.label else NONE for s in samples], dtype=np.int8),
+        label=np.array([number_of(s.label, s) if s.label else NONE for s in samples], dtype=np.int8),
         answered=is_answered,
         drawn_ahead=np.array([s.drawn_ahead for s in samples], dtype=np.float64),
         unmended=np.array([a.coc is not None and not a.mended for a in answers], dtype=bool),
@@ -173,7 +170,7 @@ _TEXT = ("key", "walk", "language", "against")
 def _column(name: str, scores: Scores) -> pa.Array:
     values = getattr(scores, name)
     if name in ("reference", "answer", "label", "verdict"):
-        words = (*VERDICTS, None) if name == "verdict" else (*scores.actions.tokens, "(unparsed)", None)
+        words = (*VERDICTS, None) if name == "verdict" else (*TOKENS, "(unparsed)", None)
         return pa.array([words[number] for number in values.tolist()], pa.string())
     return pa.array(values.tolist() if name in _TEXT else values, from_pandas=True)
 
@@ -185,7 +182,7 @@ def write_scores(path: Path, scores: Scores) -> None:
         pq.write_table(table, file, compression="zstd")
 
 
-def read_scores(path: Path, actions: ActionSet) -> Scores:
+def read_scores(path: Path) -> Scores:
     """Read `scores.parquet`, whose decisions are of a set."""
     columns: dict[str, list[Any]] = {name: [] for name in COLUMNS}
     for group in row_groups(path):
@@ -196,15 +193,15 @@ def read_scores(path: Path, actions: ActionSet) -> Scores:
             with arrow_errors(path):  # text that is no UTF-8 shows here
                 columns[name] += group.column(name).to_pylist()
     try:
-        found = {name: _column_values(name, values, actions) for name, values in columns.items()}
-        return Scores(actions, **found)
+        found = {name: _column_values(name, values) for name, values in columns.items()}
+        return Scores(**found)
     except (TypeError, ValueError, KeyError) as error:
         raise InputError("not the scores of an evaluation", where=path, got=str(error)[:200]) from None
 
 
-def _column_values(name: str, values: list[Any], actions: ActionSet) -> np.ndarray:
+def _column_values(name: str, values: list[Any]) -> np.ndarray:
     if name in ("reference", "answer", "label", "verdict"):
-        tokens = {token: number for number, token in enumerate(actions.tokens)}
+        tokens = {token: number for number, token in enumerate(TOKENS)}
         numbers: dict[Any, int] = {None: NONE, **(_VERDICT if name == "verdict" else tokens | {"(unparsed)": UNPARSED})}
         return np.array([numbers[word] for word in values], dtype=np.int8)
     if name in _TEXT:
@@ -250,7 +247,7 @@ NEITHER = ("soft_conflict", "abstain", "drawn_ahead", "tokens")  # more of it is
 class _Sums:
     """Of each walk the sums over its samples: numerators, denominators (walks, figures).
 
-    names: of the figures; tokens: of the decisions. confusion: (walks, a, a + 1) of a actions, what does not parse
+    names: of the figures; tokens: of the decisions. confusion: (walks, a, a + 1) of a decisions, what does not parse
     last.
     """
 
@@ -295,13 +292,13 @@ def _sums(scores: Scores, walk: np.ndarray, num_walks: int) -> _Sums:
     terms = _terms(scores)
     per_walk = [[np.bincount(walk, part.astype(float), num_walks) for part in pair] for pair in terms.values()]
     answered = scores.answered
-    count = len(scores.actions.tokens)
+    count = len(TOKENS)
     answer = np.where(scores.answer == UNPARSED, count, scores.answer)
     cell = (walk * count + scores.reference) * (count + 1) + answer
     confusion = np.bincount(cell[answered], minlength=num_walks * count * (count + 1))
     return _Sums(
         list(terms),
-        scores.actions.tokens,
+        TOKENS,
         np.array([pair[0] for pair in per_walk]).T,
         np.array([pair[1] for pair in per_walk]).T,
         confusion.reshape(num_walks, count, count + 1).astype(float),

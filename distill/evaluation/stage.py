@@ -41,7 +41,7 @@ from distill.evaluation.measure import (
 )
 from distill.evaluation.pages import markdown_of, page_of
 from distill.evaluation.scores import CONFIDENCE, SCORES, Scores, join, write_scores
-from distill.schema import Sample, open_split, read_training_set, resolve_trees, tree_inputs
+from distill.schema import Sample, open_split, resolve_trees, tree_inputs
 from distill.student.model import require
 
 NUM_EXAMPLES = 12  # samples that the page shows next to their answers
@@ -127,14 +127,13 @@ def _evaluate(
     seed: int,
 ) -> tuple[Evaluation, Scores]:
     given: Any = {"resamples": cfg.resamples, "confidence": CONFIDENCE, "seed": seed}
-    actions = read_training_set(dataset).actions
     parts: list[dict[str, Scores]] = []
     measurements: dict[Language, Measurement] = {}
     metrics: dict[Language, Metric | None] = {}
     asked: list[tuple[Sample, Prediction]] = []
     for language in sorted({sample.language for sample, _ in pairs}):
         own = [pair for pair in pairs if pair[0].language == language]
-        floors = Floors(open_split(dataset, "train"), language, seed, actions)
+        floors = Floors(open_split(dataset, "train"), language, seed)
         scorer = None
         if language in models:
             references = [text_of(coc_of(sample)) for sample, _ in own]
@@ -151,7 +150,6 @@ def _evaluate(
         split=predictions[0].split,
         **given,
         not_asked=0,
-        actions=actions,
         metrics=metrics,
         judged=bool(judged),
         speed={},

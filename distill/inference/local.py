@@ -20,7 +20,6 @@ import numpy as np
 
 from cosfly.chat.answers import Answer, AnswerBook
 from cosfly.errors import ConfigError, InputError
-from cosfly.products.actions import ActionSet
 from cosfly.products.answer_text import answer_schema
 from cosfly.products.captions import Language
 from cosfly.products.places import flight_of
@@ -249,7 +248,7 @@ class SchemaConstraint:
 class AnswerSchemas:
     """Makes the constraints of batches; texts of a language share their grammar."""
 
-    def __init__(self, student: Student, actions: ActionSet) -> None:
+    def __init__(self, student: Student) -> None:
         """"""
         require("llguidance")
         from llguidance import LLMatcher
@@ -259,7 +258,7 @@ class AnswerSchemas:
         languages: tuple[Language, ...] = ("en", "zh")
         # Free whitespace would let a student pad for ever.
         strict: Any = {"whitespace_flexible": False}
-        schemas = {language: answer_schema(actions, language=language) for language in languages}
+        schemas = {language: answer_schema(language=language) for language in languages}
         grammar_of = LLMatcher.grammar_from_json_schema
         self._grammars = {language: grammar_of(schema, defaults=strict) for language, schema in schemas.items()}
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import IO
 
 from cosfly.chat.answers import Answer, AnswerBook
-from cosfly.products.actions import ActionSet
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.places import flight_of
 from cosfly.products.predictions import FAILED, PREDICTIONS, Prediction, Split
@@ -37,11 +36,9 @@ def failed(sample: Sample, code: str, error: Exception) -> SampleOutcome:
     return SampleOutcome(sample, Failed(id=sample.key, code=code, message=str(error)))
 
 
-def make_prediction(
-    sample: Sample, split: Split, text: str, num_tokens: int, is_finished: bool, actions: ActionSet
-) -> Prediction:
+def make_prediction(sample: Sample, split: Split, text: str, num_tokens: int, is_finished: bool) -> Prediction:
     """Check an answer and give its record."""
-    parsed = parse_answer(text, actions, sample.language, finish_reason=None if is_finished else "length")
+    parsed = parse_answer(text, sample.language, finish_reason=None if is_finished else "length")
     return Prediction(
         sample_id=sample.sample_id,
         language=sample.language,
@@ -57,26 +54,26 @@ def make_prediction(
     )
 
 
-def failed_prediction(sample: Sample, split: Split, code: str, actions: ActionSet) -> Prediction:
+def failed_prediction(sample: Sample, split: Split, code: str) -> Prediction:
     """Give the record of a sample without an answer: empty, and its reason says that it is no wrong one."""
-    return make_prediction(sample, split, "", 0, False, actions).model_copy(update={"reason": f"{FAILED}{code}"})
+    return make_prediction(sample, split, "", 0, False).model_copy(update={"reason": f"{FAILED}{code}"})
 
 
-def prediction_of(answered: SampleOutcome, split: Split, actions: ActionSet) -> Prediction:
+def prediction_of(answered: SampleOutcome, split: Split) -> Prediction:
     """Give the record of a sample."""
     found = answered.found
     if isinstance(found, Failed):
-        return failed_prediction(answered.sample, split, found.code, actions)
+        return failed_prediction(answered.sample, split, found.code)
     is_finished = found.finish_reason not in ("length", CONTEXT_FULL)
     num_tokens = found.usage.get("completion_tokens", 0)
-    return make_prediction(answered.sample, split, found.text, num_tokens, is_finished, actions)
+    return make_prediction(answered.sample, split, found.text, num_tokens, is_finished)
 
 
 class Results:
     """Writes what came of the samples one by one; the file appears when all are there. Holds counts and failures."""
 
-    def __init__(self, split: Split, model: str, actions: ActionSet, file: IO[bytes]) -> None:
-        self.split, self.model, self._actions, self._file = split, model, actions, file
+    def __init__(self, split: Split, model: str, file: IO[bytes]) -> None:
+        self.split, self.model, self._file = split, model, file
         self.tally, self.failures = Tally(), list[Failed]()
         self.num_parsed = 0
         self.new = Counter[str]()  # answers of this run and their tokens
@@ -85,7 +82,7 @@ class Results:
     def add(self, answered: SampleOutcome) -> None:
         found = answered.found
         own = {"model": self.model}
-        prediction = prediction_of(answered, self.split, self._actions).model_copy(update=own)
+        prediction = prediction_of(answered, self.split).model_copy(update=own)
         self._file.write((dump_json(prediction.model_dump(mode="json")) + "\n").encode())
         self.tally.input += 1
         if isinstance(found, Failed):
@@ -99,10 +96,10 @@ class Results:
 
 
 @contextlib.contextmanager
-def writing_results(out: Path, split: Split, model: str, actions: ActionSet) -> Iterator[Results]:
+def writing_results(out: Path, split: Split, model: str) -> Iterator[Results]:
     """Open the files of a run's results."""
     with atomic_file(out / PREDICTIONS) as file:
-        results = Results(split, model, actions, file)
+        results = Results(split, model, file)
         yield results
         write_failures(out / "failures.jsonl", results.failures)
 

@@ -19,7 +19,6 @@ from cosfly.chat.contract import Engine, NoAnswer, Request, started
 from cosfly.chat.student_chat import TAUGHT, StudentEndpointConfig, picture_to_send, read_taught, student_request
 from cosfly.chat.vllm_engine import VllmConfig, VllmEngine
 from cosfly.errors import ConfigError, InputError, TeacherError
-from cosfly.products.actions import ActionSet
 from cosfly.products.answer_text import answer_schema
 from cosfly.products.predictions import PREDICTIONS, Split
 from cosfly.work.config import Config, MayDiffer
@@ -38,12 +37,12 @@ WAITING = 4
 
 
 def make_request(
-    sample: Sample, trees: Mapping[str, Path], sampling: StudentEndpointConfig, max_pixels: int, actions: ActionSet
+    sample: Sample, trees: Mapping[str, Path], sampling: StudentEndpointConfig, max_pixels: int
 ) -> Request:
     """Give a sample as chat messages: its pictures as the student was taught to see them, then the question."""
     pictures = iter([picture_to_send(picture, max_pixels) for picture in load_pictures(sample, trees)])
     frames = [[next(pictures) for _ in sample.views] for _ in sample.frames]
-    return student_request(sample.prompt, frames, answer_schema(actions, language=sample.language), sampling)
+    return student_request(sample.prompt, frames, answer_schema(language=sample.language), sampling)
 
 
 class EngineAnswers:
@@ -55,7 +54,6 @@ class EngineAnswers:
         book: AnswerBook,
         trees: Mapping[str, Path],
         sampling: StudentEndpointConfig,
-        actions: ActionSet,
         *,
         max_pixels: int,
         in_flight: int,
@@ -64,7 +62,7 @@ class EngineAnswers:
         Args:
             engine: started. max_pixels: most of a picture; 0: all. in_flight: most at once.
         """
-        self.engine, self.book, self.trees, self.sampling, self.actions = engine, book, trees, sampling, actions
+        self.engine, self.book, self.trees, self.sampling = engine, book, trees, sampling
         self.max_pixels, self._most = max_pixels, in_flight
         self._slots = asyncio.Semaphore(in_flight)
         self._kept = KeptAnswers(engine, book)
@@ -96,7 +94,7 @@ class EngineAnswers:
         flight = self._flights.begun(sample)
         async with self._slots:
             try:
-                how = self.sampling, self.max_pixels, self.actions
+                how = self.sampling, self.max_pixels
                 request = await asyncio.to_thread(make_request, sample, self.trees, *how)
                 reply = await self._kept.ask(request, flight, sample.sample_id, sample.language)
             except InputError as error:
@@ -159,7 +157,6 @@ class Inputs:
     trees: Mapping[str, Path]
     model: str | Path
     adapter: Path | None
-    actions: ActionSet
 
     @property
     def taught_pixels(self) -> int:
@@ -191,7 +188,7 @@ async def _answering(
     async with started(engine):
         max_pixels = cfg.max_pixels or (inputs.taught_pixels if cfg.engine == "vllm" else 0)
         how: Any = {"max_pixels": max_pixels, "in_flight": in_flight}
-        asking = EngineAnswers(engine, book, inputs.trees, cfg.sampling, inputs.actions, **how)
+        asking = EngineAnswers(engine, book, inputs.trees, cfg.sampling, **how)
         yield asking.answers(inputs.samples, advance)
 
 
@@ -206,7 +203,7 @@ def local_answers(cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> LocalAn
         model=inputs.name,
         batch_size=cfg.batch_size,
         max_tokens=cfg.max_new_tokens,
-        constrain=AnswerSchemas(student, inputs.actions) if cfg.constrained else None,
+        constrain=AnswerSchemas(student) if cfg.constrained else None,
         feature_bytes=int(cfg.feature_memory_gb * 1e9),
     )
 
@@ -290,7 +287,7 @@ def run(
         fix = "--set distill.infer.split=val, or prepare more walks"
         raise InputError("the split is empty", where=dataset, got=cfg.split, fix=fix)
     samples = split[: cfg.max_samples] if cfg.max_samples else split
-    results = _answer_all(cfg, Inputs(samples, trees, model, adapter, split.actions), out)
+    results = _answer_all(cfg, Inputs(samples, trees, model, adapter), out)
     outputs = [out / PREDICTIONS, *sorted((out / ANSWERS).glob("*.jsonl"))]
     stage.finish(outputs, results.tally, **facts, model=results.model, parsed=results.num_parsed, speed=results.speed)
     return out / PREDICTIONS
@@ -314,7 +311,7 @@ async def _write_answers(cfg: InferConfig, inputs: Inputs, out: Path) -> Results
     with AnswerBook(out / ANSWERS) as book, progress_bar(STAGE, total=len(inputs.samples)) as advance:
         async with _answering(cfg, inputs, book, advance) as answers:
             started_s = time.monotonic()
-            with writing_results(out, cfg.split, name, inputs.actions) as results:
+            with writing_results(out, cfg.split, name) as results:
                 async with contextlib.aclosing(answers) as each:
                     async for answered in each:
                         results.add(answered)

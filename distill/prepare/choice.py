@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.products.actions import ActionSet
+from cosfly.products.actions import TOKENS
 
 
 def _rank(sample_id: str, seed: int) -> int:
@@ -71,7 +71,7 @@ class Balance:
     windows: Mapping[str, int]
     last_rank: Mapping[str, int]
 
-    def cost(self, samples_left_out: int, actions: ActionSet) -> dict[str, Any]:
+    def cost(self, samples_left_out: int) -> dict[str, Any]:
         """Give `balance` of the manifest. effective_decisions: as many equally frequent ones have the same entropy."""
         after = {decision: min(count, self.most_windows) for decision, count in self.windows.items()}
         return {
@@ -80,7 +80,7 @@ class Balance:
             "windows_left_out": {name: n - after[name] for name, n in self.windows.items() if n > after[name]},
             "samples_left_out": samples_left_out,
             "effective_decisions": [_effective(self.windows), _effective(after)],
-            "absent": [action for action in actions.tokens if action not in self.windows],
+            "absent": [action for action in TOKENS if action not in self.windows],
         }
 
 

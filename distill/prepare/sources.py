@@ -10,7 +10,6 @@ from typing import Literal
 
 from cosfly.errors import InputError, VerifyError
 from cosfly.look.frame_views import VIEW_FILES, View
-from cosfly.products.actions import OWN_ACTIONS
 from cosfly.products.captions import Caption
 from cosfly.products.flights import find_flights, track_of
 from cosfly.products.frames import frame_name, frame_path
@@ -48,12 +47,10 @@ class RunSource:
 
 
 def inputs_of(sources: Sequence[RunSource]) -> dict[str, Path]:
-    """Name what a stage reads: `data`, `captions`, own `actions` where there are; of several runs with a number."""
+    """Name what a stage reads: `data`, `captions`; of several runs with a number."""
     inputs: dict[str, Path] = {}
     for number, source in enumerate(sources, 1):
-        files = {"data": source.data, "captions": source.captions, "actions": source.captions.with_name(OWN_ACTIONS)}
-        if not files["actions"].is_file():
-            del files["actions"]
+        files = {"data": source.data, "captions": source.captions}
         inputs |= {f"{number}.{name}" if len(sources) > 1 else name: path for name, path in files.items()}
     return inputs
 

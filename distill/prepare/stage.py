@@ -19,7 +19,7 @@ from pydantic import Field, model_validator
 
 from cosfly.errors import InputError
 from cosfly.look.frame_views import DEPTH_RANGE_M, Pictures, View, scaled_size
-from cosfly.products.actions import ActionSet, actions_beside, not_in_set, one_set
+from cosfly.products.actions import TOKENS, not_in_set
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import PICTURES_MARK, Caption, Language, Verdict, read_captions
 from cosfly.products.places import FlightChoice
@@ -80,7 +80,6 @@ def make_sample(
     caption: Caption,
     language: Language,
     cfg: PrepareConfig,
-    actions: ActionSet,
     *,
     run: str = "",
     walk: str = "",
@@ -97,7 +96,7 @@ def make_sample(
     if coc is None or language not in caption.prompt:
         return f"no_{language}"
     answer = dump_json(coc.model_dump())
-    parsed = parse_answer(answer, actions, language)
+    parsed = parse_answer(answer, language)
     if parsed.coc is None:  # nothing may be taught that evaluation would call wrong
         return f"answer_{parsed.reason}"
     if PICTURES_MARK not in caption.prompt[language].user:
@@ -160,7 +159,6 @@ class _Windows:
 
     def __init__(self, cfg: PrepareConfig, sources: Sequence[RunSource]) -> None:
         self._cfg, self._sources = cfg, sources
-        self.actions = one_set((source.captions, actions_beside(source.captions)) for source in sources)
         self.flights = Flights(sources)
         self._frames_of = lru_cache(maxsize=16)(lambda flight: flight.whole_frames(cfg.modalities))
         self._read = lru_cache(maxsize=16)(lambda flight: read_flight(flight.folder, strict=False))
@@ -175,8 +173,8 @@ class _Windows:
 
     def _window(self, source: RunSource, caption: Caption) -> _Window:
         flight = self.flights.of(source, caption)
-        if caption.en is not None and caption.en.flight_decision not in self.actions.actions:
-            raise not_in_set(caption.en.flight_decision, f"{source.captions}: {caption.sample_id}", self.actions)
+        if caption.en is not None and caption.en.flight_decision not in TOKENS:
+            raise not_in_set(caption.en.flight_decision, f"{source.captions}: {caption.sample_id}")
         caption.town = flight.town  # the tree may have been converted since
         window = _Window(flight, flight.sample_id(caption), [], [])
         if not self._is_chosen(flight):
@@ -185,7 +183,7 @@ class _Windows:
         walk = self.walks.get(flight.key, "")
         for language in self._cfg.languages:
             named = {"run": source.run, "walk": walk, "sample_id": window.sample_id}
-            sample = make_sample(caption, language, self._cfg, self.actions, **named)
+            sample = make_sample(caption, language, self._cfg, **named)
             if isinstance(sample, str):
                 window.left_out.append(sample)
             elif reason := self._unfit(flight, sample):
@@ -254,11 +252,11 @@ def run(
     del ranks  # of a million windows they take as much as the writing
     with TrainingSetWriter(out).writing() as writer:
         facts, left_out = _write(windows, chosen, writer)
-    writer.finish(cfg.split_by, [SourceTree(run=s.run, sha256=fingerprint(s.data)) for s in sources], windows.actions)
+    writer.finish(cfg.split_by, [SourceTree(run=s.run, sha256=fingerprint(s.data)) for s in sources])
     counts = check_no_leak({split: open_split(out, split) for split in SPLITS}, cfg.split_by)
     excluded += left_out
     if chosen.balance is not None:
-        facts["train"]["balance"] = cost = chosen.balance.cost(left_out["balance"], windows.actions)
+        facts["train"]["balance"] = cost = chosen.balance.cost(left_out["balance"])
         log.info("%s: balance of train: %s", STAGE, ", ".join(f"{name} {value}" for name, value in cost.items()))
     _warn(facts)
     tally = Tally(input=sum(counts.values()) + excluded.total(), kept=sum(counts.values()), dropped=excluded)

@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import Field
 
 from cosfly.errors import InputError
-from cosfly.products.actions import shipped_actions
+from cosfly.products.actions import TOKENS
 from cosfly.products.captions import FIELDS
 from cosfly.work.chance import rng_for
 from cosfly.work.config import Config
@@ -97,7 +97,7 @@ def make_random_student(folder: Path, cfg: RandomStudent, seed: int, texts: Iter
     from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
     quiet_transformers()
-    tokenizer = _tokenizer((*_TOKENIZER_TEXT, " ".join(shipped_actions().tokens), *texts), cfg.vocabulary)
+    tokenizer = _tokenizer((*_TOKENIZER_TEXT, " ".join(TOKENS), *texts), cfg.vocabulary)
     sizes: Any = {"patch_size": 16, "merge_size": 2, "temporal_patch_size": 2}
     areas: Any = {"shortest_edge": 32 * 32, "longest_edge": 1280 * 1280}  # in pixels
     image_processor = Qwen2VLImageProcessorPil(**sizes, image_mean=[0.5] * 3, image_std=[0.5] * 3, size=areas)

@@ -20,7 +20,6 @@ import numpy as np
 from pydantic import BaseModel
 
 from cosfly.errors import ConfigError, InputError
-from cosfly.products.actions import ActionSet
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import verdict_on
 from cosfly.work.chance import rng_for
@@ -90,7 +89,7 @@ def validate(
     with torch.no_grad(), progress_bar(f"{STAGE}: validation", total=len(order)) as advance:
         for ready in supply.steps(samples, census.pictures_of, shares):
             if ready.rows:
-                sums += _validate_batch(student, ready.rows, supply, cfg, samples.actions)
+                sums += _validate_batch(student, ready.rows, supply, cfg)
             advance(len(ready.rows))
     nats, weight, count, parsed, right, known, consistent = ranks.total(sums.tolist())
     found = Validation(samples=int(count), loss=nats / weight if weight else 0.0)
@@ -100,7 +99,7 @@ def validate(
     return found.model_copy(update={"accuracy": right / count, "parsed": parsed / count, "consistent": of_future})
 
 
-def _validate_batch(student: Student, rows: Sequence[Row], supply: Supply, cfg: TrainConfig, actions: ActionSet) -> Any:
+def _validate_batch(student: Student, rows: Sequence[Row], supply: Supply, cfg: TrainConfig) -> Any:
     features = supply.features.of([picture for row in rows for picture in row.pictures])
     encoded = [row.encoded for row in rows]
     nats, _ = answer_loss(student, encoded, features, cfg.logit_chunk)
@@ -110,14 +109,14 @@ def _validate_batch(student: Student, rows: Sequence[Row], supply: Supply, cfg: 
         with student.computing():
             answers = decode(student, encoded, features, max_tokens=cfg.max_new_tokens)
         both = zip(rows, answers, strict=True)
-        counts = sum((_judged_answer(row.sample, answer, actions) for row, answer in both), counts)
+        counts = sum((_judged_answer(row.sample, answer) for row, answer in both), counts)
     return np.array([float(nats), weight, len(rows), *counts])
 
 
-def _judged_answer(sample: Sample, answer: Completion, actions: ActionSet) -> Any:
+def _judged_answer(sample: Sample, answer: Completion) -> Any:
     """Give what an answer adds to the counts: parsed, right, with a known future, consistent with it."""
     finish_reason = None if answer.is_finished else "length"
-    coc = parse_answer(answer.text, actions, sample.language, finish_reason=finish_reason).coc
+    coc = parse_answer(answer.text, sample.language, finish_reason=finish_reason).coc
     decision, ruled_out = coc and coc.flight_decision, sample.contradicted
     is_known, is_right = ruled_out is not None, decision == sample.decision
     verdict = verdict_on(decision, sample.label, ruled_out or ()) if decision and is_known else None

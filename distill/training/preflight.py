@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from cosfly.errors import ConfigError, InputError
-from cosfly.products.actions import ActionSet
+from cosfly.products.actions import TOKENS
 from cosfly.work.store import write_json
 from distill.schema import Sample, Samples
 from distill.student.encoding import END_OF_ANSWER, EncodedSample, chat_text, prompt_text
@@ -186,7 +186,7 @@ def findings(
             for reason, count in sorted(part.skipped.items())
         ),
         Precheck("validation", f"{len(validation)} samples of {len(validation.decisions)} decisions"),
-        *_about_decisions(census, validation, samples.actions),
+        *_about_decisions(census, validation),
         _about_chat(student, samples[int(census.indices[0])]),
         _about_memory(cfg, student, census, features),
         _about_features(census, validation, features),
@@ -194,9 +194,9 @@ def findings(
     ]
 
 
-def _about_decisions(census: Census, validation: Census, actions: ActionSet) -> list[Precheck]:
+def _about_decisions(census: Census, validation: Census) -> list[Precheck]:
     """Say once which decisions train never shows: a fact of most small sets, and of weight where val asks for them."""
-    missing = [action for action in actions.tokens if not census.decisions[action]]
+    missing = [action for action in TOKENS if not census.decisions[action]]
     asked = {action: validation.decisions[action] for action in missing if validation.decisions[action]}
     if not asked:
         return [Precheck("decisions", f"no sample of {', '.join(missing)}")] if missing else []

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cosfly.products.actions import ORDERS, TOKENS
 from cosfly.products.segments import Segment
 from cosfly.space.blind import FITTED_ON, LEAST_WINDOWS, fit_deciders, is_drawn_ahead, past_of
 from cosfly.work.chance import draws_for, rng_for
@@ -40,7 +41,7 @@ def ceilings_of(folder: Path, record: ReleaseRecord) -> Ceilings:
 def _windows(shard: Path, record: ReleaseRecord) -> Iterator[tuple[np.ndarray, int, str, int]]:
     """Yield of labelled windows the past, the label's number, the split, and whether it may hang on what was drawn
     later, -1 where that is not known; a flight in memory."""
-    numbers = {name: number for number, name in enumerate(record.actions.tokens)}
+    numbers = {name: number for number, name in enumerate(TOKENS)}
     most_rank = 2**64 * FITTED_ON / max(1, record.numbers.captions.with_label)
     configs = [s.config for source in record.provenance.sources for s in source.stages if s.stage == "caption"]
     num_future = max((c["window"]["future_frames"] for c in configs if "window" in c), default=FUTURE_FRAMES)
@@ -52,7 +53,7 @@ def _windows(shard: Path, record: ReleaseRecord) -> Iterator[tuple[np.ndarray, i
         for now, row in enumerate(rows.rows):
             if row["label"] is None or int.from_bytes(draws_for(0, STAGE, row["sample_id"])[:8]) > most_rank:
                 continue
-            is_ordered, last = record.actions.actions[row["label"]].is_order, now + num_future
+            is_ordered, last = row["label"] in ORDERS, now + num_future
             is_known = not rows.is_foreign and place.get(row["frame_index"] + num_future) == last
             ahead = is_drawn_ahead(flight, now, last, is_ordered) if is_known else None
             past = past_of(flight, [place[index] for index in row[WINDOW]], is_ordered)

@@ -18,6 +18,7 @@ import yaml
 from cosfly.escaping import for_terminal
 from cosfly.look.coverage_page import ranges, shares
 from cosfly.look.page import markdown
+from cosfly.products.actions import TOKENS
 from cosfly.products.captions import FIELDS
 from cosfly.products.coverage import NAMED
 from cosfly.products.frames import FrameFile
@@ -67,7 +68,7 @@ def render_card(record: ReleaseRecord) -> str:
         fields=FIELDS,
         counted=[column for column in CAPTION if column.counted and column.words != "actions"],
         funnel=_funnel(record.history),
-        never_decided=[name for name in record.actions.tokens if name not in decided],
+        never_decided=[name for name in TOKENS if name not in decided],
         most_decided=max(decided.items(), key=lambda pair: pair[1], default=("none", 0)),
         repaired=sum(count for name, count in captions.frames_by["repair_strategy"].items() if name != "none"),
         small_splits=[name for name, own in splits.items() if len(own.walks) < FEW_WALKS],

@@ -25,6 +25,7 @@ import pyarrow.parquet as pq
 
 from cosfly.errors import InputError
 from cosfly.geometry import step_s
+from cosfly.products.actions import TOKENS
 from cosfly.products.frames import FrameFile
 from cosfly.products.motion import ACTION, PlannedMotion
 from cosfly.reading.arrays import parse_array, parse_picture
@@ -265,7 +266,7 @@ def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> li
     """Number episodes and frames; a unit is a data file of whole flights."""
     fps, size_px = _fps(flights), _size(release)
     found = {decision for flight in flights for decision in flight.decisions}
-    decisions = ("", *release.record.actions.tokens)
+    decisions = ("", *TOKENS)
     tasks = tuple(dict.fromkeys(task_of(f.goal, one) for f in flights for one in decisions if one in f.decisions))
     if unknown := found - {*decisions}:
         raise InputError(

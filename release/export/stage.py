@@ -16,7 +16,6 @@ from pydantic import Field
 import cosfly
 from cosfly.errors import InputError, VerifyError
 from cosfly.escaping import for_markdown
-from cosfly.products.actions import RecordedActions, shipped_actions
 from cosfly.reading.documents import FileFormat, read_model
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.work.stage_folder import Resume, StageFolder, result_of
@@ -38,8 +37,7 @@ class SourceRelease(Strict):
 
 
 class ExportRecord(Strict):
-    """`export.json`. actions, prompts: the closed set of
-    decisions (null: the one that ships) and the questions, as the release's record has them."""
+    """`export.json`. prompts: the questions, as the release's record has them."""
 
     format: str
     format_version: str
@@ -49,7 +47,6 @@ class ExportRecord(Strict):
     credits: str
     maps: list[ReleasedMap]
     coordinates: dict[str, Any]
-    actions: RecordedActions = Field(default_factory=shipped_actions)
     prompts: dict[str, dict[str, str]] = Field(default_factory=dict)
     codings: dict[str, str]
     notes: list[str]
@@ -72,7 +69,6 @@ def describe(release: Release, facts: FormatFacts, cfg: ExportConfig, *, frames:
         credits=record.credits,
         maps=record.maps,
         coordinates=facts.coordinates or record.coordinates,
-        actions=record.actions,
         prompts=record.prompts,
         codings=facts.codings,
         notes=facts.notes,

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from cosfly.errors import InputError
 from cosfly.escaping import published_name
-from cosfly.products.actions import ActionSet, not_in_set
+from cosfly.products.actions import ACTIONS, not_in_set
 from cosfly.products.captions import Caption, caption_lines
 from cosfly.products.places import sample_id
 from cosfly.reading.documents import parse_document, parse_json, validated
@@ -91,14 +91,12 @@ def index_captions(
     path: Path,
     lengths: dict[FlightKey, int],
     others: set[FlightKey],
-    actions: ActionSet,
     tell: Callable[[str, InputError], None],
 ) -> tuple[dict[FlightKey, FlightCaptions], CaptionAccount]:
     """Go over the captions once and note where those of each flight stand.
 
     Args:
         lengths: of the flights that are released, their frames; others: the flights of the tree that are left out.
-        actions: what a decision may be.
         tell: takes what is wrong with a caption, under its sample id.
     """
     found = {key: FlightCaptions(path, bytearray(length)) for key, length in lengths.items()}
@@ -110,7 +108,7 @@ def index_captions(
         key = (caption.town, caption.trajectory, caption.variant)
         problem = _no_place(caption, key, lengths, others, where)
         if problem is None and caption.status == "accepted":
-            problem = _no_caption(caption, actions, where)
+            problem = _no_caption(caption, where)
             if problem is None and key in found and found[key].has_caption[caption.frame_index]:
                 problem = InputError("a frame has two accepted captions", where=where)
         if problem is not None:
@@ -147,7 +145,7 @@ def _no_place(
     return None
 
 
-def _no_caption(caption: Caption, actions: ActionSet, where: str) -> InputError | None:
+def _no_caption(caption: Caption, where: str) -> InputError | None:
     """Say why an accepted caption cannot be released, None if it can."""
     if caption.en is None or caption.zh is None:
         fix = "release captions in both languages; English alone can be reported and train students"
@@ -157,8 +155,8 @@ def _no_caption(caption: Caption, actions: ActionSet, where: str) -> InputError 
         got = f"{decision} and {caption.zh.flight_decision}"
         return InputError("the two languages decide differently", where=where, got=got)
     for name, action in (("en.flight_decision", decision), ("label", caption.label)):
-        if action is not None and action not in actions.actions:
-            return not_in_set(action, f"{where}: {name}", actions)
+        if action is not None and action not in ACTIONS:
+            return not_in_set(action, f"{where}: {name}")
     if caption.verdict == "CONSISTENT" and decision != caption.label:
         return InputError(
             "a decision is called consistent with another label", where=where, got=f"{decision}, {caption.label}"

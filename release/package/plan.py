@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cosfly.errors import CosflyError, InputError, NothingKept, VerifyError
-from cosfly.products.actions import ActionSet, actions_beside, one_set
 from cosfly.products.frames import DEPTH_PNG, FILE_NAMES, frame_name, frame_path
 from cosfly.products.places import FlightChoice
 from cosfly.products.review import how_to_decide
@@ -135,7 +134,6 @@ class ReleasePlan:
     shards: list[PlannedShard]
     account: CaptionAccount
     material: Material
-    actions: ActionSet
     left_out: Counter[str]
     window_frames: int
     maps: list[ReleasedMap]
@@ -145,14 +143,13 @@ class ReleasePlan:
 def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> ReleasePlan:
     """Look at all of the material, and decide what goes where."""
     faults = Faults(stage)
-    actions = one_set((source.captions, actions_beside(source.captions)) for source in sources)
     choice, accepts = FlightChoice(match=cfg.flights), cfg.unbound == "accept"
     material = gather(sources, include_review=cfg.include_review, accept_unbound=accepts, choice=choice)
     flights, walks, left_out = survey(material.candidates, cfg.tracks, faults.tell)
     flights, without_twin = keep_pairs(flights, cfg.pairs, cfg.tracks, faults.tell)
     left_out = left_out + without_twin
     check_alike(flights, faults.tell)
-    captions, account = _index(sources, material, flights, actions, faults)
+    captions, account = _index(sources, material, flights, faults)
     faults.check()
     if not flights:
         raise _no_flight(sources, material, left_out, stage)
@@ -165,7 +162,7 @@ def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> 
     maps = maps_of([flight.candidate for flight in flights])
     return ReleasePlan(
         flights=sized, placements=placements, shards=shards_of(sized, placements, cfg.shard_bytes), account=account,
-        material=material, actions=actions, left_out=left_out, window_frames=account.window_frames, maps=maps,
+        material=material, left_out=left_out, window_frames=account.window_frames, maps=maps,
         licence=choose_licence(cfg.licence, [(one.town, one.licence) for one in maps]),
     )  # fmt: skip
 
@@ -188,7 +185,7 @@ def _no_flight(sources: list[Source], material: Material, left_out: Counter[str]
 
 
 def _index(
-    sources: list[Source], material: Material, flights: list[Surveyed], actions: ActionSet, faults: Faults
+    sources: list[Source], material: Material, flights: list[Surveyed], faults: Faults
 ) -> tuple[dict[str, FlightCaptions], CaptionAccount]:
     """Find the captions of each flight, by its name."""
     total, found = CaptionAccount(), dict[str, FlightCaptions]()
@@ -196,7 +193,7 @@ def _index(
         own = _by_key([flight for flight in flights if flight.candidate.source == number])
         others: set[FlightKey] = {one.key for one in material.candidates if one.source == number} - own.keys()
         lengths = {key: min(flight.num_frames for flight in group) for key, group in own.items()}
-        captions, account = index_captions(source.captions, lengths, others, actions, faults.tell)
+        captions, account = index_captions(source.captions, lengths, others, faults.tell)
         for key, of_flight in captions.items():
             if len(own[key]) > 1 and of_flight.count:
                 names = ", ".join(flight.name for flight in own[key])

@@ -178,7 +178,6 @@ def make_record(
         frame_selection=RULE,
         depth=StoredDepth() if "depth" in cfg.modalities else None,
         coordinates=columns.CONTRACT,
-        actions=plan.actions,
         prompts=prompts,
         splits=splits_of(cfg, plan, written, flights),
         numbers=numbers,

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cosfly.errors import ConfigError, InputError
-from cosfly.products.actions import OWN_ACTIONS
 from cosfly.products.boxes import UNKNOWN_LICENCE
 from cosfly.products.captions import OWN_PROMPTS, QUESTIONS
 from cosfly.products.flights import find_flights
@@ -42,7 +41,7 @@ class Source:
             files["inspect"] = self.inspect
             if (decisions := self.inspect.with_name(REVIEW)).exists():
                 files["review"] = decisions
-        own = {"actions": OWN_ACTIONS, **{f"prompts/{name}": f"{OWN_PROMPTS}/{name}.txt" for name in QUESTIONS}}
+        own = {f"prompts/{name}": f"{OWN_PROMPTS}/{name}.txt" for name in QUESTIONS}
         return files | {role: path for role, name in own.items() if (path := self.captions.parent / name).is_file()}
 
     @property

@@ -9,6 +9,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
+from cosfly.products.actions import ACTIONS, TOKENS
 from cosfly.products.answer_text import MIN_CHARACTERS, MIN_CHARACTERS_ZH
 from cosfly.products.captions import FIELDS
 from cosfly.products.frames import LEVEL_NAMES
@@ -269,7 +270,7 @@ def _frames(counts: Counts) -> Table:
 
 def _captions(record: ReleaseRecord, counts: Counts) -> list[Table]:
     """What captions say: decisions, verdicts, repairs, evidence, lengths."""
-    order = [name for name in (*record.actions.tokens, "none") if counts.labels[name] or counts.decisions[name]]
+    order = [name for name in (*TOKENS, "none") if counts.labels[name] or counts.decisions[name]]
     confusion: Rows = [[label, *(counts.confusion[label, decision] for decision in order)] for label in order]
     repairs = _shares(counts.repairs.most_common(), counts.repairs.total())
     return [
@@ -279,11 +280,11 @@ def _captions(record: ReleaseRecord, counts: Counts) -> list[Table]:
 
 
 def _decisions(record: ReleaseRecord, counts: Counts) -> Table:
-    actions, decisions, labels = record.actions, counts.decisions, counts.labels
+    decisions, labels = counts.decisions, counts.labels
     total, labelled = decisions.total(), labels.total() - labels["none"]
     rows: Rows = []
-    for name in (*actions.tokens, *sorted(decisions.keys() - {*actions.tokens, "none"})):
-        group = actions.actions[name].group if name in actions.actions else ""
+    for name in (*TOKENS, *sorted(decisions.keys() - {*TOKENS, "none"})):
+        group = ACTIONS[name].group if name in ACTIONS else ""
         shares = percent(decisions[name], total), percent(labels[name], labelled)
         rows.append([name, decisions[name], shares[0], labels[name], shares[1], group])
     note = f"Decisions of {total:,} captions, and the labels that the later positions imply for {labelled:,} of them."

@@ -9,7 +9,6 @@ from typing import Any, Literal
 import numpy as np
 
 from cosfly.errors import InputError
-from cosfly.products.actions import ActionSet
 from cosfly.products.shown_captions import CaptionReader
 from cosfly.work.items import Item, Outcome
 from release.flight_rows import FlightRows
@@ -29,11 +28,10 @@ SENSELESS = (ValueError, KeyError, TypeError, IndexError, ArithmeticError, Attri
 
 @dataclass(frozen=True)
 class Context:
-    """What the record says that the checks of flights need. actions: the closed set of decisions. by_town: splits
+    """What the record says that the checks of flights need. by_town: splits
     share no town either. both: every flight's twin is released too. captions: by run the settings of its caption
     stage, if its source has one."""
 
-    actions: ActionSet
     window_frames: int | None = None
     by_town: bool = False
     both: bool = False
@@ -46,7 +44,7 @@ class Context:
             own = [stage.config for stage in source.stages if stage.stage == "caption"]
             captions[source.run] = own[0] if len(own) == 1 else {}
         both = asked.pairs == "both" and len(asked.tracks) == 2
-        return cls(record.actions, asked.window_frames, record.splits.by == "town", both, captions)
+        return cls(asked.window_frames, record.splits.by == "town", both, captions)
 
     def caption_settings(self, flight: FlightRows) -> dict[str, Any]:
         """Return the settings of a flight's captions; folders above a town are part of a run's name."""
@@ -92,12 +90,12 @@ def _check_flight(
     """Run all checks of a flight; a value that makes a check impossible is a finding."""
 
     def read_captions() -> None:
-        shown = flight.shown(twin, context.actions, context.caption_settings(flight))
+        shown = flight.shown(twin, context.caption_settings(flight))
         for lie in reader(shown) if reader is not None else ():
             findings.error(lie.code, lie.where, lie.got, lie.expected)
 
     checks: list[Callable[[], None]] = [
-        lambda: check_identity(flight, context.actions, findings),
+        lambda: check_identity(flight, findings),
         lambda: check_geometry(flight, findings),
         lambda: check_captions(flight, context.window_frames, findings),
         read_captions,

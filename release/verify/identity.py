@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.products.actions import ActionSet
+from cosfly.products.actions import TOKENS
 from release.columns import REQUIRED, SCALARS, TARGET_PICTURE
 from release.flight_rows import FlightRows
 from release.verify.findings import Findings
@@ -19,7 +19,7 @@ RANGES = {column.name: column.ranges for column in SCALARS if column.ranges}
 LARGEST = 1e7  # of any number: farther than any town reaches, m
 
 
-def check_identity(flight: FlightRows, actions: ActionSet, findings: Findings) -> None:
+def check_identity(flight: FlightRows, findings: Findings) -> None:
     """Check ids, names, constants, closed sets, ranges and nulls of a flight's rows."""
     _check_names(flight, findings)
     for name in CONSTANT:
@@ -28,7 +28,7 @@ def check_identity(flight: FlightRows, actions: ActionSet, findings: Findings) -
         if any(differs):
             i = differs.index(True)
             findings.error("constant", flight.where(i, name), column[i], f"{column[0]}, as in the flight's first row")
-    closed = {name: actions.tokens if words == "actions" else words for name, words in CLOSED.items()}
+    closed = {name: TOKENS if words == "actions" else words for name, words in CLOSED.items()}
     for i, row in enumerate(flight.rows):
         for name in (name for name in REQUIRED if name in row and row[name] is None):
             findings.error("null", flight.where(i, name), "null", "a value in every row")

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cosfly.errors import InputError
-from cosfly.products.actions import shipped_actions
 from cosfly.products.playback import ORIGINAL
 from cosfly.products.shown_captions import CaptionReader
 from cosfly.work.config import Config
@@ -136,7 +135,7 @@ def _verify_tree(folder: Path, how: _How, findings: Findings) -> None:
         return
     findings.facts.append(f"structure: a playback tree of {len(entries):,} flights, with {', '.join(source.files)}")
     if how.level != "structure":
-        _check_all(source, entries, Context(shipped_actions()), replace(how, reader=None), findings)
+        _check_all(source, entries, Context(), replace(how, reader=None), findings)
     for flight in (folder / entry.parts[0] for entry in entries):
         if how.level == "pixels" and (flight / CHECKSUMS).is_file():
             digests = read_digests(flight, findings)

@@ -22,8 +22,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from caption.run.windows import current_frames, cut_future, label_motion, order_comes_within
-from caption.schema import LabelConfig, WindowConfig
-from caption.truth.actions import measure, table_of
+from caption.schema import WindowConfig
+from caption.truth.actions import TABLE, measure
 from cosfly.app.settings import RunConfig
 from cosfly.geometry import look_at, wrap_deg
 from cosfly.maps.stage import load_map
@@ -31,7 +31,7 @@ from cosfly.pedestrians.stage import make_walk
 from cosfly.pedestrians.walkable import walkable_ground
 from cosfly.planners.reacquire import screens_of
 from cosfly.planners.stage import draw_styles_of, plan_flight
-from cosfly.products.actions import shipped_actions
+from cosfly.products.actions import TOKENS
 from cosfly.products.playback import Flight
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import walk_id
@@ -74,13 +74,12 @@ def flight_of(trace: DroneTrace) -> Flight:
 
 def windows_of(cfg: RunConfig, names: list[str]) -> Windows:
     """The labelled windows of some towns, as a caption campaign cuts them."""
-    actions, cut = shipped_actions(), WindowConfig()
-    table, numbers = table_of(actions, LabelConfig()), {name: k for k, name in enumerate(actions.tokens)}
+    cut, numbers = WindowConfig(), {name: k for k, name in enumerate(TOKENS)}
     found = []
     for flight in (flight_of(trace) for name in names for trace in flights_of(cfg, name)):
         motion = label_motion(flight)
         for now in current_frames(len(flight), cut):
-            label = table.label_of(measure(cut_future(flight, motion, now, cut.future_frames)))
+            label = TABLE.label_of(measure(cut_future(flight, motion, now, cut.future_frames)))
             if label is None or order_comes_within(flight.mission, now, cut.future_frames):
                 continue
             is_ordered = flight.mission is not None and flight.mission.order_at(now) is not None

@@ -88,11 +88,9 @@ def main() -> None:
 
 
 def _settings(url: str, concurrency: int) -> CaptionConfig:
-    image = {"cache_frames": 100_000}
     endpoint = {"concurrency": concurrency, "model": "bench"}
-    return CaptionConfig.model_validate(
-        {"teacher": url, "endpoint": endpoint, "image": image, "repair": {"hard_conflict": "keep"}}
-    )
+    repair = {"hard_conflict": "keep"}
+    return CaptionConfig.model_validate({"teacher": url, "endpoint": endpoint, "repair": repair})
 
 
 def _client(

@@ -24,7 +24,7 @@ from cosfly.closed_loop.settings import FlyConfig
 from cosfly.pedestrians import stage as pedestrians
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners.contract import PlanConfig
-from cosfly.products.actions import shipped_actions
+from cosfly.products.actions import TOKENS
 from cosfly.products.boxes import write_boxes
 from cosfly.render.settings import RenderConfig
 from cosfly.simplify.passes import SimplifyConfig, simplify
@@ -39,7 +39,7 @@ def time_envs(rounds: int) -> None:
 
     from cosfly.envs.episodes import NUM_DECISIONS
 
-    hover = shipped_actions().tokens.index("hover")  # which crashes nowhere, so that no town is made meanwhile
+    hover = TOKENS.index("hover")  # which crashes nowhere, so that no town is made meanwhile
     how = {"shared_memory": False, "context": "spawn"}
     for _ in range(rounds):
         for num in (1, 2):

@@ -21,7 +21,7 @@ from cosfly.closed_loop import stage
 from cosfly.closed_loop.measures import score_pursuits
 from cosfly.closed_loop.pilots import Outlook, PilotAnswer, open_pilot
 from cosfly.planners import stage as planning
-from cosfly.products.actions import shipped_actions
+from cosfly.products.actions import TOKENS
 from cosfly.products.captions import read_captions
 from cosfly.products.flight_scores import SCORE, SCORE_FORMAT
 from cosfly.products.pursuits import PURSUITS, read_pursuit
@@ -37,7 +37,7 @@ NOISE = (0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
 def replaced(action: str, item: str, noise: float, without: tuple[str, ...]) -> str:
     rng = rng_for(0, "checkpoint", f"{noise}/{item}")
     if rng.random() < noise:
-        return str(rng.choice(shipped_actions().tokens))
+        return str(rng.choice(TOKENS))
     return "track_straight" if action in without else action
 
 

@@ -28,10 +28,10 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from teacher_server import TeacherServer
 
-from cosfly.products.actions import shipped_actions
+from cosfly.products.actions import TOKENS
 from cosfly.products.captions import read_captions
 
-TOKENS = shipped_actions().tokens
+TOKENS = TOKENS
 TUPLE, FRAMES = re.compile(r"\(([-\d.,; ]+)\)"), 5
 STEPS, RATE, WIDTH = 3000, 2e-3, 64
 
