@@ -37,9 +37,9 @@ from cosfly.reading.files import sha256_file
 from cosfly.work.config import build as build_config
 from cosfly.work.store import CHECKSUMS, read_checksums
 from release.columns import POSE
-from release.export.contract import FORMATS, ExportConfig, ExportUnit
+from release.export.contract import FORMATS, ExportConfig, ExportUnit, Files, FormatFacts
 from release.export.lerobot import merged, runs_of, states, summarize, tiff_of_depth
-from release.export.source import ReleasedRows, Span, open_release, scan
+from release.export.source import ReleasedRows, Span, open_release, rows_of_flight, scan
 from release.export.stage import read_export
 from release.export.stage import run as export
 from release.package import stage as package
@@ -284,6 +284,20 @@ def test_an_export_says_where_it_came_from_and_whose_it_is(format, dataset, tmp_
 def plan(release, flights, cfg):
     """A toy format, as docs/extending.md describes it: the poses of each flight as CSV."""
     return [ExportUnit(flight.name, len(flight), flights=(flight,)) for flight in flights]
+
+
+def write(release, unit, folder, cfg):
+    files, (flight,) = Files(folder), unit.flights
+    poses = [row["pose"] for row in rows_of_flight(release, flight, ["pose"])]
+    lines = [",".join(repr(value) for value in pose.values()) for pose in poses]
+    files.put(f"{unit.name.replace('/', '__')}.csv", "\n".join(lines).encode())
+    return files.written(lines=len(lines))
+
+
+def finish(release, units, written, folder, cfg):
+    files = Files(folder)
+    files.put("lines.txt", str(sum(one.facts["lines"] for one in written)).encode())
+    return FormatFacts(version="1", codings={"pose": "CSV"}, how_to_open="open(...)", files=files.digests)
 
 
 def test_a_format_of_your_own_takes_three_functions(dataset, tmp_path, monkeypatch):
