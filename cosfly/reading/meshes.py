@@ -14,7 +14,7 @@ import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -59,7 +59,8 @@ def too_many(where: object, num_triangles: int) -> InputError:
     return over_limit(where, f"{num_triangles:,} triangles", f"{MOST_TRIANGLES:,}", "simplify the meshes")
 
 
-class _Folder(NamedTuple):
+@dataclass(frozen=True)
+class _Folder:
     """The folder of a mesh. As trimesh's resolver, it gives materials without pictures."""
 
     path: Path
