@@ -59,8 +59,6 @@ def test_float32_against_float64(tmp_path):
     assert study.truth == "float64"
     assert 0 < single.max_cm <= np.spacing(np.float32(FAR_M)) / 2 * 100 * 1.001
     assert single.psnr_db > 145
-    assert rows_of(study)["64-bit float"].max_cm == 0
-    assert single.rounding_cm is None
 
 
 def test_a_frame_of_the_tree_is_studied_with_its_picture(tmp_path):
@@ -81,13 +79,11 @@ def test_a_frame_of_the_tree_is_studied_with_its_picture(tmp_path):
     known = depth[(depth != 1000) & (depth != 0)]
     assert study.share_measured == known.size / depth.size
     rows = rows_of(study)
-    lossless = [row for name, row in rows.items() if name.startswith("32-bit float")]
-    assert [(row.max_cm, row.psnr_db, row.unique) for row in lossless] == [(0.0, None, len(np.unique(known)))] * 2
-    assert rows["32-bit float"].rounding_cm == pytest.approx(np.spacing(known.max()) / 2 * 100)
-    assert rows["16-bit PNG of millimetres"].max_cm == pytest.approx(0.05, abs=0.002)
+    row = rows["32-bit float"]
+    assert (row.max_cm, row.psnr_db, row.unique) == (0.0, None, len(np.unique(known)))
     assert rows["8-bit"].edges < rows["12-bit"].edges <= 1.0
     table = (tmp_path / "out/depth_study.md").read_text()
-    assert table.count("\n| ") == 1 + len(study.rows)
+    assert table.count("\n| ") == 2 + len(study.rows)
     assert str(tmp_path) not in table
     picture = cv2.imread(str(tmp_path / "out/depth_study.png"))
     assert picture.std() > 20

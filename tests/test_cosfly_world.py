@@ -11,14 +11,16 @@ from pydantic import ValidationError
 from teacher_server import TeacherServer
 
 from cosfly.errors import InputError
+from cosfly.maps.simworld import SimWorldConfig
+from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.reading.documents import read_json, read_model
 from cosfly.work.stage_folder import read_manifest
-from cosfly.worlds.checks import check_world, unlikeness
+from cosfly.worlds.checks import check_world
 from cosfly.worlds.objects import OBJECTS, assets
 from cosfly.worlds.plan import PLAN_FORMAT, NamedObject, WorldPlan
 from cosfly.worlds.rules import plan_by_rules
 from cosfly.worlds.settings import WorldConfig
-from cosfly.worlds.stage import read_world, run
+from cosfly.worlds.stage import run
 from cosfly.worlds.town import build, footprints, of_kinds
 
 PROMPTS = list(csv.DictReader(Path(__file__).with_name("world_prompts.tsv").open(), delimiter="\t"))
@@ -47,7 +49,9 @@ def test_a_prompt_gives_a_valid_world_with_each_named_object(row):
 
 def test_a_world_read_by_the_importer_is_the_one_that_was_laid_out(tmp_path):
     cfg = WorldConfig(prompt="a small village with a hospital, a church and a lawn")
-    found, town = read_world(run(cfg, tmp_path / "w", seed=3)), build(plan_by_rules(cfg.prompt, 3)[0], cfg.name, 3)
+    world = SimWorldConfig(world=run(cfg, tmp_path / "w", seed=3), stand_m=0.0)
+    found = load_map(MapsConfig(source="simworld", simworld=world))
+    town = build(plan_by_rules(cfg.prompt, 3)[0], cfg.name, 3)
     expected = town.boxes
     assert len(found) == len(expected) > 500
     assert (found.kinds == expected.kinds).all()
@@ -71,8 +75,6 @@ def test_the_same_prompt_and_seed_give_the_same_bytes_and_another_seed_another_w
     cfg = WorldConfig(prompt="a small village with a well")
     one, two, other = (run(cfg, tmp_path / name, seed=seed) for name, seed in (("a", 1), ("b", 1), ("c", 2)))
     assert one.read_bytes() == two.read_bytes() != other.read_bytes()
-    assert unlikeness([read_world(one), read_world(two)]) == [0.0]
-    assert unlikeness([read_world(one), read_world(other)])[0] > 0.2
 
 
 def test_any_plan_that_can_be_gives_a_world_and_says_what_it_lacks():
@@ -184,7 +186,6 @@ def test_worlds_go_on_to_releases_with_the_settings_that_are_told(tmp_path):
     told = [word for setting in small for word in ("--set", setting)]
     result = invoke("world", ["a small village", *told], "--count 2 --run --seed 5 --out", [tmp_path / "many"])
     assert result.exit_code == 0, result.output
-    assert read_json(tmp_path / "many/diversity.json", what="diversity")["ways_apart_m"][0] > 1.0
     for number in range(2):
         run_folder = tmp_path / f"many/world_{number:03}/run"
         assert read_json(run_folder / "roi_polygon.json", what="region")["points_world"]

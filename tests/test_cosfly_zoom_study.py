@@ -32,9 +32,6 @@ def test_a_longer_lens_shows_the_middle_as_large():
     assert np.tan(np.radians(longer.fov_deg / 2)) == pytest.approx(np.tan(np.radians(55)) / 5)
 
 
-# --- figures ----------------------------------------------------------------------------------------------------------
-
-
 # --- the study --------------------------------------------------------------------------------------------------------
 
 
@@ -65,11 +62,5 @@ def test_the_target_grows_as_the_lens_does(studied):
     assert long["visibility"]["mean"] == pytest.approx(wide["visibility"]["mean"], abs=0.05)
     assert 0.2 < long["track_quality"]["mean"] < 1.0
     assert set(found["by_flight"]) == {"path_000", "path_002"}
-    fidelity = found["fidelity"]  # optical zoom is sharper than digital
-    assert set(fidelity) == {"2", "5"}
-    for kernels in fidelity.values():
-        assert all(one["sharpness"]["mean"] < 0.9 for one in kernels.values())
-        assert kernels["bicubic"]["sharpness"]["mean"] > kernels["bilinear"]["sharpness"]["mean"]
-    assert fidelity["5"]["bicubic"]["ssim"]["mean"] < fidelity["2"]["bicubic"]["ssim"]["mean"]
     counts = read_manifest(out).counts  # a bad flight is counted and stops no other
     assert (counts.input, counts.kept, dict(counts.failed)) == (3, 2, {"render": 1})

@@ -1,7 +1,7 @@
 """`cosfly reproduce`: the paper's tables and figures from one run, each beside the paper's own, on one page.
 
 What the run recorded is read from its stages. What it has not is measured anew in folders of their own below `out`:
-planners, TA*'s beam, MuCO's weights and zoom are stages that go on after a kill; depth, weather and single pictures are
+planners, TA*'s beam and zoom are stages that go on after a kill; depth, weather and single pictures are
 done again. `paper.yaml` says where each figure stands, what the paper's is, why they differ, and what is left out.
 """
 
@@ -37,7 +37,7 @@ from cosfly.products.segments import FOLLOW
 from cosfly.reading.arrays import read_picture
 from cosfly.reading.documents import FileFormat, read_model, read_object
 from cosfly.reading.files import read_bytes
-from cosfly.studies import depth, variants, weather, zoom
+from cosfly.studies import beam, depth, weather, zoom
 from cosfly.work.config import build, read_yaml
 from cosfly.work.journal import Journal
 from cosfly.work.stage_events import read_events
@@ -53,7 +53,6 @@ log = logging.getLogger(__name__)
 FORMAT = FileFormat("cosfly.reproduction", "1.0")
 STAGES = ("maps", "simplify", "pedestrians", "plan")  # of a run without which nothing can be told
 PLANNERS = ("track_astar", "muco", "foresight")  # the first is held against the others, as in the paper
-BEAMS = (64, 256, 512, 1024, 2048, 4096)
 BESIDE = ("bench.json", "benchmark.json")  # of `cosfly bench` and `cosfly plan benchmark`
 LENSES_DEG = (120, 110, 90, 70, 60, 45, 30)  # tab:zoom_conversion
 ZOOM = {"fovs_deg": (110, 90, 60, 30), "every": 12, "modalities": ("rgb", "depth", "instance")}
@@ -336,7 +335,8 @@ def measure(
     plan = cfg.plan.model_copy(update={"styles": {FOLLOW: 1.0}})
     compared = build(compare.CompareConfig, plan.model_dump() | {"planners": PLANNERS}, "planners")
     compare.run(compared, simplified, paths, out / "compare", **how)
-    variants.run(variants.beam_study(plan, BEAMS), simplified, paths, out / "beam", **how)
+    beams = build(beam.BeamConfig, plan.model_dump(), "beams")
+    beam.run(beams, simplified, paths, out / "beam", **how)
     if "release" in done:
         release_stats(run / "release/dataset", out / "release", pixels=0)
     if "render" not in done:

@@ -96,6 +96,6 @@ def study_zoom(
     given = {name: value for name, value in (("num_flights", flights), ("every", every)) if value is not None}
     studied = build(zoom.ZoomStudyConfig, job.cfg.render.model_dump() | given, "--flights, --every")
     product = zoom.run(studied, map_, simplified, traces, out, seed=job.cfg.seed, **job.manner)
-    head, rows = zoom.HEAD, zoom.text_rows(read_object(product, what="zoom study"))
-    options.tell_table(console, head, rows, title="Zoom (mean ± standard deviation over flights)", left=head)
+    table = zoom.text_table(read_object(product, what="zoom study"))
+    options.tell_table(console, table.columns, table.rows, title=table.title)
     job.finish(product, out)

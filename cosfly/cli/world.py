@@ -29,10 +29,6 @@ def world(
     ] = None,
     model: Annotated[str | None, Option(help="Its name."), Sets("world.endpoint.model")] = None,
     count: Annotated[int, Option(min=1, max=1000, help="So many worlds, each of a seed of its own.")] = 1,
-    against: Annotated[
-        list[Path] | None,
-        Option(help="A SimWorld world to compare buildings with (sizes: maps.simworld.sizes); repeat it."),
-    ] = None,
     run: Annotated[
         bool, Option("--run", help="Go on: walks, flights, frames and all that `cosfly run` makes, with --set.")
     ] = False,
@@ -43,25 +39,11 @@ def world(
     words = "-".join(re.findall(r"[a-z0-9]+", prompt.lower())[:5]) or "world"
     out = out or Path("worlds") / f"{words[:40]}-{time.strftime('%Y%m%d-%H%M%S')}"
     folders = [out] if count == 1 else [out / f"world_{number:03}" for number in range(count)]
-    other_cities = {"against": against or (), "sizes": job.cfg.maps.simworld.sizes}
-    products = [
-        stage.run(job.cfg.world, folder, seed=job.cfg.seed + number, resume=job.resume, **other_cities)
-        for number, folder in enumerate(folders)
-    ]
-    for product in products:
-        job.finish(product, product.parent)
-    if count > 1:
-        found = stage.write_diversity(products, out)
-        typer.echo(
-            f"not shared of two worlds' built-up ground: {found['mean_unlike']:.0%}, least {found['least_unlike']:.0%}"
-        )
+    for number, folder in enumerate(folders):
+        job.finish(stage.run(job.cfg.world, folder, seed=job.cfg.seed + number, resume=job.resume), folder)
     if run:
         for number, folder in enumerate(folders):
             _go_on(job, folder, job.cfg.seed + number)
-        if count > 1:
-            found = stage.write_diversity(products, out, [folder / "run/plan/drone_trace.json" for folder in folders])
-            if apart_m := found.get("ways_apart_m"):
-                typer.echo(f"walks and flights of two worlds are {min(apart_m):.1f} m or more apart, on average")
 
 
 def _go_on(job: Job, folder: Path, seed: int) -> None:

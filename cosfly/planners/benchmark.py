@@ -23,8 +23,9 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from cosfly.errors import EnvironmentMissing, InputError
+from cosfly.look.tables import TextTable
 from cosfly.planners import compare
-from cosfly.planners.compare import AXES, FIGURES, INTERVAL_PERCENT, NUM_RESAMPLES, CompareConfig, TextTable
+from cosfly.planners.compare import AXES, FIGURES, INTERVAL_PERCENT, NUM_RESAMPLES, CompareConfig
 from cosfly.planners.contract import ALL_PLANNERS, title_of
 from cosfly.planners.stage import check_ids, draw_styles_of
 from cosfly.products.boxes import BoxMap, read_boxes
@@ -385,10 +386,8 @@ def text_tables(found: Benchmark) -> list[TextTable]:
 def markdown(found: Benchmark) -> str:
     """Give the tables as a page of text."""
     parts = [f"# Planners on {len(found.scenarios)} scenarios of {found.map}, seed {found.seed}"]
-    for table in text_tables(found):
-        lines = [table.columns, ["---", *["---:"] * (len(table.columns) - 1)], *table.rows]
-        parts.append("\n".join([f"## {table.title}\n", *(f"| {' | '.join(line)} |" for line in lines)]))
-    return "\n\n".join(parts).replace("*", "\\*") + "\n"
+    parts += ["## " + table.title.replace("*", "\\*") + f"\n\n{table.markdown()}" for table in text_tables(found)]
+    return "\n\n".join(parts)
 
 
 def _cells(values: Iterable[float | None], digits: int = 3) -> list[str]:

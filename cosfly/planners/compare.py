@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
 from cosfly.errors import InputError, NoPathError
+from cosfly.look.tables import TextTable
 from cosfly.look.topview import INK, PAPER, add_caption, draw_area, draw_dot, draw_line, draw_text, png_bytes
 from cosfly.planners.contract import ALL_PLANNERS, PLANNERS, PlanConfig, known_planner, title_of
 from cosfly.planners.overview import draw_walks
@@ -454,15 +454,6 @@ def draw_radar(axes: dict[str, dict[str, float]]) -> bytes:
 
 # --- tables -----------------------------------------------------------------------------------------------------------
 # `compare.json` as tables of text: figures, axes with their intervals, and wins against each other planner.
-
-
-@dataclass(frozen=True)
-class TextTable:
-    """A table for the terminal; the first column is words, the others are numbers."""
-
-    title: str
-    columns: list[str]
-    rows: list[list[str]]
 
 
 class _Comparison(BaseModel):

@@ -1,9 +1,7 @@
-"""Is a world valid, is it what its plan says, how is it beside other cities, how unlike are several."""
+"""Checks of a world: is it valid, and does it match its plan."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import combinations
 from typing import Any, NamedTuple
 
 import cv2
@@ -12,8 +10,6 @@ import shapely
 
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import GROUND_KINDS
-from cosfly.products.motion import in_axes_of
-from cosfly.products.traces import DroneTrace
 from cosfly.worlds.plan import WorldPlan
 from cosfly.worlds.town import Town, footprints, land_m2, of_kinds, trees_of
 
@@ -23,8 +19,6 @@ STEP_M = 0.25  # what is lower does not either
 AT_THE_DOOR_M = 2.0  # from a building to the pavement it is reached by
 WALK_M = 100.0  # the longest walk that must find room: app:simworld:step4 samples 50 to 100 m
 OVERLAP_M = 0.05
-GRID_M = 4.0  # of the pictures of buildings that are compared between worlds
-WAY_POINTS = 50
 
 
 class Buildings(NamedTuple):
@@ -32,20 +26,6 @@ class Buildings(NamedTuple):
 
     polygons: np.ndarray
     tops_m: np.ndarray
-
-    @property
-    def sides_m(self) -> np.ndarray:
-        """Side of the square of each one's area."""
-        return np.sqrt(shapely.area(self.polygons))
-
-    @property
-    def gaps_m(self) -> np.ndarray:
-        """From each to the nearest other one."""
-        if len(self.polygons) < 2:
-            return np.zeros(0)
-        tree = shapely.STRtree(self.polygons)
-        _, gaps = tree.query_nearest(self.polygons, exclusive=True, return_distance=True, all_matches=False)
-        return gaps
 
 
 def buildings_of(box_map: BoxMap) -> Buildings:
@@ -128,56 +108,3 @@ def _drawn(polygons: np.ndarray, low: np.ndarray, shape: np.ndarray, cell_m: flo
         corners = np.round((np.asarray(polygon.exterior.coords)[:, :2] - low) / cell_m - 0.5).astype(np.int32)
         cv2.fillPoly(picture, [corners], 1)
     return picture
-
-
-# --- beside other cities ----------------------------------------------------------------------------------------------
-
-MEASURES = ("side of buildings, m", "gap to the next building, m", "height of buildings, m")
-
-
-def measures(box_map: BoxMap) -> dict[str, np.ndarray]:
-    """Give what cities are compared by, one value for each building."""
-    buildings = buildings_of(box_map)
-    return dict(zip(MEASURES, (buildings.sides_m, buildings.gaps_m, buildings.tops_m), strict=True))
-
-
-def compare(ours: BoxMap, other: BoxMap) -> list[dict[str, Any]]:
-    """Give quartiles of each measure in both, and how far its distributions are apart (Kolmogorov, Smirnov)."""
-    rows = []
-    for name, one in measures(ours).items():
-        two = measures(other)[name]
-        values = np.sort(np.concatenate([one, two]))
-        both = [np.searchsorted(np.sort(each), values, side="right") / max(1, len(each)) for each in (one, two)]
-        quartiles = [np.percentile(each, (25, 50, 75)).round(1).tolist() if len(each) else [] for each in (one, two)]
-        distance = round(float(np.abs(both[0] - both[1]).max()), 3)
-        rows.append({"measure": name, "ours": quartiles[0], "other": quartiles[1], "distance": distance})
-    return rows
-
-
-# --- several worlds ---------------------------------------------------------------------------------------------------
-
-
-def unlikeness(worlds: Sequence[BoxMap]) -> list[float]:
-    """Give for every pair of worlds the share of ground built up in one of them that is not in both, 0 to 1."""
-    half = max(np.abs(np.stack(world.bounds())[:, :2]).max() for world in worlds)
-    low, shape = np.array([-half, -half]), np.full(2, int(2 * half / GRID_M) + 1)
-    built = [_drawn(buildings_of(world).polygons, low, shape, GRID_M) > 0 for world in worlds]
-    return [round(1.0 - float((a & b).sum() / max(1, (a | b).sum())), 3) for a, b in combinations(built, 2)]
-
-
-def ways_apart(worlds: Sequence[Sequence[DroneTrace]]) -> list[float]:
-    """Give for every pair of worlds how far a walk and its flight are from the nearest of the other world, mean, m.
-
-    They are laid over each other with one start and one direction from start to end, WAY_POINTS at even times.
-    """
-    shapes = [np.stack([_laid_out(trace) for trace in traces]) for traces in worlds]
-    gaps_m = (np.linalg.norm(a[:, None] - b[None], axis=-1).mean(axis=-1) for a, b in combinations(shapes, 2))
-    return [round(float((gap.min(axis=0).mean() + gap.min(axis=1).mean()) / 2), 2) for gap in gaps_m]
-
-
-def _laid_out(trace: DroneTrace) -> np.ndarray:
-    """Walk and flight from the walk's start, x towards its end, (2 * WAY_POINTS, 3) m."""
-    rows = np.linspace(0, len(trace.time_s) - 1, WAY_POINTS).round().astype(int)
-    away_m = np.concatenate([trace.targets_m[rows], trace.positions_m[rows]]) - trace.targets_m[0]
-    end_m = trace.targets_m[-1] - trace.targets_m[0]
-    return in_axes_of(float(np.degrees(np.arctan2(end_m[1], end_m[0]))), away_m)

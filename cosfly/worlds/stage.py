@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +15,13 @@ import yaml
 
 import cosfly
 from cosfly.look.topview import TopView, draw_map, png_bytes
-from cosfly.maps.simworld import PLACEHOLDER_CM, SimWorldConfig
-from cosfly.maps.stage import MapsConfig, load_map
-from cosfly.products.boxes import OUR_LICENCE, BoxMap
-from cosfly.products.traces import read_traces
+from cosfly.maps.simworld import PLACEHOLDER_CM
+from cosfly.products.boxes import OUR_LICENCE
 from cosfly.reading.documents import FileFormat
 from cosfly.work.config import read_yaml, shipped
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
 from cosfly.work.store import write_bytes, write_json, write_model
-from cosfly.worlds.checks import check_world, compare, unlikeness, ways_apart
+from cosfly.worlds.checks import check_world
 from cosfly.worlds.objects import OBJECTS, assets
 from cosfly.worlds.plan import PLAN_FORMAT
 from cosfly.worlds.planner import plan_by_model
@@ -39,28 +36,15 @@ CHECKS_FORMAT = FileFormat("cosfly.world_checks", "1.0", "checks of a world")
 CREDITS = "cosfly; sizes of assets by SimWorld, maitrix-org and contributors"
 
 
-def run(
-    cfg: WorldConfig,
-    out: Path,
-    *,
-    seed: int = 0,
-    resume: Resume = "if-same",
-    against: Sequence[Path] = (),
-    sizes: Sequence[Path] = (),
-) -> Path:
+def run(cfg: WorldConfig, out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
     """Reads a prompt; writes trace.json, plan.json, layout.json, placement.json, combined_world.json with Bbox.json,
     checks.json, map.png, and loop.yaml: settings for `cosfly run` on it.
 
-    Args:
-        against: SimWorld worlds whose buildings the world's are compared with.
-        sizes: their size tables; none: Bbox.json beside each.
     Raises:
         InputError: the prompt cannot be planned. TeacherError: the language model gives no plan.
     """
     prompt = check_prompt(cfg.prompt)
-    others = {f"against_{number}": path for number, path in enumerate(against)}
-    real = {str(path): read_world(path, sizes) for path in against}  # a broken one before the folder is bound to it
-    stage = StageFolder.open(out, "world", config=cfg, inputs=others, seed=seed, resume=resume)
+    stage = StageFolder.open(out, "world", config=cfg, inputs={}, seed=seed, resume=resume)
     product = out / WORLD_FILE
     if stage.is_complete:
         return product
@@ -77,8 +61,7 @@ def run(
     town = build(plan, cfg.name, seed)
     _write_world(town, out, seed)
     checks = check_world(town, plan)
-    compared = {path: compare(town.boxes, boxes) for path, boxes in real.items()}
-    write_json(out / "checks.json", {**CHECKS_FORMAT.header, "checks": checks, "compared": compared})
+    write_json(out / "checks.json", {**CHECKS_FORMAT.header, "checks": checks})
     view = TopView.around(np.stack(town.boxes.bounds()), 1000)
     write_bytes(out / "map.png", png_bytes(draw_map(town.boxes, view)))
     write_bytes(out / LOOP_FILE, _loop_settings(cfg, out).encode())
@@ -103,24 +86,6 @@ def run(
     outputs = [out / name for name in (*files, LOOP_FILE)]
     stage.finish(outputs, tally, num_boxes=len(town.boxes), is_valid=all(one["is_met"] for one in checks))
     return product
-
-
-def read_world(path: Path, sizes: Sequence[Path] = ()) -> BoxMap:
-    """Read a SimWorld world as our importer does, with its size tables, or Bbox.json beside it."""
-    cfg = SimWorldConfig(world=path, sizes=[*sizes], stand_m=0.0)
-    return load_map(MapsConfig(source="simworld", simworld=cfg))
-
-
-def write_diversity(worlds: Sequence[Path], out: Path, traces: Sequence[Path] = ()) -> dict[str, Any]:
-    """Write `diversity.json`: how unlike the built-up ground of every two worlds is, and their flights where there are
-    some."""
-    pairs = unlikeness([read_world(path) for path in worlds])
-    found: dict[str, Any] = {"worlds": len(worlds), "least_unlike": min(pairs)}
-    found["mean_unlike"] = round(float(np.mean(pairs)), 3)
-    if flights := [some for path in traces if (some := read_traces(path))]:
-        found["ways_apart_m"] = ways_apart(flights)
-    write_json(out / "diversity.json", {**FileFormat("cosfly.world_diversity", "1.0").header, **found, "pairs": pairs})
-    return found
 
 
 def _write_world(town: Town, out: Path, seed: int) -> None:

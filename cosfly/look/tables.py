@@ -1,0 +1,19 @@
+"""A table of text, for the terminal and for a page of Markdown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table; the first column is words, the others are numbers."""
+
+    title: str
+    columns: list[str]
+    rows: list[list[str]]
+
+    def markdown(self) -> str:
+        """Return the table in Markdown, without its title."""
+        lines = [self.columns, ["---", *["---:"] * (len(self.columns) - 1)], *self.rows]
+        return "".join(f"| {' | '.join(line)} |\n" for line in lines).replace("*", "\\*")
