@@ -15,14 +15,13 @@ from typing import Any, Literal, Self, get_args, get_origin, overload
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from pydantic import BaseModel, ConfigDict
 
 from cosfly.errors import InputError
 from cosfly.look.frame_views import VIEW_FILES, Pictures, View
 from cosfly.products.captions import Language, Prompt
 from cosfly.products.frames import frame_name
 from cosfly.products.splits import SPLITS, Split
-from cosfly.reading.documents import FileFormat, read_model, validated
+from cosfly.reading.documents import FileFormat, Record, read_model, validated
 from cosfly.reading.tables import TableRows
 from cosfly.work.provenance import fingerprint
 from cosfly.work.store import atomic_file, write_bytes, write_model
@@ -34,11 +33,7 @@ PAGE = "README.md"
 ROWS_AT_ONCE = 1000
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class SplitMember(_Strict):
+class SplitMember(Record):
     """Of any kind of sample, what says whose it is."""
 
     sample_id: str  # unique in the set
@@ -98,14 +93,14 @@ class Sample(SplitMember):
         return [f"{frame}/{VIEW_FILES[view]}" for frame in self.frames for view in self.views]
 
 
-class SourceTree(_Strict):
+class SourceTree(Record):
     """A playback tree that samples name frames of: its run and its fingerprint (cosfly/work/provenance.py)."""
 
     run: str
     sha256: str
 
 
-class TrainingSet(_Strict):
+class TrainingSet(Record):
     """`training_set.json`. samples: of each split. systems: the system prompts, which samples name by their place."""
 
     split_by: Literal["walk", "town"]

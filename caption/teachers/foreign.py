@@ -10,8 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict
-
 from caption.schema import CaptionConfig
 from caption.teachers.prompts import Question
 from caption.writing.contract import Draft
@@ -19,16 +17,14 @@ from cosfly.chat.contract import NoAnswer, Reply
 from cosfly.errors import InputError
 from cosfly.products.captions import Coc, Language, TeacherRecord, TeacherSettings, Writing
 from cosfly.products.predictions import FAILED, Prediction, read_predictions
-from cosfly.reading.documents import model_lines
+from cosfly.reading.documents import Record, model_lines
 from cosfly.work.store import dump_json
 
 NOT_IN_FILE = "not_in_file"
 
 
-class ForeignCaption(BaseModel):
+class ForeignCaption(Record):
     """One line of the file. The decision may be spelled in any way that an answer's may."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     sample_id: str
     en: Coc

@@ -10,20 +10,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
-
 from caption.truth.facts import Facts
 from cosfly.products.captions import Coc, Language
-from cosfly.reading.documents import parse_document, validated
+from cosfly.reading.documents import Record, parse_document, validated
 from cosfly.reading.files import read_unpacked
 
 GOLD = Path(__file__).with_name("gold.jsonl.gz")
 
 
-class PlantedError(BaseModel):
+class PlantedError(Record):
     """One thing made wrong."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     kind: str
     field: Literal["critical_components", "reasoning_trace", "flight_decision"]
@@ -35,10 +31,8 @@ class PlantedError(BaseModel):
         return coc.model_copy(update={self.field: getattr(coc, self.field).replace(self.old, self.new, 1)})
 
 
-class GoldCaption(BaseModel):
+class GoldCaption(Record):
     """A true caption with its planted errors. label: the decision that its flight took."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     id: str
     language: Language

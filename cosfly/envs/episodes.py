@@ -11,7 +11,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, Moment
 from cosfly.errors import InputError, NoPathError, nearest
@@ -28,7 +27,7 @@ from cosfly.products.boxes import BoxMap
 from cosfly.products.others import Other
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import walk_id
-from cosfly.reading.documents import FileFormat, read_model
+from cosfly.reading.documents import FileFormat, Record, read_model
 from cosfly.render.settings import RenderConfig
 from cosfly.simplify.passes import SimplifyConfig, simplify
 from cosfly.space.kernels import BoxIndex, obstacle_index
@@ -55,10 +54,8 @@ TASKS = {
 REACQUIRES = "cosfly/Reacquire-v0"
 
 
-class BenchmarkTown(BaseModel):
+class BenchmarkTown(Record):
     """A town by name and seed."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str
     preset: str
@@ -75,10 +72,8 @@ TRAINING = tuple(
 )  # fmt: skip
 
 
-class EpisodeLists(BaseModel):
+class EpisodeLists(Record):
     """The file of lists: environment -> list -> episodes, each a town and the number of its walk."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     lists: dict[str, dict[str, tuple[tuple[str, int], ...]]]
 

@@ -6,21 +6,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from cosfly.products.boxes import BoxMap
 from cosfly.products.columns import LARGEST
 from cosfly.reading.arrays import read_picture
-from cosfly.reading.documents import FileFormat, read_model
+from cosfly.reading.documents import FileFormat, Record, read_model
 from cosfly.work.store import write_bytes, write_model
 
 FORMAT = FileFormat("cosfly.backdrop", "1.0", "world frame of a picture")
 
 
-class WorldFrame(BaseModel):
+class WorldFrame(Record):
     """Where a picture lies, north up: the world place of its top left corner, and the side of a pixel, m."""
-
-    model_config = ConfigDict(extra="forbid")
 
     west_m: float = Field(ge=-LARGEST, le=LARGEST)
     north_m: float = Field(ge=-LARGEST, le=LARGEST)

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from cosfly.reading.documents import model_lines
+from cosfly.reading.documents import Record, model_lines
 from cosfly.work.store import atomic_file
 
 FIELDS = ("critical_components", "reasoning_trace", "flight_decision")
@@ -30,10 +30,8 @@ LabelFrom = Literal["flight", "twin", "offsets", "perturbed"]
 CAPTION_VERSION: Literal["2.0"] = "2.0"
 
 
-class Usage(BaseModel):
+class Usage(Record):
     """Tokens of one answer or of several; 0 where a server does not count them."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     prompt_tokens: int = 0
     completion_tokens: int = 0
@@ -49,10 +47,8 @@ class Usage(BaseModel):
         return self.prompt_tokens + self.completion_tokens
 
 
-class Coc(BaseModel):
+class Coc(Record):
     """One Chain-of-Cause answer in one language."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     critical_components: str
     reasoning_trace: str
@@ -78,13 +74,12 @@ GOAL_BEGINS = tuple(words.partition("%s")[0] for words in GOAL_WORDS.values())
 PICTURES_MARK = "<pictures>"  # in a prompt: the place of the sentence that says what pictures are given
 
 
-class Prompt(BaseModel):
+class Prompt(Record):
     """A question in one language. That of a caption holds PICTURES_MARK: teacher and student see other pictures.
 
     The line with the mark says what frames there are; those after it, what was measured, and the mission.
     """
 
-    model_config = ConfigDict(extra="forbid")
     system: str
     user: str
 
@@ -102,10 +97,8 @@ _Value = TypeVar("_Value")
 _Given = Annotated[_Value | None, Field(exclude_if=partial(is_, None))]  # a key that is left out where it has no value
 
 
-class TeacherSettings(BaseModel):
+class TeacherSettings(Record):
     """How a teacher was asked; the rule teacher has a seed only."""
-
-    model_config = ConfigDict(extra="forbid")
 
     temperature: _Given[float] = None
     top_p: _Given[float] = None
@@ -114,11 +107,9 @@ class TeacherSettings(BaseModel):
     extra_body: _Given[dict[str, Any]] = None
 
 
-class TeacherRecord(BaseModel):
+class TeacherRecord(Record):
     """Who answered. structured: how the answer's shape was enforced (see Reply); left out where nothing was asked. run:
     of a student's predictions for several trees, the one that these captions are of."""
-
-    model_config = ConfigDict(extra="forbid")
 
     kind: TeacherKind
     model: str
@@ -127,10 +118,8 @@ class TeacherRecord(BaseModel):
     run: _Given[str] = None
 
 
-class JudgeRecord(BaseModel):
+class JudgeRecord(Record):
     """What a judge said of a conflict: one of Judgement, or `unjudged`; overruled_by: geometry or text."""
-
-    model_config = ConfigDict(extra="forbid")
 
     verdict: str
     reason: str
@@ -138,13 +127,11 @@ class JudgeRecord(BaseModel):
     overruled_by: _Given[str] = None
 
 
-class RepairRecord(BaseModel):
+class RepairRecord(Record):
     """What became of a rejected answer.
 
     rung: the ask that mended it (hint, multi_sample, anchored, fix_label). outcome: repaired, failed, no_label.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     strategy: str
     rung: str | None = None
@@ -154,10 +141,8 @@ class RepairRecord(BaseModel):
     first_verdict: Verdict | None
 
 
-class KeyframeRecord(BaseModel):
+class KeyframeRecord(Record):
     """Why a window was taken (start, change, stride); windows left out up to the next; label changes among them."""
-
-    model_config = ConfigDict(extra="forbid")
 
     reason: str
     skipped: int
@@ -186,17 +171,15 @@ class Claim(BaseModel):
     quote: _Given[str] = None
 
 
-class Template(BaseModel):
+class Template(Record):
     """The two texts of an answer with slots in place of facts. claims: of words beside slots, which they quote."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     critical_components: str
     reasoning_trace: str
     claims: _Given[list[Claim]] = None
 
 
-class Evidence(BaseModel):
+class Evidence(Record):
     """What the states of a caption's sentences follow from, so that an outsider can judge them again: the column
     `evidence` of a release.
 
@@ -204,21 +187,17 @@ class Evidence(BaseModel):
     the flight contradicts.
     """
 
-    model_config = ConfigDict(extra="forbid")
-
     slots: _Given[dict[Language, Template]] = None
-    problems: list[str] = []
-    contradicted: list[str] = []
+    problems: list[str] = Field([])
+    contradicted: list[str] = Field([])
 
 
-class Checks(BaseModel):
+class Checks(Record):
     """What was checked. structure, bilingual: `ok` or a reason. refused: why answers of the right structure were
     not taken, one reason each. evidence: `ok` or the contradictions. sentences: language -> state of
     each sentence of both texts, in order. contradicted: decisions that the flight contradicts, whatever was decided.
     recovered: what was mended in the answers' text. frame: what is wrong with a picture. refusal: the server's words
     where it refused the window, or how it cut the answer short of `max_tokens`."""
-
-    model_config = ConfigDict(extra="forbid")
 
     keyframe: _Given[KeyframeRecord] = None
     structure: _Given[str] = None

@@ -13,12 +13,12 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, field_validator
+from pydantic import Field, field_validator
 
 from cosfly.products.playback import Flight
 from cosfly.products.walks import TARGET_HEIGHT_M
 from cosfly.products.weather import preset_token
-from cosfly.reading.documents import read_json, validated
+from cosfly.reading.documents import Record, read_json, validated
 
 DEFAULT = Path(__file__).with_name("default_coverage.json")
 
@@ -63,23 +63,21 @@ NAMED = ("styles", "paces", "labels", "weathers", "times_of_day")
 PAIR = " | "  # between the two names of a pair
 
 
-class Coverage(BaseModel):
+class Coverage(Record):
     """Frames by bin of each axis, by style, by pace, by label, which only captions tell, and by weather and time of
     day, where there is any.
 
     skies: frames by both, as "heavy_rain | night".
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     frames: int = 0
-    bins: dict[str, list[int]] = {}
-    styles: dict[str, int] = {}
-    paces: dict[str, int] = {}
-    labels: dict[str, int] = {}
-    weathers: dict[str, int] = {}
-    times_of_day: dict[str, int] = {}
-    skies: dict[str, int] = {}
+    bins: dict[str, list[int]] = Field({})
+    styles: dict[str, int] = Field({})
+    paces: dict[str, int] = Field({})
+    labels: dict[str, int] = Field({})
+    weathers: dict[str, int] = Field({})
+    times_of_day: dict[str, int] = Field({})
+    skies: dict[str, int] = Field({})
 
     @field_validator("bins")
     @classmethod

@@ -7,13 +7,12 @@ with replacement (Efron and Tibshirani 1993, sec. 8; the cluster bootstrap).
 from __future__ import annotations
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+
+from cosfly.reading.documents import Record
 
 
-class Figure(BaseModel):
+class Figure(Record):
     """A figure over `count` samples with its interval; all None where nothing is known."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     value: float | None
     low: float | None

@@ -10,20 +10,16 @@ from collections import Counter
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, model_validator
+from pydantic import Field, FiniteFloat, NonNegativeInt, model_validator
 
 from cosfly.products.figures import Figure
 from cosfly.products.pursuits import Answer, Ended
-from cosfly.reading.documents import FileFormat, read_model
+from cosfly.reading.documents import FileFormat, Record, read_model
 
 SCORE, SCORE_FORMAT = "score.json", FileFormat("cosfly.score", "1.0", "score")
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class FlightScore(_Strict):
+class FlightScore(Record):
     """Of one flight. groups: the kind of its walk and its map (measures.GROUPS) -> which. answers: how often the
     student, when it was asked, answered how. sums: figure -> what the flight adds to it, and of how many."""
 
@@ -36,7 +32,7 @@ class FlightScore(_Strict):
     sums: dict[str, tuple[FiniteFloat, Annotated[FiniteFloat, Field(ge=0)]]]
 
 
-class Score(_Strict):
+class Score(Record):
     """Of one student. episodes_sha256: of what was to be flown: only students of the same are comparable. list_sha256:
     of the published list of episodes, None of a run's own walks. trained_on: towns, None where nobody knows.
     figures: by measures.MEASURES; by: kind of group -> group -> figures."""

@@ -17,7 +17,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations, world_from_camera
@@ -27,7 +27,7 @@ from cosfly.products.places import tree_of_flight
 from cosfly.products.png import areas_png, colours_png, floats_of, floats_png
 from cosfly.products.weather import WeatherRecord
 from cosfly.reading.arrays import PNG_SIGNATURE, parse_array_header, read_array, read_picture
-from cosfly.reading.documents import FileFormat, read_model
+from cosfly.reading.documents import FileFormat, Record, read_model
 from cosfly.reading.files import read_bytes
 from cosfly.work.config import Config
 from cosfly.work.store import dump_json
@@ -109,11 +109,7 @@ class Look(Config):
 # --- meta.json --------------------------------------------------------------------------------------------------------
 
 
-class _Group(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class TreePosition(_Group):
+class TreePosition(Record):
     """A place or a shift in the tree's axes, m."""
 
     x: float
@@ -126,7 +122,7 @@ class TreePosition(_Group):
         return mirror_positions(np.array([self.x, self.y, self.z]))
 
 
-class TreeAngles(_Group):
+class TreeAngles(Record):
     """A turn in the tree's axes, degrees."""
 
     pitch: float
@@ -164,7 +160,7 @@ def tree_pose(position_m: np.ndarray, rotation_deg: np.ndarray) -> TreePose:
     return TreePose(**dict(tree_position(position_m)), **dict(tree_angles(rotation_deg)))
 
 
-class CameraMeta(_Group):
+class CameraMeta(Record):
     """The camera that drew a frame; intrinsic 3x3 px, clip planes in m."""
 
     width: int
@@ -191,7 +187,7 @@ def camera_meta(camera: Camera, near_m: float, far_m: float) -> CameraMeta:
     )
 
 
-class TargetMeta(_Group):
+class TargetMeta(Record):
     """The person in a frame: hip point, box and how much of it is seen; px unless said, null where there is none."""
 
     world_location: TreePosition
@@ -217,7 +213,7 @@ class TargetMeta(_Group):
         return self.world_location.vector_m
 
 
-class PerturbationMeta(_Group):
+class PerturbationMeta(Record):
     """What was done to a frame: none | applied | the reason for falling back, and the offsets."""
 
     position: str
@@ -227,7 +223,7 @@ class PerturbationMeta(_Group):
     drone_rotation: TreeAngles
 
 
-class OtherMeta(_Group):
+class OtherMeta(Record):
     """Somebody beside the target: the middle of the box and its yaw in the tree's axes; how much of the picture."""
 
     instance_id: int
@@ -248,7 +244,7 @@ class OtherMeta(_Group):
         return float(np.radians(mirror_rotations(np.array([0.0, self.yaw, 0.0]))[1]))
 
 
-class OthersMeta(_Group):
+class OthersMeta(Record):
     """The others of a frame, and the shares of the target's box, 0 to 1, that they hide and that the map hides."""
 
     target_hidden_by_others: float
@@ -266,7 +262,7 @@ class OthersMeta(_Group):
         return dict(zip(COMPANY, (len(seen), how_far_m, nearest, *alike), strict=True))
 
 
-class FrameMeta(_Group):
+class FrameMeta(Record):
     """`meta.json`: what a loader needs to know of one frame without opening anything else."""
 
     coordinates: dict[str, str] = COORDINATES

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from cosfly.products.columns import LARGEST
+from cosfly.reading.documents import Record
 
 Height = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 
@@ -127,11 +128,9 @@ class Ground:
         return tops - turns[:, :, 2] * half[:, 2:], half, turns
 
 
-class GroundGrid(BaseModel):
+class GroundGrid(Record):
     """Ground that slopes, in the header of `boxes_3d.json`. heights_m: rows from south to north, each from west to
     east."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     west_m: Height
     south_m: Height

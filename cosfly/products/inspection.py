@@ -6,13 +6,13 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import Field, FiniteFloat
 
 from cosfly.errors import InputError
 from cosfly.products.coverage import Coverage
 from cosfly.products.issues import Issue
 from cosfly.products.playback import ORIGINAL
-from cosfly.reading.documents import FileFormat, read_model
+from cosfly.reading.documents import FileFormat, Record, read_model
 from cosfly.work.store import write_model
 
 INSPECT_FORMAT = FileFormat("cosfly.inspect", "1.0", "inspection")
@@ -21,11 +21,7 @@ Result = Literal["accepted", "review", "rejected"]
 RESULTS: tuple[Result, ...] = ("accepted", "review", "rejected")
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-
-class FlightInspection(_Strict):
+class FlightInspection(Record):
     """What was found out about one flight. `folder` is relative to the playback tree; metrics are None where unknown.
 
     sha256: of its files (`provenance.digest_of`), so that nobody takes another flight, or other pictures, for the one
@@ -58,7 +54,7 @@ class FlightInspection(_Strict):
         return self.issues[0].code if self.result != "accepted" and self.issues else None
 
 
-class TrajectoryFunnel(_Strict):
+class TrajectoryFunnel(Record):
     """planned = sum(dropped) + not_rendered + rendered; rendered = accepted + review + rejected."""
 
     planned: int
@@ -75,7 +71,7 @@ class TrajectoryFunnel(_Strict):
         assert self.rendered == self.accepted + self.review + self.rejected, self
 
 
-class FlightFunnel(_Strict):
+class FlightFunnel(Record):
     """inspected = accepted + review + rejected; `reasons` counts the worst finding of those in review or rejected."""
 
     inspected: int
@@ -86,14 +82,14 @@ class FlightFunnel(_Strict):
     reasons: dict[str, int]
 
 
-class Funnel(_Strict):
+class Funnel(Record):
     """From planned trajectories to accepted flights (sec:step6); a trajectory is as good as its worst flight."""
 
     trajectories: TrajectoryFunnel
     flights: FlightFunnel
 
 
-class Inspection(_Strict):
+class Inspection(Record):
     """The whole file."""
 
     settings: dict[str, Any]

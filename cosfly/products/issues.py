@@ -5,18 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
-
 from cosfly.escaping import cut, for_terminal
+from cosfly.reading.documents import Record
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 
-class Issue(BaseModel):
+class Issue(Record):
     """One finding. `count` says how often it occurred; `where` and `got` are the first occurrence's."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     severity: Severity
     code: str

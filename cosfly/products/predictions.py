@@ -5,21 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
-
 from cosfly.errors import InputError
 from cosfly.products.captions import Coc, Language
 from cosfly.products.splits import Split
-from cosfly.reading.documents import model_lines
+from cosfly.reading.documents import Record, model_lines
 
 PREDICTIONS = "predictions.jsonl"
 FAILED = "failed_"  # what the reason of a prediction begins with that could not be made
 
 
-class Prediction(BaseModel):
+class Prediction(Record):
     """One line of `predictions.jsonl`. `coc` is None where the answer has not the right structure, for the `reason`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     schema_version: Literal["1.0"] = "1.0"
     sample_id: str

@@ -10,10 +10,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, model_validator
+from pydantic import Field, FiniteFloat, NonNegativeInt, model_validator
 
 from cosfly.products.motion import ACTION
-from cosfly.reading.documents import FileFormat, read_model
+from cosfly.reading.documents import FileFormat, Record, read_model
 from cosfly.work.store import write_model
 
 PURSUITS = "pursuits"  # the folder of them in what `cosfly fly` writes
@@ -32,11 +32,7 @@ _Triple = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 _Least = Annotated[FiniteFloat, Field(ge=0)]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class PursuitFrame(_Strict):
+class PursuitFrame(Record):
     """One frame. command: as ACTION (cosfly/products/motion.py), None of the last. answer_s: how long the student took,
     None where nobody was asked. words: what it said, its reasons or, where they cannot be read, the raw answer.
 
@@ -64,7 +60,7 @@ class PursuitFrame(_Strict):
     target_m: _Triple
 
 
-class WalkStyle(_Strict):
+class WalkStyle(Record):
     """How hard a walk is to follow, whoever flies: its pace; the mean turn of who walks, deg/s; the share of its frames
     that hide the person from a drone right behind, at the distance and the height at which the flight began."""
 
@@ -73,7 +69,7 @@ class WalkStyle(_Strict):
     hidden_share: Annotated[FiniteFloat, Field(ge=0, le=1)]
 
 
-class Pursuit(_Strict):
+class Pursuit(Record):
     """One flight. episode: its id, unique in a folder. list_sha256: of the list of episodes that it is of, None of a
     run's own walks. controller_sha256: of the table that turned decisions into commands, None of a student that
     commands. num_walk_frames: of the whole walk, those before the first decision (`lead`) not counted: a flight that

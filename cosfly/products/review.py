@@ -14,10 +14,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from cosfly.errors import InputError
 from cosfly.products.inspection import FlightInspection, Inspection, count_trajectories, read_inspection
+from cosfly.reading.documents import Record
 from cosfly.reading.files import sha256_file
 from cosfly.work.journal import Journal
 
@@ -27,10 +28,8 @@ REVIEW = "review.jsonl"
 Verdict = Literal["accepted", "rejected"]
 
 
-class Choice(BaseModel):
+class Choice(Record):
     """What somebody says of a flight by its folder in the playback tree, or of a trajectory by that above it."""
-
-    model_config = ConfigDict(extra="forbid")
 
     folder: str
     verdict: Verdict

@@ -8,20 +8,18 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import Field
 
 from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader
-from cosfly.reading.documents import FileFormat, read_model
+from cosfly.reading.documents import FileFormat, Record, read_model
 from cosfly.work.store import write_model
 
 IDS_FILE, IDS_FORMAT = "instance_ids.json", FileFormat("cosfly.instance_ids", "1.0", "record of ids")
 TOWN_FILE, TOWN_FORMAT = "map.json", FileFormat("cosfly.town_map", "1.0", "town's map")
 
 
-class TownMap(BaseModel):
+class TownMap(Record):
     """The map below a town's flights: its name and licence, and who must be named (one sentence or more)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str
     licence: LicenceId
@@ -42,14 +40,12 @@ def read_town_map(town: Path) -> TownMap:
     return read_model(town / TOWN_FILE, TownMap, TOWN_FORMAT, tree=town.parent)
 
 
-class InstanceIds(BaseModel):
+class InstanceIds(Record):
     """person: the target's id; shared: of boxes without their own; others: of who else moves; boxes: (id, box id)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     person: int
     shared: int
-    others: list[int] = []
+    others: list[int] = Field([])
     num_shared: int
     are_box_ids: bool
     boxes: list[tuple[int, int]]

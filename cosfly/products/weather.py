@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from cosfly.reading.documents import Record
 from cosfly.work.config import Config
 
 WeatherMode = Literal["fixed", "random_per_path", "by_weight"]
@@ -43,10 +44,8 @@ class WeatherParams(TimePreset, WeatherPreset):  # in this order, so that the ai
     """The six resolved knobs (tab:weather_params_fields)."""
 
 
-class WeatherRecord(BaseModel):
+class WeatherRecord(Record):
     """`weather` of `trajectory.json` and `meta.json` (tab:weather_meta); flights without weather have none."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     mode: WeatherMode
     weather_name: str = Field(min_length=1)

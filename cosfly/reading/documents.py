@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import SchemaValidator
 
 from cosfly.errors import InputError, plain
@@ -149,6 +149,12 @@ def read_object(path: Path, *, what: str = "file", tree: Path | None = None) -> 
 
 
 # --- models -----------------------------------------------------------------------------------------------------------
+
+
+class Record(BaseModel):
+    """Base of what a file holds: frozen, and an unknown key is an error."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 def validated(model: type[Model], value: Any, where: str | Path) -> Model:

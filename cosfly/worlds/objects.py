@@ -12,8 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
-
+from cosfly.reading.documents import Record
 from cosfly.unreal.assets import ASSETS
 from cosfly.work.config import read_yaml
 
@@ -22,10 +21,8 @@ Part = tuple[str, float, float, float, float, float, float]  # kind, middle x y,
 STRETCH = 6.0  # longest side of an asset's box over the shortest, relative to the asset's own, that still looks like it
 
 
-class Object(BaseModel):
+class Object(Record):
     """One thing that can be named; the table says what its fields mean."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str
     parts: tuple[Part, ...] = ()

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cosfly.maps.synthetic import MIN_BLOCK_M, SyntheticConfig
 from cosfly.maps.town_blocks import LotsConfig
-from cosfly.reading.documents import FileFormat
+from cosfly.reading.documents import FileFormat, Record
 from cosfly.worlds.objects import OBJECTS, Object, assets
 
 PLAN_FORMAT = FileFormat("cosfly.world_plan", "1", "plan of a world")
@@ -22,10 +22,8 @@ SPACE_M = 4.0  # round each object
 EDGE_M = 14.0  # of an open block, both sides together, that belongs to its trees
 
 
-class NamedObject(BaseModel):
+class NamedObject(Record):
     """So many of an object of the table."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str = Field(description="a name of the object table")
     count: int = Field(1, ge=1, le=60)

@@ -11,11 +11,11 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import Language
-from cosfly.reading.documents import read_json, read_object
+from cosfly.reading.documents import Record, read_json, read_object
 from cosfly.reading.files import sha256_file
 from cosfly.work.config import Config
 from cosfly.work.console import progress_bar
@@ -42,13 +42,11 @@ class BertScoreConfig(Config):
     device: Device = Field("auto", description="auto, cpu or cuda")
 
 
-class Metric(BaseModel):
+class Metric(Record):
     """What a score was measured with: two scores can be compared where all of it is equal.
 
     sha256: of the folder's files that decide. cut: references longer than max_tokens, of which the rest was not read.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     model: str
     layer: int

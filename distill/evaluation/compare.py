@@ -10,12 +10,12 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from cosfly.errors import InputError
 from cosfly.escaping import for_markdown
 from cosfly.look.page import page
-from cosfly.reading.documents import FileFormat
+from cosfly.reading.documents import FileFormat, Record
 from cosfly.work.chance import rng_for
 from cosfly.work.config import Config
 from cosfly.work.stage_folder import Resume, StageFolder, Tally
@@ -57,10 +57,8 @@ class ReportConfig(Config):
     resamples: int = Field(5000, ge=100, description="draws of walks that they are made of")
 
 
-class Pairing(BaseModel):
+class Pairing(Record):
     """Of two students: on how many samples they are compared, and the first's figures less the second's."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     first: str
     second: str
@@ -68,10 +66,8 @@ class Pairing(BaseModel):
     differences: dict[str, Difference]
 
 
-class StudentComparison(BaseModel):
+class StudentComparison(Record):
     """`comparison.json`. not_comparable: figures that were measured in another way, and why."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     students: dict[str, FigureSet]
     models: dict[str, str]

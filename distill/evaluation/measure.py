@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel
 
 from cosfly.chat.answers import Answer, read_line
 from cosfly.errors import InputError
@@ -17,7 +17,7 @@ from cosfly.products.captions import FIELDS, Coc, Language, SentenceState, read_
 from cosfly.products.figures import Figure, draw_walks
 from cosfly.products.predictions import FAILED, Prediction
 from cosfly.products.splits import Split
-from cosfly.reading.documents import FileFormat, read_model, read_object, validated
+from cosfly.reading.documents import FileFormat, Record, read_model, read_object, validated
 from cosfly.space.blind import DRAWN_AHEAD, FITTED_ON, LEAST_WINDOWS, LOOKS_BACK
 from cosfly.work.chance import rng_for
 from cosfly.work.journal import Journal
@@ -29,11 +29,7 @@ from distill.evaluation.scores import UNPARSED, ScoredAnswer, Scores, figures_of
 from distill.schema import Sample
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Speed(_Strict):
+class Speed(Record):
     """How fast a student answered, None where nothing says.
 
     seconds: of the last start of `distill infer`, without loading. samples_per_s: answers made in it. latency_s: of an
@@ -91,7 +87,7 @@ SentenceStates = Mapping[str, Sequence[SentenceState]]  # sample's key -> states
 TextScorer = Callable[[Sequence[tuple[str, str]]], np.ndarray]  # (candidate, reference) -> (n, 3)
 
 
-class FigureSet(_Strict):
+class FigureSet(Record):
     """Of one who answers: figures by name (FIGURES), accuracy by decision, reference -> answers."""
 
     figures: dict[str, Figure]
@@ -99,7 +95,7 @@ class FigureSet(_Strict):
     confusion: dict[str, dict[str, int]]
 
 
-class Measurement(_Strict):
+class Measurement(Record):
     """Of one language, or over all. who: `student`, then the floors. failed: samples without an answer, by reason."""
 
     samples: int
@@ -110,7 +106,7 @@ class Measurement(_Strict):
     who: dict[str, FigureSet]
 
 
-class Example(_Strict):
+class Example(Record):
     """A sample with its answer, side by side."""
 
     key: str
@@ -122,7 +118,7 @@ class Example(_Strict):
     f1: float | None
 
 
-class Evaluation(_Strict):
+class Evaluation(Record):
     """`report.json`."""
 
     model: str

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from pydantic import BaseModel, ConfigDict
 
 from cosfly.errors import InputError
 from cosfly.products.actions import TOKENS, not_in_set
 from cosfly.products.captions import Coc, SentenceState, Verdict, verdict_on
 from cosfly.products.figures import Figure, draw_walks, figure_of_draws, interval_of
 from cosfly.products.predictions import FAILED, Prediction
+from cosfly.reading.documents import Record
 from cosfly.reading.tables import arrow_errors, row_groups
 from cosfly.work.store import atomic_file, dump_json, sha256_bytes
 from distill.schema import Sample
@@ -348,13 +348,11 @@ def figures_of(scores: Scores, draws: np.ndarray, *, confidence: float) -> tuple
     return {name: found[name] for name in FIGURES}, decisions
 
 
-class Difference(BaseModel):
+class Difference(Record):
     """One student's figure less another's on the samples that both were asked.
 
     p: two-sided, the share of draws on the other side of zero, doubled; no smaller than one draw can tell.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     value: float | None
     low: float | None

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from cosfly.errors import InputError, VerifyError
 from cosfly.geometry import step_s
@@ -21,7 +21,7 @@ from cosfly.products.flights import find_flights, read_twin
 from cosfly.products.places import Place, flight_ids, place_of, sample_id
 from cosfly.products.playback import ORIGINAL, Flight, read_flight
 from cosfly.products.splits import SPLITS, Course, Split, walks_of
-from cosfly.reading.documents import FileFormat, read_model, validated
+from cosfly.reading.documents import FileFormat, Record, read_model, validated
 from cosfly.reading.tables import rows_of
 from cosfly.work.console import progress_bar
 from cosfly.work.provenance import fingerprint
@@ -65,10 +65,8 @@ class TrackSample(SplitMember):
 COLUMNS = columns_of(TrackSample)
 
 
-class TrackSet(BaseModel):
+class TrackSet(Record):
     """`tracks.json`. samples: windows of each split; observed, predicted, stride: of a window, in frames."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     split_by: Literal["walk", "town"]
     observed: int

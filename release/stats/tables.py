@@ -7,13 +7,14 @@ from collections.abc import Callable, Iterable
 from statistics import fmean
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import Field
 
 from cosfly.products.actions import ACTIONS, TOKENS
 from cosfly.products.answer_text import MIN_CHARACTERS, MIN_CHARACTERS_ZH
 from cosfly.products.captions import FIELDS
 from cosfly.products.frames import LEVEL_NAMES
 from cosfly.products.weather import TIMES, WEATHERS, preset_token
+from cosfly.reading.documents import Record
 from cosfly.space.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3, smoothness_score
 from release.card.numbers import Sum, bounded, spread_of
 from release.columns import LANGUAGE_NAMES, LANGUAGES, PICTURES, STATES
@@ -28,14 +29,12 @@ REVIEW_BELOW = 0.5  # of the smoothness score (sec:step6)
 VERDICTS = ("CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN")
 
 
-class Table(BaseModel):
+class Table(Record):
     """One table. paper: the label of the paper's; rows: as long as `head`; plot: how the page draws it beside.
 
     bars: the second column as bars, named by the first. stacked: all columns of numbers, a bar a row. heat: the numbers
     of a row and column of names.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     key: str
     title: str
@@ -46,28 +45,24 @@ class Table(BaseModel):
     plot: Plot | None = None
 
 
-class Absent(BaseModel):
+class Absent(Record):
     """What the paper tells of its data and this release cannot: not in it, never made up."""
-
-    model_config = ConfigDict(extra="forbid")
 
     what: str
     paper: str
     why: str
 
 
-class Stats(BaseModel):
+class Stats(Record):
     """The whole file. content_digest: of the release that was counted; runs: that it was made of;
     rules: what they are, by what they decide."""
-
-    model_config = ConfigDict(extra="forbid")
 
     name: str
     runs: list[str]
     content_digest: str
     tables: list[Table]
     absent: list[Absent]
-    rules: dict[str, str] = {}
+    rules: dict[str, str] = Field({})
 
 
 SPREAD = "axis|mean|std|least|most|values"
