@@ -152,9 +152,8 @@ class Column:
     member ("" where it has none).
     required: it is null in no row (of a caption's: in no row with a caption). constant: it does not change within a
     flight.
-    title: what people call it; annotation: it counts as one, under that title, in the statistics. counted: the card
-    counts the captions by its
-        values. shown: the viewer shows it beside the frame or caption.
+    title: what people call it. counted: the card counts the captions by its values. shown: the viewer shows it with
+    the frame or caption.
     """
 
     name: str
@@ -166,7 +165,6 @@ class Column:
     required: bool = False
     constant: bool = False
     title: str = ""
-    annotation: bool = False
     counted: bool = False
     shown: bool = False
 
@@ -251,7 +249,7 @@ FRAME = (  # everything of a frame but pictures and depth
     Column("pair", "string", constant=True),
     Column("people", "string", lambda f, i: f.people and dump_json(f.people.as_json()), constant=True),
     Column(
-        "goal_en", "string", lambda f, i: f.goal and f.goal.en, constant=True, title="goal in words", annotation=True,
+        "goal_en", "string", lambda f, i: f.goal and f.goal.en, constant=True, title="goal in words",
         shown=True,
     ),
     Column("goal_zh", "string", lambda f, i: f.goal and f.goal.zh, constant=True, title="goal in Chinese", shown=True),
@@ -259,12 +257,11 @@ FRAME = (  # everything of a frame but pictures and depth
     Column("goal_frame", "int32", lambda f, i: f.goal and f.goal.frame, constant=True),
     Column(TARGET_PICTURE, "image", lambda f, i: f.target_picture(i)),
     Column(
-        "weather", "string", lambda f, i: f.weather["weather"], constant=True, title="weather", annotation=True,
+        "weather", "string", lambda f, i: f.weather["weather"], constant=True, title="weather",
         shown=True,
     ),
     Column(
-        "time_of_day", "string", lambda f, i: f.weather["time_of_day"], constant=True, title="time of day",
-        annotation=True, shown=True,
+        "time_of_day", "string", lambda f, i: f.weather["time_of_day"], constant=True, title="time of day", shown=True,
     ),
     Column(
         "weather_mode", "string", lambda f, i: f.weather_record and f.weather_record.mode, words=get_args(WeatherMode),
@@ -278,7 +275,7 @@ FRAME = (  # everything of a frame but pictures and depth
         },
     ),
     Column(
-        "look", LOOK, constant=True, title="sun and air", annotation=True,
+        "look", LOOK, constant=True,
         ranges={
             "sun_azimuth_deg": (0.0, 360.0), "sun_elevation_deg": (-90.0, 90.0), "haze_m": (0.0, 1e6),
             "exposure": (0.0, 100.0),
@@ -299,35 +296,26 @@ FRAME = (  # everything of a frame but pictures and depth
     Column(
         "pose", POSE, lambda f, i: np.concatenate([f.positions_m[i], f.rotations_deg[i]]),
         ranges={"pitch_deg": (-90.0, 90.0), "yaw_deg": (-360.0, 360.0), "roll_deg": (-180.0, 180.0)},
-        required=True, title="drone pose (position, rotation)", annotation=True,
+        required=True,
     ),
-    Column("target", POINT, lambda f, i: f.targets_m[i], title="target position", annotation=True),
+    Column("target", POINT, lambda f, i: f.targets_m[i]),
     Column("target_heading_deg", "float64", lambda f, i: f.target_headings_deg[i], ranges={"": (-360.0, 360.0)}),
     Column("target_uv", ("u_px", "v_px"), lambda f, i: f.target_uv[i]),
-    Column("target_bbox", BOX, lambda f, i: f.target_bbox[i], title="projected box of the target", annotation=True),
+    Column("target_bbox", BOX, lambda f, i: f.target_bbox[i]),
     Column(
         "target_mask_bbox", BOX,
         lambda f, i: np.full(4, np.nan) if f.target_mask_bbox is None else f.target_mask_bbox[i],
-        title="box of the target's pixels", annotation=True,
     ),
     Column("target_depth_m", "float64", lambda f, i: f.target_depth_m[i]),
     Column("target_in_view", "bool", lambda f, i: f.target_in_view[i], required=True),
     Column("target_visible", "bool", lambda f, i: f.target_visible[i], required=True),
-    Column(
-        "visibility", "float64", lambda f, i: f.visibility[i], ranges=NONE_TO_ONE,
-        title="rendered visibility of the target", annotation=True,
-    ),
+    Column("visibility", "float64", lambda f, i: f.visibility[i], ranges=NONE_TO_ONE),
     Column(
         "target_height_px", "float64", lambda f, i: f.told_legibility(i)["height_px"], ranges={"": (0.0, 100_000.0)},
     ),
     Column("target_contrast", "float64", lambda f, i: f.told_legibility(i)["contrast"], ranges={"": (0.0, 300.0)}),
-    Column(
-        "target_legible", "bool", lambda f, i: f.told_legibility(i)["legible"], title="target can be made out",
-        annotation=True,
-    ),
-    Column(
-        "others_in_view", "int32", partial(_of_company, 0), title="other people in view", annotation=True, shown=True,
-    ),
+    Column("target_legible", "bool", lambda f, i: f.told_legibility(i)["legible"]),
+    Column("others_in_view", "int32", partial(_of_company, 0), title="other people in view", shown=True),
     Column(
         "other_distance_m", "float64", lambda f, i: None if f.company is None else f.company[i, 1],
         ranges={"": (0.0, 1e6)},
@@ -336,20 +324,15 @@ FRAME = (  # everything of a frame but pictures and depth
     Column("alike_id", "int32", partial(_of_company, 3), ranges={"": (0, PERSON_ID)}),
     Column(
         "alike_differences", "int32", partial(_of_company, 4), title="things in which the most alike differs",
-        annotation=True, shown=True,
+        shown=True,
     ),
     Column("is_perturbed", "bool", lambda f, i: f.is_perturbed[i], required=True),
-    Column(
-        "perturbation", "events", lambda f, i: f.events(i), title="what became of the perturbation", annotation=True,
-    ),
-    Column(
-        "drone_offset", POSE, lambda f, i: np.concatenate([f.drone_offsets_m[i], f.rotation_offsets_deg[i]]),
-        title="offsets of the perturbation", annotation=True,
-    ),
+    Column("perturbation", "events", lambda f, i: f.events(i)),
+    Column("drone_offset", POSE, lambda f, i: np.concatenate([f.drone_offsets_m[i], f.rotation_offsets_deg[i]])),
     Column("target_offset", POINT, lambda f, i: f.target_offsets_m[i]),
-    Column("action", ACTION, lambda f, i: f.motion.action[i], title="action of a policy", annotation=True),
+    Column("action", ACTION, lambda f, i: f.motion.action[i]),
     Column("actions", "numbers", lambda f, i: f.motion.actions[i]),
-    Column("waypoints", "numbers", lambda f, i: f.motion.waypoints(i), title="waypoints ahead", annotation=True),
+    Column("waypoints", "numbers", lambda f, i: f.motion.waypoints(i)),
     Column("body_waypoints", "numbers", lambda f, i: f.motion.body_waypoints(i)),
     Column("poses_between", "numbers", lambda f, i: f.motion.between[i]),
     Column("has_caption", "bool", of_caption=lambda c: True, required=True),
@@ -389,7 +372,6 @@ CAPTION = (  # what a row holds of an accepted caption, and nulls where there is
         Column(
             f"caption_{language}_{name}", "string", required=True, words="actions" if name == "flight_decision" else (),
             of_caption=partial(_text, language, name),
-            title=f"caption in {LANGUAGE_NAMES[language]}", annotation=name == "reasoning_trace",
         )
         for language in LANGUAGES for name in FIELDS
     ),

@@ -16,16 +16,13 @@ from typing import Any
 from cosfly.products.captions import FIELDS
 from cosfly.products.walks import TARGET_HEIGHT_M
 from release.card.numbers import Place3, Sum, bounded, clean_place
-from release.columns import BOX, LANGUAGES, PLACE, POINT, POSE, SCALARS
+from release.columns import BOX, LANGUAGES, PLACE, POINT, POSE
 
 SAME_FOV_DEG = 0.05
 LEAST_STEP_S = 1e-3  # between two frames
 STATES_OF = {  # shifted, turned
     (False, False): "unperturbed", (True, False): "position only", (False, True): "rotation only", (True, True): "full",
 }  # fmt: skip
-TEXT_BIN = {"en": 25, "zh": 10}  # characters
-# What a frame may be annotated with: a name, and the column that holds it.
-ANNOTATIONS = {column.title: column.name for column in SCALARS if column.annotation}
 
 
 @dataclass
@@ -131,23 +128,18 @@ class Counts:
 
     frames: int = 0
     flights: dict[tuple[str, ...], FlightSums] = field(default_factory=dict)  # by PLACE
-    annotated: Counter[str] = field(default_factory=Counter)
     image_px: Counter[str] = field(default_factory=Counter)
     step_s: Counter[float] = field(default_factory=Counter)
     last: tuple[tuple[str, ...], int, float] | None = None
-    over_frames: dict[str, Sum] = field(default_factory=lambda: defaultdict(Sum))
     decisions: Counter[str] = field(default_factory=Counter)
     labels: Counter[str] = field(default_factory=Counter)
     confusion: Counter[tuple[str, str]] = field(default_factory=Counter)
     verdicts: Counter[tuple[str, str]] = field(default_factory=Counter)  # verdict, track
     repairs: Counter[str] = field(default_factory=Counter)
-    sentences: Counter[tuple[str, str]] = field(default_factory=Counter)  # language, state
     lengths: dict[tuple[str, str], Sum] = field(default_factory=lambda: defaultdict(Sum))  # language, field
-    length_bins: Counter[tuple[str, str, int]] = field(default_factory=Counter)
     weather: Counter[tuple[str | None, str | None]] = field(default_factory=Counter)
     events: Counter[tuple[str, str, str]] = field(default_factory=Counter)  # track, event, outcome
     states: Counter[str] = field(default_factory=Counter)  # of perturbed flights: which of the two offsets are not zero
-    styles: Counter[str] = field(default_factory=Counter)
 
     def add(self, row: Mapping[str, Any]) -> None:
         """Count a row; rows of a flight come one after the other."""
@@ -158,26 +150,14 @@ class Counts:
             names = {name: row[name] for name in ("track", "town", "split", "walk")}
             self.flights[place] = FlightSums(**names, fov_deg=bounded(row["fov_deg"]), focal_px=focal_px)
         self.flights[place].add(row)
-        self.annotated.update(name for name, column in ANNOTATIONS.items() if row[column] is not None)
         self.image_px[f"{row['width_px']} x {row['height_px']} px"] += 1
         if self.last is not None and self.last[:2] == (place, row["frame_index"] - 1):
             self.step_s[round(row["time_s"] - self.last[2], 3)] += 1
         self.last = (place, row["frame_index"], row["time_s"])
         self.weather[row["weather"], row["time_of_day"]] += 1
-        self._over_frames(row)
         self._perturbed(row)
         if row["has_caption"]:
             self._caption(row)
-
-    def _over_frames(self, row: Mapping[str, Any]) -> None:
-        """As the frames are, perturbation and all."""
-        target, pose = row["target"], row["pose"]
-        if target is not None:
-            offset = [pose[axis] - target[axis] for axis in POINT]
-            self.over_frames["altitude"].add(offset[2] + TARGET_HEIGHT_M)
-            self.over_frames["distance"].add(math.hypot(*offset))
-        if row["visibility"] is not None:
-            self.over_frames["visibility"].add(row["visibility"])
 
     def _perturbed(self, row: Mapping[str, Any]) -> None:
         for event, outcome in (row["perturbation"] or {}).items():
@@ -198,8 +178,5 @@ class Counts:
         self.verdicts[verdict, row["track"]] += 1
         self.repairs[row["repair_strategy"] or "none: the first answer stood"] += 1
         for language in LANGUAGES:
-            self.sentences.update((language, state) for state in row[f"sentence_states_{language}"] or ())
             for name in FIELDS[:2]:
-                length = len(row[f"caption_{language}_{name}"] or "")
-                self.lengths[language, name].add(length)
-                self.length_bins[language, name, length // TEXT_BIN[language]] += 1
+                self.lengths[language, name].add(len(row[f"caption_{language}_{name}"] or ""))

@@ -17,14 +17,14 @@ from cosfly.products.weather import TIMES, WEATHERS, preset_token
 from cosfly.reading.documents import Record
 from cosfly.space.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3, smoothness_score
 from release.card.numbers import Sum, bounded, spread_of
-from release.columns import LANGUAGE_NAMES, LANGUAGES, PICTURES, STATES
+from release.columns import LANGUAGE_NAMES, LANGUAGES
 from release.record import ReleaseRecord, Spread
-from release.stats.counting import ANNOTATIONS, TEXT_BIN, Counts, FlightSums
+from release.stats.counting import Counts, FlightSums
 from release.stats.pixels import Pixels
 
 Cell = str | int | float | None
 Rows = list[list[Cell]]
-Plot = Literal["bars", "stacked", "heat"]
+Plot = Literal["bars", "heat"]
 REVIEW_BELOW = 0.5  # of the smoothness score (sec:step6)
 VERDICTS = ("CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN")
 
@@ -32,8 +32,7 @@ VERDICTS = ("CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN")
 class Table(Record):
     """One table. paper: the label of the paper's; rows: as long as `head`; plot: how the page draws it beside.
 
-    bars: the second column as bars, named by the first. stacked: all columns of numbers, a bar a row. heat: the numbers
-    of a row and column of names.
+    bars: the second column as bars, named by the first. heat: the numbers of a row and column of names.
     """
 
     key: str
@@ -66,27 +65,17 @@ class Stats(Record):
 
 
 SPREAD = "axis|mean|std|least|most|values"
-LENGTHS = [(language, name) for language in LANGUAGES for name in FIELDS[:2]]
 SHAPES: dict[str, tuple[str, str, str, Plot | None]] = {  # of each table: title, of the paper, head, how it is drawn
     "release": ("The release", "sec:dataset_stats, sec:exp_release", "|number", None),
     "quality_stats": ("Funnel and smoothness", "tab:quality_stats", "|value", None),
     "dist_stats": ("Per-axis statistics over trajectories", "tab:dist_stats", SPREAD, None),
-    "dist_frames": ("The same over frames", "tab:dist_stats", SPREAD, None),
     "decisions": ("Decisions", "tab:coc_actions", "action|decisions|%|labels|% |group", "bars"),
     "confusion": ("Label (rows) against decision (columns)", "fig:confusion_patterns", "label", "heat"),
     "verdicts": ("Decision against the geometry", "fig:consistency_verdict", "verdict|captions|%", "bars"),
     "repairs": ("Repairs", "fig:regen_strategy", "strategy|captions|%", "bars"),
     "teachers": ("Teachers", "tab:caption_pipeline", "|number", None),
-    "evidence": ("Evidence of sentences", "", "language|" + "|".join(STATES), "stacked"),
     "text_lengths": ("Length of the texts", "fig:coc_lengths", SPREAD.replace("axis", "text") + "|floor", None),
-    **{
-        f"lengths_{language}_{name}": (f"{LANGUAGE_NAMES[language]}, {name.replace('_', ' ')}: characters",
-                                       "fig:coc_lengths", "characters|captions", "bars")
-        for language, name in LENGTHS
-    },
-    "annotations": ("Annotations of a frame", "sec:dataset_stats", "annotation|frames|%", None),
     "towns": ("Towns", "sec:exp_release", "town|trajectories|frames|captions|map (licence)", "bars"),
-    "splits": ("Splits", "", "split|frames|captions|flights|trajectories|walks|towns", "bars"),
     "zoom_eval": ("Zoom", "tab:zoom_eval", "level|field of view, deg|track|focal length, px|flights|width, px|"
                   "height, px|visibility, %|IoU", None),
     "fovs": ("Fields of view", "tab:zoom_config, sec:exp_release", "degrees|trajectories|frames", "bars"),
@@ -105,9 +94,9 @@ def make_stats(record: ReleaseRecord, counts: Counts, pixels: Pixels | None) -> 
         pixels: of some frames' pictures; None where nobody looked at them.
     """
     tables = [
-        _release(record, counts), _quality(record, counts), _dist(record, counts), _frames(counts),
-        *_captions(record, counts), _annotations(record, counts), _towns(record, counts), _splits(record),
-        _zoom(counts), _fovs(counts), *weather(counts), *_perturbation(counts), *_pixels(pixels),
+        _release(record, counts), _quality(record, counts), _dist(record, counts),
+        *_captions(record, counts), _towns(record, counts), _zoom(counts), _fovs(counts), *weather(counts),
+        *_perturbation(counts), *_pixels(pixels),
     ]  # fmt: skip
     return Stats(
         name=record.name, runs=[source.run for source in record.provenance.sources], tables=tables,
@@ -253,24 +242,17 @@ def _dist(record: ReleaseRecord, counts: Counts) -> Table:
     return _table("dist_stats", rows, note)
 
 
-def _frames(counts: Counts) -> Table:
-    titles = {"altitude": "altitude over the person's ground, m", "distance": "target distance, m"}
-    titles["visibility"] = "rendered visibility"
-    rows = [_spread_row(title, counts.over_frames[name].spread()) for name, title in titles.items()]
-    return _table("dist_frames", rows, "Both tracks, as the pictures show it, perturbation and all.")
-
-
 # --- captions ---------------------------------------------------------------------------------------------------------
 
 
 def _captions(record: ReleaseRecord, counts: Counts) -> list[Table]:
-    """What captions say: decisions, verdicts, repairs, evidence, lengths."""
+    """What captions say: decisions, verdicts, repairs, lengths."""
     order = [name for name in (*TOKENS, "none") if counts.labels[name] or counts.decisions[name]]
     confusion: Rows = [[label, *(counts.confusion[label, decision] for decision in order)] for label in order]
     repairs = _shares(counts.repairs.most_common(), counts.repairs.total())
     return [
         _decisions(record, counts), _table("confusion", confusion, more=order), _verdicts(counts),
-        _table("repairs", repairs), _teachers(record), *_evidence(counts), *_lengths(counts),
+        _table("repairs", repairs), _teachers(record), _lengths(counts),
     ]  # fmt: skip
 
 
@@ -305,34 +287,17 @@ def _teachers(record: ReleaseRecord) -> Table:
     return _table("teachers", rows, "As the record tells it, of all captions that were read.")
 
 
-def _evidence(counts: Counts) -> list[Table]:
-    if not counts.sentences:
-        return []
-
-    rows: Rows = [[LANGUAGE_NAMES[name], *(counts.sentences[name, state] for state in STATES)] for name in LANGUAGES]
-    return [_table("evidence", rows, "Sentences of the captions against the geometry of their flight.")]
-
-
-def _lengths(counts: Counts) -> list[Table]:
-    rows, tables = list[list[Cell]](), list[Table]()
-    for language, name in LENGTHS:
-        least = (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS)[name]
-        title = f"{LANGUAGE_NAMES[language]}, {name.replace('_', ' ')}"
-        rows.append([*_spread_row(title, counts.lengths[language, name].spread()), least])
-        found = {k: n for (own, field, k), n in counts.length_bins.items() if (own, field) == (language, name)}
-        width, bins = TEXT_BIN[language], range(min(found, default=0), max(found, default=-1) + 1)
-        binned: Rows = [[f"{k * width} to {k * width + width - 1}", found.get(k, 0)] for k in bins]
-        tables += [_table(f"lengths_{language}_{name}", binned)] if binned else []
-    return [_table("text_lengths", rows, "Characters. The last column is the least that an answer may have."), *tables]
+def _lengths(counts: Counts) -> Table:
+    rows = list[list[Cell]]()
+    for language in LANGUAGES:
+        for name in FIELDS[:2]:
+            least = (MIN_CHARACTERS_ZH if language == "zh" else MIN_CHARACTERS)[name]
+            title = f"{LANGUAGE_NAMES[language]}, {name.replace('_', ' ')}"
+            rows.append([*_spread_row(title, counts.lengths[language, name].spread()), least])
+    return _table("text_lengths", rows, "Characters. The last column is the least that an answer may have.")
 
 
 # --- frames -----------------------------------------------------------------------------------------------------------
-
-
-def _annotations(record: ReleaseRecord, counts: Counts) -> Table:
-    found = {f"picture: {PICTURES[file].name}": counts.frames for file in record.settings.modalities}
-    found |= {name: counts.annotated[name] for name in ANNOTATIONS}
-    return _table("annotations", _shares(found.items(), counts.frames))
 
 
 def _towns(record: ReleaseRecord, counts: Counts) -> Table:
@@ -346,14 +311,6 @@ def _towns(record: ReleaseRecord, counts: Counts) -> Table:
         [town, trajectories[town], frames[town], captions[town], maps.get(town, "")] for town in sorted(frames)
     ]
     return _table("towns", rows)
-
-
-def _splits(record: ReleaseRecord) -> Table:
-    rows: Rows = [
-        [split, own.frames, own.captions, own.flights, own.trajectories, len(own.walks), len(own.towns)]
-        for split, own in record.splits.splits.items()
-    ]
-    return _table("splits", rows, title=f"Splits, by {record.splits.by}")
 
 
 def _zoom(counts: Counts) -> Table:
