@@ -118,7 +118,7 @@ class TeacherRecord(Record):
     run: _Given[str] = None
 
 
-class JudgeRecord(Record):
+class JudgeRecord(Record, frozen=False):
     """What a judge said of a conflict: one of Judgement, or `unjudged`; overruled_by: geometry or text."""
 
     verdict: str
@@ -127,7 +127,7 @@ class JudgeRecord(Record):
     overruled_by: _Given[str] = None
 
 
-class RepairRecord(Record):
+class RepairRecord(Record, frozen=False):
     """What became of a rejected answer.
 
     rung: the ask that mended it (hint, multi_sample, anchored, fix_label). outcome: repaired, failed, no_label.
@@ -141,7 +141,7 @@ class RepairRecord(Record):
     first_verdict: Verdict | None
 
 
-class KeyframeRecord(Record):
+class KeyframeRecord(Record, frozen=False):
     """Why a window was taken (start, change, stride); windows left out up to the next; label changes among them."""
 
     reason: str
@@ -192,7 +192,7 @@ class Evidence(Record):
     contradicted: list[str] = Field([])
 
 
-class Checks(Record):
+class Checks(Record, frozen=False):
     """What was checked. structure, bilingual: `ok` or a reason. refused: why answers of the right structure were
     not taken, one reason each. evidence: `ok` or the contradictions. sentences: language -> state of
     each sentence of both texts, in order. contradicted: decisions that the flight contradicts, whatever was decided.
