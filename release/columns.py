@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any, Literal, get_args
 
@@ -247,7 +247,7 @@ FRAME = (  # everything of a frame but pictures and depth
     Column("walk", "string", constant=True),
     Column("split", "string", constant=True),
     Column("pair", "string", constant=True),
-    Column("people", "string", lambda f, i: f.people and dump_json(f.people.as_json()), constant=True),
+    Column("people", "string", lambda f, i: f.people and dump_json(asdict(f.people)), constant=True),
     Column(
         "goal_en", "string", lambda f, i: f.goal and f.goal.en, constant=True, title="goal in words",
         shown=True,

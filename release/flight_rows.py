@@ -17,7 +17,7 @@ from cosfly.products.people import People
 from cosfly.products.playback import EVENTS, Flight
 from cosfly.products.shown_captions import ShownCaption, ShownFlight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
-from cosfly.reading.documents import parse_document
+from cosfly.reading.documents import parse_document, validated
 from release.columns import BOX, COMPANY_COLUMNS, INTRINSICS, POINT, POSE, between_of, matrices_of
 
 Row = dict[str, Any]
@@ -125,7 +125,7 @@ class FlightRows:
     def people(self) -> People | None:
         """What people look like, None where nobody says. Raises InputError, as `goal` does."""
         told, where = self.rows[0].get("people"), self.where(0, "people")
-        return None if told is None else People.from_json(parse_document(told, where), where)
+        return None if told is None else validated(People, parse_document(told, where), where)
 
     @cached_property
     def goal(self) -> Goal | None:

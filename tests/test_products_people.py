@@ -1,17 +1,20 @@
 """The wardrobe: drawn, written, read, told apart."""
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 
 from cosfly.errors import InputError
 from cosfly.products.people import COLORS, HAIR, Appearance, People, draw_appearance, look_alike
+from cosfly.reading.documents import validated
 
 
 def test_a_drawn_person_is_read_back_as_written():
     rng = np.random.default_rng(1)
     for _ in range(200):
         person = draw_appearance(rng)
-        assert Appearance.from_json(person.as_json(), "here") == person
+        assert validated(Appearance, asdict(person), "here") == person
         assert person.hat_color not in HAIR
 
 
@@ -39,9 +42,9 @@ def test_the_most_alike_differs_least_the_greatest_id_of_several():
 
 @pytest.mark.parametrize(("field", "value"), [("top", "toga"), ("hat_color", "red"), ("figure", 3), ("bag", None)])
 def test_what_the_wardrobe_lacks_is_refused(field, value):
-    bare = Appearance("man", "jacket", "red", "shorts", "blue").as_json()
+    bare = asdict(Appearance("man", "jacket", "red", "shorts", "blue"))
     with pytest.raises(InputError, match=field):
-        Appearance.from_json(bare | {field: value}, "here")
+        validated(Appearance, bare | {field: value}, "here")
 
 
 def test_colours_are_far_apart():

@@ -1,7 +1,7 @@
 """Goals in a release: in its columns, exports and pages; a false or ambiguous one, or another picture, is found."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
@@ -54,7 +54,7 @@ def changed(flight: FlightRows, says: list[str] | None = None, people: People | 
     """Tell another goal, its words and all."""
     says, people = says or list(flight.goal.says), people or flight.people
     words = {f"goal_{language}": text for language, text in words_of(says, people.target).items()}
-    new = {**words, "goal_says": says, "people": json.dumps(people.as_json())} | values
+    new = {**words, "goal_says": says, "people": json.dumps(asdict(people))} | values
     return [{**row, **new} for row in flight.rows]
 
 

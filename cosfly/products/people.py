@@ -11,7 +11,6 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.products.captions import Language
 
 Words = dict[Language, str]
@@ -78,22 +77,10 @@ class Appearance:
         """Whether each thing worn can be seen: a long coat leaves nothing of shorts or a skirt."""
         return self.top != "coat" or self.legs == "trousers"
 
-    def as_json(self) -> dict[str, str]:
-        return asdict(self)
-
-    @classmethod
-    def from_json(cls, record: object, where: str) -> Appearance:
-        """Read an appearance; raises InputError where a value is no row of its table."""
-        if not isinstance(record, dict):
-            raise InputError("no appearance", where=where, got=type(record).__name__, expected="an object")
-        values = {}
-        for name in cls.__dataclass_fields__:
-            value, rows = record.get(name), _rows(name, record)
-            if not isinstance(value, str) or value not in rows:
-                expected = ", ".join(repr(row) for row in rows)
-                raise InputError("no such look", where=f"{where}.{name}", got=repr(value)[:60], expected=expected)
-            values[name] = value
-        return cls(**values)
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value not in (rows := _rows(name, vars(self))):
+                raise ValueError(f"{name} must be one of {', '.join(map(repr, rows))}")
 
     def differences(self, other: Appearance) -> tuple[str, ...]:
         """Name the fields that tell two people apart; empty where they look alike. A garment counts once."""
@@ -120,19 +107,6 @@ class People:
             return None, None
         num_differences, number = min(differing)
         return -number, num_differences
-
-    def as_json(self) -> dict:
-        others = {str(number): other.as_json() for number, other in self.others.items()}
-        return {"target": self.target.as_json(), "others": others}
-
-    @classmethod
-    def from_json(cls, record: object, where: str) -> People:
-        """Read the people of a flight; raises InputError where that is something else."""
-        others = record.get("others") if isinstance(record, dict) else None
-        if not isinstance(record, dict) or not isinstance(others, dict) or not all(map(str.isdecimal, others)):
-            raise InputError("no people", where=where, got=repr(record)[:60], expected="target, others by instance id")
-        found = {int(number): Appearance.from_json(o, f"{where}.others.{number}") for number, o in others.items()}
-        return cls(Appearance.from_json(record.get("target"), f"{where}.target"), found)
 
 
 def _rows(name: str, record: dict) -> tuple[str, ...]:

@@ -361,7 +361,7 @@ def write_flight(folder: Path, flight: Flight) -> None:
     raw["source"] = flight.source
     raw.update(flown_as_json(flight.segments, mirrored(flight.mission)))
     if flight.people is not None:
-        raw["people"] = flight.people.as_json()
+        raw["people"] = asdict(flight.people)
     if flight.goal is not None:
         raw["goal"] = asdict(flight.goal)
     camera = flight.camera

@@ -5,14 +5,18 @@ A file without them holds a flight that follows the walker, as the paper's do, a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import asdict, dataclass, replace
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from cosfly.errors import InputError
 from cosfly.products.columns import is_number
+from cosfly.reading.documents import validated
 
 FOLLOW = "follow"  # the style where nothing else is said
 MISSION_KINDS = ("geofence", "battery", "time_over")
+Frame = Annotated[int, Field(strict=True, ge=0)]
 
 
 @dataclass(frozen=True)
@@ -20,12 +24,9 @@ class Segment:
     """Frames [begin, end) of one style. keeps_sight: whether they are judged by how much they see of the target."""
 
     style: str
-    begin: int
-    end: int
+    begin: Frame
+    end: Frame
     keeps_sight: bool = True
-
-    def as_json(self) -> dict:
-        return {"style": self.style, "begin": self.begin, "end": self.end, "keeps_sight": self.keeps_sight}
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Mission:
 
 def flown_as_json(segments: tuple[Segment, ...], mission: Mission | None) -> dict:
     """Give the keys that a record has of them: none for a flight that follows from end to end."""
-    record: dict = {"segments": [part.as_json() for part in segments]} if segments else {}
+    record: dict = {"segments": [asdict(part) for part in segments]} if segments else {}
     return record | ({"mission": mission.as_json()} if mission is not None else {})
 
 
@@ -65,17 +66,11 @@ def mirrored(mission: Mission | None) -> Mission | None:
 
 def read_segments(value: Any, num_frames: int, where: str) -> tuple[Segment, ...]:
     """Read segments; none is no segment."""
-    if value is None:
-        return ()
-    if not isinstance(value, list) or not all(isinstance(part, dict) for part in value):
-        raise InputError("not segments", where=where, got=repr(value)[:60], expected="a list of objects")
-    segments = []
-    for k, part in enumerate(value):
-        begin, end = (_frame(part, name, num_frames, f"{where}[{k}]") for name in ("begin", "end"))
-        if not isinstance(part.get("style"), str):
-            raise InputError("missing", where=f"{where}[{k}].style", got=repr(part.get("style")), expected="a name")
-        segments.append(Segment(part["style"], begin, end, part.get("keeps_sight") is not False))
-    return tuple(segments)
+    segments = () if value is None else validated(tuple[Segment, ...], value, where)
+    for k, part in enumerate(segments):
+        for name in ("begin", "end"):
+            _frame(vars(part), name, num_frames, f"{where}[{k}]")
+    return segments
 
 
 def read_mission(value: Any, num_frames: int, where: str) -> Mission | None:

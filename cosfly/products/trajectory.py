@@ -144,7 +144,7 @@ class FieldReader:
     def people(self, raw: dict) -> People | None:
         """What people look like, None where nothing is said; somebody else's field of this name is noted and left."""
         with self.noted():
-            return People.from_json(raw["people"], f"{self.path}: people") if "people" in raw else None
+            return validated(People, raw["people"], f"{self.path}: people") if "people" in raw else None
         return None
 
     def goal(self, raw: dict, num_points: int) -> Goal | None:

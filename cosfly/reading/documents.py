@@ -18,13 +18,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import SchemaValidator
 
 from cosfly.errors import InputError, plain
 from cosfly.reading.files import CHECK_PATH, FILE_MB, decoded, not_utf8, read_bytes, read_lines
 
 Model = TypeVar("Model", bound=BaseModel)
+Kind = TypeVar("Kind")
 
 DEPTH = 64  # the deepest honest file, a CityJSON CompositeSolid, has 10
 DIGITS = 40  # ids have up to 20; a float holds no number of 309
@@ -157,27 +158,27 @@ class Record(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-def validated(model: type[Model], value: Any, where: str | Path) -> Model:
-    """Give what a JSON value says as a model. It ends at the first wrong member of a list or object: each error takes
-    kilobytes.
+def validated(kind: type[Kind], value: Any, where: str | Path) -> Kind:
+    """Return what a JSON value says as a model or a dataclass. It ends at the first wrong member of a list or object:
+    each error takes kilobytes.
 
     Raises:
         InputError: names the file and the first wrong field.
     """
     try:
-        return _validator(model).validate_python(value)
+        return _validator(kind).validate_python(value)
     except ValidationError as error:
         detail = error.errors(include_url=False, include_context=False)[0]
         places = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in detail["loc"])
         field = "".join(places).removeprefix(".") or "top level"
-        what = "not an object" if detail["type"] == "model_type" else plain(detail["msg"])
+        what = "not an object" if detail["type"] in ("model_type", "dataclass_type") else plain(detail["msg"])
         raise InputError(what, where=f"{where}: {field}", got=_shown(detail["input"])) from None
 
 
 @functools.cache
-def _validator(model: type[BaseModel]) -> SchemaValidator:
+def _validator(kind: type) -> SchemaValidator:
     # The models inside would bring validators of their own, which collect all errors.
-    return SchemaValidator(_ending_early(model.__pydantic_core_schema__), _use_prebuilt=False)  # type: ignore[call-arg]
+    return SchemaValidator(_ending_early(TypeAdapter(kind).core_schema), _use_prebuilt=False)  # type: ignore[call-arg]
 
 
 def _ending_early(schema: Any) -> Any:

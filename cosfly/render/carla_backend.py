@@ -15,6 +15,7 @@ import queue
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -280,7 +281,7 @@ class CarlaRenderer:
         """Spawn somebody, the same for the same clothes or paint, and note the number in pictures."""
         if isinstance(body, PosedPerson):
             names = sorted(one.id for one in self._library.filter("walker.pedestrian.*"))
-            worn = dump_json(body.clothes.looks.as_json())
+            worn = dump_json(asdict(body.clothes.looks))
             name = names[int(sha256_bytes(worn.encode())[:8], 16) % len(names)]
         else:
             sizes_m = self._vehicle_sizes()
