@@ -66,7 +66,6 @@ STYLE = """
 OF_BENCHMARK: dict[str, tuple[str, str]] = {
     "Four axes": ("tab:appendix_h_four_axis_scores, fig:appendix_h_alg3d_measured", "axes_radar.png"),
     "TA* + Smooth less": ("tab:appendix_h_tastar_muco_delta, fig:appendix_h_tastar_muco_deltas", "deltas.png"),
-    "TA* + Smooth against": ("tab:appendix_h_tastar_muco_win_rates", ""),
     "Weighted score": ("tab:appendix_h_extended_ranking, fig:appendix_h_four_axis_bar", "axes_bars.png"),
     "Feasibility": ("tab:appendix_h_extended_feasibility, fig:appendix_h_alg3d_projections", "axes_pairs.png"),
     "Groups": ("tab:appendix_h_group_summary, fig:appendix_h_measured_trajectory_grid", "flights_3d.png"),

@@ -6,9 +6,7 @@ and dynamics, of which there are none, are means over what is flown, and of one 
 
 The 14-way score of the paper (tab:appendix_h_extended_ranking) is printed without its weights. Its rows give them away:
 with each criterion normalised from the worst planner, 0, to the best, 1, all fourteen scores are 0.35 visibility + 0.30
-collision + 0.35 clearance within 0.0001, and path length, acceleration and jerk count for nothing. (Blocked sight is
-1 - visibility, so that any part of the 0.35 may be its.) How far the ranks depend on that stands in `ranking`: with
-equal weights, and with any weights at all, drawn evenly.
+collision + 0.35 clearance within 0.0001, and path length, acceleration and jerk count for nothing.
 """
 
 from __future__ import annotations
@@ -52,13 +50,11 @@ GROUPS = {
 GROUP_OF = {planner: group for group, members in GROUPS.items() for planner in members}
 # Criteria of the weighted score: its figure, and whether more is better.
 CRITERIA = {
-    "visibility": ("five_ray_mean", True), "collision": ("collision_fraction", False),
-    "clearance": ("clearance_min_m", True), "length": ("length_m", False), "acceleration": ("accel_rms_mps2", False),
-    "jerk": ("jerk_rms_mps3", False),
-}  # fmt: skip
+    "visibility": ("five_ray_mean", True),
+    "collision": ("collision_fraction", False),
+    "clearance": ("clearance_min_m", True),
+}
 WEIGHTS = {"visibility": 0.35, "collision": 0.30, "clearance": 0.35}  # the paper's, see above
-EQUAL_WEIGHTS = {"visibility": 2 / 7} | dict.fromkeys([*CRITERIA][1:], 1 / 7)  # of seven: blocked sight is visibility
-RANDOM_WEIGHTS = 1000
 INSTALL = 'pip install "cosfly[ompl]"'
 
 
@@ -86,9 +82,6 @@ _PRINTED = {
 PAPER = {planner: PaperRow(*row) for planner, row in _PRINTED.items()}
 PAPER_SHORTEST_M = 85.73  # to which the paper normalises path efficiency
 PAPER_GROUPS = dict(zip(list(GROUPS)[1:], (0.9364, 0.6205, 0.6083, 0.6075), strict=True))  # visibility
-PAPER_WINS = {
-    "visibility_higher": 18, "path_shorter": 14, "jerk_lower": 11, "clearance_larger": 17, "both_collision_free": 20,
-}  # fmt: skip
 
 
 class BenchmarkConfig(CompareConfig):
@@ -214,14 +207,11 @@ class AxisRow(BaseModel):
 
 
 class RankRow(BaseModel):
-    """normalized: criterion -> 0 (worst) to 1 (best). ranks: lowest and highest of 95 % of all weights."""
+    """normalized: criterion -> 0 (worst) to 1 (best)."""
 
     rank: int
     score: float
-    interval: Interval
     normalized: dict[str, float]
-    rank_equal_weights: int
-    ranks_any_weights: Interval
 
 
 class GroupRow(BaseModel):
@@ -229,7 +219,6 @@ class GroupRow(BaseModel):
 
     num_planners: int
     figures: dict[str, float | None]
-    visibility_interval: Interval
 
 
 class Benchmark(BaseModel):
@@ -246,9 +235,6 @@ class Benchmark(BaseModel):
     shortest_mean_m: float
     axes: dict[str, AxisRow]
     deltas: dict[str, dict[str, float | None]] = {}
-    delta_intervals: dict[str, Interval] = {}
-    win_rates: dict[str, dict[str, float]] = {}
-    weights: dict[str, float]
     ranking: dict[str, RankRow]
     groups: dict[str, GroupRow]
 
@@ -259,7 +245,7 @@ def read_benchmark(path: Path) -> Benchmark:
 
 
 def summarize(records: list[ScenarioRecord], planners: tuple[str, ...], rng: np.random.Generator) -> dict[str, Any]:
-    """Make the tables of `benchmark.json` from the raw records. rng: draws scenarios and weights."""
+    """Make the tables of `benchmark.json` from the raw records. rng: draws scenarios."""
     traces = [record.traces() for record in records]
     figures = {p: [compare.flight_figures(t[p]) if p in t else None for t in traces] for p in planners}
     tables = {p: np.array([_row(flight) for flight in rows]) for p, rows in figures.items()}
@@ -278,25 +264,18 @@ def summarize(records: list[ScenarioRecord], planners: tuple[str, ...], rng: np.
         "means": {p: {n: _number(value) for n, value in row.items()} for p, row in means.items()},
         "shortest_mean_m": round(min(free_m or [row["length_m"] for row in means.values()]), 4),
         "axes": axis_rows,
-        **_versus(tables, means, drawn),
-        "weights": WEIGHTS,
-        "ranking": _ranking(means, drawn, rng),
-        "groups": _groups(means, drawn),
+        "deltas": _deltas(means),
+        "ranking": _ranking(means),
+        "groups": _groups(means),
     }
 
 
-def _versus(tables: dict[str, np.ndarray], means: dict, drawn: list[dict]) -> dict[str, Any]:
-    """Give TA*+Smooth less MuCO, and how often it wins; nothing where one of them took no part or flew nothing."""
-    one, other = GROUPS["target-aware"]
-    if not all(p in means and np.isfinite(list(means[p].values())).all() for p in (one, other)):
+def _deltas(means: dict[str, dict[str, float]]) -> dict[str, dict[str, float | None]]:
+    """Return TA*+Smooth less MuCO; nothing where one of them took no part or flew nothing."""
+    pair = GROUPS["target-aware"]
+    if not all(p in means and np.isfinite(list(means[p].values())).all() for p in pair):
         return {}
-    flown = [np.nan_to_num(tables[planner], nan=np.inf).tolist() for planner in (one, other)]
-    first, second = ([dict(zip(NAMES, row, strict=True)) for row in rows] for rows in flown)
-    return {
-        "deltas": compare.deltas(means[one], means[other]),
-        "delta_intervals": {n: _interval([found[one][n] - found[other][n] for found in drawn]) for n in NAMES},
-        "win_rates": compare.win_rates(first, second),
-    }
+    return compare.deltas(*(means[p] for p in pair))
 
 
 def _row(flight: dict[str, float] | None) -> list[float]:
@@ -327,39 +306,27 @@ def _normalized(means: dict[str, dict[str, float]]) -> np.ndarray:
     return np.stack(columns, axis=1)
 
 
-def _ranks(scores: np.ndarray) -> np.ndarray:
-    """Give places from 1 for scores (planners, k), ties in the order of planners."""
-    return np.argsort(np.argsort(-np.round(scores, 9), axis=0, kind="stable"), axis=0, kind="stable") + 1
-
-
-def _ranking(means: dict, drawn: list[dict], rng: np.random.Generator) -> dict[str, RankRow]:
-    chosen, equal = ([weights.get(name, 0.0) for name in CRITERIA] for weights in (WEIGHTS, EQUAL_WEIGHTS))
+def _ranking(means: dict[str, dict[str, float]]) -> dict[str, RankRow]:
     normalized = _normalized(means)
-    scores = normalized @ chosen
-    scores_drawn = np.array([_normalized(found) @ chosen for found in drawn])
-    ranks_any = _ranks(normalized @ rng.dirichlet(np.ones(len(CRITERIA)), size=RANDOM_WEIGHTS).T)
-    ranks, ranks_equal = _ranks(scores[:, None])[:, 0], _ranks((normalized @ equal)[:, None])[:, 0]
-    rows = {
-        planner: RankRow(
-            rank=ranks[k],
-            score=round(scores[k], 4),
-            interval=_interval(scores_drawn[:, k]),
+    scores = (normalized @ list(WEIGHTS.values())).round(4)
+    planners = list(means)
+    order = np.argsort(-scores, kind="stable").tolist()
+    return {
+        planners[k]: RankRow(
+            rank=rank,
+            score=scores[k],
             normalized=dict(zip(CRITERIA, np.round(normalized[k], 4).tolist(), strict=True)),
-            rank_equal_weights=ranks_equal[k],
-            ranks_any_weights=_interval(ranks_any[k]),
         )
-        for k, planner in enumerate(means)
+        for rank, k in enumerate(order, 1)
     }
-    return dict(sorted(rows.items(), key=lambda entry: entry[1].rank))
 
 
-def _groups(means: dict, drawn: list[dict]) -> dict[str, GroupRow]:
+def _groups(means: dict[str, dict[str, float]]) -> dict[str, GroupRow]:
     rows = {}
     for group, all_members in GROUPS.items():
         if members := [planner for planner in all_members if planner in means]:
             figures = {name: _number(float(np.mean([means[p][name] for p in members]))) for name in NAMES}
-            seen = [np.mean([found[p]["five_ray_mean"] for p in members]) for found in drawn]
-            rows[group] = GroupRow(num_planners=len(members), figures=figures, visibility_interval=_interval(seen))
+            rows[group] = GroupRow(num_planners=len(members), figures=figures)
     return rows
 
 
@@ -394,10 +361,6 @@ def _cells(values: Iterable[float | None], digits: int = 3) -> list[str]:
     return ["-" if value is None else f"{value:.{digits}f}" for value in values]
 
 
-def _span(interval: Interval, digits: int = 3) -> str:
-    return f"{interval[0]:.{digits}f} to {interval[1]:.{digits}f}"
-
-
 def _printed(planner: str, *names: str) -> list[str]:
     """Give what the paper prints of a planner."""
     digits = {"num_free": 0, "clearance_m": 2}
@@ -409,7 +372,8 @@ def _tables(found: Benchmark) -> Iterator[TextTable]:
     num, pair = len(found.scenarios), GROUPS["target-aware"]
     rows = []
     for p, row in sorted(found.axes.items(), key=lambda entry: -entry[1].scores["mean"]):
-        scores, spread = _cells(row.scores[axis] for axis in (*AXES, "mean")), _span(row.intervals["mean"])
+        scores = _cells(row.scores[axis] for axis in (*AXES, "mean"))
+        spread = " to ".join(_cells(row.intervals["mean"]))
         ours = _cells(found.means[p][name] for name in ("collision_fraction", "clearance_min_m"))
         rows.append([title_of(p), *scores, spread, *_printed(p, "axes_mean"), *ours])
     columns = ["visibility", "efficiency", "smoothness", "safety", "mean", "95 %", "paper", "collision", "clearance"]
@@ -419,32 +383,17 @@ def _tables(found: Benchmark) -> Iterator[TextTable]:
     rows = []
     for name, words, digits in FIGURES if found.deltas else ():
         values = [*(found.means[p][name] for p in pair), found.deltas[name]["delta"]]
-        relative = _cells([found.deltas[name]["relative_percent"]], 1)
-        rows.append([words, *_cells(values, digits), *relative, _span(found.delta_intervals[name], digits)])
-    columns = ["figure", *map(title_of, pair), "delta", "%", "95 % of the delta"]
+        rows.append([words, *_cells(values, digits), *_cells([found.deltas[name]["relative_percent"]], 1)])
+    columns = ["figure", *map(title_of, pair), "delta", "%"]
     yield TextTable("TA* + Smooth less MuCO", columns, rows)
-
-    rows = [
-        [
-            name.replace("_", " "),
-            f"{row['count']:.0f} of {row['of']:.0f}",
-            f"{row['rate']:.3f}",
-            f"{PAPER_WINS[name]} of 20",
-        ]
-        for name, row in found.win_rates.items()
-    ]
-    yield TextTable("TA* + Smooth against MuCO", ["criterion", "count", "rate", "paper"], rows)
 
     rows = []
     for p, place in found.ranking.items():
-        normalized, (low, high) = _cells(place.normalized[name] for name in found.weights), place.ranks_any_weights
-        beside = [*_printed(p, "weighted"), str(place.rank_equal_weights), f"{low:.0f} to {high:.0f}"]
-        rows.append(
-            [f"{place.rank} {title_of(p)}", *_cells([place.score]), _span(place.interval), *normalized, *beside]
-        )
-    words = ", ".join(f"{weight:g} {name}" for name, weight in found.weights.items())
-    columns = ["planner", "score", "95 %", *found.weights, "paper", "rank, equal weights", "ranks, any weights"]
-    yield TextTable(f"Weighted score: {words}; each from the worst, 0, to the best, 1", columns, rows)
+        normalized = _cells(place.normalized[name] for name in WEIGHTS)
+        rows.append([f"{place.rank} {title_of(p)}", *_cells([place.score]), *normalized, *_printed(p, "weighted")])
+    words = ", ".join(f"{weight:g} {name}" for name, weight in WEIGHTS.items())
+    title = f"Weighted score: {words}; each from the worst, 0, to the best, 1"
+    yield TextTable(title, ["planner", "score", *WEIGHTS, "paper"], rows)
 
     rows = []
     for p, flights in found.figures.items():
@@ -460,7 +409,7 @@ def _tables(found: Benchmark) -> Iterator[TextTable]:
     rows = []
     names = ("five_ray_mean", "blocked_fraction", "collision_fraction", "clearance_min_m", "length_m")
     for group, means in found.groups.items():
-        beside = [_span(means.visibility_interval), *_cells([PAPER_GROUPS.get(group)])]
-        rows.append([group, str(means.num_planners), *_cells(means.figures[name] for name in names), *beside])
-    columns = ["visibility", "blocked", "collision", "clearance", "length", "95 % of visibility", "paper"]
+        figures = [*(means.figures[name] for name in names), PAPER_GROUPS.get(group)]
+        rows.append([group, str(means.num_planners), *_cells(figures)])
+    columns = ["visibility", "blocked", "collision", "clearance", "length", "paper: visibility"]
     yield TextTable("Groups; clearance and length in m", ["group", "planners", *columns], rows)

@@ -98,18 +98,16 @@ def _deltas(found: Benchmark) -> bytes:
         base = found.means["muco"][name]
         if name in shown and base:
             sign = 100.0 / base * (1.0 if name in more_is_better else -1.0)
-            ends = sorted(sign * end for end in found.delta_intervals[name])
             words = title if name in more_is_better else f"less {title}"
-            rows.append((words, sign * (found.deltas[name]["delta"] or 0.0), ends))
+            rows.append((words, sign * (found.deltas[name]["delta"] or 0.0)))
     axes = figure.add_subplot()
-    for place, (_, change, (low, high)) in enumerate(rows):
+    for place, (_, change) in enumerate(rows):
         axes.barh(place, change, color=_color("track_astar") if change >= 0 else _color("muco"))
-        axes.plot([low, high], [place, place], color="black", lw=1.0)
-        axes.annotate(f"{change:+.1f} %", (max(change, high, 0.0), place), xytext=(6, -4), textcoords="offset points")
+        axes.annotate(f"{change:+.1f} %", (max(change, 0.0), place), xytext=(6, -4), textcoords="offset points")
     axes.axvline(0.0, color="black", lw=0.8)
-    axes.set_yticks(range(len(rows)), [words for words, _, _ in rows])
+    axes.set_yticks(range(len(rows)), [words for words, _ in rows])
     axes.margins(x=0.15)
-    axes.set_xlabel("relative to MuCO, %; to the right TA* + Smooth is better; lines: 95 %")
+    axes.set_xlabel("relative to MuCO, %; to the right TA* + Smooth is better")
     axes.set_title("TA* + Smooth against MuCO")
     return _png(figure)
 

@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
-from cosfly.errors import InputError, NoPathError
+from cosfly.errors import NoPathError
 from cosfly.look.tables import TextTable
-from cosfly.look.topview import INK, PAPER, add_caption, draw_area, draw_dot, draw_line, draw_text, png_bytes
+from cosfly.look.topview import PAPER, add_caption, draw_area, draw_dot, draw_line, draw_text, png_bytes
 from cosfly.planners.contract import ALL_PLANNERS, PLANNERS, PlanConfig, known_planner, title_of
 from cosfly.planners.overview import draw_walks
 from cosfly.planners.stage import check_ids, draw_styles_of, plan_flight, warm_up
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import Walk, read_paths
-from cosfly.reading.documents import FileFormat, read_object, validated
+from cosfly.reading.documents import FileFormat, read_object
 from cosfly.work.chance import rng_for
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Resume, StageFolder, read_manifest, result_of
@@ -231,7 +231,7 @@ def run(
     watch: Watch = Watch(),
     resume: Resume = "if-same",
 ) -> Path:
-    """Reads a simplified map and `path.json`, writes `compare.json`, each planner's flights and three pictures; gives
+    """Reads a simplified map and `path.json`, writes `compare.json`, each planner's flights and two pictures; gives
     the first.
 
     A walk that a planner cannot fly is dropped with that planner's name, one that none can is a failure.
@@ -270,7 +270,6 @@ def run(
     flown: list[Walk] = [by_id[walk_id] for walk_id in shared]
     pictures = {
         "compare_overlay.png": draw_overlay(box_map, flown, flights),
-        "compare_series.png": draw_series(flown, flights),
         "compare_radar.png": draw_radar(summary["axes"]),
     }
     for name, picture in pictures.items():
@@ -321,8 +320,6 @@ def timings(shared: Collection[FlightsOfWalk], planners: Sequence[str]) -> dict[
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
-# Pictures of a comparison, drawn with OpenCV: overlay from above, altitude and visibility over time, radar of the axes.
-
 
 # RGB: the paper's blue and orange, then others that differ in brightness too.
 PALETTE = (
@@ -362,64 +359,6 @@ def draw_overlay(box_map: BoxMap, walks: list[Walk], flights: dict[str, list[Dro
     return png_bytes(caption)
 
 
-# --- over time --------------------------------------------------------------------------------------------------------
-
-
-def draw_series(walks: list[Walk], flights: dict[str, list[DroneTrace]]) -> bytes:
-    """Draw altitude above the walk and visibility over time: flights thin, the mean of those still flying thick."""
-    ground = [walk.positions_m[:, 2] for walk in walks]
-    altitudes = {p: [t.positions_m[:, 2] - g for t, g in zip(ts, ground, strict=True)] for p, ts in flights.items()}
-    seen = {planner: [trace.visibility for trace in traces] for planner, traces in flights.items()}
-    end_s = max(float(trace.time_s[-1]) for traces in flights.values() for trace in traces)
-    top = max(float(values.max()) for rows in altitudes.values() for values in rows)
-    picture = np.full((880, 1400, 3), PAPER, dtype=np.uint8)
-    times = {planner: [trace.time_s - trace.time_s[0] for trace in traces] for planner, traces in flights.items()}
-    bottom = min(20.0, *(float(values.min()) for rows in altitudes.values() for values in rows))
-    high = max(10.0 * np.ceil((top + 1.0) / 10.0), 30.0)
-    _panel(picture, (90, 60, 1360, 410), "altitude above the walk (m)", (bottom - 2.0, high), end_s, times, altitudes)
-    _panel(picture, (90, 480, 1360, 820), "five-ray visibility", (-0.03, 1.05), end_s, times, seen)
-    draw_text(picture, "time (s)", 725, 866, align=0.5)
-    draw_text(picture, f"{len(walks)} walks: every flight thin, the mean of those still flying thick", 90, 28, 0.6)
-    _legend(picture, flights, 28)
-    return png_bytes(picture)
-
-
-def _panel(picture, frame, title, bounds, end_s, times, values) -> None:
-    """Draw one axis. frame: left, top, right, bottom, px. bounds: low, high. times, values: planner -> flights."""
-    left, top, right, bottom = frame
-
-    def pixels(t, v) -> np.ndarray:
-        x = left + (right - left) * np.asarray(t, dtype=np.float64) / max(end_s, 1e-9)
-        y = bottom - (bottom - top) * (np.asarray(v, dtype=np.float64) - bounds[0]) / (bounds[1] - bounds[0])
-        return np.stack([x, y], axis=1)
-
-    for tick in _ticks(*bounds):
-        draw_line(picture, pixels([0, end_s], [tick, tick]), FAINT)
-        draw_text(picture, f"{tick:g}", left - 10, pixels([0], [tick])[0, 1] + 5, 0.5, align=1.0)
-    for tick in _ticks(0.0, end_s):
-        draw_line(picture, np.array([pixels([tick], [bounds[0]])[0], pixels([tick], [bounds[1]])[0]]), FAINT)
-        draw_text(picture, f"{tick:g}", pixels([tick], [bounds[0]])[0, 0], bottom + 20, 0.5, align=0.5)
-    for planner, rows in values.items():
-        pale = tuple(int(0.35 * c + 0.65 * p) for c, p in zip(color_of(planner), PAPER, strict=True))
-        for t, v in zip(times[planner], rows, strict=True):
-            draw_line(picture, pixels(t, v), pale)
-    for planner, rows in values.items():
-        longest = max(times[planner], key=len)
-        mean = [np.mean([row[i] for row in rows if len(row) > i]) for i in range(len(longest))]
-        draw_line(picture, pixels(longest, mean), color_of(planner), 3)
-    draw_line(picture, np.array([[left, top], [right, top], [right, bottom], [left, bottom]]), INK, closed=True)
-    draw_text(picture, title, left, top - 10)
-
-
-def _ticks(low: float, high: float) -> np.ndarray:
-    """Give about six round numbers from low to high."""
-    rough = (high - low) / 6.0
-    power = 10.0 ** np.floor(np.log10(rough))
-    step = power * next(k for k in (1.0, 2.0, 5.0, 10.0) if k * power >= rough)
-    ticks = np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) * step
-    return np.round(ticks, 6) + 0.0  # no minus zero
-
-
 # --- axes -------------------------------------------------------------------------------------------------------------
 
 
@@ -453,66 +392,34 @@ def draw_radar(axes: dict[str, dict[str, float]]) -> bytes:
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
-# `compare.json` as tables of text: figures, axes with their intervals, and wins against each other planner.
-
-
-class _Comparison(BaseModel):
-    """What the tables are made of: `compare.json`, and the times of its manifest."""
-
-    means: dict[str, dict[str, float]] = Field(min_length=1)
-    deltas: dict[str, dict[str, dict[str, float | None]]]
-    axes: dict[str, dict[str, float]]
-    axis_differences: dict[str, dict[str, dict[str, float]]]
-    win_rates: dict[str, dict[str, dict[str, float]]]
-    timings: dict[str, dict[str, float]]
 
 
 def text_tables(product: Path) -> list[TextTable]:
-    """Read `compare.json` and its manifest as tables of text: figures, axes, and wins against each other planner."""
-    found = read_object(product, what="comparison")
-    record = validated(_Comparison, found | {"timings": read_manifest(product.parent).facts.get("timings")}, product)
-    try:
-        return _tables_of(record)
-    except (KeyError, TypeError) as error:
-        raise InputError("a table lacks a part", where=product, got=str(error), fix="compare again") from None
-
-
-def _tables_of(record: _Comparison) -> list[TextTable]:
-    first, *others = planners = list(record.means)
-    titles = [title_of(planner) for planner in planners]
-    axes = [
-        [name.replace("_", " "), *(f"{record.axes[planner][name]:.3f}" for planner in planners)]
-        for name in (*AXES, "mean")
+    """Read `compare.json` and its manifest as tables of text: figures, axes, and the first planner's wins."""
+    found, times = read_object(product, what="comparison"), read_manifest(product.parent).facts["timings"]
+    first, *others = planners = list(found["means"])
+    titles, less = [title_of(planner) for planner in planners], [f"less {title_of(other)}" for other in others]
+    figures, axes = [], []
+    for name, words, digits in FIGURES:
+        figures.append([words, *(f"{found['means'][planner][name]:.{digits}f}" for planner in planners)])
+        for change in (found["deltas"][other][name] for other in others):
+            relative = change["relative_percent"]
+            figures[-1] += [f"{change['delta']:+.{digits}f}", "n/a" if relative is None else f"{relative:+.1f}"]
+    means_ms = [f"{times[planner]['mean_ms']:.1f}" for planner in planners]
+    figures.append(["planning time (ms)", *means_ms, *[""] * 2 * len(others)])
+    for name in (*AXES, "mean"):
+        rows = [found["axis_differences"][other][name] for other in others]
+        apart = [f"{row['difference']:+.3f} ({row['low']:+.3f} to {row['high']:+.3f})" for row in rows]
+        axes.append([name.replace("_", " "), *(f"{found['axes'][p][name]:.3f}" for p in planners), *apart])
+    rates = found["win_rates"]
+    criteria = next(iter(rates.values()))
+    wins = [
+        [name.replace("_", " "), *(f"{rates[o][name]['count']} of {rates[o][name]['of']}" for o in others)]
+        for name in criteria
     ]
-    differences = ["difference"] if len(others) == 1 else [f"less {title_of(other)}" for other in others]
-    columns = ["figure", *titles, *(column for title in differences for column in (title, "%"))]
-    tables = [
-        TextTable("Means over the walks that all fly", columns, _figure_rows(record)),
-        TextTable("Axis scores, higher is better", ["axis", *titles], axes),
+    columns = ["figure", *titles, *(column for title in less for column in (title, "%"))]
+    return [
+        TextTable("Means over the walks that all fly", columns, figures),
+        TextTable("Axis scores, higher is better; differences with 95 % intervals", ["axis", *titles, *less], axes),
+        TextTable(f"{title_of(first)}, walk by walk", ["criterion", *(f"to {title_of(o)}" for o in others)], wins),
     ]
-    for other, intervals in record.axis_differences.items():
-        rows = [
-            [name.replace("_", " "), *(f"{row[part]:+.3f}" for part in ("difference", "low", "high"))]
-            for name, row in intervals.items()
-        ]
-        title = f"Axis scores, {title_of(first)} less {title_of(other)}, and 95 % of what other walks would give"
-        tables.append(TextTable(title, ["axis", "difference", "from", "to"], rows))
-    for other, rates in record.win_rates.items():
-        rows = [
-            [name.replace("_", " "), f"{row['count']:.0f} of {row['of']:.0f}", f"{row['rate']:.3f}"]
-            for name, row in rates.items()
-        ]
-        title = f"{title_of(first)} against {title_of(other)}, walk by walk"
-        tables.append(TextTable(title, ["criterion", "count", "rate"], rows))
-    return tables
-
-
-def _figure_rows(record: _Comparison) -> list[list[str]]:
-    rows = []
-    for name, title, digits in FIGURES:
-        rows.append([title, *(f"{figures[name]:.{digits}f}" for figures in record.means.values())])
-        for change in record.deltas.values():
-            relative = change[name]["relative_percent"]
-            rows[-1] += [f"{change[name]['delta']:+.{digits}f}", "n/a" if relative is None else f"{relative:+.1f}"]
-    times = [f"{record.timings[planner]['mean_ms']:.1f}" for planner in record.means]
-    return [*rows, ["planning time (ms)", *times, *[""] * 2 * len(record.deltas)]]
