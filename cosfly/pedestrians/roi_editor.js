@@ -13,8 +13,8 @@ const LABELS = {
     keys: "Click: vertex. Drag: move. Double click on an edge: new vertex. Wheel: zoom; right drag: pan. Keys: arrows move the vertex by a cell (Shift: ten) or pan; N, B next and last vertex; " +
       "Space: vertex at the cross; + - zoom; Esc: choose nothing.",
     occupied: "occupied", margin: "safety margin", unused: "free, not used", free: "free", in_region: "in the region", walkable: "walkable", outside: "outside the map", cell: "cell",
-    region: "cells in the region", walkable_cells: "walkable cells", components: "components", large: "large enough", largest: "largest", used: "cells used", pairs: "pairs of ends", walks: "walks that find ends",
-    of: "of", saved: "saved to", whole: "the whole map: no polygon is closed", few: "a polygon needs three vertices", nowhere: "a hole begins inside a closed polygon",
+    region: "cells in the region", walkable_cells: "walkable cells", components: "components", large: "large enough", largest: "largest", used: "cells used",
+    saved: "saved to", whole: "the whole map: no polygon is closed", few: "a polygon needs three vertices", nowhere: "a hole begins inside a closed polygon",
     size: "the mask has another size", expected: "expected", masked: "mask", same_region: "equal to the region", same_walkable: "equal to walkable cells", here: "only here", there: "only in the mask",
     not_saved: "close the open polygon first", drawing: "click to add vertices, then close the polygon", lost: "the editor's server does not answer: is it still running?", no_picture: "cannot be read as a picture", large_file: "the file is too large",
   },
@@ -24,8 +24,8 @@ const LABELS = {
     mask: "对比掩膜", south: "首行为南", polygon: "多边形", holeOf: "孔洞", open_ring: "未闭合", points: "个点",
     keys: "单击：加顶点；拖动：移动；双击边：插入顶点；滚轮：缩放；右键拖动：平移。按键：方向键移动顶点一格（Shift：十格）或平移；N、B 下一个/上一个顶点；空格：在十字处加顶点；+ - 缩放；Esc：取消选择。",
     occupied: "占用", margin: "安全边距", unused: "空闲但不用", free: "空闲", in_region: "区域内", walkable: "可行走", outside: "地图之外", cell: "栅格",
-    region: "区域内栅格", walkable_cells: "可行走栅格", components: "连通块", large: "足够大", largest: "最大", used: "使用的栅格", pairs: "端点对", walks: "能找到端点的路径",
-    of: "/", saved: "已保存到", whole: "整张地图：没有闭合的多边形", few: "多边形至少需要三个顶点", nowhere: "孔洞须从已闭合的多边形内开始",
+    region: "区域内栅格", walkable_cells: "可行走栅格", components: "连通块", large: "足够大", largest: "最大", used: "使用的栅格",
+    saved: "已保存到", whole: "整张地图：没有闭合的多边形", few: "多边形至少需要三个顶点", nowhere: "孔洞须从已闭合的多边形内开始",
     size: "掩膜尺寸不同", expected: "应为", masked: "掩膜", same_region: "与区域相同", same_walkable: "与可行走栅格相同", here: "仅此处", there: "仅掩膜",
     not_saved: "请先闭合多边形", drawing: "单击添加顶点，然后闭合多边形", lost: "编辑器服务没有应答：它还在运行吗？", no_picture: "无法作为图片读取", large_file: "文件太大",
   },
@@ -257,7 +257,7 @@ function update() {
   const figures = state.answer.figures, number = (value) => value.toLocaleString("en");
   const rows = figures ? [
     ["region", figures.region === null ? "–" : number(figures.region)], ["walkable_cells", number(figures.walkable)], ["components", `${number(figures.components)} (${number(figures.large)} ${say("large")})`],
-    ["largest", number(figures.largest)], ["used", number(figures.used)], ["pairs", number(figures.pairs)], ["walks", `${figures.walks.toFixed(1)} ${say("of")} ${figures.of_walks}`],
+    ["largest", number(figures.largest)], ["used", number(figures.used)],
   ] : [];
   show("figures", ...rows.map(([name, value]) => make("tr", {}, make("td", {}, say(name)), make("td", { class: "n", id: `figure-${name}` }, value))));
   document.body.dataset.rings = drawn;

@@ -21,8 +21,6 @@ from typing import Any
 import cv2
 import numpy as np
 import shapely
-from scipy.ndimage import find_objects
-from scipy.signal import fftconvolve
 from shapely.geometry.base import BaseGeometry
 
 from cosfly.errors import CosflyError, EnvironmentMissing, InputError, StorageError
@@ -56,31 +54,9 @@ FROM_ABOVE_PX = 2400
 # --- figures ----------------------------------------------------------------------------------------------------------
 
 
-def endpoint_pairs(ground: WalkableGround, cfg: PedestriansConfig) -> tuple[int, float]:
-    """Count the pairs of ends that a walk may have: of one part, and as far apart as the settings want.
-
-    Returns:
-        pairs, each once; the share of cells where walks begin that have another end.
-    """
-    low, high = cfg.min_distance_m / cfg.resolution_m, cfg.max_distance_m / cfg.resolution_m
-    offsets = np.arange(-int(high), int(high) + 1)
-    squared = offsets[:, None] ** 2 + offsets**2
-    ring = ((squared >= low**2) & (squared <= high**2)).astype(np.float64)
-    num_pairs, num_starts = 0, 0
-    parts = np.where(ground.may_end, ground.parts, 0)
-    for number, box in enumerate(find_objects(parts), start=1):
-        if box is None or np.hypot(*(side.stop - side.start for side in box)) < low:
-            continue
-        ends = parts[box] == number
-        goals = np.rint(fftconvolve(ends.astype(np.float64), ring, mode="same"))[ends]
-        num_pairs += int(goals.sum()) // 2
-        num_starts += int(np.count_nonzero(goals))
-    return num_pairs, num_starts / max(1, int(np.count_nonzero(parts)))
-
-
-def figures(ground: WalkableGround, cfg: PedestriansConfig) -> dict[str, Any]:
-    """Give what the page tells of a ground: cells, components, pairs of ends, walks that find ends."""
-    counts, (num_pairs, share) = ground.counts, endpoint_pairs(ground, cfg)
+def figures(ground: WalkableGround) -> dict[str, Any]:
+    """Return what the page shows of a ground: cells and components."""
+    counts = ground.counts
     return {
         "region": counts["cells_in_roi"],
         "walkable": counts["cells_walkable"],
@@ -88,9 +64,6 @@ def figures(ground: WalkableGround, cfg: PedestriansConfig) -> dict[str, Any]:
         "components": counts["components"],
         "large": counts["components_used"],
         "largest": counts["component_sizes_used"][0],
-        "pairs": num_pairs,
-        "walks": cfg.num_paths * (1.0 - (1.0 - share) ** (1 + cfg.num_retries)),
-        "of_walks": cfg.num_paths,
     }
 
 
@@ -223,7 +196,7 @@ class Editor:
         if ground.is_in_roi is not None:
             picture[ground.is_in_roi] = IN_REGION
         picture[ground.walkable] = WALKABLE
-        return {"cells": _encoded(picture), "figures": figures(ground, self.cfg)}
+        return {"cells": _encoded(picture), "figures": figures(ground)}
 
     def save(self, data: bytes) -> dict[str, Any]:
         """Write the region, unless somebody else has written the file meanwhile."""
