@@ -79,26 +79,15 @@ def leaderboard(
         list[str], Argument(metavar="[NAME=]DIR...", help="Folders of `cosfly fly`; those of one name are one student.")
     ],
     out: options.Out,
-    open_loop: Annotated[
-        list[str] | None,
-        Option(metavar="NAME=SHARE|DIR", help="Its share of right decisions, or a folder of `distill evaluate`."),
-    ] = None,
     rounds: Annotated[
         bool, Option("--rounds", help="They are rounds of one student, in order: the gain of each.")
     ] = False,
 ) -> None:
-    """Students side by side: figures with intervals, curves, flights, and what open-loop accuracy foretells."""
+    """Students side by side: figures with intervals, and frames of their best and worst flights."""
     from cosfly.closed_loop import leaderboard as board
 
     named = [
         (text.partition("=")[0], Path(text.partition("=")[2])) if "=" in text else ("", Path(text)) for text in folders
     ]
-    told = {}
-    for text in open_loop or []:
-        name, _, value = text.partition("=")
-        is_share = value.replace(".", "", 1).isdecimal()
-        if is_share and float(value) > 1:
-            raise typer.BadParameter(f"{value}: a share is at most 1", param_hint="--open-loop")
-        told[name] = float(value) if is_share else board.open_loop_of(Path(value))
-    cfg = board.LeaderboardConfig(rounds=rounds, open_loop=told)
+    cfg = board.LeaderboardConfig(rounds=rounds)
     typer.echo(board.run(cfg, named, out, seed=job.cfg.seed, resume=job.resume))
