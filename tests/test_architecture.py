@@ -159,7 +159,6 @@ READING = {
 }
 ALLOWED_TO_READ = {
     ("cosfly.work.ray_engine", "loads"),  # what a worker says, as `multiprocessing` reads it from a pipe
-    ("cosfly.work.folder_lock", "open"),  # a lock, opened to be written
     ("cosfly.work.stage_events", "read_bytes"),  # /proc, whose files have no size
     ("cosfly.products.png", "decompress"),  # of a picture, up to the size that its header gives
     ("cosfly.chat.protocol", "loads"),  # the reply, of a bounded size

@@ -158,8 +158,8 @@ def test_foreign_files_are_not_touched(tmp_path):
 def test_a_folder_in_which_another_process_works_is_refused(tmp_path, held_by_another):
     out = tmp_path / "out"
     _open(out).journal.append({"id": "a", "status": "kept"})
-    with held_by_another(out) as other:
-        with pytest.raises(ResumeError, match=f"another process is at work .* process {other.pid} on .* since 20"):
+    with held_by_another(out):
+        with pytest.raises(ResumeError, match="another process is at work"):
             _open(out)
         assert (out / ".lock").exists()
     assert not _open(out).is_complete  # the other was killed: what it left behind holds nobody up

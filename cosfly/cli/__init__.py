@@ -130,10 +130,7 @@ def main() -> None:
 
 
 def _fail(message: str, status: int) -> None:
-    from cosfly.work.folder_lock import give_up
-
     typer.echo(f"error: {message}", err=True)
-    give_up()
     _end(status)
 
 

@@ -215,7 +215,7 @@ class StageFolder:
             raise StorageError("the output folder is a file", where=out, fix="choose another --out")
         if (out / "manifest.json").exists() and (complete := cls._complete(out, record, resume)):
             return complete
-        lock = hold_folder(out, nothing=("stage.json",))
+        lock = hold_folder(out)
         try:
             refuse_links(out)
             _take_up(out, record, resume, (*BEGUN, *begun))
