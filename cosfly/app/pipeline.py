@@ -24,13 +24,12 @@ import cosfly.planners.stage
 import cosfly.render.stage
 import cosfly.simplify.stage
 import release.package.stage
-from cosfly.app import estimate
 from cosfly.app.settings import RunConfig, manner_of_work
 from cosfly.errors import ConfigError, CosflyError, InputError, ResumeError
 from cosfly.look.gallery import contact_sheet, preview_gif
 from cosfly.products.others import OTHERS_FILE
 from cosfly.reading.documents import read_object
-from cosfly.work.folder_lock import give_up, hold_folder
+from cosfly.work.folder_lock import hold_folder
 from cosfly.work.stage_folder import Manifest, Resume, read_manifest
 from cosfly.work.store import refuse_link, write_bytes, write_json
 from release.package.sources import Source, choose_licence
@@ -106,9 +105,8 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "
     out = cfg.opened(out)
     check_out(out)
     towns = check(cfg)
-    left = _TimeLeft(cfg, out)
     if not towns:
-        return _run_town(cfg, out, _up_to(until, stages(cfg, out, resume=resume)), left)
+        return _run_town(cfg, out, _up_to(until, stages(cfg, out, resume=resume)))
     for name in (*towns, "release"):
         refuse_link(out / name)
     with _run_folder(cfg, out):
@@ -116,11 +114,11 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "
         for number, (name, town) in enumerate(towns.items(), 1):
             log.info("town %d of %d: %s", number, len(towns), name)
             own = _up_to(until, stages(town, out / name, resume=resume)[:-1])  # the release is made of all
-            made = _run_town(town, out / name, own, left)
+            made = _run_town(town, out / name, own)
             results += [replace(one, stage=replace(one.stage, name=f"{name}/{one.stage.name}")) for one in made]
         if until == "release":
             joint = joint_release(cfg, [Source.of_run(out / name) for name in towns], out, resume)
-            results.append(_do(joint, out, "all towns", left))
+            results.append(_do(joint, out, "all towns"))
         _save_summary(results, out)
     return results
 
@@ -131,17 +129,13 @@ def _up_to(name: str, todo: list[Stage]) -> list[Stage]:
 
 @contextlib.contextmanager
 def _run_folder(cfg: RunConfig, out: Path) -> Iterator[None]:
-    """Hold a run folder, and keep `run.yaml` in it, which other settings replace when every stage has taken them."""
-    stood = (out / "run.yaml").exists()
-    with hold_folder(out, nothing=() if stood else ("run.yaml",)):
-        is_new = not (out / "run.yaml").exists()
-        if is_new:
+    """Hold a run folder with its `run.yaml`, which other settings replace when every stage has taken them, or at once
+    where no map is finished yet."""
+    with hold_folder(out):
+        is_new = not any(any(out.glob(maps)) for maps in ("maps/manifest.json", "*/maps/manifest.json"))
+        if is_new or not (out / "run.yaml").exists():
             _save_run(cfg, out)
-        try:
-            yield
-        except BaseException:
-            give_up(out)  # so that a run that was refused before anything was done leaves nothing of its own
-            raise
+        yield
         if not is_new:
             _save_run(cfg, out)
 
@@ -199,35 +193,12 @@ def check_with_files(cfg: RunConfig) -> None:
         raise problems[0]
 
 
-class _TimeLeft:
-    """How long a run will still take, in words, by the figures of runs before it."""
-
-    def __init__(self, cfg: RunConfig, out: Path) -> None:
-        self._cfg, self._out, self._rates = cfg, out, estimate.rates_near(out)
-        self._begun: set[str] = set()  # in this call: run.yaml has the settings of before until all stages are done
-
-    def told(self, place: str, folder: Path) -> str:
-        """Say what a stage will take, and all that is not done: `[5/8] render: about 1 min; with all that follows about
-        3 min`."""
-        try:
-            rows = estimate.estimate(self._cfg, self._out, self._rates)
-        except CosflyError as error:  # the stage itself will say so, and what to do
-            log.debug("no estimate: %s", error)
-            return f"[{place}] {folder.name}"
-        name = folder.relative_to(self._out).as_posix()
-        rows = [row for row in rows if row.name not in self._begun]
-        self._begun.add(name)
-        own = [row for row in rows if row.name == name]
-        own_time, all_time = estimate.time_left(own), estimate.time_left(rows)
-        return f"[{place}] {folder.name}: about {own_time}; with all that follows about {all_time}"
-
-
-def _run_town(cfg: RunConfig, out: Path, todo: list[Stage], left: _TimeLeft) -> list[StageResult]:
+def _run_town(cfg: RunConfig, out: Path, todo: list[Stage]) -> list[StageResult]:
     """Do the stages of one town."""
     for stage in todo:
         refuse_link(out / stage.name)
     with _run_folder(cfg, out):
-        results = [_do(stage, out, f"{number}/{len(todo)}", left) for number, stage in enumerate(todo, 1)]
+        results = [_do(stage, out, f"{number}/{len(todo)}") for number, stage in enumerate(todo, 1)]
         tree = out / "render"
         has_frames = (tree / "manifest.json").exists()
         if has_frames and not (_is_summed_up(results, out) and (out / "preview.gif").exists()):
@@ -237,12 +208,12 @@ def _run_town(cfg: RunConfig, out: Path, todo: list[Stage], left: _TimeLeft) -> 
     return results
 
 
-def _do(stage: Stage, out: Path, place: str, left: _TimeLeft) -> StageResult:
+def _do(stage: Stage, out: Path, place: str) -> StageResult:
     """Do a stage that is not complete; one that is refuses other settings, or goes on where more is to be done."""
     folder = out / stage.name
     before = read_manifest(folder) if (folder / "manifest.json").exists() else None
     if before is None:
-        log.info("%s", left.told(place, folder))
+        log.info("[%s] %s", place, stage.name)
     stage.work()
     after = read_manifest(folder)
     if before == after:

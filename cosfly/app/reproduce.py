@@ -22,20 +22,18 @@ from pydantic import BaseModel, Field
 import cosfly
 import cosfly.pedestrians.stage
 from cosfly.app import bench as benchmark
-from cosfly.app.failure_case import failure_case
 from cosfly.app.runs import look
 from cosfly.app.settings import RunConfig, manner_of_work
 from cosfly.errors import InputError
 from cosfly.look.frame_views import small_jpeg
 from cosfly.look.gallery import four_panels
 from cosfly.look.page import page, run_name
-from cosfly.planners import benchmark as plan_benchmark
 from cosfly.planners import compare
 from cosfly.products.boxes import read_boxes
 from cosfly.products.captions import FIELDS, read_captions
 from cosfly.products.segments import FOLLOW
 from cosfly.reading.arrays import read_picture
-from cosfly.reading.documents import FileFormat, read_model, read_object
+from cosfly.reading.documents import FileFormat, read_object
 from cosfly.reading.files import read_bytes
 from cosfly.studies import beam, depth, weather, zoom
 from cosfly.work.config import build, read_yaml
@@ -53,23 +51,14 @@ log = logging.getLogger(__name__)
 FORMAT = FileFormat("cosfly.reproduction", "1.0")
 STAGES = ("maps", "simplify", "pedestrians", "plan")  # of a run without which nothing can be told
 PLANNERS = ("track_astar", "muco", "foresight")  # the first is held against the others, as in the paper
-BESIDE = ("bench.json", "benchmark.json")  # of `cosfly bench` and `cosfly plan benchmark`
 LENSES_DEG = (120, 110, 90, 70, 60, 45, 30)  # tab:zoom_conversion
 ZOOM = {"fovs_deg": (110, 90, 60, 30), "every": 12, "modalities": ("rgb", "depth", "instance")}
 WIDTH_PX = 1500  # of pictures on the page
 STYLE = """
 .pair { display: flex; flex-wrap: wrap; gap: 12px 34px; align-items: flex-start; }
 .pair img { flex: 1 1 420px; min-width: 0; max-width: min(100%, 860px); border-radius: 4px; }
-.panel h2 { margin-top: 2px; } [id="muco_visibility"] img, [id$="failure"] img { flex-basis: 100%; max-width: 100%; }
+.panel h2 { margin-top: 2px; } [id="muco_visibility"] img { flex-basis: 100%; max-width: 100%; }
 """
-# Of `cosfly plan benchmark`, by the first words of its tables: their labels, and a figure of each.
-OF_BENCHMARK: dict[str, tuple[str, str]] = {
-    "Four axes": ("tab:appendix_h_four_axis_scores, fig:appendix_h_alg3d_measured", "axes_radar.png"),
-    "TA* + Smooth less": ("tab:appendix_h_tastar_muco_delta, fig:appendix_h_tastar_muco_deltas", "deltas.png"),
-    "Weighted score": ("tab:appendix_h_extended_ranking, fig:appendix_h_four_axis_bar", "axes_bars.png"),
-    "Feasibility": ("tab:appendix_h_extended_feasibility, fig:appendix_h_alg3d_projections", "axes_pairs.png"),
-    "Groups": ("tab:appendix_h_group_summary, fig:appendix_h_measured_trajectory_grid", "flights_3d.png"),
-}
 # Of `cosfly release stats` the tables that name one of the paper; the others are told of plans here.
 OF_RELEASE = ("release", "decisions", "confusion", "repairs", "text_lengths", "fovs", "weather")
 
@@ -112,13 +101,11 @@ def read_paper() -> Paper:
     return build(Paper, read_yaml(path), path)
 
 
-def run(
-    cfg: RunConfig, folder: Path, out: Path, *, walks: int = 20, beside: Sequence[Path] = (), resume: Resume
-) -> Path:
+def run(cfg: RunConfig, folder: Path, out: Path, *, walks: int = 20, resume: Resume) -> Path:
     """Reads a run folder, writes `reproduction.html` and `reproduction.json`, and what it measures; gives the page.
 
     Args:
-        walks: how many planners are measured on. beside: folders of `cosfly bench` and `cosfly plan benchmark`.
+        walks: how many planners are measured on.
     Raises:
         InputError: it is no run folder, one of several towns, or one that has no flights yet.
     """
@@ -128,12 +115,9 @@ def run(
         raise InputError(
             "the run has not come to its flights", where=folder, got=f"no {', no '.join(missing)}", fix=fix
         )
-    for one in beside:
-        if not any((one / name).is_file() for name in BESIDE):
-            raise InputError("nothing to set beside", where=one, expected=" or ".join(BESIDE))
     printed = read_paper()
     made = measure(cfg, folder, out, walks, done, {**manner_of_work(cfg), "resume": resume})
-    places = Places([*beside, folder, out], made)
+    places = Places([folder, out], made)
     made |= work(cfg, folder, places, done)
     parts, left_out = [settings(cfg, printed)], dict(printed.left_out)
     for label, table in printed.tables.items():
@@ -141,11 +125,6 @@ def run(
             parts.append(part(label, table, places, folder))
         except MissingFile as absent:
             left_out[f"{label}, {table.also}".strip(", ")] = f"needs {absent}, to which this run has not come"
-    try:
-        parts += benchmarked(places)
-    except MissingFile:
-        labels = ", ".join(labels for labels, _ in OF_BENCHMARK.values())
-        left_out[labels] = "of all 14 planners: `cosfly plan benchmark MAP PATHS --out DIR`, then --beside DIR"
     if "release" in done:
         tables = read_object(out / "release/stats.json", what="statistics")["tables"]
         parts += [Part(**one) for one in tables if one["key"] in OF_RELEASE]
@@ -301,21 +280,6 @@ def settings(cfg: RunConfig, printed: Paper) -> Part:
     return Part(key="settings", title="Settings", head=head, rows=rows, paper=labels, note=note)
 
 
-def benchmarked(places: Places) -> list[Part]:
-    """Give the tables of `cosfly plan benchmark`, in which the paper's figures stand, and what it drew."""
-    file, parts = places.file("benchmark.json"), list[Part]()
-    for table in plan_benchmark.text_tables(plan_benchmark.read_benchmark(file)):
-        labels, picture = next(row for words, row in OF_BENCHMARK.items() if table.title.startswith(words))
-        drawn = _jpeg(file.with_name(picture)) if picture and file.with_name(picture).is_file() else None
-        note, rows = (
-            f"Of all planners, from {file.parent.name}/benchmark.json.",
-            [list[Cell](row) for row in table.rows],
-        )
-        told = {"title": table.title, "head": ["planner or figure", *table.columns[1:]], "rows": rows, "paper": labels}
-        parts.append(Part(key=f"benchmark_{len(parts)}", **told, note=note, source="measured anew", picture=drawn))
-    return parts
-
-
 # --- what is measured anew --------------------------------------------------------------------------------------------
 
 
@@ -346,7 +310,7 @@ def measure(
     weather.run(cfg.render, boxes, traces, out / "weather", seed=cfg.seed)
     lenses = build(zoom.ZoomStudyConfig, cfg.render.model_dump() | ZOOM, "zoom")
     zoom.run(lenses, boxes, simplified, traces, out / "zoom", **how)
-    return {"sample": frame, "failure": failure_case(run, out / "failure.png")}
+    return {"sample": frame}
 
 
 def work(cfg: RunConfig, run: Path, places: Places, done: Sequence[str]) -> dict[str, Any]:
@@ -365,16 +329,12 @@ def work(cfg: RunConfig, run: Path, places: Places, done: Sequence[str]) -> dict
     if "render" in manifests:
         events = read_events(run / "render")
         workers = max((event.workers or 1 for event in events if event.event == "began"), default=1)
-        rows = [benchmark.row_of(events, manifests["render"], workers, counts_frames=True)]
-        if any((root / "bench.json").is_file() for root in places.roots):
-            rows = read_model(places.file("bench.json"), benchmark.Bench, benchmark.FORMAT).rows
-        first = rows[0].per_s or None  # nothing where its events count no frames
+        row = benchmark.row_of(events, manifests["render"], workers, counts_frames=True)
         found["rendering"] = {
-            f"{one.workers} workers": [
-                one.seconds, one.attempted, one.successful, one.per_s, first and one.per_s / first, one.cores_used,
-                one.peak_memory_mib, one.restarts, one.failed, one.gpu_percent, one.gpu_gib,
+            f"{row.workers} workers": [
+                row.seconds, row.attempted, row.successful, row.per_s, 1.0 if row.per_s else None, row.cores_used,
+                row.peak_memory_mib, row.restarts, row.failed, row.gpu_percent, row.gpu_gib,
             ]
-            for one in rows
         }  # fmt: skip
     captions = read_captions(run / "caption/captions.jsonl") if {"caption", "render"} <= {*done} else iter(())
     if kept := [one for one in captions if one.en and one.zh and one.status == "accepted"]:

@@ -61,7 +61,7 @@ def _tell_estimate(cfg: RunConfig, out: Path) -> None:
     from cosfly.app import estimate
     from cosfly.work.console import answer_console
 
-    rows, told = estimate.estimate(cfg, out, estimate.rates_near(out)), []
+    rows, told = estimate.estimate(cfg, out), []
     for row in rows:
         time = "done" if row.is_done else "unknown" if row.seconds is None else duration(row.seconds)
         tokens = (
@@ -186,13 +186,12 @@ def reproduce(
     config: Annotated[Path, Argument(metavar="[RUN]", help="A run folder; of several towns, that of one.")] = Path(),
     out: Annotated[Path | None, Option(show_default="RUN/reproduce", help="Folder for the page.")] = None,
     walks: Annotated[int, Option(min=1, help="Walks on the run's map that planners are measured on.")] = 20,
-    beside: Annotated[list[Path] | None, Option(help="Folder of `cosfly bench`, of `plan benchmark`.")] = None,
 ) -> None:
     """The paper's tables and figures from one run, beside the paper's own, on one page. Run it again to continue."""
     from cosfly.app import reproduce as reproduction
 
     out = out or config / "reproduce"
-    typer.echo(reproduction.run(job.cfg, config, out, walks=walks, beside=beside or (), resume=job.resume))
+    typer.echo(reproduction.run(job.cfg, config, out, walks=walks, resume=job.resume))
 
 
 config_app = typer.Typer(no_args_is_help=True, help="Look at configurations.")
