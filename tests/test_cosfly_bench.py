@@ -30,8 +30,6 @@ EVENTS = [
         disk_free_mib=1.0,
         gpu_percent=40.0,
         gpu_mib=2048.0,
-        worker_gpu_percent={0: 30.0},
-        worker_gpu_mib={0: 500.0, 1: 700.0},
     ),
     event(10, "item_done", worker=0, item="a", status="kept", seconds=8.0, steps=40),
     event(12, "worker_died", worker=1, pid=2, item="b", seconds=9.0, steps=30),
@@ -51,10 +49,6 @@ def test_figures_of_a_run():
     assert (row.restarts, row.failed) == (1, 0)
     assert (row.peak_memory_mib, row.cores_used) == (220.0, 1.5)
     assert (row.gpu_percent, row.gpu_gib) == (45.0, 2.0)
-    assert (row.worker_gpu_percent, row.worker_gpu_mib) == (15.0, 700.0)  # worker 1 did nothing when it was looked at
-    hidden = [one.model_copy(update={"worker_gpu_percent": None, "worker_gpu_mib": None}) for one in EVENTS]
-    row = row_of(hidden, MANIFEST, 2, counts_frames=True)
-    assert (row.gpu_gib, row.worker_gpu_percent, row.worker_gpu_mib) == (2.0, None, None)
     without = [one.model_copy(update={"gpu_percent": None, "gpu_mib": None}) for one in EVENTS]
     assert row_of(without, MANIFEST, 2, counts_frames=True).gpu_percent is None
     items = row_of(EVENTS, MANIFEST, 2, counts_frames=False)
@@ -70,9 +64,9 @@ def test_tables_are_those_of_the_paper():
     assert [dict(zip(head, row, strict=True))["speed-up"] for row in rows] == ["1.00x", "2.00x"]
     assert "| 2 | 10.0 | 200 | 200 | 20.00 | 2.00x |" in markdown(bench)
     assert "NVIDIA" not in markdown(bench)
-    seen = bench.rows[1].model_copy(update={"gpu_percent": 58.6, "gpu_gib": 10.6, "worker_gpu_mib": 5300.0})
+    seen = bench.rows[1].model_copy(update={"gpu_percent": 58.6, "gpu_gib": 10.6})
     bench.rows[1] = seen
-    assert "| 2 | 58.6 | 10.6 | hidden | 5300.0 |" in markdown(bench)
+    assert "| 2 | 58.6 | 10.6 |" in markdown(bench)
 
 
 def test_what_lost_workers_had_done_is_counted_and_left_out(tmp_path):

@@ -43,8 +43,6 @@ class BenchRun(BaseModel):
     peak_memory_mib: float
     gpu_percent: float | None = None  # the mean of the probes, and the most memory; None on a machine without
     gpu_gib: float | None = None
-    worker_gpu_percent: float | None = None  # the mean of the probes, and the most memory, of one worker; None where
-    worker_gpu_mib: float | None = None  # the driver does not tell whose process is whose, as in a container
     restarts: int
     failed: int
 
@@ -121,9 +119,6 @@ def row_of(events: list[Event], manifest: Manifest, workers: int, *, counts_fram
     lost = [event for event in events if event.event in LOSSES]
     probes = [event for event in events if event.event == "probe"]
     loads = [probe.gpu_percent for probe in probes if probe.gpu_percent is not None]
-    held_mib = [mib for probe in probes for mib in (probe.worker_gpu_mib or {}).values()]
-    # The driver has no sample of a process that did nothing.
-    shares = [(probe.worker_gpu_percent or {}).get(k, 0.0) for probe in probes for k in probe.worker_gpu_mib or {}]
     size = (lambda event: event.steps or 0) if counts_frames else (lambda event: 1)
     return BenchRun(
         workers=workers,
@@ -134,8 +129,6 @@ def row_of(events: list[Event], manifest: Manifest, workers: int, *, counts_fram
         peak_memory_mib=max((sum((probe.rss_mib or {}).values()) for probe in probes), default=0.0),
         gpu_percent=round(float(np.mean(loads)), 1) if loads else None,
         gpu_gib=round(max(probe.gpu_mib or 0.0 for probe in probes) / 1024.0, 2) if loads else None,
-        worker_gpu_percent=round(float(np.mean(shares)), 1) if any(shares) else None,
-        worker_gpu_mib=max(held_mib, default=None),
         restarts=sum(event.event == "restarted" for event in events),
         failed=manifest.counts.failed.total(),
     )
@@ -173,12 +166,10 @@ def tables(bench: Bench) -> dict[str, list[tuple[str, ...]]]:
     for one in bench.stages:
         lost = ", ".join(f"{LOSSES[mode]} ({count})" for mode, count in one.modes.items()) or "none"
         stages.append((one.stage, str(one.launches), str(one.restarts), f"{one.seconds:.1f}", lost))
-    gpu: list[tuple[str, ...]] = [("workers", "GPU %", "GPU GiB", "% a worker", "MiB a worker")]
-    for row in bench.rows:
-        if row.gpu_percent is not None:
-            figures = row.gpu_percent, row.gpu_gib, row.worker_gpu_percent, row.worker_gpu_mib
-            gpu.append((str(row.workers), *("hidden" if one is None else f"{one:.1f}" for one in figures)))
-    found = {f"{bench.stage} on {bench.cores} cores": scaling} | ({"its NVIDIA devices": gpu} if gpu[1:] else {})
+    found = {f"{bench.stage} on {bench.cores} cores": scaling}
+    if any(row.gpu_percent is not None for row in bench.rows):
+        used = [(str(row.workers), str(row.gpu_percent), str(row.gpu_gib)) for row in bench.rows]
+        found["its NVIDIA devices"] = [("workers", "GPU %", "GPU GiB"), *used]
     return found | {"stages of the run": stages}
 
 

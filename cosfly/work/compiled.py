@@ -4,9 +4,9 @@ Numba keeps a compiled function until its own file changes, with everything it c
 `kernels.py` alone, a planner would go on with the old kernels. Here every version of the compiled sources, taken
 together, has a cache folder of its own: $XDG_CACHE_HOME/cosfly/<digest>. NUMBA_CACHE_DIR, if set, is left alone.
 
-Compiling costs seconds at first use. Two habits keep it down: a constant among the arguments of a compiled function is a
-type of its own to numba, which compiles the function once more, so it is passed as `int64(0)`; and whole arrays are set
-by `fill` or a loop, because numba's `array[:] = ...` brings the formatting of its error message along.
+Compiling costs seconds at first use. Two habits keep it down: a constant among the arguments of a compiled function is
+a type of its own to numba, which compiles the function once more, so it is passed as `int64(0)`; and whole arrays are
+set by `fill` or a loop, because numba's `array[:] = ...` brings the formatting of its error message along.
 """
 
 from __future__ import annotations

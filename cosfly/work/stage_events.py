@@ -18,7 +18,6 @@ from cosfly.work.journal import Journal
 EVENTS = "events.jsonl"
 PROBES_OF_ONE_PACE = 500  # after so many the pace is halved: a week of work makes a few thousand lines
 MEBIBYTE = 2**20
-GPU_SAMPLE_S = 2.0  # of the driver's samples of what each process computes, the last so many seconds
 Loss = Literal["heartbeat_lost", "timed_out", "worker_died"]
 LOSSES: dict[str, str] = {  # events of a worker that is of no use any more
     "heartbeat_lost": "its worker stood still",
@@ -54,8 +53,8 @@ class Event(BaseModel):
     the name of the machine where it works, of a cluster's.
 
     Of a probe: rss_mib by worker (the most since the probe before), cores in use by all workers, free disk space, mean
-    load and memory in use of all NVIDIA devices of the machine where it has some, their part by worker where the driver
-    tells whose it is, and how far the stage is: `done` of `total`, of steps, as frames, or of items.
+    load and memory in use of all NVIDIA devices of the machine where it has some, and how far the stage is: `done` of
+    `total`, of steps, as frames, or of items.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -76,8 +75,6 @@ class Event(BaseModel):
     disk_free_mib: float | None = None
     gpu_percent: float | None = None
     gpu_mib: float | None = None
-    worker_gpu_percent: dict[int, float] | None = None
-    worker_gpu_mib: dict[int, float] | None = None
     done: int | None = None
     total: int | None = None
     unit: Literal["steps", "items"] | None = None
@@ -90,15 +87,14 @@ class Event(BaseModel):
 
 
 class Vitals(NamedTuple):
-    """What the system of its machine says of a worker process. pid: None on another machine."""
+    """What the system of its machine says of a worker process."""
 
     cpu_s: float
     rss_mib: float
-    pid: int | None = None
 
     @classmethod
     def of(cls, pid: int) -> Vitals:
-        return cls(cpu_seconds(pid), rss_mib(pid), pid)
+        return cls(cpu_seconds(pid), rss_mib(pid))
 
 
 class EventLog:
@@ -117,7 +113,7 @@ class EventLog:
 
     def probe(self, workers: Mapping[int, Vitals]) -> None:
         """Look at memory and time of the workers (by place) and at the disk; not every look is written."""
-        for worker, (cpu_s, mib, _) in workers.items():
+        for worker, (cpu_s, mib) in workers.items():
             self._peaks_mib[worker] = max(self._peaks_mib.get(worker, 0.0), mib)
             before_s = self._cpu_s.get(worker, 0.0)
             self._used_s += cpu_s - before_s if cpu_s >= before_s else cpu_s  # of one that replaces another
@@ -128,8 +124,7 @@ class EventLog:
         elapsed_s = time.monotonic() - self._probed_s
         cores = round(self._used_s / elapsed_s, 2) if elapsed_s else 0.0
         free = shutil.disk_usage(self._folder).free / MEBIBYTE
-        pids = {worker: seen.pid for worker, seen in workers.items() if seen.pid is not None}
-        far = (self._how_far()._asdict() if self._how_far else {}) | gpu_use(pids)
+        far = (self._how_far()._asdict() if self._how_far else {}) | gpu_use()
         self.tell("probe", rss_mib=self._peaks_mib, cores_used=cores, disk_free_mib=round(free, 1), **far)
         self._peaks_mib, self._used_s, self._probed_s = {}, 0.0, time.monotonic()
         if self._num_probes == self._pace * PROBES_OF_ONE_PACE:
@@ -177,19 +172,12 @@ def cpu_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK") if fields else 0.0  # utime, stime: proc(5)
 
 
-def gpu_use(pids: Mapping[int, int]) -> dict[str, Any]:
-    """Give what the driver says of the machine's NVIDIA devices: `gpu_percent`, their mean load, `gpu_mib`, their
-    memory in use together, and both by worker (place -> process id); nothing where there is none.
-
-    The driver knows processes by the ids of the host, or tells of none, so a container with ids of its own hides which
-    worker uses what: its `worker_gpu_mib` and `worker_gpu_percent` are then empty, the figures of the devices are not.
-    """
+def gpu_use() -> dict[str, float]:
+    """Return what the driver reports of the machine's NVIDIA devices: `gpu_percent`, their mean load, and `gpu_mib`,
+    their memory in use together; nothing where there is none."""
     nvml, loads, used_mib = _nvml(), list[float](), 0.0
     if nvml is None:
         return {}
-    places = {pid: place for place, pid in pids.items()}
-    mib, percent = dict[int, float](), dict[int, float]()
-    since_us = int(1e6 * (time.time() - GPU_SAMPLE_S))
     for index in range(_asked(nvml.nvmlDeviceGetCount) or 0):
         if (device := _asked(nvml.nvmlDeviceGetHandleByIndex, index)) is None:
             continue
@@ -197,20 +185,7 @@ def gpu_use(pids: Mapping[int, int]) -> dict[str, Any]:
             loads.append(rates.gpu)
         if memory := _asked(nvml.nvmlDeviceGetMemoryInfo, device):
             used_mib += memory.used / MEBIBYTE
-        held = dict[int, int | None]()  # a process that draws and computes is in both lists, with all it holds
-        for lister in (nvml.nvmlDeviceGetGraphicsRunningProcesses, nvml.nvmlDeviceGetComputeRunningProcesses):
-            held |= {one.pid: one.usedGpuMemory for one in _asked(lister, device) or ()}
-        for pid, used in held.items():
-            if used is not None and (place := places.get(pid)) is not None:
-                mib[place] = round(mib.get(place, 0.0) + used / MEBIBYTE, 1)
-        samples = _asked(nvml.nvmlDeviceGetProcessUtilization, device, since_us) or ()
-        for pid, load in {one.pid: one.smUtil for one in sorted(samples, key=lambda one: one.timeStamp)}.items():
-            if (place := places.get(pid)) is not None:
-                percent[place] = percent.get(place, 0.0) + load
-    if not loads:
-        return {}
-    of_devices = {"gpu_percent": round(sum(loads) / len(loads), 1), "gpu_mib": round(used_mib, 1)}
-    return of_devices | {"worker_gpu_percent": percent, "worker_gpu_mib": mib}
+    return {"gpu_percent": round(sum(loads) / len(loads), 1), "gpu_mib": round(used_mib, 1)} if loads else {}
 
 
 @lru_cache(maxsize=1)

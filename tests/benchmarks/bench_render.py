@@ -301,8 +301,7 @@ def workers_table(folder: Path, counts: list[int], num_points: int) -> list[list
             render_stage.run(cfg, folder / FILES[0], simplified, folder / FILES[1], Path(out), workers=count)
             row = row_of(read_events(Path(out)), read_manifest(Path(out)), count, counts_frames=True)
         speed_up = row.per_s / rows[0][3] if rows else 1.0
-        held = "hidden" if row.gpu_gib and row.worker_gpu_mib is None else row.worker_gpu_mib
-        gpu = [row.gpu_percent, row.gpu_gib, held, row.worker_gpu_percent]
+        gpu = [row.gpu_percent, row.gpu_gib]
         use = [row.cores_used, row.peak_memory_mib / count, *("-" if one is None else one for one in gpu)]
         rows.append([count, row.seconds, row.successful, row.per_s, speed_up, *use, *PAPER.get(count, ("", "", ""))])
         print(rows[-1], flush=True)
@@ -333,7 +332,7 @@ def main() -> None:
             title = f"The render stage, {2 * NUM_FLIGHTS} flights of two tracks, {renderer.device}"
             renderer.close()
             names = ["workers", "s", "frames", "frames/s", "speed-up", "cores", "MiB a worker", "GPU %", "GPU GiB"]
-            names += ["GPU MiB a worker", "GPU % a worker", "paper: frames/s", "GPU %", "GPU GiB"]
+            names += ["paper: frames/s", "GPU %", "GPU GiB"]
             scenes.print_table(title, names, workers_table(folder, counts, given.frames or 94))
         return
     given.workers = given.workers or [2]
