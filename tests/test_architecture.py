@@ -163,7 +163,6 @@ ALLOWED_TO_READ = {
     ("cosfly.products.png", "decompress"),  # of a picture, up to the size that its header gives
     ("cosfly.chat.protocol", "loads"),  # the reply, of a bounded size
     ("cosfly.closed_loop.policy", "loads"),  # the answer of a process that it started, of a bounded size
-    ("cosfly.chat.wire", "decompress"),  # of a reply, up to that size
     ("distill.student.random_student", "loads"),  # what the tokenizer's own library gives
     ("distill.student.checkpoint", "load_file"),  # tensors, whose checksums were compared
     ("cosfly.unreal.guard", "loads"),  # lines of the process that started it

@@ -2,8 +2,7 @@
 
 One folder keeps the answers of one asker, in one journal a flight: `answers/<flight>.jsonl`. One process writes it. An
 answer is handed to the system as it arrives, so a killed process loses none; a thread waits for the disk, once for all
-answers that arrived meanwhile. In memory are only flights that are being worked on. A flight that is done ends with a
-line of totals, so that a later start reads that line instead of a week of answers.
+answers that arrived meanwhile. In memory are only flights that are being worked on.
 """
 
 from __future__ import annotations
@@ -13,13 +12,14 @@ import logging
 import re
 import time
 from collections import Counter
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 from weakref import WeakValueDictionary
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.chat.budget import Budget
 from cosfly.chat.contract import MOST_TOKENS, CountName, Engine, NoAnswer, Reply, Request
@@ -32,7 +32,6 @@ from cosfly.work.store import dump_json, sha256_bytes
 log = logging.getLogger(__name__)
 
 MOST_OPEN_FILES = 64
-TOTALS = "totals"  # the key of a line of totals; an answer has none of this name
 _PLAIN_NAME = re.compile(r"\w[\w.+-]*")
 
 
@@ -71,14 +70,6 @@ class Answer(BaseModel):
         return Reply(self.text, usage, self.structured, self.finish_reason, is_kept=True)
 
 
-class Totals(BaseModel):
-    """The last line of a flight that is done: its answers and their tokens."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    totals: dict[str, Count]
-
-
 def answer_key(model: str, request: Request) -> str:
     """Hash image bytes, prompt, model and sampling: what an answer depends on."""
     texts = [
@@ -91,19 +82,17 @@ def answer_key(model: str, request: Request) -> str:
     return sha256_bytes(dump_json([texts, request.digests, sampling, request.schema]).encode())
 
 
-def read_line(record: dict) -> Answer | Totals:
-    """Read a line of a journal of answers; one that cannot be used is a ValidationError."""
-    return (Totals if TOTALS in record else Answer).model_validate(record)
+def read_answers(journal: Journal) -> Iterator[Answer]:
+    """Yield the answers of a journal; InputError where a line cannot be used."""
+    return journal.read_as(Answer.model_validate)
 
 
 @dataclass
 class _Flight:
-    """One flight's journal, its answers by key, and what it says of their number and tokens."""
+    """One flight's journal and its answers by key."""
 
     journal: Journal
     answers: dict[str, Answer]
-    totals: Counter[str]
-    is_closed: bool  # its last line is one of totals
 
 
 class AnswerBook:
@@ -114,7 +103,8 @@ class AnswerBook:
         self.folder = folder
         self.totals: Counter[str] = Counter()  # answers, prompt_tokens, completion_tokens: of all runs into this folder
         for path in sorted(folder.glob("*.jsonl")):
-            self.totals.update(_last_totals(path) or _read(path).totals)
+            for answer in read_answers(Journal(path)):
+                self._count(answer)
         self._flights: dict[str, _Flight] = {}
         self._waiting: list[tuple[Journal, asyncio.Future]] = []  # for the disk
         self._disk = ThreadPoolExecutor(1, "journal")
@@ -136,9 +126,8 @@ class AnswerBook:
         """
         opened = self._open(flight)
         opened.journal.append(answer.model_dump(mode="json"), sync=False)
-        opened.answers[answer.key], opened.is_closed = answer, False
-        for totals in (opened.totals, self.totals):
-            _count(totals, answer)
+        opened.answers[answer.key] = answer
+        self._count(answer)
         on_disk = asyncio.get_running_loop().create_future()
         self._waiting.append((opened.journal, on_disk))
         if self._syncing is None or self._syncing.done():
@@ -146,19 +135,21 @@ class AnswerBook:
         await on_disk
 
     def forget(self, flight: str) -> None:
-        """Drop a flight that was worked on from memory; its journal stays, with its totals at the end."""
-        opened = self._flights.pop(flight, None)
-        if opened is not None:
-            if not opened.is_closed:
-                opened.journal.append({TOTALS: dict(opened.totals)}, sync=False)
+        """Drop a flight that was worked on from memory; its journal stays."""
+        if (opened := self._flights.pop(flight, None)) is not None:
             opened.journal.close()
 
     def _open(self, flight: str) -> _Flight:
         if flight not in self._flights:
-            self._flights[flight] = found = _read(self.folder / journal_name(flight))
-            if found.journal.num_damaged:
-                log.warning("%s: %d damaged lines are left out", found.journal.path, found.journal.num_damaged)
+            journal = Journal(self.folder / journal_name(flight))
+            self._flights[flight] = _Flight(journal, {answer.key: answer for answer in read_answers(journal)})
+            if journal.num_damaged:
+                log.warning("%s: %d damaged lines are left out", journal.path, journal.num_damaged)
         return self._flights[flight]
+
+    def _count(self, answer: Answer) -> None:
+        self.totals["answers"] += 1
+        self.totals.update(answer.usage)
 
     async def _sync(self) -> None:
         loop = asyncio.get_running_loop()
@@ -184,39 +175,10 @@ class AnswerBook:
     def __enter__(self) -> AnswerBook:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+    def __exit__(self, *_: object) -> None:
         self._disk.shutdown(wait=True)
-        for flight, opened in list(self._flights.items()):
-            if kind is None:
-                self.forget(flight)
-            else:  # perhaps a full disk: the lines that are there tell the totals, too
-                opened.journal.close()
-
-
-def _last_totals(path: Path) -> dict[str, int] | None:
-    """Give the totals that a journal ends with; None where it does not, or with some that cannot be."""
-    try:
-        last = read_line(Journal(path).last() or {})
-    except ValidationError:
-        return None
-    return last.totals if isinstance(last, Totals) else None
-
-
-def _read(path: Path) -> _Flight:
-    found = _Flight(Journal(path), {}, Counter(), is_closed=True)
-    for line in found.journal.read_as(read_line):
-        found.is_closed = isinstance(line, Totals)
-        if isinstance(line, Totals):
-            found.totals = Counter(line.totals)
-        else:
-            found.answers[line.key] = line
-            _count(found.totals, line)
-    return found
-
-
-def _count(totals: Counter[str], answer: Answer) -> None:
-    totals["answers"] += 1
-    totals.update(answer.usage)
+        for flight in list(self._flights):
+            self.forget(flight)
 
 
 def _sync_all(journals: set[Journal]) -> None:

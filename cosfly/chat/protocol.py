@@ -14,6 +14,7 @@ from cosfly.work.store import dump_json
 
 _IMAGE_MARK = re.compile(rb'"\\u0000(\d+)"')
 THOUGHT_FIELDS = ("reasoning_content", "reasoning", "thinking", "reasoning_details")  # of a message, beside its content
+TEXT_PARTS = (None, "text", "output_text")
 ERROR_INSTEAD = "an error in place of an answer"  # with status 200
 ENDED = (
     "error",
@@ -125,21 +126,14 @@ def _name(value: Any) -> str | None:
 
 
 def final_text(message: dict[str, Any]) -> str | None:
-    """Give what a message says in the end, "" where it holds thoughts alone, None where it holds nothing.
-
-    That is its text, the arguments of the one function that it calls (a schema is served so by some), or why it
-    refuses.
-    """
+    """Return what a message says in the end: its text, or why it refuses; "" where it holds thoughts alone, None where
+    it holds nothing."""
     text = _joined(message.get("content"))
     if text:
         return text
-    calls = [call.get("function") for call in _objects(message.get("tool_calls"))] or [message.get("function_call")]
-    if len(calls) == 1 and isinstance(calls[0], dict) and (arguments := _joined(calls[0].get("arguments"))):
-        return arguments
     if isinstance(message.get("refusal"), str):
         return message["refusal"]
-    is_thought = any(message.get(name) for name in THOUGHT_FIELDS)
-    return "" if is_thought else text
+    return "" if any(message.get(name) for name in THOUGHT_FIELDS) else text
 
 
 def thoughts_of(completion: Any) -> int:
@@ -150,24 +144,11 @@ def thoughts_of(completion: Any) -> int:
 
 
 def _joined(content: Any) -> str | None:
-    """Give the text of a content: a text, a list of parts, or an object that should have been a text."""
+    """Return the text of a content, which is a text or a list of parts."""
     if isinstance(content, list):
-        parts = (part.get("text") if isinstance(part, dict) else part for part in content if _is_said(part))
+        parts = (part.get("text") for part in content if isinstance(part, dict) and part.get("type") in TEXT_PARTS)
         return "".join(part for part in parts if isinstance(part, str))
-    if isinstance(content, dict):
-        try:
-            return content["text"] if isinstance(content.get("text"), str) else dump_json(content)
-        except ValueError:  # it holds 1e999
-            return None
     return content if isinstance(content, str) else None
-
-
-def _is_said(part: Any) -> bool:
-    return not isinstance(part, dict) or part.get("type") in (None, "text", "output_text")
-
-
-def _objects(value: Any) -> list[dict[str, Any]]:
-    return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
 def _usage(value: Any) -> Usage | None:
@@ -189,4 +170,4 @@ def read_models(response: Response) -> list[dict[str, Any]] | None:
     listed = value.get("data") if isinstance(value, dict) else None
     if not isinstance(listed, list):
         return None
-    return [entry for entry in _objects(listed) if _name(entry.get("id"))]
+    return [entry for entry in listed if isinstance(entry, dict) and _name(entry.get("id"))]

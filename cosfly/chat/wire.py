@@ -8,20 +8,15 @@ import functools
 import math
 import re
 import ssl
-import time
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from email.utils import parsedate_to_datetime
 
 import httpx
 
 from cosfly.errors import TeacherError
 
 KEY_VARIABLE = "COSFLY_API_KEY"
-# All that we can unpack within a limit. `identity` alone would do, but some proxies pack whatever a client says.
-HEADERS = {"Content-Type": "application/json", "Accept-Encoding": "gzip"}
-MOST_DATE = 64  # characters of a Retry-After
+HEADERS = {"Content-Type": "application/json", "Accept-Encoding": "identity"}
 
 
 def check_url(url: str) -> None:
@@ -58,9 +53,9 @@ def base_url(url: str) -> str:
 
 @dataclass(frozen=True)
 class Response:
-    """What a server answered. body: unpacked; of one that is longer than the limit its beginning (`is_cut`).
+    """What a server answered. body: of one that is longer than the limit its beginning (`is_cut`).
 
-    retry_after_s: how long it asks to wait; None where it does not say, or says what nobody can wait for.
+    retry_after_s: how long it asks to wait; None where it does not say so in seconds.
     """
 
     status: int
@@ -80,7 +75,7 @@ class Connections:
         """
         Args:
             key: sent with each request; "": none.
-            timeout_s: of one exchange. most_bytes: of one answer, unpacked.
+            timeout_s: of one exchange. most_bytes: of one answer.
         """
         if not (key.isascii() and key.isprintable()):  # an error of httpx would quote it
             raise TeacherError("the key holds what no header can, perhaps the end of a line", where=KEY_VARIABLE)
@@ -99,7 +94,7 @@ class Connections:
 
         Raises:
             TimeoutError: it was not all there in time, from the first byte sent to the last one read, however steadily
-            it dripped. httpx.RequestError: no connection, or it broke; or what came is not packed as it says.
+            it dripped. httpx.RequestError: no connection, or it broke; or what came is compressed.
         """
         method = "GET" if content is None else "POST"
         with self._connection() as connection, _url_errors():
@@ -107,13 +102,16 @@ class Connections:
                 asyncio.timeout(self._timeout_s),
                 connection.stream(method, url, content=content, headers=HEADERS) as response,
             ):
-                body = _Body(response.headers.get("content-encoding", ""), self._most_bytes)
-                async for packed in response.aiter_raw():
-                    body.add(packed)
-                    if body.is_cut:  # the rest stays unread, and the connection is closed
+                encoding, body = response.headers.get("content-encoding", "identity"), bytearray()
+                if encoding.strip().lower() not in ("", "identity"):
+                    raise httpx.DecodingError(f"compressed with {encoding[:40]!r}, which was not asked for")
+                async for piece in response.aiter_raw():
+                    body += piece
+                    if len(body) > self._most_bytes:  # the rest stays unread, and the connection is closed
                         break
-                wait_s = retry_after_s(response.headers.get("retry-after", ""), time.time())
-                return Response(response.status_code, body.whole(), body.is_cut, wait_s)
+                is_cut = len(body) > self._most_bytes
+                wait_s = retry_after_s(response.headers.get("retry-after", ""))
+                return Response(response.status_code, bytes(body[: self._most_bytes]), is_cut, wait_s)
 
     @contextlib.contextmanager
     def _connection(self) -> Iterator[httpx.AsyncClient]:
@@ -152,48 +150,10 @@ def _tls() -> ssl.SSLContext:
         raise TeacherError("the certificates cannot be read", where=where, got=str(error)) from None
 
 
-class _Body:
-    """A body as it arrives, unpacked up to a limit."""
-
-    def __init__(self, encoding: str, most_bytes: int) -> None:
-        encoding = encoding.strip().lower()
-        if encoding not in ("", "identity", "gzip", "x-gzip"):
-            raise httpx.DecodingError(f"packed with {encoding[:40]!r}, which was not asked for")
-        self._unzip = zlib.decompressobj(zlib.MAX_WBITS | 16) if encoding.endswith("gzip") else None
-        self._read, self._most = bytearray(), most_bytes
-        self.is_cut = False
-
-    def add(self, packed: bytes) -> None:
-        """Add what has arrived; of a bomb no more is unpacked than fits."""
-        room = self._most - len(self._read)
-        if self._unzip is not None and self._unzip.eof:  # zlib would keep all of it
-            raise httpx.DecodingError("more than the gzip data that it claims to be")
-        try:
-            found = packed if self._unzip is None else self._unzip.decompress(packed, room + 1)
-        except zlib.error as error:
-            raise httpx.DecodingError(str(error)) from None
-        self.is_cut = len(found) > room
-        self._read += found[:room]
-
-    def whole(self) -> bytes:
-        if self._unzip is not None and not (self._unzip.eof or self.is_cut):
-            raise httpx.DecodingError("packed as gzip, and not complete")
-        return bytes(self._read)
-
-
-def retry_after_s(header: str, now_s: float) -> float | None:
-    """Read Retry-After, seconds or a date; None where it is neither, or no time to come.
-
-    Args:
-        now_s: seconds since 1970.
-    """
-    if len(header) > MOST_DATE:
-        return None
+def retry_after_s(header: str) -> float | None:
+    """Read the seconds of a Retry-After; None where it holds none."""
     try:
         wait_s = float(header)
     except ValueError:
-        try:
-            wait_s = max(0.0, parsedate_to_datetime(header).timestamp() - now_s)
-        except (ValueError, TypeError, IndexError, OverflowError):
-            return None
+        return None
     return wait_s if 0.0 <= wait_s < math.inf else None

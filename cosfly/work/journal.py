@@ -17,8 +17,6 @@ from cosfly.reading.documents import parse_json
 from cosfly.reading.files import disk_errors, open_file, read_lines
 from cosfly.work.store import dump_json, sha256_bytes, storage_errors
 
-TAIL = 65_536  # bytes at the end in which `last` looks
-
 T = TypeVar("T")
 
 
@@ -82,13 +80,6 @@ class Journal:
                     fix = "run the same command again: what stood in it is done again"
                     raise InputError("a line was damaged meanwhile", where=f"{self.path}: byte {line_byte}", fix=fix)
                 yield record
-
-    def last(self) -> dict | None:
-        """Give the last record without a look at the others; None where it is damaged, very long, or there is none."""
-        with open_file(self.path, what="journal") as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
-            tail = file.read()
-        return _record_of(tail[tail.rfind(b"\n", 0, -1) + 1 :])
 
     def append(self, record: dict, *, sync: bool = True) -> int:
         """Add a record and, unless told otherwise, wait until it is on the disk; gives the byte where it begins."""

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel
 
-from cosfly.chat.answers import Answer, read_line
+from cosfly.chat.answers import read_answers
 from cosfly.errors import InputError
 from cosfly.products.actions import TOKENS
 from cosfly.products.captions import FIELDS, Coc, Language, SentenceState, read_captions
@@ -55,8 +55,7 @@ def speed_of(predictions_path: Path, predictions: Sequence[Prediction]) -> Speed
     seconds, num_new = _last_start(folder)
     tokens = [prediction.num_tokens for prediction in predictions if prediction.num_tokens]
     journals = sorted((folder / "answers").glob("*.jsonl"))
-    lines = (line for path in journals for line in Journal(path).read_as(read_line))
-    latencies = np.array([line.latency_s for line in lines if isinstance(line, Answer)])
+    latencies = np.array([answer.latency_s for path in journals for answer in read_answers(Journal(path))])
     return Speed(
         seconds=seconds,
         samples_per_s=num_new / seconds if seconds and num_new else None,
