@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from caption.run.progress import duration
 from cosfly.app.settings import RunConfig
 from cosfly.app.settings_guide import Setting, changed
 from cosfly.errors import CosflyError, InputError
 from cosfly.products.review import undecided
 from cosfly.work.config import load
 from cosfly.work.folder_lock import is_held
-from cosfly.work.stage_events import HowFar, progress_of, read_events
 from cosfly.work.stage_folder import Failed, StageFolder, Tally, read_manifest
 
 STAGES = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")  # of a run, in order
@@ -36,7 +34,6 @@ class StageLook:
         name: of a town's stage: `town/stage`. folder: where it stands.
         state: whether it has ended, has begun, or has not.
         tally: what became of its items; of one that has begun, of those that are done.
-        far, left_s: of one that works now, how far it is and how long it will still take; None where nobody knows.
     """
 
     name: str
@@ -44,8 +41,6 @@ class StageLook:
     state: Literal["complete", "begun", "to do"]
     tally: Tally | None = None
     seconds: float | None = None
-    far: HowFar | None = None
-    left_s: float | None = None
 
     @property
     def stage(self) -> str:
@@ -56,14 +51,6 @@ class StageLook:
     def size_bytes(self) -> int:
         """What it takes on the disk: looks at each of its files."""
         return _size(self.folder)
-
-    def items_in_words(self) -> str:
-        """Say what became of its items; of one at work how far it is: `120 of 428 frames, about 3 min left`."""
-        if self.far is None:
-            return "" if self.tally is None else str(self.tally)
-        what = "frames" if self.far.unit == "steps" else "items"
-        left = "" if self.left_s is None else f", about {duration(self.left_s)} left"
-        return f"{self.far.done:,} of {self.far.total:,} {what}{left}"
 
 
 @dataclass(frozen=True)
@@ -114,9 +101,7 @@ def look(run: Path) -> RunLook:
     folders = [(f"{town}/{name}", run / town / name) for town in cfg.towns for name in STAGES[:-1]]
     folders = [*folders, ("release", run / "release")] if cfg.towns else [(name, run / name) for name in STAGES]
     found = [run / name for name in TO_LOOK_AT if (run / name).exists()]
-    is_at_work = is_held(run)
-    stages = [_stage(name, folder, is_at_work) for name, folder in folders]
-    return RunLook(run, cfg, is_at_work, stages, changed(cfg), found)
+    return RunLook(run, cfg, is_held(run), [_stage(*one) for one in folders], changed(cfg), found)
 
 
 def find(root: Path, *, depth: int = 2) -> Iterator[Path]:
@@ -135,7 +120,7 @@ def find(root: Path, *, depth: int = 2) -> Iterator[Path]:
                 yield from find(path, depth=depth - 1)
 
 
-def _stage(name: str, folder: Path, is_at_work: bool) -> StageLook:
+def _stage(name: str, folder: Path) -> StageLook:
     if (folder / "manifest.json").exists():
         manifest = read_manifest(folder)
         return StageLook(name, folder, "complete", manifest.counts, manifest.seconds)
@@ -151,8 +136,7 @@ def _stage(name: str, folder: Path, is_at_work: bool) -> StageLook:
             tally.dropped[record.reason] += 1
         else:
             tally.kept += 1
-    far = progress_of(read_events(folder)) if is_at_work else None
-    return StageLook(name, folder, "begun", tally, None, *(far or ()))
+    return StageLook(name, folder, "begun", tally)
 
 
 def _size(folder: Path) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,19 +53,6 @@ def changed(cfg: BaseModel, section: str | None = None) -> list[Setting]:
     """Explain those settings that are not the defaults; raises as `explain`."""
     defaults = {setting.name: setting.value for setting in explain(type(cfg)())}
     return [one for one in explain(cfg, section) if not one.is_group and one.value != defaults.get(one.name)]
-
-
-def with_words(settings: Sequence[Setting], words: Sequence[str]) -> list[Setting]:
-    """Give those settings, no groups, whose name, value, kind or meaning have all the words."""
-
-    def has_all(one: Setting) -> bool:
-        text = " ".join((one.name, dump_json(one.value), one.kind, one.meaning)).casefold()
-        return all(word.casefold() in text for word in words)
-
-    if found := [one for one in settings if not one.is_group and has_all(one)]:
-        return found
-    fix = "try fewer words, or the start of one"
-    raise ConfigError("no setting has these words", where="--find", got=" and ".join(words), fix=fix)
 
 
 def _explain(

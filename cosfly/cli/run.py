@@ -114,7 +114,15 @@ def show(run: Annotated[Path, Argument(metavar="RUN", help="A run folder.")]) ->
     rows = []
     for one in seen.stages:
         seconds = "" if one.seconds is None else f"{one.seconds:.1f}"
-        rows.append((one.name, one.state, one.items_in_words(), seconds, size(num) if (num := one.size_bytes) else ""))
+        rows.append(
+            (
+                one.name,
+                one.state,
+                "" if one.tally is None else str(one.tally),
+                seconds,
+                size(num) if (num := one.size_bytes) else "",
+            )
+        )
     head = ("stage", "state", "items", "seconds", "on disk")
     options.tell_table(answer_console, head, rows, left=("state", "items"), **PLAIN)
     lines = ["settings that are not the defaults:"] if seen.differing else []
@@ -219,12 +227,8 @@ def config_show(
     overrides: Annotated[list[str] | None, Option("--set", "-s", metavar="A.B=C", help="Override one setting.")] = None,
     describe: Annotated[bool, Option("--describe", help="Say what each setting means and may be.")] = False,
     changed: Annotated[bool, Option("--changed", help="Only what is not the default.")] = False,
-    find: Annotated[
-        list[str] | None,
-        Option(metavar="WORD", help="Only settings with this word in name, value or meaning; repeat it."),
-    ] = None,
 ) -> None:
-    """Print the resolved configuration: every setting with its value, and with --describe or --find what it means."""
+    """Print the resolved configuration: every setting with its value, and with --describe what it means."""
     import yaml
 
     from cosfly.app import settings_guide
@@ -234,9 +238,7 @@ def config_show(
         config, section = None, config
     cfg = options.resolve(None if config is None else Path(config), overrides)
     explained = (settings_guide.changed if changed else settings_guide.explain)(cfg, section)
-    if find:
-        explained = settings_guide.with_words(explained, find)
-    if describe or find:
+    if describe:
         for line in settings_guide.as_lines(explained):
             answer_console.print(line)
     else:

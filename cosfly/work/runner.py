@@ -20,7 +20,7 @@ from cosfly.work.console import progress_bar
 from cosfly.work.items import Item, Outcome, Work, advance, attempt, counted_steps
 from cosfly.work.journal import Journal
 from cosfly.work.ray_engine import ALL_ROOM, Cluster
-from cosfly.work.stage_events import EventLog, HowFar
+from cosfly.work.stage_events import EventLog
 from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Kept, StageFolder, Tally, read_item, write_failures
 from cosfly.work.store import remove_partials
 from cosfly.work.worker_pool import LocalPost, StartPost, Watch, WorkerPool
@@ -157,7 +157,7 @@ def _in_processes(
     if watch.ray is not None:
         cluster = Cluster(watch.ray, stage.path)
         start_post, workers = cluster.start_post, cluster.room if workers == ALL_ROOM else workers
-    events = EventLog(stage.path, progress.how_far)
+    events = EventLog(stage.path)
     pool = WorkerPool(*start, min(workers, len(items)), watch, events, progress.move, start_post)
     try:
         yield from pool.outcomes(items)
@@ -188,9 +188,6 @@ class _Progress:
         with progress_bar(label, total=self._total, done=self._done) as self._advance:
             yield
 
-    def how_far(self) -> HowFar:
-        return HowFar(self._done, self._total, "steps" if self._in_steps else "items")
-
     def move(self, item: Item, num_steps: int) -> None:
         """Note how many steps of an item are done; fewer than before where it is begun again."""
         if self._in_steps:
@@ -203,5 +200,4 @@ class _Progress:
     def _set(self, item: Item, count: int) -> None:
         gained = count - self._in_hand.get(item.item_id, 0)
         self._in_hand[item.item_id] = count
-        self._done += gained
         self._advance(gained)

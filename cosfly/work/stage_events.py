@@ -6,7 +6,7 @@ import contextlib
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -40,21 +40,12 @@ Kind = Literal[
 ]
 
 
-class HowFar(NamedTuple):
-    """How far a stage is."""
-
-    done: int
-    total: int
-    unit: Literal["steps", "items"]
-
-
 class Event(BaseModel):
     """A line of `events.jsonl`. at_s: seconds since 1970. worker: its place, 0 and up; a restarted one keeps it. node:
     the name of the machine where it works, of a cluster's.
 
     Of a probe: rss_mib by worker (the most since the probe before), cores in use by all workers, free disk space, mean
-    load and memory in use of all NVIDIA devices of the machine where it has some, and how far the stage is: `done` of
-    `total`, of steps, as frames, or of items.
+    load and memory in use of all NVIDIA devices of the machine where it has some.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -75,15 +66,6 @@ class Event(BaseModel):
     disk_free_mib: float | None = None
     gpu_percent: float | None = None
     gpu_mib: float | None = None
-    done: int | None = None
-    total: int | None = None
-    unit: Literal["steps", "items"] | None = None
-
-    @property
-    def how_far(self) -> HowFar | None:
-        if self.done is None or self.total is None or self.unit is None:
-            return None
-        return HowFar(self.done, self.total, self.unit)
 
 
 class Vitals(NamedTuple):
@@ -98,10 +80,10 @@ class Vitals(NamedTuple):
 
 
 class EventLog:
-    """Adds to a stage's `events.jsonl`. A kill costs the line in hand. how_far: asked at each probe that is written."""
+    """Adds to a stage's `events.jsonl`. A kill costs the line in hand."""
 
-    def __init__(self, folder: Path, how_far: Callable[[], HowFar] | None = None) -> None:
-        self._journal, self._folder, self._how_far = Journal(folder / EVENTS), folder, how_far
+    def __init__(self, folder: Path) -> None:
+        self._journal, self._folder = Journal(folder / EVENTS), folder
         self._num_probes, self._pace, self._probed_s = 0, 1, time.monotonic()
         self._peaks_mib: dict[int, float] = {}
         self._cpu_s: dict[int, float] = {}  # by worker, at the probe before
@@ -124,8 +106,7 @@ class EventLog:
         elapsed_s = time.monotonic() - self._probed_s
         cores = round(self._used_s / elapsed_s, 2) if elapsed_s else 0.0
         free = shutil.disk_usage(self._folder).free / MEBIBYTE
-        far = (self._how_far()._asdict() if self._how_far else {}) | gpu_use()
-        self.tell("probe", rss_mib=self._peaks_mib, cores_used=cores, disk_free_mib=round(free, 1), **far)
+        self.tell("probe", rss_mib=self._peaks_mib, cores_used=cores, disk_free_mib=round(free, 1), **gpu_use())
         self._peaks_mib, self._used_s, self._probed_s = {}, 0.0, time.monotonic()
         if self._num_probes == self._pace * PROBES_OF_ONE_PACE:
             self._num_probes, self._pace = 0, 2 * self._pace
@@ -144,17 +125,6 @@ def iterate_events(folder: Path) -> Iterator[Event]:
 def read_events(folder: Path) -> list[Event]:
     """Read all of them."""
     return list(iterate_events(folder))
-
-
-def progress_of(events: Sequence[Event]) -> tuple[HowFar, float | None] | None:
-    """Tell how far a stage at work is, and the seconds that it will still take at this pace; None: nobody knows."""
-    began = max((k for k, event in enumerate(events) if event.event == "began"), default=0)
-    told = [(event.at_s, far) for event in events[began:] if (far := event.how_far)]
-    if not told:
-        return None
-    (first_s, first), (last_s, last) = told[0], told[-1]
-    gained = last.done - first.done
-    return last, (last.total - last.done) * (last_s - first_s) / gained if gained > 0 else None
 
 
 def lost_steps(folder: Path) -> int:
