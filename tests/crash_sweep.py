@@ -197,8 +197,8 @@ def lose_release(_: Place, out: Path) -> None:
 # same folder; a function is what comes before.
 COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
     "maps": ["maps --out {out} {tiny}"],
-    "maps carla": ["maps carla --port {carla} --out {out}"],
-    "maps unrealcv": ["maps unrealcv --port {unrealcv} --out {out}"],
+    "maps carla": ["maps --source carla --set maps.carla.port={carla} --out {out}"],
+    "maps unrealcv": ["maps --source unrealcv --set maps.unrealcv.port={unrealcv} --out {out}"],
     "maps roi-backdrop": ["maps roi-backdrop --map {maps} --out {out}/above.png --bounds -9 -9 9 9 --pixels-per-m 1"],
     "world": ["world 'a small village with a well' --out {out}"],
     "simplify": ["simplify --map {maps} --out {out} {tiny}"],

@@ -58,7 +58,8 @@ def same_boxes(exported: BoxMap, town: BoxMap) -> None:
 def test_a_served_town_comes_back_as_it_is(tmp_path):
     town = invent(SyntheticConfig(), 3)
     with serving(town, tmp_path / "town", protocol="unrealcv") as port:
-        words = ["maps", "unrealcv", "--cvport", str(port), "--out", str(tmp_path / "out"), "--most-default", "0.01"]
+        settings = f"maps.unrealcv={{port: {port}, most_default: 0.01}}"
+        words = ["maps", "--source", "unrealcv", "--set", settings, "--out", str(tmp_path / "out")]
         done = CliRunner().invoke(app, words, catch_exceptions=False)
     assert done.exit_code == 0, done.output
     assert "using ip-port socket" not in done.output

@@ -37,55 +37,6 @@ def maps(
     job.finish(stage.run(cfg.maps, out, seed=cfg.seed, resume=job.resume, follow_links=cfg.follow_links), out)
 
 
-@maps_app.command("carla")
-@takes("resume")
-def maps_carla(
-    job: Job,
-    out: options.Out,
-    host: Annotated[str | None, Option(help="Where the server is."), Sets("maps.carla.host")] = None,
-    port: Annotated[int | None, Option(help="Its port of calls."), Sets("maps.carla.port")] = None,
-    town: Annotated[str | None, Option(help="Town to load, as Town10HD_Opt."), Sets("maps.carla.town")] = None,
-) -> None:
-    """The town of a running CARLA server as boxes_3d.json, and a table of its categories."""
-    from cosfly.maps import stage
-    from cosfly.maps.carla_export import histogram
-    from cosfly.products.boxes import read_boxes
-    from cosfly.work.console import console
-
-    cfg = job.cfg.maps.model_copy(update={"source": "carla"})
-    product = stage.run(cfg, out, seed=job.cfg.seed, resume=job.resume)
-    head = ("category", "boxes", "share", "Town10HD_Opt in the paper")
-    options.tell_table(console, head, histogram(read_boxes(product)))
-    job.finish(product, out)
-
-
-@maps_app.command("unrealcv")
-@takes("resume")
-def maps_unrealcv(
-    job: Job,
-    out: options.Out,
-    host: Annotated[str | None, Option("--host", "--cvip", help="Where it is."), Sets("maps.unrealcv.host")] = None,
-    port: Annotated[int | None, Option("--port", "--cvport", help="Its port."), Sets("maps.unrealcv.port")] = None,
-    level: Annotated[str | None, Option(help="Level to open."), Sets("maps.unrealcv.level")] = None,
-    most_default: Annotated[
-        float | None,
-        Option(help="Fail where more than this share of sizes is a default."),
-        Sets("maps.unrealcv.most_default"),
-    ] = None,
-) -> None:
-    """The level of a running UnrealCV server as boxes_3d.json, what each box is, a page, and where sizes come from."""
-    from cosfly.maps import stage
-    from cosfly.products.boxes import read_boxes
-    from cosfly.work.console import console
-
-    cfg = job.cfg.maps.model_copy(update={"source": "unrealcv"})
-    product = stage.run(cfg, out, seed=job.cfg.seed, resume=job.resume)
-    counts = read_boxes(product).header.extent_sources
-    rows = [(name, f"{num:,}", f"{num / sum(counts.values()):.2%}") for name, num in counts.items()]
-    options.tell_table(console, ("size from", "boxes", "share"), rows)
-    job.finish(product, out)
-
-
 @maps_app.command("roi-backdrop")
 @takes("seed")
 def maps_roi_backdrop(

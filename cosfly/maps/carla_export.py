@@ -31,11 +31,6 @@ log = logging.getLogger(__name__)
 HUGE_KINDS, SLAB_M = ("Terrain", "Vegetation"), 2.0  # what is lower is ground to stand on
 ROAD_STEP_M, BESIDE_M = 25.0, 60.0  # of points on roads, and how near a box counts as beside one
 SLOPE_M = 1.0  # roads of heights that differ more are no flat ground
-# Boxes of Town10HD_Opt by category (tab:box_categories).
-PAPER_COUNTS = {
-    "Vegetation": 62581, "Poles": 880, "Buildings": 781, "Static": 667, "Other": 287, "Fences": 148,
-    "TrafficSigns": 147, "TrafficLight": 62, "Walls": 34, "Terrain": 23, "RailTrack": 4,
-}  # fmt: skip
 
 
 class CarlaMapConfig(CarlaConfig):
@@ -170,19 +165,3 @@ def _tell(told: CarlaTown, box_map: BoxMap, where: str, tops_m: np.ndarray) -> N
             "%s: %d of %d places on roads have no object within %.0f m: on a large map only tiles near the spectator do"
         )
         log.warning(what, where, num, len(roads_m), BESIDE_M)
-
-
-def histogram(box_map: BoxMap) -> list[tuple[str, str, str, str]]:
-    """Rows of a table: category, boxes, share, and the paper's boxes of Town10HD_Opt."""
-    counts = box_map.counts()
-    names = [*counts, *(name for name in PAPER_COUNTS if name not in counts)]
-    rows = [
-        (
-            name,
-            f"{counts.get(name, 0):,}",
-            f"{counts.get(name, 0) / len(box_map):.2%}",
-            f"{PAPER_COUNTS.get(name, 0):,}",
-        )
-        for name in names
-    ]
-    return [*rows, ("all", f"{len(box_map):,}", "100%", f"{sum(PAPER_COUNTS.values()):,}")]

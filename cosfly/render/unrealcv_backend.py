@@ -153,7 +153,10 @@ class UnrealCvRenderer:
             self._ids[color] = NO_INSTANCE if row is None else ids[row]
             self._kinds[color] = KINDS[kind_of(class_name) or "Other"] if row is None else self._map.kinds[row]
         if not linked:
-            what, fix = "no box of the map is in the level", "export the map from this level: cosfly maps unrealcv"
+            what, fix = (
+                "no box of the map is in the level",
+                "cosfly maps --source unrealcv exports the level",
+            )
             raise InputError(what, where=self._server.where, got=self._map.name, fix=fix)
         if len(linked) < len(self._map) or num_doubtful:
             what = "%s: %d of %d boxes are objects of the level; %d objects have no colour of their own"
