@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import importlib.metadata
 import importlib.util
 import os
@@ -11,11 +10,9 @@ import shutil
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from cosfly.chat.client import ChatClient, EndpointConfig
-from cosfly.chat.refusals import Refusal
-from cosfly.errors import EnvironmentMissing, TeacherError
+from cosfly.errors import EnvironmentMissing
 
 State = Literal["ok", "missing", "optional"]
 
@@ -42,7 +39,7 @@ class Check:
     detail: str
 
 
-def examine(folder: Path, teacher: str | None = None) -> list[Check]:
+def examine(folder: Path) -> list[Check]:
     """Look at everything. `missing` in any check means that the main job cannot run here."""
     memory_gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     return [
@@ -52,7 +49,6 @@ def examine(folder: Path, teacher: str | None = None) -> list[Check]:
         _gl(),
         _gpu(),
         *map(_package, OPTIONAL_PACKAGES),
-        *([] if teacher is None else [_endpoint(teacher)]),
     ]
 
 
@@ -98,22 +94,3 @@ def _package(name: str) -> Check:
         purpose, brings = OPTIONAL_PACKAGES[name]
         return Check(name, "optional", f'not installed; for {purpose}: pip install "{brings}"')
     return Check(name, "ok", importlib.metadata.version(name.replace("_", "-")))
-
-
-def _endpoint(url: str) -> Check:
-    """Ask an OpenAI-compatible server for its models. The key comes from the environment and is not shown."""
-    try:
-        where, found = asyncio.run(_models(url))
-    except TeacherError as error:
-        return Check("endpoint", "missing", str(error))
-    if isinstance(found, Refusal):
-        return Check("endpoint", "missing", f"{where}: no list of models here: {found.said}")
-    return Check("endpoint", "ok", f"{where}: {', '.join(model['id'] for model in found) or 'no models'}")
-
-
-async def _models(url: str) -> tuple[str, list[dict[str, Any]] | Refusal]:
-    client = ChatClient(url, EndpointConfig(timeout_s=10.0))
-    try:
-        return client.where, await client.models()
-    finally:
-        await client.close()

@@ -16,8 +16,6 @@ from cosfly.maps.stage import load_map
 from cosfly.products.traces import read_traces
 from cosfly.products.walks import read_paths, walk_id
 from cosfly.render.weather import dark_flights
-from cosfly.work.config import load
-from cosfly.work.stage_folder import flattened
 
 UNITS = {
     "maps": "map", "simplify": "map", "pedestrians": "walks", "plan": "walks", "render": "frames", "inspect": "frames",
@@ -102,17 +100,6 @@ def _amounts(cfg: RunConfig, out: Path) -> dict[str, int]:
     return {"map": 1, "walks": walks, "frames": sum(frames), "windows": num_windows(cfg, frames)}
 
 
-def other_settings(cfg: RunConfig, out: Path) -> list[str]:
-    """Name the settings of stages that the work in a run folder was made with otherwise, by their dotted paths."""
-    if not (out / "run.yaml").is_file():
-        return []
-    sections = {"seed", "towns", "roi", *STAGES}
-    found, wanted = (
-        flattened(one.model_dump(mode="json", include=sections)) for one in (load(RunConfig, out / "run.yaml"), cfg)
-    )
-    return sorted(name for name in found.keys() | wanted.keys() if found.get(name) != wanted.get(name))
-
-
 def estimate(cfg: RunConfig, out: Path) -> list[StageEstimate]:
     """Estimate each stage of a run, of several towns each town's under its name; a finished stage costs nothing.
 
@@ -132,15 +119,12 @@ def estimate(cfg: RunConfig, out: Path) -> list[StageEstimate]:
 
 def _stages(cfg: RunConfig, out: Path, names: tuple[str, ...]) -> Iterator[StageEstimate]:
     counts = _amounts(cfg, out)
-    changed = {name.partition(".")[0] for name in other_settings(cfg, out)}
-    fresh = 0 if changed - set(names) else min((names.index(name) for name in changed), default=len(names))
-    for place, name in enumerate(names):
-        yield _stage(name, counts[UNITS[name]], cfg, out, place < fresh)
+    for name in names:
+        yield _stage(name, counts[UNITS[name]], cfg, out)
 
 
-def _stage(name: str, count: int, cfg: RunConfig, out: Path, stands: bool = True) -> StageEstimate:
-    """Estimate a stage; `stands`: what is finished of it was made with these settings."""
-    if stands and _is_complete(out / name):
+def _stage(name: str, count: int, cfg: RunConfig, out: Path) -> StageEstimate:
+    if _is_complete(out / name):
         return StageEstimate(name, count, 0.0, 0.0, (0.0, 0.0), True)
     seconds, size_mb = (rate * count * (_mpx(cfg) if name in BY_PIXELS else 1) for rate in RATES[name])
     if name == "caption" and cfg.caption.teacher_kind != "rules":
@@ -171,11 +155,6 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
     lines = [f"figures: {BASIS}", f"in all about {time_left(rows)}; {disk}", *caveats(cfg)]
     if any(row.tokens is None for row in rows):
         lines.append(f"tokens are {UNKNOWN_TOKENS}")
-    if others := other_settings(cfg, out):
-        listed = f"{', '.join(others[:6])}{' ...' if len(others) > 6 else ''}"
-        lines.append(
-            f"{out} was made with other settings ({listed}): its finished stages refuse them; choose another --out"
-        )
     if needed > free_bytes(out):
         lines.append("there is not enough space for it: choose another --out, or fewer walks or pixels")
     return lines

@@ -256,11 +256,10 @@ def _is_section(word: str) -> bool:
 
 @app.command()
 def doctor(
-    teacher: Annotated[str | None, Option(help="URL of an endpoint to ask as well.")] = None,
     out: Annotated[Path, Option(help="Where runs will be written.")] = Path("runs"),
 ) -> None:
-    """What works here: GL, GPU, packages, endpoint, disk. Exit 1 if the main job cannot run."""
+    """What works here: GL, GPU, packages, disk. Exit 1 if the main job cannot run."""
     from cosfly.app import doctor as examination
     from cosfly.work.console import answer_console
 
-    options.tell_checks(examination.examine(out, teacher), answer_console)
+    options.tell_checks(examination.examine(out), answer_console)

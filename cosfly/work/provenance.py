@@ -188,9 +188,12 @@ def _check_finished(path: Path) -> None:
     if path.is_file():
         name = path.absolute().relative_to(folder.absolute()).as_posix()
         digests = {name: digests[name]} if name in digests else {}
-    wrong = [*_changed(folder, digests), *_strangers(folder, digests)]
-    if wrong:
-        raise _not_as_recorded(folder, wrong)
+    if wrong := list(_changed(folder, digests)):
+        more = f" and {len(wrong) - NUM_NAMED} more" if len(wrong) > NUM_NAMED else ""
+        what = "what stands here is not what its stage finished"
+        expected = "the files that its records hold the digests of"
+        fix = "put the files back or make them again; to use a file that you changed, copy it to a folder of its own"
+        raise VerifyError(what, where=folder, got="; ".join(wrong[:NUM_NAMED]) + more, expected=expected, fix=fix)
 
 
 def _changed(folder: Path, digests: Mapping[str, str]) -> Iterator[str]:
@@ -200,26 +203,6 @@ def _changed(folder: Path, digests: Mapping[str, str]) -> Iterator[str]:
             yield f"{path} is missing"
         elif sha256_file(path) != digest:
             yield f"{path} has other bytes"
-
-
-def _strangers(folder: Path, listed: Collection[str]) -> Iterator[str]:
-    """Find the flights in a tree that its manifest does not know."""
-    if not any(name.endswith(f"/{FLIGHT}") for name in listed):
-        return
-    for place, folders, files in os.walk(folder):
-        if FLIGHT in files:
-            folders.clear()  # frames
-            path = Path(place, FLIGHT)
-            if path.relative_to(folder).as_posix() not in listed:
-                yield f"{path} is no flight of this tree"
-        folders[:] = [inner for inner in folders if not inner.startswith(".")]
-
-
-def _not_as_recorded(where: Path, wrong: list[str]) -> VerifyError:
-    more = f" and {len(wrong) - NUM_NAMED} more" if len(wrong) > NUM_NAMED else ""
-    what, expected = "what stands here is not what its stage finished", "the files that its records hold the digests of"
-    fix = "put the files back or make them again; to use a file that you changed, copy it to a folder of its own"
-    return VerifyError(what, where=where, got="; ".join(wrong[:NUM_NAMED]) + more, expected=expected, fix=fix)
 
 
 def _check_belongs(name: str, path: Path, inputs: Mapping[str, Path], found: Mapping[str, StageInput]) -> None:
