@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 
 from cosfly import cli
-from cosfly.app import doctor
 from cosfly.app.settings import RunConfig
-from cosfly.chat.wire import Connections, Response
+from cosfly.chat.client import ChatClient, EndpointConfig
+from cosfly.chat.wire import base_url
 from cosfly.cli.options import Job, resolve
-from cosfly.errors import InputError
+from cosfly.errors import InputError, TeacherError
 from cosfly.work.stage_folder import StageFolder, Tally
 from cosfly.work.store import write_json
 
@@ -158,28 +158,21 @@ def test_failed_items_make_the_command_exit_1_unless_the_settings_accept_them(ca
     assert capfd.readouterr().out.count("product") == 2
 
 
-# --- the doctor -------------------------------------------------------------------------------------------------------
+# --- addresses of servers ---------------------------------------------------------------------------------------------
 
 
-def test_the_doctor_asks_for_the_models_where_captions_do_or_says_what_is_wrong(tmp_path, monkeypatch):
-    for teacher in ("http://me:pw@h/v1", "http://h?key=pw", "http://[::1", "http://127.0.0.1:1"):
-        found = doctor.examine(tmp_path, teacher)[-1]
-        assert (found.state, "pw" in found.detail) == ("missing", False), teacher
-    urls = []
+def test_an_address_that_holds_a_secret_is_refused_without_it():
+    for url in ("http://me:pw@h/v1", "http://h?key=pw", "http://[::1"):
+        with pytest.raises(TeacherError) as caught:
+            ChatClient(url, EndpointConfig())
+        assert "pw" not in str(caught.value), url
 
-    async def exchange(self, url, content=None):
-        urls.append(url)
-        return Response(200, b'{"data": [{"id": "one"}, {"id": "two"}]}')
 
-    monkeypatch.setattr(Connections, "exchange", exchange)
-    asked = {
-        "http://h:8000": "http://h:8000/v1/models",
-        "http://h:8000/v1/chat/completions": "http://h:8000/v1/models",
-        "https://h/v1beta/openai": "https://h/v1beta/openai/models",
-        "https://h/api/v3/": "https://h/api/v3/models",
+def test_every_form_of_an_address_leads_to_one_root():
+    roots = {
+        "http://h:8000": "http://h:8000/v1",
+        "http://h:8000/v1/chat/completions": "http://h:8000/v1",
+        "https://h/v1beta/openai": "https://h/v1beta/openai",
+        "https://h/api/v3/": "https://h/api/v3",
     }
-    for teacher in asked:
-        found = doctor.examine(tmp_path, teacher)[-1]
-        assert found.state == "ok"
-        assert found.detail.endswith(": one, two")
-    assert urls == list(asked.values())
+    assert {url: base_url(url) for url in roots} == roots
