@@ -62,12 +62,11 @@ class StageRow(BaseModel):
 
 
 class Bench(BaseModel):
-    """`bench.json`: one row for each count of workers, and the stages of the run as they were made."""
+    """`bench.json`: one row for each count of workers."""
 
     stage: str
     cores: int
     rows: list[BenchRun]
-    stages: list[StageRow] = []
 
 
 def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterable[int]) -> Bench:
@@ -93,7 +92,6 @@ def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterab
         stage=stage,
         cores=len(os.sched_getaffinity(0)),
         rows=[_measured(cfg, run_folder, out / f"workers_{count}", stage, count) for count in sorted(set(workers))],
-        stages=stage_rows(run_folder, STAGES),
     )
     write_bytes(out / "bench.md", markdown(bench).encode())
     write_model(out / "bench.json", bench, FORMAT)
@@ -149,8 +147,7 @@ def stage_rows(run_folder: Path, names: Iterable[str]) -> list[StageRow]:
 
 
 def tables(bench: Bench) -> dict[str, list[tuple[str, ...]]]:
-    """Give how the stage scales (tab:render_scaling), what that takes of a GPU where there is one, and the stages of
-    the run (tab:watchdog_reliability).
+    """Return how the stage scales (tab:render_scaling), and what that takes of a GPU where there is one.
 
     A table's first row is its head, the first column is a name.
     """
@@ -162,15 +159,11 @@ def tables(bench: Bench) -> dict[str, list[tuple[str, ...]]]:
         rates = f"{row.per_s:.2f}", f"{row.per_s / first:.2f}x", f"{row.cores_used:.2f}", f"{row.peak_memory_mib:.0f}"
         counts = str(row.attempted), str(row.successful)
         scaling.append((str(row.workers), f"{row.seconds:.1f}", *counts, *rates, str(row.restarts), str(row.failed)))
-    stages: list[tuple[str, ...]] = [("stage", "launches", "restarts", "wall s", "lost workers")]
-    for one in bench.stages:
-        lost = ", ".join(f"{LOSSES[mode]} ({count})" for mode, count in one.modes.items()) or "none"
-        stages.append((one.stage, str(one.launches), str(one.restarts), f"{one.seconds:.1f}", lost))
     found = {f"{bench.stage} on {bench.cores} cores": scaling}
     if any(row.gpu_percent is not None for row in bench.rows):
         used = [(str(row.workers), str(row.gpu_percent), str(row.gpu_gib)) for row in bench.rows]
         found["its NVIDIA devices"] = [("workers", "GPU %", "GPU GiB"), *used]
-    return found | {"stages of the run": stages}
+    return found
 
 
 def markdown(bench: Bench) -> str:

@@ -1,4 +1,4 @@
-"""What a run will take: time, disk and tokens by stage, from its settings and the figures of the quickstart."""
+"""What a run will take: time and disk by stage, from its settings and the figures of the quickstart."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ UNITS = {
     "caption": "windows", "release": "frames",
 }  # fmt: skip
 BY_PIXELS = ("render", "inspect", "release")  # what costs as much as its pictures have pixels
-UNKNOWN_TOKENS = "not known before asking: cosfly caption --plan"
 BASIS = "the quickstart on a 2-core machine (docs/first-runs.md)"
 # Seconds and MB of a unit of each stage; of BY_PIXELS of a million pixels. Of `cosfly run quickstart`: seconds of
 # docs/first-runs.md (2 cores, AMD EPYC, idle): 3 walks, 858 frames of 0.9216 Mpx, 804 windows of teacher `rules`.
@@ -37,13 +36,12 @@ DETOUR = 1.14
 
 @dataclass(frozen=True)
 class StageEstimate:
-    """One stage of a run. tokens: in and out, None where nobody knows; is_done: it costs nothing any more."""
+    """One stage of a run. seconds: None where its teacher decides; is_done: it costs nothing any more."""
 
     name: str
     count: int
     seconds: float | None
     bytes: float
-    tokens: tuple[float, float] | None
     is_done: bool
 
     @property
@@ -125,11 +123,11 @@ def _stages(cfg: RunConfig, out: Path, names: tuple[str, ...]) -> Iterator[Stage
 
 def _stage(name: str, count: int, cfg: RunConfig, out: Path) -> StageEstimate:
     if _is_complete(out / name):
-        return StageEstimate(name, count, 0.0, 0.0, (0.0, 0.0), True)
+        return StageEstimate(name, count, 0.0, 0.0, True)
     seconds, size_mb = (rate * count * (_mpx(cfg) if name in BY_PIXELS else 1) for rate in RATES[name])
     if name == "caption" and cfg.caption.teacher_kind != "rules":
-        return StageEstimate(name, count, None, size_mb * 1e6, None, False)
-    return StageEstimate(name, count, seconds, size_mb * 1e6, (0.0, 0.0), False)
+        return StageEstimate(name, count, None, size_mb * 1e6, False)
+    return StageEstimate(name, count, seconds, size_mb * 1e6, False)
 
 
 # --- in words ---------------------------------------------------------------------------------------------------------
@@ -153,8 +151,8 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
     needed = sum(row.bytes for row in rows)
     disk = f"{in_words(needed)} of disk, {in_words(free_bytes(out))} are free"
     lines = [f"figures: {BASIS}", f"in all about {time_left(rows)}; {disk}", *caveats(cfg)]
-    if any(row.tokens is None for row in rows):
-        lines.append(f"tokens are {UNKNOWN_TOKENS}")
+    if any(row.seconds is None for row in rows):
+        lines.append("cosfly caption --plan says what the teacher will take")
     if needed > free_bytes(out):
         lines.append("there is not enough space for it: choose another --out, or fewer walks or pixels")
     return lines

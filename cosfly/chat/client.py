@@ -256,13 +256,23 @@ class ChatClient:
         Raises:
             TeacherError: nobody answers; it refuses the key, does not speak the protocol, or lacks the model.
         """
-        wanted, entries = self.cfg.model, await self.models()
-        if isinstance(entries, Refusal):
+        wanted = self.cfg.model
+        try:
+            response = await self._connections.exchange(f"{self.url}/models")
+        except (TimeoutError, httpx.RequestError) as error:
+            is_late = isinstance(error, TimeoutError | httpx.TimeoutException)
+            why = f"no answer within {self.cfg.timeout_s:g} s" if is_late else f"{type(error).__name__} {error}"
+            fix = "start the server or check its address"
+            raise self.error("cannot reach the teacher", got=self.clean(why), fix=fix) from None
+        if response.status in (401, 403):
+            self.stop_if_fatal(self.refusal(response))
+        entries = None if response.is_cut else read_models(response)
+        if entries is None:
             if wanted:
                 self.model = wanted  # some hosts list no models; the first request will tell
                 return
             what = "no list of models here, so it may not be an OpenAI-compatible endpoint"
-            raise self.error(what, got=entries.said, fix="check the URL, or give --model")
+            raise self.error(what, got=self.refusal(response).said, fix="check the URL, or give --model")
         names = [entry["id"] for entry in entries]
         if wanted in names or (wanted is None and len(names) == 1):
             self.model = wanted or names[0]
@@ -277,24 +287,6 @@ class ChatClient:
             expected=f"one of {listed}",
             fix="give --model",
         )
-
-    async def models(self) -> list[dict[str, Any]] | Refusal:
-        """Ask which models there are; gives what is said in place of a list.
-
-        Raises:
-            TeacherError: nobody answers, or it refuses the key.
-        """
-        try:
-            response = await self._connections.exchange(f"{self.url}/models")
-        except (TimeoutError, httpx.RequestError) as error:
-            is_late = isinstance(error, TimeoutError | httpx.TimeoutException)
-            why = f"no answer within {self.cfg.timeout_s:g} s" if is_late else f"{type(error).__name__} {error}"
-            fix = "start the server or check its address"
-            raise self.error("cannot reach the teacher", got=self.clean(why), fix=fix) from None
-        if response.status in (401, 403):
-            self.stop_if_fatal(self.refusal(response))
-        entries = None if response.is_cut else read_models(response)
-        return self.refusal(response) if entries is None else entries
 
     def read(self, response: Response, *, is_structured: bool) -> Reply | Refusal | str:
         """Give what a response says: a reply, what it refuses (some servers do so with status 200), or a word on what

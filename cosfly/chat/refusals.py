@@ -11,7 +11,7 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
-Kind = Literal["account", "too_long", "num_images", "no_vision", "schema", "parameter", "picture", "content", "unknown"]
+Kind = Literal["account", "too_long", "num_images", "no_vision", "schema", "parameter", "content", "unknown"]
 
 MOST_CHARACTERS = 4000  # of a text that are searched: some servers send the request back
 
@@ -49,7 +49,6 @@ MEANINGS: dict[Kind, Meaning] = {
         "out",
         True,
     ),
-    "picture": Meaning("the server cannot read a picture", "look at the frame", False),
     "content": Meaning("the server's filter refuses the content", "look at the window, or ask another server", False),
     "unknown": Meaning("the server refuses the request", "see to the server", False),
 }
@@ -90,13 +89,6 @@ _PATTERNS: tuple[tuple[Kind, str], ...] = (
         r"|extra inputs are not permitted|not support (the )?parameters?|argument not supported|unknown name"
         r"|not supported (with|by|for|on) this model|unknown (field|parameter)|unexpected keyword"
         r"|property .{0,80}is unsupported",
-    ),
-    (
-        "picture",
-        r"cannot identify image"
-        r"|(failed|unable) to (load|decode|process|open) (the )?image|invalid[_ ]image|unsupported image"
-        r"|could not process image|valid image|image (data|file) .{0,40}(corrupt|truncated|invalid)|image file is "
-        r"truncated|(illegal|invalid) base64",
     ),
     (
         "content",

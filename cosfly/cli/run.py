@@ -29,7 +29,7 @@ def run(
     config: Annotated[Path, Argument(help=CONFIG)],
     out: Annotated[Path | None, Option(show_default="runs/<name>, or that of the run.yaml", help="Run folder.")] = None,
     dry_run: Annotated[
-        bool, Option("--dry-run", help="Say what it would take (time, disk, tokens by stage) and write nothing.")
+        bool, Option("--dry-run", help="Say what it would take (time and disk by stage) and write nothing.")
     ] = False,
     until: Annotated[Until, Option(help="The last stage that is done.")] = "release",
 ) -> None:
@@ -64,18 +64,9 @@ def _tell_estimate(cfg: RunConfig, out: Path) -> None:
     rows, told = estimate.estimate(cfg, out), []
     for row in rows:
         time = "done" if row.is_done else "unknown" if row.seconds is None else duration(row.seconds)
-        tokens = (
-            "unknown"
-            if row.tokens is None
-            else ", ".join(f"{count:,.0f}" for count in row.tokens)
-            if any(row.tokens)
-            else "0"
-        )
-        told.append(
-            (row.name, f"{row.count:,} {estimate.UNITS[row.stage]}", time, estimate.in_words(row.bytes), tokens)
-        )
+        told.append((row.name, f"{row.count:,} {estimate.UNITS[row.stage]}", time, estimate.in_words(row.bytes)))
     title = f"What {out} would take; nothing is written"
-    options.tell_table(answer_console, ("stage", "to do", "time", "disk", "tokens in, out"), told, title=title)
+    options.tell_table(answer_console, ("stage", "to do", "time", "disk"), told, title=title)
     for line in estimate.remarks(cfg, out, rows):
         answer_console.print(line, soft_wrap=True)
 
