@@ -12,7 +12,7 @@ import numpy as np
 
 from cosfly.geometry import rotation_matrices
 from cosfly.planners.benchmark import PAPER, Benchmark, ScenarioRecord
-from cosfly.planners.compare import AXES, FIGURES, color_of, draw_radar
+from cosfly.planners.compare import AXES, FIGURES, color_of
 from cosfly.planners.contract import PLANNERS, title_of
 from cosfly.products.boxes import BoxMap
 from cosfly.products.walks import TARGET_HEIGHT_M
@@ -29,7 +29,7 @@ def draw(found: Benchmark, records: list[ScenarioRecord], box_map: BoxMap) -> di
     """Give the figures, name -> PNG; those of TA*+Smooth against MuCO only where both took part."""
     scores = {p: row.scores for p, row in found.axes.items()}
     primary = {p: row for p, row in scores.items() if p not in PAPER or PAPER[p].axes_mean is not None}
-    pictures = {"axes_radar.png": draw_radar(primary or scores)}  # the paper's seven and ours, where there are any
+    pictures = {"axes_radar.png": _radar(primary or scores)}  # the paper's seven and ours, where there are any
     pictures |= {"axes_bars.png": _bars(found), "axes_pairs.png": _pairs(found)}
     if found.deltas:
         pictures |= {"deltas.png": _deltas(found), "flights_3d.png": _flights(found, records, box_map)}
@@ -50,6 +50,18 @@ def _png(figure: Any) -> bytes:
     file = io.BytesIO()
     figure.savefig(file, format="png", metadata={"Software": None})
     return file.getvalue()
+
+
+def _radar(scores: dict[str, dict[str, float]]) -> bytes:
+    figure = _figure(8.0, 9.0)
+    axes, angles = figure.add_subplot(projection="polar"), np.arange(len(AXES)) * 2.0 * np.pi / len(AXES)
+    for planner, row in scores.items():
+        style = {"edgecolor": _color(planner), "lw": 2.0, "label": f"{title_of(planner)}: mean {row['mean']:.3f}"}
+        axes.fill(angles, [row[name] for name in AXES], facecolor="none", **style)
+    axes.set_xticks(angles, [name.replace("_", " ") for name in AXES])
+    axes.set_ylim(0.0, 1.0)
+    figure.legend(loc="outside lower center", ncols=3)
+    return _png(figure)
 
 
 def _bars(found: Benchmark) -> bytes:

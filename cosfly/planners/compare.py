@@ -19,7 +19,7 @@ from pydantic import BaseModel, Field, field_validator
 
 from cosfly.errors import NoPathError
 from cosfly.look.tables import TextTable
-from cosfly.look.topview import PAPER, add_caption, draw_area, draw_dot, draw_line, draw_text, png_bytes
+from cosfly.look.topview import add_caption, draw_dot, draw_line, draw_text, png_bytes
 from cosfly.planners.contract import ALL_PLANNERS, PLANNERS, PlanConfig, known_planner, title_of
 from cosfly.planners.overview import draw_walks
 from cosfly.planners.stage import check_ids, draw_styles_of, plan_flight, warm_up
@@ -231,7 +231,7 @@ def run(
     watch: Watch = Watch(),
     resume: Resume = "if-same",
 ) -> Path:
-    """Reads a simplified map and `path.json`, writes `compare.json`, each planner's flights and two pictures; gives
+    """Reads a simplified map and `path.json`, writes `compare.json`, each planner's flights and a picture; gives
     the first.
 
     A walk that a planner cannot fly is dropped with that planner's name, one that none can is a failure.
@@ -268,13 +268,8 @@ def run(
         write_traces(outputs[-1], traces, {**header, "planner": name})
     by_id = {walk.path_id: walk for walk in walks}
     flown: list[Walk] = [by_id[walk_id] for walk_id in shared]
-    pictures = {
-        "compare_overlay.png": draw_overlay(box_map, flown, flights),
-        "compare_radar.png": draw_radar(summary["axes"]),
-    }
-    for name, picture in pictures.items():
-        outputs.append(out / name)
-        write_bytes(outputs[-1], picture)
+    outputs.append(out / "compare_overlay.png")
+    write_bytes(outputs[-1], draw_overlay(box_map, flown, flights))
     stage.finish(outputs, finished.tally, timings=timings(shared.values(), cfg.planners))
     return product
 
@@ -327,8 +322,6 @@ PALETTE = (
     (110, 110, 110),
 )  # fmt: skip
 LEGEND_PX = 160  # of one planner
-MOST_FILLED = 4  # planners of a radar; of more one would see the last alone
-FAINT = (215, 215, 215)
 
 
 def color_of(planner: str) -> tuple[int, int, int]:
@@ -357,38 +350,6 @@ def draw_overlay(box_map: BoxMap, walks: list[Walk], flights: dict[str, list[Dro
     caption = add_caption(picture, f"{box_map.name}: {len(walks)} walks (dark); dots are starts")
     _legend(caption, flights, 25)
     return png_bytes(caption)
-
-
-# --- axes -------------------------------------------------------------------------------------------------------------
-
-
-def draw_radar(axes: dict[str, dict[str, float]]) -> bytes:
-    """Draw the four axis scores of each planner, 0 in the middle and 1 at the rim; PNG bytes."""
-    picture = np.full((700 + 30 * len(axes), 900, 3), PAPER, dtype=np.uint8)  # a line of words for each planner
-    names = [name for name in next(iter(axes.values())) if name != "mean"]
-    middle, radius_px = np.array([450.0, 340.0 + 30.0 * len(axes)]), 270.0
-    angles = np.arange(len(names)) * 2.0 * np.pi / len(names) - np.pi / 2.0
-    spokes = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    for share in (0.25, 0.5, 0.75, 1.0):
-        draw_line(picture, middle + radius_px * share * spokes, FAINT, closed=True)
-        draw_text(picture, f"{share:g}", middle[0] + 6, middle[1] - radius_px * share + 14, 0.42, (130, 130, 130))
-    for spoke, name in zip(spokes, names, strict=True):
-        draw_line(picture, np.array([middle, middle + radius_px * spoke]), FAINT)
-        x, y = middle + (radius_px + 22) * spoke
-        align = 0.5 if abs(spoke[0]) < 0.1 else float(spoke[0] < 0)
-        draw_text(picture, name.replace("_", " "), x, y + 5, 0.6, align=align)
-    for planner, scores in axes.items():
-        shape = middle + radius_px * spokes * np.clip([[scores[name]] for name in names], 0.0, 1.0)
-        if len(axes) <= MOST_FILLED:
-            filled = picture.copy()
-            draw_area(filled, shape, color_of(planner))
-            picture[:] = (0.82 * picture + 0.18 * filled).astype(np.uint8)
-        draw_line(picture, shape, color_of(planner), 3, closed=True)
-    for row, (planner, scores) in enumerate(axes.items()):
-        words = ", ".join(f"{name.replace('_', ' ')} {scores[name]:.3f}" for name in names)
-        draw_line(picture, np.array([[40, 30 + 30 * row], [74, 30 + 30 * row]]), color_of(planner), 3)
-        draw_text(picture, f"{title_of(planner)}: mean {scores['mean']:.3f} ({words})", 84, 35 + 30 * row, 0.5)
-    return png_bytes(picture)
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
