@@ -1,4 +1,4 @@
-"""The review queue: who decides, what is refused, what the release makes of it, and the pages."""
+"""The review queue: who decides, what is refused, and what the release makes of it."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ import shutil
 from pathlib import Path
 
 import pytest
-from browser import browser
 from test_cosfly_inspection import CFG, plan_of, write_map
 from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.errors import InputError
-from cosfly.inspection import review
 from cosfly.inspection.stage import run
 from cosfly.products.flights import find_flights
 from cosfly.products.inspection import read_inspection
@@ -102,15 +100,7 @@ def test_the_command_decides_and_says_what_is_open(product):
     done = ask("--accept", first, "--accept", second, "--reject", third, "--by", "Bo", "--reason", "steady")
     assert done.exit_code == 0, done.output
     assert "4 flights in review: 2 accepted, 1 rejected, 1 open" in done.output
-    page = ask()
-    assert page.exit_code == 0
-    assert product.with_name("review.html").is_file()
-    filled = product.with_name("filled.json")
-    about = {**review.FORMAT.header, "inspection": sha256_file(product), "by": "Cy"}
-    filled.write_text(json.dumps(about | {"choices": [{"folder": third, "verdict": "accepted", "reason": "again"}]}))
-    assert "3 accepted" in ask("--decisions", str(filled)).output
-    filled.write_text(json.dumps(about | {"inspection": "0" * 64, "choices": []}))
-    assert isinstance(ask("--decisions", str(filled)).exception, InputError)
+    assert ask().output == done.output
 
 
 def test_a_trajectory_stands_for_its_flights(product):
@@ -134,33 +124,3 @@ def test_a_trajectory_stands_for_its_flights(product):
     assert {f: d.verdict for f, d in read_decisions(product).items()} == dict.fromkeys((clean, perturbed), "rejected")
     with pytest.raises(InputError, match="of a flight or of its trajectory"):
         decide(product, "accepted", trajectory.rpartition("/")[0])
-
-
-@pytest.mark.slow
-def test_what_the_page_saves_is_what_the_command_takes(product):
-    """A person fills it in: one accepted, one rejected with markup in the reason, one without a reason, which stops
-    it."""
-    page_path = review.write_page(product)
-    with browser(product.parent / "profile") as page:
-        page.open(page_path)
-        page.run("document.getElementById('by').value = 'Dee'")
-        page.run(
-            "const parts = [...document.querySelectorAll('.choice')]; parts.slice(0, 3).forEach((p, k) => "
-            "{ p.querySelectorAll('input[type=radio]')[k % 2].click(); p.querySelector('.reason').value = "
-            "['fine', '<b>bad</b>', ''][k]; })"
-        )
-        page.run("document.getElementById('save').click()")
-        assert "without a reason" in page.run("document.getElementById('state').textContent")
-        page.run(
-            "[...document.querySelectorAll('.reason')][2].value = 'fine too'; document.getElementById('save').click()"
-        )
-        text = page.run("document.getElementById('text').value")
-        assert not page.said
-        assert all(address.startswith(("file:", "data:", "blob:")) for address in page.requests)
-    filled = product.with_name("decisions.json")
-    filled.write_text(text)
-    review.take(product, filled)
-    assert [d.verdict for d in read_decisions(product).values()] == ["accepted", "rejected", "accepted"]
-    again = review.page_html(product)
-    assert again.count(" checked") == 3
-    assert "<b>bad" not in again

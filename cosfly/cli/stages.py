@@ -290,23 +290,19 @@ def inspect_review(
     ] = None,
     by: Annotated[str | None, Option(help="Who decides.")] = None,
     reason: Annotated[str | None, Option(help="Why.")] = None,
-    decisions: Annotated[Path | None, Option(help="What review.html saved: take its decisions.")] = None,
 ) -> None:
-    """Decide flights that were left to a person: make review.html, or take decisions into review.jsonl."""
-    from cosfly.inspection import review
-    from cosfly.products.review import Verdict
+    """Decide flights that were left to a person, into review.jsonl; without a decision, list those that are open."""
+    from cosfly.products.review import Choice, add_decisions, summary
 
     product = folder / "inspect.json" if folder.is_dir() else folder
-    chosen: list[tuple[Verdict, str]] = [("accepted", name) for name in accept or []]
-    chosen += [("rejected", name) for name in reject or []]
-    if decisions is not None and chosen:
-        raise typer.BadParameter("a file of decisions, or flights, not both", param_hint="'--decisions'")
-    if chosen and not (by and reason):
-        raise typer.BadParameter("who decides and why must be given", param_hint="'--by', '--reason'")
-    if decisions is not None:
-        review.take(product, decisions)
-    elif chosen:
-        review.decide(product, chosen, by or "", reason or "")
-    else:
-        typer.echo(review.write_page(product))
-    typer.echo(review.summary(product))
+    given = {"accepted": accept or [], "rejected": reject or []}
+    if accept or reject:
+        if not (by and reason):
+            raise typer.BadParameter("who decides and why must be given", param_hint="'--by', '--reason'")
+        choices = [
+            Choice.model_validate({"folder": name, "verdict": verdict, "reason": reason})
+            for verdict, names in given.items()
+            for name in names
+        ]
+        add_decisions(product, choices, by)
+    typer.echo(summary(product))

@@ -13,7 +13,6 @@ from cosfly.look.coverage_page import coverage_html
 from cosfly.look.page import fragment, page
 from cosfly.products.inspection import RESULTS, FlightInspection, Inspection
 from cosfly.products.playback import STATES
-from cosfly.products.review import Decision
 from cosfly.reading.files import read_text
 
 STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))
@@ -71,34 +70,24 @@ def report_html(name: str, inspection: Inspection, views: Mapping[str, FlightVie
     )
 
 
-def cards(
-    flights: list[FlightInspection],
-    views: Mapping[str, FlightView],
-    page_mb: float,
-    decisions: Mapping[str, Decision] | None = None,
-) -> dict[str, Any]:
-    """Give what pages show of flights: a row for each that opens, and how many lack pictures for the page's size.
-
-    Args:
-        decisions: those of flights that a person is to decide on; None where nobody is.
-    """
+def cards(flights: list[FlightInspection], views: Mapping[str, FlightView], page_mb: float) -> dict[str, Any]:
+    """Return what the page shows of flights: a row for each that opens, and how many lack pictures for its size."""
     parts, size, left_out = list[str](), 0, 0
     for flight in flights:
-        card = _card(flight, views.get(flight.folder), decisions)
+        card = _card(flight, views.get(flight.folder))
         if flight.folder in views and size + len(card) > page_mb * MB:
-            card, left_out = _card(flight, None, decisions), left_out + 1
+            card, left_out = _card(flight, None), left_out + 1
         size += len(card)
         parts.append(card)
     return {"style": STYLE, "columns": COLUMNS, "cards": parts, "left_out": left_out, "page_mb": page_mb}
 
 
-def _card(flight: FlightInspection, view: FlightView | None, decisions: Mapping[str, Decision] | None) -> str:
+def _card(flight: FlightInspection, view: FlightView | None) -> str:
     issues = [issue for issue in flight.issues if issue.severity != "note"]
     plots = [] if view is None else [plot for name in PLOTS if (plot := _plot(name, view)) is not None]
     return fragment(
         "cosfly/inspection/card.html", flight=flight, columns=COLUMNS, issues=issues, view=view, plots=plots,
         asked=in_question(flight.issues, int(flight.metrics.get("num_frames") or 0)),
-        is_queue=decisions is not None, decision=(decisions or {}).get(flight.folder),
     )  # fmt: skip
 
 

@@ -36,7 +36,7 @@ Z_FIGHTING_MAX = 1e-3
 # renders have 0
 JUMP_GONE_MAX = 0.02
 THUMBNAIL_PX = 240  # width of the pictures in report.html, px
-# size of report.html, and of review.html, beyond which flights are listed without pictures, map and plots, accepted
+# size of report.html beyond which flights are listed without pictures, map and plots, accepted
 # ones first, MB; a flight takes 0.06
 PAGE_MB = 25.0
 

@@ -81,11 +81,22 @@ def undecided(inspected: Path) -> list[str]:
     return [flight.folder for flight in flights if flight.result == "review" and flight.folder not in decisions]
 
 
+def summary(inspected: Path) -> str:
+    """Return in a line how far the review is, with the names of flights that are open."""
+    queue = [flight.folder for flight in read_inspection(inspected).flights if flight.result == "review"]
+    decisions = read_decisions(inspected)
+    verdicts = [decisions[folder].verdict for folder in queue if folder in decisions]
+    waiting, others = undecided(inspected), len(decisions.keys() - set(queue))
+    counts = f"{verdicts.count('accepted')} accepted, {verdicts.count('rejected')} rejected, {len(waiting)} open"
+    text = f"{len(queue)} flights in review: {counts}" + (f"; {others} others rejected" if others else "")
+    return text + (f" ({', '.join(waiting[:3])}{', ...' if len(waiting) > 3 else ''})" if waiting else "")
+
+
 def how_to_decide(folder: Path) -> str:
     """Say how a person decides the flights that an inspection, in `folder`, left in review."""
     return (
-        f"cosfly inspect review --inspect {folder} makes a page to look at them; with --accept FLIGHT --by NAME "
-        f"--reason TEXT it accepts one"
+        f"look at {folder}/report.html, then cosfly inspect review --inspect {folder} --accept FLIGHT (or --reject) "
+        f"--by NAME --reason TEXT"
     )
 
 
