@@ -9,10 +9,13 @@ from specimens_planning import WORLDS, walk_along
 
 from cosfly.errors import EnvironmentMissing
 from cosfly.planners import benchmark
-from cosfly.planners.benchmark import CRITERIA, PAPER, WEIGHTS, BenchmarkConfig, read_benchmark, read_scenarios
+from cosfly.planners.benchmark import CRITERIA, PAPER, WEIGHTS, BenchmarkConfig, read_benchmark
+from cosfly.planners.compare import FlightsOfWalk
 from cosfly.planners.contract import ALL_PLANNERS
 from cosfly.products.boxes import write_boxes
 from cosfly.products.walks import write_paths
+from cosfly.work.journal import Journal
+from cosfly.work.stage_folder import read_item, result_of
 
 FEW = ("foresight", "track_astar", "muco", "minimum_jerk", "theta_star")
 
@@ -95,10 +98,11 @@ def test_what_is_not_flown_is_counted_and_stays_in_every_table(made):
     assert len([entry for entry in manifest["outputs"] if entry["path"].endswith(".png")]) == 5
 
 
-def test_the_tables_are_those_of_the_raw_records(made):
-    found, records = read_benchmark(made / "benchmark.json"), read_scenarios(made / "scenarios.jsonl")
-    assert [set(r.flights) | set(r.infeasible) for r in records] == [set(FEW)] * 2
-    traces = [record.traces() for record in records]
+def test_the_tables_are_those_of_the_flights(made):
+    found, records = read_benchmark(made / "benchmark.json"), Journal(made / "items.jsonl").read_as(read_item)
+    flown = {record.id: result_of(record, FlightsOfWalk) for record in records}
+    assert [set(one.flights) | set(one.errors) for one in flown.values()] == [set(FEW)] * 2
+    traces = [one.traces(walk_id) for walk_id, one in flown.items()]
     for planner in ("track_astar", "muco", "theta_star"):
         seen = np.mean([flown[planner].visibility.mean() for flown in traces])
         assert found.means[planner]["five_ray_mean"] == pytest.approx(seen, abs=1e-4)

@@ -170,7 +170,7 @@ def plan_benchmark(
     scenarios: Annotated[int, Option(help="Walks, from the first one on.")] = 20,
     planner: Annotated[list[str] | None, Option(show_default="all", help="A planner; repeat it.")] = None,
 ) -> None:
-    """The paper's comparison of 14 planners and ours: tables with intervals, benchmark.json, raw flights, figures."""
+    """The paper's comparison of 14 planners and ours: tables with intervals, benchmark.json, figures."""
     from cosfly.planners import benchmark
     from cosfly.work.config import build
     from cosfly.work.console import console

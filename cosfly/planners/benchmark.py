@@ -15,7 +15,7 @@ import importlib.util
 import logging
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, Field
@@ -27,13 +27,12 @@ from cosfly.planners.compare import AXES, FIGURES, INTERVAL_PERCENT, NUM_RESAMPL
 from cosfly.planners.contract import ALL_PLANNERS, title_of
 from cosfly.planners.stage import check_ids, draw_styles_of
 from cosfly.products.boxes import BoxMap, read_boxes
-from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import read_paths
-from cosfly.reading.documents import FileFormat, model_lines, read_model
+from cosfly.reading.documents import FileFormat, read_model
 from cosfly.work.chance import rng_for
 from cosfly.work.runner import Item, Watch, run_items
 from cosfly.work.stage_folder import Resume, StageFolder, result_of
-from cosfly.work.store import dump_json, write_bytes, write_model
+from cosfly.work.store import write_bytes, write_model
 
 log = logging.getLogger(__name__)
 
@@ -84,37 +83,14 @@ PAPER_SHORTEST_M = 85.73  # to which the paper normalises path efficiency
 PAPER_GROUPS = dict(zip(list(GROUPS)[1:], (0.9364, 0.6205, 0.6083, 0.6075), strict=True))  # visibility
 
 
+Flown = dict[str, compare.FlightsOfWalk]  # by the id of the walk
+
+
 class BenchmarkConfig(CompareConfig):
     """Settings of a benchmark: those of a comparison, and how many scenarios."""
 
     planners: tuple[str, ...] = Field(tuple(ALL_PLANNERS), description="who takes part")
     scenarios: int = Field(20, ge=1, description="walks from the beginning of the file, at most")
-
-
-# --- the raw record ---------------------------------------------------------------------------------------------------
-
-
-class ScenarioRecord(BaseModel):
-    """A line of `scenarios.jsonl`: what became of one walk.
-
-    flights: planner -> flight, as in `drone_trace.json`. infeasible: planner -> why it flew nothing. Together they name
-    every planner of the benchmark.
-    """
-
-    schema_version: Literal["1.0"] = "1.0"
-    id: str
-    flights: dict[str, dict[str, Any]]
-    infeasible: dict[str, str]
-
-    def traces(self) -> dict[str, DroneTrace]:
-        """Give the flights; raises InputError where one is not what a flight must be."""
-        return {name: DroneTrace.from_json(f, f"{self.id}: flights.{name}") for name, f in self.flights.items()}
-
-
-def read_scenarios(path: Path) -> list[ScenarioRecord]:
-    """Read `scenarios.jsonl` back; raises InputError, with the line and the field."""
-    lines = model_lines(path, ScenarioRecord, what="scenarios of a benchmark", fix="run cosfly plan benchmark")
-    return [record for _, record in lines]
 
 
 # --- stage ------------------------------------------------------------------------------------------------------------
@@ -131,8 +107,7 @@ def run(
     watch: Watch = Watch(),
     resume: Resume = "if-same",
 ) -> Path:
-    """Reads a simplified map and `path.json`, writes `scenarios.jsonl` and from it `benchmark.json` and the figures;
-    gives `benchmark.json`.
+    """Reads a simplified map and `path.json`, writes `benchmark.json`, its tables and the figures; returns the first.
 
     A walk that no planner flies, as one through a house, is a failure and no scenario. Planning times stand in
     `items.jsonl` and in the manifest, the only files that differ when all is done again.
@@ -144,7 +119,7 @@ def run(
     cfg = _without_missing(cfg)
     inputs = {"map": simplified_map, "paths": paths}
     stage = StageFolder.open(out, "plan_benchmark", config=cfg, inputs=inputs, seed=seed, resume=resume)
-    product, raw, page = (out / name for name in ("benchmark.json", "scenarios.jsonl", "benchmark.md"))
+    product, page = out / "benchmark.json", out / "benchmark.md"
     if stage.is_complete:
         return product
     box_map, walks = read_boxes(simplified_map), read_paths(paths)
@@ -155,18 +130,16 @@ def run(
     if not done.tally.kept:
         raise stage.nothing_kept(done.tally, expected="a walk that a planner flies")
     flown = {record.id: result_of(record, compare.FlightsOfWalk) for record in done.kept}
-    lines = [ScenarioRecord(id=name, flights=f.flights, infeasible=f.errors) for name, f in flown.items()]
-    write_bytes(raw, "".join(dump_json(line.model_dump()) + "\n" for line in lines).encode())
     header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.all_values()}
-    summary = summarize(read_scenarios(raw), cfg.planners, rng_for(seed, "plan_benchmark", "intervals"))
+    summary = summarize(flown, cfg.planners, rng_for(seed, "plan_benchmark", "intervals"))
     found = Benchmark(**header, **summary)
     write_model(product, found, FORMAT)
     write_bytes(page, markdown(found).encode())
-    pictures = _pictures(found, lines, box_map)
+    pictures = _pictures(found, flown, box_map)
     for name, picture in pictures.items():
         write_bytes(out / name, picture)
     stage.finish(
-        [product, raw, page, *(out / name for name in pictures)],
+        [product, page, *(out / name for name in pictures)],
         done.tally,
         timings=compare.timings(flown.values(), cfg.planners),
     )
@@ -184,14 +157,14 @@ def _without_missing(cfg: BenchmarkConfig) -> BenchmarkConfig:
     return cfg.model_copy(update={"planners": tuple(name for name in cfg.planners if name not in sampling)})
 
 
-def _pictures(found: Benchmark, records: list[ScenarioRecord], box_map: BoxMap) -> dict[str, bytes]:
+def _pictures(found: Benchmark, flown: Flown, box_map: BoxMap) -> dict[str, bytes]:
     """Draw the figures; none, with one line that says so, where matplotlib is not installed."""
     if importlib.util.find_spec("matplotlib") is None:
         log.warning("matplotlib is not installed; there are no figures; %s", INSTALL)
         return {}
     from cosfly.planners.benchmark_figures import draw
 
-    return draw(found, records, box_map)
+    return draw(found, flown, box_map)
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
@@ -244,13 +217,13 @@ def read_benchmark(path: Path) -> Benchmark:
     return read_model(path, Benchmark, FORMAT)
 
 
-def summarize(records: list[ScenarioRecord], planners: tuple[str, ...], rng: np.random.Generator) -> dict[str, Any]:
-    """Make the tables of `benchmark.json` from the raw records. rng: draws scenarios."""
-    traces = [record.traces() for record in records]
+def summarize(flown: Flown, planners: tuple[str, ...], rng: np.random.Generator) -> dict[str, Any]:
+    """Make the tables of `benchmark.json` from the flights. rng: draws scenarios."""
+    traces = [found.traces(name) for name, found in flown.items()]
     figures = {p: [compare.flight_figures(t[p]) if p in t else None for t in traces] for p in planners}
     tables = {p: np.array([_row(flight) for flight in rows]) for p, rows in figures.items()}
-    means = _means(tables, np.arange(len(records)))
-    drawn = [_means(tables, draw) for draw in rng.integers(len(records), size=(NUM_RESAMPLES, len(records)))]
+    means = _means(tables, np.arange(len(flown)))
+    drawn = [_means(tables, draw) for draw in rng.integers(len(flown), size=(NUM_RESAMPLES, len(flown)))]
     axes, axes_drawn = compare.axis_scores(means), [compare.axis_scores(found) for found in drawn]
     axis_rows = {
         p: AxisRow(scores=row, intervals={axis: _interval([found[p][axis] for found in axes_drawn]) for axis in row})
@@ -258,8 +231,8 @@ def summarize(records: list[ScenarioRecord], planners: tuple[str, ...], rng: np.
     }
     free_m = [row["length_m"] for row in means.values() if row["collision_fraction"] == 0]
     return {
-        "scenarios": [record.id for record in records],
-        "infeasible": {record.id: record.infeasible for record in records if record.infeasible},
+        "scenarios": list(flown),
+        "infeasible": {name: found.errors for name, found in flown.items() if found.errors},
         "figures": figures,
         "means": {p: {n: _number(value) for n, value in row.items()} for p, row in means.items()},
         "shortest_mean_m": round(min(free_m or [row["length_m"] for row in means.values()]), 4),

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from cosfly.geometry import rotation_matrices
-from cosfly.planners.benchmark import PAPER, Benchmark, ScenarioRecord
+from cosfly.planners.benchmark import PAPER, Benchmark, Flown
 from cosfly.planners.compare import AXES, FIGURES, color_of
 from cosfly.planners.contract import PLANNERS, title_of
 from cosfly.products.boxes import BoxMap
@@ -25,14 +25,14 @@ FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (
 SIGNS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
-def draw(found: Benchmark, records: list[ScenarioRecord], box_map: BoxMap) -> dict[str, bytes]:
+def draw(found: Benchmark, flown: Flown, box_map: BoxMap) -> dict[str, bytes]:
     """Give the figures, name -> PNG; those of TA*+Smooth against MuCO only where both took part."""
     scores = {p: row.scores for p, row in found.axes.items()}
     primary = {p: row for p, row in scores.items() if p not in PAPER or PAPER[p].axes_mean is not None}
     pictures = {"axes_radar.png": _radar(primary or scores)}  # the paper's seven and ours, where there are any
     pictures |= {"axes_bars.png": _bars(found), "axes_pairs.png": _pairs(found)}
     if found.deltas:
-        pictures |= {"deltas.png": _deltas(found), "flights_3d.png": _flights(found, records, box_map)}
+        pictures |= {"deltas.png": _deltas(found), "flights_3d.png": _flights(found, flown, box_map)}
     return pictures
 
 
@@ -124,17 +124,17 @@ def _deltas(found: Benchmark) -> bytes:
     return _png(figure)
 
 
-def _flights(found: Benchmark, records: list[ScenarioRecord], box_map: BoxMap) -> bytes:
+def _flights(found: Benchmark, flown: Flown, box_map: BoxMap) -> bytes:
     """Draw the scenarios where TA*+Smooth sees most more than MuCO."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-    def gain(record: ScenarioRecord) -> float:
-        rows = [found.figures[planner][found.scenarios.index(record.id)] for planner in ("track_astar", "muco")]
+    def gain(walk_id: str) -> float:
+        rows = [found.figures[planner][found.scenarios.index(walk_id)] for planner in ("track_astar", "muco")]
         return (rows[0] or {}).get("five_ray_mean", 0.0) - (rows[1] or {}).get("five_ray_mean", 0.0)
 
     figure = _figure(14.0, 11.0)
-    for place, record in enumerate(sorted(records, key=gain, reverse=True)[:FLIGHTS_SHOWN], 1):
-        traces = record.traces()
+    for place, walk_id in enumerate(sorted(flown, key=gain, reverse=True)[:FLIGHTS_SHOWN], 1):
+        traces = flown[walk_id].traces(walk_id)
         points = np.concatenate([trace.positions_m for trace in traces.values()])
         targets = next(iter(traces.values())).targets_m
         low, high = np.minimum(points.min(axis=0), targets.min(axis=0)), points.max(axis=0)
@@ -154,7 +154,7 @@ def _flights(found: Benchmark, records: list[ScenarioRecord], box_map: BoxMap) -
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
         axes.set_box_aspect(high - low, zoom=1.15)
         axes.locator_params(nbins=5)
-        axes.set_title(f"{record.id}: visibility {gain(record):+.3f}")
+        axes.set_title(f"{walk_id}: visibility {gain(walk_id):+.3f}")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     figure.suptitle("Where TA* + Smooth sees most more than MuCO; gray: generic planners")
     return _png(figure)

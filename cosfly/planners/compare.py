@@ -253,7 +253,8 @@ def run(
     if not finished.tally.kept:
         raise stage.nothing_kept(finished.tally, expected="a walk that all planners fly")
     shared = {record.id: result_of(record, FlightsOfWalk) for record in finished.kept}
-    flights = {name: _flights_of(name, shared, out) for name in cfg.planners}
+    traces = [found.traces(walk_id) for walk_id, found in shared.items()]
+    flights = {name: [flown[name] for flown in traces] for name in cfg.planners}
     header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.all_values()}
     named = {name: ALL_PLANNERS[name] for name in flights}
     summary = {
@@ -263,9 +264,9 @@ def run(
     }
     write_json(product, {**FORMAT.header, **header, **summary})
     outputs = [product]
-    for name, traces in flights.items():
+    for name, own in flights.items():
         outputs.append(out / f"drone_trace_{name}.json")
-        write_traces(outputs[-1], traces, {**header, "planner": name})
+        write_traces(outputs[-1], own, {**header, "planner": name})
     by_id = {walk.path_id: walk for walk in walks}
     flown: list[Walk] = [by_id[walk_id] for walk_id in shared]
     outputs.append(out / "compare_overlay.png")
@@ -281,12 +282,9 @@ class FlightsOfWalk(BaseModel):
     errors: dict[str, str]
     times_ms: dict[str, float]
 
-
-def _flights_of(planner: str, shared: dict[str, FlightsOfWalk], out: Path) -> list[DroneTrace]:
-    return [
-        DroneTrace.from_json(found.flights.get(planner) or {}, f"{out}/items.jsonl: {walk_id}: {planner}")
-        for walk_id, found in shared.items()
-    ]
+    def traces(self, walk_id: str) -> dict[str, DroneTrace]:
+        """Return the flights by planner; raises InputError where one is not what a flight must be."""
+        return {name: DroneTrace.from_json(f, f"items.jsonl: {walk_id}: {name}") for name, f in self.flights.items()}
 
 
 def _left_out(records: Iterable[ItemRecord]) -> list[dict[str, str]]:
