@@ -54,24 +54,15 @@ def study_weather(
         int | None, Option(show_default="the one that looks down least", help="Which of its frames.")
     ] = None,
     fov: Annotated[float, Option(min=1.0, max=169.0, help="Horizontal field of view, degrees.")] = 67.38,
-    weather_pool: Annotated[Path | None, Option(help="YAML file with weather presets of yours.")] = None,
-    tod_pool: Annotated[Path | None, Option(help="YAML file with times of day of yours.")] = None,
 ) -> None:
     """One view under every weather and time of day: nine pictures, and a sheet of all."""
-    from cosfly.render.settings import RenderConfig
-    from cosfly.render.weather import read_pools
+    from cosfly.products.weather import TIMES, WEATHERS
     from cosfly.studies import weather
-    from cosfly.work.config import build
     from cosfly.work.console import progress_bar
 
-    pools = {"weather_pool": weather_pool, "tod_pool": tod_pool}
-    given = {name: path for name, path in pools.items() if path is not None}
-    mode = {"weather_mode": "random_per_path"} if given else {}
-    cfg = build(RenderConfig, job.cfg.render.model_dump() | mode | given, "--weather-pool, --tod-pool")
-    presets = read_pools(cfg)
-    with progress_bar("study weather: pictures", len(presets.weathers) * len(presets.times)) as advance:
+    with progress_bar("study weather: pictures", len(WEATHERS) * len(TIMES)) as advance:
         chosen: Any = {"trajectory": trajectory, "frame": frame, "fov_deg": fov, "seed": job.cfg.seed}
-        product = weather.run(cfg, map_, traces, out, **chosen, advance=lambda: advance(1))
+        product = weather.run(job.cfg.render, map_, traces, out, **chosen, advance=lambda: advance(1))
     for path in product:
         typer.echo(path)
 

@@ -15,13 +15,12 @@ from cosfly.look.frame_views import encode_picture
 from cosfly.look.topview import PAPER, draw_text
 from cosfly.products.boxes import check_ground, read_boxes
 from cosfly.products.traces import DroneTrace, read_traces
-from cosfly.products.weather import resolved
+from cosfly.products.weather import TIMES, WEATHERS, resolved
 from cosfly.render.contract import PosedPerson, Renderer
 from cosfly.render.flight import MARGIN_M
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import renderer_of
-from cosfly.render.weather import Pools, read_pools
 from cosfly.work.chance import rng_for
 from cosfly.work.store import write_bytes
 
@@ -54,10 +53,9 @@ def run(
         trajectory: index of a flight of the traces; frame: of its clean track, None for the one that looks down least.
         advance: called for each picture that is drawn.
     Raises:
-        InputError: no such flight or frame, or an input is malformed. ConfigError: presets are malformed.
-            EnvironmentMissing: no renderer.
+        InputError: no such flight or frame, or an input is malformed. EnvironmentMissing: no renderer.
     """
-    pools, flights = read_pools(cfg), read_traces(traces)
+    flights = read_traces(traces)
     if not 0 <= trajectory < len(flights):
         raise InputError("there is no such flight", where=traces, got=trajectory, expected=f"0 to {len(flights) - 1}")
     trace = flights[trajectory]
@@ -73,17 +71,12 @@ def run(
     check_ground(box_map, boxes)
     renderer = renderer_of(cfg, box_map, seed)
     try:
-        pictures = _drawn(
-            renderer, pools, trace, index, intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg), seed, advance
-        )
+        intrinsic = intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg)
+        pictures = _drawn(renderer, trace, index, intrinsic, seed, advance)
     finally:
         renderer.close()
-    pairs = list(pictures)
-    shown = [pair for pair in FIGURE if pair in pictures]
-    if len(shown) < len(FIGURE):  # presets of somebody's own
-        shown = [pairs[int(k)] for k in np.unique(np.linspace(0, len(pairs) - 1, len(FIGURE)).round())]
-    figure = _grid([_tile(pictures[pair], pair, FIGURE_TILE_PX) for pair in shown], FIGURE_COLUMNS)
-    sheet = _grid([_tile(picture, pair, SHEET_TILE_PX) for pair, picture in pictures.items()], len(pools.times))
+    figure = _grid([_tile(pictures[pair], pair, FIGURE_TILE_PX) for pair in FIGURE], FIGURE_COLUMNS)
+    sheet = _grid([_tile(picture, pair, SHEET_TILE_PX) for pair, picture in pictures.items()], len(TIMES))
     for name, picture in ((FIGURE_NAME, figure), (SHEET_NAME, sheet)):
         write_bytes(out / name, encode_picture(picture, "jpeg", JPEG_QUALITY))
     return out / FIGURE_NAME, out / SHEET_NAME
@@ -91,7 +84,6 @@ def run(
 
 def _drawn(
     renderer: Renderer,
-    pools: Pools,
     trace: DroneTrace,
     index: int,
     intrinsic: np.ndarray,
@@ -103,8 +95,8 @@ def _drawn(
     places = np.concatenate([trace.positions_m, trace.targets_m])
     corners = places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M
     pictures = {}
-    for pair in product(pools.weathers, pools.times):
-        renderer.prepare(*corners, resolved(pools.weathers[pair[0]], pools.times[pair[1]]))
+    for pair in product(WEATHERS, TIMES):
+        renderer.prepare(*corners, resolved(WEATHERS[pair[0]], TIMES[pair[1]]))
         rgb = renderer.render(pose, intrinsic, person).rgb
         pictures[pair] = cv2.resize(rgb, FIGURE_TILE_PX, interpolation=cv2.INTER_AREA)
         advance()
@@ -124,5 +116,4 @@ def _tile(picture: np.ndarray, pair: tuple[str, str], size_px: tuple[int, int]) 
 
 
 def _grid(tiles: list[np.ndarray], num_columns: int) -> np.ndarray:
-    tiles = tiles + [np.full_like(tiles[0], PAPER[0])] * (-len(tiles) % num_columns)
     return np.vstack([np.hstack(tiles[k : k + num_columns]) for k in range(0, len(tiles), num_columns)])
