@@ -11,7 +11,6 @@ import contextlib
 import logging
 import os
 import pickle
-import re
 import signal
 import sys
 from collections import deque
@@ -290,10 +289,6 @@ def _knock(address: str) -> None:
 
 
 def _refused(address: str, error: Exception | str) -> EnvironmentMissing:
-    versions = re.findall(r"(?:Ray|Python): (\S+)", str(error))
-    if len(versions) == 4:
-        theirs, ours = (f"Ray {ray} on Python {python}" for ray, python in (versions[:2], versions[2:]))
-        fix = "have the same on every node and here"
-        return EnvironmentMissing("a cluster of other versions", where=address, got=theirs, expected=ours, fix=fix)
     fix = "start one there (ray start --head), or leave out --address for a cluster of this machine"
-    return EnvironmentMissing("no Ray cluster answers", where=address, got=str(error), fix=fix)
+    got = " ".join(str(error).split())
+    return EnvironmentMissing("no Ray cluster answers", where=address, got=got, fix=fix)

@@ -6,7 +6,7 @@ import contextlib
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -115,21 +115,18 @@ class EventLog:
         self._journal.close()
 
 
-def iterate_events(folder: Path) -> Iterator[Event]:
-    """Yield the events of a stage folder in order; damaged lines and those of a later cosfly are left out."""
+def read_events(folder: Path) -> list[Event]:
+    """Read the events of a stage folder in order; damaged lines and those of a later cosfly are left out."""
+    events = list[Event]()
     for line in Journal(folder / EVENTS).read():
         with contextlib.suppress(ValidationError):
-            yield Event.model_validate(line)
-
-
-def read_events(folder: Path) -> list[Event]:
-    """Read all of them."""
-    return list(iterate_events(folder))
+            events.append(Event.model_validate(line))
+    return events
 
 
 def lost_steps(folder: Path) -> int:
     """Count the steps, as frames, of items which then failed or were lost with their worker: they are in no product."""
-    events = iterate_events(folder)
+    events = read_events(folder)
     return sum(event.steps or 0 for event in events if event.event in LOSSES or event.status == "failed")
 
 
