@@ -80,7 +80,7 @@ def test_errors_are_one_line_and_exit_1(capfd, monkeypatch, tmp_path, subtests):
         (("caption", "prompts", "--export", "taken"), ("taken", "cannot write", "--out")),
         (("run", "quickstart", "--out", "stage"), ("stage: the folder of a stage", "choose another --out")),
         (("run", "quickstart", "--out", "stage", "--dry-run"), ("stage: the folder of a stage", "another --out")),
-        (("config", "show", "--log-file", "no/log.txt"), ("cannot write the log",)),
+        (("--log-file", "no/log.txt", "config", "show"), ("cannot write the log",)),
     ):
         with subtests.test(words=words):
             status, line = answer(capfd, monkeypatch, *words)
@@ -100,26 +100,6 @@ def wait() -> None:
 sys.argv = ["cosfly", "wait"]
 cli.main()
 """
-
-
-def test_options_of_all_commands_may_stand_anywhere(subtests):
-    for words, moved in [
-        (["run", "quickstart", "-v"], ["-v", "run", "quickstart"]),
-        (["run", "--log-file", "a.log", "quickstart"], ["--log-file", "a.log", "run", "quickstart"]),
-        (["-q", "run", "--log-file=a.log"], ["-q", "--log-file=a.log", "run"]),
-        (["run", "--", "-v"], ["run", "--", "-v"]),
-        (["run", "--log-file"], ["--log-file", "run"]),
-        (["run", "quickstart"], ["run", "quickstart"]),
-    ]:
-        with subtests.test(words=words, moved=moved):
-            assert cli.options_first(words) == moved
-
-
-def told(*words: str) -> tuple[str, str]:
-    """What a command says on the error stream, which is a pipe, and in its log file."""
-    done = subprocess.run([sys.executable, "-m", "cosfly", *words], capture_output=True, text=True, check=True)
-    file = Path(words[words.index("--log-file") + 1]) if "--log-file" in words else None
-    return done.stderr, file.read_text() if file else ""
 
 
 IMPORTING = """

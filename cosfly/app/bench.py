@@ -18,7 +18,7 @@ from cosfly.errors import ConfigError, ResumeError
 from cosfly.reading.documents import FileFormat
 from cosfly.work.stage_events import EVENTS, LOSSES, Event, read_events
 from cosfly.work.stage_folder import Manifest, read_manifest
-from cosfly.work.store import write_bytes, write_model
+from cosfly.work.store import write_model
 
 if TYPE_CHECKING:
     from cosfly.app.settings import RunConfig
@@ -70,7 +70,7 @@ class Bench(BaseModel):
 
 
 def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterable[int]) -> Bench:
-    """Reads a run up to `stage`; writes `bench.json`, `bench.md` and the events of each run; products go again.
+    """Reads a run up to `stage`; writes `bench.json` and the events of each run; products go again.
 
     Raises:
         ConfigError: the stage has no items, or a server does them. ResumeError: `out` holds something.
@@ -93,7 +93,6 @@ def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterab
         cores=len(os.sched_getaffinity(0)),
         rows=[_measured(cfg, run_folder, out / f"workers_{count}", stage, count) for count in sorted(set(workers))],
     )
-    write_bytes(out / "bench.md", markdown(bench).encode())
     write_model(out / "bench.json", bench, FORMAT)
     return bench
 
@@ -164,12 +163,3 @@ def tables(bench: Bench) -> dict[str, list[tuple[str, ...]]]:
         used = [(str(row.workers), str(row.gpu_percent), str(row.gpu_gib)) for row in bench.rows]
         found["its NVIDIA devices"] = [("workers", "GPU %", "GPU GiB"), *used]
     return found
-
-
-def markdown(bench: Bench) -> str:
-    """Give the tables as Markdown."""
-    parts = []
-    for title, (head, *rows) in tables(bench).items():
-        lines = [head, ("---",) * len(head), *rows]
-        parts.append(f"**{title}**\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines))
-    return "\n".join(parts)

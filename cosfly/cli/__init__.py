@@ -9,7 +9,6 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -29,10 +28,6 @@ from cosfly.errors import CosflyError, plain
 
 # The exit codes of Ctrl-C, which Typer makes of a KeyboardInterrupt without a word, and of SIGTERM.
 ENDED = {130: "interrupted", 143: "terminated"}
-
-FLAGS = ("-v", "--verbose", "-q", "--quiet")  # of all commands; no command has others of these names
-
-VALUES = ("--log-file",)  # the same, with a value each
 
 log = logging.getLogger(__name__)
 
@@ -90,28 +85,12 @@ def _root(
     log.debug("cosfly %s, Python %s, in %s", __version__, sys.version.split()[0], Path.cwd())
 
 
-def options_first(words: Sequence[str]) -> list[str]:
-    """Move the options of all commands before the command, so that they may stand anywhere."""
-    ours, others = list[str](), list(words)
-    end = others.index("--") if "--" in others else len(others)
-    number = 0
-    while number < end:
-        word = others[number]
-        count = 2 if word in VALUES else 1 if word in FLAGS or word.partition("=")[0] in VALUES else 0
-        count = min(count, end - number)
-        ours += others[number : number + count]
-        del others[number : number + count]
-        end -= count
-        number += count == 0
-    return ours + others
-
-
 def main() -> None:
     """Entry point: a CosflyError is one line and exit 1; a bug keeps its traceback."""
     # As Ctrl-C: workers end, locks are let go.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
-        app(options_first(sys.argv[1:]))
+        app()
     except CosflyError as error:
         _fail(str(error), 1)
     except (SystemExit, KeyboardInterrupt) as end:

@@ -159,7 +159,7 @@ def list_runs(root: Annotated[Path, Argument(metavar="[DIR]", help="Where runs a
 def bench(
     job: Job,
     config: Annotated[Path, Argument(metavar="RUN", help="Folder of a run that is finished up to the stage.")],
-    out: Annotated[Path, Option(help="New folder for bench.json and bench.md.")],
+    out: Annotated[Path, Option(help="New folder for bench.json.")],
     stage: Annotated[str, Option(help="Stage to measure.")] = "render",
     workers: Annotated[str, Option(help="Counts of worker processes, as in 1,2,4.")] = "1,2,4",
 ) -> None:
