@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-from cosfly.cli import app, options_first
+from cosfly.cli import app
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -59,7 +59,7 @@ ALL = [(page.name, text) for page in PAGES for text in commands(page)]
 
 def parsed(text: str) -> tuple[Any, list[str]]:
     """The command that a line names, and its words after that."""
-    words = options_first(shlex.split(text, comments=True))
+    words = shlex.split(text, comments=True)
     command: Any = COMMAND_LINE
     while words and words[0] in getattr(command, "commands", {}):
         command, words = command.commands[words[0]], words[1:]

@@ -30,7 +30,7 @@ from test_distill_evaluate import make_encoder
 from test_docs_commands import ALL, PAGES, blocks
 from typer.testing import CliRunner
 
-from cosfly.cli import app, options_first
+from cosfly.cli import app
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
 from cosfly.products.captions import read_captions
@@ -122,7 +122,7 @@ class Place:
             text = re.sub(rf"(port[ =]){told}\b", rf"\g<1>{port_here}", text)
         words = [part for word in shlex.split(text, comments=True) for part in (sorted(glob.glob(word)) or [word])]
         small = max((name for name in SMALL if text.startswith(f"{name} ")), key=len, default=None)
-        return options_first([*words, *SMALL.get(small or "", [])])
+        return [*words, *SMALL.get(small or "", [])]
 
     def clear(self, text: str) -> None:
         """Take away what another command of the documents left where this one will write."""
