@@ -27,9 +27,8 @@ def free_port() -> int:
 
 
 def command(town: Path, port: int, *faults: str, protocol: str = "carla") -> list[str]:
-    told = [word for fault in faults for word in ("--fault", fault)]
     simulators = str(Path(__file__).with_name("simulators"))
-    return [sys.executable, simulators, str(town), "--port", str(port), "--protocol", protocol, *told]
+    return [sys.executable, simulators, str(town), "--port", str(port), protocol, *faults]
 
 
 @contextlib.contextmanager

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from simulator_serving import free_port, serving
 from simulators import unrealcv_server
-from simulators.scene import Fault
 from simulators.unrealcv_server import UnrealCvServer
 from test_renderers_contract import street
 from typer.testing import CliRunner
@@ -33,7 +32,7 @@ pytest.importorskip("unrealcv")
 def beside(box_map: BoxMap, *faults: str):
     """A server in a thread of this process; gives its port."""
     port = free_port()
-    server = UnrealCvServer(box_map, port, [Fault.of(text) for text in faults])
+    server = UnrealCvServer(box_map, port, faults)
     threading.Thread(target=server.serve, daemon=True).start()
     yield port
 

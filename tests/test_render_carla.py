@@ -202,7 +202,7 @@ def test_a_server_that_we_start_is_started_again(tmp_path):
     write_boxes(tmp_path / "boxes_3d.json", street())
     port = free_port()
     plain = " ".join(command(tmp_path / "boxes_3d.json", 0)).replace(" 0", " {port}")
-    start = f"sh -c 'mkdir {tmp_path}/{{port}} 2>/dev/null && exec {plain} --fault die@6; exec {plain}'"
+    start = f"sh -c 'mkdir {tmp_path}/{{port}} 2>/dev/null && exec {plain} die@6; exec {plain}'"
     cfg = config(port, timeout_s=15.0, server_command=start)
     tree = run(cfg, *inputs, tmp_path / "tree", workers=2)
     assert len(find_flights(tree)) == 2
