@@ -135,10 +135,6 @@ class SourceRecord(Strict):
     review_sha256: str | None = None
     stages: list[MadeBy]
 
-    def has(self, run: str) -> bool:
-        """Tell whether flights of a run are of it: folders above a town count as part of a run's name."""
-        return run == self.run or run.startswith(f"{self.run}_")
-
 
 class ReleasedTeacher(Strict):
     """Who was asked, and how: of all captions that were read, the released ones and the others."""

@@ -16,7 +16,7 @@ from caption.run.windows import cut_windows
 from caption.schema import WindowConfig
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.mirror import check_mirror, flight_numbers
-from caption.truth.prose import check_prose, judge_prose
+from caption.truth.prose import judge_prose
 from cosfly.products.actions import ACTIONS, TOKENS
 from cosfly.products.captions import Coc
 from specimens import make_flight
@@ -60,8 +60,8 @@ FLIGHT = flight_numbers(PAPER_FACTS)
 
 def test_the_papers_own_sample_passes_both_checks():
     assert check_mirror(PAPER_EN, PAPER_ZH, FLIGHT) is None
-    assert check_prose(PAPER_EN, PAPER_FACTS, "en") == []
-    assert check_prose(PAPER_ZH, PAPER_FACTS, "zh") == []
+    assert not any(judged.problems for judged in judge_prose(PAPER_EN, PAPER_FACTS, "en"))
+    assert not any(judged.problems for judged in judge_prose(PAPER_ZH, PAPER_FACTS, "zh"))
 
 
 def altered(coc: Coc, old: str, new: str) -> Coc:
@@ -168,7 +168,7 @@ def test_the_rule_teacher_justifies_any_given_decision_without_contradiction(dec
     for facts, _, _ in clean_captions(2)[::7]:
         english, chinese = write_answers(facts, np.random.default_rng(3), decision)
         assert english.flight_decision == chinese.flight_decision == decision
-        assert check_prose(english, facts, "en") == []
-        assert check_prose(chinese, facts, "zh") == []
+        assert not any(judged.problems for judged in judge_prose(english, facts, "en"))
+        assert not any(judged.problems for judged in judge_prose(chinese, facts, "zh"))
         assert check_mirror(english, chinese, flight_numbers(facts)) is None
         assert ACTIONS[decision].zh in chinese.reasoning_trace

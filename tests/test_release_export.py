@@ -33,6 +33,7 @@ from cosfly.products.inspection import write_inspection
 from cosfly.products.playback import read_flight
 from cosfly.products.town import read_town_map
 from cosfly.reading.arrays import parse_picture
+from cosfly.reading.documents import read_model
 from cosfly.reading.files import sha256_file
 from cosfly.work.config import build as build_config
 from cosfly.work.store import CHECKSUMS, read_checksums
@@ -40,7 +41,7 @@ from release.columns import POSE
 from release.export.contract import FORMATS, ExportConfig, ExportUnit, Files, FormatFacts
 from release.export.lerobot import merged, runs_of, states, summarize, tiff_of_depth
 from release.export.source import ReleasedRows, Span, open_release, rows_of_flight, scan
-from release.export.stage import read_export
+from release.export.stage import EXPORT_FORMAT, ExportRecord
 from release.export.stage import run as export
 from release.package import stage as package
 from release.package.sources import Source
@@ -102,7 +103,7 @@ def test_tree_to_release_to_tree_loses_nothing(whole, dataset, tmp_path):
             p.relative_to(b).as_posix(): sha256_file(p) for p in b.rglob("*") if p.is_file() and p.name != CHECKSUMS
         }
     assert len(read_public(product)) == 3  # the strictest public reader
-    about = read_export(product / "export.json")
+    about = read_model(product / "export.json", ExportRecord, EXPORT_FORMAT)
     assert about.coordinates["handedness"] == "left"
     assert read_town_map(product / "Town01").licence == about.maps[0].licence
 
@@ -271,7 +272,7 @@ def test_the_same_bytes_with_one_process_and_with_two(format, dataset, tmp_path)
 @pytest.mark.parametrize("format", FORMATS)
 def test_an_export_says_where_it_came_from_and_whose_it_is(format, dataset, tmp_path):
     product = export(config(format), dataset, tmp_path / "out")
-    about, record = read_export(product / "export.json"), open_release(dataset).record
+    about, record = read_model(product / "export.json", ExportRecord, EXPORT_FORMAT), open_release(dataset).record
     assert about.release.record_sha256 == sha256_file(dataset / "release.json")
     assert (about.licence, about.credits, about.maps) == (record.licence, record.credits, record.maps)
     assert about.frames == record.numbers.frames

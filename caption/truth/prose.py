@@ -51,11 +51,6 @@ def judge_prose(coc: Coc, facts: Facts, language: Language) -> list[Judged]:
     return judged
 
 
-def check_prose(coc: Coc, facts: Facts, language: Language) -> list[str]:
-    """Give what contradicts a window, each as "kind: sentence"."""
-    return [problem for judged in judge_prose(coc, facts, language) for problem in judged.problems]
-
-
 def _problems(stated: Stated, facts: Facts, language: Language, decision: str) -> Iterator[str]:
     if not mentions("elsewhere", language).search(stated.text):
         if any(_is_of_nothing(numeral, facts) for numeral in stated.numerals):

@@ -17,7 +17,7 @@ import numpy as np
 from cosfly.errors import InputError
 from cosfly.products.frames import DEPTH_NPY, INVALID_DEPTH_M, SKY_DEPTH_M, depth_values, public_name
 from cosfly.products.kinds import KINDS
-from cosfly.products.png import parse_png
+from cosfly.products.png import colours_of
 from cosfly.work.compiled import njit
 
 NO_DEPTH = np.empty((0, 0), np.float32)
@@ -69,8 +69,8 @@ def unpack(files: dict[str, bytes], where: Path) -> Picture:
     Raises:
         InputError: one is damaged, of another size than `rgb.png`, or no picture of a playback tree; names it.
     """
-    colours = _pixels(files["rgb.png"], where / "rgb.png")
-    instance = _pixels(files["instance.png"], where / "instance.png") if "instance.png" in files else NO_IDS
+    colours = colours_of(files["rgb.png"], where / "rgb.png")
+    instance = colours_of(files["instance.png"], where / "instance.png") if "instance.png" in files else NO_IDS
     depth_name = next((name for name in files if public_name(name) == DEPTH_NPY), DEPTH_NPY)
     depth = depth_values(memoryview(files[depth_name]), where / depth_name) if depth_name in files else NO_DEPTH
     depth.flags.writeable = False  # the compiled checks are compiled for such, once
@@ -79,13 +79,6 @@ def unpack(files: dict[str, bytes], where: Path) -> Picture:
             got, expected = ("{1} x {0} px".format(*found.shape) for found in (values, colours))
             raise InputError("of another size than rgb.png", where=where / name, got=got, expected=expected)
     return Picture(colours, depth, instance)
-
-
-def _pixels(data: bytes, where: Path) -> np.ndarray:
-    png = parse_png(data, where)
-    if png.channels < 3:
-        raise InputError("not a colour picture", where=where, got=f"{png.channels} channels", expected="RGB or RGBA")
-    return np.ascontiguousarray(png.pixels()[..., :3])
 
 
 def look_at(picture: Picture, left_out: np.ndarray, flat_share: float) -> PixelFigures:

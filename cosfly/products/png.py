@@ -11,8 +11,7 @@ a pixel's four channels are the bytes of a float32, lowest first, each row store
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from isal import isal_zlib as zlib
@@ -22,7 +21,6 @@ from cosfly.reading.arrays import PNG_SIGNATURE, check_pixels
 from cosfly.work.compiled import njit
 
 CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # by colour type; palettes are no pictures of a data set
-MOST_NAMED = 8  # chunks
 CHUNK, NUMBER = struct.Struct(">I4s"), struct.Struct(">I")
 RGB, RGBA = 3, 4
 NONE, SUB, UP, AVERAGE, PAETH = range(5)  # filters
@@ -31,24 +29,16 @@ FIRST = 16  # bytes that are packed apart from the rest
 NOT_UNPACKED: Any = zlib.error  # its stub says that it is no class
 
 
-@dataclass
-class Png:
+class Png(NamedTuple):
     """An unpacked PNG: `lines` (h, 1 + w * channels) uint8, of each row its filter and its bytes as the filter left
-    them. others: names of the chunks that are no pixels (colours meant, words); num_behind: bytes behind its end."""
+    them."""
 
-    width_px: int
-    height_px: int
-    channels: int
     lines: np.ndarray
-    others: tuple[str, ...] = ()
-    num_behind: int = 0
-    _pixels: np.ndarray | None = None
+    channels: int
 
     def pixels(self) -> np.ndarray:
-        """Give the picture, (h, w, channels) uint8."""
-        if self._pixels is None:
-            self._pixels = _undone(self.lines, self.channels).reshape(self.height_px, self.width_px, self.channels)
-        return self._pixels
+        """Return the picture, (h, w, channels) uint8."""
+        return _undone(self.lines, self.channels).reshape(len(self.lines), -1, self.channels)
 
 
 def parse_png(data: bytes | memoryview, where: object) -> Png:
@@ -57,8 +47,7 @@ def parse_png(data: bytes | memoryview, where: object) -> Png:
     Raises:
         InputError: it is none, damaged, of another kind, or larger than pictures may be.
     """
-    width, height, kind, packed, others, num_behind = _chunks(data, where)
-    channels = CHANNELS[kind]
+    width, height, channels, packed = _chunks(data, where)
     stride = 1 + width * channels
     unpacker = zlib.decompressobj()
     try:
@@ -70,7 +59,7 @@ def parse_png(data: bytes | memoryview, where: object) -> Png:
     lines = np.frombuffer(found, np.uint8).reshape(height, stride)
     if (lines[:, 0] > PAETH).any():
         raise _broken(where, "a row with a filter that does not exist")
-    return Png(width, height, channels, lines, others, num_behind)
+    return Png(lines, channels)
 
 
 def colours_png(rgb: np.ndarray) -> bytes:
@@ -100,6 +89,15 @@ def floats_png(values: np.ndarray) -> bytes:
     lines[:1, 1:] = raw[:1]
     np.subtract(raw[1:], raw[:-1], out=lines[1:, 1:])
     return _png(lines, RGBA)
+
+
+def colours_of(data: bytes | memoryview, where: object) -> np.ndarray:
+    """Decode a picture of colours, (h, w, 3) uint8, without alpha; raises as `parse_png`, and where it is grey."""
+    png = parse_png(data, where)
+    if png.channels < RGB:
+        got = f"{png.channels} channels"
+        raise InputError("not a colour picture", where=str(where), got=got, expected="RGB or RGBA")
+    return np.ascontiguousarray(png.pixels()[..., :RGB])
 
 
 def floats_of(data: bytes | memoryview, where: object) -> np.ndarray:
@@ -137,16 +135,15 @@ def _broken(where: object, got: str) -> InputError:
     return InputError("the image does not decode", where=str(where), got=got, expected="a whole PNG")
 
 
-def _chunks(data: bytes | memoryview, where: object) -> tuple[int, int, int, bytes, tuple[str, ...], int]:
-    """Walk through the chunks: width, height, colour type, the packed pixels, names of other chunks, bytes behind the
-    end."""
+def _chunks(data: bytes | memoryview, where: object) -> tuple[int, int, int, bytes]:
+    """Return width, height, channels and the packed pixels of the chunks."""
     if data[:8] != PNG_SIGNATURE or data[12:16] != b"IHDR" or len(data) < 33:
         raise InputError("not an image", where=str(where), got=f"{len(data)} bytes", expected="a PNG")
     width, height, depth, kind, packing, filters, interlace = struct.unpack_from(">IIBBBBB", data, 16)
     check_pixels(width * height, str(where), f"{width} x {height} px")
     if depth != 8 or kind not in CHANNELS or packing or filters or interlace or not width or not height:
         raise _broken(where, f"{depth} bits, colour type {kind}, interlace {interlace}, {width} x {height} px")
-    position, parts, others, view = len(PNG_SIGNATURE), list[memoryview](), list[str](), memoryview(data)
+    position, parts, view = len(PNG_SIGNATURE), list[memoryview](), memoryview(data)
     while position + 12 <= len(data):
         length, name = CHUNK.unpack_from(data, position)
         end = position + 8 + length
@@ -157,9 +154,7 @@ def _chunks(data: bytes | memoryview, where: object) -> tuple[int, int, int, byt
         if name == b"IDAT":
             parts.append(view[position + 8 : end])
         elif name == b"IEND":
-            return width, height, kind, b"".join(parts), tuple(others), len(data) - end - 4
-        elif name != b"IHDR" and len(others) < MOST_NAMED:
-            others.append(name.decode("latin-1"))
+            return width, height, CHANNELS[kind], b"".join(parts)
         position = end + 4
     raise _broken(where, f"an end at byte {len(data)}, before the image's")
 

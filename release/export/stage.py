@@ -16,7 +16,7 @@ from pydantic import Field
 import cosfly
 from cosfly.errors import InputError, VerifyError
 from cosfly.escaping import for_markdown
-from cosfly.reading.documents import FileFormat, read_model
+from cosfly.reading.documents import FileFormat
 from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.work.stage_folder import Resume, StageFolder, result_of
 from cosfly.work.store import CHECKSUMS, dump_json, inside, sha256_bytes, storage_errors, write_bytes, write_checksums
@@ -84,15 +84,6 @@ def write_export(path: Path, record: ExportRecord) -> str:
     data = (dump_json(value, indent=1) + "\n").encode()
     write_bytes(path, data)
     return sha256_bytes(data)
-
-
-def read_export(path: Path) -> ExportRecord:
-    """Read `export.json`.
-
-    Raises:
-        InputError: names the file and the field.
-    """
-    return read_model(path, ExportRecord, EXPORT_FORMAT, tree=path.parent)
 
 
 def render_readme(record: ExportRecord) -> str:

@@ -9,7 +9,7 @@ from cosfly.geometry import BODY_FROM_CAMERA
 from cosfly.products.frames import PERSON_ID
 from cosfly.products.goals import LANDMARKS, SeenFrame, meant, target_picture, words_of
 from cosfly.products.kinds import KINDS
-from cosfly.products.png import parse_png
+from cosfly.products.png import colours_of
 from release.columns import TARGET_PICTURE, matrices_of
 from release.flight_rows import FlightRows
 from release.verify.findings import Findings
@@ -43,7 +43,7 @@ def check_goal(
     if (shown := flight.rows[i].get(TARGET_PICTURE)) and rgb:
         where = flight.where(i, TARGET_PICTURE)
         try:
-            pixels, of_frame = (parse_png(data, where).pixels()[..., :3] for data in (shown["bytes"], rgb))
+            pixels, of_frame = (colours_of(data, where) for data in (shown["bytes"], rgb))
         except InputError as error:
             found.error("goal", where, f"{error.what}: {error.got}", "a picture")
             return

@@ -10,7 +10,7 @@ import numpy as np
 from cosfly.errors import InputError
 from cosfly.products.frames import SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.products.kinds import KINDS
-from cosfly.products.png import parse_png
+from cosfly.products.png import colours_of
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.space.reprojection import COLUMNS, GRID_ROWS, SHARED_ID, median_of
 from cosfly.work.compiled import njit
@@ -40,26 +40,18 @@ def decode(flight: FlightRows, i: int, files: Pictures, findings: Findings) -> D
             if file == "depth":
                 found[file] = depth_values(memoryview(data), Path(where))
                 found[file].flags.writeable = False  # the compiled checks are compiled for such, once
-                size = found[file].shape[::-1]
             else:
-                found[file], size = _colours(data, where)
+                found[file] = colours_of(data, where)
         except InputError as error:
             findings.error("picture", where, f"{error.what}: {error.got}", f"a {file} picture of {width} x {height} px")
             continue
+        size = found[file].shape[1::-1]
         if size != (width, height):
             findings.error("picture", where, f"{size[0]} x {size[1]} px", f"{width} x {height} px, as the row says")
             found.pop(file)
     if len(found) < len(files):
         return None
     return found.get("depth", NOTHING), found.get("instance", NO_IDS)
-
-
-def _colours(data: bytes | memoryview, where: str) -> tuple[np.ndarray, tuple[int, int]]:
-    """Return the pixels of a PNG, (h, w, 3) uint8, and its width and height."""
-    png = parse_png(data, where)
-    if png.channels < 3:
-        raise InputError("not a colour picture", got=f"{png.channels} channels")
-    return np.ascontiguousarray(png.pixels()[..., :3]), (png.width_px, png.height_px)
 
 
 def check_picture(flight: FlightRows, i: int, decoded: Decoded, findings: Findings) -> bool:
