@@ -16,7 +16,7 @@ from caption.run.windows import cut_windows
 from caption.schema import WindowConfig
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.mirror import check_mirror, flight_numbers
-from caption.truth.prose import judge_prose
+from caption.writing.prose import judge_prose
 from cosfly.products.actions import ACTIONS, TOKENS
 from cosfly.products.captions import Coc
 from specimens import make_flight

@@ -8,25 +8,69 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Iterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from typing import get_args
+from pathlib import Path
+from typing import Literal, get_args
 
 from rich.table import Table
 
 from caption.schema import JudgeConfig, Judgement
-from caption.truth.gold import GoldCaption, read_gold
+from caption.truth.facts import Facts
 from caption.truth.vocabulary import Vocabulary
 from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget
 from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import NoAnswer, Request, Troubles, started
 from cosfly.errors import InputError
-from cosfly.products.captions import Coc, JudgeRecord
+from cosfly.products.captions import Coc, JudgeRecord, Language
 from cosfly.products.places import flight_of
+from cosfly.reading.documents import Record, parse_document, validated
+from cosfly.reading.files import read_unpacked
 from cosfly.reading.objects import find_object
 from cosfly.work.store import dump_json
+
+GOLD = Path(__file__).with_name("gold.jsonl.gz")
+
+
+class PlantedError(Record):
+    """One thing made wrong."""
+
+    kind: str
+    field: Literal["critical_components", "reasoning_trace", "flight_decision"]
+    old: str
+    new: str
+
+    def in_text(self, coc: Coc) -> Coc:
+        """Give the caption with the error in its text."""
+        return coc.model_copy(update={self.field: getattr(coc, self.field).replace(self.old, self.new, 1)})
+
+
+class GoldCaption(Record):
+    """A true caption with its planted errors. label: the decision that its flight took."""
+
+    id: str
+    language: Language
+    facts: Facts
+    label: str
+    critical_components: str
+    reasoning_trace: str
+    flight_decision: str
+    errors: tuple[PlantedError, ...]
+
+    @property
+    def coc(self) -> Coc:
+        return Coc(**{name: getattr(self, name) for name in Coc.model_fields})
+
+
+def read_gold(path: Path = GOLD) -> Iterator[GoldCaption]:
+    """Yield the captions of a set, by default the one that ships."""
+    for number, line in enumerate(read_unpacked(path, what="gold captions").splitlines(), 1):
+        where = f"{path}:{number}"
+        value = parse_document(line, where, what="line")
+        yield validated(GoldCaption, value, where)
+
 
 JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)
 UNJUDGED = "unjudged"

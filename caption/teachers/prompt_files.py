@@ -70,21 +70,12 @@ def _problems(path: Path, text: str) -> Iterator[str]:
     version, _, body = text.partition("\n")
     if not version.startswith(VERSION):
         yield f"{path}:1: the first line must be {VERSION!r} and a version of yours"
-        body = text
     if not body.strip():
         yield f"{path}:2: the prompt is empty"
-    known, seen = set(slots_of(shipped)), set[str]()
-    for match in Template.pattern.finditer(text):
-        place, name = f"{path}:{text.count(chr(10), 0, match.start()) + 1}", match["named"] or match["braced"]
-        if match["invalid"] is not None:
-            yield f"{place}: a $ that begins no slot; write $$ for a dollar sign"
-        elif name is not None and name not in known:
-            yield f"{place}: unknown slot ${name}{nearest(name, known)}"
-        elif name is not None:
-            seen.add(name)
-    last = text.rstrip("\n").count("\n") + 1
-    for name in sorted(known - seen):
-        yield f"{path}:{last}: the slot ${name} is missing"
+    if not Template(text).is_valid():
+        yield f"{path}: a $ that begins no slot; write $$ for a dollar sign"
+    elif wrong := {*slots_of(shipped)} ^ {*slots_of(text)}:
+        yield f"{path}: slots that are missing or unknown: {', '.join(sorted(wrong))}"
 
 
 def slots_of(text: str) -> list[str]:

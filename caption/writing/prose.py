@@ -2,15 +2,109 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
+from functools import cache
 
 from caption.schema import Judged
+from caption.truth.borne_out import bears_out_number
 from caption.truth.facts import Facts
+from caption.truth.glossary import listed, mentions
 from caption.truth.mirror import check_mirror, flight_numbers
-from caption.truth.prose import judge_prose
+from caption.truth.numerals import Numeral
+from caption.truth.stated import Pole, Stated, read_stated, subject_before
 from caption.writing.contract import Draft, Refused, WayOfWriting
 from cosfly.products.answer_text import Parsed
-from cosfly.products.captions import Language, Writing
+from cosfly.products.captions import Coc, Language, Writing
+from cosfly.products.sentences import sentences_of
+
+LONGEST = 500  # characters of a sentence that is read; a model that repeats itself ends none
+SHOWN = 120  # characters of a sentence in a problem
+MEASURED = ("m", "mps", "deg", "dps", "px")
+_RISES = {"increasing": 1, "decreasing": -1}
+_ENDS = {"en": re.compile(r"\bfrom\b[^,;.]{0,24}$", re.I), "zh": re.compile(r"[从由自][^，；。]{0,12}$")}
+_TO = {
+    "en": re.compile(r"[^,;]{0,12}\b(?:to|down to|up to)\b[^,;\d]{0,16}", re.I),
+    "zh": re.compile(r"[^，；\d]{0,10}[到至为][^，；\d]{0,6}"),
+}
+_ASKED_WITHIN: dict[Language, str] = {"en": r"[^.;]{0,40}?", "zh": r"[^。；]{0,16}?"}
+
+
+@cache
+def _asks(language: Language) -> re.Pattern[str]:
+    return re.compile(f"{listed('asked', language)}{_ASKED_WITHIN[language]}{listed('sideways', language)}", re.I)
+
+
+def judge_prose(coc: Coc, facts: Facts, language: Language) -> list[Judged]:
+    """Give the state of every sentence of both texts, contradicted or unread, in order."""
+    judged = []
+    for name, text in sentences_of(coc):
+        problems: tuple[str, ...] = ()
+        if len(text) <= LONGEST:
+            stated = read_stated(text, language)
+            kinds = dict.fromkeys(_problems(stated, facts, language, coc.flight_decision if name[0] == "R" else ""))
+            problems = tuple(f"{kind}: {text[:SHOWN]}" for kind in kinds)
+        judged.append(Judged(name, text, "contradicted" if problems else "unread", problems))
+    return judged
+
+
+def _problems(stated: Stated, facts: Facts, language: Language, decision: str) -> Iterator[str]:
+    if not mentions("elsewhere", language).search(stated.text):
+        if any(_is_of_nothing(numeral, facts) for numeral in stated.numerals):
+            yield "number"
+        if any(_runs_against(pole, stated, language) for pole in stated.poles):
+            yield "trend"
+        if any(_compares_against(pole, stated, language) for pole in stated.poles):
+            yield "comparison"
+    if _plans_other_side(stated, language, decision):
+        yield "decision"
+
+
+def _is_of_nothing(numeral: Numeral, facts: Facts) -> bool:
+    is_of_picture = numeral.unit == "px" and numeral.value in (facts.width_px, facts.height_px)
+    is_measured = numeral.kind == "number" and numeral.unit in MEASURED and not is_of_picture
+    return is_measured and not bears_out_number(numeral, facts)
+
+
+def _runs_against(pole: Pole, stated: Stated, language: Language) -> bool:
+    """Tell whether "decreases from 20 m to 21 m" contradicts itself."""
+    sign = _RISES.get(pole.value, 0) if pole.dimension == "trend" and not pole.is_negated else 0
+    pairs = list(zip(stated.numerals, stated.numerals[1:], strict=False))
+    if not sign or len(pairs) != 1:
+        return False
+    (first, last) = pairs[0]
+    is_way = _ENDS[language].search(stated.text, 0, first.start) and _TO[language].fullmatch(
+        stated.text, first.start + len(first.text), last.start
+    )
+    return bool(is_way) and last.unit in ("m", "mps") and sign * (last.value - first.value) < 0
+
+
+def _compares_against(pole: Pole, stated: Stated, language: Language) -> bool:
+    """Tell whether "faster" stands beside two speeds, the drone's and the target's, of which the other is larger."""
+    if pole.dimension != "pace" or pole.value not in ("faster", "slower") or pole.is_negated or not pole.is_compared:
+        return False
+    speeds = [numeral for numeral in stated.numerals if numeral.unit == "mps" and numeral.kind == "number"]
+    if len(speeds) != 2 or len(stated.numerals) != 2 or stated.frames:
+        return False
+    owners = [subject_before(stated.text, numeral.start, language) for numeral in speeds]
+    if sorted(owners) != ["drone", "target"] or not pole.about:
+        return False
+    own, other = speeds if owners[0] == pole.about else speeds[::-1]
+    return (own.value - other.value) * (1 if pole.value == "faster" else -1) < 0
+
+
+def _plans_other_side(stated: Stated, language: Language, decision: str) -> bool:
+    """Tell whether a sentence plainly asks for the other side than the decision, and never names the decision's own."""
+    side = next((side for side in ("left", "right") if side in decision), None)
+    sides = {pole.value for pole in stated.poles if pole.dimension == "side"}
+    is_plain = not any(pole.is_negated for pole in stated.poles if pole.dimension == "side")
+    return (
+        side is not None
+        and is_plain
+        and len(sides) == 1
+        and side not in sides
+        and bool(_asks(language).search(stated.text))
+    )
 
 
 class Prose(WayOfWriting):

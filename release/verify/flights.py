@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -9,17 +10,133 @@ from typing import Any, Literal
 import numpy as np
 
 from cosfly.errors import InputError
+from cosfly.products.actions import TOKENS
 from cosfly.products.shown_captions import CaptionReader
 from cosfly.work.items import Item, Outcome
-from release.flight_rows import FlightRows
+from release.columns import CAPTION, CAPTION_NAMES, LANGUAGES, REQUIRED, SCALARS, TARGET_PICTURE, WINDOW
+from release.flight_rows import FlightRows, Row
 from release.record import ReleaseRecord
 from release.verify.across import summary_of
 from release.verify.findings import Findings
 from release.verify.geometry import check_geometry
-from release.verify.identity import check_identity
-from release.verify.said import check_captions
 from release.verify.scene import check_pictures
 from release.verify.sources import Entry, FlightSource, flight_rows
+
+CONSTANT = [column.name for column in SCALARS if column.constant]
+ZOOMED = ("fov_deg", "intrinsics")  # but of a camera that zooms; geometry.py looks at each row's
+CLOSED = {column.name: column.words for column in SCALARS if column.words}
+RANGES = {column.name: column.ranges for column in SCALARS if column.ranges}
+LARGEST = 1e7  # of any number: farther than any town reaches, m
+
+
+def check_identity(flight: FlightRows, findings: Findings) -> None:
+    """Check ids, names, constants, closed sets, ranges and nulls of a flight's rows."""
+    _check_names(flight, findings)
+    for name in CONSTANT:
+        column = flight.column(name)
+        differs = [value != column[0] and not (flight.zooms and name in ZOOMED) for value in column]
+        if any(differs):
+            i = differs.index(True)
+            findings.error("constant", flight.where(i, name), column[i], f"{column[0]}, as in the flight's first row")
+    closed = {name: TOKENS if words == "actions" else words for name, words in CLOSED.items()}
+    for i, row in enumerate(flight.rows):
+        for name in (name for name in REQUIRED if name in row and row[name] is None):
+            findings.error("null", flight.where(i, name), "null", "a value in every row")
+        for name, allowed in closed.items():
+            value = row.get(name)
+            if value is not None and value not in allowed:
+                expected = f"one of {len(allowed)} words: {', '.join(allowed[:4])} ..."
+                findings.error("closed_set", flight.where(i, name), repr(value), expected)
+        for name, value in row.items():
+            if isinstance(value, float | dict):
+                _check_numbers(flight, i, name, value, findings)
+
+
+def _check_names(flight: FlightRows, findings: Findings) -> None:
+    first, index = flight.rows[0], flight.index
+    if flight.name != "/".join(str(first.get(n)) for n in ("run", "town", "trajectory", "variant")):
+        findings.error("flight", flight.name, "rows of another flight", "rows of this one")
+    for i, row in enumerate(flight.rows):
+        given, number = row.get("sample_id"), row.get("frame_index") or 0
+        own = f"{row.get('trajectory')}_{row.get('variant')}_frame_{number:05d}"
+        expected = own if flight.given_id is None else f"{flight.given_id}_frame_{number:05d}"
+        fits = str(given).endswith(own) if flight.given_id is None else given == expected
+        if "sample_id" in row and not fits:
+            findings.error("sample_id", flight.where(i, "sample_id"), repr(given), f"{expected}, of its own columns")
+    if (backwards := np.diff(index, prepend=-1) <= 0).any():
+        k = int(np.argmax(backwards))
+        findings.error("frame_index", flight.where(k), f"{index[max(k - 1, 0) :][:2]}", "indices that grow, from 0 on")
+    if (flight.time_s[1:] <= flight.time_s[:-1]).any():
+        findings.error("time", flight.where(0, "time_s"), "times that do not grow", "times that grow with the frames")
+
+
+def _check_numbers(flight: FlightRows, i: int, name: str, value: Any, findings: Findings) -> None:
+    """Check that numbers are finite, of a sane size, and within their range; a group is whole or null."""
+    if isinstance(value, dict) and name in ("perturbation", "image", "instance", TARGET_PICTURE):
+        return
+    ranges = RANGES.get(name, {})
+    for member, number in value.items() if isinstance(value, dict) else (("", value),):
+        low, high = ranges.get(member, (-LARGEST, LARGEST))
+        if isinstance(number, str | bool) or (number is not None and low <= number <= high):
+            continue
+        place = flight.where(i, f"{name}.{member}".rstrip("."))
+        if number is None:
+            findings.error("null", place, "null", "a number: the group is there")
+        elif not math.isfinite(number):
+            findings.error("not_finite", place, number, "a finite number")
+        else:
+            findings.error("range", place, number, f"{low:g} to {high:g}")
+
+
+NEVER_NULL = [column.name for column in CAPTION if column.required]
+
+
+def check_captions(flight: FlightRows, window_frames: int | None, findings: Findings) -> None:
+    """Check the captions of a flight's rows.
+
+    Args:
+        window_frames: of every window, as the record says; None where nobody says.
+    """
+    released = set(flight.index.tolist())
+    for i, row in enumerate(flight.rows):
+
+        def tell(code: str, column: str, got: object, expected: str, i: int = i) -> None:
+            findings.error(code, flight.where(i, column), got, expected)
+
+        if not row.get("has_caption"):
+            if present := [name for name in CAPTION_NAMES if row.get(name) is not None]:
+                tell("caption", present[0], "a value", "null: has_caption is false")
+        elif absent := [name for name in NEVER_NULL if name in row and not row[name]]:
+            tell("caption", absent[0], repr(row.get(absent[0])), "a value: has_caption is true")
+        else:
+            _check_window(row, released, window_frames, tell)
+            _check_decision(row, tell)
+
+
+def _check_window(row: Row, released: set[int], window_frames: int | None, tell: Callable[..., None]) -> None:
+    window, index = row[WINDOW], row["frame_index"]
+    if any(frame is None or frame > index for frame in window):
+        tell("window", WINDOW, window, f"nothing after frame {index}, which is the current one")
+    elif window != list(range(index - len(window) + 1, index + 1)):
+        tell("window", WINDOW, window, f"frames that follow each other and end with {index}")
+    elif window_frames is not None and len(window) != window_frames:
+        tell("window", WINDOW, f"{len(window)} frames", f"{window_frames}, as settings.window_frames says")
+    elif not released.issuperset(window):
+        tell("window", WINDOW, f"frame {min(set(window) - released)} is not in the rows", "windows that are whole")
+
+
+def _check_decision(row: Row, tell: Callable[..., None]) -> None:
+    """One decision, and a verdict that follows from it and the label."""
+    decision, label, verdict = row["decision"], row["label"], row["verdict"]
+    decisions = {decision, *(row[f"caption_{language}_flight_decision"] for language in LANGUAGES)}
+    if len(decisions) > 1:
+        tell("decision", "decision", sorted(decisions), "one decision in the row")
+    if (verdict == "CONSISTENT") != (label is not None and decision == label):
+        got = f"{verdict}: decision {decision}, label {label}"
+        tell("verdict", "verdict", got, "CONSISTENT exactly where the decision is the label")
+    elif (verdict == "ABSTAIN" and label is not None) or (verdict == "SOFT_CONFLICT" and label is None):
+        tell("verdict", "verdict", f"{verdict}, label {label}", "ABSTAIN where there is no label, and else not")
+
 
 Level = Literal["structure", "rows", "pixels"]
 # What a senseless value raises in a check of another value; the cause is reported by a check of its own.
