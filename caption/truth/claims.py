@@ -1,7 +1,7 @@
 """Claims: what a sentence states, in a form that can be compared exactly with the facts.
 
 A claim names a fact by its reference (references.py) and gives its value. A teacher that writes slots claims what it
-says in words of its own (quoted.py).
+says in words of its own (caption/writing/slots.py).
 """
 
 from __future__ import annotations
