@@ -15,12 +15,11 @@ from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.reading.documents import read_json, read_model
 from cosfly.work.stage_folder import read_manifest
-from cosfly.worlds.checks import check_world
 from cosfly.worlds.objects import OBJECTS, assets
 from cosfly.worlds.plan import PLAN_FORMAT, NamedObject, WorldPlan
 from cosfly.worlds.rules import plan_by_rules
 from cosfly.worlds.settings import WorldConfig
-from cosfly.worlds.stage import run
+from cosfly.worlds.stage import check_world, run
 from cosfly.worlds.town import build, footprints, of_kinds
 
 PROMPTS = list(csv.DictReader(Path(__file__).with_name("world_prompts.tsv").open(), delimiter="\t"))

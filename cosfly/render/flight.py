@@ -7,8 +7,12 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+
+# --- whether a flight can be drawn at all: nobody stands below the ground or looks out of a wall ----------------------
+from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from cosfly.errors import RenderError
@@ -16,9 +20,9 @@ from cosfly.geometry import mask_box, world_from_camera
 from cosfly.look.overlay import Overlay
 from cosfly.products import frames
 from cosfly.products.frames import Camera, DepthFormat, FrameFile, FrameMeta, Look, OthersMeta, TargetMeta, frame_name
-from cosfly.products.goals import target_picture
+from cosfly.products.goals import Goal, SeenFrame, find_says, otherwise, target_picture, words_of
 from cosfly.products.kinds import KINDS
-from cosfly.products.people import Appearance
+from cosfly.products.people import Appearance, People
 from cosfly.products.playback import LEGIBILITY, TARGET_FILE, Flight, write_flight
 from cosfly.products.segments import Mission, Segment
 from cosfly.products.traces import DroneTrace
@@ -35,14 +39,50 @@ from cosfly.render.camera import (
     view_target,
 )
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
-from cosfly.render.goal import MOST_TRIED, find_goal
 from cosfly.render.person import Cast, Gait
 from cosfly.render.perturbation import HIDDEN, STEP_UP_M, PerturbedTrack, Poses, Surroundings
 from cosfly.space.kernels import signed_distances
 from cosfly.work.runner import advance
 from cosfly.work.store import sha256_bytes, storage_errors, write_checksums, write_json
 
-# --- whether a flight can be drawn at all: nobody stands below the ground or looks out of a wall ----------------------
+MOST_TRIED = 8  # frames of a flight, the first in which the target is legible
+# Two looks are told apart by so many pixels, and such a share of a person's, of so much colour difference (CIE76).
+TOLD_PX, TOLD_SHARE, TOLD_CONTRAST = 8, 0.04, 10.0
+
+
+def find_goal(
+    people: People, i: int, draw: Callable[[Appearance], Frame], intrinsic: np.ndarray, rotation: np.ndarray
+) -> Goal | None:
+    """Find what tells the target of frame i from the others that have a pixel in it.
+
+    Args:
+        draw: the frame with a target of that look. intrinsic: (3, 3) px. rotation: (3, 3), world from camera.
+    """
+    looks, frame = people.target, draw(people.target)
+
+    @cache
+    def differs(other: Appearance) -> bool:
+        return are_told_apart(frame, draw(other))
+
+    def tells(slot: str, other: Appearance) -> bool:
+        if slot == "figure":
+            return differs(replace(looks, figure=other.figure))
+        kept, worn = ((getattr(one, slot), getattr(one, f"{slot}_color")) for one in (looks, other))
+        if kept[1] and worn[1] and kept[1] != worn[1]:  # the wardrobe's colours are told apart where they are seen
+            other = otherwise(looks, slot)
+        return differs(replace(looks, **{name: getattr(other, name) for name in (slot, f"{slot}_color")}))
+
+    seen = SeenFrame(frame.kinds, frame.ids, frame.depth, intrinsic, rotation)
+    says = find_says({PERSON_ID: looks, **people.others}, seen, tells)
+    return None if says is None else Goal(i, **words_of(says, looks), says=says)
+
+
+def are_told_apart(frame: Frame, other: Frame) -> bool:
+    """Tell whether the target of two frames that differ in its look alone is another one to the eye."""
+    is_person = (frame.ids == PERSON_ID) | (other.ids == PERSON_ID)
+    colors = [cv2.cvtColor(one.rgb.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[is_person] for one in (frame, other)]
+    num_px = np.count_nonzero(np.linalg.norm(colors[0] - colors[1], axis=-1) >= TOLD_CONTRAST)
+    return bool(num_px >= max(TOLD_PX, TOLD_SHARE * np.count_nonzero(is_person)))
 
 
 TOUCH_M = 0.01  # so deep in a box a camera still counts as touching it
