@@ -38,7 +38,7 @@ from cosfly.products.goals import Goal
 from cosfly.products.motion import PlannedMotion, without_perturbation
 from cosfly.products.people import People
 from cosfly.products.places import place_of, tree_of_flight
-from cosfly.products.segments import FOLLOW, Mission, Segment, flown_as_json, mirrored
+from cosfly.products.segments import FOLLOW, Mission, Segment, flown_as_json, mirrored, read_flown
 from cosfly.products.trajectory import (
     BBOX,
     SCHEMA,
@@ -53,7 +53,7 @@ from cosfly.products.trajectory import (
 )
 from cosfly.products.walks import pace_of
 from cosfly.products.weather import WeatherRecord
-from cosfly.reading.documents import read_json
+from cosfly.reading.documents import read_json, validated
 from cosfly.reading.files import read_bytes
 from cosfly.work.store import write_json
 
@@ -299,9 +299,12 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
     if not all(target or p.get("target", "missing") is None for target, p in zip(targets, points, strict=True)):
         reader.issue("points[].target", "missing", "an object, or null where there is nobody")
     company = np.column_stack([numbers_of(others, name) for name in COMPANY])
-    segments, mission = reader.flown(raw, len(points))
-    reader.weather(raw)
-    people = reader.people(raw)
+    segments, mission = reader.told(lambda: read_flown(raw, len(points), f"{path}: ")) or ((), None)
+    people = reader.told(lambda: validated(People, raw["people"], f"{path}: people")) if "people" in raw else None
+    has_goal = raw.get("goal") is not None and "absent" not in object_of(raw, "goal")
+    goal = reader.told(lambda: Goal.from_json(raw["goal"], len(points), f"{path}: goal")) if has_goal else None
+    if {"params", "mode"} & object_of(raw, "weather").keys():  # public files may call something else so
+        reader.told(lambda: validated(WeatherRecord, raw["weather"], f"{path}: weather"))
     is_original = bool(object_of(raw, "augmentation").get("is_original", variant == ORIGINAL))
     drone, turn, walker = (
         offsets_of(points, name, axes, is_original)
@@ -341,7 +344,7 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
         segments=segments,
         mission=mirrored(mission),
         people=people,
-        goal=reader.goal(raw, len(points)),
+        goal=goal,
         company=None if np.isnan(company[:, 0]).any() else company,
     )
 

@@ -64,8 +64,13 @@ def mirrored(mission: Mission | None) -> Mission | None:
     return replace(mission, home_m=(x, -y, z))
 
 
-def read_segments(value: Any, num_frames: int, where: str) -> tuple[Segment, ...]:
-    """Read segments; none is no segment."""
+def read_flown(record: dict, num_frames: int, where: str) -> tuple[tuple[Segment, ...], Mission | None]:
+    """Read what `flown_as_json` gives. where: what stands in a message before the names of the two keys."""
+    segments, mission = (record.get(name) for name in ("segments", "mission"))
+    return _segments(segments, num_frames, f"{where}segments"), _mission(mission, num_frames, f"{where}mission")
+
+
+def _segments(value: Any, num_frames: int, where: str) -> tuple[Segment, ...]:
     segments = () if value is None else validated(tuple[Segment, ...], value, where)
     for k, part in enumerate(segments):
         for name in ("begin", "end"):
@@ -73,8 +78,7 @@ def read_segments(value: Any, num_frames: int, where: str) -> tuple[Segment, ...
     return segments
 
 
-def read_mission(value: Any, num_frames: int, where: str) -> Mission | None:
-    """Read a mission; null is none."""
+def _mission(value: Any, num_frames: int, where: str) -> Mission | None:
     if value is None:
         return None
     home = value.get("home") if isinstance(value, dict) else None

@@ -10,7 +10,7 @@ import numpy as np
 
 from cosfly.errors import InputError
 from cosfly.products.columns import column, matrix, read_items, rounded, step_field, text_id, write_items
-from cosfly.products.segments import Mission, Segment, flown_as_json, read_mission, read_segments
+from cosfly.products.segments import Mission, Segment, flown_as_json, read_flown
 from cosfly.products.walks import PLAIN_PACE, pace_field, pace_of
 from cosfly.reading.documents import FileFormat
 
@@ -140,8 +140,7 @@ class DroneTrace:
                 raise InputError("missing", where=f"{where}.{group}", expected="an object of columns")
             groups[group] = np.stack([column(part, name, f"{where}.{group}", len(time_s)) for name in names], axis=1)
         visibility, clearances_m = (column(record, name, where, len(time_s)) for name in ("visibility", "clearance"))
-        segments = read_segments(record.get("segments"), len(time_s), f"{where}.segments")
-        mission = read_mission(record.get("mission"), len(time_s), f"{where}.mission")
+        segments, mission = read_flown(record, len(time_s), f"{where}.")
         more: dict[str, Any] = {name: record[name] for name in MORE if name in record}
         more |= {"segments": segments, "mission": mission, "pace": pace_of(record, where)}
         more["part_of"] = Excerpt.from_json(record.get("part_of"), f"{where}.part_of")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -13,12 +13,10 @@ from cosfly.errors import InputError
 from cosfly.geometry import step_s
 from cosfly.products.columns import is_number, numbers
 from cosfly.products.frames import ANGLES, XYZ, Camera
-from cosfly.products.goals import Goal
-from cosfly.products.people import People
-from cosfly.products.segments import Mission, Segment, read_mission, read_segments
-from cosfly.products.weather import WeatherRecord
 from cosfly.reading.arrays import check_pixels
-from cosfly.reading.documents import MISSING, validated
+from cosfly.reading.documents import MISSING
+
+Told = TypeVar("Told")
 
 SCHEMA, SCHEMA_VERSION = "drone_nav_traj_v7", "7.0.0"
 WAYPOINT_TOLERANCE_M = 1e-5  # the public readers' own bound on nav_waypoint.t1_world
@@ -127,31 +125,11 @@ class FieldReader:
             return None
         return np.concatenate([found, np.full((1, *found.shape[1:]), np.nan)])
 
-    def flown(self, raw: dict, num_points: int) -> tuple[tuple[Segment, ...], Mission | None]:
-        """Styles of the parts, and mission; somebody else's fields of these names are noted and left."""
+    def told(self, read: Callable[[], Told]) -> Told | None:
+        """Return what is read of a field that a file need not have; None where it is somebody else's of this name,
+        which is noted."""
         with self.noted():
-            segments = read_segments(raw.get("segments"), num_points, f"{self.path}: segments")
-            return segments, read_mission(raw.get("mission"), num_points, f"{self.path}: mission")
-        return (), None
-
-    def weather(self, raw: dict) -> None:
-        """Check the record of weather, where it is one as the paper has it; public files may call something else so."""
-        told = raw.get("weather")
-        if isinstance(told, dict) and ("params" in told or "mode" in told):
-            with self.noted():
-                validated(WeatherRecord, told, f"{self.path}: weather")
-
-    def people(self, raw: dict) -> People | None:
-        """What people look like, None where nothing is said; somebody else's field of this name is noted and left."""
-        with self.noted():
-            return validated(People, raw["people"], f"{self.path}: people") if "people" in raw else None
-        return None
-
-    def goal(self, raw: dict, num_points: int) -> Goal | None:
-        """The goal in words, None where there is none; somebody else's field of this name is noted and left."""
-        with self.noted():
-            if raw.get("goal") is not None and "absent" not in object_of(raw, "goal"):
-                return Goal.from_json(raw["goal"], num_points, f"{self.path}: goal")
+            return read()
         return None
 
     def camera(self, group: Any) -> Camera:
