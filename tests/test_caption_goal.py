@@ -10,7 +10,7 @@ from caption.run.windows import cut_windows
 from caption.schema import WindowConfig
 from caption.teachers.prompt_files import shipped_prompts
 from caption.teachers.prompts import user_prompts
-from caption.teachers.statements import describe
+from caption.teachers.rules import describe
 from caption.truth.facts import measure_facts
 from caption.truth.references import find_fact, number_holds, parse_reference
 from caption.truth.vocabulary import Vocabulary

@@ -21,7 +21,7 @@ from teacher_server import CHINESE, ENGLISH, TeacherServer, is_mirror
 from caption.run.stage import run
 from caption.run.windows import cut_windows
 from caption.schema import WindowConfig
-from caption.teachers.statements import describe
+from caption.teachers.rules import describe
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.mirror import check_translation
 from caption.truth.references import Fact, look_up, parse_reference

@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 from cosfly.errors import InputError
 from cosfly.geometry import intrinsic_matrix, look_at, world_from_camera
 from cosfly.maps import cityjson
-from cosfly.maps.cityjson import CityJsonConfig
+from cosfly.maps.cityjson import CityJsonConfig, solid_mesh, top_within, triangles_of
 from cosfly.maps.footprints import Rectangle
-from cosfly.maps.solids import solid_mesh, top_within, triangles_of
 from cosfly.maps.stage import MapsConfig
 from cosfly.maps.stage import run as make_map
 from cosfly.products.boxes import BoxMap, make_box_map, read_boxes, write_boxes

@@ -29,8 +29,7 @@ from release.stats import stats
 from release.viewer.content import (
     ViewerConfig,
 )
-from release.viewer.of_release import VIEW_OF, picture
-from release.viewer.page import run
+from release.viewer.page import VIEW_OF, picture, run
 from specimens import make_playback_tree
 
 NUM_POINTS = 24
