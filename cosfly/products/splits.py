@@ -60,6 +60,13 @@ class Course:
             found[:, axis] = np.interp(seconds, time_s, places_m[:, axis])
         return Course(self.name, self.town, seconds, found)
 
+    @cached_property
+    def key(self) -> tuple[str, bytes]:
+        """What is the same for two flights of one walk and length, but for noise, where both are `at_seconds`."""
+        digest = hashlib.sha256(self.time_s.tobytes())
+        digest.update(np.round(self.target_m[:, :2] / SAME_M).tobytes())
+        return town_family(self.town), digest.digest()
+
 
 def town_family(town: str) -> str:
     """Give the name that a town has in all of its builds: `Town03` and `Town03_Opt` are one map."""
@@ -71,23 +78,6 @@ def town_family(town: str) -> str:
 # --- walks ------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Track:
-    """A course at the full seconds that it knows: seconds (k,) whole numbers, increasing; places_m (k, 2) x, y."""
-
-    name: str
-    family: str
-    seconds: np.ndarray
-    places_m: np.ndarray
-
-    @cached_property
-    def key(self) -> tuple[str, bytes]:
-        """What is the same for two flights of one walk and length, but for noise."""
-        digest = hashlib.sha256(self.seconds.tobytes())
-        digest.update(np.round(self.places_m / SAME_M).tobytes())
-        return self.family, digest.digest()
-
-
 def walks_of(courses: Iterable[Course]) -> dict[str, str]:
     """Tell which courses are of one walk: name -> walk.
 
@@ -96,49 +86,31 @@ def walks_of(courses: Iterable[Course]) -> dict[str, str]:
     called by the first of its names in the alphabet, so neither the order of the courses nor their number of flights
     matters.
     """
-    tracks = sorted((_track(course) for course in courses), key=lambda track: (track.name, track.key))
-    groups = _Groups(track.name for track in tracks)
-    once: dict[tuple[str, bytes], _Track] = {}
-    for track in tracks:
-        if len(track.seconds):
-            groups.unite(track.name, once.setdefault(track.key, track).name)
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    tracks = sorted((course.at_seconds() for course in courses), key=lambda track: (track.name, track.key))
+    once: dict[tuple[str, bytes], Course] = {}
+    pairs = [(one.name, once.setdefault(one.key, one).name) for one in tracks if len(one.time_s)]
     families = defaultdict(list)
     for track in once.values():
-        families[track.family].append(track)
-    for family in families.values():
-        for one, other in _near_pairs(family):
-            groups.unite(one, other)
-    return {name: groups.first_of(name) for name in groups.first}
+        families[town_family(track.town)].append(track)
+    pairs += [pair for family in families.values() for pair in _near_pairs(family)]
+    number = {name: k for k, name in enumerate(dict.fromkeys(track.name for track in tracks))}  # by alphabet
+    ends = np.array([(number[one], number[other]) for one, other in pairs], dtype=np.int32).reshape(-1, 2).T
+    joined = coo_array((np.ones(ends.shape[1], dtype=bool), tuple(ends)), shape=(len(number), len(number)))
+    first: dict[int, str] = {}
+    groups = connected_components(joined, directed=False)[1].tolist() if number else []
+    return {name: first.setdefault(group, name) for name, group in zip(number, groups, strict=True)}
 
 
-class _Groups:
-    """Names that were united, each with the first name of its group."""
-
-    def __init__(self, names: Iterable[str]) -> None:
-        self.first = {name: name for name in names}
-
-    def first_of(self, name: str) -> str:
-        while self.first[name] != name:
-            self.first[name] = name = self.first[self.first[name]]
-        return name
-
-    def unite(self, one: str, other: str) -> None:
-        first, second = sorted((self.first_of(one), self.first_of(other)))
-        self.first[second] = first
-
-
-def _track(course: Course) -> _Track:
-    told = course.at_seconds()
-    return _Track(told.name, town_family(told.town), told.time_s, told.target_m[:, :2])
-
-
-def _near_pairs(tracks: list[_Track]) -> list[tuple[str, str]]:
+def _near_pairs(tracks: list[Course]) -> list[tuple[str, str]]:
     """Find the pairs of tracks that are near each other for long enough."""
     from scipy.spatial import cKDTree
 
-    owners = np.repeat(np.arange(len(tracks)), [len(track.seconds) for track in tracks])
-    seconds = np.concatenate([track.seconds for track in tracks])
-    places_m = np.concatenate([track.places_m for track in tracks])
+    owners = np.repeat(np.arange(len(tracks)), [len(track.time_s) for track in tracks])
+    seconds = np.concatenate([track.time_s for track in tracks])
+    places_m = np.concatenate([track.target_m[:, :2] for track in tracks])
     order = np.argsort(seconds, kind="stable")
     num_near: dict[tuple[int, int], int] = defaultdict(int)
     for at_once in np.split(order, np.flatnonzero(np.diff(seconds[order])) + 1):
@@ -148,7 +120,7 @@ def _near_pairs(tracks: list[_Track]) -> list[tuple[str, str]]:
                 num_near[one, other] += 1
     found = []
     for (one, other), count in num_near.items():
-        shared = np.intersect1d(tracks[one].seconds, tracks[other].seconds, assume_unique=True)
+        shared = np.intersect1d(tracks[one].time_s, tracks[other].time_s, assume_unique=True)
         if count >= min(len(shared), max(FEW_S, NEAR_SHARE * len(shared))):
             found.append((tracks[one].name, tracks[other].name))
     return found
