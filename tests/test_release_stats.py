@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from specimens_release import build, make_inputs
 from specimens_rows import make_row
 
+from cosfly.geometry import box_iou
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
 from cosfly.products.inspection import read_inspection, write_inspection
 from cosfly.products.kinds import KINDS
@@ -22,7 +23,7 @@ from cosfly.reading.documents import read_json
 from cosfly.space.flight_metrics import accel_rms, jerk_rms, length_m
 from release.columns import POINT, POSE
 from release.record import read_record
-from release.stats.counting import Counts, overlap
+from release.stats.counting import Counts
 from release.stats.pixels import BIN_M, Pixels
 from release.stats.stats import run
 from release.stats.tables import Stats
@@ -82,8 +83,8 @@ def test_differences_are_taken_over_frames_in_a_row_alone():
     ],
 )
 def test_overlap(a, b, share):
-    assert overlap(list(a), list(b)) == pytest.approx(share)
-    assert overlap(list(b), list(a)) == pytest.approx(share)
+    assert box_iou(np.array(a), np.array(b)) == pytest.approx(share)
+    assert box_iou(np.array(b), np.array(a)) == pytest.approx(share)
 
 
 def test_captions_are_counted_by_what_they_say():

@@ -166,7 +166,7 @@ def validated(kind: type[Kind], value: Any, where: str | Path) -> Kind:
         InputError: names the file and the first wrong field.
     """
     try:
-        return _validator(kind).validate_python(value)
+        return _validator(kind).validate_python(value)  # type: ignore[arg-type]
     except ValidationError as error:
         detail = error.errors(include_url=False, include_context=False)[0]
         places = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in detail["loc"])

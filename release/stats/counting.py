@@ -13,6 +13,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
+from cosfly.geometry import box_iou
 from cosfly.products.captions import FIELDS
 from cosfly.products.walks import TARGET_HEIGHT_M
 from release.card.numbers import Place3, Sum, bounded, clean_place
@@ -76,7 +79,7 @@ class FlightSums:
             self.width_px.add(box[2] - box[0])
             self.height_px.add(box[3] - box[1])
             if row["target_mask_bbox"] is not None:
-                self.iou.add(overlap(box, [row["target_mask_bbox"][name] for name in BOX]))
+                self.iou.add(box_iou(np.array(box), np.array([row["target_mask_bbox"][name] for name in BOX])))
 
     def _move(self, index: int, time_s: float, place: Place3) -> None:
         place = (bounded(place[0]), bounded(place[1]), bounded(place[2]))
@@ -112,14 +115,6 @@ def clean_target(row: Mapping[str, Any]) -> Place3 | None:
         return None
     x, y, z = (target[axis] - offset[axis] for axis in POINT)
     return x, y, z
-
-
-def overlap(a: list[float], b: list[float]) -> float:
-    """Give the intersection over union of two boxes, xmin, ymin, xmax, ymax; 0 where neither has an area."""
-    width, height = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
-    both = max(0.0, width) * max(0.0, height)
-    areas = sum(max(0.0, box[2] - box[0]) * max(0.0, box[3] - box[1]) for box in (a, b))
-    return both / (areas - both) if areas > both else 0.0
 
 
 @dataclass
