@@ -27,10 +27,9 @@ from cosfly.products.playback import read_flight
 from cosfly.products.splits import SPLITS
 from cosfly.space.blind import past_of
 from distill.prepare import stage
-from distill.prepare.choice import Balance, WindowRanks, balance_of, keeps, limit_to
 from distill.prepare.sources import RunSource
 from distill.prepare.splitting import check_no_leak
-from distill.prepare.stage import PrepareConfig, make_sample
+from distill.prepare.stage import Balance, PrepareConfig, WindowRanks, balance_of, keeps, limit_to, make_sample
 from distill.schema import RECORD, Sample, open_split, resolve_trees, split_path
 from specimens import make_playback_tree
 
@@ -278,7 +277,7 @@ def test_the_library_of_data_sets_opens_it(tree, captions, tmp_path):
         assert systems[row["system"]] == sample.prompt.system
 
 
-# --- distill/prepare/choice.py ----------------------------------------------------------------------------------------
+# --- choice ---------------------------------------------------------------------------------------------------------
 
 
 def windows_of(counts: dict[str, int]) -> list[tuple[str, str]]:

@@ -27,8 +27,7 @@ from release.card.render import first_split, render_card
 from release.columns import POINT
 from release.record import read_record
 from release.verify.findings import Findings
-from release.verify.records import check_numbers
-from release.verify.verify import verify
+from release.verify.verify import check_numbers, verify
 
 ROOT = Path(__file__).resolve().parents[1]
 ROWS = [make_row(i, variant, f"trajectory_{k}") for k in (1, 2) for variant in ("ORI", "aug_001") for i in range(12)]

@@ -21,8 +21,7 @@ from release.export.source import ReleasedRows
 from release.export.tree import flight_of_rows
 from release.flight_rows import FlightRows, Row
 from release.verify.findings import Findings
-from release.verify.pictures import decode
-from release.verify.scene import check_goal
+from release.verify.scene import check_goal, decode
 from release.verify.verify import verify
 
 pytestmark = [needs_gl]

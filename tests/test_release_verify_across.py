@@ -14,7 +14,7 @@ from release.flight_rows import FlightRows
 from release.verify import scene
 from release.verify.across import Summary, check_across
 from release.verify.findings import Findings
-from release.verify.pictures import PERSON, SKY, survey
+from release.verify.scene import PERSON, SKY, survey
 
 
 def flight(number: int, **values) -> Summary:
