@@ -138,7 +138,7 @@ def release_export(
     """Write a release in another format, without loss, or its accepted captions to one file."""
     from cosfly.work.config import build
 
-    if format in ("tree", "webdataset", "lerobot"):
+    if format == "tree" or format == "webdataset" or format == "lerobot":
         from release.export import stage as export
         from release.export.contract import ExportConfig
 

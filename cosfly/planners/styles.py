@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from cosfly.products.segments import FOLLOW
 
@@ -104,4 +105,5 @@ def with_ranges(row: Style, ranges: Mapping[str, Range]) -> Style:
             raise ValueError(f"{name} is a least and a greatest value, got {low:g} before {high:g}")
         if low <= 0 and name not in ("bearing_deg", "round_mps", "climb_m"):
             raise ValueError(f"{name} must be greater than 0, got {low:g}")
-    return replace(row, **dict(ranges))
+    given: dict[str, Any] = dict(ranges)
+    return replace(row, **given)

@@ -279,8 +279,8 @@ def draw_fidelity(renderer: Renderer, script: FlightScript, i: int, cfg: ZoomStu
         draw_frame(renderer, lens, i, script.perturbed.poses, 0.0)[0].rgb for lens in (at_level(script, wide), longer)
     )
     size, half = np.array([cfg.width_px, cfg.height_px]), 0.5 / MAGNIFICATION
-    corners = [np.round(size * share).astype(int).tolist() for share in (0.5 - half, 0.5 + half)]
-    marked = cv2.rectangle(rgb.copy(), *corners, CROP_COLOR, max(2, cfg.width_px // 400))
+    low, high = (np.round(size * share).astype(int).tolist() for share in (0.5 - half, 0.5 + half))
+    marked = cv2.rectangle(rgb.copy(), low, high, CROP_COLOR, max(2, cfg.width_px // 400))
     panels = [(marked, f"{cfg.levels_deg[0]:g} deg, 1.0x")]
     for kernel in KERNELS:
         digital = digital_zoom(rgb, MAGNIFICATION, kernel)
