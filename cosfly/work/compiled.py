@@ -4,14 +4,16 @@ Numba keeps a compiled function until its own file changes, with everything it c
 `kernels.py` alone, a planner would go on with the old kernels. Here every version of the compiled sources, taken
 together, has a cache folder of its own: $XDG_CACHE_HOME/cosfly/<digest>. NUMBA_CACHE_DIR, if set, is left alone.
 
-Compiling costs seconds at first use. Two habits keep it down: a constant among the arguments of a compiled function is
-a type of its own to numba, which compiles the function once more, so it is passed as `int64(0)`; and whole arrays are
-set by `fill` or a loop, because numba's `array[:] = ...` brings the formatting of its error message along.
+Of several processes that need a function, one compiles it and the others wait for its lock and load it. Compiling costs
+seconds at first use. Two habits keep it down: a constant among the arguments of a compiled function is a type of its
+own to numba, which compiles the function once more, so it is passed as `int64(0)`; and whole arrays are set by `fill`
+or a loop, because numba's `array[:] = ...` brings the formatting of its error message along.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
 import logging
 import os
@@ -23,7 +25,7 @@ from typing import Any
 
 import numba
 from numba import boolean, int64
-from numba.core import event
+from numba.core import caching, event
 
 from cosfly.reading.files import read_bytes
 
@@ -35,10 +37,55 @@ PACKAGE = Path(__file__).parents[1]
 UNUSED_DAYS = 30  # a cache of other sources that no process has opened for so long is deleted
 
 
+class _SharedCache(caching.FunctionCache):
+    """What is compiled of a function. Who finds nothing holds the function's lock until it has saved its own."""
+
+    _lock: Any = None
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        found = super().load_overload(sig, target_context)
+        if found is None and self._take_lock():
+            found = super().load_overload(sig, target_context)  # another process may have compiled it meanwhile
+            if found is not None:
+                self._release_lock()
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        finally:
+            self._release_lock()
+
+    def _take_lock(self) -> bool:
+        if self._lock is None:  # a function may need itself, or another overload of itself
+            try:
+                os.makedirs(self.cache_path, exist_ok=True)
+                path = os.path.join(self.cache_path, f"{self._py_func.__qualname__}.lock")
+                self._lock = open(path, "w")  # noqa: SIM115
+                fcntl.flock(self._lock, fcntl.LOCK_EX)
+            except OSError:  # no place for a lock: each compiles for itself
+                self._release_lock()
+                return False
+        return True
+
+    def _release_lock(self) -> None:
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+
 def njit(**options: Any) -> Callable[[Callable], Callable]:
     """Numba's decorator, without the wrapper for callers in C, which nobody uses and which takes a tenth of the
     time."""
-    return numba.njit(no_cfunc_wrapper=True, **options)  # type: ignore[call-overload]
+    compile_lazily = numba.njit(no_cfunc_wrapper=True, **options)  # type: ignore[call-overload]
+
+    def decorate(function: Callable) -> Callable:
+        compiled = compile_lazily(function)
+        if options.get("cache"):
+            compiled._cache = _SharedCache(function)
+        return compiled
+
+    return decorate
 
 
 def sources_digest(package: Path) -> str:
