@@ -75,10 +75,6 @@ class BoxesConfig(Config):
         return {"boxes": self.path}
 
 
-class WrongRow(Exception):
-    """What is wrong with one row, in words."""
-
-
 class _Row(NamedTuple):
     where: str
     values: Mapping[str, Any]
@@ -138,18 +134,15 @@ def _read_rows(cfg: BoxesConfig, path: Path) -> BoxMap:
     rows = list((_table_rows if path.suffix.lower() == ".csv" else _feature_rows)(cfg, path))
     if not rows:
         raise InputError("the map holds no boxes", where=path, expected="a box a line, or a feature each")
-    boxes, ids, places = BoxList(), list[Any](), dict[str, list[str]]()
+    boxes, places = BoxList(), dict[str, list[str]]()  # what is wrong -> with which rows, so that it is listed once
     for row in rows:
-        try:
-            _add(boxes, row, cfg)
-        except WrongRow as wrong:
-            places.setdefault(str(wrong), []).append(row.where)
-        ids.append(row.values.get("id"))
-    ids = ids if all(ids) else []
-    numbers = [int(text) if (text := str(one)).isascii() and text.isdecimal() else -1 for one in ids]
+        if wrong := _add(boxes, row, cfg):
+            places.setdefault(wrong, []).append(row.where)
+    ids = [str(row.values["id"]) for row in rows if row.values.get("id")]
+    numbers = [int(text) if text.isascii() and text.isdecimal() else -1 for text in ids if len(ids) == len(rows)]
     if len(set(numbers)) < len(numbers) or not all(0 <= number < 2**63 for number in numbers):
         places["id is not a whole number, each once"] = [""]
-    if places:  # what is wrong with many rows is listed once
+    if places:
         more = {wrong: f" (and {len(where) - 1} more)" if len(where) > 1 else "" for wrong, where in places.items()}
         problems = [f"{where[0]}: {wrong}{more[wrong]}".removeprefix(": ") for wrong, where in places.items()]
         expected = f"columns {', '.join(COLUMNS)}; types {', '.join(TYPES)}, or translated by maps.boxes.types"
@@ -216,9 +209,10 @@ def _unknown(names: Sequence[str], cfg: BoxesConfig) -> list[str]:
     return [f"unknown column {name!r}{nearest(name, COLUMNS)}" for name in names if name not in known]
 
 
-def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> None:
+def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> str:
+    """Add the boxes of a row; return what is wrong with the row, "" if nothing."""
     if row.wrong:
-        raise WrongRow(row.wrong)
+        return row.wrong
     name = str(row.values.get("type", ""))
     kind, numbers = cfg.types.get(name, name), {k: _number(row.values[k]) for k in NUMBERS if k in row.values}
     wrong = [] if kind in TYPES else [f"unknown type {name[:40]!r}{nearest(name, [*TYPES, *cfg.types])}"]
@@ -233,7 +227,7 @@ def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> None:
     if row.outline is not None and not row.outline.is_valid:
         wrong.append(f"the outline crosses itself: {shapely.is_valid_reason(row.outline)}")
     if wrong:
-        raise WrongRow(", ".join(wrong))
+        return ", ".join(wrong)
     height_m = SLAB_M if is_slab else numbers["height_m"]
     low_m = cfg.ground_z_m - (SLAB_M if is_slab else 0.0)
     if "z_m" in numbers:
@@ -241,9 +235,10 @@ def _add(boxes: BoxList, row: _Row, cfg: BoxesConfig) -> None:
     if row.outline is None:
         place, size = (numbers["x_m"], numbers["y_m"]), (numbers["length_m"], numbers["width_m"])
         boxes.add(kind, place, size, low_m, low_m + height_m, numbers.get("yaw_deg", 0.0))
-        return
+        return ""
     for rectangle in cover(row.outline, min_fill=OUTLINE_FILL, min_size_m=OUTLINE_PIECE_M, shares=CUT_SHARES):
         boxes.add(kind, rectangle.center, rectangle.size, low_m, low_m + height_m, rectangle.yaw_deg)
+    return ""
 
 
 def _number(value: Any) -> float:
