@@ -14,7 +14,6 @@ import numpy as np
 from release_tampering import depth_of, pixels_of, png, set_depth
 
 from cosfly.geometry import box_corners, project, world_from_camera
-from cosfly.products.captions import FIELDS
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 
 Row = dict[str, Any]
@@ -240,12 +239,6 @@ def with_poses(own: Rows, others: Rows) -> None:
         projected(row)
 
 
-CAPTION = [
-    "decision", "label", "label_from", "verdict", "repair_strategy", "teacher_kind", "teacher_model", "writing",
-    "sentence_states_en", "sentence_states_zh",
-    *(f"caption_{lang}_{name}" for lang in ("en", "zh") for name in FIELDS),
-    "system_en", "system_zh", "prompt_en", "prompt_zh",
-]  # fmt: skip
 DECISIONS = ("decision", "caption_en_flight_decision", "caption_zh_flight_decision")
 
 
@@ -369,7 +362,6 @@ LIES_OF_ROWS: dict[str, Lie] = {
     "window_with_a_gap": alter(caption, caption_window=lambda w: [w[0] - 1, *w[1:]]),
     "window_with_a_frame_twice": alter(caption, caption_window=lambda w: [w[0], *w[:-1]]),
     "decision_differs_between_languages": put(not_hovering, caption_zh_flight_decision="hover"),
-    "captions_of_two_windows_exchanged": swapped(captioned, 0, -1, *CAPTION),
     "decision_and_label_changed_together": put(
         not_hovering, **dict.fromkeys((*DECISIONS, "label"), "hover"), verdict="CONSISTENT"
     ),

@@ -85,6 +85,6 @@ def test_every_answer_parses_and_every_window_is_accounted_for(server, tmp_path)
 def test_the_doctor_sees_that_this_server_applies_the_schema(server):
     findings = {finding.name: finding for finding in examine_endpoint(server.url, settings(server), VOCABULARY)}
     assert findings["JSON schema"].state == "ok"
-    assert findings["images per prompt"].state == "ok"
-    assert findings["finish reason"].state == "ok"
-    assert findings["largest prompt"].state == "ok", findings["largest prompt"].detail
+    assert findings["answers"].state == "ok"
+    assert findings["image input"].state == "ok", findings["image input"].detail
+    assert findings["context length"].state == "ok", findings["context length"].detail
