@@ -114,7 +114,6 @@ KINDS = {
     "town 30 degrees": ("town", NARROW),
     "town colours alone": ("town", ["release.modalities=[rgb]"]),
     "town few frames": ("town", ["release.num_frames=12"]),
-    "town claims": ("town", [TEACHER, "caption.writing=claims"]),
     "town slots of a teacher": ("town", [TEACHER, "caption.writing=slots"]),
     "town prose": ("town", [TEACHER, "caption.writing=prose"]),
     "town without captions": ("town", []),
