@@ -237,7 +237,7 @@ class Asking:
         if self.dropped is None or not most or not caption.attempts:
             return
         self.dropped[str(caption.drop_reason)] += 1
-        if self.dropped.total() >= most:
+        if self.dropped.total() == most:
             raise TeacherError(
                 f"none of the first {most} answers was accepted",
                 where=self.cfg.teacher,
