@@ -39,6 +39,7 @@ from cosfly.work import runner
 from cosfly.work.config import shipped
 from cosfly.work.runner import Item, Watch
 from cosfly.work.stage_folder import StageFolder
+from distill.student.random_student import make_tiny_student
 
 # Pages in the order in which what one makes is there for the next; the last one draws the tree of all others anew.
 FIRST, LAST = ("first-runs.md", "commands.md"), ("rendering.md",)
@@ -204,8 +205,8 @@ BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "work/flown0": copy_of("work/random"),
     "work/flown1": copy_of("work/rules"),
     "work/unlabelled/render": copy_of("work/render"),
-    "Qwen/Qwen3.5-2B": copy_of("work/train/student"),
-    "models/Qwen3.5-2B": copy_of("work/train/student"),
+    "Qwen/Qwen3.5-2B": lambda root, target: make_tiny_student(target),
+    "models/Qwen3.5-2B": lambda root, target: make_tiny_student(target),
     "models/roberta-large": lambda root, target: make_encoder(target),
     "models/bert-base-chinese": lambda root, target: make_encoder(target),
     "work/evaluation-4B": copy_of("work/evaluation-2B"),
