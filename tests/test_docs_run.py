@@ -204,6 +204,7 @@ BROUGHT: dict[str, Callable[[Path, Path], object]] = {
     "runs/town2": copy_of("runs/diverse/old_town"),
     "work/flown0": copy_of("work/random"),
     "work/flown1": copy_of("work/rules"),
+    "work/copy": copy_of("work/release"),
     "work/unlabelled/render": copy_of("work/render"),
     "Qwen/Qwen3.5-2B": lambda root, target: make_tiny_student(target),
     "models/Qwen3.5-2B": lambda root, target: make_tiny_student(target),
