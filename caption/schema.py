@@ -24,7 +24,7 @@ from cosfly.look.frame_views import DEPTH_RANGE_M, Layout, View
 from cosfly.products.captions import KeyframeRecord, LabelFrom, Language, SentenceState, TeacherKind, Verdict, Writing
 from cosfly.products.places import FlightChoice
 from cosfly.products.predictions import PREDICTIONS
-from cosfly.work.config import Config, MayDiffer
+from cosfly.runtime.config import Config, MayDiffer
 
 Strategy = Literal["anchored", "hint", "multi_sample", "cascade"]
 Treatment = Literal["keep", "repair", "drop"]

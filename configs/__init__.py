@@ -1,1 +1,1 @@
-"""The configurations that ship with cosfly, installed as package data (see cosfly.work.config.shipped)."""
+"""The configurations that ship with cosfly, installed as package data (see cosfly.runtime.config.shipped)."""

@@ -16,15 +16,15 @@ from typing import Any, Literal, Self, get_args, get_origin, overload
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cosfly.errors import InputError
 from cosfly.look.frame_views import VIEW_FILES, Pictures, View
 from cosfly.products.captions import Language, Prompt
 from cosfly.products.frames import frame_name
 from cosfly.products.splits import SPLITS, Split
-from cosfly.reading.documents import FileFormat, Record, read_model, validated
-from cosfly.reading.tables import TableRows
-from cosfly.work.provenance import fingerprint
-from cosfly.work.store import atomic_file, write_bytes, write_model
+from cosfly.runtime.documents import FileFormat, Record, read_model, validated
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.provenance import fingerprint
+from cosfly.runtime.store import atomic_file, write_bytes, write_model
+from cosfly.runtime.tables import TableRows
 
 RECORD, RECORD_FORMAT = "training_set.json", FileFormat("cosfly.training_set", "4.0", "training set")
 PAGE = "README.md"
@@ -94,7 +94,7 @@ class Sample(SplitMember):
 
 
 class SourceTree(Record):
-    """A playback tree that samples name frames of: its run and its fingerprint (cosfly/work/provenance.py)."""
+    """A playback tree that samples name frames of: its run and its fingerprint (cosfly/runtime/provenance.py)."""
 
     run: str
     sha256: str

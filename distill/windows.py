@@ -19,16 +19,16 @@ import numpy as np
 import pyarrow as pa
 from pydantic import BaseModel
 
-from cosfly.errors import ConfigError, EnvironmentMissing, InputError, nearest
 from cosfly.look.frame_views import VIEW_FILES, Pictures, read_view, scaled_size
 from cosfly.products.captions import FIELDS, Language, Prompt, read_captions
 from cosfly.products.frames import frame_name
 from cosfly.products.playback import Flight, read_flight
-from cosfly.reading.arrays import parse_picture
-from cosfly.reading.documents import read_object, validated
-from cosfly.reading.files import check_stays_below
-from cosfly.reading.tables import TableRows, open_table, rows_of
-from cosfly.work.store import inside
+from cosfly.runtime.arrays import parse_picture
+from cosfly.runtime.documents import read_object, validated
+from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError, nearest
+from cosfly.runtime.files import check_stays_below
+from cosfly.runtime.store import inside
+from cosfly.runtime.tables import TableRows, open_table, rows_of
 
 # What is known of each frame, as the columns of a release are called: members of a struct, "" for a number.
 FACTS: dict[str, tuple[str, ...]] = {

@@ -17,7 +17,6 @@ from typing import Any, Literal, get_args
 import numpy as np
 import pyarrow as pa
 
-from cosfly.escaping import published_name
 from cosfly.geometry import BODY_FROM_CAMERA
 from cosfly.products.captions import FIELDS, Caption, LabelFrom, Language, SentenceState, TeacherKind, Verdict, Writing
 from cosfly.products.frames import (
@@ -36,7 +35,8 @@ from cosfly.products.motion import ACTION
 from cosfly.products.places import sample_id
 from cosfly.products.playback import EVENTS, Flight
 from cosfly.products.weather import WeatherMode, WeatherParams
-from cosfly.work.store import dump_json
+from cosfly.runtime.escaping import published_name
+from cosfly.runtime.store import dump_json
 
 POSE = ("x_m", "y_m", "z_m", "pitch_deg", "yaw_deg", "roll_deg")
 POINT = ("x_m", "y_m", "z_m")

@@ -17,7 +17,7 @@ from cosfly.products.people import People
 from cosfly.products.playback import EVENTS, Flight
 from cosfly.products.shown_captions import ShownCaption, ShownFlight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
-from cosfly.reading.documents import parse_document, validated
+from cosfly.runtime.documents import parse_document, validated
 from release.columns import BOX, COMPANY_COLUMNS, INTRINSICS, POINT, POSE, between_of, matrices_of
 
 Row = dict[str, Any]

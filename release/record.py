@@ -9,13 +9,13 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from cosfly.errors import InputError
 from cosfly.products.coverage import Coverage
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile
 from cosfly.products.inspection import TrajectoryFunnel
 from cosfly.products.town import TownMap
-from cosfly.reading.documents import FileFormat, read_model
-from cosfly.work.store import sha256_bytes, write_model
+from cosfly.runtime.documents import FileFormat, read_model
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.store import sha256_bytes, write_model
 from release.columns import COUNTED, SPLIT_NAMES, SplitName
 
 RELEASE_FORMAT = FileFormat("cosfly.release", "3.0", "release record")

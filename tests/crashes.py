@@ -28,10 +28,10 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
-from cosfly.errors import CosflyError
-from cosfly.work import worker_pool
-from cosfly.work.provenance import checked_inputs, recorded_digests
-from cosfly.work.stage_events import EVENTS
+from cosfly.runtime import worker_pool
+from cosfly.runtime.errors import CosflyError
+from cosfly.runtime.provenance import checked_inputs, recorded_digests
+from cosfly.runtime.stage_events import EVENTS
 from release.verify.verify import verify
 
 PACKAGES = tuple(f"/{name}/" for name in ("cosfly", "caption", "distill", "release"))

@@ -12,8 +12,8 @@ from cosfly.products.flights import find_flights
 from cosfly.products.places import sample_id
 from cosfly.products.playback import read_flight
 from cosfly.products.splits import Split
-from cosfly.work.provenance import fingerprint
-from cosfly.work.store import write_json
+from cosfly.runtime.provenance import fingerprint
+from cosfly.runtime.store import write_json
 from distill.prepare import stage as prepare
 from distill.prepare.sources import RunSource
 from distill.prepare.stage import PrepareConfig

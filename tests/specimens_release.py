@@ -24,7 +24,7 @@ from cosfly.products.inspection import (
 )  # fmt: skip
 from cosfly.products.issues import Issue
 from cosfly.products.playback import read_flight
-from cosfly.work.config import load
+from cosfly.runtime.config import load
 from release.export.source import open_release, read_span, scan
 from release.package.config import ReleaseConfig
 from release.package.sources import Source

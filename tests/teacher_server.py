@@ -21,7 +21,7 @@ from typing import BinaryIO
 
 from cosfly.chat import client
 from cosfly.products.actions import TOKENS
-from cosfly.work.journal import Journal
+from cosfly.runtime.journal import Journal
 
 client.FIRST_PAUSE_S, client.LONGEST_PAUSE_S = 0.01, 0.02  # no test waits for a server that fails
 MODEL = "test-teacher"

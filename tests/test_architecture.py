@@ -16,7 +16,7 @@ PACKAGES = ("cosfly", "caption", "distill", "release")
 STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")  # a folder each
 # From the ground up: a room may import what stands before it, and itself; stages do not import each other, nor do
 # siblings.
-ROOMS = ("root", "reading", "work", "products", "space", "look", "chat", "unreal", "stages", "siblings", "app", "cli")
+ROOMS = ("runtime", "root", "products", "space", "look", "chat", "unreal", "stages", "siblings", "app", "cli")
 ASSEMBLY = ("app", "closed_loop", "envs", "studies", "worlds")  # what may know all stages and siblings
 HEAVY = {
     *("torch", "transformers", "peft", "accelerate", "bert_score", "datasets"),
@@ -64,8 +64,7 @@ def _imports(name: str, path: Path, top_level_only: bool) -> set[str]:
 
 
 def room(name: str) -> str:
-    """Where a module stands: one of ROOMS, of which `root` has the errors, the escaping and the geometry that all
-    others know."""
+    """Where a module stands: one of ROOMS, of which `root` has the geometry that all others know."""
     package, _, rest = name.partition(".")
     first = rest.partition(".")[0]
     if package != "cosfly":
@@ -94,10 +93,10 @@ def ours(name: str) -> set[str]:
 
 
 def test_the_sources_were_found():
-    assert {"cosfly.cli", "cosfly.work.store", "caption", "distill", "release"} <= SOURCES.keys()
+    assert {"cosfly.cli", "cosfly.runtime.store", "caption", "distill", "release"} <= SOURCES.keys()
     assert {room(name) for name in SOURCES} == set(ROOMS)
     assert {path.name for path in (ROOT / "cosfly").glob("*.py")} == {
-        "__init__.py", "__main__.py", "errors.py", "escaping.py", "geometry.py",
+        "__init__.py", "__main__.py", "geometry.py",
     }  # fmt: skip
 
 
@@ -149,7 +148,7 @@ def test_heavy_packages_are_imported_where_they_are_used():
 
 def test_compiled_functions_share_one_cache():
     importers = {name for name, path in SOURCES.items() if re.search(r"^(import|from) numba\b", path.read_text(), re.M)}
-    assert importers == {"cosfly.work.compiled"}
+    assert importers == {"cosfly.runtime.compiled"}
 
 
 # Names that read what stands on disk, or text that stood there. Only the gate calls them: it knows what a file may do.
@@ -157,9 +156,13 @@ READING = {
     *("open", "read_bytes", "read_text", "load", "loads", "safe_load", "full_load", "fromfile", "memmap", "imread"),
     *("imdecode", "decompress", "ParquetFile", "read_table", "read_metadata", "load_file", "genfromtxt", "loadtxt"),
 }
+GATE = tuple(
+    f"cosfly.runtime.{name}"
+    for name in ("files", "documents", "arrays", "tables", "objects", "settings_text", "geojson", "meshes")
+)
 ALLOWED_TO_READ = {
-    ("cosfly.work.ray_engine", "loads"),  # what a worker says, as `multiprocessing` reads it from a pipe
-    ("cosfly.work.stage_events", "read_bytes"),  # /proc, whose files have no size
+    ("cosfly.runtime.ray_engine", "loads"),  # what a worker says, as `multiprocessing` reads it from a pipe
+    ("cosfly.runtime.stage_events", "read_bytes"),  # /proc, whose files have no size
     ("cosfly.products.png", "decompress"),  # of a picture, up to the size that its header gives
     ("cosfly.chat.protocol", "loads"),  # the reply, of a bounded size
     ("cosfly.closed_loop.policy", "loads"),  # the answer of a process that it started, of a bounded size
@@ -193,10 +196,7 @@ def reading_calls(name: str, path: Path) -> set[tuple[str, str]]:
 def test_only_the_gate_opens_files_to_read_them():
     """And each exception is needed."""
     assert {
-        call
-        for name, path in SOURCES.items()
-        if not name.startswith("cosfly.reading")
-        for call in reading_calls(name, path)
+        call for name, path in SOURCES.items() if not name.startswith(GATE) for call in reading_calls(name, path)
     } == ALLOWED_TO_READ
 
 
@@ -204,10 +204,10 @@ def test_the_rules_can_fail(monkeypatch, tmp_path):
     def put(text):  # a path of its own: what a file says is read once
         bad = tmp_path / f"bad_{len(list(tmp_path.iterdir()))}.py"
         bad.write_text(text)
-        monkeypatch.setitem(SOURCES, "cosfly.work.store", bad)
+        monkeypatch.setitem(SOURCES, "cosfly.runtime.store", bad)
 
     put("import torch\nimport release.package.stage\n")
-    with pytest.raises(AssertionError, match=r"cosfly\.work\.store"):
+    with pytest.raises(AssertionError, match=r"cosfly\.runtime\.store"):
         test_imports_point_one_way()
     with pytest.raises(AssertionError):
         test_heavy_packages_are_imported_where_they_are_used()
@@ -288,9 +288,9 @@ def test_foreign_text_is_escaped_in_one_place():
     assert [
         name
         for name, text in texts.items()
-        if name not in ("cosfly.escaping", "cosfly.look.page") and page.search(text)
+        if name not in ("cosfly.runtime.escaping", "cosfly.look.page") and page.search(text)
     ] == []
-    assert [name for name, text in texts.items() if name != "cosfly.work.console" and console.search(text)] == []
+    assert [name for name, text in texts.items() if name != "cosfly.runtime.console" and console.search(text)] == []
 
 
 def text_of(name: str) -> str:

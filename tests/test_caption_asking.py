@@ -18,8 +18,8 @@ from teacher_server import is_mirror, kept_answers
 from caption.run.stage import run
 from cosfly.chat import client
 from cosfly.chat.answers import Answer, AnswerBook
-from cosfly.errors import TeacherError
 from cosfly.products.captions import read_captions
+from cosfly.runtime.errors import TeacherError
 from specimens import make_playback_tree
 
 
@@ -224,7 +224,7 @@ import json, resource, sys
 from pathlib import Path
 from caption.schema import CaptionConfig
 from caption.run.stage import run
-from cosfly.errors import StorageError
+from cosfly.runtime.errors import StorageError
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2)
 try:
     run(CaptionConfig.model_validate(json.loads(sys.argv[4])), Path(sys.argv[2]), Path(sys.argv[3]))

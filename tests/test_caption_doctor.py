@@ -15,7 +15,7 @@ from caption.run.forecast import make_forecast
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.doctor import ODD_WORD, Finding, examine_endpoint, largest_messages
-from cosfly.errors import NothingKept
+from cosfly.runtime.errors import NothingKept
 
 TOKENS_PER_IMAGE, CONTEXT = 220, 8192
 

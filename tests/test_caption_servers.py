@@ -24,7 +24,7 @@ from teacher_server import MODEL, Sent, Wild, obedient_answer
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from cosfly.chat.client import KEY_VARIABLE
-from cosfly.errors import NothingKept, TeacherError
+from cosfly.runtime.errors import NothingKept, TeacherError
 
 TRIES = 2
 

@@ -29,10 +29,10 @@ from caption.writing.contract import Draft, Refused
 from caption.writing.filling import Filler
 from caption.writing.slots import fact_table
 from caption.writing.templates import Sentence, read_sentence
-from cosfly.errors import NothingKept
 from cosfly.products.actions import TOKENS
 from cosfly.products.answer_text import Parsed
 from cosfly.products.captions import Coc, Language, read_captions
+from cosfly.runtime.errors import NothingKept
 from specimens import make_flight
 
 FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, -6.0, -10.0), offset_x_px=(0, 10, 40, None, -64))

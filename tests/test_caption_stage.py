@@ -18,10 +18,10 @@ from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig
 from caption.truth.actions import TABLE, measure
 from cosfly.chat.budget import BudgetConfig
-from cosfly.errors import NothingKept, ResumeError
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight, write_flight
+from cosfly.runtime.errors import NothingKept, ResumeError
 from specimens import make_playback_tree
 
 

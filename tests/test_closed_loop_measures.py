@@ -6,7 +6,7 @@ from test_products_pursuits import frame, pursuit
 
 from cosfly.closed_loop.measures import MEASURES, measure, score_pursuits
 from cosfly.products.flight_scores import SCORE, SCORE_FORMAT, read_score
-from cosfly.work.store import write_model
+from cosfly.runtime.store import write_model
 
 
 def flight(seen="", *, walk="path_0", ended="finished", num_walk_frames=None, **columns):

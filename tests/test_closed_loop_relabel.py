@@ -10,11 +10,11 @@ from test_closed_loop_fly import TINY, fly, town  # noqa: F401
 
 from cosfly.closed_loop.settings import Drone
 from cosfly.closed_loop.stepper import ClosedLoopFlight
-from cosfly.errors import NothingKept
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight
-from cosfly.work.runner import run_items
+from cosfly.runtime.errors import NothingKept
+from cosfly.runtime.runner import run_items
 
 STUDENT, FRAMES = "--workers 1 --student track_straight --set fly.tree=false", 5
 

@@ -17,7 +17,7 @@ from cosfly.chat.protocol import error_words, read_body, read_completion, read_m
 from cosfly.chat.wire import Response
 from cosfly.products.answer_text import normalize_action, parse_answer
 from cosfly.products.captions import Coc
-from cosfly.reading.objects import find_object
+from cosfly.runtime.objects import find_object
 
 GOOD = {
     "critical_components": "A pedestrian walks ahead on the pavement.",

@@ -7,11 +7,11 @@ from typer.testing import CliRunner
 from cosfly.app.bench import Bench, row_of, run, stage_rows, tables
 from cosfly.app.settings import RunConfig
 from cosfly.cli import app
-from cosfly.errors import ConfigError, ResumeError
-from cosfly.work.runner import Item, run_items
-from cosfly.work.stage_events import Event, read_events
-from cosfly.work.stage_folder import Manifest, Tally, read_manifest
-from cosfly.work.worker_pool import Watch
+from cosfly.runtime.errors import ConfigError, ResumeError
+from cosfly.runtime.runner import Item, run_items
+from cosfly.runtime.stage_events import Event, read_events
+from cosfly.runtime.stage_folder import Manifest, Tally, read_manifest
+from cosfly.runtime.worker_pool import Watch
 
 
 def event(at_s: float, kind: str, **fields) -> Event:

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from specimens_distill import make_caption
 
-from cosfly.errors import InputError
 from cosfly.products.actions import TOKENS
 from cosfly.products.answer_text import answer_schema, is_in_script, normalize_action, parse_answer
 from cosfly.products.captions import Caption, Coc, read_captions, write_captions
 from cosfly.products.sentences import END, cut_sentences
+from cosfly.runtime.errors import InputError
 
 GOOD = {
     "critical_components": "A pedestrian walks ahead on the pavement.",

@@ -15,9 +15,9 @@ from cosfly.app.settings import RunConfig
 from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.wire import base_url
 from cosfly.cli.options import Job, resolve
-from cosfly.errors import InputError, TeacherError
-from cosfly.work.stage_folder import StageFolder, Tally
-from cosfly.work.store import write_json
+from cosfly.runtime.errors import InputError, TeacherError
+from cosfly.runtime.stage_folder import StageFolder, Tally
+from cosfly.runtime.store import write_json
 
 
 @pytest.fixture(autouse=True)

@@ -25,7 +25,7 @@ def test_a_caller_sees_a_change_of_what_it_calls(tmp_path):
     """Its own file stays as it is: numba alone would go on with the old function."""
     package = make_package(tmp_path)
     (package / "upper.py").write_text(
-        "from cosfly.work.compiled import njit\nfrom cosfly.lower import f\n\n\n"
+        "from cosfly.runtime.compiled import njit\nfrom cosfly.lower import f\n\n\n"
         "@njit(cache=True)\ndef g(x):\n    return f(x)\n"
     )
     env = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
@@ -34,7 +34,7 @@ def test_a_caller_sees_a_change_of_what_it_calls(tmp_path):
     printed = []
     for factor in (2, 3, 2):
         (package / "lower.py").write_text(
-            f"from cosfly.work.compiled import njit\n\n\n@njit(cache=True)\ndef f(x):\n    return {factor} * x\n"
+            f"from cosfly.runtime.compiled import njit\n\n\n@njit(cache=True)\ndef f(x):\n    return {factor} * x\n"
         )
         code = "from cosfly.upper import g; print(g(7), sum(g.stats.cache_hits.values()))"
         done = subprocess.run(
@@ -49,7 +49,7 @@ def test_compiling_is_told_once_and_loading_is_not(tmp_path):
     """Two functions in a new cache: one line; the second process loads them and says nothing."""
     (tmp_path / "two.py").write_text(
         "import logging\nlogging.basicConfig(level=logging.INFO, format='%(message)s')\n"
-        "from cosfly.work.compiled import njit\n\n\n@njit(cache=True)\ndef f(x):\n    return x + 1\n\n\n"
+        "from cosfly.runtime.compiled import njit\n\n\n@njit(cache=True)\ndef f(x):\n    return x + 1\n\n\n"
         "@njit(cache=True)\ndef g(x):\n    return x - 1\n\n\nf(1), g(1), f(1.5)\n"
     )
     env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}

@@ -5,8 +5,8 @@ from pydantic import BaseModel, Field
 
 from cosfly.app.settings import RunConfig
 from cosfly.app.settings_guide import explain, nested
-from cosfly.errors import ConfigError
-from cosfly.work.config import Config, load
+from cosfly.runtime.config import Config, load
+from cosfly.runtime.errors import ConfigError
 
 
 class Inner(Config):

@@ -12,9 +12,9 @@ from cosfly.pedestrians.stage import make_walk
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
 from cosfly.products.kinds import KINDS
 from cosfly.products.walks import Walk
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.config import load, shipped
 from cosfly.simplify.passes import simplify
-from cosfly.work.chance import rng_for
-from cosfly.work.config import load, shipped
 
 CFG = PedestriansConfig(road_cost=20, open_cost=3, min_component_cells=100, min_distance_m=20)
 

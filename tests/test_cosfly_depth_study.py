@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from cosfly.cli import app
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import frame_name
-from cosfly.reading.documents import read_json
+from cosfly.runtime.documents import read_json
 from cosfly.studies.depth import (
     BITS,
     Study,

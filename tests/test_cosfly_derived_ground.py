@@ -17,9 +17,9 @@ from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.render.draping import drape, is_draped
+from cosfly.runtime.chance import rng_for
 from cosfly.simplify.passes import SimplifyConfig, simplify
 from cosfly.space.grid import empty_grid, lies_off_ground, surface_kinds
-from cosfly.work.chance import rng_for
 
 ROADS, SIDEWALKS, TERRAIN = (KINDS[name] for name in ("Roads", "Sidewalks", "Terrain"))
 

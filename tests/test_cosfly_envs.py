@@ -17,9 +17,9 @@ import cosfly.envs
 from cosfly.closed_loop.policy import MOST_LATE, Policy
 from cosfly.envs.episodes import HELD_OUT, TASKS, TRAINING, read_list
 from cosfly.envs.follow import FULL_REWARD_M, NO_REWARD_M, reward_of
-from cosfly.errors import InputError
 from cosfly.products.pursuits import read_pursuit
-from cosfly.work.config import read_yaml
+from cosfly.runtime.config import read_yaml
+from cosfly.runtime.errors import InputError
 
 FOLLOW, SMALL = "cosfly/Follow-v0", (160, 96)
 DOCUMENT = Path(cosfly.envs.__file__).parents[2] / "docs" / "closed-loop.md"

@@ -21,14 +21,14 @@ from caption.run.report import page_html
 from caption.run.stage import run as caption
 from caption.schema import CaptionConfig
 from cosfly.chat.budget import BudgetConfig
-from cosfly.errors import InputError
-from cosfly.escaping import LONGEST, for_markdown, for_terminal
 from cosfly.inspection.report import report_html
 from cosfly.inspection.stage import run as inspect
 from cosfly.products.captions import Caption, read_captions
 from cosfly.products.inspection import Inspection, read_inspection
-from cosfly.reading.documents import read_json
-from cosfly.work import console as shared
+from cosfly.runtime import console as shared
+from cosfly.runtime.documents import read_json
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.escaping import LONGEST, for_markdown, for_terminal
 from release.card.render import render_card
 from release.record import ReleaseRecord
 from specimens import make_playback_tree

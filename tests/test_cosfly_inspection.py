@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from cosfly.errors import NothingKept
 from cosfly.geometry import mask_box
 from cosfly.inspection import frames
 from cosfly.inspection.files import check_recorded
@@ -38,10 +37,11 @@ from cosfly.products.issues import Report
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import read_flight, write_flight
 from cosfly.products.traces import DroneTrace, write_traces
-from cosfly.reading.documents import read_json
-from cosfly.reading.files import sha256_file
+from cosfly.runtime.documents import read_json
+from cosfly.runtime.errors import NothingKept
+from cosfly.runtime.files import sha256_file
+from cosfly.runtime.store import CHECKSUMS, write_checksums, write_json
 from cosfly.space.kernels import obstacle_index, signed_distances
-from cosfly.work.store import CHECKSUMS, write_checksums, write_json
 from release.verify.verify import verify
 from specimens import make_playback_tree
 

@@ -11,7 +11,6 @@ from numpy.testing import assert_allclose
 
 import cosfly
 from cosfly.app import library
-from cosfly.errors import ConfigError, EnvironmentMissing, InputError
 from cosfly.maps import stage as maps_stage
 from cosfly.maps.stage import MapsConfig
 from cosfly.pedestrians import stage as pedestrians_stage
@@ -22,6 +21,7 @@ from cosfly.products.boxes import BoxMap
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.render.contract import PERSON_ID
 from cosfly.render.settings import RenderConfig
+from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError
 from cosfly.simplify import stage as simplify_stage
 from cosfly.simplify.passes import SimplifyConfig
 

@@ -14,7 +14,6 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosfly.errors import InputError
 from cosfly.geometry import intrinsic_matrix, look_at, world_from_camera
 from cosfly.maps import cityjson
 from cosfly.maps.cityjson import CityJsonConfig, solid_mesh, top_within, triangles_of
@@ -25,7 +24,6 @@ from cosfly.products.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.products.frames import Look
 from cosfly.products.kinds import KINDS
 from cosfly.products.meshes import MESHES_FILE, Meshes, MeshRef, write_meshes
-from cosfly.reading.meshes import Mesh, read_meshes
 from cosfly.render.contract import (
     GROUND_PLANE_DROP_M,
     GROUND_PLANE_HALF_M,
@@ -36,8 +34,10 @@ from cosfly.render.contract import (
 )
 from cosfly.render.solids import solids_of
 from cosfly.render.stage import RENDERERS, open_renderer
+from cosfly.runtime.config import build
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.meshes import Mesh, read_meshes
 from cosfly.simplify.passes import SimplifyConfig, simplify
-from cosfly.work.config import build
 
 SIZE = (320, 180)
 UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # from glTF's axes
@@ -195,10 +195,10 @@ def test_missing_linked_and_large_files_are_clear_errors(tmp_path: Path) -> None
 
 def test_a_file_may_have_so_many_triangles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trimesh.creation.icosphere(subdivisions=3).export(tmp_path / "fine.glb")
-    monkeypatch.setattr("cosfly.reading.meshes.MOST_TRIANGLES", 500)
+    monkeypatch.setattr("cosfly.runtime.meshes.MOST_TRIANGLES", 500)
     with pytest.raises(InputError, match="over the limit"):
         read_meshes(tmp_path / "fine.glb", tree=tmp_path)
-    monkeypatch.setattr("cosfly.reading.meshes.FILE_MB", 1e-3)
+    monkeypatch.setattr("cosfly.runtime.meshes.FILE_MB", 1e-3)
     with pytest.raises(InputError, match="over the limit"):
         read_meshes(tmp_path / "fine.glb", tree=tmp_path)
 

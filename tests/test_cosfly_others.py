@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosfly.errors import InputError
 from cosfly.pedestrians.lanes import lanes_of
 from cosfly.pedestrians.others import PASS_M, company_of
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, run, walkable_ground
@@ -17,8 +16,9 @@ from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, write_boxes
 from cosfly.products.kinds import KINDS
 from cosfly.products.others import Company, Other, gaps_m, read_others, write_others
 from cosfly.products.walks import read_paths
-from cosfly.work.chance import rng_for
-from cosfly.work.store import dump_json
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.store import dump_json
 
 PERSON, CAR = "Pedestrians", "Car"
 

@@ -12,7 +12,6 @@ from test_renderers_contract import circling, street, write_inputs
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.errors import InputError
 from cosfly.geometry import box_corners, intrinsic_matrix, project, world_from_camera
 from cosfly.look.gallery import four_panels
 from cosfly.look.overlay import TARGET_COLOR, Overlay, _lines
@@ -24,7 +23,8 @@ from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.contract import instance_ids
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
-from cosfly.work.store import read_checksums
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.store import read_checksums
 
 SETTINGS = {
     "width_px": 320,

@@ -21,9 +21,9 @@ from cosfly.products.ground import Ground
 from cosfly.products.kinds import KINDS
 from cosfly.products.roi import Roi
 from cosfly.products.walks import paces_of, read_paths
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.store import dump_json
 from cosfly.space.grid import OccupancyGrid
-from cosfly.work.chance import rng_for
-from cosfly.work.store import dump_json
 
 BUILDINGS, ROADS, WATER = KINDS["Buildings"], KINDS["Roads"], KINDS["Water"]
 

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from cosfly.errors import InputError, VerifyError
-from cosfly.reading.documents import read_json
-from cosfly.reading.files import sha256_file
-from cosfly.work import provenance
-from cosfly.work.config import Config
-from cosfly.work.stage_folder import StageFolder, Tally
-from cosfly.work.store import dump_json, sha256_bytes, write_bytes, write_checksums, write_json
+from cosfly.runtime import provenance
+from cosfly.runtime.config import Config
+from cosfly.runtime.documents import read_json
+from cosfly.runtime.errors import InputError, VerifyError
+from cosfly.runtime.files import sha256_file
+from cosfly.runtime.stage_folder import StageFolder, Tally
+from cosfly.runtime.store import dump_json, sha256_bytes, write_bytes, write_checksums, write_json
 
 
 def begin(out: Path, name: str, **inputs: Path) -> StageFolder:

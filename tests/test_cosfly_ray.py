@@ -18,11 +18,11 @@ from toy_workers import make_talking_worker, make_worker, stage_in
 
 from cosfly.app import pipeline
 from cosfly.app.settings import RunConfig
-from cosfly.errors import EnvironmentMissing
-from cosfly.work.config import load
-from cosfly.work.ray_engine import ALL_ROOM, ENVIRONMENT, STORE_BYTES, RayConfig
-from cosfly.work.runner import Item, Watch, run_items
-from cosfly.work.stage_events import LOSSES, read_events
+from cosfly.runtime.config import load
+from cosfly.runtime.errors import EnvironmentMissing
+from cosfly.runtime.ray_engine import ALL_ROOM, ENVIRONMENT, STORE_BYTES, RayConfig
+from cosfly.runtime.runner import Item, Watch, run_items
+from cosfly.runtime.stage_events import LOSSES, read_events
 
 ray = pytest.importorskip("ray")
 os.environ |= ENVIRONMENT

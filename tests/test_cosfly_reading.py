@@ -20,17 +20,17 @@ from tables import each
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.errors import ConfigError, CosflyError, InputError
 from cosfly.maps import cityjson
 from cosfly.maps.footprints import check_outline, num_crossings
 from cosfly.products.boxes import read_boxes
 from cosfly.products.frames import depth_bytes, read_depth, rgb_bytes
-from cosfly.reading import arrays, documents, files, tables
-from cosfly.reading.files import LinkedPath, read_text
-from cosfly.work.config import Config, apply_overrides, build, read_yaml
-from cosfly.work.journal import Journal
-from cosfly.work.stage_folder import StageFolder, read_failures
-from cosfly.work.store import inside
+from cosfly.runtime import arrays, documents, files, tables
+from cosfly.runtime.config import Config, apply_overrides, build, read_yaml
+from cosfly.runtime.errors import ConfigError, CosflyError, InputError
+from cosfly.runtime.files import LinkedPath, read_text
+from cosfly.runtime.journal import Journal
+from cosfly.runtime.stage_folder import StageFolder, read_failures
+from cosfly.runtime.store import inside
 from release.record import RELEASE_FORMAT, read_record
 from specimens import make_playback_tree
 

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from tables import each
 from test_renderers_contract import circling, pose_towards, street, write_inputs
 
-from cosfly.errors import ConfigError, EnvironmentMissing
 from cosfly.geometry import focal_px, intrinsic_matrix, look_at, world_from_camera
 from cosfly.products.boxes import BoxMap, make_box_map
 from cosfly.products.flights import find_flights
@@ -23,7 +22,6 @@ from cosfly.products.others import Other
 from cosfly.products.people import draw_appearance
 from cosfly.products.playback import read_flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
-from cosfly.reading.files import sha256_file
 from cosfly.render.camera import rendered_visibility, view_target
 from cosfly.render.contract import (
     FAR_M,
@@ -48,9 +46,11 @@ from cosfly.render.person import cast_of, choose_clothes
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, in_frame, perturb
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run, script_flight
+from cosfly.runtime.config import build
+from cosfly.runtime.errors import ConfigError, EnvironmentMissing
+from cosfly.runtime.files import sha256_file
+from cosfly.runtime.store import read_checksums
 from cosfly.space.kernels import obstacle_index, signed_distances
-from cosfly.work.config import build
-from cosfly.work.store import read_checksums
 
 LARGER = (640, 360)
 CAMERA = Camera(320, 180, intrinsic_matrix(320, 180, 90.0))

@@ -17,13 +17,13 @@ from cosfly.products.kinds import KINDS
 from cosfly.products.others import Company, Other, write_others
 from cosfly.products.people import Appearance, People
 from cosfly.products.playback import TARGET_FILE, read_flight
-from cosfly.reading.arrays import read_picture
 from cosfly.render.contract import Frame, PosedOther, PosedPerson, other_id
 from cosfly.render.flight import are_told_apart, find_goal
 from cosfly.render.person import choose_clothes
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
-from cosfly.work.config import build
+from cosfly.runtime.arrays import read_picture
+from cosfly.runtime.config import build
 
 LOOKS = Appearance("man", "jacket", "blue", "trousers", "red")
 

@@ -3,9 +3,9 @@
 import pytest
 
 from cosfly.app.reproduce import OF_RELEASE, MissingFile, Paper, Places, read_paper
-from cosfly.errors import InputError
-from cosfly.work.journal import Journal
-from cosfly.work.store import write_json
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.journal import Journal
+from cosfly.runtime.store import write_json
 from release.stats.tables import SHAPES
 
 # All labels of tables and figures in the paper.

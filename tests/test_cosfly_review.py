@@ -12,13 +12,13 @@ from test_cosfly_inspection import CFG, plan_of, write_map
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.errors import InputError
 from cosfly.inspection.stage import run
 from cosfly.products.flights import find_flights
 from cosfly.products.inspection import read_inspection
 from cosfly.products.review import REVIEW, Choice, add_decisions, read_decisions, read_settled
 from cosfly.products.traces import write_traces
-from cosfly.reading.files import sha256_file
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import sha256_file
 from release.package.sources import Source, gather
 from specimens import make_playback_tree
 

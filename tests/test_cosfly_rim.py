@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from specimens_slopes import sloped_town
 
-from cosfly.errors import EnvironmentMissing, RenderError
 from cosfly.geometry import intrinsic_matrix, world_from_camera
 from cosfly.maps.stage import MapsConfig
 from cosfly.maps.stage import load_map as load_source
@@ -20,7 +19,8 @@ from cosfly.products.traces import DroneTrace
 from cosfly.render.contract import NO_INSTANCE, instance_ids
 from cosfly.render.rim import FLIGHTS_TO_M, REACH_M, SOLIDS_FROM_M, check_outside_rim, rim_of
 from cosfly.render.stage import open_renderer
-from cosfly.work.config import build
+from cosfly.runtime.config import build
+from cosfly.runtime.errors import EnvironmentMissing, RenderError
 
 FLAT = [KINDS["Terrain"], KINDS["Roads"]]
 

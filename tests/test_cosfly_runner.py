@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from cosfly.errors import EnvironmentMissing, InputError, StorageError
-from cosfly.work.chance import draws_for, rng_for
-from cosfly.work.config import Config
-from cosfly.work.runner import Item, Outcome, run_items
-from cosfly.work.stage_folder import Failed, Kept, StageFolder
-from cosfly.work.store import dump_json
+from cosfly.runtime.chance import draws_for, rng_for
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import EnvironmentMissing, InputError, StorageError
+from cosfly.runtime.runner import Item, Outcome, run_items
+from cosfly.runtime.stage_folder import Failed, Kept, StageFolder
+from cosfly.runtime.store import dump_json
 
 
 def make_worker(log: Path):

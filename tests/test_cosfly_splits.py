@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosfly.errors import InputError
 from cosfly.products.playback import Flight, read_flight, write_flight
 from cosfly.products.splits import SPLITS, Course, assign_splits, town_family, walks_of
+from cosfly.runtime.errors import InputError
 from specimens import make_flight
 
 STEP_S = 0.5

@@ -9,13 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field
 
-from cosfly.errors import InputError, NothingKept, ResumeError, StorageError, VerifyError
-from cosfly.reading.documents import read_json
-from cosfly.work import store
-from cosfly.work.config import Config, MayDiffer
-from cosfly.work.journal import Journal
-from cosfly.work.stage_folder import Failed, StageFolder, Tally, read_manifest, write_failures
-from cosfly.work.store import inside, write_bytes, write_json
+from cosfly.runtime import store
+from cosfly.runtime.config import Config, MayDiffer
+from cosfly.runtime.documents import read_json
+from cosfly.runtime.errors import InputError, NothingKept, ResumeError, StorageError, VerifyError
+from cosfly.runtime.journal import Journal
+from cosfly.runtime.stage_folder import Failed, StageFolder, Tally, read_manifest, write_failures
+from cosfly.runtime.store import inside, write_bytes, write_json
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):

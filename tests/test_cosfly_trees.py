@@ -22,16 +22,16 @@ from specimens_foreign import NOBODY, write_foreign_tree
 
 from caption.run import stage as caption_stage
 from caption.schema import CaptionConfig
-from cosfly.errors import InputError, VerifyError
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.settings import InspectConfig
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights, read_twin
 from cosfly.products.inspection import read_inspection
 from cosfly.products.playback import read_flight, write_flight
-from cosfly.reading.documents import read_json
-from cosfly.work.stage_folder import read_failures
-from cosfly.work.store import write_json
+from cosfly.runtime.documents import read_json
+from cosfly.runtime.errors import InputError, VerifyError
+from cosfly.runtime.stage_folder import read_failures
+from cosfly.runtime.store import write_json
 from distill.prepare import stage as prepare
 from distill.prepare.sources import RunSource as Prepared
 from distill.prepare.stage import PrepareConfig

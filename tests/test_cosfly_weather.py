@@ -12,7 +12,6 @@ from test_cosfly_render import needs_gl
 from test_renderers_contract import HIP, circling, opened, pose_towards, street, write_inputs
 
 from cosfly.app.settings import RunConfig
-from cosfly.errors import ConfigError
 from cosfly.geometry import intrinsic_matrix
 from cosfly.products.boxes import MapHeader, make_box_map
 from cosfly.products.flights import find_flights
@@ -20,14 +19,15 @@ from cosfly.products.frames import read_depth, read_instance, read_meta, read_rg
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import read_flight
 from cosfly.products.weather import TIMES, WEATHER_GROUPS, WEATHERS, WeatherParams, resolved, sky_kind
-from cosfly.reading.documents import read_json
 from cosfly.render.contract import PosedPerson
 from cosfly.render.gl.weather_pass import light_direction, lights_on
 from cosfly.render.person import choose_clothes
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.render.weather import path_seed, read_pools, weather_of
-from cosfly.work.config import build, load, shipped
+from cosfly.runtime.config import build, load, shipped
+from cosfly.runtime.documents import read_json
+from cosfly.runtime.errors import ConfigError
 
 SIZE = (320, 180)
 RANDOM = {"weather_mode": "random_per_path"}

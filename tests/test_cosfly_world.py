@@ -10,11 +10,11 @@ from commands import invoke
 from pydantic import ValidationError
 from teacher_server import TeacherServer
 
-from cosfly.errors import InputError
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.stage import MapsConfig, load_map
-from cosfly.reading.documents import read_json, read_model
-from cosfly.work.stage_folder import read_manifest
+from cosfly.runtime.documents import read_json, read_model
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.stage_folder import read_manifest
 from cosfly.worlds.objects import OBJECTS, assets
 from cosfly.worlds.plan import PLAN_FORMAT, NamedObject, WorldPlan
 from cosfly.worlds.rules import plan_by_rules

@@ -12,7 +12,6 @@ import pytest
 from test_cosfly_render import needs_gl
 from test_renderers_contract import circling, write_inputs
 
-from cosfly.errors import ConfigError, InputError
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.flight import InspectConfig
 from cosfly.products.flights import find_flights
@@ -24,7 +23,8 @@ from cosfly.products.traces import DroneTrace
 from cosfly.render.lens import ZoomConfig, cameras_of, zoomed_deg
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
-from cosfly.work.config import build
+from cosfly.runtime.config import build
+from cosfly.runtime.errors import ConfigError, InputError
 from release.columns import INTRINSICS, Placement, matrices_of, scalar_row
 from specimens import make_flight
 

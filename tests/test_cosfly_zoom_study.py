@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 from cosfly.cli import app
 from cosfly.geometry import intrinsic_matrix
 from cosfly.products.frames import Camera
+from cosfly.runtime.stage_folder import read_manifest
 from cosfly.studies.zoom import enlarged_camera
-from cosfly.work.stage_folder import read_manifest
 
 LEVELS = [110.0, 60.0, 30.0]
 

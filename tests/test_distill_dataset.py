@@ -19,12 +19,12 @@ from pydantic import ValidationError
 from specimens_distill import make_caption, make_captions, prepared
 from specimens_foreign import write_foreign_tree
 
-from cosfly.errors import ResumeError, VerifyError
 from cosfly.products.actions import TOKENS
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import write_captions
 from cosfly.products.playback import read_flight
 from cosfly.products.splits import SPLITS
+from cosfly.runtime.errors import ResumeError, VerifyError
 from cosfly.space.blind import past_of
 from distill.prepare import stage
 from distill.prepare.sources import RunSource

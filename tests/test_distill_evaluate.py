@@ -13,12 +13,12 @@ import pytest
 from commands import invoke
 from specimens_distill import make_caption, write_set
 
-from cosfly.errors import InputError
 from cosfly.products.actions import TOKENS
 from cosfly.products.figures import draw_walks
 from cosfly.products.predictions import Prediction, read_predictions
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.store import dump_json
 from cosfly.space.blind import LEAST_WINDOWS
-from cosfly.work.store import dump_json
 from distill.evaluation import compare
 from distill.evaluation.bertscore import BertScoreConfig, Scorer
 from distill.evaluation.floors import Floors, coc_of, majority

@@ -14,8 +14,8 @@ from PIL import Image
 from specimens_distill import make_captions, prepared
 from teacher_server import TeacherServer, kept_answers
 
-from cosfly.errors import ResumeError, TeacherError
 from cosfly.products.predictions import read_predictions
+from cosfly.runtime.errors import ResumeError, TeacherError
 from distill.inference import stage as infer
 from distill.schema import open_split
 from specimens import make_playback_tree

@@ -15,7 +15,7 @@ pytest.importorskip("peft", reason="needs the extra distill")
 
 from specimens_students import FAST, load, samples_of
 
-from cosfly.errors import InputError
+from cosfly.runtime.errors import InputError
 from distill.student.encoding import END_OF_ANSWER, chat_text, encode_text, prompt_text
 from distill.student.model import END_OF_TURN, Processor
 from distill.training import stage as train

@@ -15,7 +15,7 @@ pytest.importorskip("peft", reason="needs the extra distill")
 from safetensors.torch import load_file  # noqa: E402
 from specimens_students import MAX_PIXELS, inputs_of, load, log_of, losses_of, run, samples_of, trees_of  # noqa: E402
 
-from cosfly.errors import InputError  # noqa: E402
+from cosfly.runtime.errors import InputError  # noqa: E402
 from distill.schema import Sample  # noqa: E402
 from distill.student.checkpoint import Progress  # noqa: E402
 from distill.student.decoding import Completion  # noqa: E402

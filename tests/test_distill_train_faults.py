@@ -18,7 +18,7 @@ pytest.importorskip("peft", reason="needs the extra distill")
 
 from specimens_students import FAST, TWELVE, begun, load, log_of, run, samples_of  # noqa: E402
 
-from cosfly.errors import ConfigError, InputError  # noqa: E402
+from cosfly.runtime.errors import ConfigError, InputError  # noqa: E402
 from distill.student.checkpoint import load_checkpoint, newest_checkpoint  # noqa: E402
 from distill.student.model import student_folder  # noqa: E402
 from distill.training import fit  # noqa: E402

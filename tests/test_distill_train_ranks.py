@@ -21,7 +21,7 @@ from safetensors.torch import load_file  # noqa: E402
 from simulator_serving import free_port  # noqa: E402
 from specimens_students import TWELVE, log_of, losses_of  # noqa: E402
 
-from cosfly.errors import ConfigError, InputError  # noqa: E402
+from cosfly.runtime.errors import ConfigError, InputError  # noqa: E402
 from distill.training.ranks import Ranks, joined  # noqa: E402
 
 # A usual rate: with one that makes a student learn in 12 steps, rounding grows beyond 1e-5 within few of them.

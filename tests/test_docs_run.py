@@ -35,10 +35,10 @@ from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
 from cosfly.products.captions import read_captions
 from cosfly.products.kinds import KIND_NAMES
-from cosfly.work import runner
-from cosfly.work.config import shipped
-from cosfly.work.runner import Item, Watch
-from cosfly.work.stage_folder import StageFolder
+from cosfly.runtime import runner
+from cosfly.runtime.config import shipped
+from cosfly.runtime.runner import Item, Watch
+from cosfly.runtime.stage_folder import StageFolder
 from distill.student.random_student import make_tiny_student
 
 # Pages in the order in which what one makes is there for the next; the last one draws the tree of all others anew.

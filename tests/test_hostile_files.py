@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import pytest
 from specimens_release import build, make_inputs
 
-from cosfly.errors import CosflyError
 from cosfly.maps import boxfile, cityjson, simworld
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.boxes import MapHeader, make_box_map, read_boxes, write_boxes
@@ -23,9 +22,10 @@ from cosfly.products.frames import DEPTH_PNG, read_depth, read_instance, read_me
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import read_flight
 from cosfly.products.roi import read_roi
-from cosfly.reading.tables import rows_of
-from cosfly.work.stage_folder import read_manifest
-from cosfly.work.store import CHECKSUMS, read_checksums, write_json
+from cosfly.runtime.errors import CosflyError
+from cosfly.runtime.stage_folder import read_manifest
+from cosfly.runtime.store import CHECKSUMS, read_checksums, write_json
+from cosfly.runtime.tables import rows_of
 from release.record import read_record
 from specimens import pack_depth
 

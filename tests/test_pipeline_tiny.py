@@ -14,14 +14,14 @@ from cosfly.app import pipeline
 from cosfly.app.estimate import estimate
 from cosfly.app.settings import RunConfig
 from cosfly.cli import app
-from cosfly.errors import ConfigError, ResumeError, VerifyError
 from cosfly.products.captions import read_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight
-from cosfly.reading.documents import read_json
-from cosfly.work.config import load
-from cosfly.work.stage_folder import read_failures
-from cosfly.work.store import write_json
+from cosfly.runtime.config import load
+from cosfly.runtime.documents import read_json
+from cosfly.runtime.errors import ConfigError, ResumeError, VerifyError
+from cosfly.runtime.stage_folder import read_failures
+from cosfly.runtime.store import write_json
 from release.verify.verify import verify
 
 TINY = [

@@ -14,7 +14,6 @@ from caption.schema import FutureMotion
 from caption.truth.actions import TABLE as ACTION_TABLE
 from caption.truth.actions import measure
 from cosfly.app.settings import RunConfig
-from cosfly.errors import NoPathError
 from cosfly.geometry import intrinsic_matrix, look_at, world_from_camera, wrap_deg
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.stage import make_walk
@@ -31,11 +30,12 @@ from cosfly.products.frames import LEGIBLE_HEIGHT_PX, Camera
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.walks import paces_of, walk_id, write_paths
 from cosfly.render.camera import view_target
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.config import load, shipped
+from cosfly.runtime.errors import NoPathError
+from cosfly.runtime.stage_folder import read_manifest
 from cosfly.simplify.passes import simplify
 from cosfly.space import kernels
-from cosfly.work.chance import rng_for
-from cosfly.work.config import load, shipped
-from cosfly.work.stage_folder import read_manifest
 
 OPEN = kernels.obstacle_index(town_of())
 STRAIGHT = walk_along("straight", [(0, 0), (90, 0)])

@@ -6,11 +6,11 @@ from itertools import chain, combinations
 import numpy as np
 import pytest
 
-from cosfly.errors import InputError
 from cosfly.products.frames import PERSON_ID
 from cosfly.products.goals import LANDMARKS, ORDER, SIDES, SLOTS, Goal, SeenFrame, find_says, meant, words_of
 from cosfly.products.kinds import KINDS
 from cosfly.products.people import COLORS, FIGURES, GARMENTS, Appearance, draw_appearance, look_alike
+from cosfly.runtime.errors import InputError
 
 RELATIONS = {*SIDES, *LANDMARKS}
 TREE_M, POST_M = 20, 40  # columns of the picture below, a metre each

@@ -5,9 +5,9 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from cosfly.errors import InputError
 from cosfly.products.people import COLORS, HAIR, Appearance, People, draw_appearance, look_alike
-from cosfly.reading.documents import validated
+from cosfly.runtime.documents import validated
+from cosfly.runtime.errors import InputError
 
 
 def test_a_drawn_person_is_read_back_as_written():

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from cosfly.errors import InputError
 from cosfly.products.pursuits import Pursuit, PursuitFrame, WalkStyle, pursuit_file, read_pursuit, write_pursuit
+from cosfly.runtime.errors import InputError
 
 
 def frame(time_s: float, answer: str, **more) -> PursuitFrame:

@@ -20,7 +20,7 @@ from specimens_release import TWO_SPLITS, make_release, rows_by_id
 from specimens_rows import make_row
 
 from cosfly.products.actions import TOKENS
-from cosfly.reading.arrays import parse_picture
+from cosfly.runtime.arrays import parse_picture
 from release.card.croissant import CROISSANT
 from release.card.numbers import RowCounts, spread_of
 from release.card.render import first_split, render_card

@@ -25,18 +25,18 @@ from specimens_release import (
     rows_by_id,
 )
 
-from cosfly.errors import InputError
 from cosfly.products.captions import write_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import depth_bytes
 from cosfly.products.inspection import write_inspection
 from cosfly.products.playback import read_flight
 from cosfly.products.town import read_town_map
-from cosfly.reading.arrays import parse_picture
-from cosfly.reading.documents import read_model
-from cosfly.reading.files import sha256_file
-from cosfly.work.config import build as build_config
-from cosfly.work.store import CHECKSUMS, read_checksums
+from cosfly.runtime.arrays import parse_picture
+from cosfly.runtime.config import build as build_config
+from cosfly.runtime.documents import read_model
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import sha256_file
+from cosfly.runtime.store import CHECKSUMS, read_checksums
 from release.columns import POSE
 from release.export.contract import FORMATS, ExportConfig, ExportUnit, Files, FormatFacts
 from release.export.lerobot import merged, runs_of, states, summarize, tiff_of_depth

@@ -14,7 +14,7 @@ from owners import LEROBOT, python_with
 from specimens_release import make_release, rows_by_id
 from test_release_export import config
 
-from cosfly.reading.arrays import parse_picture
+from cosfly.runtime.arrays import parse_picture
 from release.columns import POSE
 from release.export.stage import run as export
 

@@ -27,7 +27,7 @@ from caption.run.released import read_released
 from cosfly.app import pipeline
 from cosfly.app.settings import RunConfig
 from cosfly.products.captions import write_captions
-from cosfly.work.config import load
+from cosfly.runtime.config import load
 from release.package import stage as package
 from release.package.sources import Source
 from release.verify.verify import verify

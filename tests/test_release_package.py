@@ -17,7 +17,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from specimens_release import CFG, all_bytes, build, make_inspection, rewrite_captions, source_of
 
-from cosfly.errors import ConfigError, InputError
 from cosfly.products.boxes import MapHeader
 from cosfly.products.frames import read_depth, read_instance, read_rgb
 from cosfly.products.inspection import (
@@ -25,7 +24,8 @@ from cosfly.products.inspection import (
 )
 from cosfly.products.playback import read_flight
 from cosfly.products.town import write_town_map
-from cosfly.reading.documents import read_json
+from cosfly.runtime.documents import read_json
+from cosfly.runtime.errors import ConfigError, InputError
 from release.card.render import render_card
 from release.package.plan import plan_shards
 from release.package.sources import Source

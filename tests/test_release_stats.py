@@ -19,7 +19,7 @@ from cosfly.geometry import box_iou
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
 from cosfly.products.inspection import read_inspection, write_inspection
 from cosfly.products.kinds import KINDS
-from cosfly.reading.documents import read_json
+from cosfly.runtime.documents import read_json
 from cosfly.space.flight_metrics import accel_rms, jerk_rms, length_m
 from release.columns import POINT, POSE
 from release.record import read_record

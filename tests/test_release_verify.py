@@ -23,10 +23,10 @@ from specimens_foreign import hub_snapshot, write_foreign_tree
 from specimens_release import run_here
 
 from caption.run.released import read_released
-from cosfly.errors import InputError
 from cosfly.products.frames import instance_bytes
-from cosfly.reading.documents import read_json
-from cosfly.work.store import write_bytes
+from cosfly.runtime.documents import read_json
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.store import write_bytes
 from release.columns import INTRINSICS
 from release.export.contract import ExportConfig
 from release.export.stage import run as export

@@ -22,7 +22,7 @@ from cosfly.products.captions import write_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.kinds import KINDS
 from cosfly.products.playback import read_flight
-from cosfly.reading.tables import rows_of
+from cosfly.runtime.tables import rows_of
 from release.columns import PLACE, POINT
 from release.record import read_record
 from release.stats import stats

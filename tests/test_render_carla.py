@@ -15,7 +15,6 @@ from simulator_serving import as_client, command, free_port, serving
 from simulators.scene import clothes_of
 from test_renderers_contract import circling, street, write_inputs
 
-from cosfly.errors import EnvironmentMissing, RenderError
 from cosfly.geometry import intrinsic_matrix, world_from_camera
 from cosfly.products.boxes import write_boxes
 from cosfly.products.flights import find_flights
@@ -27,8 +26,9 @@ from cosfly.render.carla_backend import CarlaRenderConfig
 from cosfly.render.contract import PERSON_ID, PosedPerson
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
+from cosfly.runtime.config import build
+from cosfly.runtime.errors import EnvironmentMissing, RenderError
 from cosfly.unreal.conventions import DEPTH_STEP_M
-from cosfly.work.config import build
 
 pytest.importorskip("carla")
 FRAMES = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0], "town": "Street", "first_timestamp": 1776000000}

@@ -15,7 +15,7 @@ from cosfly.products.playback import read_flight
 from cosfly.render.camera import contrast_of, legibility
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
-from cosfly.work.config import build
+from cosfly.runtime.config import build
 
 
 def test_contrast_is_of_the_person_against_what_is_around():

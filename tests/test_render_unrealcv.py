@@ -17,7 +17,6 @@ from test_renderers_contract import street
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.errors import EnvironmentMissing, RenderError
 from cosfly.geometry import intrinsic_matrix, world_from_camera
 from cosfly.maps import unrealcv_export
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig
@@ -28,8 +27,9 @@ from cosfly.render.contract import PERSON_ID, PosedCar, PosedOther, PosedPerson,
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.render.unrealcv_backend import UnrealCvRenderConfig
+from cosfly.runtime.config import build
+from cosfly.runtime.errors import EnvironmentMissing, RenderError
 from cosfly.unreal.unrealcv_client import UnrealCvConfig, connect
-from cosfly.work.config import build
 
 pytest.importorskip("unrealcv")
 CLEAN = {**FRAMES, "tracks": ["clean"]}

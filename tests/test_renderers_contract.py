@@ -24,7 +24,6 @@ import numpy as np
 import pytest
 from simulator_serving import serving
 
-from cosfly.errors import EnvironmentMissing, RenderError
 from cosfly.geometry import box_corners, intrinsic_matrix, look_at, project, rotation_matrices, world_from_camera
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run as inspect_tree
@@ -58,7 +57,8 @@ from cosfly.render.draping import layers_of
 from cosfly.render.person import choose_clothes
 from cosfly.render.settings import ENGINES, RenderConfig
 from cosfly.render.stage import RENDERERS, open_renderer, run
-from cosfly.work.config import build
+from cosfly.runtime.config import build
+from cosfly.runtime.errors import EnvironmentMissing, RenderError
 
 SIZE = (320, 180)
 DEPTH_TOLERANCE_M = 0.001  # within 60 m

@@ -6,11 +6,11 @@ import signal
 import time
 from pathlib import Path
 
-from cosfly.errors import RenderError
-from cosfly.work.config import Config
-from cosfly.work.runner import Item, Outcome, advance
-from cosfly.work.stage_folder import StageFolder
-from cosfly.work.store import atomic_folder
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import RenderError
+from cosfly.runtime.runner import Item, Outcome, advance
+from cosfly.runtime.stage_folder import StageFolder
+from cosfly.runtime.store import atomic_folder
 
 
 def stage_in(path: Path) -> StageFolder:

@@ -27,9 +27,9 @@ from caption.truth.vocabulary import Vocabulary
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.contract import NoAnswer
 from cosfly.chat.interrupts import run_until_interrupted
-from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import Coc
-from cosfly.work.store import refuse_links, write_json
+from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.store import refuse_links, write_json
 
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 RESULT = "compare_strategies.json"

@@ -11,8 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.products.actions import TOKENS
 from cosfly.products.captions import Caption, TeacherRecord, Usage
-from cosfly.work.stage_folder import Tally
-from cosfly.work.store import sha256_bytes
+from cosfly.runtime.stage_folder import Tally
+from cosfly.runtime.store import sha256_bytes
 
 NUM_CARDS = 24
 # Fields of the report that count captions by a word.

@@ -20,7 +20,7 @@ from rich.table import Table
 from cosfly.chat.budget import Budget
 from cosfly.chat.contract import Troubles
 from cosfly.products.captions import Caption
-from cosfly.work.console import SECONDS_BETWEEN_LINES, console
+from cosfly.runtime.console import SECONDS_BETWEEN_LINES, console
 
 log = logging.getLogger(__name__)
 

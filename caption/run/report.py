@@ -16,8 +16,8 @@ from cosfly.products.captions import Caption, Language
 from cosfly.products.frames import frame_name
 from cosfly.products.places import flight_of
 from cosfly.products.sentences import sentences_of
-from cosfly.reading.files import read_text
-from cosfly.work.store import write_bytes
+from cosfly.runtime.files import read_text
+from cosfly.runtime.store import write_bytes
 
 PICTURE_WIDTH_PX = 240
 VERDICTS = {  # what it means

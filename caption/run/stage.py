@@ -28,12 +28,12 @@ from caption.truth.glossary import GLOSSARY_FILE
 from caption.truth.vocabulary import Vocabulary
 from cosfly.chat.interrupts import run_until_interrupted
 from cosfly.chat.student_chat import student_files
-from cosfly.errors import ConfigError, ResumeError, TeacherError
 from cosfly.products.captions import caption_lines, line_of, write_caption_lines
 from cosfly.products.places import flight_of
-from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
-from cosfly.work.stage_folder import Resume, StageFolder, Tally, read_manifest
-from cosfly.work.store import write_json
+from cosfly.runtime.errors import ConfigError, ResumeError, TeacherError
+from cosfly.runtime.runner import Item, Outcome, Watch, Work, advance, run_items
+from cosfly.runtime.stage_folder import Resume, StageFolder, Tally, read_manifest
+from cosfly.runtime.store import write_json
 
 log = logging.getLogger(__name__)
 

@@ -23,7 +23,6 @@ from caption.truth.references import measured_series
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft, Refused, refuse_decision
 from cosfly.chat.contract import NoAnswer, Reply
-from cosfly.errors import InputError, RenderError
 from cosfly.products.actions import ACTIONS
 from cosfly.products.answer_text import Parsed, parse_answer
 from cosfly.products.captions import (
@@ -36,8 +35,9 @@ from cosfly.products.captions import (
     Usage,
     Verdict,
 )
-from cosfly.reading.objects import CONTEXT_FULL
-from cosfly.work.store import dump_json
+from cosfly.runtime.errors import InputError, RenderError
+from cosfly.runtime.objects import CONTEXT_FULL
+from cosfly.runtime.store import dump_json
 
 MAX_COMPLAINTS = 8  # named at once
 

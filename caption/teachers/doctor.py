@@ -31,10 +31,10 @@ from cosfly.chat.client import ChatClient
 from cosfly.chat.contract import Reply
 from cosfly.chat.protocol import read_body, request_body, response_format, thoughts_of
 from cosfly.chat.refusals import MEANINGS, Refusal
-from cosfly.errors import TeacherError
 from cosfly.look.frame_views import VIEW_FILES
 from cosfly.products.answer_text import answer_schema
-from cosfly.reading.documents import parse_json
+from cosfly.runtime.documents import parse_json
+from cosfly.runtime.errors import TeacherError
 
 State = Literal["ok", "warning", "unusable"]
 

@@ -23,13 +23,13 @@ from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget
 from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import NoAnswer, Request, Troubles, started
-from cosfly.errors import InputError
 from cosfly.products.captions import Coc, JudgeRecord, Language
 from cosfly.products.places import flight_of
-from cosfly.reading.documents import Record, parse_document, validated
-from cosfly.reading.files import read_unpacked
-from cosfly.reading.objects import find_object
-from cosfly.work.store import dump_json
+from cosfly.runtime.documents import Record, parse_document, validated
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import read_unpacked
+from cosfly.runtime.objects import find_object
+from cosfly.runtime.store import dump_json
 
 GOLD = Path(__file__).with_name("gold.jsonl.gz")
 

@@ -14,10 +14,10 @@ from string import Template
 
 from caption.schema import CaptionConfig
 from caption.truth.vocabulary import Vocabulary
-from cosfly.errors import ConfigError, InputError, nearest
 from cosfly.products.captions import OWN_PROMPTS
-from cosfly.reading.files import read_text
-from cosfly.work.store import refuse_links, storage_errors, write_bytes
+from cosfly.runtime.errors import ConfigError, InputError, nearest
+from cosfly.runtime.files import read_text
+from cosfly.runtime.store import refuse_links, storage_errors, write_bytes
 
 log = logging.getLogger(__name__)
 

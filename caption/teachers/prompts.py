@@ -20,7 +20,7 @@ from cosfly.look.frame_views import Pictures, frame_label
 from cosfly.products.actions import ACTIONS, TOKENS
 from cosfly.products.captions import GOAL_WORDS, PICTURES_MARK, Language, Prompt, Writing
 from cosfly.products.segments import MISSION_KINDS
-from cosfly.work.store import dump_json, sha256_bytes
+from cosfly.runtime.store import dump_json, sha256_bytes
 
 MAX_RETURNED_CHARACTERS = 6000  # of a refused answer, when it is shown to who wrote it
 

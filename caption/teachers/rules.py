@@ -13,7 +13,7 @@ from pathlib import Path
 
 from caption.truth.facts import Facts
 from caption.truth.references import QUANTITIES, Fact, find_fact, parse_reference
-from cosfly.work.config import read_yaml
+from cosfly.runtime.config import read_yaml
 
 Both = tuple[str, str]  # English, Chinese
 

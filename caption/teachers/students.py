@@ -31,10 +31,10 @@ from cosfly.chat.student_chat import (
     read_taught,
     student_request,
 )
-from cosfly.errors import ConfigError, TeacherError
 from cosfly.look.frame_views import Pictures
 from cosfly.products.answer_text import answer_schema
 from cosfly.products.captions import Language, Prompt
+from cosfly.runtime.errors import ConfigError, TeacherError
 
 
 def as_taught(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfig:

@@ -37,7 +37,7 @@ from cosfly.look.frame_views import Pictures
 from cosfly.products.answer_text import answer_schema
 from cosfly.products.captions import TeacherRecord, TeacherSettings, Writing
 from cosfly.products.places import flight_of
-from cosfly.work.chance import draws_for, rng_for
+from cosfly.runtime.chance import draws_for, rng_for
 
 ENCODING_THREADS = 4
 

@@ -24,10 +24,10 @@ from caption.truth.vocabulary import terms_in
 from caption.writing.contract import Refused
 from caption.writing.earned import is_earned
 from caption.writing.outside import SLOT_MARK, check_outside, decisions_named, decisions_opposed, states_beside
-from cosfly.errors import nearest
 from cosfly.products.actions import ACTIONS
 from cosfly.products.answer_text import is_in_script
 from cosfly.products.captions import Language, SentenceState
+from cosfly.runtime.errors import nearest
 
 _BRACES = re.compile(r"\{([^{}]*)\}")
 _ARTICLE = re.compile(r"\b([Aa])n?\s+$")

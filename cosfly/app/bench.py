@@ -14,11 +14,11 @@ import numpy as np
 from pydantic import BaseModel
 
 from caption.teachers.teacher import EMBEDDED
-from cosfly.errors import ConfigError, ResumeError
-from cosfly.reading.documents import FileFormat
-from cosfly.work.stage_events import EVENTS, LOSSES, Event, read_events
-from cosfly.work.stage_folder import Manifest, read_manifest
-from cosfly.work.store import write_model
+from cosfly.runtime.documents import FileFormat
+from cosfly.runtime.errors import ConfigError, ResumeError
+from cosfly.runtime.stage_events import EVENTS, LOSSES, Event, read_events
+from cosfly.runtime.stage_folder import Manifest, read_manifest
+from cosfly.runtime.store import write_model
 
 if TYPE_CHECKING:
     from cosfly.app.settings import RunConfig

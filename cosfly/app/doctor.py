@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from cosfly.errors import EnvironmentMissing
+from cosfly.runtime.errors import EnvironmentMissing
 
 State = Literal["ok", "missing", "optional"]
 

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.errors import ConfigError, InputError
 from cosfly.geometry import intrinsic_matrix, look_at, world_from_camera
 from cosfly.maps.stage import SOURCES, MapsConfig
 from cosfly.maps.stage import load_map as load_source
@@ -28,9 +27,10 @@ from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import renderer_of
 from cosfly.render.weather import WeatherConfig, drawn_seed, read_pools, weather_of
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.config import build
+from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.simplify.passes import SimplifyConfig, simplify
-from cosfly.work.chance import rng_for
-from cosfly.work.config import build
 
 __all__ = ["BoxMap", "DroneTrace", "Frame", "load_map", "plan", "read_captions", "render_frames"]
 

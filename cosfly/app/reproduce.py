@@ -24,7 +24,6 @@ import cosfly.pedestrians.stage
 from cosfly.app import bench as benchmark
 from cosfly.app.runs import look
 from cosfly.app.settings import RunConfig, manner_of_work
-from cosfly.errors import InputError
 from cosfly.look.frame_views import small_jpeg
 from cosfly.look.gallery import four_panels
 from cosfly.look.page import page, run_name
@@ -32,15 +31,16 @@ from cosfly.planners import compare
 from cosfly.products.boxes import read_boxes
 from cosfly.products.captions import FIELDS, read_captions
 from cosfly.products.segments import FOLLOW
-from cosfly.reading.arrays import read_picture
-from cosfly.reading.documents import FileFormat, read_object
-from cosfly.reading.files import read_bytes
+from cosfly.runtime.arrays import read_picture
+from cosfly.runtime.config import build, read_yaml
+from cosfly.runtime.documents import FileFormat, read_object
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import read_bytes
+from cosfly.runtime.journal import Journal
+from cosfly.runtime.stage_events import read_events
+from cosfly.runtime.stage_folder import Resume, read_manifest
+from cosfly.runtime.store import write_bytes, write_json
 from cosfly.studies import beam, depth, weather, zoom
-from cosfly.work.config import build, read_yaml
-from cosfly.work.journal import Journal
-from cosfly.work.stage_events import read_events
-from cosfly.work.stage_folder import Resume, read_manifest
-from cosfly.work.store import write_bytes, write_json
 from distill.prepare.dual_track import windows_of
 from release.stats.stats import TABLE_LOOK
 from release.stats.stats import run as release_stats

@@ -10,11 +10,11 @@ from typing import Literal
 
 from cosfly.app.settings import RunConfig
 from cosfly.app.settings_guide import Setting, changed
-from cosfly.errors import CosflyError, InputError
 from cosfly.products.review import undecided
-from cosfly.work.config import load
-from cosfly.work.folder_lock import is_held
-from cosfly.work.stage_folder import Failed, StageFolder, Tally, read_manifest
+from cosfly.runtime.config import load
+from cosfly.runtime.errors import CosflyError, InputError
+from cosfly.runtime.folder_lock import is_held
+from cosfly.runtime.stage_folder import Failed, StageFolder, Tally, read_manifest
 
 STAGES = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")  # of a run, in order
 TO_LOOK_AT = (

@@ -11,18 +11,18 @@ from pydantic import Field, model_validator
 
 from caption.schema import CaptionConfig
 from cosfly.closed_loop.settings import FlyConfig
-from cosfly.errors import ConfigError
 from cosfly.inspection.settings import InspectConfig
 from cosfly.maps.stage import MapsConfig
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners.contract import PlanConfig
-from cosfly.reading.files import LinkedPath
 from cosfly.render.settings import RenderConfig
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.config import Config, build
+from cosfly.runtime.errors import ConfigError
+from cosfly.runtime.files import LinkedPath
+from cosfly.runtime.ray_engine import ALL_ROOM, RayConfig
+from cosfly.runtime.worker_pool import Watch
 from cosfly.simplify.passes import SimplifyConfig
-from cosfly.work.chance import rng_for
-from cosfly.work.config import Config, build
-from cosfly.work.ray_engine import ALL_ROOM, RayConfig
-from cosfly.work.worker_pool import Watch
 from cosfly.worlds.settings import WorldConfig
 from distill.evaluation.compare import ReportConfig
 from distill.evaluation.stage import EvaluateConfig

@@ -8,8 +8,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from cosfly.errors import ConfigError, nearest
-from cosfly.work.store import dump_json
+from cosfly.runtime.errors import ConfigError, nearest
+from cosfly.runtime.store import dump_json
 
 
 @dataclass(frozen=True)

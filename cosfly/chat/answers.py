@@ -23,11 +23,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.chat.budget import Budget
 from cosfly.chat.contract import MOST_TOKENS, CountName, Engine, NoAnswer, Reply, Request
-from cosfly.errors import CosflyError
 from cosfly.products.captions import Usage
-from cosfly.reading.objects import CONTEXT_FULL
-from cosfly.work.journal import Journal
-from cosfly.work.store import dump_json, sha256_bytes
+from cosfly.runtime.errors import CosflyError
+from cosfly.runtime.journal import Journal
+from cosfly.runtime.objects import CONTEXT_FULL
+from cosfly.runtime.store import dump_json, sha256_bytes
 
 log = logging.getLogger(__name__)
 

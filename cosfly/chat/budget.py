@@ -15,9 +15,9 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from cosfly.errors import TeacherError
 from cosfly.products.captions import Usage
-from cosfly.work.config import Config
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import TeacherError
 
 MILLION = 1_000_000
 BYTES_PER_TOKEN = 3  # a low guess: a budget that counts with it is kept

@@ -32,9 +32,9 @@ from cosfly.chat.protocol import (
 from cosfly.chat.refusals import MEANINGS, Refusal, kind_of
 from cosfly.chat.throttle import Throttle
 from cosfly.chat.wire import KEY_VARIABLE, Connections, Response, base_url, check_url
-from cosfly.errors import TeacherError
-from cosfly.reading.objects import CONTEXT_FULL
-from cosfly.work.config import Config, MayDiffer
+from cosfly.runtime.config import Config, MayDiffer
+from cosfly.runtime.errors import TeacherError
+from cosfly.runtime.objects import CONTEXT_FULL
 
 log = logging.getLogger(__name__)
 

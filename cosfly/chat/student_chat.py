@@ -19,11 +19,11 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
 from cosfly.chat.client import EndpointConfig
 from cosfly.chat.contract import Request
-from cosfly.errors import InputError
 from cosfly.look.frame_views import View, encode_picture, frame_label
 from cosfly.products.captions import Language, Prompt
-from cosfly.reading.documents import FileFormat, read_model
-from cosfly.work.store import sha256_bytes, write_model
+from cosfly.runtime.documents import FileFormat, read_model
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.store import sha256_bytes, write_model
 
 IMAGE_ENCODING: Literal["png"] = "png"
 IMAGE_PART: dict[str, Any] = {"type": "image"}  # a picture as chat templates know it

@@ -19,9 +19,9 @@ from pydantic import Field
 
 from cosfly.chat.client import EndpointConfig
 from cosfly.chat.contract import NoAnswer, Reply, Request
-from cosfly.errors import ConfigError, EnvironmentMissing, InputError, TeacherError
 from cosfly.products.captions import Usage
-from cosfly.work.config import Config
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError, TeacherError
 
 INSTALL = 'pip install "cosfly[vllm]" on a machine with an accelerator'
 ADDED_PER_STEP = 8  # requests handed over between two looks at what is finished

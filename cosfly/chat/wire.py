@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import httpx
 
-from cosfly.errors import TeacherError
+from cosfly.runtime.errors import TeacherError
 
 KEY_VARIABLE = "COSFLY_API_KEY"
 HEADERS = {"Content-Type": "application/json", "Accept-Encoding": "identity"}

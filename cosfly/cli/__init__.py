@@ -24,7 +24,7 @@ from cosfly.cli.stages import app as stages_app
 from cosfly.cli.studies import app as studies_app
 from cosfly.cli.view import app as view_app
 from cosfly.cli.world import app as world_app
-from cosfly.errors import CosflyError, plain
+from cosfly.runtime.errors import CosflyError, plain
 
 # The exit codes of Ctrl-C, which Typer makes of a KeyboardInterrupt without a word, and of SIGTERM.
 ENDED = {130: "interrupted", 143: "terminated"}
@@ -79,7 +79,7 @@ def _root(
     if version:
         typer.echo(f"cosfly {__version__}")
         raise typer.Exit
-    from cosfly.work.console import set_up_logging
+    from cosfly.runtime.console import set_up_logging
 
     set_up_logging(logging.DEBUG if verbose else logging.WARNING if quiet else logging.INFO, log_file)
     log.debug("cosfly %s, Python %s, in %s", __version__, sys.version.split()[0], Path.cwd())
@@ -99,7 +99,7 @@ def main() -> None:
             _fail(f"{ENDED[code]}; finished work is kept: run the same command again to continue", code)
         _end(code)
     except OSError as error:
-        from cosfly.work.store import DISK_FULL
+        from cosfly.runtime.store import DISK_FULL
 
         if error.filename is not None or error.errno not in DISK_FULL:
             raise

@@ -79,7 +79,7 @@ def caption(
 
 def _tell_forecast(job: Job, tree: Path, target: Path) -> None:
     from caption.run.forecast import make_forecast
-    from cosfly.work.console import console
+    from cosfly.runtime.console import console
 
     forecast = make_forecast(job.cfg.caption, tree, target, seed=job.cfg.seed, resume=job.resume)
     options.tell_table(console, (), forecast, title="What this run will take")
@@ -100,7 +100,7 @@ def _examine_endpoint(url: str, cfg: CaptionConfig) -> None:
     """Print a table of what works; exit 1 when the endpoint is unusable."""
     from caption.teachers.doctor import examine_endpoint
     from caption.teachers.prompt_files import vocabulary_of
-    from cosfly.work.console import console
+    from cosfly.runtime.console import console
 
     findings = examine_endpoint(url, cfg, vocabulary_of(cfg))
     options.tell_checks(findings, console, "What the endpoint can do")
@@ -139,7 +139,7 @@ def caption_judge_check(
 
     from caption.teachers.judge import check_judge, gold_conflicts, judge_check_table
     from caption.teachers.prompt_files import vocabulary_of
-    from cosfly.work.console import console
+    from cosfly.runtime.console import console
 
     cfg, seed = job.cfg.caption, job.cfg.seed
     found = asyncio.run(check_judge(cfg.judge, vocabulary_of(cfg), gold_conflicts(), seed))
@@ -158,7 +158,7 @@ def caption_compare_strategies(
 ) -> None:
     """Compare hint, multi_sample, anchored and cascade on the same conflicts: consistency, text, asks, tokens."""
     from caption.run import compare
-    from cosfly.work.console import console
+    from cosfly.runtime.console import console
 
     tree = job.tree(data)
     comparisons = compare.run(job.cfg.caption, tree, out, seed=job.cfg.seed, conflicts=conflicts)

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer import Option
 
-from cosfly.errors import ConfigError, InputError, nearest
+from cosfly.runtime.errors import ConfigError, InputError, nearest
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
     from cosfly.app.settings import RunConfig
-    from cosfly.work.stage_folder import Resume, Tally
+    from cosfly.runtime.stage_folder import Resume, Tally
 
 log = logging.getLogger(__name__)
 
@@ -119,7 +119,7 @@ class Job:
 
     def finish(self, product: Path, out: Path) -> None:
         """Name a stage's product. Too much that failed is an error: whoever calls the next stage must know."""
-        from cosfly.work.stage_folder import read_manifest
+        from cosfly.runtime.stage_folder import read_manifest
 
         typer.echo(product)
         self.check_failures({out.name: read_manifest(out).counts}, out / "failures.jsonl")
@@ -211,8 +211,8 @@ def stage_group(text: str) -> typer.Typer:
 def resolve(config: Path | None, overrides: list[str] | None, given: Mapping[str, Any] = {}) -> RunConfig:
     """Resolve the settings: defaults, file, --set, then `given`: what options say of single settings."""
     from cosfly.app.settings import RunConfig
-    from cosfly.work.config import config_file, load
-    from cosfly.work.store import dump_json
+    from cosfly.runtime.config import config_file, load
+    from cosfly.runtime.store import dump_json
 
     # As YAML, which JSON is: a colon in a text is only a colon.
     extra = [f"{name}={dump_json(str(value) if isinstance(value, Path) else value)}" for name, value in given.items()]

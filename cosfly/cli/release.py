@@ -81,7 +81,7 @@ def release_verify(
     """Check that a release is what its records say and can be true, from cheap to dear. Exit 1 if anything is wrong."""
     from caption.run.released import read_released
     from cosfly.app.settings import manner_of_work
-    from cosfly.work.store import write_json
+    from cosfly.runtime.store import write_json
     from release.verify.verify import LEVELS, verify
 
     if level not in LEVELS:
@@ -136,7 +136,7 @@ def release_export(
     overwrite: Annotated[bool, Option("--overwrite", help="Captions: replace an existing file.")] = False,
 ) -> None:
     """Write a release in another format, without loss, or its accepted captions to one file."""
-    from cosfly.work.config import build
+    from cosfly.runtime.config import build
 
     if format == "tree" or format == "webdataset" or format == "lerobot":
         from release.export import stage as export

@@ -59,7 +59,7 @@ def _is_begun(config: Path, cfg: RunConfig) -> bool:
 def _tell_estimate(cfg: RunConfig, out: Path) -> None:
     from caption.run.progress import duration
     from cosfly.app import estimate
-    from cosfly.work.console import answer_console
+    from cosfly.runtime.console import answer_console
 
     rows, told = estimate.estimate(cfg, out), []
     for row in rows:
@@ -72,7 +72,7 @@ def _tell_estimate(cfg: RunConfig, out: Path) -> None:
 
 
 def _closing_table(results: list[StageResult], out: Path) -> None:
-    from cosfly.work.console import console
+    from cosfly.runtime.console import console
 
     rows = []
     for result in results:
@@ -95,8 +95,8 @@ def show(run: Annotated[Path, Argument(metavar="RUN", help="A run folder.")]) ->
     from cosfly.app.estimate import in_words as size
     from cosfly.app.runs import look
     from cosfly.products.review import how_to_decide
-    from cosfly.work.console import answer_console
-    from cosfly.work.store import dump_json
+    from cosfly.runtime.console import answer_console
+    from cosfly.runtime.store import dump_json
 
     seen = look(run)
     at_work = ", at work now" if seen.is_at_work else ""
@@ -132,8 +132,8 @@ def list_runs(root: Annotated[Path, Argument(metavar="[DIR]", help="Where runs a
     """List the runs in a folder: how far they are, flights, captions, size."""
     from cosfly.app.estimate import in_words as size
     from cosfly.app.runs import looks
-    from cosfly.errors import CosflyError
-    from cosfly.work.console import answer_console
+    from cosfly.runtime.console import answer_console
+    from cosfly.runtime.errors import CosflyError
 
     rows, errors = [], []
     for seen in looks(root):
@@ -167,7 +167,7 @@ def bench(
     from rich.box import SIMPLE_HEAD
 
     from cosfly.app import bench as benchmark
-    from cosfly.work.console import console
+    from cosfly.runtime.console import console
 
     counts = [int(word) if word.isdecimal() else 0 for word in workers.split(",")]
     if min(counts) < 1:
@@ -223,7 +223,7 @@ def config_show(
     import yaml
 
     from cosfly.app import settings_guide
-    from cosfly.work.console import answer_console
+    from cosfly.runtime.console import answer_console
 
     if section is None and config is not None and _is_section(config):
         config, section = None, config
@@ -239,7 +239,7 @@ def config_show(
 
 def _is_section(word: str) -> bool:
     """Tell whether a word is no file and no configuration that ships."""
-    from cosfly.work.config import shipped
+    from cosfly.runtime.config import shipped
 
     path = Path(word)
     return not path.exists() and path.suffix not in (".yaml", ".yml") and not shipped(f"{path.name}.yaml").exists()
@@ -251,6 +251,6 @@ def doctor(
 ) -> None:
     """What works here: GL, GPU, packages, disk. Exit 1 if the main job cannot run."""
     from cosfly.app import doctor as examination
-    from cosfly.work.console import answer_console
+    from cosfly.runtime.console import answer_console
 
     options.tell_checks(examination.examine(out), answer_console)

@@ -149,8 +149,8 @@ def plan_compare(
     """Planners on the same walks: tables, compare.json, the flights, and pictures."""
     from cosfly.planners import compare
     from cosfly.planners.compare import text_tables
-    from cosfly.work.config import build
-    from cosfly.work.console import console
+    from cosfly.runtime.config import build
+    from cosfly.runtime.console import console
 
     settings = job.cfg.plan.model_dump() | ({"planners": planner} if planner else {})
     compared = build(compare.CompareConfig, settings, "--planner")
@@ -172,8 +172,8 @@ def plan_benchmark(
 ) -> None:
     """The paper's comparison of 14 planners and ours: tables with intervals, benchmark.json, figures."""
     from cosfly.planners import benchmark
-    from cosfly.work.config import build
-    from cosfly.work.console import console
+    from cosfly.runtime.config import build
+    from cosfly.runtime.console import console
 
     settings = job.cfg.plan.model_dump() | {"scenarios": scenarios} | ({"planners": planner} if planner else {})
     cfg = build(benchmark.BenchmarkConfig, settings, "plan benchmark")
@@ -245,8 +245,8 @@ def render(
     from cosfly.look.gallery import preview_gif
     from cosfly.render import stage
     from cosfly.render.settings import RenderConfig
-    from cosfly.work.config import build
-    from cosfly.work.store import inside
+    from cosfly.runtime.config import build
+    from cosfly.runtime.store import inside
 
     wanted = {"rgb": require_rgb, "depth": require_depth}
     modalities: list[str] = [name for name in job.cfg.render.modalities if wanted.get(name) is not False]

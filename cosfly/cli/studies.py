@@ -57,8 +57,8 @@ def study_weather(
 ) -> None:
     """One view under every weather and time of day: nine pictures, and a sheet of all."""
     from cosfly.products.weather import TIMES, WEATHERS
+    from cosfly.runtime.console import progress_bar
     from cosfly.studies import weather
-    from cosfly.work.console import progress_bar
 
     with progress_bar("study weather: pictures", len(WEATHERS) * len(TIMES)) as advance:
         chosen: Any = {"trajectory": trajectory, "frame": frame, "fov_deg": fov, "seed": job.cfg.seed}
@@ -79,10 +79,10 @@ def study_zoom(
     every: Annotated[int | None, Option(show_default="2", help="Every how many frames of a flight are drawn.")] = None,
 ) -> None:
     """The same flights at every level of zoom: target size, visibility, track quality; optical against digital zoom."""
-    from cosfly.reading.documents import read_object
+    from cosfly.runtime.config import build
+    from cosfly.runtime.console import console
+    from cosfly.runtime.documents import read_object
     from cosfly.studies import zoom
-    from cosfly.work.config import build
-    from cosfly.work.console import console
 
     given = {name: value for name, value in (("num_flights", flights), ("every", every)) if value is not None}
     studied = build(zoom.ZoomStudyConfig, job.cfg.render.model_dump() | given, "--flights, --every")

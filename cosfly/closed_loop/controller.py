@@ -15,12 +15,12 @@ from pydantic import Field
 
 from cosfly.closed_loop.settings import Drone
 from cosfly.closed_loop.stepper import Moment
-from cosfly.errors import ConfigError
 from cosfly.geometry import look_at, wrap_deg
 from cosfly.products.motion import in_axes_of
 from cosfly.products.walks import TARGET_HEIGHT_M
-from cosfly.reading.documents import FileFormat
-from cosfly.work.config import Config, build, read_yaml
+from cosfly.runtime.config import Config, build, read_yaml
+from cosfly.runtime.documents import FileFormat
+from cosfly.runtime.errors import ConfigError
 
 CONTROLLER_FORMAT = FileFormat("cosfly.controller", "1.0", "controller")
 AIM_MOST_M = 100.0  # a camera that looks at the horizon has no place ahead

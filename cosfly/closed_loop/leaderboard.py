@@ -22,7 +22,6 @@ from cosfly.closed_loop.measures import (
     walk_sums,
 )
 from cosfly.closed_loop.settings import FLOORS
-from cosfly.errors import InputError
 from cosfly.look.frame_views import thumbnail
 from cosfly.look.page import page
 from cosfly.products.figures import Figure
@@ -30,11 +29,12 @@ from cosfly.products.flight_scores import Score, read_score
 from cosfly.products.flights import find_flights
 from cosfly.products.playback import read_flight
 from cosfly.products.pursuits import Pursuit, pursuit_file, read_pursuit
-from cosfly.reading.documents import FileFormat
-from cosfly.work.chance import rng_for
-from cosfly.work.config import Config
-from cosfly.work.stage_folder import Resume, StageFolder, Tally
-from cosfly.work.store import sha256_bytes, write_bytes, write_model
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.config import Config
+from cosfly.runtime.documents import FileFormat
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
+from cosfly.runtime.store import sha256_bytes, write_bytes, write_model
 from distill.evaluation.pages import COLORS, STYLE, bars, shown_as
 
 HEADLINE = ("success", "in_view", "tracked_frames", "kept_s", "lost", "crashed")

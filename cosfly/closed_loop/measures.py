@@ -15,13 +15,13 @@ from itertools import groupby, pairwise
 
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.products.figures import Figure, draw_walks, figure_of_draws
 from cosfly.products.flight_scores import FlightScore, Score
 from cosfly.products.pursuits import Pursuit
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.store import dump_json, sha256_bytes
 from cosfly.space.flight_metrics import RELAXED_SAFETY_M, derivative_rms
-from cosfly.work.chance import rng_for
-from cosfly.work.store import dump_json, sha256_bytes
 
 LOSS_S = 2.0  # unseen for so long the person is lost; for less it is hidden by a tree or a lamp
 BAND_M = (5.0, 40.0)  # over ground: a quarter and twice of what plans keep (plan.behind_distance_m)

@@ -30,7 +30,6 @@ from cosfly.chat.contract import NoAnswer
 from cosfly.chat.student_chat import TAUGHT
 from cosfly.closed_loop.settings import FLOORS, FlyConfig
 from cosfly.closed_loop.stepper import ClosedLoopFlight, Moment
-from cosfly.errors import CosflyError
 from cosfly.geometry import wrap_deg
 from cosfly.products.actions import TOKENS
 from cosfly.products.answer_text import parse_answer
@@ -38,7 +37,8 @@ from cosfly.products.frames import COMPANY, FILE_NAMES, depth_file, frame_name, 
 from cosfly.products.motion import in_axes_of
 from cosfly.products.places import sample_id
 from cosfly.products.pursuits import MOST_WORDS, Answer
-from cosfly.work.chance import rng_for
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.errors import CosflyError
 from distill.inference.stage import InferConfig, Inputs, local_answers
 from distill.schema import Sample
 

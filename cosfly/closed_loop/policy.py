@@ -23,13 +23,13 @@ import numpy as np
 
 from cosfly.closed_loop.pilots import Outlook, PilotAnswer
 from cosfly.closed_loop.stepper import ClosedLoopFlight, Moment
-from cosfly.errors import InputError
 from cosfly.geometry import wrap_deg
 from cosfly.products.actions import TOKENS
 from cosfly.products.goals import SLOTS, words_of
 from cosfly.products.motion import in_axes_of
 from cosfly.products.pursuits import MOST_WORDS, Answer
-from cosfly.work.worker import end_with_parent
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.worker import end_with_parent
 
 START_LIMIT_S = 300.0  # a policy may read a model first
 MOST_REPLY_BYTES = 65_536

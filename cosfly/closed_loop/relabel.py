@@ -24,7 +24,6 @@ from cosfly.closed_loop.measures import LOSS_S
 from cosfly.closed_loop.pilots import Ceiling
 from cosfly.closed_loop.stage import PLAN, TRACES, TREE, FlightsConfig, flown_trace
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, as_drawn
-from cosfly.errors import ConfigError, InputError, NoPathError
 from cosfly.geometry import look_at, step_s
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_on
@@ -33,11 +32,12 @@ from cosfly.products.flight_scores import read_score
 from cosfly.products.pursuits import Pursuit, PursuitFrame, pursuit_file, read_pursuit
 from cosfly.products.traces import ARRAYS, DroneTrace, Excerpt, read_traces, write_traces
 from cosfly.render import stage as rendering
+from cosfly.runtime.errors import ConfigError, InputError, NoPathError
+from cosfly.runtime.provenance import read_stage_record
+from cosfly.runtime.runner import Item, Outcome, Watch, Work, advance, run_items
+from cosfly.runtime.stage_folder import Resume, StageFolder, flattened
 from cosfly.space.flight_metrics import CLEARANCE_CAP_M
 from cosfly.space.kernels import signed_distances, swept_distances
-from cosfly.work.provenance import read_stage_record
-from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
-from cosfly.work.stage_folder import Resume, StageFolder, flattened
 
 CAPTIONS = "caption"
 

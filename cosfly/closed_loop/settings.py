@@ -9,9 +9,9 @@ from typing import Any, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from cosfly.errors import nearest
 from cosfly.products.motion import ACTION
-from cosfly.work.config import Config
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import nearest
 
 ROUNDING = 1e-9  # of a command that was made as fast as it may be
 

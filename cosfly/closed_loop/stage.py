@@ -23,7 +23,6 @@ from cosfly.closed_loop.measures import score_pursuits
 from cosfly.closed_loop.pilots import Outlook, PilotAnswer, open_pilot
 from cosfly.closed_loop.settings import FlyConfig
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, Moment, as_drawn
-from cosfly.errors import ConfigError
 from cosfly.geometry import headings_of, step_s
 from cosfly.planners import stage as planning
 from cosfly.planners.contract import PlanConfig
@@ -33,15 +32,16 @@ from cosfly.products.flight_scores import SCORE, SCORE_FORMAT
 from cosfly.products.motion import PlannedMotion
 from cosfly.products.pursuits import Pursuit, PursuitFrame, WalkStyle, pursuit_file, read_pursuit, write_pursuit
 from cosfly.products.traces import DroneTrace, read_traces, write_traces
-from cosfly.reading.files import sha256_file
 from cosfly.render import stage as rendering
 from cosfly.render.settings import RenderConfig
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import ConfigError
+from cosfly.runtime.files import sha256_file
+from cosfly.runtime.runner import Item, Outcome, Watch, Work, advance, run_items
+from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
+from cosfly.runtime.store import write_model
 from cosfly.space.flight_metrics import flight_metrics
 from cosfly.space.kernels import BoxIndex, obstacle_index, visibility
-from cosfly.work.config import Config
-from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
-from cosfly.work.stage_folder import Resume, StageFolder, Tally
-from cosfly.work.store import write_model
 from distill.inference.stage import InferConfig
 
 log = logging.getLogger(__name__)

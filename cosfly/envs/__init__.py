@@ -6,7 +6,7 @@ They draw, move and judge as `cosfly fly` does, and need neither a GPU nor a sim
 from __future__ import annotations
 
 from cosfly.envs.episodes import TASKS
-from cosfly.errors import EnvironmentMissing
+from cosfly.runtime.errors import EnvironmentMissing
 
 try:
     import gymnasium

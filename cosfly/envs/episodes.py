@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, Moment
-from cosfly.errors import InputError, NoPathError, nearest
 from cosfly.maps.synthetic import PRESETS, SyntheticConfig, load
 from cosfly.pedestrians.lanes import Lane, lanes_of
 from cosfly.pedestrians.others import company_of
@@ -27,12 +26,13 @@ from cosfly.products.boxes import BoxMap
 from cosfly.products.others import Other
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import walk_id
-from cosfly.reading.documents import FileFormat, Record, read_model
 from cosfly.render.settings import RenderConfig
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.documents import FileFormat, Record, read_model
+from cosfly.runtime.errors import InputError, NoPathError, nearest
+from cosfly.runtime.store import dump_json, sha256_bytes
 from cosfly.simplify.passes import SimplifyConfig, simplify
 from cosfly.space.kernels import BoxIndex, obstacle_index
-from cosfly.work.chance import rng_for
-from cosfly.work.store import dump_json, sha256_bytes
 
 EPISODES_FILE = Path(__file__).with_name("episodes.json")
 EPISODES_FORMAT = FileFormat("cosfly.episodes", "1.0", "episodes")

@@ -22,9 +22,9 @@ from cosfly.envs.episodes import (
     read_list,
     world_of,
 )
-from cosfly.errors import ConfigError, InputError
 from cosfly.products.actions import TOKENS
 from cosfly.render.contract import FAR_M
+from cosfly.runtime.errors import ConfigError, InputError
 
 GOAL_CHARACTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ -,"
 # Of the distance between drone and person: all of the reward up to the first, none beyond the second.

@@ -20,9 +20,9 @@ from cosfly.envs.episodes import (
     read_list,
     world_of,
 )
-from cosfly.errors import InputError
-from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.work.stage_folder import Resume, StageFolder
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.stage_folder import Resume, StageFolder
 
 
 class ListConfig(FlightsConfig):

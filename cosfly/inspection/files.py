@@ -8,15 +8,15 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from cosfly.errors import InputError
 from cosfly.products.frames import FRAME_FILES, FRAMES_DIR, FrameMeta, frame_name, frame_path, public_name, read_meta
 from cosfly.products.issues import Report
 from cosfly.products.places import tree_of_flight
 from cosfly.products.playback import Flight
-from cosfly.reading.arrays import array_header, picture_size
-from cosfly.reading.files import sha256_file
-from cosfly.work.runner import advance
-from cosfly.work.store import CHECKSUMS, read_checksums, sha256_bytes
+from cosfly.runtime.arrays import array_header, picture_size
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import sha256_file
+from cosfly.runtime.runner import advance
+from cosfly.runtime.store import CHECKSUMS, read_checksums, sha256_bytes
 
 
 def check_files(flight: Flight, report: Report) -> dict[int, FrameMeta | None]:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import BaseModel
 
-from cosfly.errors import InputError, VerifyError
 from cosfly.geometry import project, step_s, world_from_camera, wrap_deg
 from cosfly.inspection.files import Checksums, check_files, check_recorded
 from cosfly.inspection.frames import FrameNumbers, check_frames, check_others, choose_frames, others_told, target_box
@@ -38,6 +37,8 @@ from cosfly.products.issues import Report
 from cosfly.products.playback import STATES, Flight, read_flight
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import TARGET_HEIGHT_M
+from cosfly.runtime.errors import InputError, VerifyError
+from cosfly.runtime.provenance import digest_of, folder_digests
 from cosfly.space.flight_metrics import (
     CLEARANCE_CAP_M,
     CLEARANCE_TOLERANCE_M,
@@ -46,7 +47,6 @@ from cosfly.space.flight_metrics import (
     length_m,
     smoothness_score,
 )
-from cosfly.work.provenance import digest_of, folder_digests
 
 if TYPE_CHECKING:
     from cosfly.products.boxes import BoxMap

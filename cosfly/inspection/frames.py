@@ -13,7 +13,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.geometry import box_corners, box_iou, mask_box, project, world_from_camera
 from cosfly.inspection.files import Checksums
 from cosfly.inspection.pixels import NUM_IDS, Picture, PixelFigures, look_at, unpack
@@ -43,10 +42,11 @@ from cosfly.products.others import BUILDS, Other, distances_to_boxes_m
 from cosfly.products.places import tree_of_flight
 from cosfly.products.playback import Flight
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
-from cosfly.reading.files import read_bytes
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import read_bytes
+from cosfly.runtime.runner import advance
 from cosfly.space.flight_metrics import CLEARANCE_TOLERANCE_M
 from cosfly.space.reprojection import LEAST_SEEN, Agreement, View, compare_views
-from cosfly.work.runner import advance
 
 # --- jumps ------------------------------------------------------------------------------------------------------------
 # Do the frames of a flight show one world? What stands still is carried from each frame into the next

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.products.frames import DEPTH_NPY, INVALID_DEPTH_M, SKY_DEPTH_M, depth_values, public_name
 from cosfly.products.kinds import KINDS
 from cosfly.products.png import colours_of
-from cosfly.work.compiled import njit
+from cosfly.runtime.compiled import njit
+from cosfly.runtime.errors import InputError
 
 NO_DEPTH = np.empty((0, 0), np.float32)
 NO_DEPTH.flags.writeable = False

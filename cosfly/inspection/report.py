@@ -13,7 +13,7 @@ from cosfly.look.coverage_page import coverage_html
 from cosfly.look.page import fragment, page
 from cosfly.products.inspection import RESULTS, FlightInspection, Inspection
 from cosfly.products.playback import STATES
-from cosfly.reading.files import read_text
+from cosfly.runtime.files import read_text
 
 STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))
 MB = 1_000_000

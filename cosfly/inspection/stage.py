@@ -11,7 +11,6 @@ import logging
 from collections import Counter
 from pathlib import Path
 
-from cosfly.errors import InputError
 from cosfly.inspection.flight import InspectedFlight, inspect_flight, trace_id
 from cosfly.inspection.report import report_html
 from cosfly.inspection.settings import PAGE_MB, InspectConfig
@@ -34,10 +33,11 @@ from cosfly.products.issues import Report
 from cosfly.products.playback import read_flight
 from cosfly.products.review import how_to_decide
 from cosfly.products.traces import DroneTrace, read_traces
-from cosfly.work.provenance import recorded_digests
-from cosfly.work.runner import Item, ItemOutcomes, Outcome, Watch, Work, run_items
-from cosfly.work.stage_folder import Failed, Resume, StageFolder, result_of
-from cosfly.work.store import write_bytes
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.provenance import recorded_digests
+from cosfly.runtime.runner import Item, ItemOutcomes, Outcome, Watch, Work, run_items
+from cosfly.runtime.stage_folder import Failed, Resume, StageFolder, result_of
+from cosfly.runtime.store import write_bytes
 
 log = logging.getLogger(__name__)
 

@@ -15,10 +15,10 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.products.captions import Language
 from cosfly.products.frames import FILE_NAMES, SKY_DEPTH_M, frame_path, read_depth, read_instance, read_meta, read_rgb
 from cosfly.products.kinds import KINDS
+from cosfly.runtime.errors import InputError
 
 View = Literal["rgb", "depth", "segmentation", "middle"]
 Layout = Literal["separate", "tiled"]

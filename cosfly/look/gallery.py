@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from cosfly.errors import InputError
 from cosfly.look.frame_views import DEPTH_RANGE_M, VIEW_FILES, read_view
 from cosfly.look.overlay import Overlay
 from cosfly.look.topview import add_caption, draw_text
@@ -19,8 +18,9 @@ from cosfly.products.frames import DEBUG_FILE, FRAME_FILES, frame_path, read_ins
 from cosfly.products.places import ALL_FLIGHTS, FlightChoice
 from cosfly.products.playback import Flight, read_flight
 from cosfly.products.town import read_instance_ids
-from cosfly.reading.arrays import read_picture
-from cosfly.work.store import inside, write_bytes
+from cosfly.runtime.arrays import read_picture
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.store import inside, write_bytes
 
 TILE_PX = (320, 180)
 NUM_RGB_TILES = 4

@@ -17,9 +17,9 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
 import cosfly
-from cosfly.escaping import for_markdown, for_terminal, markdown_code
-from cosfly.reading.files import read_text
-from cosfly.work.store import dump_json
+from cosfly.runtime.escaping import for_markdown, for_terminal, markdown_code
+from cosfly.runtime.files import read_text
+from cosfly.runtime.store import dump_json
 
 ROOT = Path(cosfly.__file__).parents[1]  # cosfly, caption, distill and release stand side by side
 

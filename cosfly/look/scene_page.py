@@ -14,8 +14,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from cosfly.errors import InputError
-from cosfly.escaping import for_terminal
 from cosfly.geometry import rotation_matrices
 from cosfly.look.frame_views import thumbnail
 from cosfly.look.page import page, scripts
@@ -27,8 +25,10 @@ from cosfly.products.places import town_folder
 from cosfly.products.playback import Flight, read_flight
 from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.products.walks import read_paths
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.escaping import for_terminal
+from cosfly.runtime.store import write_bytes
 from cosfly.space.grid import occupancy
-from cosfly.work.store import write_bytes
 
 MB = 1024 * 1024
 # How much of a kind one sees through: 1 is opaque.

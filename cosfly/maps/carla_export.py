@@ -19,12 +19,12 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
-from cosfly.errors import EnvironmentMissing, InputError
 from cosfly.products.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_box_map
 from cosfly.products.kinds import KINDS
+from cosfly.runtime.errors import EnvironmentMissing, InputError
+from cosfly.runtime.store import sha256_bytes
 from cosfly.unreal.carla_client import CarlaConfig, connect
 from cosfly.unreal.conventions import world_pose
-from cosfly.work.store import sha256_bytes
 
 log = logging.getLogger(__name__)
 

@@ -21,7 +21,6 @@ import shapely
 from pydantic import Field
 from shapely.geometry import Polygon
 
-from cosfly.errors import ConfigError, InputError
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.cityjson_file import CityObject, read_model
 from cosfly.maps.derived_ground import with_derived_ground
@@ -29,8 +28,9 @@ from cosfly.maps.footprints import CUT_SHARES, Rectangle, check_outline, cover, 
 from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.products.ground import Ground, GroundGrid
 from cosfly.products.meshes import MESHES_FILE, Meshes, MeshRef
-from cosfly.reading.meshes import Mesh
-from cosfly.work.config import Config, MayDiffer
+from cosfly.runtime.config import Config, MayDiffer
+from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.meshes import Mesh
 
 FOOT_M = 0.01  # vertices this near to the lowest one are the solid's foot
 EDGE_M = 0.05  # what only touches a rectangle is not over it

@@ -16,10 +16,10 @@ from typing import Any, Literal, NamedTuple, TypeGuard
 
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.products.columns import numbers
-from cosfly.reading.documents import MISSING, parse_document, parse_json
-from cosfly.reading.files import over_limit, read_unpacked
+from cosfly.runtime.documents import MISSING, parse_document, parse_json
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import over_limit, read_unpacked
 
 log = logging.getLogger(__name__)
 

@@ -19,15 +19,15 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, field_validator
 
-from cosfly.errors import ConfigError, InputError
 from cosfly.geometry import box_corners
 from cosfly.maps.boxlist import BoxList
 from cosfly.products.boxes import BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.products.columns import LARGEST
 from cosfly.products.kinds import KIND_NAMES
-from cosfly.reading.documents import read_json, validated
+from cosfly.runtime.config import Config
+from cosfly.runtime.documents import read_json, validated
+from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.unreal.assets import Asset, asset_of, kind_of
-from cosfly.work.config import Config
 
 log = logging.getLogger(__name__)
 

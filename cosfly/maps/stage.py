@@ -21,10 +21,10 @@ from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig
 from cosfly.products.boxes import BoxMap, check_ground, write_boxes
 from cosfly.products.meshes import MESHES_FILE
-from cosfly.reading.files import LinkedPath
-from cosfly.work.config import Config
-from cosfly.work.stage_folder import Resume, StageFolder, Tally
-from cosfly.work.store import write_bytes
+from cosfly.runtime.config import Config
+from cosfly.runtime.files import LinkedPath
+from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
+from cosfly.runtime.store import write_bytes
 
 log = logging.getLogger(__name__)
 

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from pydantic import Field, model_validator
 
-from cosfly.errors import nearest
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.town_blocks import (
     BASE_TOP_M,
@@ -37,8 +36,9 @@ from cosfly.maps.town_blocks import (
     tree,
 )
 from cosfly.products.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
-from cosfly.work.chance import rng_for
-from cosfly.work.config import Config
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import nearest
 
 GENERATOR_VERSION = "1"
 

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from cosfly.maps.boxlist import BoxList
-from cosfly.work.config import Config
+from cosfly.runtime.config import Config
 
 # Tops of the surfaces, m. Two centimetres apart at least: a depth buffer tells them apart at 300 m.
 PAVED_TOP_M, LAWN_TOP_M, PAINT_TOP_M, ROAD_TOP_M, BASE_TOP_M = 0.0, -0.02, -0.03, -0.06, -0.12

@@ -18,14 +18,14 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
-from cosfly.errors import InputError
 from cosfly.maps.simworld import read_sizes
 from cosfly.products.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_box_map
 from cosfly.products.kinds import KIND_NAMES, KINDS
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.store import write_json
 from cosfly.unreal.assets import asset_of, id_of, is_nothing, kind_of
 from cosfly.unreal.conventions import CM_PER_M, world_pose
 from cosfly.unreal.unrealcv_client import UnrealCvConfig, UnrealCvConnection, connect
-from cosfly.work.store import write_json
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from cosfly.work.compiled import njit
+from cosfly.runtime.compiled import njit
 
 SQRT2 = math.sqrt(2.0)
 

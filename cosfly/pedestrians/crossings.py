@@ -18,8 +18,8 @@ import numpy as np
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.products.walks import Walk
+from cosfly.runtime.compiled import njit
 from cosfly.space.grid import OccupancyGrid, surface, surface_kinds
-from cosfly.work.compiled import njit
 
 MARKED_M, GAP_M = 2.0, 2.0
 ACROSS_SHARE = 0.5

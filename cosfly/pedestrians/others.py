@@ -29,7 +29,7 @@ from cosfly.pedestrians.walking import (
 from cosfly.products.ground import Ground
 from cosfly.products.others import Company, Other, gaps_m
 from cosfly.products.walks import Walk
-from cosfly.work.chance import draw_by_share
+from cosfly.runtime.chance import draw_by_share
 
 MOST_WAITS, WAIT_S = 10, 3.0  # who meets somebody again after so many waits is drawn anew
 KEEP_BACK_M = {"Pedestrians": 1.5, "Car": 7.0}  # way from where one waits to where one would have met

@@ -23,7 +23,6 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from cosfly.errors import CosflyError, EnvironmentMissing, InputError, StorageError
 from cosfly.look.page import page, scripts
 from cosfly.look.topview import TopView, draw_map, png_bytes
 from cosfly.pedestrians.walkable import (
@@ -36,9 +35,10 @@ from cosfly.pedestrians.walkable import (
 from cosfly.products.backdrop import Backdrop
 from cosfly.products.boxes import AXES, BoxMap, check_ground, read_boxes
 from cosfly.products.roi import Roi, RoiPolygon, parse_roi, write_roi
-from cosfly.reading.files import read_bytes, read_text
+from cosfly.runtime.errors import CosflyError, EnvironmentMissing, InputError, StorageError
+from cosfly.runtime.files import read_bytes, read_text
+from cosfly.runtime.store import sha256_bytes
 from cosfly.space.grid import OccupancyGrid, empty_grid
-from cosfly.work.store import sha256_bytes
 
 log = logging.getLogger(__name__)
 

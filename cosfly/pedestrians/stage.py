@@ -26,7 +26,6 @@ import cv2
 import numpy as np
 from pydantic import BaseModel
 
-from cosfly.errors import NoPathError
 from cosfly.look.topview import INK, TopView, draw_dot, draw_line, draw_text, png_bytes
 from cosfly.pedestrians.astar import route_cost
 from cosfly.pedestrians.crossings import CROSSING, ROAD, where_walked
@@ -46,11 +45,12 @@ from cosfly.products.ground import Ground
 from cosfly.products.others import OTHERS_FILE, Company, write_others
 from cosfly.products.roi import read_roi
 from cosfly.products.walks import Walk, pace_field, paces_of, walk_id, write_paths
-from cosfly.reading.documents import FileFormat
-from cosfly.work.chance import draw_by_share, rng_for
-from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.work.stage_folder import Resume, StageFolder, result_of
-from cosfly.work.store import write_bytes, write_json
+from cosfly.runtime.chance import draw_by_share, rng_for
+from cosfly.runtime.documents import FileFormat
+from cosfly.runtime.errors import NoPathError
+from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.stage_folder import Resume, StageFolder, result_of
+from cosfly.runtime.store import write_bytes, write_json
 
 # --- overview ---------------------------------------------------------------------------------------------------------
 # The pedestrian stage from above: obstacles, region of interest, usable ground and every walk, for a look before going

@@ -19,7 +19,6 @@ import numpy as np
 import shapely
 from pydantic import Field, field_validator, model_validator
 
-from cosfly.errors import NoPathError, nearest
 from cosfly.geometry import DT_S
 from cosfly.pedestrians.astar import find_route
 from cosfly.pedestrians.crossings import CROSSING, ROAD, costs_of, footing_of
@@ -29,6 +28,8 @@ from cosfly.products.ground import Ground
 from cosfly.products.kinds import GROUND_KINDS, PAVED_KINDS
 from cosfly.products.roi import MOST_VERTICES, Roi
 from cosfly.products.walks import PLAIN_PACE
+from cosfly.runtime.config import Config, MayDiffer
+from cosfly.runtime.errors import NoPathError, nearest
 from cosfly.space.grid import (
     SURFACE_REACH_M,
     OccupancyGrid,
@@ -41,7 +42,6 @@ from cosfly.space.grid import (
     roi_mask,
     surface,
 )
-from cosfly.work.config import Config, MayDiffer
 
 log = logging.getLogger(__name__)
 

@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import BaseModel, Field
 
-from cosfly.errors import EnvironmentMissing, InputError
 from cosfly.look.tables import TextTable
 from cosfly.planners import compare
 from cosfly.planners.compare import AXES, FIGURES, INTERVAL_PERCENT, NUM_RESAMPLES, CompareConfig
@@ -28,11 +27,12 @@ from cosfly.planners.contract import ALL_PLANNERS, title_of
 from cosfly.planners.stage import check_ids, draw_styles_of
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.walks import read_paths
-from cosfly.reading.documents import FileFormat, read_model
-from cosfly.work.chance import rng_for
-from cosfly.work.runner import Item, Watch, run_items
-from cosfly.work.stage_folder import Resume, StageFolder, result_of
-from cosfly.work.store import write_bytes, write_model
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.documents import FileFormat, read_model
+from cosfly.runtime.errors import EnvironmentMissing, InputError
+from cosfly.runtime.runner import Item, Watch, run_items
+from cosfly.runtime.stage_folder import Resume, StageFolder, result_of
+from cosfly.runtime.store import write_bytes, write_model
 
 log = logging.getLogger(__name__)
 

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
-from cosfly.errors import NoPathError
 from cosfly.look.tables import TextTable
 from cosfly.look.topview import add_caption, draw_dot, draw_line, draw_text, png_bytes
 from cosfly.planners.contract import ALL_PLANNERS, PLANNERS, PlanConfig, known_planner, title_of
@@ -26,11 +25,12 @@ from cosfly.planners.stage import check_ids, draw_styles_of, plan_flight, warm_u
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import Walk, read_paths
-from cosfly.reading.documents import FileFormat, read_object
-from cosfly.work.chance import rng_for
-from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Resume, StageFolder, read_manifest, result_of
-from cosfly.work.store import write_bytes, write_json
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.documents import FileFormat, read_object
+from cosfly.runtime.errors import NoPathError
+from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.stage_folder import Dropped, Failed, ItemRecord, Resume, StageFolder, read_manifest, result_of
+from cosfly.runtime.store import write_bytes, write_json
 
 FORMAT = FileFormat("cosfly.plan_compare", "2.1")
 CLEARANCE_SCALE_M = 5.0  # a clearance of this or more is full safety

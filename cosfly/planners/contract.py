@@ -19,10 +19,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from cosfly.errors import NoPathError, nearest
 from cosfly.geometry import DT_S
 from cosfly.planners.styles import ALTITUDE_LEAST_M, NAMES, OTHER_SIDE, ROWS, Range, Style, with_ranges
 from cosfly.products.segments import FOLLOW
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import NoPathError, nearest
 from cosfly.space.flight_metrics import (
     ACCEL_RMS_MAX_MPS2,
     FIVE_RAY_MEAN_MIN,
@@ -30,7 +31,6 @@ from cosfly.space.flight_metrics import (
     RELAXED_SAFETY_M,
     SAFETY_DISTANCE_M,
 )
-from cosfly.work.config import Config
 
 if TYPE_CHECKING:
     from cosfly.space.kernels import BoxIndex

@@ -17,7 +17,7 @@ from cosfly.planners.reacquire import finds_again, wish_of_reacquire
 from cosfly.planners.styles import OTHER_SIDE, REACQUIRE, RETURN_HOME, ROWS, WHOLE, suits
 from cosfly.products.segments import FOLLOW, MISSION_KINDS, Mission, Segment
 from cosfly.products.walks import Walk
-from cosfly.work.chance import draw_to_quota
+from cosfly.runtime.chance import draw_to_quota
 
 if TYPE_CHECKING:
     from cosfly.space.kernels import BoxIndex

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosfly.runtime.compiled import njit
 from cosfly.space.kernels import (
     CELL,
     HALF_X,
@@ -24,7 +25,6 @@ from cosfly.space.kernels import (
     touches,
     turned,
 )
-from cosfly.work.compiled import njit
 
 NUM_SECTORS = 128  # of the horizon round a target
 

@@ -15,18 +15,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cosfly.errors import InputError, NoPathError
 from cosfly.geometry import DT_S, step_s
 from cosfly.planners.contract import PlanConfig, Scenario, load_planner
 from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.products.segments import FOLLOW
 from cosfly.products.traces import DroneTrace, write_traces
 from cosfly.products.walks import TARGET_HEIGHT_M, Walk, read_paths
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.errors import InputError, NoPathError
+from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.stage_folder import Failed, Resume, StageFolder
+from cosfly.runtime.store import write_bytes
 from cosfly.space.flight_metrics import CLEARANCE_CAP_M, CLEARANCE_TOLERANCE_M, flight_metrics
-from cosfly.work.chance import rng_for
-from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.work.stage_folder import Failed, Resume, StageFolder
-from cosfly.work.store import write_bytes
 
 if TYPE_CHECKING:
     from cosfly.planners.intent import Intent

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from cosfly.errors import InputError
+from cosfly.runtime.errors import InputError
 
 
 class Action(NamedTuple):

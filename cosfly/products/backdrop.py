@@ -10,9 +10,9 @@ from pydantic import Field
 
 from cosfly.products.boxes import BoxMap
 from cosfly.products.columns import LARGEST
-from cosfly.reading.arrays import read_picture
-from cosfly.reading.documents import FileFormat, Record, read_model
-from cosfly.work.store import write_bytes, write_model
+from cosfly.runtime.arrays import read_picture
+from cosfly.runtime.documents import FileFormat, Record, read_model
+from cosfly.runtime.store import write_bytes, write_model
 
 FORMAT = FileFormat("cosfly.backdrop", "1.0", "world frame of a picture")
 

@@ -12,14 +12,14 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 
-from cosfly.errors import InputError, nearest
 from cosfly.geometry import axis_aligned_half_extents
 from cosfly.products.columns import LARGEST, rounded
 from cosfly.products.ground import Ground, GroundGrid
 from cosfly.products.kinds import GROUND_KINDS, KIND_COLORS, KIND_NAMES, KINDS
 from cosfly.products.meshes import Meshes, MeshRef
-from cosfly.reading.documents import MISSING, FileFormat, check_schema, read_json, validated
-from cosfly.work.store import dump_json, write_bytes
+from cosfly.runtime.documents import MISSING, FileFormat, check_schema, read_json, validated
+from cosfly.runtime.errors import InputError, nearest
+from cosfly.runtime.store import dump_json, write_bytes
 
 BOXES_FORMAT = FileFormat("cosfly.boxes_3d", "1.0", "map")
 MAP_MB = 4_096  # 15 million boxes; ten million took 2.7 GB as they are written

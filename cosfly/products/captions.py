@@ -14,8 +14,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from cosfly.reading.documents import Record, model_lines
-from cosfly.work.store import atomic_file
+from cosfly.runtime.documents import Record, model_lines
+from cosfly.runtime.store import atomic_file
 
 FIELDS = ("critical_components", "reasoning_trace", "flight_decision")
 Language = Literal["en", "zh"]

@@ -8,10 +8,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.geometry import step_s
-from cosfly.reading.documents import MISSING, FileFormat, check_schema, read_json
-from cosfly.work.store import write_json
+from cosfly.runtime.documents import MISSING, FileFormat, check_schema, read_json
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.store import write_json
 
 Item = TypeVar("Item")
 

@@ -18,7 +18,7 @@ from pydantic import Field, field_validator
 from cosfly.products.playback import Flight
 from cosfly.products.walks import TARGET_HEIGHT_M
 from cosfly.products.weather import preset_token
-from cosfly.reading.documents import Record, read_json, validated
+from cosfly.runtime.documents import Record, read_json, validated
 
 DEFAULT = Path(__file__).with_name("default_coverage.json")
 

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.errors import InputError, VerifyError
 from cosfly.products.places import ALL_FLIGHTS, TRACKS, FlightChoice, Track
 from cosfly.products.playback import ORIGINAL, Flight, read_flight
-from cosfly.reading.files import files_named
+from cosfly.runtime.errors import InputError, VerifyError
+from cosfly.runtime.files import files_named
 
 TWIN_TOLERANCE_S = 1e-3
 

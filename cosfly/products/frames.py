@@ -19,18 +19,18 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations, world_from_camera
 from cosfly.products.kinds import KINDS
 from cosfly.products.people import People
 from cosfly.products.places import tree_of_flight
 from cosfly.products.png import areas_png, colours_png, floats_of, floats_png
 from cosfly.products.weather import WeatherRecord
-from cosfly.reading.arrays import PNG_SIGNATURE, parse_array_header, read_array, read_picture
-from cosfly.reading.documents import FileFormat, Record, read_model
-from cosfly.reading.files import read_bytes
-from cosfly.work.config import Config
-from cosfly.work.store import dump_json
+from cosfly.runtime.arrays import PNG_SIGNATURE, parse_array_header, read_array, read_picture
+from cosfly.runtime.config import Config
+from cosfly.runtime.documents import FileFormat, Record, read_model
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import read_bytes
+from cosfly.runtime.store import dump_json
 
 FRAMES_DIR = "frames_playback"
 FrameFile = Literal["rgb", "depth", "instance"]

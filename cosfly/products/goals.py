@@ -13,11 +13,11 @@ from itertools import combinations
 import cv2
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.products.captions import Language
 from cosfly.products.frames import PERSON_ID
 from cosfly.products.kinds import KINDS
 from cosfly.products.people import COLORS, FIGURES, GARMENTS, Appearance, Words
+from cosfly.runtime.errors import InputError
 
 # What is large is said first. Slot -> how Chinese says that it is worn; what both languages say of nothing there.
 SLOTS = {"top": ("穿",), "legs": ("穿",), "bag": ("背", "no bag", "不带包"), "hat": ("戴", "no hat", "不戴帽子")}

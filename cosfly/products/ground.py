@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from cosfly.products.columns import LARGEST
-from cosfly.reading.documents import Record
+from cosfly.runtime.documents import Record
 
 Height = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 

@@ -8,12 +8,12 @@ from typing import Any, Literal
 
 from pydantic import Field, FiniteFloat
 
-from cosfly.errors import InputError
 from cosfly.products.coverage import Coverage
 from cosfly.products.issues import Issue
 from cosfly.products.playback import ORIGINAL
-from cosfly.reading.documents import FileFormat, Record, read_model
-from cosfly.work.store import write_model
+from cosfly.runtime.documents import FileFormat, Record, read_model
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.store import write_model
 
 INSPECT_FORMAT = FileFormat("cosfly.inspect", "1.0", "inspection")
 

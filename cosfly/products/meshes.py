@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from cosfly.errors import InputError
-from cosfly.reading.meshes import (
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.meshes import (
     BINARY_CHUNK,
     GLB_MAGIC,
     JSON_CHUNK,
@@ -25,7 +25,7 @@ from cosfly.reading.meshes import (
     read_meshes,
     too_many,
 )
-from cosfly.work.store import write_bytes
+from cosfly.runtime.store import write_bytes
 
 MESHES_FILE = "meshes.glb"
 FLOAT, ARRAY_BUFFER = 5126, 34962

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.products.columns import column, read_items, records, rounded, text_id, write_items
 from cosfly.products.kinds import KINDS
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
-from cosfly.reading.documents import FileFormat
+from cosfly.runtime.documents import FileFormat
+from cosfly.runtime.errors import InputError
 
 OTHERS_FILE = "others.json"
 OTHERS_FORMAT = FileFormat("cosfly.others", "1.0", "others")

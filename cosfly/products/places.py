@@ -18,9 +18,9 @@ from typing import Literal, get_args
 
 from pydantic import Field
 
-from cosfly.errors import InputError
-from cosfly.reading.files import is_below, real_path
-from cosfly.work.config import Config
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import is_below, real_path
 
 TOWN = "Town"  # what the name of a town's folder begins with
 

@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from cosfly.errors import InputError
 from cosfly.geometry import mirror_positions, mirror_rotations
 from cosfly.products.columns import is_number
 from cosfly.products.frames import (
@@ -53,9 +52,10 @@ from cosfly.products.trajectory import (
 )
 from cosfly.products.walks import pace_of
 from cosfly.products.weather import WeatherRecord
-from cosfly.reading.documents import read_json, validated
-from cosfly.reading.files import read_bytes
-from cosfly.work.store import write_json
+from cosfly.runtime.documents import read_json, validated
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import read_bytes
+from cosfly.runtime.store import write_json
 
 ORIGINAL = "ORI"  # the folder of a clean flight
 TARGET_FILE = "target.png"  # of a flight: the person of its goal, cut out of the frame that this is true of

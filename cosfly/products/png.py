@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from isal import isal_zlib as zlib
 
-from cosfly.errors import InputError
-from cosfly.reading.arrays import PNG_SIGNATURE, check_pixels
-from cosfly.work.compiled import njit
+from cosfly.runtime.arrays import PNG_SIGNATURE, check_pixels
+from cosfly.runtime.compiled import njit
+from cosfly.runtime.errors import InputError
 
 CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # by colour type; palettes are no pictures of a data set
 CHUNK, NUMBER = struct.Struct(">I4s"), struct.Struct(">I")

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from cosfly.errors import InputError
 from cosfly.products.captions import Coc, Language
 from cosfly.products.splits import Split
-from cosfly.reading.documents import Record, model_lines
+from cosfly.runtime.documents import Record, model_lines
+from cosfly.runtime.errors import InputError
 
 PREDICTIONS = "predictions.jsonl"
 FAILED = "failed_"  # what the reason of a prediction begins with that could not be made

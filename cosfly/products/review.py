@@ -16,11 +16,11 @@ from typing import Literal
 
 from pydantic import Field
 
-from cosfly.errors import InputError
 from cosfly.products.inspection import FlightInspection, Inspection, count_trajectories, read_inspection
-from cosfly.reading.documents import Record
-from cosfly.reading.files import sha256_file
-from cosfly.work.journal import Journal
+from cosfly.runtime.documents import Record
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import sha256_file
+from cosfly.runtime.journal import Journal
 
 log = logging.getLogger(__name__)
 

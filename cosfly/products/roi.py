@@ -11,13 +11,13 @@ import shapely
 from pydantic import BaseModel
 from shapely.geometry.base import BaseGeometry
 
-from cosfly.errors import InputError
 from cosfly.products.boxes import AXES, BoxMap
 from cosfly.products.columns import numbers
-from cosfly.reading.documents import parse_document, validated
-from cosfly.reading.files import over_limit, read_bytes
-from cosfly.reading.geojson import Feature, features_of, is_geojson
-from cosfly.work.store import write_json
+from cosfly.runtime.documents import parse_document, validated
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import over_limit, read_bytes
+from cosfly.runtime.geojson import Feature, features_of, is_geojson
+from cosfly.runtime.store import write_json
 
 WHAT = "region of interest"
 MOST_VERTICES = 100_000  # of a region; to see that a spiky ring does not cross itself takes 8 s then

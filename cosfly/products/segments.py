@@ -10,9 +10,9 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from cosfly.errors import InputError
 from cosfly.products.columns import is_number
-from cosfly.reading.documents import validated
+from cosfly.runtime.documents import validated
+from cosfly.runtime.errors import InputError
 
 FOLLOW = "follow"  # the style where nothing else is said
 MISSION_KINDS = ("geofence", "battery", "time_over")

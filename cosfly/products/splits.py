@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from cosfly.errors import InputError
+from cosfly.runtime.errors import InputError
 
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = ("train", "val", "test")  # the order in which scarce groups are handed out

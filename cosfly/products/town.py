@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import Field
 
 from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader
-from cosfly.reading.documents import FileFormat, Record, read_model
-from cosfly.work.store import write_model
+from cosfly.runtime.documents import FileFormat, Record, read_model
+from cosfly.runtime.store import write_model
 
 IDS_FILE, IDS_FORMAT = "instance_ids.json", FileFormat("cosfly.instance_ids", "1.0", "record of ids")
 TOWN_FILE, TOWN_FORMAT = "map.json", FileFormat("cosfly.town_map", "1.0", "town's map")

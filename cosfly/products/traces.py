@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.products.columns import column, matrix, read_items, rounded, step_field, text_id, write_items
 from cosfly.products.segments import Mission, Segment, flown_as_json, read_flown
 from cosfly.products.walks import PLAIN_PACE, pace_field, pace_of
-from cosfly.reading.documents import FileFormat
+from cosfly.runtime.documents import FileFormat
+from cosfly.runtime.errors import InputError
 
 TRACE_FORMAT = FileFormat("cosfly.drone_trace", "1.0", "drone traces")
 ARRAYS = ("time_s", "positions_m", "rotations_deg", "targets_m", "visibility")

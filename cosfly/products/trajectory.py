@@ -9,12 +9,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.geometry import step_s
 from cosfly.products.columns import is_number, numbers
 from cosfly.products.frames import ANGLES, XYZ, Camera
-from cosfly.reading.arrays import check_pixels
-from cosfly.reading.documents import MISSING
+from cosfly.runtime.arrays import check_pixels
+from cosfly.runtime.documents import MISSING
+from cosfly.runtime.errors import InputError
 
 Told = TypeVar("Told")
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.products.columns import column, matrix, read_items, rounded, step_field, text_id, write_items
-from cosfly.reading.documents import FileFormat
-from cosfly.work.chance import draw_to_quota, rng_for
+from cosfly.runtime.chance import draw_to_quota, rng_for
+from cosfly.runtime.documents import FileFormat
+from cosfly.runtime.errors import InputError
 
 # The tracked person: an axis-aligned box round the hip point, which is the target's position everywhere.
 PERSON_HALF_EXTENTS_M = (0.3, 0.3, 0.9)

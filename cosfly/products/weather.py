@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from cosfly.reading.documents import Record
-from cosfly.work.config import Config
+from cosfly.runtime.config import Config
+from cosfly.runtime.documents import Record
 
 WeatherMode = Literal["fixed", "random_per_path", "by_weight"]
 SkyKind = Literal[

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from cosfly.errors import InputError, RenderError
 from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, Look
 from cosfly.products.kinds import KIND_NAMES, KINDS
@@ -39,6 +38,10 @@ from cosfly.render.contract import (
     instance_ids,
 )
 from cosfly.render.engines import WALK_MPS, NoPictureError, fov_of, keep_asking
+from cosfly.runtime.config import MayDiffer
+from cosfly.runtime.errors import InputError, RenderError
+from cosfly.runtime.items import worker_place
+from cosfly.runtime.store import dump_json, sha256_bytes
 from cosfly.unreal.carla_client import CarlaConfig, CarlaConnection, connect
 from cosfly.unreal.conventions import (
     ACTOR_BITS,
@@ -50,9 +53,6 @@ from cosfly.unreal.conventions import (
     world_pose,
 )
 from cosfly.unreal.guard import EngineGuard, values_of, with_values
-from cosfly.work.config import MayDiffer
-from cosfly.work.items import worker_place
-from cosfly.work.store import dump_json, sha256_bytes
 
 log = logging.getLogger(__name__)
 

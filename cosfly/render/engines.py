@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from cosfly.errors import EnvironmentMissing, RenderError
 from cosfly.geometry import focal_px
 from cosfly.products.frames import Camera
 from cosfly.render.contract import Frame
+from cosfly.runtime.errors import EnvironmentMissing, RenderError
 
 log = logging.getLogger(__name__)
 

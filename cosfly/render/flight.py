@@ -15,7 +15,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from cosfly.errors import RenderError
 from cosfly.geometry import mask_box, world_from_camera
 from cosfly.look.overlay import Overlay
 from cosfly.products import frames
@@ -28,8 +27,6 @@ from cosfly.products.segments import Mission, Segment
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.products.weather import WeatherRecord
-from cosfly.reading.documents import FileFormat
-from cosfly.reading.files import sha256_file
 from cosfly.render.camera import (
     TargetView,
     contrast_of,
@@ -41,9 +38,12 @@ from cosfly.render.camera import (
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
 from cosfly.render.person import Cast, Gait
 from cosfly.render.perturbation import HIDDEN, STEP_UP_M, PerturbedTrack, Poses, Surroundings
+from cosfly.runtime.documents import FileFormat
+from cosfly.runtime.errors import RenderError
+from cosfly.runtime.files import sha256_file
+from cosfly.runtime.runner import advance
+from cosfly.runtime.store import sha256_bytes, storage_errors, write_checksums, write_json
 from cosfly.space.kernels import signed_distances
-from cosfly.work.runner import advance
-from cosfly.work.store import sha256_bytes, storage_errors, write_checksums, write_json
 
 MOST_TRIED = 8  # frames of a flight, the first in which the target is legible
 # Two looks are told apart by so many pixels, and such a share of a person's, of so much colour difference (CIE76).

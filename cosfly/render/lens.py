@@ -11,7 +11,7 @@ from pydantic import Field
 from cosfly.geometry import focal_px, intrinsic_matrix
 from cosfly.products.frames import Camera
 from cosfly.products.segments import Segment
-from cosfly.work.config import Config
+from cosfly.runtime.config import Config
 
 
 class ZoomConfig(Config):

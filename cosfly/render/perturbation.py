@@ -24,9 +24,9 @@ from cosfly.products.shift_draws import ShiftDraw, shift_draws
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.render.contract import plane_z_m
 from cosfly.render.person import NOBODY, Cast
+from cosfly.runtime.config import Config
 from cosfly.space.flight_metrics import CLEARANCE_CAP_M, SAFETY_DISTANCE_M
 from cosfly.space.kernels import obstacle_index, signed_distances
-from cosfly.work.config import Config
 
 HEAD_OFFSET_M = np.array([0.0, 0.0, 0.6])  # from the hip point: where branches and signs may be in the way
 NONE, APPLIED = "none", "applied"

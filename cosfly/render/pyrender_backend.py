@@ -17,7 +17,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from cosfly.errors import EnvironmentMissing, RenderError
 from cosfly.geometry import rotation_matrices, rotation_matrix
 from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import SKY_DEPTH_M, Look
@@ -28,6 +27,7 @@ from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, PosedCar, 
 from cosfly.render.draping import drape, is_draped, layers_of
 from cosfly.render.figure import figure_of
 from cosfly.render.solids import are_solids, solids_of
+from cosfly.runtime.errors import EnvironmentMissing, RenderError
 
 SKY_COLOR = np.array([0.52, 0.64, 0.78])  # also the haze's, linear RGB like all colours here
 AMBIENT = 0.45  # share of a surface's colour that the sky lights; the sun adds the rest to what faces it

@@ -13,13 +13,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from cosfly.errors import RenderError
 from cosfly.geometry import axis_aligned_half_extents
 from cosfly.products.boxes import BoxMap, make_box_map
 from cosfly.products.kinds import KINDS
 from cosfly.products.traces import DroneTrace
 from cosfly.render.contract import FAR_M, ground_plane
-from cosfly.work.chance import rng_for
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.errors import RenderError
 
 # Distances from the map's bounds, m.
 REACH_M = FAR_M + 60.0

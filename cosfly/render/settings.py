@@ -8,13 +8,13 @@ from pydantic import Field, field_validator, model_validator
 
 from cosfly.products.frames import LEAST_FOV_DEG, MOST_FOV_DEG, DepthFormat, FrameFile, Look
 from cosfly.products.places import folder_name
-from cosfly.reading.arrays import LONGEST_SIDE_PX
 from cosfly.render.carla_backend import CarlaRenderConfig
 from cosfly.render.lens import ZoomConfig
 from cosfly.render.perturbation import PerturbationConfig
 from cosfly.render.unrealcv_backend import UnrealCvRenderConfig
 from cosfly.render.weather import WeatherConfig
-from cosfly.work.config import Config
+from cosfly.runtime.arrays import LONGEST_SIDE_PX
+from cosfly.runtime.config import Config
 
 ENGINES = ("carla", "unrealcv")  # renderers that are running somewhere
 

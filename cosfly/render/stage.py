@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel
 
-from cosfly.errors import ConfigError, InputError
 from cosfly.geometry import step_s
 from cosfly.look.overlay import Overlay
 from cosfly.products.boxes import BoxMap, check_ground, read_boxes
@@ -35,12 +34,13 @@ from cosfly.render.perturbation import PerturbedTrack, Poses, Surroundings, pert
 from cosfly.render.rim import check_outside_rim, rim_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.weather import coverage_of, drawn_seed, fog_hides, read_pools, told_coverage, weather_of
-from cosfly.work.chance import rng_for
-from cosfly.work.config import Config
-from cosfly.work.provenance import checked_inputs, fingerprint
-from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.work.stage_folder import Kept, Resume, StageFolder, Tally, result_of
-from cosfly.work.store import CHECKSUMS, atomic_folder, dump_json, inside, sha256_bytes, write_json
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.provenance import checked_inputs, fingerprint
+from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.stage_folder import Kept, Resume, StageFolder, Tally, result_of
+from cosfly.runtime.store import CHECKSUMS, atomic_folder, dump_json, inside, sha256_bytes, write_json
 
 log = logging.getLogger(__name__)
 

@@ -22,12 +22,10 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from cosfly.errors import ConfigError, InputError, RenderError
 from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, Look
 from cosfly.products.kinds import KINDS
 from cosfly.products.weather import WeatherParams
-from cosfly.reading.arrays import parse_array, parse_picture
 from cosfly.render.contract import (
     NEAR_M,
     NO_INSTANCE,
@@ -41,12 +39,14 @@ from cosfly.render.contract import (
     instance_ids,
 )
 from cosfly.render.engines import WALK_MPS, NoPictureError, fov_of, keep_asking
+from cosfly.runtime.arrays import parse_array, parse_picture
+from cosfly.runtime.config import MayDiffer
+from cosfly.runtime.errors import ConfigError, InputError, RenderError
+from cosfly.runtime.items import worker_place
 from cosfly.unreal.assets import id_of, kind_of
 from cosfly.unreal.conventions import FAR_CM, camera_rotation_deg, unreal_pose, world_pose
 from cosfly.unreal.guard import EngineGuard
 from cosfly.unreal.unrealcv_client import OURS, NoAnswerError, UnrealCvConfig, connect, is_refusal, ours
-from cosfly.work.config import MayDiffer
-from cosfly.work.items import worker_place
 
 log = logging.getLogger(__name__)
 

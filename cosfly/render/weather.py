@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cosfly.errors import ConfigError, nearest
 from cosfly.products.boxes import BoxMap
 from cosfly.products.frames import LEGIBLE_CONTRAST
 from cosfly.products.kinds import KINDS
@@ -30,8 +29,9 @@ from cosfly.products.weather import (
     resolved,
     sky_kind,
 )  # fmt: skip
-from cosfly.work.chance import draw_to_quota, rng_for
-from cosfly.work.config import Config, MayDiffer, build, read_yaml
+from cosfly.runtime.chance import draw_to_quota, rng_for
+from cosfly.runtime.config import Config, MayDiffer, build, read_yaml
+from cosfly.runtime.errors import ConfigError, nearest
 
 # Extinction per m at 100 percent; dense fog (80) leaves 5 % of what stands 60 m away.
 FOG_AT_FULL, FOG_POWER = 0.10, 2.4

@@ -25,8 +25,8 @@ from cosfly.geometry import axis_aligned_half_extents
 from cosfly.products.boxes import BoxMap, SimplifyPass
 from cosfly.products.kinds import KINDS, SURFACE_KINDS
 from cosfly.products.meshes import Meshes
-from cosfly.work.compiled import njit
-from cosfly.work.config import Config
+from cosfly.runtime.compiled import njit
+from cosfly.runtime.config import Config
 
 # --- the first pass of Step 2: clusters of neighbouring boxes become one box each -------------------------------------
 # Clusters come from union-find over the pairs that a sweep meets, never over all pairs.

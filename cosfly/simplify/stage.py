@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.look.topview import TopView, add_caption, draw_map, png_bytes
 from cosfly.products.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.products.kinds import KINDS, SURFACE_KINDS
-from cosfly.reading.documents import FileFormat
+from cosfly.runtime.documents import FileFormat
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
+from cosfly.runtime.store import write_bytes, write_json
 from cosfly.simplify.passes import Simplification, SimplifyConfig, simplify
 from cosfly.space.grid import blocks_walking, compare, connected_parts, empty_grid, inflate, occupancy
-from cosfly.work.stage_folder import Resume, StageFolder, Tally
-from cosfly.work.store import write_bytes, write_json
 
 SAFETY_RADIUS_M = 0.5  # tab:ped_params; for the walkable area in the report
 REPORT_FORMAT = FileFormat("cosfly.simplify_report", "1.0")

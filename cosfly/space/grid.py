@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 import shapely
 
-from cosfly.errors import InputError
 from cosfly.geometry import rotation_matrices
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import GROUND_KINDS, KINDS, LAYERS
 from cosfly.products.roi import Roi
-from cosfly.work.compiled import njit
+from cosfly.runtime.compiled import njit
+from cosfly.runtime.errors import InputError
 
 RESOLUTION_M = 0.5  # tab:ped_params
 HUMAN_HEIGHT_M = 2.0  # tab:ped_params

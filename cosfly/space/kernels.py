@@ -14,7 +14,7 @@ import numpy as np
 from cosfly.geometry import rotation_matrices
 from cosfly.products.boxes import BoxMap
 from cosfly.products.kinds import GROUND_KINDS, KINDS
-from cosfly.work.compiled import njit
+from cosfly.runtime.compiled import njit
 
 CELL_M = 8.0  # about the influence radius of obstacles: a distance query looks at nine cells
 MAX_CELLS = 1 << 18  # a map with a stray box a thousand kilometres away must not fill the memory

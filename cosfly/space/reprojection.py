@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosfly.work.compiled import njit
+from cosfly.runtime.compiled import njit
 
 COLUMNS, GRID_ROWS = 64, 36  # points are taken at the middle of so many cells
 NEAR_M, FAR_M = 0.3, 999.0  # beyond stands the sky

@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field
 
-from cosfly.errors import NoPathError
 from cosfly.planners.compare import INTERVAL_PERCENT, NUM_RESAMPLES
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import check_ids, draw_styles_of, make_scenario, plan_flight, warm_up
 from cosfly.products.boxes import read_boxes
 from cosfly.products.walks import read_paths
-from cosfly.reading.documents import FileFormat
-from cosfly.work.chance import rng_for
-from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.work.stage_folder import Resume, StageFolder, result_of
-from cosfly.work.store import write_json
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.documents import FileFormat
+from cosfly.runtime.errors import NoPathError
+from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.stage_folder import Resume, StageFolder, result_of
+from cosfly.runtime.store import write_json
 
 FORMAT = FileFormat("cosfly.beam_study", "1.0")
 PAPER_BEAM = 2048

@@ -9,7 +9,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.geometry import intrinsic_matrix, world_from_camera
 from cosfly.look.frame_views import encode_picture
 from cosfly.look.topview import PAPER, draw_text
@@ -21,8 +20,9 @@ from cosfly.render.flight import MARGIN_M
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import renderer_of
-from cosfly.work.chance import rng_for
-from cosfly.work.store import write_bytes
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.store import write_bytes
 
 FIGURE = (  # fig:weather_gallery
     ("clear", "morning"), ("clear", "noon"), ("clear", "dusk"),

@@ -23,15 +23,15 @@ from cosfly.look.topview import add_caption
 from cosfly.products.boxes import check_ground, read_boxes
 from cosfly.products.frames import Camera, level_name, rgb_bytes
 from cosfly.products.traces import read_traces
-from cosfly.reading.documents import FileFormat
 from cosfly.render.contract import Renderer
 from cosfly.render.flight import MARGIN_M, FlightScript, check_flight, draw_frame
 from cosfly.render.perturbation import Surroundings
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import renderer_of, script_flight
-from cosfly.work.runner import Item, Outcome, Watch, Work, advance, run_items
-from cosfly.work.stage_folder import Resume, StageFolder, result_of
-from cosfly.work.store import write_bytes, write_json
+from cosfly.runtime.documents import FileFormat
+from cosfly.runtime.runner import Item, Outcome, Watch, Work, advance, run_items
+from cosfly.runtime.stage_folder import Resume, StageFolder, result_of
+from cosfly.runtime.store import write_bytes, write_json
 
 FORMAT = FileFormat("cosfly.zoom_study", "2.0")
 STAGE = "zoom_study"

@@ -7,7 +7,7 @@ from fnmatch import fnmatchcase
 from typing import NamedTuple
 
 from cosfly.products.kinds import KINDS
-from cosfly.work.store import sha256_bytes
+from cosfly.runtime.store import sha256_bytes
 
 
 class Asset(NamedTuple):

@@ -10,8 +10,8 @@ from typing import Any
 
 from pydantic import Field
 
-from cosfly.errors import ConfigError, EnvironmentMissing, nearest
-from cosfly.work.config import Config, MayDiffer
+from cosfly.runtime.config import Config, MayDiffer
+from cosfly.runtime.errors import ConfigError, EnvironmentMissing, nearest
 
 PROBE_S = 5.0  # for a server to accept a connection
 

@@ -19,9 +19,9 @@ from typing import Any
 
 from pydantic import Field
 
-from cosfly.errors import ConfigError, EnvironmentMissing
-from cosfly.escaping import for_terminal
-from cosfly.work.config import Config, MayDiffer
+from cosfly.runtime.config import Config, MayDiffer
+from cosfly.runtime.errors import ConfigError, EnvironmentMissing
+from cosfly.runtime.escaping import for_terminal
 
 PROBE_S = 5.0  # for a server to accept a connection
 LEAST_VERSION = (0, 4, 0)  # the first with bounds, classes, and more than one camera

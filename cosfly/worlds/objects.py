@@ -12,9 +12,9 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
-from cosfly.reading.documents import Record
+from cosfly.runtime.config import read_yaml
+from cosfly.runtime.documents import Record
 from cosfly.unreal.assets import ASSETS
-from cosfly.work.config import read_yaml
 
 Where = Literal["open", "quay", "water", "layout"]
 Part = tuple[str, float, float, float, float, float, float]  # kind, middle x y, size x y, low, high, m

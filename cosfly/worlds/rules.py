@@ -10,9 +10,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from cosfly.errors import InputError
-from cosfly.work.chance import rng_for
-from cosfly.work.config import read_yaml
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.config import read_yaml
+from cosfly.runtime.errors import InputError
 from cosfly.worlds.objects import OBJECTS
 from cosfly.worlds.plan import NamedObject, WorldPlan
 

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from cosfly.chat.budget import BudgetConfig
 from cosfly.chat.client import EndpointConfig
-from cosfly.work.config import Config, MayDiffer
+from cosfly.runtime.config import Config, MayDiffer
 
 
 class WorldConfig(Config):

@@ -21,17 +21,17 @@ from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget, BudgetConfig
 from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import NoAnswer, Reply, started
-from cosfly.errors import TeacherError
 from cosfly.look.topview import TopView, draw_map, png_bytes
 from cosfly.maps.simworld import PLACEHOLDER_CM
 from cosfly.products.boxes import OUR_LICENCE, BoxMap
 from cosfly.products.kinds import GROUND_KINDS
-from cosfly.reading.documents import FileFormat, validated
-from cosfly.reading.objects import find_object
-from cosfly.work.config import read_yaml, shipped
-from cosfly.work.folder_lock import hold_folder
-from cosfly.work.stage_folder import Resume, StageFolder, Tally
-from cosfly.work.store import sha256_bytes, write_bytes, write_json, write_model
+from cosfly.runtime.config import read_yaml, shipped
+from cosfly.runtime.documents import FileFormat, validated
+from cosfly.runtime.errors import TeacherError
+from cosfly.runtime.folder_lock import hold_folder
+from cosfly.runtime.objects import find_object
+from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
+from cosfly.runtime.store import sha256_bytes, write_bytes, write_json, write_model
 from cosfly.worlds.objects import OBJECTS, assets
 from cosfly.worlds.plan import PLAN_FORMAT, WorldPlan
 from cosfly.worlds.rules import check_prompt, plan_by_rules

@@ -23,7 +23,7 @@ from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.town_blocks import LAWN_TOP_M, PAVED_TOP_M, SLAB_M
 from cosfly.products.boxes import BoxMap, make_box_map
 from cosfly.products.kinds import KIND_NAMES, KINDS
-from cosfly.work.chance import rng_for
+from cosfly.runtime.chance import rng_for
 from cosfly.worlds.objects import Object, asset_for, assets
 from cosfly.worlds.plan import SPACE_M, WorldPlan, objects_of, town_settings, unknown_objects
 

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import Language
-from cosfly.reading.documents import Record, read_json, read_object
-from cosfly.reading.files import sha256_file
-from cosfly.work.config import Config
-from cosfly.work.console import progress_bar
+from cosfly.runtime.config import Config
+from cosfly.runtime.console import progress_bar
+from cosfly.runtime.documents import Record, read_json, read_object
+from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.files import sha256_file
 from distill.student.model import Device, pick_device, quiet_transformers, require
 
 log = logging.getLogger(__name__)

@@ -12,14 +12,14 @@ from typing import Any
 
 from pydantic import Field
 
-from cosfly.errors import InputError
-from cosfly.escaping import for_markdown
 from cosfly.look.page import page
-from cosfly.reading.documents import FileFormat, Record
-from cosfly.work.chance import rng_for
-from cosfly.work.config import Config
-from cosfly.work.stage_folder import Resume, StageFolder, Tally
-from cosfly.work.store import write_bytes, write_model
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.config import Config
+from cosfly.runtime.documents import FileFormat, Record
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.escaping import for_markdown
+from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
+from cosfly.runtime.store import write_bytes, write_model
 from distill.evaluation.measure import STUDENT, Evaluation, FigureSet, read_report
 from distill.evaluation.pages import (
     COLORS,

@@ -19,9 +19,9 @@ import numpy as np
 
 from cosfly.products.actions import TOKENS
 from cosfly.products.captions import Coc, Language
-from cosfly.reading.documents import parse_document, validated
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.documents import parse_document, validated
 from cosfly.space.blind import FITTED_ON, Decider, fit_deciders
-from cosfly.work.chance import rng_for
 from distill.evaluation.scores import ScoredAnswer, number_of
 from distill.schema import Sample
 

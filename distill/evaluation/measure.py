@@ -11,18 +11,18 @@ import numpy as np
 from pydantic import BaseModel
 
 from cosfly.chat.answers import read_answers
-from cosfly.errors import InputError
 from cosfly.products.actions import TOKENS
 from cosfly.products.captions import FIELDS, Coc, Language, SentenceState, read_captions
 from cosfly.products.figures import Figure, draw_walks
 from cosfly.products.predictions import FAILED, Prediction
 from cosfly.products.splits import Split
-from cosfly.reading.documents import FileFormat, Record, read_model, read_object, validated
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.documents import FileFormat, Record, read_model, read_object, validated
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.journal import Journal
+from cosfly.runtime.provenance import MANIFEST_FORMAT
+from cosfly.runtime.stage_folder import read_manifest
 from cosfly.space.blind import DRAWN_AHEAD, FITTED_ON, LEAST_WINDOWS, LOOKS_BACK
-from cosfly.work.chance import rng_for
-from cosfly.work.journal import Journal
-from cosfly.work.provenance import MANIFEST_FORMAT
-from cosfly.work.stage_folder import read_manifest
 from distill.evaluation.bertscore import Metric, score_beside_floors
 from distill.evaluation.floors import WITH_TEXT, Floors, coc_of
 from distill.evaluation.scores import UNPARSED, ScoredAnswer, Scores, figures_of, score_answers

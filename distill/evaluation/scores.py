@@ -18,14 +18,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cosfly.errors import InputError
 from cosfly.products.actions import TOKENS, not_in_set
 from cosfly.products.captions import Coc, SentenceState, Verdict, verdict_on
 from cosfly.products.figures import Figure, draw_walks, figure_of_draws, interval_of
 from cosfly.products.predictions import FAILED, Prediction
-from cosfly.reading.documents import Record
-from cosfly.reading.tables import arrow_errors, row_groups
-from cosfly.work.store import atomic_file, dump_json, sha256_bytes
+from cosfly.runtime.documents import Record
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.store import atomic_file, dump_json, sha256_bytes
+from cosfly.runtime.tables import arrow_errors, row_groups
 from distill.schema import Sample
 
 SCORES = "scores.parquet"

@@ -13,13 +13,13 @@ from typing import Any
 
 from pydantic import Field
 
-from cosfly.errors import InputError
 from cosfly.look.frame_views import thumbnail
 from cosfly.products.captions import Language
 from cosfly.products.predictions import Prediction, read_predictions
-from cosfly.work.config import Config
-from cosfly.work.stage_folder import Resume, StageFolder, Tally
-from cosfly.work.store import inside, write_bytes, write_model
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
+from cosfly.runtime.store import inside, write_bytes, write_model
 from distill.evaluation.bertscore import BertScoreConfig, Metric, Scorer, check_encoder, deciding_files
 from distill.evaluation.floors import Floors, coc_of
 from distill.evaluation.measure import (

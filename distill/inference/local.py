@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 
 from cosfly.chat.answers import Answer, AnswerBook
-from cosfly.errors import ConfigError, InputError
 from cosfly.products.answer_text import answer_schema
 from cosfly.products.captions import Language
 from cosfly.products.places import flight_of
-from cosfly.work.console import Advance
-from cosfly.work.store import dump_json, sha256_bytes
+from cosfly.runtime.console import Advance
+from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.store import dump_json, sha256_bytes
 from distill.inference.outcome import OpenFlights, SampleOutcome, failed
 from distill.schema import Sample
 from distill.student.decoding import Completion, Constraint, decode

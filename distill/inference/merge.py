@@ -14,12 +14,12 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field
 
 from cosfly.chat.student_chat import TAUGHT
-from cosfly.errors import InputError
-from cosfly.reading.documents import read_json, read_object, validated
-from cosfly.work.config import Config
-from cosfly.work.console import progress_bar
-from cosfly.work.stage_folder import Resume, StageFolder, Tally
-from cosfly.work.store import atomic_folder, storage_errors, write_json
+from cosfly.runtime.config import Config
+from cosfly.runtime.console import progress_bar
+from cosfly.runtime.documents import read_json, read_object, validated
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
+from cosfly.runtime.store import atomic_folder, storage_errors, write_json
 from distill.student.checkpoint import read_adapter_facts, save_tensors
 from distill.student.model import require, student_folder, weight_files
 

@@ -13,9 +13,9 @@ from cosfly.chat.answers import Answer, AnswerBook
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.places import flight_of
 from cosfly.products.predictions import FAILED, PREDICTIONS, Prediction, Split
-from cosfly.reading.objects import CONTEXT_FULL
-from cosfly.work.stage_folder import Failed, Tally, write_failures
-from cosfly.work.store import atomic_file, dump_json
+from cosfly.runtime.objects import CONTEXT_FULL
+from cosfly.runtime.stage_folder import Failed, Tally, write_failures
+from cosfly.runtime.store import atomic_file, dump_json
 from distill.schema import Sample
 
 ANSWERS = "answers"  # the folder of journals

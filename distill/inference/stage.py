@@ -18,13 +18,13 @@ from cosfly.chat.client import ChatClient
 from cosfly.chat.contract import Engine, NoAnswer, Request, started
 from cosfly.chat.student_chat import TAUGHT, StudentEndpointConfig, picture_to_send, read_taught, student_request
 from cosfly.chat.vllm_engine import VllmConfig, VllmEngine
-from cosfly.errors import ConfigError, InputError, TeacherError
 from cosfly.products.answer_text import answer_schema
 from cosfly.products.predictions import PREDICTIONS, Split
-from cosfly.work.config import Config, MayDiffer
-from cosfly.work.console import Advance, progress_bar
-from cosfly.work.stage_folder import Resume, StageFolder, read_manifest
-from cosfly.work.store import sha256_bytes
+from cosfly.runtime.config import Config, MayDiffer
+from cosfly.runtime.console import Advance, progress_bar
+from cosfly.runtime.errors import ConfigError, InputError, TeacherError
+from cosfly.runtime.stage_folder import Resume, StageFolder, read_manifest
+from cosfly.runtime.store import sha256_bytes
 from distill.inference.local import AnswerSchemas, LocalAnswers
 from distill.inference.outcome import ANSWERS, OpenFlights, Results, SampleOutcome, failed, writing_results
 from distill.schema import Sample, open_split, resolve_trees, tree_inputs

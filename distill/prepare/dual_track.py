@@ -15,18 +15,18 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from cosfly.errors import InputError, VerifyError
 from cosfly.geometry import step_s
 from cosfly.products.flights import find_flights, read_twin
 from cosfly.products.places import Place, flight_ids, place_of, sample_id
 from cosfly.products.playback import ORIGINAL, Flight, read_flight
 from cosfly.products.splits import SPLITS, Course, Split, walks_of
-from cosfly.reading.documents import FileFormat, Record, read_model, validated
-from cosfly.reading.tables import rows_of
-from cosfly.work.console import progress_bar
-from cosfly.work.provenance import fingerprint
-from cosfly.work.stage_folder import Failed, Resume, StageFolder, Tally, write_failures
-from cosfly.work.store import write_bytes, write_model
+from cosfly.runtime.console import progress_bar
+from cosfly.runtime.documents import FileFormat, Record, read_model, validated
+from cosfly.runtime.errors import InputError, VerifyError
+from cosfly.runtime.provenance import fingerprint
+from cosfly.runtime.stage_folder import Failed, Resume, StageFolder, Tally, write_failures
+from cosfly.runtime.store import write_bytes, write_model
+from cosfly.runtime.tables import rows_of
 from distill.prepare.sources import check_names, run_of
 from distill.prepare.splitting import SplitConfig, check_no_leak
 from distill.schema import PAGE, SourceTree, SplitFiles, SplitMember, columns_of, page_of, split_path, tree_inputs

@@ -21,7 +21,6 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from cosfly.errors import InputError
 from cosfly.look.frame_views import DEPTH_RANGE_M, Pictures, View, scaled_size
 from cosfly.products.actions import TOKENS, not_in_set
 from cosfly.products.answer_text import parse_answer
@@ -29,11 +28,12 @@ from cosfly.products.captions import PICTURES_MARK, Caption, Language, Verdict, 
 from cosfly.products.places import FlightChoice
 from cosfly.products.playback import read_flight
 from cosfly.products.splits import SPLITS, Split
+from cosfly.runtime.console import progress_bar
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.provenance import fingerprint
+from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
+from cosfly.runtime.store import dump_json
 from cosfly.space.blind import is_drawn_ahead, past_of
-from cosfly.work.console import progress_bar
-from cosfly.work.provenance import fingerprint
-from cosfly.work.stage_folder import Resume, StageFolder, Tally
-from cosfly.work.store import dump_json
 from distill.prepare.sources import CaptionedFlight, Flights, RunSource, check_sources, inputs_of
 from distill.prepare.splitting import SplitConfig, check_no_leak
 from distill.schema import Sample, SourceTree, TrainingSetWriter, open_split

@@ -17,10 +17,10 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from cosfly.errors import InputError
-from cosfly.reading.documents import FileFormat, parse_json, read_json, read_model, read_object, validated
-from cosfly.reading.files import read_lines, sha256_file
-from cosfly.work.store import atomic_folder, read_checksums, write_bytes, write_checksums, write_json, write_model
+from cosfly.runtime.documents import FileFormat, parse_json, read_json, read_model, read_object, validated
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import read_lines, sha256_file
+from cosfly.runtime.store import atomic_folder, read_checksums, write_bytes, write_checksums, write_json, write_model
 from distill.student.model import Student, weight_files
 
 log = logging.getLogger(__name__)

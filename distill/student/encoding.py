@@ -16,10 +16,10 @@ import numpy as np
 from PIL import Image
 
 from cosfly.chat.student_chat import IMAGE_PART, chat_messages
-from cosfly.errors import InputError
 from cosfly.products.frames import tree_of
-from cosfly.reading.arrays import array_header, picture_size
-from cosfly.work.store import inside
+from cosfly.runtime.arrays import array_header, picture_size
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.store import inside
 from distill.schema import Sample
 from distill.student.model import END_OF_TURN, IMAGE_TOKEN, Processor, Student
 

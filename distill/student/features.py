@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cosfly.look.frame_views import VIEW_FILES, Pictures, View
-from cosfly.work.store import inside
+from cosfly.runtime.store import inside
 from distill.schema import Sample
 from distill.student.encoding import patches_of, picture_grid
 from distill.student.model import Processor, Student

@@ -13,12 +13,12 @@ from typing import Any
 
 from pydantic import Field
 
-from cosfly.errors import InputError
 from cosfly.products.actions import TOKENS
 from cosfly.products.captions import FIELDS
-from cosfly.work.chance import rng_for
-from cosfly.work.config import Config
-from cosfly.work.store import atomic_folder
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.store import atomic_folder
 from distill.student.checkpoint import disk_errors
 from distill.student.model import END_OF_TURN, IMAGE_TOKEN, quiet_transformers, require
 

@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from cosfly.errors import ConfigError, InputError
 from cosfly.products.answer_text import parse_answer
 from cosfly.products.captions import verdict_on
-from cosfly.work.chance import rng_for
-from cosfly.work.console import progress_bar
-from cosfly.work.store import dump_json, storage_errors
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.console import progress_bar
+from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.store import dump_json, storage_errors
 from distill.schema import Sample, Samples
 from distill.student.checkpoint import (
     Progress,

@@ -15,13 +15,13 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from cosfly.errors import CosflyError, EnvironmentMissing, InputError
 from cosfly.look.frame_views import VIEW_FILES
 from cosfly.products.frames import frame_path
 from cosfly.products.places import flight_of
-from cosfly.work.console import progress_bar
-from cosfly.work.store import inside
-from cosfly.work.worker import end_with_parent
+from cosfly.runtime.console import progress_bar
+from cosfly.runtime.errors import CosflyError, EnvironmentMissing, InputError
+from cosfly.runtime.store import inside
+from cosfly.runtime.worker import end_with_parent
 from distill.schema import Sample
 from distill.student.encoding import EncodedSample, encode_text, image_size, special_token_in
 from distill.student.features import FramePicture, PictureData, PictureReader, VisionFeatures, pictures_of

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
-from cosfly.errors import ConfigError
+from cosfly.runtime.errors import ConfigError
 from distill.student.encoding import IGNORED, EncodedSample, padded
 from distill.student.model import Student
 

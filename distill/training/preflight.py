@@ -14,9 +14,9 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from cosfly.errors import ConfigError, InputError
 from cosfly.products.actions import TOKENS
-from cosfly.work.store import write_json
+from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.store import write_json
 from distill.schema import Sample, Samples
 from distill.student.encoding import END_OF_ANSWER, EncodedSample, chat_text, prompt_text
 from distill.student.features import VisionFeatures

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from cosfly.errors import ConfigError, CosflyError, EnvironmentMissing
+from cosfly.runtime.errors import ConfigError, CosflyError, EnvironmentMissing
 from distill.student.model import Device, pick_device
 
 log = logging.getLogger(__name__)

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.chat.student_chat import FrameLook, Taught, write_taught
-from cosfly.errors import ConfigError, InputError
 from cosfly.products.captions import Language, Prompt
-from cosfly.work.chance import rng_for
-from cosfly.work.stage_folder import Resume, StageFolder, Tally
-from cosfly.work.store import atomic_folder, write_json
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
+from cosfly.runtime.store import atomic_folder, write_json
 from distill.schema import Sample, open_split, resolve_trees, tree_inputs
 from distill.student.checkpoint import ADAPTER_FACTS, Progress, adapter_facts, write_adapter_folder, write_model_folder
 from distill.student.features import PictureReader, VisionFeatures

@@ -12,8 +12,8 @@ import numpy as np
 
 from cosfly.products.actions import ORDERS, TOKENS
 from cosfly.products.segments import Segment
+from cosfly.runtime.chance import draws_for, rng_for
 from cosfly.space.blind import FITTED_ON, LEAST_WINDOWS, fit_deciders, is_drawn_ahead, past_of
-from cosfly.work.chance import draws_for, rng_for
 from release.card.numbers import DIGITS, row_lists
 from release.columns import PLACE, SHORT_NAMES, WINDOW
 from release.flight_rows import FlightRows

@@ -17,9 +17,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cosfly.errors import InputError
 from cosfly.products.coverage import AXES, Coverage, axis_values
-from cosfly.reading.tables import arrow_errors, num_rows, open_table, row_groups
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.tables import arrow_errors, num_rows, open_table, row_groups
 from release.columns import CAPTION_FIELDS, COUNTED, LANGUAGES, PICTURES, PLACE, POINT, REQUIRED, schema
 from release.record import CaptionNumbers, FileNumbers, FramesBy, Numbers, Spread
 

@@ -15,14 +15,14 @@ from typing import Any
 
 import yaml
 
-from cosfly.escaping import for_terminal
 from cosfly.look.coverage_page import ranges, shares
 from cosfly.look.page import markdown
 from cosfly.products.actions import TOKENS
 from cosfly.products.captions import FIELDS
 from cosfly.products.coverage import NAMED
 from cosfly.products.frames import FrameFile
-from cosfly.reading.files import read_text
+from cosfly.runtime.escaping import for_terminal
+from cosfly.runtime.files import read_text
 from cosfly.space.blind import DRAWN_AHEAD, LEAST_WINDOWS, LOOKS_BACK
 from release.columns import CAPTION, PICTURES, SCALARS, SPLIT_NAMES, schema
 from release.record import History, ReleaseRecord, SourceRecord, shard_pattern

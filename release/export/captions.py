@@ -16,13 +16,13 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Any, Literal, NamedTuple
 
-from cosfly.errors import InputError, NothingKept, StorageError
 from cosfly.look.frame_views import Pictures, frame_label
 from cosfly.products.captions import FIELDS, Language, Prompt, read_captions
 from cosfly.products.frames import FILE_NAMES, frame_name
 from cosfly.products.places import Place
-from cosfly.reading.files import check_stays_below
-from cosfly.work.store import atomic_file, dump_json, inside
+from cosfly.runtime.errors import InputError, NothingKept, StorageError
+from cosfly.runtime.files import check_stays_below
+from cosfly.runtime.store import atomic_file, dump_json, inside
 from release.columns import LANGUAGES, SplitName, caption_values
 from release.export.source import open_release, rows_of_flight, scan
 from release.export.tree import tree_folder

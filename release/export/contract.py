@@ -18,9 +18,9 @@ from typing import Any, Literal, Protocol, cast
 
 from pydantic import BaseModel, Field
 
-from cosfly.reading.files import sha256_file
-from cosfly.work.config import Config
-from cosfly.work.store import atomic_file, sha256_bytes
+from cosfly.runtime.config import Config
+from cosfly.runtime.files import sha256_file
+from cosfly.runtime.store import atomic_file, sha256_bytes
 from release.export.source import Release, ReleasedRows, Span
 
 FormatName = Literal["tree", "webdataset", "lerobot"]

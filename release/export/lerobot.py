@@ -23,14 +23,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cosfly.errors import InputError
 from cosfly.geometry import step_s
 from cosfly.products.actions import TOKENS
 from cosfly.products.frames import FrameFile
 from cosfly.products.motion import ACTION, PlannedMotion
-from cosfly.reading.arrays import parse_array, parse_picture
-from cosfly.work.runner import advance
-from cosfly.work.store import atomic_file, dump_json
+from cosfly.runtime.arrays import parse_array, parse_picture
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.runner import advance
+from cosfly.runtime.store import atomic_file, dump_json
 from release.columns import BOX, CAPTION_FIELDS, PICTURES, POINT, POSE, SPLIT_NAMES
 from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
 from release.export.source import (

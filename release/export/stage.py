@@ -14,12 +14,20 @@ import yaml
 from pydantic import Field
 
 import cosfly
-from cosfly.errors import InputError, VerifyError
-from cosfly.escaping import for_markdown
-from cosfly.reading.documents import FileFormat
-from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.work.stage_folder import Resume, StageFolder, result_of
-from cosfly.work.store import CHECKSUMS, dump_json, inside, sha256_bytes, storage_errors, write_bytes, write_checksums
+from cosfly.runtime.documents import FileFormat
+from cosfly.runtime.errors import InputError, VerifyError
+from cosfly.runtime.escaping import for_markdown
+from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.stage_folder import Resume, StageFolder, result_of
+from cosfly.runtime.store import (
+    CHECKSUMS,
+    dump_json,
+    inside,
+    sha256_bytes,
+    storage_errors,
+    write_bytes,
+    write_checksums,
+)
 from release.export.contract import ExportConfig, ExportUnit, FormatFacts, UnitFiles, format_of
 from release.export.source import Release, open_release, scan
 from release.record import ReleasedMap, Strict

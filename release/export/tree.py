@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.products.boxes import UNKNOWN_LICENCE
 from cosfly.products.frames import COMPANY, COORDINATES, FILE_NAMES, frame_name
 from cosfly.products.goals import Goal
@@ -29,9 +28,10 @@ from cosfly.products.playback import LEGIBILITY, TARGET_FILE, Flight, write_flig
 from cosfly.products.segments import FOLLOW, Segment
 from cosfly.products.town import TOWN_FILE, TOWN_FORMAT, TownMap
 from cosfly.products.walks import pace_field
-from cosfly.reading.files import sha256_file
-from cosfly.work.runner import advance
-from cosfly.work.store import CHECKSUMS, checksum_lines, write_model
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import sha256_file
+from cosfly.runtime.runner import advance
+from cosfly.runtime.store import CHECKSUMS, checksum_lines, write_model
 from release.columns import COMPANY_COLUMNS, PICTURES, SCALAR_NAMES, TARGET_PICTURE, matrices_of
 from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
 from release.export.source import DEPTH_CODING, Release, ReleasedRows, picture, read_span

@@ -14,10 +14,10 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from cosfly.errors import InputError
 from cosfly.products.frames import FrameFile
-from cosfly.work.runner import advance
-from cosfly.work.store import atomic_file, dump_json
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.runner import advance
+from cosfly.runtime.store import atomic_file, dump_json
 from release.columns import PICTURES, SPLIT_NAMES, TARGET_PICTURE
 from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
 from release.export.source import DEPTH_CODING, PART, Release, ReleasedRows, Span, picture, read_span

@@ -8,14 +8,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from cosfly.errors import InputError
-from cosfly.escaping import published_name
 from cosfly.products.actions import ACTIONS, not_in_set
 from cosfly.products.captions import Caption, caption_lines
 from cosfly.products.places import sample_id
-from cosfly.reading.documents import parse_document, parse_json, validated
-from cosfly.reading.files import read_span
-from cosfly.work.store import dump_json
+from cosfly.runtime.documents import parse_document, parse_json, validated
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.escaping import published_name
+from cosfly.runtime.files import read_span
+from cosfly.runtime.store import dump_json
 from release.columns import LANGUAGES
 
 FlightKey = tuple[str, str, str]  # town's folder, trajectory, variant

@@ -7,7 +7,7 @@ from pydantic import Field, field_validator, model_validator
 from cosfly.products.boxes import LicenceId
 from cosfly.products.frames import FILE_NAMES, FrameFile
 from cosfly.products.places import Track
-from cosfly.work.config import Config
+from cosfly.runtime.config import Config
 from release.columns import SplitName
 from release.record import Pairs, SplitBy
 

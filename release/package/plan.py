@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cosfly.errors import CosflyError, InputError, NothingKept, VerifyError
 from cosfly.products.frames import DEPTH_PNG, FILE_NAMES, frame_name, frame_path
 from cosfly.products.places import FlightChoice
 from cosfly.products.review import how_to_decide
-from cosfly.work.stage_folder import Failed, StageFolder, Tally, write_failures
+from cosfly.runtime.errors import CosflyError, InputError, NothingKept, VerifyError
+from cosfly.runtime.stage_folder import Failed, StageFolder, Tally, write_failures
 from release.columns import SPLIT_NAMES, Placement, SplitName
 from release.package.captions import CaptionAccount, FlightCaptions, FlightKey, index_captions
 from release.package.config import ReleaseConfig

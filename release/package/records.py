@@ -14,11 +14,11 @@ import numpy as np
 import pyarrow as pa
 
 import cosfly
-from cosfly.errors import VerifyError
-from cosfly.escaping import published
-from cosfly.reading.files import sha256_file
-from cosfly.work.provenance import StageInput, stages_behind
-from cosfly.work.store import write_bytes, write_checksums
+from cosfly.runtime.errors import VerifyError
+from cosfly.runtime.escaping import published
+from cosfly.runtime.files import sha256_file
+from cosfly.runtime.provenance import StageInput, stages_behind
+from cosfly.runtime.store import write_bytes, write_checksums
 from release import columns
 from release.card.croissant import CROISSANT, render_croissant
 from release.card.render import render_card

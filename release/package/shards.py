@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel
 
-from cosfly.errors import CosflyError, InputError, VerifyError
 from cosfly.products.frames import (
     FILE_NAMES,
     FRAMES_DIR,
@@ -28,11 +27,12 @@ from cosfly.products.frames import (
 )
 from cosfly.products.playback import TARGET_FILE, Flight
 from cosfly.products.png import parse_png
-from cosfly.reading.arrays import PNG_HEADER_BYTES, png_size
-from cosfly.reading.files import check_stays_below, read_bytes, sha256_file
-from cosfly.work.items import advance
-from cosfly.work.provenance import FLIGHT, digest_of, folder_digests
-from cosfly.work.store import CHECKSUMS, atomic_file, read_checksums
+from cosfly.runtime.arrays import PNG_HEADER_BYTES, png_size
+from cosfly.runtime.errors import CosflyError, InputError, VerifyError
+from cosfly.runtime.files import check_stays_below, read_bytes, sha256_file
+from cosfly.runtime.items import advance
+from cosfly.runtime.provenance import FLIGHT, digest_of, folder_digests
+from cosfly.runtime.store import CHECKSUMS, atomic_file, read_checksums
 from release import columns
 from release.columns import Placement, ReleasedCaption, caption_values
 from release.package.captions import FlightCaptions

@@ -6,7 +6,6 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from cosfly.errors import ConfigError, InputError
 from cosfly.products.boxes import UNKNOWN_LICENCE
 from cosfly.products.captions import OWN_PROMPTS, QUESTIONS
 from cosfly.products.flights import find_flights
@@ -14,9 +13,10 @@ from cosfly.products.inspection import FlightInspection, Inspection, TrajectoryF
 from cosfly.products.places import ALL_FLIGHTS, FlightChoice, Place, flight_ids, folder_name
 from cosfly.products.review import REVIEW, read_settled
 from cosfly.products.town import read_town_map
-from cosfly.reading.files import check_stays_below, read_text
-from cosfly.work.provenance import is_bound
-from cosfly.work.store import inside
+from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.files import check_stays_below, read_text
+from cosfly.runtime.provenance import is_bound
+from cosfly.runtime.store import inside
 from release.package.captions import FlightKey
 from release.record import ReleasedMap
 

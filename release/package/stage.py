@@ -10,11 +10,11 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from cosfly.errors import VerifyError
-from cosfly.work.provenance import read_stage_record
-from cosfly.work.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.work.stage_folder import Failed, Resume, StageFolder, Tally, result_of
-from cosfly.work.store import CHECKSUMS, atomic_folder
+from cosfly.runtime.errors import VerifyError
+from cosfly.runtime.provenance import read_stage_record
+from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.stage_folder import Failed, Resume, StageFolder, Tally, result_of
+from cosfly.runtime.store import CHECKSUMS, atomic_folder
 from release.card.ceilings import ceilings_of
 from release.card.numbers import compute_numbers
 from release.package.config import ReleaseConfig

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.products.frames import FRAMES_DIR, frame_name, read_meta
 from cosfly.products.places import Track
 from cosfly.products.playback import Flight, read_flight
 from cosfly.products.splits import Course, town_family, walks_of
-from cosfly.work.console import progress_bar
+from cosfly.runtime.console import progress_bar
+from cosfly.runtime.errors import InputError
 from release.columns import Placement, SplitName
 from release.package.sources import Candidate
 from release.record import Pairs, SplitBy

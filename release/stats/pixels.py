@@ -12,13 +12,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.look.frame_views import small_jpeg
 from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.products.kinds import KIND_NAMES
-from cosfly.reading.arrays import parse_picture
-from cosfly.reading.tables import arrow_errors, open_table, row_groups
-from cosfly.work.console import progress_bar
+from cosfly.runtime.arrays import parse_picture
+from cosfly.runtime.console import progress_bar
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.tables import arrow_errors, open_table, row_groups
 from release.card.numbers import check_columns
 from release.columns import PICTURES
 from release.record import ReleaseRecord

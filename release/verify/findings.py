@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from pydantic import ConfigDict
 
-from cosfly.escaping import cut, for_terminal
 from cosfly.products.issues import Issue, Report, Severity, sort_key
+from cosfly.runtime.escaping import cut, for_terminal
 from release.flight_rows import FlightRows
 
 EXAMPLES = 3  # places of a kind that are named

@@ -9,12 +9,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.geometry import BODY_FROM_CAMERA
 from cosfly.products.actions import TOKENS
 from cosfly.products.frames import LEGIBLE_CONTRAST, LEGIBLE_HEIGHT_PX, LEGIBLE_SHARE
 from cosfly.products.shown_captions import CaptionReader
-from cosfly.work.items import Item, Outcome
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.items import Item, Outcome
 from release.columns import CAPTION, CAPTION_NAMES, LANGUAGES, REQUIRED, SCALARS, TARGET_PICTURE, WINDOW
 from release.flight_rows import FlightRows, Row
 from release.record import ReleaseRecord

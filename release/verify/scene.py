@@ -10,13 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.geometry import BODY_FROM_CAMERA
 from cosfly.products.frames import PERSON_ID, SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.products.goals import LANDMARKS, SeenFrame, meant, target_picture, words_of
 from cosfly.products.kinds import KINDS
 from cosfly.products.png import colours_of
 from cosfly.products.walks import PERSON_HALF_EXTENTS_M
+from cosfly.runtime.compiled import njit
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.items import advance
 from cosfly.space.reprojection import (
     COLUMNS,
     GRID_ROWS,
@@ -27,8 +29,6 @@ from cosfly.space.reprojection import (
     compare_views,
     median_of,
 )
-from cosfly.work.compiled import njit
-from cosfly.work.items import advance
 from release.columns import PICTURES, TARGET_PICTURE, matrices_of
 from release.flight_rows import FlightRows
 from release.verify.findings import Findings

@@ -12,13 +12,13 @@ from typing import Any
 
 import pyarrow as pa
 
-from cosfly.errors import InputError
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import FILE_NAMES, FrameFile, frame_path
 from cosfly.products.places import Place, flight_ids
 from cosfly.products.playback import Flight, read_flight
-from cosfly.reading.files import read_bytes
-from cosfly.reading.tables import open_table, read_row_group, row_batches
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import read_bytes
+from cosfly.runtime.tables import open_table, read_row_group, row_batches
 from release.columns import PICTURES, PLACE, SCALAR_NAMES, SCALARS, Placement, flight_name, flight_spans
 from release.flight_rows import FlightRows, Row
 

@@ -17,17 +17,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cosfly.errors import InputError
 from cosfly.products.playback import ORIGINAL
 from cosfly.products.shown_captions import CaptionReader
 from cosfly.products.splits import town_family
-from cosfly.reading.files import open_file, read_bytes, sha256_file
-from cosfly.reading.tables import open_table
-from cosfly.work.config import Config
-from cosfly.work.items import Item
-from cosfly.work.runner import Watch, run_items
-from cosfly.work.stage_folder import Failed, Kept, StageFolder, flattened
-from cosfly.work.store import CHECKSUMS, read_checksums
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import open_file, read_bytes, sha256_file
+from cosfly.runtime.items import Item
+from cosfly.runtime.runner import Watch, run_items
+from cosfly.runtime.stage_folder import Failed, Kept, StageFolder, flattened
+from cosfly.runtime.store import CHECKSUMS, read_checksums
+from cosfly.runtime.tables import open_table
 from release import columns
 from release.card.ceilings import ceilings_of
 from release.card.croissant import CROISSANT, render_croissant

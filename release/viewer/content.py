@@ -12,14 +12,14 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from pydantic import BaseModel, Field
 
-from cosfly.errors import InputError
 from cosfly.geometry import box_corners
 from cosfly.look.frame_views import View, small_jpeg
 from cosfly.products.boxes import BoxMap
 from cosfly.products.captions import Coc, Language
 from cosfly.products.kinds import GROUND_KINDS, KIND_NAMES
 from cosfly.products.sentences import sentences_of
-from cosfly.work.config import Config
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import InputError
 from release.columns import BOX, CAPTION, FIELDS, FRAME, LANGUAGES, POINT, TARGET_PICTURE, Column
 
 Point2 = tuple[float, float]  # x, y, m

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.errors import InputError
 from cosfly.look.frame_views import VIEW_FILES, View, read_view
 from cosfly.products.boxes import read_boxes
 from cosfly.products.captions import Caption, read_captions
@@ -19,7 +18,8 @@ from cosfly.products.frames import frame_path
 from cosfly.products.places import folder_name, place_of, town_folder
 from cosfly.products.playback import Flight, read_flight
 from cosfly.products.review import read_settled
-from cosfly.work.console import progress_bar
+from cosfly.runtime.console import progress_bar
+from cosfly.runtime.errors import InputError
 from release.columns import Placement, caption_values, scalar_row
 from release.viewer.content import (
     PageBox,

@@ -35,11 +35,11 @@ from cosfly.products.actions import TOKENS
 from cosfly.products.playback import Flight
 from cosfly.products.traces import DroneTrace
 from cosfly.products.walks import walk_id
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.config import load, shipped
 from cosfly.simplify.passes import simplify
 from cosfly.space.blind import FITTED_ON, fit_deciders, is_drawn_ahead, past_of
 from cosfly.space.kernels import obstacle_index
-from cosfly.work.chance import rng_for
-from cosfly.work.config import load, shipped
 from specimens import make_flight
 
 UNSEEN = ("old_town", "market")

@@ -27,8 +27,8 @@ from cosfly.planners.contract import PlanConfig
 from cosfly.products.actions import TOKENS
 from cosfly.products.boxes import write_boxes
 from cosfly.render.settings import RenderConfig
+from cosfly.runtime.stage_folder import read_manifest
 from cosfly.simplify.passes import SimplifyConfig, simplify
-from cosfly.work.stage_folder import read_manifest
 from distill.inference.stage import InferConfig
 
 SEED = 64

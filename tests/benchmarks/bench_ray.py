@@ -32,11 +32,11 @@ from toy_workers import make_talking_worker, stage_in
 
 from cosfly.app import pipeline
 from cosfly.app.settings import RunConfig
-from cosfly.work.config import load
-from cosfly.work.ray_engine import RayConfig, connected
-from cosfly.work.runner import Item, Watch, run_items
-from cosfly.work.stage_events import LOSSES, Event, read_events, rss_mib
-from cosfly.work.stage_folder import read_manifest
+from cosfly.runtime.config import load
+from cosfly.runtime.ray_engine import RayConfig, connected
+from cosfly.runtime.runner import Item, Watch, run_items
+from cosfly.runtime.stage_events import LOSSES, Event, read_events, rss_mib
+from cosfly.runtime.stage_folder import read_manifest
 
 WORKERS = 2
 TOWN = ("pedestrians.num_paths=7", "render.width_px=320", "render.height_px=180", "release.licence=cc-by-4.0")

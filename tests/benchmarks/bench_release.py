@@ -35,7 +35,7 @@ from specimens_distill import make_captions
 from cosfly.products.flights import find_flights
 from cosfly.products.frames import FILE_NAMES, FrameFile, depth_bytes, frame_name, instance_bytes, rgb_bytes
 from cosfly.products.playback import Flight, write_flight
-from cosfly.work.store import CHECKSUMS, checksum_lines, sha256_bytes
+from cosfly.runtime.store import CHECKSUMS, checksum_lines, sha256_bytes
 from release.package.config import ReleaseConfig
 from release.package.sources import Source
 from release.package.stage import run

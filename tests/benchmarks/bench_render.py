@@ -45,9 +45,9 @@ from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import Surroundings
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, script_flight
+from cosfly.runtime.stage_events import read_events
+from cosfly.runtime.stage_folder import read_manifest
 from cosfly.space.kernels import obstacle_index
-from cosfly.work.stage_events import read_events
-from cosfly.work.stage_folder import read_manifest
 
 SIZE = (1280, 720)
 PAPER = {1: (1.07, 46.3, 7.5), 2: (1.43, 58.6, 10.6), 4: (2.55, 86.8, 24.3), 6: (2.68, 91.6, 34.0)}  # frames/s, %, GiB

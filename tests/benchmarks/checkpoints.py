@@ -26,9 +26,9 @@ from cosfly.products.captions import read_captions
 from cosfly.products.flight_scores import SCORE, SCORE_FORMAT
 from cosfly.products.pursuits import PURSUITS, read_pursuit
 from cosfly.products.traces import read_traces
-from cosfly.work.chance import rng_for
-from cosfly.work.runner import Item
-from cosfly.work.store import write_model
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.runner import Item
+from cosfly.runtime.store import write_model
 
 TURNS = ("yaw_left_to_follow", "yaw_right_to_follow")
 NOISE = (0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)

@@ -17,9 +17,9 @@ from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, walkable_ground
 from cosfly.products.boxes import BoxMap
 from cosfly.products.walks import Walk
+from cosfly.runtime.chance import rng_for
+from cosfly.runtime.config import build
 from cosfly.simplify.passes import SimplifyConfig, simplify
-from cosfly.work.chance import rng_for
-from cosfly.work.config import build
 
 SHARED_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 NUM_WALKS, SEED = 20, 0

@@ -23,13 +23,13 @@ from pathlib import Path
 import numpy as np
 import scenes
 
-from cosfly.work.config import Config
-from cosfly.work.journal import Journal
-from cosfly.work.ray_engine import RayConfig
-from cosfly.work.runner import Item, Outcome, Work, run_items
-from cosfly.work.stage_events import read_events
-from cosfly.work.stage_folder import StageFolder
-from cosfly.work.worker_pool import Watch
+from cosfly.runtime.config import Config
+from cosfly.runtime.journal import Journal
+from cosfly.runtime.ray_engine import RayConfig
+from cosfly.runtime.runner import Item, Outcome, Work, run_items
+from cosfly.runtime.stage_events import read_events
+from cosfly.runtime.stage_folder import StageFolder
+from cosfly.runtime.worker_pool import Watch
 
 STAGES = ("plan", "render", "inspect", "caption", "release")
 OPS = {"render": 5.1, "inspect": 9.5, "caption": 2.2, "release": 3.2}  # opens and mkdirs of a frame, counted by strace

@@ -20,8 +20,8 @@ from cosfly.products.others import BUILDS
 from cosfly.render.contract import PERSON_ID, Frame, PosedCar, PosedOther, PosedPerson, instance_ids, other_id
 from cosfly.render.person import SLOW_MPS, choose_clothes
 from cosfly.render.stage import open_renderer
+from cosfly.runtime.chance import rng_for
 from cosfly.unreal.conventions import SIMULATED_STEP_S, world_pose
-from cosfly.work.chance import rng_for
 
 MOST_MOVERS = 64
 FAULT = re.compile(r"(\w+)(?::(\w+))?@(\d+)(\+?)(?:=([\d.]+))?")  # NAME[:SENSOR]@TICK[+][=SECONDS]

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cosfly.planners.muco.nearby import Nearby, hits_among, known, nearest_among, nothing_nearby, remember
+from cosfly.runtime.compiled import int64, njit
 from cosfly.space.kernels import (
     HALF_X,
     RAY_OFFSETS_M,
@@ -24,7 +25,6 @@ from cosfly.space.kernels import (
     nearest_box,
     normal_of_box,
 )
-from cosfly.work.compiled import int64, njit
 
 # --- window of frames -------------------------------------------------------------------------------------------------
 # What the five rays see from a waypoint and its neighbours half a metre away: the difference window of MuCO's

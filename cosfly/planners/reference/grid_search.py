@@ -13,8 +13,8 @@ import numpy as np
 
 from cosfly.planners.reference.task import Task, planner
 from cosfly.planners.track_astar import MOVES
+from cosfly.runtime.compiled import njit
 from cosfly.space.kernels import collect_hits
-from cosfly.work.compiled import njit
 
 VOXEL_M = 4.0  # as for TA*
 WEIGHT = 2.0  # of weighted A*

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.errors import EnvironmentMissing
 from cosfly.planners.reference.task import Task, planner
+from cosfly.runtime.errors import EnvironmentMissing
 
 RRT_CALLS, PRM_CALLS = 4000, 6000  # of the condition to stop, one or two for each sample
 RRT_RANGE_M = 15.0

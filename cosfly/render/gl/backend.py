@@ -28,7 +28,7 @@ from cosfly.render.gl.scene import build_scene
 from cosfly.render.gl.shade import Shade, shades_of
 from cosfly.render.gl.view import CameraView
 from cosfly.render.gl.weather_pass import WeatherPass, defines
-from cosfly.work.worker import return_freed_memory
+from cosfly.runtime.worker import return_freed_memory
 
 SHADOW_SIZE_PX, HEIGHT_SIZE_PX = 2560, 768
 AMBIENT_BLUR_M, TALLEST_AMBIENT_M = 5.0, 14.0  # a tower takes no more sky from its foot than a house

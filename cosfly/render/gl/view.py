@@ -8,7 +8,7 @@ import numpy as np
 
 from cosfly.render.contract import FAR_M, NEAR_M
 from cosfly.render.gl.parts import Parts
-from cosfly.work.compiled import njit
+from cosfly.runtime.compiled import njit
 
 SMALLEST_PX = 0.4  # an object whose radius on the image is below this is not drawn
 

@@ -19,9 +19,9 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from cosfly.errors import InputError
-from cosfly.reading.documents import parse_document
-from cosfly.reading.files import MB, decoded, over_limit, read_bytes
+from cosfly.runtime.documents import parse_document
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import MB, decoded, over_limit, read_bytes
 
 MOST_TRIANGLES = 2_000_000  # of a file, and of all that a map draws
 FILE_MB = MOST_TRIANGLES * 256 / MB  # an OBJ takes some 100 bytes for a triangle

@@ -23,14 +23,14 @@ from dataclasses import dataclass, field, replace
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Protocol
 
-from cosfly.errors import CosflyError, EnvironmentMissing
-from cosfly.work.items import Item, Work
-from cosfly.work.stage_events import LOSSES, EventLog, Loss, Vitals
-from cosfly.work.stage_folder import Failed, ItemRecord
-from cosfly.work.worker import Abort, Manner, Message, Sign, Start, signals_held_back, work_through
+from cosfly.runtime.errors import CosflyError, EnvironmentMissing
+from cosfly.runtime.items import Item, Work
+from cosfly.runtime.stage_events import LOSSES, EventLog, Loss, Vitals
+from cosfly.runtime.stage_folder import Failed, ItemRecord
+from cosfly.runtime.worker import Abort, Manner, Message, Sign, Start, signals_held_back, work_through
 
 if TYPE_CHECKING:
-    from cosfly.work.ray_engine import RayConfig
+    from cosfly.runtime.ray_engine import RayConfig
 
 log = logging.getLogger(__name__)
 

@@ -20,10 +20,10 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
-from cosfly.errors import CosflyError
-from cosfly.work.console import set_levels
-from cosfly.work.items import Item, Work, attempt, counted_steps, take_place
-from cosfly.work.stage_folder import ItemRecord
+from cosfly.runtime.console import set_levels
+from cosfly.runtime.errors import CosflyError
+from cosfly.runtime.items import Item, Work, attempt, counted_steps, take_place
+from cosfly.runtime.stage_folder import ItemRecord
 
 LEFT_TO_THE_PARENT = frozenset({signal.SIGINT, signal.SIGTERM})  # it ends its workers, and alone speaks of it
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # prctl(2)

@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from cosfly.errors import ConfigError
+from cosfly.runtime.errors import ConfigError
 
 MOST_BYTES = 1_000_000  # a run's settings are some 10 kB; the longest word list that ships has 100
 

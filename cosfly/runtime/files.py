@@ -19,7 +19,7 @@ import zlib
 from collections.abc import Iterator
 from pathlib import Path, PosixPath
 
-from cosfly.errors import InputError
+from cosfly.runtime.errors import InputError
 
 log = logging.getLogger(__name__)
 

@@ -21,8 +21,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from cosfly.errors import InputError
-from cosfly.reading.files import disk_errors, open_file, over_limit, read_bytes
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import disk_errors, open_file, over_limit, read_bytes
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_HEADER_BYTES = 24  # signature, length and name of the first chunk, width, height

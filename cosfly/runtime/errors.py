@@ -24,7 +24,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
-from cosfly.escaping import for_terminal
+from cosfly.runtime.escaping import for_terminal
 
 MOST_TOLD = 12  # problems in a message
 

@@ -22,12 +22,12 @@ from typing import Any
 from pydantic import Field
 
 import cosfly
-from cosfly.errors import EnvironmentMissing
-from cosfly.reading.files import sha256_file
-from cosfly.work.config import Config
-from cosfly.work.items import Item
-from cosfly.work.stage_events import Vitals
-from cosfly.work.worker import Manner, Message, Start
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import EnvironmentMissing
+from cosfly.runtime.files import sha256_file
+from cosfly.runtime.items import Item
+from cosfly.runtime.stage_events import Vitals
+from cosfly.runtime.worker import Manner, Message, Start
 
 log = logging.getLogger(__name__)
 
@@ -193,14 +193,14 @@ def _host() -> type:
                 fix = "install the same on every node, then start Ray there again"
                 got = f"{cosfly.__version__} ({python})"
                 return node, None, {"what": "another cosfly", "got": got, "expected": version, "fix": fix}
-            from cosfly.reading.files import sha256_file
-            from cosfly.work.worker import Manner
-            from cosfly.work.worker_pool import LocalPost
+            from cosfly.runtime.files import sha256_file
+            from cosfly.runtime.worker import Manner
+            from cosfly.runtime.worker_pool import LocalPost
 
             try:
                 os.chdir(cwd)
                 is_same = sha256_file(Path(folder) / "stage.json") == record
-            except (OSError, cosfly.errors.InputError):
+            except (OSError, cosfly.runtime.errors.InputError):
                 is_same = False
             if not is_same:
                 got = f"no {Path(cwd) / folder}, or another folder of that name"

@@ -21,8 +21,8 @@ from typing import Any, NamedTuple, TypeVar
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import SchemaValidator
 
-from cosfly.errors import InputError, plain
-from cosfly.reading.files import CHECK_PATH, FILE_MB, decoded, not_utf8, read_bytes, read_lines
+from cosfly.runtime.errors import InputError, plain
+from cosfly.runtime.files import CHECK_PATH, FILE_MB, decoded, not_utf8, read_bytes, read_lines
 
 Model = TypeVar("Model", bound=BaseModel)
 Kind = TypeVar("Kind")

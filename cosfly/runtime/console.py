@@ -15,8 +15,8 @@ from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.text import Text
 
-from cosfly.errors import StorageError
-from cosfly.escaping import LONGEST_LOG, for_terminal
+from cosfly.runtime.errors import StorageError
+from cosfly.runtime.escaping import LONGEST_LOG, for_terminal
 
 
 class _Console(Console):

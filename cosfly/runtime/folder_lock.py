@@ -11,8 +11,8 @@ from weakref import WeakValueDictionary
 
 from filelock import FileLock, Timeout
 
-from cosfly.errors import ResumeError, StorageError
-from cosfly.work.store import storage_errors
+from cosfly.runtime.errors import ResumeError, StorageError
+from cosfly.runtime.store import storage_errors
 
 LOCK = ".lock"
 

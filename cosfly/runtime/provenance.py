@@ -17,10 +17,10 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from cosfly.errors import InputError, VerifyError
-from cosfly.reading.documents import FileFormat, read_json, read_model, read_object
-from cosfly.reading.files import files_named, sha256_file
-from cosfly.work.store import CHECKSUMS, checksum_lines, dump_json, inside, read_checksums, sha256_bytes
+from cosfly.runtime.documents import FileFormat, read_json, read_model, read_object
+from cosfly.runtime.errors import InputError, VerifyError
+from cosfly.runtime.files import files_named, sha256_file
+from cosfly.runtime.store import CHECKSUMS, checksum_lines, dump_json, inside, read_checksums, sha256_bytes
 
 log = logging.getLogger(__name__)
 

@@ -12,10 +12,10 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from cosfly.errors import InputError, plain
-from cosfly.reading.documents import parse_json
-from cosfly.reading.files import disk_errors, open_file, read_lines
-from cosfly.work.store import dump_json, sha256_bytes, storage_errors
+from cosfly.runtime.documents import parse_json
+from cosfly.runtime.errors import InputError, plain
+from cosfly.runtime.files import disk_errors, open_file, read_lines
+from cosfly.runtime.store import dump_json, sha256_bytes, storage_errors
 
 T = TypeVar("T")
 

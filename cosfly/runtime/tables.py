@@ -17,8 +17,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from cosfly.errors import InputError
-from cosfly.reading.files import FILE_MB, MB, SMALL_UNPACKED_MB, UNPACK_FACTOR, open_file, over_limit
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.files import FILE_MB, MB, SMALL_UNPACKED_MB, UNPACK_FACTOR, open_file, over_limit
 
 MOST_FOOTER_BYTES = 100 * MB  # what the footer's strings and lists may take; ours have some 10 kB
 

@@ -18,13 +18,13 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_serializer
 
 import cosfly
-from cosfly.errors import NothingKept, ResumeError, StorageError, VerifyError
-from cosfly.reading.documents import Model, model_lines, read_model, validated
-from cosfly.reading.files import sha256_file
-from cosfly.work.config import Config
-from cosfly.work.folder_lock import LOCK, FolderLock, hold_folder, remove_left_lock
-from cosfly.work.journal import Journal
-from cosfly.work.provenance import (
+from cosfly.runtime.config import Config
+from cosfly.runtime.documents import Model, model_lines, read_model, validated
+from cosfly.runtime.errors import NothingKept, ResumeError, StorageError, VerifyError
+from cosfly.runtime.files import sha256_file
+from cosfly.runtime.folder_lock import LOCK, FolderLock, hold_folder, remove_left_lock
+from cosfly.runtime.journal import Journal
+from cosfly.runtime.provenance import (
     MANIFEST_FORMAT,
     STAGE_FORMAT,
     Output,
@@ -32,8 +32,8 @@ from cosfly.work.provenance import (
     checked_inputs,
     read_stage_record,
 )
-from cosfly.work.stage_events import EVENTS, lost_steps
-from cosfly.work.store import (
+from cosfly.runtime.stage_events import EVENTS, lost_steps
+from cosfly.runtime.store import (
     dump_json,
     inside,
     is_partial_of,

@@ -12,9 +12,9 @@ from typing import Annotated, Any, TypeVar, get_args
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import to_jsonable_python
 
-from cosfly.errors import ConfigError, InputError, nearest, plain
-from cosfly.reading.files import read_text
-from cosfly.reading.settings_text import parse_yaml
+from cosfly.runtime.errors import ConfigError, InputError, nearest, plain
+from cosfly.runtime.files import read_text
+from cosfly.runtime.settings_text import parse_yaml
 
 MOST_LISTED = 15  # names of settings in a message
 MOST_ELSEWHERE = 3  # places of an unknown name, as in "did you mean plan.x or render.x"

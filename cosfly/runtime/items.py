@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from cosfly.errors import CosflyError
-from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Kept
+from cosfly.runtime.errors import CosflyError
+from cosfly.runtime.stage_folder import Dropped, Failed, ItemRecord, Kept
 
 log = logging.getLogger(__name__)
 

@@ -15,15 +15,15 @@ from functools import partial
 
 import numpy as np
 
-from cosfly.errors import CosflyError, EnvironmentMissing
-from cosfly.work.console import progress_bar
-from cosfly.work.items import Item, Outcome, Work, advance, attempt, counted_steps
-from cosfly.work.journal import Journal
-from cosfly.work.ray_engine import ALL_ROOM, Cluster
-from cosfly.work.stage_events import EventLog
-from cosfly.work.stage_folder import Dropped, Failed, ItemRecord, Kept, StageFolder, Tally, read_item, write_failures
-from cosfly.work.store import remove_partials
-from cosfly.work.worker_pool import LocalPost, StartPost, Watch, WorkerPool
+from cosfly.runtime.console import progress_bar
+from cosfly.runtime.errors import CosflyError, EnvironmentMissing
+from cosfly.runtime.items import Item, Outcome, Work, advance, attempt, counted_steps
+from cosfly.runtime.journal import Journal
+from cosfly.runtime.ray_engine import ALL_ROOM, Cluster
+from cosfly.runtime.stage_events import EventLog
+from cosfly.runtime.stage_folder import Dropped, Failed, ItemRecord, Kept, StageFolder, Tally, read_item, write_failures
+from cosfly.runtime.store import remove_partials
+from cosfly.runtime.worker_pool import LocalPost, StartPost, Watch, WorkerPool
 
 __all__ = ["Item", "ItemOutcomes", "Outcome", "Watch", "Work", "advance", "run_items"]
 

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cosfly.errors import InputError
-from cosfly.reading.documents import read_json
+from cosfly.runtime.documents import read_json
+from cosfly.runtime.errors import InputError
 
 GEOMETRIES = ("Point", "Polygon", "MultiPolygon")
 LARGEST = 1e9  # of a coordinate

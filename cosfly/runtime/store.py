@@ -15,9 +15,9 @@ from typing import IO, Any
 
 from pydantic import BaseModel
 
-from cosfly.errors import InputError, StorageError
-from cosfly.reading.documents import FileFormat
-from cosfly.reading.files import check_stays_below, read_text
+from cosfly.runtime.documents import FileFormat
+from cosfly.runtime.errors import InputError, StorageError
+from cosfly.runtime.files import check_stays_below, read_text
 
 DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EIO})
