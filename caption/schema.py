@@ -20,10 +20,10 @@ from cosfly.chat.client import EndpointConfig
 from cosfly.chat.student_chat import MAX_ANSWER_TOKENS
 from cosfly.chat.vllm_engine import VllmConfig
 from cosfly.chat.wire import check_url
+from cosfly.formats.captions import KeyframeRecord, LabelFrom, Language, SentenceState, TeacherKind, Verdict, Writing
+from cosfly.formats.places import FlightChoice
+from cosfly.formats.predictions import PREDICTIONS
 from cosfly.look.frame_views import DEPTH_RANGE_M, Layout, View
-from cosfly.products.captions import KeyframeRecord, LabelFrom, Language, SentenceState, TeacherKind, Verdict, Writing
-from cosfly.products.places import FlightChoice
-from cosfly.products.predictions import PREDICTIONS
 from cosfly.runtime.config import Config, MayDiffer
 
 Strategy = Literal["anchored", "hint", "multi_sample", "cascade"]

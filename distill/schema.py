@@ -16,10 +16,10 @@ from typing import Any, Literal, Self, get_args, get_origin, overload
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from cosfly.formats.captions import Language, Prompt
+from cosfly.formats.frames import frame_name
+from cosfly.formats.splits import SPLITS, Split
 from cosfly.look.frame_views import VIEW_FILES, Pictures, View
-from cosfly.products.captions import Language, Prompt
-from cosfly.products.frames import frame_name
-from cosfly.products.splits import SPLITS, Split
 from cosfly.runtime.documents import FileFormat, Record, read_model, validated
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.provenance import fingerprint

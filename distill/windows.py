@@ -19,10 +19,10 @@ import numpy as np
 import pyarrow as pa
 from pydantic import BaseModel
 
+from cosfly.formats.captions import FIELDS, Language, Prompt, read_captions
+from cosfly.formats.frames import frame_name
+from cosfly.formats.playback import Flight, read_flight
 from cosfly.look.frame_views import VIEW_FILES, Pictures, read_view, scaled_size
-from cosfly.products.captions import FIELDS, Language, Prompt, read_captions
-from cosfly.products.frames import frame_name
-from cosfly.products.playback import Flight, read_flight
 from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.documents import read_object, validated
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError, nearest

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 
 from cosfly import plan
+from cosfly.formats.boxes import MapHeader, make_box_map
+from cosfly.formats.kinds import KINDS
 from cosfly.planners.styles import NAMES, suits
-from cosfly.products.boxes import MapHeader, make_box_map
-from cosfly.products.kinds import KINDS
 
 WAY_M = [(0.5 * k, 0.0) for k in range(-80, 101)]  # a walker may stop at each
 HOUSES = [((5.0, 12.0, 14.0), (16.0, 6.0, 14.0)), ((5.0, -12.0, 14.0), (16.0, 6.0, 14.0))]  # which hide the walker

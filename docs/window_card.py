@@ -11,10 +11,10 @@ from pathlib import Path
 
 import cv2
 
-from cosfly.products.captions import read_captions
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import read_rgb
-from cosfly.products.playback import read_flight
+from cosfly.formats.captions import read_captions
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import read_rgb
+from cosfly.formats.playback import read_flight
 
 CROP_PX = (360, 270)  # region round the target that is shown of each frame, at the size it has in a 1280x720 image
 

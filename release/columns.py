@@ -17,9 +17,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 import pyarrow as pa
 
-from cosfly.geometry import BODY_FROM_CAMERA
-from cosfly.products.captions import FIELDS, Caption, LabelFrom, Language, SentenceState, TeacherKind, Verdict, Writing
-from cosfly.products.frames import (
+from cosfly.formats.captions import FIELDS, Caption, LabelFrom, Language, SentenceState, TeacherKind, Verdict, Writing
+from cosfly.formats.frames import (
     INVALID_DEPTH_M,
     LEAST_FOV_DEG,
     LEGIBLE_CONTRAST,
@@ -31,10 +30,11 @@ from cosfly.products.frames import (
     FrameFile,
     Look,
 )
-from cosfly.products.motion import ACTION
-from cosfly.products.places import sample_id
-from cosfly.products.playback import EVENTS, Flight
-from cosfly.products.weather import WeatherMode, WeatherParams
+from cosfly.formats.motion import ACTION
+from cosfly.formats.places import sample_id
+from cosfly.formats.playback import EVENTS, Flight
+from cosfly.formats.weather import WeatherMode, WeatherParams
+from cosfly.geometry import BODY_FROM_CAMERA
 from cosfly.runtime.escaping import published_name
 from cosfly.runtime.store import dump_json
 

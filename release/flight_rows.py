@@ -9,14 +9,14 @@ from typing import Any, get_args
 
 import numpy as np
 
+from cosfly.formats.captions import Language
+from cosfly.formats.frames import Camera
+from cosfly.formats.goals import Goal
+from cosfly.formats.people import People
+from cosfly.formats.playback import EVENTS, Flight
+from cosfly.formats.shown_captions import ShownCaption, ShownFlight
+from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
 from cosfly.geometry import BODY_FROM_CAMERA, CORNER_SIGNS, rotation_matrices
-from cosfly.products.captions import Language
-from cosfly.products.frames import Camera
-from cosfly.products.goals import Goal
-from cosfly.products.people import People
-from cosfly.products.playback import EVENTS, Flight
-from cosfly.products.shown_captions import ShownCaption, ShownFlight
-from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.runtime.documents import parse_document, validated
 from release.columns import BOX, COMPANY_COLUMNS, INTRINSICS, POINT, POSE, between_of, matrices_of
 

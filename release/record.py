@@ -9,10 +9,10 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from cosfly.products.coverage import Coverage
-from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile
-from cosfly.products.inspection import TrajectoryFunnel
-from cosfly.products.town import TownMap
+from cosfly.formats.coverage import Coverage
+from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile
+from cosfly.formats.inspection import TrajectoryFunnel
+from cosfly.formats.town import TownMap
 from cosfly.runtime.documents import FileFormat, read_model
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import sha256_bytes, write_model

@@ -149,7 +149,7 @@ def _judge(place: Place) -> str:
 def _simulator(protocol: str, place: Place) -> int:
     from simulator_serving import serving
 
-    from cosfly.products.boxes import read_boxes
+    from cosfly.formats.boxes import read_boxes
 
     town = read_boxes(Path(place.given("base")) / "maps/boxes_3d.json")
     return place.stack.enter_context(serving(town, place.root / protocol, protocol=protocol))

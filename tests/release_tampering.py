@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from caption.run.released import read_released
-from cosfly.products.frames import depth_bytes
+from cosfly.formats.frames import depth_bytes
 from cosfly.runtime.files import sha256_file
 from release import columns
 from release.card.numbers import compute_numbers

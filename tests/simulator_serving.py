@@ -13,7 +13,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from cosfly.products.boxes import BoxMap, write_boxes
+from cosfly.formats.boxes import BoxMap, write_boxes
 
 
 def free_port() -> int:

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.geometry import DT_S, box_corners, intrinsic_matrix, look_at, project, world_from_camera
-from cosfly.products.frames import (
+from cosfly.formats.frames import (
     SKY_DEPTH_M,
     Camera,
     FrameMeta,
@@ -29,9 +28,10 @@ from cosfly.products.frames import (
     tree_pose,
     tree_position,
 )
-from cosfly.products.kinds import KINDS
-from cosfly.products.playback import Flight, write_flight
-from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.playback import Flight, write_flight
+from cosfly.formats.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
+from cosfly.geometry import DT_S, box_corners, intrinsic_matrix, look_at, project, world_from_camera
 
 PERSON_ID = 0x1234  # two different bytes, so that a swap of the channels shows
 FIRST_SECOND = 1_776_047_127

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.chat.student_chat import FrameLook, Taught, write_taught
-from cosfly.products.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
-from cosfly.products.flights import find_flights
-from cosfly.products.places import sample_id
-from cosfly.products.playback import read_flight
-from cosfly.products.splits import Split
+from cosfly.formats.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
+from cosfly.formats.flights import find_flights
+from cosfly.formats.places import sample_id
+from cosfly.formats.playback import read_flight
+from cosfly.formats.splits import Split
 from cosfly.runtime.provenance import fingerprint
 from cosfly.runtime.store import write_json
 from distill.prepare import stage as prepare

@@ -4,12 +4,12 @@ from dataclasses import fields, replace
 
 import numpy as np
 
+from cosfly.formats.boxes import MapHeader, make_box_map
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.walks import Walk
 from cosfly.geometry import DT_S
 from cosfly.planners.contract import PlanConfig, Wish
 from cosfly.planners.stage import make_scenario
-from cosfly.products.boxes import MapHeader, make_box_map
-from cosfly.products.kinds import KINDS
-from cosfly.products.walks import Walk
 from cosfly.space import kernels
 
 

@@ -11,9 +11,9 @@ from specimens_distill import make_caption as caption_of_frame
 
 from cosfly.app import pipeline
 from cosfly.app.settings import RunConfig
-from cosfly.products.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
-from cosfly.products.flights import find_flights
-from cosfly.products.inspection import (
+from cosfly.formats.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
+from cosfly.formats.flights import find_flights
+from cosfly.formats.inspection import (
     RESULTS,
     FlightFunnel,
     FlightInspection,
@@ -22,8 +22,8 @@ from cosfly.products.inspection import (
     TrajectoryFunnel,
     write_inspection,
 )  # fmt: skip
-from cosfly.products.issues import Issue
-from cosfly.products.playback import read_flight
+from cosfly.formats.issues import Issue
+from cosfly.formats.playback import read_flight
 from cosfly.runtime.config import load
 from release.export.source import open_release, read_span, scan
 from release.package.config import ReleaseConfig

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.ground import Ground, GroundGrid
 from cosfly.maps.synthetic import SyntheticConfig, load
-from cosfly.products.boxes import BoxMap
-from cosfly.products.ground import Ground, GroundGrid
 
 TILT = np.array([0.08, -0.05])  # rise over run to the east and to the north
 TOWN_M, REACH_M, CELL_M = 150.0, 160.0, 4.0

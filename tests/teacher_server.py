@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from cosfly.chat import client
-from cosfly.products.actions import TOKENS
+from cosfly.formats.actions import TOKENS
 from cosfly.runtime.journal import Journal
 
 client.FIRST_PAUSE_S, client.LONGEST_PAUSE_S = 0.01, 0.02  # no test waits for a server that fails

@@ -16,7 +16,7 @@ PACKAGES = ("cosfly", "caption", "distill", "release")
 STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")  # a folder each
 # From the ground up: a room may import what stands before it, and itself; stages do not import each other, nor do
 # siblings.
-ROOMS = ("runtime", "root", "products", "space", "look", "chat", "unreal", "stages", "siblings", "app", "cli")
+ROOMS = ("runtime", "root", "formats", "space", "look", "chat", "unreal", "stages", "siblings", "app", "cli")
 ASSEMBLY = ("app", "closed_loop", "envs", "studies", "worlds")  # what may know all stages and siblings
 HEAVY = {
     *("torch", "transformers", "peft", "accelerate", "bert_score", "datasets"),
@@ -138,7 +138,7 @@ def test_axes_of_the_tree_are_converted_where_its_files_are_read_and_written():
     importers = {
         name for name, path in SOURCES.items() if re.search(r"^from .*\bmirror_(pos|rot)", path.read_text(), re.M)
     }
-    assert importers == {"cosfly.products.frames", "cosfly.products.playback", "cosfly.unreal.conventions"}
+    assert importers == {"cosfly.formats.frames", "cosfly.formats.playback", "cosfly.unreal.conventions"}
 
 
 def test_heavy_packages_are_imported_where_they_are_used():
@@ -163,7 +163,7 @@ GATE = tuple(
 ALLOWED_TO_READ = {
     ("cosfly.runtime.ray_engine", "loads"),  # what a worker says, as `multiprocessing` reads it from a pipe
     ("cosfly.runtime.stage_events", "read_bytes"),  # /proc, whose files have no size
-    ("cosfly.products.png", "decompress"),  # of a picture, up to the size that its header gives
+    ("cosfly.formats.png", "decompress"),  # of a picture, up to the size that its header gives
     ("cosfly.chat.protocol", "loads"),  # the reply, of a bounded size
     ("cosfly.closed_loop.policy", "loads"),  # the answer of a process that it started, of a bounded size
     ("distill.student.random_student", "loads"),  # what the tokenizer's own library gives

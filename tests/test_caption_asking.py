@@ -18,7 +18,7 @@ from teacher_server import is_mirror, kept_answers
 from caption.run.stage import run
 from cosfly.chat import client
 from cosfly.chat.answers import Answer, AnswerBook
-from cosfly.products.captions import read_captions
+from cosfly.formats.captions import read_captions
 from cosfly.runtime.errors import TeacherError
 from specimens import make_playback_tree
 

@@ -15,7 +15,7 @@ from caption.truth.claims import judge_sentence
 from caption.truth.facts import Facts
 from caption.truth.numerals import chinese_number, english_number, read_numerals
 from caption.truth.stated import read_stated
-from cosfly.products.captions import Claim, Language
+from cosfly.formats.captions import Claim, Language
 
 
 def claim(told: str, **more) -> Claim:

@@ -16,7 +16,7 @@ from caption.run.window_loop import Trial, caption_window
 from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig, RepairConfig, WindowConfig
 from caption.teachers.teacher import RuleTeacher
-from cosfly.products.captions import Caption, Coc
+from cosfly.formats.captions import Caption, Coc
 from cosfly.runtime.errors import TeacherError
 from specimens import make_flight, make_playback_tree
 

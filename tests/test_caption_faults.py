@@ -16,7 +16,7 @@ from specimens_captions import deciding, report_of, settings
 from teacher_server import MODEL, TeacherServer, is_mirror, refusal
 
 from caption.run.stage import run
-from cosfly.products.captions import read_captions
+from cosfly.formats.captions import read_captions
 from cosfly.runtime.errors import TeacherError
 from specimens import make_playback_tree
 

@@ -14,11 +14,11 @@ from teacher_server import MODEL, TeacherServer
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.foreign import read_foreign
+from cosfly.formats.captions import Caption, Language, read_captions, write_captions
+from cosfly.formats.places import town_folder
+from cosfly.formats.predictions import Prediction
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.settings import InspectConfig
-from cosfly.products.captions import Caption, Language, read_captions, write_captions
-from cosfly.products.places import town_folder
-from cosfly.products.predictions import Prediction
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.stage_folder import Failed
 from distill.inference import stage as infer

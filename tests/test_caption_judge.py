@@ -14,7 +14,7 @@ from teacher_server import TeacherServer
 from caption.run.stage import run
 from caption.schema import CaptionConfig, JudgeConfig
 from caption.teachers.judge import JUDGEMENTS, UNJUDGED, check_judge, gold_conflicts, judge_messages, parse_judgement
-from cosfly.products.captions import read_captions
+from cosfly.formats.captions import read_captions
 from cosfly.runtime.errors import TeacherError
 from specimens import make_playback_tree
 

@@ -15,8 +15,8 @@ from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.doctor import examine_endpoint
 from caption.writing.contract import way_of
-from cosfly.products.answer_text import parse_answer
-from cosfly.products.captions import read_captions
+from cosfly.formats.answer_text import parse_answer
+from cosfly.formats.captions import read_captions
 from cosfly.runtime.errors import NothingKept
 from distill.student.random_student import make_tiny_student
 from specimens import make_playback_tree

@@ -12,7 +12,7 @@ from commands import invoke
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.prompt_files import PROMPTS, export_prompts, own_prompts, shipped_prompts
-from cosfly.products.captions import OWN_PROMPTS, read_captions
+from cosfly.formats.captions import OWN_PROMPTS, read_captions
 from cosfly.runtime.errors import ConfigError, ResumeError
 from specimens import make_playback_tree
 

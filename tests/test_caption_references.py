@@ -14,8 +14,8 @@ from caption.schema import WindowConfig
 from caption.truth.claims import judge_claim
 from caption.truth.facts import measure_facts
 from caption.truth.references import Fact, look_up, parse_reference, word_holds
-from cosfly.products.captions import Claim, Coc
-from cosfly.products.sentences import sentences_of
+from cosfly.formats.captions import Claim, Coc
+from cosfly.formats.sentences import sentences_of
 from specimens import make_flight
 
 FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, 6.0, 10.0))

@@ -29,9 +29,9 @@ from caption.writing.contract import Draft, Refused
 from caption.writing.filling import Filler
 from caption.writing.slots import fact_table
 from caption.writing.templates import Sentence, read_sentence
-from cosfly.products.actions import TOKENS
-from cosfly.products.answer_text import Parsed
-from cosfly.products.captions import Coc, Language, read_captions
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.answer_text import Parsed
+from cosfly.formats.captions import Coc, Language, read_captions
 from cosfly.runtime.errors import NothingKept
 from specimens import make_flight
 

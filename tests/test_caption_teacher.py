@@ -21,7 +21,7 @@ from caption.schema import CaptionConfig
 from cosfly.chat.client import KEY_VARIABLE
 from cosfly.chat.throttle import Throttle
 from cosfly.chat.wire import base_url
-from cosfly.products.captions import read_captions
+from cosfly.formats.captions import read_captions
 from cosfly.runtime.errors import CosflyError, NothingKept, TeacherError
 
 KEEP = {"hard_conflict": "keep"}

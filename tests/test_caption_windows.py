@@ -28,11 +28,11 @@ from caption.teachers.images import FrameEncoder
 from caption.teachers.prompts import make_question, question_messages
 from caption.truth.actions import TABLE, measure
 from caption.truth.facts import measure_facts
-from cosfly.products.boxes import MapHeader, make_box_map
-from cosfly.products.captions import read_captions
-from cosfly.products.flights import find_flights, read_twin
-from cosfly.products.playback import Flight, read_flight, write_flight
-from cosfly.products.segments import Mission
+from cosfly.formats.boxes import MapHeader, make_box_map
+from cosfly.formats.captions import read_captions
+from cosfly.formats.flights import find_flights, read_twin
+from cosfly.formats.playback import Flight, read_flight, write_flight
+from cosfly.formats.segments import Mission
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, perturb
 from specimens import make_flight, make_playback_tree
 

@@ -13,9 +13,9 @@ from cosfly.closed_loop.pilots import PilotAnswer
 from cosfly.closed_loop.settings import CONTROLLER_FILE, Drone
 from cosfly.closed_loop.stage import OpenFlight
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight
+from cosfly.formats.actions import TOKENS
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_flight
-from cosfly.products.actions import TOKENS
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.errors import ConfigError
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from test_products_pursuits import frame, pursuit
+from test_formats_pursuits import frame, pursuit
 
 from cosfly.closed_loop.measures import MEASURES, measure, score_pursuits
-from cosfly.products.flight_scores import SCORE, SCORE_FORMAT, read_score
+from cosfly.formats.flight_scores import SCORE, SCORE_FORMAT, read_score
 from cosfly.runtime.store import write_model
 
 

@@ -10,9 +10,9 @@ from test_closed_loop_fly import TINY, fly, town  # noqa: F401
 
 from cosfly.closed_loop.settings import Drone
 from cosfly.closed_loop.stepper import ClosedLoopFlight
-from cosfly.products.captions import read_captions
-from cosfly.products.flights import find_flights
-from cosfly.products.playback import read_flight
+from cosfly.formats.captions import read_captions
+from cosfly.formats.flights import find_flights
+from cosfly.formats.playback import read_flight
 from cosfly.runtime.errors import NothingKept
 from cosfly.runtime.runner import run_items
 

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from cosfly.chat.contract import Reply
 from cosfly.chat.protocol import error_words, read_body, read_completion, read_models
 from cosfly.chat.wire import Response
-from cosfly.products.answer_text import normalize_action, parse_answer
-from cosfly.products.captions import Coc
+from cosfly.formats.answer_text import normalize_action, parse_answer
+from cosfly.formats.captions import Coc
 from cosfly.runtime.objects import find_object
 
 GOOD = {

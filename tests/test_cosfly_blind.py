@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cosfly.formats.segments import Segment
 from cosfly.geometry import rotation_matrices
-from cosfly.products.segments import Segment
 from cosfly.space.blind import decide, fit_network, fit_rule, is_drawn_ahead, past_of
 from specimens import make_flight
 

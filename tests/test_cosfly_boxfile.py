@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from cosfly.formats.boxes import BoxMap, read_boxes, write_boxes
+from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES, KINDS
 from cosfly.maps.boxfile import BoxesConfig, load, plausibility
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
-from cosfly.products.boxes import BoxMap, read_boxes, write_boxes
-from cosfly.products.kinds import GROUND_KINDS, KIND_NAMES, KINDS
 from cosfly.runtime.errors import ConfigError, InputError
 
 # Three boxes, as a table would have them: a turned house, a tree, a road.

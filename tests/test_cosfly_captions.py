@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from specimens_distill import make_caption
 
-from cosfly.products.actions import TOKENS
-from cosfly.products.answer_text import answer_schema, is_in_script, normalize_action, parse_answer
-from cosfly.products.captions import Caption, Coc, read_captions, write_captions
-from cosfly.products.sentences import END, cut_sentences
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.answer_text import answer_schema, is_in_script, normalize_action, parse_answer
+from cosfly.formats.captions import Caption, Coc, read_captions, write_captions
+from cosfly.formats.sentences import END, cut_sentences
 from cosfly.runtime.errors import InputError
 
 GOOD = {

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.coverage import AXES, Coverage, azimuths_deg, coverage_of, default_coverage
+from cosfly.formats.flights import find_flights
+from cosfly.formats.playback import read_flight
 from cosfly.look.coverage_page import coverage_html, ranges, shares
-from cosfly.products.actions import TOKENS
-from cosfly.products.coverage import AXES, Coverage, azimuths_deg, coverage_of, default_coverage
-from cosfly.products.flights import find_flights
-from cosfly.products.playback import read_flight
 from specimens import make_playback_tree
 
 

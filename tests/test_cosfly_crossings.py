@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from cosfly.app.settings import RunConfig
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.walks import Walk
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.crossings import CROSSING, ROAD, where_walked
 from cosfly.pedestrians.others import company_of
 from cosfly.pedestrians.stage import make_walk
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
-from cosfly.products.kinds import KINDS
-from cosfly.products.walks import Walk
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import load, shipped
 from cosfly.simplify.passes import simplify

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import frame_name
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import frame_name
 from cosfly.runtime.documents import read_json
 from cosfly.studies.depth import (
     BITS,

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from specimens_slopes import on_ground, sampled, sloped_city
 
+from cosfly.formats.boxes import BoxMap, read_boxes
+from cosfly.formats.kinds import GROUND_KINDS, KINDS
 from cosfly.maps.boxfile import BoxesConfig
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.cityjson import CityJsonConfig
@@ -14,8 +16,6 @@ from cosfly.maps.derived_ground import CREDITS, NEAR_M, PAVEMENT_M, with_derived
 from cosfly.maps.stage import MapsConfig, load_map, run
 from cosfly.pedestrians.stage import make_walk
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
-from cosfly.products.boxes import BoxMap, read_boxes
-from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.render.draping import drape, is_draped
 from cosfly.runtime.chance import rng_for
 from cosfly.simplify.passes import SimplifyConfig, simplify

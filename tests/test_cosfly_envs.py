@@ -17,7 +17,7 @@ import cosfly.envs
 from cosfly.closed_loop.policy import MOST_LATE, Policy
 from cosfly.envs.episodes import HELD_OUT, TASKS, TRAINING, read_list
 from cosfly.envs.follow import FULL_REWARD_M, NO_REWARD_M, reward_of
-from cosfly.products.pursuits import read_pursuit
+from cosfly.formats.pursuits import read_pursuit
 from cosfly.runtime.config import read_yaml
 from cosfly.runtime.errors import InputError
 

@@ -10,8 +10,8 @@ from specimens_foreign import write_foreign_tree
 
 from caption.run.stage import run as caption_run
 from caption.schema import CaptionConfig
-from cosfly.products.flights import find_flights
-from cosfly.products.places import FlightChoice
+from cosfly.formats.flights import find_flights
+from cosfly.formats.places import FlightChoice
 from cosfly.runtime.errors import InputError
 from distill.prepare import stage as prepare
 from distill.prepare.sources import RunSource as Prepared

@@ -16,10 +16,10 @@ from caption.schema import CaptionConfig, ImageConfig, Window, WindowConfig
 from caption.teachers.images import FrameEncoder, pictures_of
 from caption.teachers.prompts import make_question, prompt_hash, question_messages
 from caption.teachers.teacher import RuleTeacher
+from cosfly.formats.captions import PICTURES_MARK, Language
+from cosfly.formats.flights import find_flights
+from cosfly.formats.playback import read_flight
 from cosfly.look.frame_views import PEDESTRIAN_RGB, Pictures
-from cosfly.products.captions import PICTURES_MARK, Language
-from cosfly.products.flights import find_flights
-from cosfly.products.playback import read_flight
 from cosfly.runtime.errors import InputError
 from distill.inference.stage import InferConfig, make_request
 from distill.prepare.stage import PrepareConfig, make_sample

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
+from cosfly.formats.boxes import make_box_map
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.roi import Roi
 from cosfly.geometry import rotation_matrix
-from cosfly.products.boxes import make_box_map
-from cosfly.products.kinds import KINDS
-from cosfly.products.roi import Roi
 from cosfly.space.grid import (
     OccupancyGrid,
     blocks_walking,

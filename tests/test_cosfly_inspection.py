@@ -14,16 +14,9 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from cosfly.geometry import mask_box
-from cosfly.inspection import frames
-from cosfly.inspection.files import check_recorded
-from cosfly.inspection.flight import check_plan, is_shifted
-from cosfly.inspection.frames import check_others, pedestrian_region
-from cosfly.inspection.settings import InspectConfig
-from cosfly.inspection.stage import run
-from cosfly.products.boxes import make_box_map, read_boxes, write_boxes
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import (
+from cosfly.formats.boxes import make_box_map, read_boxes, write_boxes
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import (
     OtherMeta,
     OthersMeta,
     depth_file,
@@ -32,11 +25,18 @@ from cosfly.products.frames import (
     read_instance,
     tree_position,
 )
-from cosfly.products.inspection import read_inspection
-from cosfly.products.issues import Report
-from cosfly.products.kinds import KINDS
-from cosfly.products.playback import read_flight, write_flight
-from cosfly.products.traces import DroneTrace, write_traces
+from cosfly.formats.inspection import read_inspection
+from cosfly.formats.issues import Report
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.playback import read_flight, write_flight
+from cosfly.formats.traces import DroneTrace, write_traces
+from cosfly.geometry import mask_box
+from cosfly.inspection import frames
+from cosfly.inspection.files import check_recorded
+from cosfly.inspection.flight import check_plan, is_shifted
+from cosfly.inspection.frames import check_others, pedestrian_region
+from cosfly.inspection.settings import InspectConfig
+from cosfly.inspection.stage import run
 from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import NothingKept
 from cosfly.runtime.files import sha256_file

@@ -11,14 +11,14 @@ from numpy.testing import assert_allclose
 
 import cosfly
 from cosfly.app import library
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.maps import stage as maps_stage
 from cosfly.maps.stage import MapsConfig
 from cosfly.pedestrians import stage as pedestrians_stage
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners import stage as plan_stage
 from cosfly.planners.contract import PLANNERS, PlanConfig
-from cosfly.products.boxes import BoxMap
-from cosfly.products.traces import DroneTrace, read_traces
 from cosfly.render.contract import PERSON_ID
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError

@@ -11,10 +11,10 @@ import pytest
 from numpy.testing import assert_allclose
 from specimens_slopes import CITY_EAST_M, CITY_NORTH_M, city_height_m, sloped_city
 
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.kinds import GROUND_KINDS, KINDS
 from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.stage import MapsConfig, load_map
-from cosfly.products.boxes import BoxMap
-from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.space.grid import lies_off_ground
 
 Model = dict

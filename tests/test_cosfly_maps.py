@@ -13,12 +13,12 @@ from tables import each
 from test_cosfly_map_kinds import city as two_houses
 from test_cosfly_map_kinds import document, load
 
+from cosfly.formats.boxes import BoxMap, read_boxes
+from cosfly.formats.kinds import KINDS
 from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.footprints import Rectangle, cover, oriented_rectangle, rectangle_polygon, united
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.stage import MapsConfig, load_map, run
-from cosfly.products.boxes import BoxMap, read_boxes
-from cosfly.products.kinds import KINDS
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import ConfigError, InputError, ResumeError
 from cosfly.simplify.passes import SimplifyConfig, simplify

@@ -11,11 +11,11 @@ from test_renderers_contract import street
 from typer.testing import CliRunner
 
 from cosfly.cli import app
+from cosfly.formats.boxes import BoxMap, read_boxes
 from cosfly.maps import carla_export
 from cosfly.maps.carla_export import CarlaMapConfig, CarlaTown, box_map_of
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
-from cosfly.products.boxes import BoxMap, read_boxes
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing
 
 pytest.importorskip("carla")

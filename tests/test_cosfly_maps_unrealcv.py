@@ -16,12 +16,12 @@ from test_renderers_contract import street
 from typer.testing import CliRunner
 
 from cosfly.cli import app
+from cosfly.formats.boxes import BoxMap, read_boxes
+from cosfly.formats.kinds import KINDS
 from cosfly.maps import unrealcv_export
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig, level_map
-from cosfly.products.boxes import BoxMap, read_boxes
-from cosfly.products.kinds import KINDS
 from cosfly.runtime.errors import EnvironmentMissing, InputError
 from cosfly.unreal.assets import id_of, kind_of
 

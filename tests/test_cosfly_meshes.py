@@ -14,16 +14,16 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
+from cosfly.formats.frames import Look
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.meshes import MESHES_FILE, Meshes, MeshRef, write_meshes
 from cosfly.geometry import intrinsic_matrix, look_at, world_from_camera
 from cosfly.maps import cityjson
 from cosfly.maps.cityjson import CityJsonConfig, solid_mesh, top_within, triangles_of
 from cosfly.maps.footprints import Rectangle
 from cosfly.maps.stage import MapsConfig
 from cosfly.maps.stage import run as make_map
-from cosfly.products.boxes import BoxMap, make_box_map, read_boxes, write_boxes
-from cosfly.products.frames import Look
-from cosfly.products.kinds import KINDS
-from cosfly.products.meshes import MESHES_FILE, Meshes, MeshRef, write_meshes
 from cosfly.render.contract import (
     GROUND_PLANE_DROP_M,
     GROUND_PLANE_HALF_M,

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from cosfly.formats.boxes import make_box_map
+from cosfly.formats.flights import find_flights
+from cosfly.formats.motion import PlannedMotion
+from cosfly.formats.playback import read_flight, write_flight
+from cosfly.formats.segments import Mission, Segment
+from cosfly.formats.traces import DroneTrace
 from cosfly.geometry import rotation_matrices
-from cosfly.products.boxes import make_box_map
-from cosfly.products.flights import find_flights
-from cosfly.products.motion import PlannedMotion
-from cosfly.products.playback import read_flight, write_flight
-from cosfly.products.segments import Mission, Segment
-from cosfly.products.traces import DroneTrace
 from cosfly.render.perturbation import Surroundings
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import script_flight

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, write_boxes
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.others import Company, Other, gaps_m, read_others, write_others
+from cosfly.formats.walks import read_paths
 from cosfly.pedestrians.lanes import lanes_of
 from cosfly.pedestrians.others import PASS_M, company_of
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, run, walkable_ground
-from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, write_boxes
-from cosfly.products.kinds import KINDS
-from cosfly.products.others import Company, Other, gaps_m, read_others, write_others
-from cosfly.products.walks import read_paths
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import dump_json

@@ -12,14 +12,14 @@ from test_renderers_contract import circling, street, write_inputs
 from typer.testing import CliRunner
 
 from cosfly.cli import app
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import read_instance, read_meta, read_rgb
+from cosfly.formats.playback import read_flight
+from cosfly.formats.town import read_instance_ids
+from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
 from cosfly.geometry import box_corners, intrinsic_matrix, project, world_from_camera
 from cosfly.look.gallery import four_panels
 from cosfly.look.overlay import TARGET_COLOR, Overlay, _lines
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import read_instance, read_meta, read_rgb
-from cosfly.products.playback import read_flight
-from cosfly.products.town import read_instance_ids
-from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.contract import instance_ids
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run

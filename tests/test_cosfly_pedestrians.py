@@ -5,6 +5,11 @@ import cv2
 import numpy as np
 import pytest
 
+from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
+from cosfly.formats.ground import Ground
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.roi import Roi
+from cosfly.formats.walks import paces_of, read_paths
 from cosfly.geometry import DT_S
 from cosfly.pedestrians.crossings import costs_of
 from cosfly.pedestrians.stage import (
@@ -16,11 +21,6 @@ from cosfly.pedestrians.stage import (
     sample_start,
     walkable_ground,
 )
-from cosfly.products.boxes import MapHeader, make_box_map, read_boxes, write_boxes
-from cosfly.products.ground import Ground
-from cosfly.products.kinds import KINDS
-from cosfly.products.roi import Roi
-from cosfly.products.walks import paces_of, read_paths
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.store import dump_json
 from cosfly.space.grid import OccupancyGrid

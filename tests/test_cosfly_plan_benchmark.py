@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from specimens_planning import WORLDS, walk_along
 
+from cosfly.formats.boxes import write_boxes
+from cosfly.formats.walks import write_paths
 from cosfly.planners import benchmark
 from cosfly.planners.benchmark import CRITERIA, PAPER, WEIGHTS, BenchmarkConfig, read_benchmark
 from cosfly.planners.compare import FlightsOfWalk
 from cosfly.planners.contract import ALL_PLANNERS
-from cosfly.products.boxes import write_boxes
-from cosfly.products.walks import write_paths
 from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.stage_folder import read_item, result_of

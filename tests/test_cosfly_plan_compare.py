@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from specimens_planning import CANYON, town_of, walk_along
 
+from cosfly.formats.boxes import write_boxes
+from cosfly.formats.traces import read_traces
+from cosfly.formats.walks import write_paths
 from cosfly.planners import compare
 from cosfly.planners.compare import CompareConfig
-from cosfly.products.boxes import write_boxes
-from cosfly.products.traces import read_traces
-from cosfly.products.walks import write_paths
 from cosfly.runtime.errors import NoPathError
 
 CFG = CompareConfig()

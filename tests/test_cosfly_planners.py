@@ -11,13 +11,13 @@ from scipy.optimize import minimize
 from specimens_planning import CANYON, WORLDS, assert_safe, first_points, scenario_of, town_of, walk_along
 
 import cosfly.planners.stage as planners
+from cosfly.formats.boxes import write_boxes
+from cosfly.formats.traces import read_traces
+from cosfly.formats.walks import write_paths
 from cosfly.geometry import DT_S, look_at
 from cosfly.planners.contract import MucoConfig, PlanConfig, Wish
 from cosfly.planners.muco import loss, muco, step
 from cosfly.planners.muco.nearby import nothing_nearby
-from cosfly.products.boxes import write_boxes
-from cosfly.products.traces import read_traces
-from cosfly.products.walks import write_paths
 from cosfly.runtime.errors import ResumeError
 from cosfly.space import flight_metrics as metrics
 from cosfly.space import kernels

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from cosfly.products.png import areas_png, colours_png, floats_of, floats_png, parse_png
+from cosfly.formats.png import areas_png, colours_png, floats_of, floats_png, parse_png
 from cosfly.runtime.errors import InputError
 
 KIND_OF = {1: 0, 2: 4, 3: 2, 4: 6}

@@ -20,10 +20,10 @@ from tables import each
 from typer.testing import CliRunner
 
 from cosfly.cli import app
+from cosfly.formats.boxes import read_boxes
+from cosfly.formats.frames import depth_bytes, read_depth, rgb_bytes
 from cosfly.maps import cityjson
 from cosfly.maps.footprints import check_outline, num_crossings
-from cosfly.products.boxes import read_boxes
-from cosfly.products.frames import depth_bytes, read_depth, rgb_bytes
 from cosfly.runtime import arrays, documents, files, tables
 from cosfly.runtime.config import Config, apply_overrides, build, read_yaml
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError

@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 from tables import each
 from test_renderers_contract import circling, pose_towards, street, write_inputs
 
+from cosfly.formats.boxes import BoxMap, make_box_map
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import Camera, Look, frame_name, read_depth, read_instance, read_meta, read_rgb
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.others import Other
+from cosfly.formats.people import draw_appearance
+from cosfly.formats.playback import read_flight
+from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
 from cosfly.geometry import focal_px, intrinsic_matrix, look_at, world_from_camera
-from cosfly.products.boxes import BoxMap, make_box_map
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import Camera, Look, frame_name, read_depth, read_instance, read_meta, read_rgb
-from cosfly.products.kinds import KINDS
-from cosfly.products.others import Other
-from cosfly.products.people import draw_appearance
-from cosfly.products.playback import read_flight
-from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.camera import rendered_visibility, view_target
 from cosfly.render.contract import (
     FAR_M,

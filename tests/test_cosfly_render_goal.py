@@ -8,15 +8,15 @@ import pytest
 from test_cosfly_render import needs_gl
 from test_renderers_contract import circling, pose_towards, write_inputs
 
+from cosfly.formats.boxes import make_box_map
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import PERSON_ID, read_depth, read_instance, read_rgb
+from cosfly.formats.goals import LANDMARKS, SIDES, SeenFrame, meant, target_picture, words_of
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.others import Company, Other, write_others
+from cosfly.formats.people import Appearance, People
+from cosfly.formats.playback import TARGET_FILE, read_flight
 from cosfly.geometry import intrinsic_matrix, world_from_camera
-from cosfly.products.boxes import make_box_map
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import PERSON_ID, read_depth, read_instance, read_rgb
-from cosfly.products.goals import LANDMARKS, SIDES, SeenFrame, meant, target_picture, words_of
-from cosfly.products.kinds import KINDS
-from cosfly.products.others import Company, Other, write_others
-from cosfly.products.people import Appearance, People
-from cosfly.products.playback import TARGET_FILE, read_flight
 from cosfly.render.contract import Frame, PosedOther, PosedPerson, other_id
 from cosfly.render.flight import are_told_apart, find_goal
 from cosfly.render.person import choose_clothes

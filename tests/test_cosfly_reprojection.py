@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cosfly.products.kinds import KINDS, LAYERS
+from cosfly.formats.kinds import KINDS, LAYERS
 from cosfly.space.reprojection import COLUMNS, FLAT, GRID_ROWS, View, compare_views, median_of
 
 

@@ -12,11 +12,11 @@ from test_cosfly_inspection import CFG, plan_of, write_map
 from typer.testing import CliRunner
 
 from cosfly.cli import app
+from cosfly.formats.flights import find_flights
+from cosfly.formats.inspection import read_inspection
+from cosfly.formats.review import REVIEW, Choice, add_decisions, read_decisions, read_settled
+from cosfly.formats.traces import write_traces
 from cosfly.inspection.stage import run
-from cosfly.products.flights import find_flights
-from cosfly.products.inspection import read_inspection
-from cosfly.products.review import REVIEW, Choice, add_decisions, read_decisions, read_settled
-from cosfly.products.traces import write_traces
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import sha256_file
 from release.package.sources import Source, gather

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from specimens_slopes import sloped_town
 
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.traces import DroneTrace
 from cosfly.geometry import intrinsic_matrix, world_from_camera
 from cosfly.maps.stage import MapsConfig
 from cosfly.maps.stage import load_map as load_source
-from cosfly.products.boxes import BoxMap
-from cosfly.products.kinds import KINDS
-from cosfly.products.traces import DroneTrace
 from cosfly.render.contract import NO_INSTANCE, instance_ids
 from cosfly.render.rim import FLIGHTS_TO_M, REACH_M, SOLIDS_FROM_M, check_outside_rim, rim_of
 from cosfly.render.stage import open_renderer

@@ -15,13 +15,13 @@ import pytest
 from browser import Page, browser
 from commands import invoke
 
+from cosfly.formats.backdrop import WorldFrame, write_backdrop
+from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.roi import read_roi
+from cosfly.formats.walks import read_paths
 from cosfly.pedestrians.roi_editor import Server, open_editor
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
-from cosfly.products.backdrop import WorldFrame, write_backdrop
-from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
-from cosfly.products.kinds import KINDS
-from cosfly.products.roi import read_roi
-from cosfly.products.walks import read_paths
 from cosfly.space.grid import roi_mask
 
 CFG = PedestriansConfig(num_paths=2, min_distance_m=20, max_distance_m=40, min_component_cells=50)

@@ -14,13 +14,13 @@ from browser import browser
 from commands import invoke
 from test_cosfly_inspection import plan_of
 
+from cosfly.formats.boxes import MapHeader, make_box_map, write_boxes
+from cosfly.formats.flights import find_flights
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.playback import read_flight
+from cosfly.formats.traces import write_traces
 from cosfly.geometry import box_corners
 from cosfly.look.scene_page import run
-from cosfly.products.boxes import MapHeader, make_box_map, write_boxes
-from cosfly.products.flights import find_flights
-from cosfly.products.kinds import KINDS
-from cosfly.products.playback import read_flight
-from cosfly.products.traces import write_traces
 from specimens import make_playback_tree
 
 EVIL = "</script><script>window.hacked=1</script><img src=x onerror='window.hacked=2'>"

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tables import each
 
-from cosfly.products.boxes import BoxMap, make_box_map, read_boxes, write_boxes
-from cosfly.products.kinds import KINDS
+from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
+from cosfly.formats.kinds import KINDS
 from cosfly.runtime.errors import ResumeError
 from cosfly.simplify.passes import (
     MergeRule,

@@ -9,14 +9,14 @@ from numpy.testing import assert_allclose
 from specimens_slopes import CELL_M, SHAPES, TILT, flat_town, on_ground, plane_m, sampled, sloped_town
 from test_renderers_contract import NAMES
 
+from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
+from cosfly.formats.ground import Ground
+from cosfly.formats.kinds import GROUND_KINDS, KINDS
+from cosfly.formats.walks import Walk
 from cosfly.geometry import DT_S, intrinsic_matrix, world_from_camera
 from cosfly.pedestrians.stage import PedestriansConfig, walkable_ground
 from cosfly.planners.contract import PLANNERS, PlanConfig
 from cosfly.planners.stage import plan_flight
-from cosfly.products.boxes import BoxMap, make_box_map, read_boxes, write_boxes
-from cosfly.products.ground import Ground
-from cosfly.products.kinds import GROUND_KINDS, KINDS
-from cosfly.products.walks import Walk
 from cosfly.render.draping import BARE_GROUND, drape, is_draped
 from cosfly.render.stage import open_renderer
 from cosfly.simplify.passes import SimplifyConfig, simplify

@@ -1,4 +1,4 @@
-"""cosfly/products/splits.py: what one walk is, and splits that share none."""
+"""cosfly/formats/splits.py: what one walk is, and splits that share none."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosfly.products.playback import Flight, read_flight, write_flight
-from cosfly.products.splits import SPLITS, Course, assign_splits, town_family, walks_of
+from cosfly.formats.playback import Flight, read_flight, write_flight
+from cosfly.formats.splits import SPLITS, Course, assign_splits, town_family, walks_of
 from cosfly.runtime.errors import InputError
 from specimens import make_flight
 

@@ -22,12 +22,12 @@ from specimens_foreign import NOBODY, write_foreign_tree
 
 from caption.run import stage as caption_stage
 from caption.schema import CaptionConfig
+from cosfly.formats.captions import read_captions
+from cosfly.formats.flights import find_flights, read_twin
+from cosfly.formats.inspection import read_inspection
+from cosfly.formats.playback import read_flight, write_flight
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.settings import InspectConfig
-from cosfly.products.captions import read_captions
-from cosfly.products.flights import find_flights, read_twin
-from cosfly.products.inspection import read_inspection
-from cosfly.products.playback import read_flight, write_flight
 from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.stage_folder import read_failures

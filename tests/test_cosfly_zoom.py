@@ -12,14 +12,14 @@ import pytest
 from test_cosfly_render import needs_gl
 from test_renderers_contract import circling, write_inputs
 
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import level_name, read_meta
+from cosfly.formats.inspection import read_inspection
+from cosfly.formats.playback import read_flight, write_flight
+from cosfly.formats.segments import Segment
+from cosfly.formats.traces import DroneTrace
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.flight import InspectConfig
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import level_name, read_meta
-from cosfly.products.inspection import read_inspection
-from cosfly.products.playback import read_flight, write_flight
-from cosfly.products.segments import Segment
-from cosfly.products.traces import DroneTrace
 from cosfly.render.lens import ZoomConfig, cameras_of, zoomed_deg
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run

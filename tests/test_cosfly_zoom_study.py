@@ -13,8 +13,8 @@ from test_renderers_contract import circling, write_inputs
 from typer.testing import CliRunner
 
 from cosfly.cli import app
+from cosfly.formats.frames import Camera
 from cosfly.geometry import intrinsic_matrix
-from cosfly.products.frames import Camera
 from cosfly.runtime.stage_folder import read_manifest
 from cosfly.studies.zoom import enlarged_camera
 

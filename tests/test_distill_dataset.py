@@ -19,11 +19,11 @@ from pydantic import ValidationError
 from specimens_distill import make_caption, make_captions, prepared
 from specimens_foreign import write_foreign_tree
 
-from cosfly.products.actions import TOKENS
-from cosfly.products.answer_text import parse_answer
-from cosfly.products.captions import write_captions
-from cosfly.products.playback import read_flight
-from cosfly.products.splits import SPLITS
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.answer_text import parse_answer
+from cosfly.formats.captions import write_captions
+from cosfly.formats.playback import read_flight
+from cosfly.formats.splits import SPLITS
 from cosfly.runtime.errors import ResumeError, VerifyError
 from cosfly.space.blind import past_of
 from distill.prepare import stage
@@ -117,7 +117,7 @@ def asked(tmp_path_factory):
     """A caption with a prompt as `cosfly caption` makes it."""
     from caption.run.stage import run as caption_run
     from caption.schema import CaptionConfig
-    from cosfly.products.captions import read_captions
+    from cosfly.formats.captions import read_captions
 
     root = tmp_path_factory.mktemp("asked")
     path = caption_run(

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from tables import each
 
-from cosfly.products.playback import read_flight
-from cosfly.products.splits import SPLITS
+from cosfly.formats.playback import read_flight
+from cosfly.formats.splits import SPLITS
 from cosfly.runtime.stage_folder import read_failures, read_manifest
 from distill.prepare import dual_track
 from distill.prepare.dual_track import DualTrackConfig, TrackSample, read_track_samples, read_track_set, windows_of

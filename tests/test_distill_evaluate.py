@@ -13,9 +13,9 @@ import pytest
 from commands import invoke
 from specimens_distill import make_caption, write_set
 
-from cosfly.products.actions import TOKENS
-from cosfly.products.figures import draw_walks
-from cosfly.products.predictions import Prediction, read_predictions
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.figures import draw_walks
+from cosfly.formats.predictions import Prediction, read_predictions
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import dump_json
 from cosfly.space.blind import LEAST_WINDOWS

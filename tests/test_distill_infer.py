@@ -14,7 +14,7 @@ from PIL import Image
 from specimens_distill import make_captions, prepared
 from teacher_server import TeacherServer, kept_answers
 
-from cosfly.products.predictions import read_predictions
+from cosfly.formats.predictions import read_predictions
 from cosfly.runtime.errors import ResumeError, TeacherError
 from distill.inference import stage as infer
 from distill.schema import open_split

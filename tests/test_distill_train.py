@@ -15,7 +15,7 @@ pytest.importorskip("peft", reason="needs the extra distill")
 
 from specimens_students import FAST, MAX_PIXELS, begun, inputs_of, load, log_of, run, samples_of, trees_of  # noqa: E402
 
-from cosfly.products.predictions import read_predictions  # noqa: E402
+from cosfly.formats.predictions import read_predictions  # noqa: E402
 from distill.inference import stage as infer  # noqa: E402
 from distill.student import model as student  # noqa: E402
 from distill.student.checkpoint import load_checkpoint  # noqa: E402

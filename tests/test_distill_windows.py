@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from specimens_release import CFG, build, make_caption, make_inspection
 
-from cosfly.products.captions import write_captions
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import frame_name, read_rgb
-from cosfly.products.inspection import write_inspection
-from cosfly.products.playback import read_flight
+from cosfly.formats.captions import write_captions
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import frame_name, read_rgb
+from cosfly.formats.inspection import write_inspection
+from cosfly.formats.playback import read_flight
 from distill.windows import FACTS, Windows
 from specimens import make_playback_tree
 

@@ -31,10 +31,10 @@ from test_docs_commands import ALL, PAGES, blocks
 from typer.testing import CliRunner
 
 from cosfly.cli import app
+from cosfly.formats.captions import read_captions
+from cosfly.formats.kinds import KIND_NAMES
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
-from cosfly.products.captions import read_captions
-from cosfly.products.kinds import KIND_NAMES
 from cosfly.runtime import runner
 from cosfly.runtime.config import shipped
 from cosfly.runtime.runner import Item, Watch

@@ -30,9 +30,9 @@ from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import NoAnswer, Reply, Request, started
 from cosfly.chat.vllm_engine import VllmEngine
-from cosfly.products.answer_text import answer_schema, parse_answer
-from cosfly.products.captions import Usage, read_captions
-from cosfly.products.predictions import read_predictions
+from cosfly.formats.answer_text import answer_schema, parse_answer
+from cosfly.formats.captions import Usage, read_captions
+from cosfly.formats.predictions import read_predictions
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, TeacherError
 from distill.inference import stage as infer
 from distill.schema import open_split

@@ -14,14 +14,14 @@ from typing import Any, NamedTuple
 import pytest
 from specimens_release import build, make_inputs
 
+from cosfly.formats.answer_text import parse_answer
+from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
+from cosfly.formats.captions import read_captions
+from cosfly.formats.frames import DEPTH_PNG, read_depth, read_instance, read_meta, read_rgb
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.playback import read_flight
+from cosfly.formats.roi import read_roi
 from cosfly.maps import boxfile, cityjson, simworld
-from cosfly.products.answer_text import parse_answer
-from cosfly.products.boxes import MapHeader, make_box_map, read_boxes, write_boxes
-from cosfly.products.captions import read_captions
-from cosfly.products.frames import DEPTH_PNG, read_depth, read_instance, read_meta, read_rgb
-from cosfly.products.kinds import KINDS
-from cosfly.products.playback import read_flight
-from cosfly.products.roi import read_roi
 from cosfly.runtime.errors import CosflyError
 from cosfly.runtime.stage_folder import read_manifest
 from cosfly.runtime.store import CHECKSUMS, read_checksums, write_json

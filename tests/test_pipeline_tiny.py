@@ -14,9 +14,9 @@ from cosfly.app import pipeline
 from cosfly.app.estimate import estimate
 from cosfly.app.settings import RunConfig
 from cosfly.cli import app
-from cosfly.products.captions import read_captions
-from cosfly.products.flights import find_flights
-from cosfly.products.playback import read_flight
+from cosfly.formats.captions import read_captions
+from cosfly.formats.flights import find_flights
+from cosfly.formats.playback import read_flight
 from cosfly.runtime.config import load
 from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import ConfigError, ResumeError, VerifyError

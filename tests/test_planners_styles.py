@@ -14,6 +14,11 @@ from caption.schema import FutureMotion
 from caption.truth.actions import TABLE as ACTION_TABLE
 from caption.truth.actions import measure
 from cosfly.app.settings import RunConfig
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.boxes import write_boxes
+from cosfly.formats.frames import LEGIBLE_HEIGHT_PX, Camera
+from cosfly.formats.traces import DroneTrace, read_traces
+from cosfly.formats.walks import paces_of, walk_id, write_paths
 from cosfly.geometry import intrinsic_matrix, look_at, world_from_camera, wrap_deg
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.stage import make_walk
@@ -24,11 +29,6 @@ from cosfly.planners.intent import draw_intent, draw_styles
 from cosfly.planners.reacquire import finds_again, screens_of
 from cosfly.planners.stage import draw_styles_of, make_scenario, plan_flight, run, style_rng
 from cosfly.planners.styles import FOLLOW, NAMES, OTHER_SIDE, REACQUIRE, RETURN_HOME, TABLE
-from cosfly.products.actions import TOKENS
-from cosfly.products.boxes import write_boxes
-from cosfly.products.frames import LEGIBLE_HEIGHT_PX, Camera
-from cosfly.products.traces import DroneTrace, read_traces
-from cosfly.products.walks import paces_of, walk_id, write_paths
 from cosfly.render.camera import view_target
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import load, shipped

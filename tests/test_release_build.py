@@ -20,11 +20,11 @@ from specimens_release import FREE, all_bytes, make_caption, make_inspection, re
 
 from caption.run import stage as caption_stage
 from caption.schema import CaptionConfig
-from cosfly.products.captions import write_captions
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import depth_bytes, read_depth
-from cosfly.products.inspection import write_inspection
-from cosfly.products.playback import read_flight
+from cosfly.formats.captions import write_captions
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import depth_bytes, read_depth
+from cosfly.formats.inspection import write_inspection
+from cosfly.formats.playback import read_flight
 from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.errors import InputError, VerifyError
 from release.package.config import ReleaseConfig

@@ -9,10 +9,10 @@ import pytest
 from commands import invoke
 from specimens_release import CFG, build, make_caption, make_inspection
 
-from cosfly.products.captions import Coc, read_captions, write_captions
-from cosfly.products.flights import find_flights
-from cosfly.products.inspection import write_inspection
-from cosfly.products.playback import read_flight
+from cosfly.formats.captions import Coc, read_captions, write_captions
+from cosfly.formats.flights import find_flights
+from cosfly.formats.inspection import write_inspection
+from cosfly.formats.playback import read_flight
 from cosfly.runtime.errors import InputError, StorageError
 from release.export.captions import FORMULA, export
 from specimens import make_playback_tree

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from specimens_release import TWO_SPLITS, make_release, rows_by_id
 from specimens_rows import make_row
 
-from cosfly.products.actions import TOKENS
+from cosfly.formats.actions import TOKENS
 from cosfly.runtime.arrays import parse_picture
 from release.card.croissant import CROISSANT
 from release.card.numbers import RowCounts, spread_of

@@ -25,12 +25,12 @@ from specimens_release import (
     rows_by_id,
 )
 
-from cosfly.products.captions import write_captions
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import depth_bytes
-from cosfly.products.inspection import write_inspection
-from cosfly.products.playback import read_flight
-from cosfly.products.town import read_town_map
+from cosfly.formats.captions import write_captions
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import depth_bytes
+from cosfly.formats.inspection import write_inspection
+from cosfly.formats.playback import read_flight
+from cosfly.formats.town import read_town_map
 from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.config import build as build_config
 from cosfly.runtime.documents import read_model

@@ -10,11 +10,11 @@ import pytest
 from test_cosfly_render import needs_gl
 from test_cosfly_render_goal import crowded_tree  # noqa: F401
 
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import FILE_NAMES, PERSON_ID, frame_path
-from cosfly.products.goals import SLOTS, words_of
-from cosfly.products.people import People
-from cosfly.products.playback import read_flight
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import FILE_NAMES, PERSON_ID, frame_path
+from cosfly.formats.goals import SLOTS, words_of
+from cosfly.formats.people import People
+from cosfly.formats.playback import read_flight
 from release.columns import SCALARS, Placement
 from release.export.lerobot import task_of
 from release.export.source import ReleasedRows

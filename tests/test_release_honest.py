@@ -26,7 +26,7 @@ from teacher_server import TeacherServer
 from caption.run.released import read_released
 from cosfly.app import pipeline
 from cosfly.app.settings import RunConfig
-from cosfly.products.captions import write_captions
+from cosfly.formats.captions import write_captions
 from cosfly.runtime.config import load
 from release.package import stage as package
 from release.package.sources import Source

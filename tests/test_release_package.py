@@ -17,13 +17,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from specimens_release import CFG, all_bytes, build, make_inspection, rewrite_captions, source_of
 
-from cosfly.products.boxes import MapHeader
-from cosfly.products.frames import read_depth, read_instance, read_rgb
-from cosfly.products.inspection import (
+from cosfly.formats.boxes import MapHeader
+from cosfly.formats.frames import read_depth, read_instance, read_rgb
+from cosfly.formats.inspection import (
     write_inspection,
 )
-from cosfly.products.playback import read_flight
-from cosfly.products.town import write_town_map
+from cosfly.formats.playback import read_flight
+from cosfly.formats.town import write_town_map
 from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import ConfigError, InputError
 from release.card.render import render_card

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from specimens_release import build, make_inputs
 from specimens_rows import make_row
 
+from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M
+from cosfly.formats.inspection import read_inspection, write_inspection
+from cosfly.formats.kinds import KINDS
 from cosfly.geometry import box_iou
-from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M
-from cosfly.products.inspection import read_inspection, write_inspection
-from cosfly.products.kinds import KINDS
 from cosfly.runtime.documents import read_json
 from cosfly.space.flight_metrics import accel_rms, jerk_rms, length_m
 from release.columns import POINT, POSE

@@ -23,7 +23,7 @@ from specimens_foreign import hub_snapshot, write_foreign_tree
 from specimens_release import run_here
 
 from caption.run.released import read_released
-from cosfly.products.frames import instance_bytes
+from cosfly.formats.frames import instance_bytes
 from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import write_bytes

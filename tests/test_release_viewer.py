@@ -16,12 +16,12 @@ from release_tampering import forge
 from specimens_distill import WINDOW, make_caption
 from specimens_foreign import hub_snapshot
 
+from cosfly.formats.boxes import make_box_map, write_boxes
+from cosfly.formats.captions import write_captions
+from cosfly.formats.flights import find_flights
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.playback import read_flight
 from cosfly.look.frame_views import read_view
-from cosfly.products.boxes import make_box_map, write_boxes
-from cosfly.products.captions import write_captions
-from cosfly.products.flights import find_flights
-from cosfly.products.kinds import KINDS
-from cosfly.products.playback import read_flight
 from cosfly.runtime.tables import rows_of
 from release.columns import PLACE, POINT
 from release.record import read_record

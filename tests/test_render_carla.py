@@ -15,13 +15,13 @@ from simulator_serving import as_client, command, free_port, serving
 from simulators.scene import clothes_of
 from test_renderers_contract import circling, street, write_inputs
 
+from cosfly.formats.boxes import write_boxes
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import read_depth, read_instance, read_meta, read_rgb
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.traces import DroneTrace
+from cosfly.formats.weather import WeatherParams
 from cosfly.geometry import intrinsic_matrix, world_from_camera
-from cosfly.products.boxes import write_boxes
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import read_depth, read_instance, read_meta, read_rgb
-from cosfly.products.kinds import KINDS
-from cosfly.products.traces import DroneTrace
-from cosfly.products.weather import WeatherParams
 from cosfly.render.carla_backend import CarlaRenderConfig
 from cosfly.render.contract import PERSON_ID, PosedPerson
 from cosfly.render.settings import RenderConfig

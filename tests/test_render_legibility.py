@@ -9,9 +9,9 @@ import pytest
 from test_cosfly_render import needs_gl
 from test_renderers_contract import circling, write_inputs
 
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import LEGIBLE_CONTRAST, TargetMeta, frame_name, read_meta
-from cosfly.products.playback import read_flight
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import LEGIBLE_CONTRAST, TargetMeta, frame_name, read_meta
+from cosfly.formats.playback import read_flight
 from cosfly.render.camera import contrast_of, legibility
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run

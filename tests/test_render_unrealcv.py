@@ -17,12 +17,12 @@ from test_renderers_contract import street
 from typer.testing import CliRunner
 
 from cosfly.cli import app
+from cosfly.formats.boxes import BoxMap, write_boxes
+from cosfly.formats.flights import find_flights
+from cosfly.formats.kinds import KINDS
 from cosfly.geometry import intrinsic_matrix, world_from_camera
 from cosfly.maps import unrealcv_export
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig
-from cosfly.products.boxes import BoxMap, write_boxes
-from cosfly.products.flights import find_flights
-from cosfly.products.kinds import KINDS
 from cosfly.render.contract import PERSON_ID, PosedCar, PosedOther, PosedPerson, other_id
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run

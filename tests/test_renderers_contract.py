@@ -24,19 +24,19 @@ import numpy as np
 import pytest
 from simulator_serving import serving
 
+from cosfly.formats import playback
+from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, write_boxes
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import SKY_DEPTH_M, Camera, Look, read_instance, read_meta
+from cosfly.formats.inspection import read_inspection
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.others import Company, Other, write_others
+from cosfly.formats.traces import DroneTrace, write_traces
+from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
 from cosfly.geometry import box_corners, intrinsic_matrix, look_at, project, rotation_matrices, world_from_camera
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run as inspect_tree
 from cosfly.look.frame_views import PEDESTRIAN_RGB, read_view
-from cosfly.products import playback
-from cosfly.products.boxes import BoxMap, MapHeader, make_box_map, write_boxes
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import SKY_DEPTH_M, Camera, Look, read_instance, read_meta
-from cosfly.products.inspection import read_inspection
-from cosfly.products.kinds import KINDS
-from cosfly.products.others import Company, Other, write_others
-from cosfly.products.traces import DroneTrace, write_traces
-from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.render.camera import hidden_shares, rendered_visibility, view_target
 from cosfly.render.carla_backend import CarlaRenderConfig
 from cosfly.render.contract import (

@@ -12,8 +12,8 @@ from simulator_serving import as_client, serving
 from simulators.carla_server import depth_picture
 from test_renderers_contract import street
 
+from cosfly.formats.kinds import KINDS
 from cosfly.geometry import intrinsic_matrix, world_from_camera
-from cosfly.products.kinds import KINDS
 from cosfly.render.stage import open_renderer
 from cosfly.unreal.conventions import (
     DEPTH_STEP_M,

@@ -27,8 +27,8 @@ from caption.truth.vocabulary import Vocabulary
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.budget import BudgetSpent
 from cosfly.chat.contract import NoAnswer, Troubles
-from cosfly.products.captions import Caption, Usage, read_captions, write_captions
-from cosfly.products.places import flight_of
+from cosfly.formats.captions import Caption, Usage, read_captions, write_captions
+from cosfly.formats.places import flight_of
 from cosfly.runtime.console import SECONDS_BETWEEN_LINES
 from cosfly.runtime.errors import CosflyError, InputError, TeacherError
 from cosfly.runtime.stage_folder import Failed, StageFolder, Tally, read_failures, write_failures

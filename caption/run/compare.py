@@ -27,7 +27,7 @@ from caption.truth.vocabulary import Vocabulary
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.contract import NoAnswer
 from cosfly.chat.interrupts import run_until_interrupted
-from cosfly.products.captions import Coc
+from cosfly.formats.captions import Coc
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.store import refuse_links, write_json
 

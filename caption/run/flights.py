@@ -14,10 +14,10 @@ from pathlib import Path
 
 from caption.run.windows import current_frames, cut_windows
 from caption.schema import CaptionConfig, Window, WindowConfig
-from cosfly.products.captions import caption_lines, write_caption_lines
-from cosfly.products.flights import find_flights, read_twin
-from cosfly.products.places import ALL_FLIGHTS, FlightChoice, flight_ids, flight_of, place_of
-from cosfly.products.playback import Flight, read_flight
+from cosfly.formats.captions import caption_lines, write_caption_lines
+from cosfly.formats.flights import find_flights, read_twin
+from cosfly.formats.places import ALL_FLIGHTS, FlightChoice, flight_ids, flight_of, place_of
+from cosfly.formats.playback import Flight, read_flight
 from cosfly.runtime.errors import InputError, VerifyError
 
 log = logging.getLogger(__name__)

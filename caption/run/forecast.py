@@ -21,8 +21,8 @@ from caption.teachers.students import as_taught
 from caption.teachers.teacher import first_budget, open_teacher
 from cosfly.chat.answers import AnswerBook
 from cosfly.chat.interrupts import run_until_interrupted
-from cosfly.products.captions import Caption, Usage
-from cosfly.products.places import flight_of
+from cosfly.formats.captions import Caption, Usage
+from cosfly.formats.places import flight_of
 from cosfly.runtime.errors import ConfigError, InputError, TeacherError
 from cosfly.runtime.stage_folder import Resume
 

@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from cosfly.products.actions import TOKENS
-from cosfly.products.captions import Caption, TeacherRecord, Usage
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.captions import Caption, TeacherRecord, Usage
 from cosfly.runtime.stage_folder import Tally
 from cosfly.runtime.store import sha256_bytes
 

@@ -19,7 +19,7 @@ from rich.table import Table
 
 from cosfly.chat.budget import Budget
 from cosfly.chat.contract import Troubles
-from cosfly.products.captions import Caption
+from cosfly.formats.captions import Caption
 from cosfly.runtime.console import SECONDS_BETWEEN_LINES, console
 
 log = logging.getLogger(__name__)

@@ -9,13 +9,13 @@ from typing import Any
 
 from caption.run.ledger import CaptionReport
 from cosfly.chat.budget import BudgetConfig
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.captions import Caption, Language
+from cosfly.formats.frames import frame_name
+from cosfly.formats.places import flight_of
+from cosfly.formats.sentences import sentences_of
 from cosfly.look.frame_views import thumbnail
 from cosfly.look.page import page, run_name
-from cosfly.products.actions import TOKENS
-from cosfly.products.captions import Caption, Language
-from cosfly.products.frames import frame_name
-from cosfly.products.places import flight_of
-from cosfly.products.sentences import sentences_of
 from cosfly.runtime.files import read_text
 from cosfly.runtime.store import write_bytes
 

@@ -28,8 +28,8 @@ from caption.truth.glossary import GLOSSARY_FILE
 from caption.truth.vocabulary import Vocabulary
 from cosfly.chat.interrupts import run_until_interrupted
 from cosfly.chat.student_chat import student_files
-from cosfly.products.captions import caption_lines, line_of, write_caption_lines
-from cosfly.products.places import flight_of
+from cosfly.formats.captions import caption_lines, line_of, write_caption_lines
+from cosfly.formats.places import flight_of
 from cosfly.runtime.errors import ConfigError, ResumeError, TeacherError
 from cosfly.runtime.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally, read_manifest

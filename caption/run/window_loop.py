@@ -23,9 +23,9 @@ from caption.truth.references import measured_series
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft, Refused, refuse_decision
 from cosfly.chat.contract import NoAnswer, Reply
-from cosfly.products.actions import ACTIONS
-from cosfly.products.answer_text import Parsed, parse_answer
-from cosfly.products.captions import (
+from cosfly.formats.actions import ACTIONS
+from cosfly.formats.answer_text import Parsed, parse_answer
+from cosfly.formats.captions import (
     Caption,
     Checks,
     Coc,

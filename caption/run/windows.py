@@ -22,11 +22,11 @@ from caption.schema import (
     observed_frames,
 )
 from caption.truth.actions import TABLE, measure
-from cosfly.products.captions import KeyframeRecord, LabelFrom, Language
-from cosfly.products.frames import files_in
-from cosfly.products.places import sample_id
-from cosfly.products.playback import Flight
-from cosfly.products.segments import Mission
+from cosfly.formats.captions import KeyframeRecord, LabelFrom, Language
+from cosfly.formats.frames import files_in
+from cosfly.formats.places import sample_id
+from cosfly.formats.playback import Flight
+from cosfly.formats.segments import Mission
 
 
 def current_frames(num_points: int, cfg: WindowConfig) -> range:

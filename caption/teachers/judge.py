@@ -23,8 +23,8 @@ from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget
 from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import NoAnswer, Request, Troubles, started
-from cosfly.products.captions import Coc, JudgeRecord, Language
-from cosfly.products.places import flight_of
+from cosfly.formats.captions import Coc, JudgeRecord, Language
+from cosfly.formats.places import flight_of
 from cosfly.runtime.documents import Record, parse_document, validated
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import read_unpacked

@@ -14,7 +14,7 @@ from string import Template
 
 from caption.schema import CaptionConfig
 from caption.truth.vocabulary import Vocabulary
-from cosfly.products.captions import OWN_PROMPTS
+from cosfly.formats.captions import OWN_PROMPTS
 from cosfly.runtime.errors import ConfigError, InputError, nearest
 from cosfly.runtime.files import read_text
 from cosfly.runtime.store import refuse_links, storage_errors, write_bytes

@@ -16,10 +16,10 @@ from caption.truth.facts import Facts, measure_facts
 from caption.truth.glossary import load_glossary
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft, WayOfWriting, way_of
+from cosfly.formats.actions import ACTIONS, TOKENS
+from cosfly.formats.captions import GOAL_WORDS, PICTURES_MARK, Language, Prompt, Writing
+from cosfly.formats.segments import MISSION_KINDS
 from cosfly.look.frame_views import Pictures, frame_label
-from cosfly.products.actions import ACTIONS, TOKENS
-from cosfly.products.captions import GOAL_WORDS, PICTURES_MARK, Language, Prompt, Writing
-from cosfly.products.segments import MISSION_KINDS
 from cosfly.runtime.store import dump_json, sha256_bytes
 
 MAX_RETURNED_CHARACTERS = 6000  # of a refused answer, when it is shown to who wrote it

@@ -31,9 +31,9 @@ from cosfly.chat.student_chat import (
     read_taught,
     student_request,
 )
+from cosfly.formats.answer_text import answer_schema
+from cosfly.formats.captions import Language, Prompt
 from cosfly.look.frame_views import Pictures
-from cosfly.products.answer_text import answer_schema
-from cosfly.products.captions import Language, Prompt
 from cosfly.runtime.errors import ConfigError, TeacherError
 
 

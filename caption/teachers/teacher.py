@@ -33,10 +33,10 @@ from cosfly.chat.budget import BYTES_PER_TOKEN, PIXELS_PER_TOKEN, Budget
 from cosfly.chat.client import ChatClient
 from cosfly.chat.contract import Engine, Reply, Request, Troubles
 from cosfly.chat.vllm_engine import VllmEngine
+from cosfly.formats.answer_text import answer_schema
+from cosfly.formats.captions import TeacherRecord, TeacherSettings, Writing
+from cosfly.formats.places import flight_of
 from cosfly.look.frame_views import Pictures
-from cosfly.products.answer_text import answer_schema
-from cosfly.products.captions import TeacherRecord, TeacherSettings, Writing
-from cosfly.products.places import flight_of
 from cosfly.runtime.chance import draws_for, rng_for
 
 ENCODING_THREADS = 4

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from caption.schema import FutureMotion
-from cosfly.products.actions import TOKENS
-from cosfly.products.captions import Verdict
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.captions import Verdict
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from caption.truth.references import QUANTITIES
 from caption.truth.said import Said, frames_of
 from caption.truth.sizes import may_mean, same_size
 from caption.truth.stated import Pole, Stated, lexicon_of, read_stated
-from cosfly.products.captions import Claim, Language
+from cosfly.formats.captions import Claim, Language
 
 # Words, negated or not, that say that the person is seen, and that not all is.
 _SEEN = {

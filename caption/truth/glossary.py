@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from pydantic import Field
 
-from cosfly.products.captions import Language
+from cosfly.formats.captions import Language
 from cosfly.runtime.config import Config, build, read_yaml
 
 GLOSSARY_FILE = Path(__file__).with_name("glossary.yaml")

@@ -9,7 +9,7 @@ from functools import cache
 from typing import Literal
 
 from caption.truth.glossary import Unit, written_units
-from cosfly.products.captions import Language
+from cosfly.formats.captions import Language
 
 _UNIT_GROUPS = ("unit", "half_of", "word_of")
 _NO_UNIT = Unit("", 1.0)

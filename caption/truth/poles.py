@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 from caption.truth.references import TURNED
-from cosfly.products.captions import Claim
+from cosfly.formats.captions import Claim
 
 Pair = tuple[str, str]  # dimension, value
 

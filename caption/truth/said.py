@@ -14,7 +14,7 @@ from caption.truth.poles import Pair, poles_between, poles_of, side_word
 from caption.truth.references import QUANTITIES, TURNING, Fact, look_up, parse_reference
 from caption.truth.sizes import both_ways, is_share, same_size, ways
 from caption.truth.stated import Pole, Stated, read_stated
-from cosfly.products.captions import Claim, Language
+from cosfly.formats.captions import Claim, Language
 
 HOUR_DEG = 30.0
 HOUR_SLACK_DEG = 20.0  # an hour of the clock is told by eye

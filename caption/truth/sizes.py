@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from caption.truth.numerals import Numeral
 from caption.truth.stated import Stated, read_stated
-from cosfly.products.captions import Claim, Language
+from cosfly.formats.captions import Claim, Language
 
 RATIO_SLACK = 0.13  # of shares and multiples in words: "a third" of 0.30 to 0.38
 EXACT_PERCENT, ABOUT_PERCENT = 0.02, 0.06

@@ -11,7 +11,7 @@ from functools import cache, lru_cache
 
 from caption.truth.glossary import GlossaryFile, glossary_file
 from caption.truth.numerals import Numeral, read_numerals
-from cosfly.products.captions import Language
+from cosfly.formats.captions import Language
 
 
 @dataclass(frozen=True, slots=True)

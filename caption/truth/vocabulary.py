@@ -9,7 +9,7 @@ from functools import cache, cached_property
 from string import Template
 
 from caption.truth.glossary import load_glossary, term_pattern
-from cosfly.products.actions import ACTIONS, TERMS
+from cosfly.formats.actions import ACTIONS, TERMS
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from caption.truth.glossary import words_beside
 from caption.truth.references import ANGLES, QUANTITIES, STEPS, TURNING, Reference
-from cosfly.products.captions import Language
+from cosfly.formats.captions import Language
 
 _PLACES = ("offset_x", "offset_y")
 _IN_PICTURE = ("visibility", "framing", "box_width", "box_height", "others_in_view", "alike_differences", *_PLACES)

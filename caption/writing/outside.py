@@ -12,8 +12,8 @@ from functools import lru_cache
 from caption.truth.glossary import load_glossary
 from caption.truth.numerals import read_numerals
 from caption.writing.contract import Refused
-from cosfly.products.actions import ACTIONS
-from cosfly.products.captions import Language
+from cosfly.formats.actions import ACTIONS
+from cosfly.formats.captions import Language
 
 SLOT_MARK = "¤"
 

@@ -64,7 +64,7 @@ def _disk(folder: Path) -> Check:
 
 
 def _gl() -> Check:
-    from cosfly.products.boxes import make_box_map
+    from cosfly.formats.boxes import make_box_map
     from cosfly.render.stage import open_renderer
 
     try:

@@ -12,6 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from cosfly.formats.boxes import BoxMap, read_boxes
+from cosfly.formats.captions import read_captions
+from cosfly.formats.traces import DroneTrace
 from cosfly.geometry import intrinsic_matrix, look_at, world_from_camera
 from cosfly.maps.stage import SOURCES, MapsConfig
 from cosfly.maps.stage import load_map as load_source
@@ -19,9 +22,6 @@ from cosfly.pedestrians.stage import make_walk, walk_along
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_flight
-from cosfly.products.boxes import BoxMap, read_boxes
-from cosfly.products.captions import read_captions
-from cosfly.products.traces import DroneTrace
 from cosfly.render.contract import Frame
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.settings import RenderConfig

@@ -24,13 +24,13 @@ import cosfly.pedestrians.stage
 from cosfly.app import bench as benchmark
 from cosfly.app.runs import look
 from cosfly.app.settings import RunConfig, manner_of_work
+from cosfly.formats.boxes import read_boxes
+from cosfly.formats.captions import FIELDS, read_captions
+from cosfly.formats.segments import FOLLOW
 from cosfly.look.frame_views import small_jpeg
 from cosfly.look.gallery import four_panels
 from cosfly.look.page import page, run_name
 from cosfly.planners import compare
-from cosfly.products.boxes import read_boxes
-from cosfly.products.captions import FIELDS, read_captions
-from cosfly.products.segments import FOLLOW
 from cosfly.runtime.arrays import read_picture
 from cosfly.runtime.config import build, read_yaml
 from cosfly.runtime.documents import FileFormat, read_object

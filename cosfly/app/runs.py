@@ -10,7 +10,7 @@ from typing import Literal
 
 from cosfly.app.settings import RunConfig
 from cosfly.app.settings_guide import Setting, changed
-from cosfly.products.review import undecided
+from cosfly.formats.review import undecided
 from cosfly.runtime.config import load
 from cosfly.runtime.errors import CosflyError, InputError
 from cosfly.runtime.folder_lock import is_held

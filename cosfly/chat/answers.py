@@ -23,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.chat.budget import Budget
 from cosfly.chat.contract import MOST_TOKENS, CountName, Engine, NoAnswer, Reply, Request
-from cosfly.products.captions import Usage
+from cosfly.formats.captions import Usage
 from cosfly.runtime.errors import CosflyError
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.objects import CONTEXT_FULL

@@ -15,7 +15,7 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from cosfly.products.captions import Usage
+from cosfly.formats.captions import Usage
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import TeacherError
 

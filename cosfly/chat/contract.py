@@ -11,7 +11,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
-from cosfly.products.captions import Usage
+from cosfly.formats.captions import Usage
 
 CountName = Literal["prompt_tokens", "completion_tokens"]
 MOST_TOKENS = 10_000_000  # of one answer: the longest context of any model that is served

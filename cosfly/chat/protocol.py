@@ -9,7 +9,7 @@ from typing import Any
 
 from cosfly.chat.contract import MOST_TOKENS, Reply, Request
 from cosfly.chat.wire import Response
-from cosfly.products.captions import Usage
+from cosfly.formats.captions import Usage
 from cosfly.runtime.store import dump_json
 
 _IMAGE_MARK = re.compile(rb'"\\u0000(\d+)"')

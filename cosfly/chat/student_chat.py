@@ -19,8 +19,8 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
 from cosfly.chat.client import EndpointConfig
 from cosfly.chat.contract import Request
+from cosfly.formats.captions import Language, Prompt
 from cosfly.look.frame_views import View, encode_picture, frame_label
-from cosfly.products.captions import Language, Prompt
 from cosfly.runtime.documents import FileFormat, read_model
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import sha256_bytes, write_model

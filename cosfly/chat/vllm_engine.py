@@ -19,7 +19,7 @@ from pydantic import Field
 
 from cosfly.chat.client import EndpointConfig
 from cosfly.chat.contract import NoAnswer, Reply, Request
-from cosfly.products.captions import Usage
+from cosfly.formats.captions import Usage
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError, TeacherError
 

@@ -94,7 +94,7 @@ def show(run: Annotated[Path, Argument(metavar="RUN", help="A run folder.")]) ->
     """Show a run: its stages, what they kept and take on the disk, the settings that are not the defaults."""
     from cosfly.app.estimate import in_words as size
     from cosfly.app.runs import look
-    from cosfly.products.review import how_to_decide
+    from cosfly.formats.review import how_to_decide
     from cosfly.runtime.console import answer_console
     from cosfly.runtime.store import dump_json
 

@@ -292,7 +292,7 @@ def inspect_review(
     reason: Annotated[str | None, Option(help="Why.")] = None,
 ) -> None:
     """Decide flights that were left to a person, into review.jsonl; without a decision, list those that are open."""
-    from cosfly.products.review import Choice, add_decisions, summary
+    from cosfly.formats.review import Choice, add_decisions, summary
 
     product = folder / "inspect.json" if folder.is_dir() else folder
     given = {"accepted": accept or [], "rejected": reject or []}

@@ -56,7 +56,7 @@ def study_weather(
     fov: Annotated[float, Option(min=1.0, max=169.0, help="Horizontal field of view, degrees.")] = 67.38,
 ) -> None:
     """One view under every weather and time of day: nine pictures, and a sheet of all."""
-    from cosfly.products.weather import TIMES, WEATHERS
+    from cosfly.formats.weather import TIMES, WEATHERS
     from cosfly.runtime.console import progress_bar
     from cosfly.studies import weather
 

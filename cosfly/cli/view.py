@@ -46,8 +46,8 @@ def view(
 
         scene_page.run(source, out, paths=paths, traces=traces or [], data=data, picture_px=picture_px, max_mb=max_mb)
     elif out.suffix in (".png", ".gif"):
+        from cosfly.formats.boxes import read_boxes
         from cosfly.look import gallery
-        from cosfly.products.boxes import read_boxes
 
         choice = job.cfg.inspect.flights
         if frame is not None:

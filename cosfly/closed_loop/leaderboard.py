@@ -22,13 +22,13 @@ from cosfly.closed_loop.measures import (
     walk_sums,
 )
 from cosfly.closed_loop.settings import FLOORS
+from cosfly.formats.figures import Figure
+from cosfly.formats.flight_scores import Score, read_score
+from cosfly.formats.flights import find_flights
+from cosfly.formats.playback import read_flight
+from cosfly.formats.pursuits import Pursuit, pursuit_file, read_pursuit
 from cosfly.look.frame_views import thumbnail
 from cosfly.look.page import page
-from cosfly.products.figures import Figure
-from cosfly.products.flight_scores import Score, read_score
-from cosfly.products.flights import find_flights
-from cosfly.products.playback import read_flight
-from cosfly.products.pursuits import Pursuit, pursuit_file, read_pursuit
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import Config
 from cosfly.runtime.documents import FileFormat

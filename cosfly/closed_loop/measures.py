@@ -1,4 +1,4 @@
-"""What flights of the closed loop are worth: figures of their records (cosfly/products/pursuits.py). No file.
+"""What flights of the closed loop are worth: figures of their records (cosfly/formats/pursuits.py). No file.
 
 Success, as ours: the flight came to its walk's end, the person was seen within the last LOSS_S, and the drone ended
 within BAND_M of it. EVT-Bench (TrackVLA, its public code) asks for the same at the episode's end, facing the target at
@@ -15,9 +15,9 @@ from itertools import groupby, pairwise
 
 import numpy as np
 
-from cosfly.products.figures import Figure, draw_walks, figure_of_draws
-from cosfly.products.flight_scores import FlightScore, Score
-from cosfly.products.pursuits import Pursuit
+from cosfly.formats.figures import Figure, draw_walks, figure_of_draws
+from cosfly.formats.flight_scores import FlightScore, Score
+from cosfly.formats.pursuits import Pursuit
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import dump_json, sha256_bytes

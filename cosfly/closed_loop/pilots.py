@@ -30,13 +30,13 @@ from cosfly.chat.contract import NoAnswer
 from cosfly.chat.student_chat import TAUGHT
 from cosfly.closed_loop.settings import FLOORS, FlyConfig
 from cosfly.closed_loop.stepper import ClosedLoopFlight, Moment
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.answer_text import parse_answer
+from cosfly.formats.frames import COMPANY, FILE_NAMES, depth_file, frame_name, instance_bytes, rgb_bytes
+from cosfly.formats.motion import in_axes_of
+from cosfly.formats.places import sample_id
+from cosfly.formats.pursuits import MOST_WORDS, Answer
 from cosfly.geometry import wrap_deg
-from cosfly.products.actions import TOKENS
-from cosfly.products.answer_text import parse_answer
-from cosfly.products.frames import COMPANY, FILE_NAMES, depth_file, frame_name, instance_bytes, rgb_bytes
-from cosfly.products.motion import in_axes_of
-from cosfly.products.places import sample_id
-from cosfly.products.pursuits import MOST_WORDS, Answer
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import CosflyError
 from distill.inference.stage import InferConfig, Inputs, local_answers

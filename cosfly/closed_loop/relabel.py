@@ -24,13 +24,13 @@ from cosfly.closed_loop.measures import LOSS_S
 from cosfly.closed_loop.pilots import Ceiling
 from cosfly.closed_loop.stage import PLAN, TRACES, TREE, FlightsConfig, flown_trace
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, as_drawn
+from cosfly.formats.boxes import read_boxes
+from cosfly.formats.flight_scores import read_score
+from cosfly.formats.pursuits import Pursuit, PursuitFrame, pursuit_file, read_pursuit
+from cosfly.formats.traces import ARRAYS, DroneTrace, Excerpt, read_traces, write_traces
 from cosfly.geometry import look_at, step_s
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_on
-from cosfly.products.boxes import read_boxes
-from cosfly.products.flight_scores import read_score
-from cosfly.products.pursuits import Pursuit, PursuitFrame, pursuit_file, read_pursuit
-from cosfly.products.traces import ARRAYS, DroneTrace, Excerpt, read_traces, write_traces
 from cosfly.render import stage as rendering
 from cosfly.runtime.errors import ConfigError, InputError, NoPathError
 from cosfly.runtime.provenance import read_stage_record

@@ -23,15 +23,15 @@ from cosfly.closed_loop.measures import score_pursuits
 from cosfly.closed_loop.pilots import Outlook, PilotAnswer, open_pilot
 from cosfly.closed_loop.settings import FlyConfig
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, Moment, as_drawn
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.boxes import read_boxes
+from cosfly.formats.flight_scores import SCORE, SCORE_FORMAT
+from cosfly.formats.motion import PlannedMotion
+from cosfly.formats.pursuits import Pursuit, PursuitFrame, WalkStyle, pursuit_file, read_pursuit, write_pursuit
+from cosfly.formats.traces import DroneTrace, read_traces, write_traces
 from cosfly.geometry import headings_of, step_s
 from cosfly.planners import stage as planning
 from cosfly.planners.contract import PlanConfig
-from cosfly.products.actions import TOKENS
-from cosfly.products.boxes import read_boxes
-from cosfly.products.flight_scores import SCORE, SCORE_FORMAT
-from cosfly.products.motion import PlannedMotion
-from cosfly.products.pursuits import Pursuit, PursuitFrame, WalkStyle, pursuit_file, read_pursuit, write_pursuit
-from cosfly.products.traces import DroneTrace, read_traces, write_traces
 from cosfly.render import stage as rendering
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.config import Config

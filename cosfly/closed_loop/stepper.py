@@ -12,15 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cosfly.closed_loop.settings import Drone
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.frames import TargetMeta
+from cosfly.formats.others import Other
+from cosfly.formats.places import town_folder
+from cosfly.formats.pursuits import Ended
+from cosfly.formats.traces import DroneTrace
+from cosfly.formats.walks import TARGET_HEIGHT_M
+from cosfly.formats.weather import WeatherParams
 from cosfly.geometry import step_s, wrap_deg
-from cosfly.products.boxes import BoxMap
-from cosfly.products.frames import TargetMeta
-from cosfly.products.others import Other
-from cosfly.products.places import town_folder
-from cosfly.products.pursuits import Ended
-from cosfly.products.traces import DroneTrace
-from cosfly.products.walks import TARGET_HEIGHT_M
-from cosfly.products.weather import WeatherParams
 from cosfly.render.camera import contrast_of, legibility
 from cosfly.render.contract import PERSON_ID, Frame
 from cosfly.render.flight import annotation, draw_frame

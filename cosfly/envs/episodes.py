@@ -13,6 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, Moment
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.others import Other
+from cosfly.formats.traces import DroneTrace
+from cosfly.formats.walks import walk_id
 from cosfly.maps.synthetic import PRESETS, SyntheticConfig, load
 from cosfly.pedestrians.lanes import Lane, lanes_of
 from cosfly.pedestrians.others import company_of
@@ -22,10 +26,6 @@ from cosfly.planners.contract import PlanConfig
 from cosfly.planners.reacquire import first_loss, screens_of
 from cosfly.planners.stage import plan_flight
 from cosfly.planners.styles import REACQUIRE
-from cosfly.products.boxes import BoxMap
-from cosfly.products.others import Other
-from cosfly.products.traces import DroneTrace
-from cosfly.products.walks import walk_id
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.documents import FileFormat, Record, read_model

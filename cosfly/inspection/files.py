@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from cosfly.products.frames import FRAME_FILES, FRAMES_DIR, FrameMeta, frame_name, frame_path, public_name, read_meta
-from cosfly.products.issues import Report
-from cosfly.products.places import tree_of_flight
-from cosfly.products.playback import Flight
+from cosfly.formats.frames import FRAME_FILES, FRAMES_DIR, FrameMeta, frame_name, frame_path, public_name, read_meta
+from cosfly.formats.issues import Report
+from cosfly.formats.places import tree_of_flight
+from cosfly.formats.playback import Flight
 from cosfly.runtime.arrays import array_header, picture_size
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import sha256_file

@@ -13,6 +13,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import BaseModel
 
+from cosfly.formats.coverage import Coverage, coverage_of
+from cosfly.formats.flights import read_twin
+from cosfly.formats.frames import LEGIBLE_HEIGHT_PX
+from cosfly.formats.inspection import FlightInspection
+from cosfly.formats.inspection import Result as FlightResult
+from cosfly.formats.issues import Report
+from cosfly.formats.playback import STATES, Flight, read_flight
+from cosfly.formats.traces import DroneTrace
+from cosfly.formats.walks import TARGET_HEIGHT_M
 from cosfly.geometry import project, step_s, world_from_camera, wrap_deg
 from cosfly.inspection.files import Checksums, check_files, check_recorded
 from cosfly.inspection.frames import FrameNumbers, check_frames, check_others, choose_frames, others_told, target_box
@@ -28,15 +37,6 @@ from cosfly.inspection.settings import (
     InspectConfig,
 )
 from cosfly.inspection.view import FlightView, draw_flight
-from cosfly.products.coverage import Coverage, coverage_of
-from cosfly.products.flights import read_twin
-from cosfly.products.frames import LEGIBLE_HEIGHT_PX
-from cosfly.products.inspection import FlightInspection
-from cosfly.products.inspection import Result as FlightResult
-from cosfly.products.issues import Report
-from cosfly.products.playback import STATES, Flight, read_flight
-from cosfly.products.traces import DroneTrace
-from cosfly.products.walks import TARGET_HEIGHT_M
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.provenance import digest_of, folder_digests
 from cosfly.space.flight_metrics import (
@@ -49,7 +49,7 @@ from cosfly.space.flight_metrics import (
 )
 
 if TYPE_CHECKING:
-    from cosfly.products.boxes import BoxMap
+    from cosfly.formats.boxes import BoxMap
     from cosfly.space.kernels import BoxIndex
 
 TIME_TOLERANCE_S = 1e-3

@@ -13,6 +13,23 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from cosfly.formats.frames import (
+    DEPTH_NPY,
+    FILE_NAMES,
+    INVALID_DEPTH_M,
+    SKY_DEPTH_M,
+    FrameMeta,
+    OtherMeta,
+    OthersMeta,
+    frame_name,
+    frame_path,
+)
+from cosfly.formats.issues import Report
+from cosfly.formats.kinds import KIND_NAMES, KINDS
+from cosfly.formats.others import BUILDS, Other, distances_to_boxes_m
+from cosfly.formats.places import tree_of_flight
+from cosfly.formats.playback import Flight
+from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
 from cosfly.geometry import box_corners, box_iou, mask_box, project, world_from_camera
 from cosfly.inspection.files import Checksums
 from cosfly.inspection.pixels import NUM_IDS, Picture, PixelFigures, look_at, unpack
@@ -25,23 +42,6 @@ from cosfly.inspection.settings import (
     Z_FIGHTING_MAX,
     InspectConfig,
 )
-from cosfly.products.frames import (
-    DEPTH_NPY,
-    FILE_NAMES,
-    INVALID_DEPTH_M,
-    SKY_DEPTH_M,
-    FrameMeta,
-    OtherMeta,
-    OthersMeta,
-    frame_name,
-    frame_path,
-)
-from cosfly.products.issues import Report
-from cosfly.products.kinds import KIND_NAMES, KINDS
-from cosfly.products.others import BUILDS, Other, distances_to_boxes_m
-from cosfly.products.places import tree_of_flight
-from cosfly.products.playback import Flight
-from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import read_bytes
 from cosfly.runtime.runner import advance

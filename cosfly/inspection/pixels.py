@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.products.frames import DEPTH_NPY, INVALID_DEPTH_M, SKY_DEPTH_M, depth_values, public_name
-from cosfly.products.kinds import KINDS
-from cosfly.products.png import colours_of
+from cosfly.formats.frames import DEPTH_NPY, INVALID_DEPTH_M, SKY_DEPTH_M, depth_values, public_name
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.png import colours_of
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import InputError
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from cosfly.formats.inspection import RESULTS, FlightInspection, Inspection
+from cosfly.formats.playback import STATES
 from cosfly.inspection.view import PLOTS, FlightView, in_question
 from cosfly.look.coverage_page import coverage_html
 from cosfly.look.page import fragment, page
-from cosfly.products.inspection import RESULTS, FlightInspection, Inspection
-from cosfly.products.playback import STATES
 from cosfly.runtime.files import read_text
 
 STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from cosfly.products.places import FlightChoice
+from cosfly.formats.places import FlightChoice
 from cosfly.runtime.config import Config
 from cosfly.space.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3, RELAXED_SAFETY_M
 

@@ -11,16 +11,11 @@ import logging
 from collections import Counter
 from pathlib import Path
 
-from cosfly.inspection.flight import InspectedFlight, inspect_flight, trace_id
-from cosfly.inspection.report import report_html
-from cosfly.inspection.settings import PAGE_MB, InspectConfig
-from cosfly.inspection.view import FlightView
-from cosfly.look.page import run_name
-from cosfly.products.boxes import read_boxes
-from cosfly.products.coverage import Coverage
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import FRAMES_DIR
-from cosfly.products.inspection import (
+from cosfly.formats.boxes import read_boxes
+from cosfly.formats.coverage import Coverage
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import FRAMES_DIR
+from cosfly.formats.inspection import (
     FlightFunnel,
     FlightInspection,
     Funnel,
@@ -29,10 +24,15 @@ from cosfly.products.inspection import (
     count_trajectories,
     write_inspection,
 )
-from cosfly.products.issues import Report
-from cosfly.products.playback import read_flight
-from cosfly.products.review import how_to_decide
-from cosfly.products.traces import DroneTrace, read_traces
+from cosfly.formats.issues import Report
+from cosfly.formats.playback import read_flight
+from cosfly.formats.review import how_to_decide
+from cosfly.formats.traces import DroneTrace, read_traces
+from cosfly.inspection.flight import InspectedFlight, inspect_flight, trace_id
+from cosfly.inspection.report import report_html
+from cosfly.inspection.settings import PAGE_MB, InspectConfig
+from cosfly.inspection.view import FlightView
+from cosfly.look.page import run_name
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.provenance import recorded_digests
 from cosfly.runtime.runner import Item, ItemOutcomes, Outcome, Watch, Work, run_items

@@ -9,12 +9,12 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, model_validator
 
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.flights import read_tracks_beside
+from cosfly.formats.issues import Issue, sort_key
+from cosfly.formats.playback import Flight
 from cosfly.look.frame_views import small_jpeg, thumbnail
 from cosfly.look.topview import INK, PAPER, TopView, draw_dot, draw_line, draw_map, draw_text
-from cosfly.products.boxes import BoxMap
-from cosfly.products.flights import read_tracks_beside
-from cosfly.products.issues import Issue, sort_key
-from cosfly.products.playback import Flight
 from cosfly.space.flight_metrics import CLEARANCE_CAP_M
 
 CURVE_POINTS = 160

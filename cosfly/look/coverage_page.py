@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from cosfly.formats.coverage import AXES, NAMED, PAIR, Axis, Coverage, default_coverage
+from cosfly.formats.weather import TIMES, WEATHERS, resolved, sky_kind
 from cosfly.look.page import fragment
-from cosfly.products.coverage import AXES, NAMED, PAIR, Axis, Coverage, default_coverage
-from cosfly.products.weather import TIMES, WEATHERS, resolved, sky_kind
 
 WIDTH_PX, HEIGHT_PX = 300.0, 110.0
 TEMPLATE = "cosfly/look/templates/coverage.html"

@@ -15,9 +15,9 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from cosfly.products.captions import Language
-from cosfly.products.frames import FILE_NAMES, SKY_DEPTH_M, frame_path, read_depth, read_instance, read_meta, read_rgb
-from cosfly.products.kinds import KINDS
+from cosfly.formats.captions import Language
+from cosfly.formats.frames import FILE_NAMES, SKY_DEPTH_M, frame_path, read_depth, read_instance, read_meta, read_rgb
+from cosfly.formats.kinds import KINDS
 from cosfly.runtime.errors import InputError
 
 View = Literal["rgb", "depth", "segmentation", "middle"]

@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import DEBUG_FILE, FRAME_FILES, frame_path, read_instance, read_meta, read_rgb, rgb_bytes
+from cosfly.formats.places import ALL_FLIGHTS, FlightChoice
+from cosfly.formats.playback import Flight, read_flight
+from cosfly.formats.town import read_instance_ids
 from cosfly.look.frame_views import DEPTH_RANGE_M, VIEW_FILES, read_view
 from cosfly.look.overlay import Overlay
 from cosfly.look.topview import add_caption, draw_text
-from cosfly.products.boxes import BoxMap
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import DEBUG_FILE, FRAME_FILES, frame_path, read_instance, read_meta, read_rgb, rgb_bytes
-from cosfly.products.places import ALL_FLIGHTS, FlightChoice
-from cosfly.products.playback import Flight, read_flight
-from cosfly.products.town import read_instance_ids
 from cosfly.runtime.arrays import read_picture
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import inside, write_bytes

@@ -14,17 +14,17 @@ from typing import Any
 import cv2
 import numpy as np
 
+from cosfly.formats.boxes import BoxMap, read_boxes
+from cosfly.formats.flights import find_flights
+from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES, KINDS, LAYERS
+from cosfly.formats.places import town_folder
+from cosfly.formats.playback import Flight, read_flight
+from cosfly.formats.traces import DroneTrace, read_traces
+from cosfly.formats.walks import read_paths
 from cosfly.geometry import rotation_matrices
 from cosfly.look.frame_views import thumbnail
 from cosfly.look.page import page, scripts
 from cosfly.look.topview import COLORS, OTHER_COLOR
-from cosfly.products.boxes import BoxMap, read_boxes
-from cosfly.products.flights import find_flights
-from cosfly.products.kinds import GROUND_KINDS, KIND_NAMES, KINDS, LAYERS
-from cosfly.products.places import town_folder
-from cosfly.products.playback import Flight, read_flight
-from cosfly.products.traces import DroneTrace, read_traces
-from cosfly.products.walks import read_paths
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import for_terminal
 from cosfly.runtime.store import write_bytes

@@ -13,9 +13,9 @@ from typing import Self
 import cv2
 import numpy as np
 
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.kinds import KIND_NAMES
 from cosfly.geometry import box_corners
-from cosfly.products.boxes import BoxMap
-from cosfly.products.kinds import KIND_NAMES
 
 # Softer than CARLA's palette, which is made for masks and not for eyes; RGB. Other kinds: OTHER_COLOR.
 COLORS: dict[str, tuple[int, int, int]] = {

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cosfly.products.boxes import BoxMap, MapHeader, make_box_map
-from cosfly.products.kinds import KINDS
+from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map
+from cosfly.formats.kinds import KINDS
 
 Pair = Sequence[float] | np.ndarray  # x and y
 

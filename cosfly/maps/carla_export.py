@@ -19,8 +19,8 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
-from cosfly.products.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_box_map
-from cosfly.products.kinds import KINDS
+from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_box_map
+from cosfly.formats.kinds import KINDS
 from cosfly.runtime.errors import EnvironmentMissing, InputError
 from cosfly.runtime.store import sha256_bytes
 from cosfly.unreal.carla_client import CarlaConfig, connect

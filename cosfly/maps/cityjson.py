@@ -21,13 +21,13 @@ import shapely
 from pydantic import Field
 from shapely.geometry import Polygon
 
+from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource
+from cosfly.formats.ground import Ground, GroundGrid
+from cosfly.formats.meshes import MESHES_FILE, Meshes, MeshRef
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.cityjson_file import CityObject, read_model
 from cosfly.maps.derived_ground import with_derived_ground
 from cosfly.maps.footprints import CUT_SHARES, Rectangle, check_outline, cover, polygons_of, rectangle_polygon, united
-from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource
-from cosfly.products.ground import Ground, GroundGrid
-from cosfly.products.meshes import MESHES_FILE, Meshes, MeshRef
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.meshes import Mesh

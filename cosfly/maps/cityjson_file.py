@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple, TypeGuard
 
 import numpy as np
 
-from cosfly.products.columns import numbers
+from cosfly.formats.columns import numbers
 from cosfly.runtime.documents import MISSING, parse_document, parse_json
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import over_limit, read_unpacked

@@ -12,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 import shapely
 
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.kinds import KINDS, PAVED_KINDS
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.footprints import Rectangle, cover, polygons_of, rectangle_polygon, united
-from cosfly.products.boxes import BoxMap
-from cosfly.products.kinds import KINDS, PAVED_KINDS
 from cosfly.space.grid import blocks_walking
 
 PAVEMENT_M = 2.5  # walkers keep half a metre off walls

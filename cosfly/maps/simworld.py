@@ -19,11 +19,11 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, field_validator
 
+from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource
+from cosfly.formats.columns import LARGEST
+from cosfly.formats.kinds import KIND_NAMES
 from cosfly.geometry import box_corners
 from cosfly.maps.boxlist import BoxList
-from cosfly.products.boxes import BoxMap, LicenceId, MapHeader, MapSource
-from cosfly.products.columns import LARGEST
-from cosfly.products.kinds import KIND_NAMES
 from cosfly.runtime.config import Config
 from cosfly.runtime.documents import read_json, validated
 from cosfly.runtime.errors import ConfigError, InputError

@@ -11,6 +11,8 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
+from cosfly.formats.boxes import BoxMap, check_ground, write_boxes
+from cosfly.formats.meshes import MESHES_FILE
 from cosfly.look.topview import TopView, draw_map, png_bytes
 from cosfly.maps import boxfile, carla_export, cityjson, simworld, synthetic, unrealcv_export
 from cosfly.maps.boxfile import BoxesConfig
@@ -19,8 +21,6 @@ from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig
-from cosfly.products.boxes import BoxMap, check_ground, write_boxes
-from cosfly.products.meshes import MESHES_FILE
 from cosfly.runtime.config import Config
 from cosfly.runtime.files import LinkedPath
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field, model_validator
 
+from cosfly.formats.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.town_blocks import (
     BASE_TOP_M,
@@ -35,7 +36,6 @@ from cosfly.maps.town_blocks import (
     ring,
     tree,
 )
-from cosfly.products.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import nearest

@@ -18,9 +18,9 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
+from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_box_map
+from cosfly.formats.kinds import KIND_NAMES, KINDS
 from cosfly.maps.simworld import read_sizes
-from cosfly.products.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_box_map
-from cosfly.products.kinds import KIND_NAMES, KINDS
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import write_json
 from cosfly.unreal.assets import asset_of, id_of, is_nothing, kind_of

@@ -15,9 +15,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from cosfly.products.boxes import BoxMap
-from cosfly.products.kinds import GROUND_KINDS, KINDS
-from cosfly.products.walks import Walk
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.kinds import GROUND_KINDS, KINDS
+from cosfly.formats.walks import Walk
 from cosfly.runtime.compiled import njit
 from cosfly.space.grid import OccupancyGrid, surface, surface_kinds
 

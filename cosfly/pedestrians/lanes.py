@@ -12,8 +12,8 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from cosfly.products.boxes import BoxMap
-from cosfly.products.kinds import KINDS
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.kinds import KINDS
 
 LONG = 1.5  # a street's box is this many times as long as wide; others are crossings and patches
 REACH = 2.0  # widths that a street is followed beyond its box, over other boxes of road, to the next junction

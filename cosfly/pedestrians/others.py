@@ -13,6 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cosfly.formats.ground import Ground
+from cosfly.formats.others import Company, Other, gaps_m
+from cosfly.formats.walks import Walk
 from cosfly.geometry import headings_of
 from cosfly.pedestrians.lanes import Lane
 from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, sample_goal
@@ -26,9 +29,6 @@ from cosfly.pedestrians.walking import (
     speeds_at,
     take_pace,
 )
-from cosfly.products.ground import Ground
-from cosfly.products.others import Company, Other, gaps_m
-from cosfly.products.walks import Walk
 from cosfly.runtime.chance import draw_by_share
 
 MOST_WAITS, WAIT_S = 10, 3.0  # who meets somebody again after so many waits is drawn anew

@@ -23,6 +23,9 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from cosfly.formats.backdrop import Backdrop
+from cosfly.formats.boxes import AXES, BoxMap, check_ground, read_boxes
+from cosfly.formats.roi import Roi, RoiPolygon, parse_roi, write_roi
 from cosfly.look.page import page, scripts
 from cosfly.look.topview import TopView, draw_map, png_bytes
 from cosfly.pedestrians.walkable import (
@@ -32,9 +35,6 @@ from cosfly.pedestrians.walkable import (
     share_on_map,
     walkable_ground,
 )
-from cosfly.products.backdrop import Backdrop
-from cosfly.products.boxes import AXES, BoxMap, check_ground, read_boxes
-from cosfly.products.roi import Roi, RoiPolygon, parse_roi, write_roi
 from cosfly.runtime.errors import CosflyError, EnvironmentMissing, InputError, StorageError
 from cosfly.runtime.files import read_bytes, read_text
 from cosfly.runtime.store import sha256_bytes

@@ -26,6 +26,11 @@ import cv2
 import numpy as np
 from pydantic import BaseModel
 
+from cosfly.formats.boxes import read_boxes
+from cosfly.formats.ground import Ground
+from cosfly.formats.others import OTHERS_FILE, Company, write_others
+from cosfly.formats.roi import read_roi
+from cosfly.formats.walks import Walk, pace_field, paces_of, walk_id, write_paths
 from cosfly.look.topview import INK, TopView, draw_dot, draw_line, draw_text, png_bytes
 from cosfly.pedestrians.astar import route_cost
 from cosfly.pedestrians.crossings import CROSSING, ROAD, where_walked
@@ -40,11 +45,6 @@ from cosfly.pedestrians.walkable import (
     walkable_ground,
 )  # fmt: skip
 from cosfly.pedestrians.walking import PACES, arrival_times, resample, speeds_at, take_pace
-from cosfly.products.boxes import read_boxes
-from cosfly.products.ground import Ground
-from cosfly.products.others import OTHERS_FILE, Company, write_others
-from cosfly.products.roi import read_roi
-from cosfly.products.walks import Walk, pace_field, paces_of, walk_id, write_paths
 from cosfly.runtime.chance import draw_by_share, rng_for
 from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import NoPathError

@@ -19,15 +19,15 @@ import numpy as np
 import shapely
 from pydantic import Field, field_validator, model_validator
 
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.ground import Ground
+from cosfly.formats.kinds import GROUND_KINDS, PAVED_KINDS
+from cosfly.formats.roi import MOST_VERTICES, Roi
+from cosfly.formats.walks import PLAIN_PACE
 from cosfly.geometry import DT_S
 from cosfly.pedestrians.astar import find_route
 from cosfly.pedestrians.crossings import CROSSING, ROAD, costs_of, footing_of
 from cosfly.pedestrians.walking import PACES, SLOWEST_SPEED_MPS
-from cosfly.products.boxes import BoxMap
-from cosfly.products.ground import Ground
-from cosfly.products.kinds import GROUND_KINDS, PAVED_KINDS
-from cosfly.products.roi import MOST_VERTICES, Roi
-from cosfly.products.walks import PLAIN_PACE
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.errors import NoPathError, nearest
 from cosfly.space.grid import (

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cosfly.products.walks import PLAIN_PACE
+from cosfly.formats.walks import PLAIN_PACE
 
 if TYPE_CHECKING:
     from cosfly.pedestrians.walkable import PedestriansConfig

@@ -20,13 +20,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import BaseModel, Field
 
+from cosfly.formats.boxes import BoxMap, read_boxes
+from cosfly.formats.walks import read_paths
 from cosfly.look.tables import TextTable
 from cosfly.planners import compare
 from cosfly.planners.compare import AXES, FIGURES, INTERVAL_PERCENT, NUM_RESAMPLES, CompareConfig
 from cosfly.planners.contract import ALL_PLANNERS, title_of
 from cosfly.planners.stage import check_ids, draw_styles_of
-from cosfly.products.boxes import BoxMap, read_boxes
-from cosfly.products.walks import read_paths
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.documents import FileFormat, read_model
 from cosfly.runtime.errors import EnvironmentMissing, InputError

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.walks import TARGET_HEIGHT_M
 from cosfly.geometry import rotation_matrices
 from cosfly.planners.benchmark import PAPER, Benchmark, Flown
 from cosfly.planners.compare import AXES, FIGURES, color_of
 from cosfly.planners.contract import PLANNERS, title_of
-from cosfly.products.boxes import BoxMap
-from cosfly.products.walks import TARGET_HEIGHT_M
 from cosfly.space.kernels import NO_OBSTACLE_KINDS
 
 GRAY = "#9a9a9a"

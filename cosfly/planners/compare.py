@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
+from cosfly.formats.boxes import BoxMap, read_boxes
+from cosfly.formats.traces import DroneTrace, write_traces
+from cosfly.formats.walks import Walk, read_paths
 from cosfly.look.tables import TextTable
 from cosfly.look.topview import add_caption, draw_dot, draw_line, draw_text, png_bytes
 from cosfly.planners.contract import ALL_PLANNERS, PLANNERS, PlanConfig, known_planner, title_of
 from cosfly.planners.overview import draw_walks
 from cosfly.planners.stage import check_ids, draw_styles_of, plan_flight, warm_up
-from cosfly.products.boxes import BoxMap, read_boxes
-from cosfly.products.traces import DroneTrace, write_traces
-from cosfly.products.walks import Walk, read_paths
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.documents import FileFormat, read_object
 from cosfly.runtime.errors import NoPathError

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
+from cosfly.formats.segments import FOLLOW
 from cosfly.geometry import DT_S
 from cosfly.planners.styles import ALTITUDE_LEAST_M, NAMES, OTHER_SIDE, ROWS, Range, Style, with_ranges
-from cosfly.products.segments import FOLLOW
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import NoPathError, nearest
 from cosfly.space.flight_metrics import (

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from cosfly.formats.segments import FOLLOW
 from cosfly.geometry import DT_S
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
 from cosfly.planners.styles import Range, Style
-from cosfly.products.segments import FOLLOW
 
 if TYPE_CHECKING:
     from cosfly.space.kernels import BoxIndex

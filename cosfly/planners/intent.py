@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from cosfly.formats.segments import FOLLOW, MISSION_KINDS, Mission, Segment
+from cosfly.formats.walks import Walk
 from cosfly.geometry import look_at
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
 from cosfly.planners.courses import ROUNDING_S, wish_of
 from cosfly.planners.reacquire import finds_again, wish_of_reacquire
 from cosfly.planners.styles import OTHER_SIDE, REACQUIRE, RETURN_HOME, ROWS, WHOLE, suits
-from cosfly.products.segments import FOLLOW, MISSION_KINDS, Mission, Segment
-from cosfly.products.walks import Walk
 from cosfly.runtime.chance import draw_to_quota
 
 if TYPE_CHECKING:

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cosfly.formats.kinds import KINDS
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
 from cosfly.planners.courses import places_of, without_jumps
 from cosfly.planners.styles import REACQUIRE, Style
-from cosfly.products.kinds import KINDS
 
 if TYPE_CHECKING:
-    from cosfly.products.boxes import BoxMap
+    from cosfly.formats.boxes import BoxMap
     from cosfly.space.kernels import BoxIndex
 
 TRIES = 120

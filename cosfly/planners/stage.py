@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cosfly.formats.boxes import BoxMap, read_boxes
+from cosfly.formats.segments import FOLLOW
+from cosfly.formats.traces import DroneTrace, write_traces
+from cosfly.formats.walks import TARGET_HEIGHT_M, Walk, read_paths
 from cosfly.geometry import DT_S, step_s
 from cosfly.planners.contract import PlanConfig, Scenario, load_planner
-from cosfly.products.boxes import BoxMap, read_boxes
-from cosfly.products.segments import FOLLOW
-from cosfly.products.traces import DroneTrace, write_traces
-from cosfly.products.walks import TARGET_HEIGHT_M, Walk, read_paths
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import InputError, NoPathError
 from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from cosfly.products.segments import FOLLOW
+from cosfly.formats.segments import FOLLOW
 
 REACQUIRE, RETURN_HOME = "reacquire", "return_home"
 ALTITUDE_LEAST_M = 8.0  # bound of every style but `follow`, unless their ranges begin lower

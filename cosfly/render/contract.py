@@ -20,12 +20,12 @@ from typing import Protocol
 
 import numpy as np
 
-from cosfly.products.boxes import BoxMap
-from cosfly.products.frames import PERSON_ID as PERSON_ID
-from cosfly.products.frames import SKY_DEPTH_M
-from cosfly.products.kinds import GROUND_KINDS, KINDS
-from cosfly.products.people import COLORS, Appearance
-from cosfly.products.weather import WeatherParams
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.frames import PERSON_ID as PERSON_ID
+from cosfly.formats.frames import SKY_DEPTH_M
+from cosfly.formats.kinds import GROUND_KINDS, KINDS
+from cosfly.formats.people import COLORS, Appearance
+from cosfly.formats.weather import WeatherParams
 from cosfly.runtime.errors import RenderError
 
 DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"  # OpenGL without a window, on a GPU or the CPU

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from cosfly.products.boxes import BoxMap
-from cosfly.products.kinds import GROUND_KINDS, KINDS, LAYERS
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.kinds import GROUND_KINDS, KINDS, LAYERS
 from cosfly.render.contract import GROUND_PLANE_HALF_M, LAWN_HALF_M, STANDING_LAYER
 from cosfly.space.grid import lies_off_ground
 

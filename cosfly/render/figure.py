@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from cosfly.formats.walks import TARGET_HEIGHT_M
 from cosfly.geometry import rotation_matrices, rotation_matrix
-from cosfly.products.walks import TARGET_HEIGHT_M
 from cosfly.render.contract import Clothes, PosedPerson
 
 HIP_SWING_RAD, ARM_SWING_RAD, KNEE_BEND_RAD = 0.25, 0.38, 0.65

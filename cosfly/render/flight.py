@@ -15,18 +15,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from cosfly.formats import frames
+from cosfly.formats.frames import Camera, DepthFormat, FrameFile, FrameMeta, Look, OthersMeta, TargetMeta, frame_name
+from cosfly.formats.goals import Goal, SeenFrame, find_says, otherwise, target_picture, words_of
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.people import Appearance, People
+from cosfly.formats.playback import LEGIBILITY, TARGET_FILE, Flight, write_flight
+from cosfly.formats.segments import Mission, Segment
+from cosfly.formats.traces import DroneTrace
+from cosfly.formats.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
+from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry import mask_box, world_from_camera
 from cosfly.look.overlay import Overlay
-from cosfly.products import frames
-from cosfly.products.frames import Camera, DepthFormat, FrameFile, FrameMeta, Look, OthersMeta, TargetMeta, frame_name
-from cosfly.products.goals import Goal, SeenFrame, find_says, otherwise, target_picture, words_of
-from cosfly.products.kinds import KINDS
-from cosfly.products.people import Appearance, People
-from cosfly.products.playback import LEGIBILITY, TARGET_FILE, Flight, write_flight
-from cosfly.products.segments import Mission, Segment
-from cosfly.products.traces import DroneTrace
-from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
-from cosfly.products.weather import WeatherRecord
 from cosfly.render.camera import (
     TargetView,
     contrast_of,

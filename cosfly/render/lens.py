@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from cosfly.formats.frames import Camera
+from cosfly.formats.segments import Segment
 from cosfly.geometry import focal_px, intrinsic_matrix
-from cosfly.products.frames import Camera
-from cosfly.products.segments import Segment
 from cosfly.runtime.config import Config
 
 

@@ -16,12 +16,12 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.frames import Camera
+from cosfly.formats.kinds import GROUND_KINDS
+from cosfly.formats.shift_draws import ShiftDraw, shift_draws
+from cosfly.formats.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.geometry import look_at, project, rotation_matrices, world_from_camera, wrap_deg
-from cosfly.products.boxes import BoxMap
-from cosfly.products.frames import Camera
-from cosfly.products.kinds import GROUND_KINDS
-from cosfly.products.shift_draws import ShiftDraw, shift_draws
-from cosfly.products.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.render.contract import plane_z_m
 from cosfly.render.person import NOBODY, Cast
 from cosfly.runtime.config import Config

@@ -13,10 +13,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from cosfly.formats.boxes import BoxMap, make_box_map
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.traces import DroneTrace
 from cosfly.geometry import axis_aligned_half_extents
-from cosfly.products.boxes import BoxMap, make_box_map
-from cosfly.products.kinds import KINDS
-from cosfly.products.traces import DroneTrace
 from cosfly.render.contract import FAR_M, ground_plane
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import RenderError

@@ -6,8 +6,8 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cosfly.products.frames import LEAST_FOV_DEG, MOST_FOV_DEG, DepthFormat, FrameFile, Look
-from cosfly.products.places import folder_name
+from cosfly.formats.frames import LEAST_FOV_DEG, MOST_FOV_DEG, DepthFormat, FrameFile, Look
+from cosfly.formats.places import folder_name
 from cosfly.render.carla_backend import CarlaRenderConfig
 from cosfly.render.lens import ZoomConfig
 from cosfly.render.perturbation import PerturbationConfig

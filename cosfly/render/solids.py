@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cosfly.formats.boxes import BoxMap
 from cosfly.geometry import rotation_matrices
-from cosfly.products.boxes import BoxMap
 
 
 @dataclass(frozen=True)

@@ -15,17 +15,17 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel
 
+from cosfly.formats.boxes import BoxMap, check_ground, read_boxes
+from cosfly.formats.frames import Look
+from cosfly.formats.others import Company, Other, read_others
+from cosfly.formats.places import place_of, town_folder
+from cosfly.formats.shift_draws import PERTURBED, rng_of_shifts
+from cosfly.formats.town import IDS_FILE, IDS_FORMAT, write_town_map
+from cosfly.formats.traces import DroneTrace, read_traces
+from cosfly.formats.walks import pace_field
+from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry import step_s
 from cosfly.look.overlay import Overlay
-from cosfly.products.boxes import BoxMap, check_ground, read_boxes
-from cosfly.products.frames import Look
-from cosfly.products.others import Company, Other, read_others
-from cosfly.products.places import place_of, town_folder
-from cosfly.products.shift_draws import PERTURBED, rng_of_shifts
-from cosfly.products.town import IDS_FILE, IDS_FORMAT, write_town_map
-from cosfly.products.traces import DroneTrace, read_traces
-from cosfly.products.walks import pace_field
-from cosfly.products.weather import WeatherRecord
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids, other_id
 from cosfly.render.flight import FlightScript, Writing, check_flight, render_flight
 from cosfly.render.lens import cameras_of

@@ -22,10 +22,10 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from cosfly.products.boxes import BoxMap
-from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, Look
-from cosfly.products.kinds import KINDS
-from cosfly.products.weather import WeatherParams
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M, Look
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.weather import WeatherParams
 from cosfly.render.contract import (
     NEAR_M,
     NO_INSTANCE,

@@ -14,10 +14,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cosfly.products.boxes import BoxMap
-from cosfly.products.frames import LEGIBLE_CONTRAST
-from cosfly.products.kinds import KINDS
-from cosfly.products.weather import (
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.frames import LEGIBLE_CONTRAST
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.weather import (
     TIMES,
     WEATHERS,
     SkyKind,

@@ -21,10 +21,10 @@ import numpy as np
 import shapely
 from pydantic import Field
 
+from cosfly.formats.boxes import BoxMap, SimplifyPass
+from cosfly.formats.kinds import KINDS, SURFACE_KINDS
+from cosfly.formats.meshes import Meshes
 from cosfly.geometry import axis_aligned_half_extents
-from cosfly.products.boxes import BoxMap, SimplifyPass
-from cosfly.products.kinds import KINDS, SURFACE_KINDS
-from cosfly.products.meshes import Meshes
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.config import Config
 

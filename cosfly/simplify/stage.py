@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from cosfly.formats.boxes import BoxMap, read_boxes, write_boxes
+from cosfly.formats.kinds import KINDS, SURFACE_KINDS
 from cosfly.look.topview import TopView, add_caption, draw_map, png_bytes
-from cosfly.products.boxes import BoxMap, read_boxes, write_boxes
-from cosfly.products.kinds import KINDS, SURFACE_KINDS
 from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally

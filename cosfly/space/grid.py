@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 import shapely
 
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.kinds import GROUND_KINDS, KINDS, LAYERS
+from cosfly.formats.roi import Roi
 from cosfly.geometry import rotation_matrices
-from cosfly.products.boxes import BoxMap
-from cosfly.products.kinds import GROUND_KINDS, KINDS, LAYERS
-from cosfly.products.roi import Roi
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import InputError
 

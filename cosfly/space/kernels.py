@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.kinds import GROUND_KINDS, KINDS
 from cosfly.geometry import rotation_matrices
-from cosfly.products.boxes import BoxMap
-from cosfly.products.kinds import GROUND_KINDS, KINDS
 from cosfly.runtime.compiled import njit
 
 CELL_M = 8.0  # about the influence radius of obstacles: a distance query looks at nine cells

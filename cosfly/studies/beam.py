@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field
 
+from cosfly.formats.boxes import read_boxes
+from cosfly.formats.walks import read_paths
 from cosfly.planners.compare import INTERVAL_PERCENT, NUM_RESAMPLES
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import check_ids, draw_styles_of, make_scenario, plan_flight, warm_up
-from cosfly.products.boxes import read_boxes
-from cosfly.products.walks import read_paths
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import NoPathError

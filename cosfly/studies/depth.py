@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from pydantic import BaseModel
 
+from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M, depth_values, frame_path, is_packed, read_rgb
 from cosfly.look.frame_views import depth_colors
 from cosfly.look.tables import TextTable
 from cosfly.look.topview import PAPER, Color, draw_line, draw_text, png_bytes
-from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, depth_values, frame_path, is_packed, read_rgb
 from cosfly.runtime.arrays import parse_array, parse_array_header
 from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import InputError

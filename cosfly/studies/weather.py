@@ -9,12 +9,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from cosfly.formats.boxes import check_ground, read_boxes
+from cosfly.formats.traces import DroneTrace, read_traces
+from cosfly.formats.weather import TIMES, WEATHERS, resolved
 from cosfly.geometry import intrinsic_matrix, world_from_camera
 from cosfly.look.frame_views import encode_picture
 from cosfly.look.topview import PAPER, draw_text
-from cosfly.products.boxes import check_ground, read_boxes
-from cosfly.products.traces import DroneTrace, read_traces
-from cosfly.products.weather import TIMES, WEATHERS, resolved
 from cosfly.render.contract import PosedPerson, Renderer
 from cosfly.render.flight import MARGIN_M
 from cosfly.render.person import choose_clothes, gait_of

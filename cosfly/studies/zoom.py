@@ -17,12 +17,12 @@ import cv2
 import numpy as np
 from pydantic import BaseModel, Field
 
+from cosfly.formats.boxes import check_ground, read_boxes
+from cosfly.formats.frames import Camera, level_name, rgb_bytes
+from cosfly.formats.traces import read_traces
 from cosfly.geometry import box_iou, intrinsic_matrix
 from cosfly.look.tables import TextTable
 from cosfly.look.topview import add_caption
-from cosfly.products.boxes import check_ground, read_boxes
-from cosfly.products.frames import Camera, level_name, rgb_bytes
-from cosfly.products.traces import read_traces
 from cosfly.render.contract import Renderer
 from cosfly.render.flight import MARGIN_M, FlightScript, check_flight, draw_frame
 from cosfly.render.perturbation import Surroundings

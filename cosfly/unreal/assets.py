@@ -6,7 +6,7 @@ import re
 from fnmatch import fnmatchcase
 from typing import NamedTuple
 
-from cosfly.products.kinds import KINDS
+from cosfly.formats.kinds import KINDS
 from cosfly.runtime.store import sha256_bytes
 
 

@@ -21,10 +21,10 @@ from cosfly.chat.answers import AnswerBook, KeptAnswers
 from cosfly.chat.budget import Budget, BudgetConfig
 from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import NoAnswer, Reply, started
+from cosfly.formats.boxes import OUR_LICENCE, BoxMap
+from cosfly.formats.kinds import GROUND_KINDS
 from cosfly.look.topview import TopView, draw_map, png_bytes
 from cosfly.maps.simworld import PLACEHOLDER_CM
-from cosfly.products.boxes import OUR_LICENCE, BoxMap
-from cosfly.products.kinds import GROUND_KINDS
 from cosfly.runtime.config import read_yaml, shipped
 from cosfly.runtime.documents import FileFormat, validated
 from cosfly.runtime.errors import TeacherError

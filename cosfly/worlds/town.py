@@ -15,14 +15,14 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from cosfly.formats.boxes import BoxMap, make_box_map
+from cosfly.formats.kinds import KIND_NAMES, KINDS
 from cosfly.geometry import box_corners
 from cosfly.maps import synthetic
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.town_blocks import LAWN_TOP_M, PAVED_TOP_M, SLAB_M
-from cosfly.products.boxes import BoxMap, make_box_map
-from cosfly.products.kinds import KIND_NAMES, KINDS
 from cosfly.runtime.chance import rng_for
 from cosfly.worlds.objects import Object, asset_for, assets
 from cosfly.worlds.plan import SPACE_M, WorldPlan, objects_of, town_settings, unknown_objects

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from cosfly.products.captions import Language
+from cosfly.formats.captions import Language
 from cosfly.runtime.config import Config
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.documents import Record, read_json, read_object

@@ -17,8 +17,8 @@ from functools import cached_property
 
 import numpy as np
 
-from cosfly.products.actions import TOKENS
-from cosfly.products.captions import Coc, Language
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.captions import Coc, Language
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.documents import parse_document, validated
 from cosfly.space.blind import FITTED_ON, Decider, fit_deciders

@@ -6,10 +6,10 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.captions import FIELDS
+from cosfly.formats.figures import Figure
 from cosfly.look.page import page
-from cosfly.products.actions import TOKENS
-from cosfly.products.captions import FIELDS
-from cosfly.products.figures import Figure
 from cosfly.runtime.escaping import for_markdown
 from cosfly.runtime.files import read_text
 from distill.evaluation.measure import STUDENT, UNPARSED_NAME, Evaluation, FigureSet, Measurement

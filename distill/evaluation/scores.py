@@ -4,7 +4,7 @@ A sample that got no answer (`answered` false: a picture could not be read, a se
 answer that does not parse is one: it decides nothing, and its texts score 0.
 
 Windows of a flight overlap, flights of a walk resemble each other and languages share windows, so samples are no
-independent draws: intervals are by bootstrap over whole walks (cosfly/products/figures.py).
+independent draws: intervals are by bootstrap over whole walks (cosfly/formats/figures.py).
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cosfly.products.actions import TOKENS, not_in_set
-from cosfly.products.captions import Coc, SentenceState, Verdict, verdict_on
-from cosfly.products.figures import Figure, draw_walks, figure_of_draws, interval_of
-from cosfly.products.predictions import FAILED, Prediction
+from cosfly.formats.actions import TOKENS, not_in_set
+from cosfly.formats.captions import Coc, SentenceState, Verdict, verdict_on
+from cosfly.formats.figures import Figure, draw_walks, figure_of_draws, interval_of
+from cosfly.formats.predictions import FAILED, Prediction
 from cosfly.runtime.documents import Record
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import atomic_file, dump_json, sha256_bytes

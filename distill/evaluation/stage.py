@@ -13,9 +13,9 @@ from typing import Any
 
 from pydantic import Field
 
+from cosfly.formats.captions import Language
+from cosfly.formats.predictions import Prediction, read_predictions
 from cosfly.look.frame_views import thumbnail
-from cosfly.products.captions import Language
-from cosfly.products.predictions import Prediction, read_predictions
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally

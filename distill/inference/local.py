@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 from cosfly.chat.answers import Answer, AnswerBook
-from cosfly.products.answer_text import answer_schema
-from cosfly.products.captions import Language
-from cosfly.products.places import flight_of
+from cosfly.formats.answer_text import answer_schema
+from cosfly.formats.captions import Language
+from cosfly.formats.places import flight_of
 from cosfly.runtime.console import Advance
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.store import dump_json, sha256_bytes

@@ -18,8 +18,8 @@ from cosfly.chat.client import ChatClient
 from cosfly.chat.contract import Engine, NoAnswer, Request, started
 from cosfly.chat.student_chat import TAUGHT, StudentEndpointConfig, picture_to_send, read_taught, student_request
 from cosfly.chat.vllm_engine import VllmConfig, VllmEngine
-from cosfly.products.answer_text import answer_schema
-from cosfly.products.predictions import PREDICTIONS, Split
+from cosfly.formats.answer_text import answer_schema
+from cosfly.formats.predictions import PREDICTIONS, Split
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.console import Advance, progress_bar
 from cosfly.runtime.errors import ConfigError, InputError, TeacherError

@@ -15,11 +15,11 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
+from cosfly.formats.flights import find_flights, read_twin
+from cosfly.formats.places import Place, flight_ids, place_of, sample_id
+from cosfly.formats.playback import ORIGINAL, Flight, read_flight
+from cosfly.formats.splits import SPLITS, Course, Split, walks_of
 from cosfly.geometry import step_s
-from cosfly.products.flights import find_flights, read_twin
-from cosfly.products.places import Place, flight_ids, place_of, sample_id
-from cosfly.products.playback import ORIGINAL, Flight, read_flight
-from cosfly.products.splits import SPLITS, Course, Split, walks_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.documents import FileFormat, Record, read_model, validated
 from cosfly.runtime.errors import InputError, VerifyError
@@ -50,7 +50,7 @@ class TrackSample(SplitMember):
 
     future: tuple[int, ...]  # of the frames to predict
     time_s: tuple[float, ...]  # of both
-    states: tuple[str | None, ...]  # of the observed frames: STATES of cosfly/products/playback.py
+    states: tuple[str | None, ...]  # of the observed frames: STATES of cosfly/formats/playback.py
     observed_position_m: tuple[Vector, ...]  # perturbed: what a model is given
     observed_rotation_deg: tuple[Vector, ...]
     observed_target_m: tuple[Vector | None, ...]

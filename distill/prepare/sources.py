@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from cosfly.formats.captions import Caption
+from cosfly.formats.flights import find_flights, track_of
+from cosfly.formats.frames import frame_name, frame_path
+from cosfly.formats.places import TRACKS, FlightChoice, Place, flight_ids, folder_name, sample_id
+from cosfly.formats.playback import read_flight
+from cosfly.formats.splits import Course, walks_of
 from cosfly.look.frame_views import VIEW_FILES, View
-from cosfly.products.captions import Caption
-from cosfly.products.flights import find_flights, track_of
-from cosfly.products.frames import frame_name, frame_path
-from cosfly.products.places import TRACKS, FlightChoice, Place, flight_ids, folder_name, sample_id
-from cosfly.products.playback import read_flight
-from cosfly.products.splits import Course, walks_of
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.files import check_stays_below
 from cosfly.runtime.provenance import was_made_of

@@ -21,13 +21,13 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from cosfly.formats.actions import TOKENS, not_in_set
+from cosfly.formats.answer_text import parse_answer
+from cosfly.formats.captions import PICTURES_MARK, Caption, Language, Verdict, read_captions
+from cosfly.formats.places import FlightChoice
+from cosfly.formats.playback import read_flight
+from cosfly.formats.splits import SPLITS, Split
 from cosfly.look.frame_views import DEPTH_RANGE_M, Pictures, View, scaled_size
-from cosfly.products.actions import TOKENS, not_in_set
-from cosfly.products.answer_text import parse_answer
-from cosfly.products.captions import PICTURES_MARK, Caption, Language, Verdict, read_captions
-from cosfly.products.places import FlightChoice
-from cosfly.products.playback import read_flight
-from cosfly.products.splits import SPLITS, Split
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.provenance import fingerprint

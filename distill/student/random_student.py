@@ -13,8 +13,8 @@ from typing import Any
 
 from pydantic import Field
 
-from cosfly.products.actions import TOKENS
-from cosfly.products.captions import FIELDS
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.captions import FIELDS
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from cosfly.products.answer_text import parse_answer
-from cosfly.products.captions import verdict_on
+from cosfly.formats.answer_text import parse_answer
+from cosfly.formats.captions import verdict_on
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import ConfigError, InputError

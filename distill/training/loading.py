@@ -15,9 +15,9 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from cosfly.formats.frames import frame_path
+from cosfly.formats.places import flight_of
 from cosfly.look.frame_views import VIEW_FILES
-from cosfly.products.frames import frame_path
-from cosfly.products.places import flight_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import CosflyError, EnvironmentMissing, InputError
 from cosfly.runtime.store import inside

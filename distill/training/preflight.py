@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from cosfly.products.actions import TOKENS
+from cosfly.formats.actions import TOKENS
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.store import write_json
 from distill.schema import Sample, Samples

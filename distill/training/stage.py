@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.chat.student_chat import FrameLook, Taught, write_taught
-from cosfly.products.captions import Language, Prompt
+from cosfly.formats.captions import Language, Prompt
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally

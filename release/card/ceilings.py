@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.products.actions import ORDERS, TOKENS
-from cosfly.products.segments import Segment
+from cosfly.formats.actions import ORDERS, TOKENS
+from cosfly.formats.segments import Segment
 from cosfly.runtime.chance import draws_for, rng_for
 from cosfly.space.blind import FITTED_ON, LEAST_WINDOWS, fit_deciders, is_drawn_ahead, past_of
 from release.card.numbers import DIGITS, row_lists

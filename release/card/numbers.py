@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cosfly.products.coverage import AXES, Coverage, axis_values
+from cosfly.formats.coverage import AXES, Coverage, axis_values
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.tables import arrow_errors, num_rows, open_table, row_groups
 from release.columns import CAPTION_FIELDS, COUNTED, LANGUAGES, PICTURES, PLACE, POINT, REQUIRED, schema

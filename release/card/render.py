@@ -15,12 +15,12 @@ from typing import Any
 
 import yaml
 
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.captions import FIELDS
+from cosfly.formats.coverage import NAMED
+from cosfly.formats.frames import FrameFile
 from cosfly.look.coverage_page import ranges, shares
 from cosfly.look.page import markdown
-from cosfly.products.actions import TOKENS
-from cosfly.products.captions import FIELDS
-from cosfly.products.coverage import NAMED
-from cosfly.products.frames import FrameFile
 from cosfly.runtime.escaping import for_terminal
 from cosfly.runtime.files import read_text
 from cosfly.space.blind import DRAWN_AHEAD, LEAST_WINDOWS, LOOKS_BACK

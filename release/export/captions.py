@@ -16,10 +16,10 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Any, Literal, NamedTuple
 
+from cosfly.formats.captions import FIELDS, Language, Prompt, read_captions
+from cosfly.formats.frames import FILE_NAMES, frame_name
+from cosfly.formats.places import Place
 from cosfly.look.frame_views import Pictures, frame_label
-from cosfly.products.captions import FIELDS, Language, Prompt, read_captions
-from cosfly.products.frames import FILE_NAMES, frame_name
-from cosfly.products.places import Place
 from cosfly.runtime.errors import InputError, NothingKept, StorageError
 from cosfly.runtime.files import check_stays_below
 from cosfly.runtime.store import atomic_file, dump_json, inside

@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cosfly.products.frames import FrameFile
+from cosfly.formats.frames import FrameFile
 from cosfly.runtime.arrays import png_size
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import sha256_file

@@ -20,14 +20,14 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.products.boxes import UNKNOWN_LICENCE
-from cosfly.products.frames import COMPANY, COORDINATES, FILE_NAMES, frame_name
-from cosfly.products.goals import Goal
-from cosfly.products.places import TOWN
-from cosfly.products.playback import LEGIBILITY, TARGET_FILE, Flight, write_flight
-from cosfly.products.segments import FOLLOW, Segment
-from cosfly.products.town import TOWN_FILE, TOWN_FORMAT, TownMap
-from cosfly.products.walks import pace_field
+from cosfly.formats.boxes import UNKNOWN_LICENCE
+from cosfly.formats.frames import COMPANY, COORDINATES, FILE_NAMES, frame_name
+from cosfly.formats.goals import Goal
+from cosfly.formats.places import TOWN
+from cosfly.formats.playback import LEGIBILITY, TARGET_FILE, Flight, write_flight
+from cosfly.formats.segments import FOLLOW, Segment
+from cosfly.formats.town import TOWN_FILE, TOWN_FORMAT, TownMap
+from cosfly.formats.walks import pace_field
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import sha256_file
 from cosfly.runtime.runner import advance
@@ -118,8 +118,8 @@ def finish(
         },
         coordinates=COORDINATES,
         notes=list(_notes(units, written)),
-        how_to_open="from cosfly.products.flights import find_flights\n"
-        "from cosfly.products.playback import read_flight\n"
+        how_to_open="from cosfly.formats.flights import find_flights\n"
+        "from cosfly.formats.playback import read_flight\n"
         "flights = [read_flight(folder, strict=False) for folder in find_flights(Path('.'))]",
         files=files,
     )

@@ -14,7 +14,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from cosfly.products.frames import FrameFile
+from cosfly.formats.frames import FrameFile
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.runner import advance
 from cosfly.runtime.store import atomic_file, dump_json

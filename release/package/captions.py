@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from cosfly.products.actions import ACTIONS, not_in_set
-from cosfly.products.captions import Caption, caption_lines
-from cosfly.products.places import sample_id
+from cosfly.formats.actions import ACTIONS, not_in_set
+from cosfly.formats.captions import Caption, caption_lines
+from cosfly.formats.places import sample_id
 from cosfly.runtime.documents import parse_document, parse_json, validated
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import published_name

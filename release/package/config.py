@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pydantic import Field, field_validator, model_validator
 
-from cosfly.products.boxes import LicenceId
-from cosfly.products.frames import FILE_NAMES, FrameFile
-from cosfly.products.places import Track
+from cosfly.formats.boxes import LicenceId
+from cosfly.formats.frames import FILE_NAMES, FrameFile
+from cosfly.formats.places import Track
 from cosfly.runtime.config import Config
 from release.columns import SplitName
 from release.record import Pairs, SplitBy

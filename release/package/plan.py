@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cosfly.products.frames import DEPTH_PNG, FILE_NAMES, frame_name, frame_path
-from cosfly.products.places import FlightChoice
-from cosfly.products.review import how_to_decide
+from cosfly.formats.frames import DEPTH_PNG, FILE_NAMES, frame_name, frame_path
+from cosfly.formats.places import FlightChoice
+from cosfly.formats.review import how_to_decide
 from cosfly.runtime.errors import CosflyError, InputError, NothingKept, VerifyError
 from cosfly.runtime.stage_folder import Failed, StageFolder, Tally, write_failures
 from release.columns import SPLIT_NAMES, Placement, SplitName

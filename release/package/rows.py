@@ -8,9 +8,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import BaseModel
 
-from cosfly.products.frames import FILE_NAMES, FrameFile, depth_bytes, depth_values, frame_path, is_packed
-from cosfly.products.places import sample_id
-from cosfly.products.playback import Flight
+from cosfly.formats.frames import FILE_NAMES, FrameFile, depth_bytes, depth_values, frame_path, is_packed
+from cosfly.formats.places import sample_id
+from cosfly.formats.playback import Flight
 from release import columns
 from release.columns import PICTURES
 

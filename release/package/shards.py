@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel
 
-from cosfly.products.frames import (
+from cosfly.formats.frames import (
     FILE_NAMES,
     FRAMES_DIR,
     SKY_DEPTH_M,
@@ -25,8 +25,8 @@ from cosfly.products.frames import (
     frame_path,
     tree_of,
 )
-from cosfly.products.playback import TARGET_FILE, Flight
-from cosfly.products.png import parse_png
+from cosfly.formats.playback import TARGET_FILE, Flight
+from cosfly.formats.png import parse_png
 from cosfly.runtime.arrays import PNG_HEADER_BYTES, png_size
 from cosfly.runtime.errors import CosflyError, InputError, VerifyError
 from cosfly.runtime.files import check_stays_below, read_bytes, sha256_file

@@ -6,13 +6,13 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from cosfly.products.boxes import UNKNOWN_LICENCE
-from cosfly.products.captions import OWN_PROMPTS, QUESTIONS
-from cosfly.products.flights import find_flights
-from cosfly.products.inspection import FlightInspection, Inspection, TrajectoryFunnel
-from cosfly.products.places import ALL_FLIGHTS, FlightChoice, Place, flight_ids, folder_name
-from cosfly.products.review import REVIEW, read_settled
-from cosfly.products.town import read_town_map
+from cosfly.formats.boxes import UNKNOWN_LICENCE
+from cosfly.formats.captions import OWN_PROMPTS, QUESTIONS
+from cosfly.formats.flights import find_flights
+from cosfly.formats.inspection import FlightInspection, Inspection, TrajectoryFunnel
+from cosfly.formats.places import ALL_FLIGHTS, FlightChoice, Place, flight_ids, folder_name
+from cosfly.formats.review import REVIEW, read_settled
+from cosfly.formats.town import read_town_map
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.files import check_stays_below, read_text
 from cosfly.runtime.provenance import is_bound

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cosfly.products.frames import FRAMES_DIR, frame_name, read_meta
-from cosfly.products.places import Track
-from cosfly.products.playback import Flight, read_flight
-from cosfly.products.splits import Course, town_family, walks_of
+from cosfly.formats.frames import FRAMES_DIR, frame_name, read_meta
+from cosfly.formats.places import Track
+from cosfly.formats.playback import Flight, read_flight
+from cosfly.formats.splits import Course, town_family, walks_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
 from release.columns import Placement, SplitName

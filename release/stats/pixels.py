@@ -12,9 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile, depth_values
+from cosfly.formats.kinds import KIND_NAMES
 from cosfly.look.frame_views import small_jpeg
-from cosfly.products.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile, depth_values
-from cosfly.products.kinds import KIND_NAMES
 from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError

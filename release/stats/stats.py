@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from cosfly.formats.coverage import Coverage
 from cosfly.look.coverage_page import coverage_html
 from cosfly.look.page import page
-from cosfly.products.coverage import Coverage
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.escaping import for_markdown
 from cosfly.runtime.store import write_bytes, write_json

@@ -9,11 +9,11 @@ from typing import Literal
 
 from pydantic import Field
 
-from cosfly.products.actions import ACTIONS, TOKENS
-from cosfly.products.answer_text import MIN_CHARACTERS, MIN_CHARACTERS_ZH
-from cosfly.products.captions import FIELDS
-from cosfly.products.frames import LEVEL_NAMES
-from cosfly.products.weather import TIMES, WEATHERS, preset_token
+from cosfly.formats.actions import ACTIONS, TOKENS
+from cosfly.formats.answer_text import MIN_CHARACTERS, MIN_CHARACTERS_ZH
+from cosfly.formats.captions import FIELDS
+from cosfly.formats.frames import LEVEL_NAMES
+from cosfly.formats.weather import TIMES, WEATHERS, preset_token
 from cosfly.runtime.documents import Record
 from cosfly.space.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3, smoothness_score
 from release.card.numbers import Sum, bounded, spread_of

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import ConfigDict
 
-from cosfly.products.issues import Issue, Report, Severity, sort_key
+from cosfly.formats.issues import Issue, Report, Severity, sort_key
 from cosfly.runtime.escaping import cut, for_terminal
 from release.flight_rows import FlightRows
 

@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosfly.formats.frames import PERSON_ID, SKY_DEPTH_M, FrameFile, depth_values
+from cosfly.formats.goals import LANDMARKS, SeenFrame, meant, target_picture, words_of
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.png import colours_of
+from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
 from cosfly.geometry import BODY_FROM_CAMERA
-from cosfly.products.frames import PERSON_ID, SKY_DEPTH_M, FrameFile, depth_values
-from cosfly.products.goals import LANDMARKS, SeenFrame, meant, target_picture, words_of
-from cosfly.products.kinds import KINDS
-from cosfly.products.png import colours_of
-from cosfly.products.walks import PERSON_HALF_EXTENTS_M
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.items import advance

@@ -12,10 +12,10 @@ from typing import Any
 
 import pyarrow as pa
 
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import FILE_NAMES, FrameFile, frame_path
-from cosfly.products.places import Place, flight_ids
-from cosfly.products.playback import Flight, read_flight
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import FILE_NAMES, FrameFile, frame_path
+from cosfly.formats.places import Place, flight_ids
+from cosfly.formats.playback import Flight, read_flight
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import read_bytes
 from cosfly.runtime.tables import open_table, read_row_group, row_batches

@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cosfly.products.playback import ORIGINAL
-from cosfly.products.shown_captions import CaptionReader
-from cosfly.products.splits import town_family
+from cosfly.formats.playback import ORIGINAL
+from cosfly.formats.shown_captions import CaptionReader
+from cosfly.formats.splits import town_family
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import open_file, read_bytes, sha256_file

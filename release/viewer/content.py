@@ -12,12 +12,12 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from pydantic import BaseModel, Field
 
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.captions import Coc, Language
+from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES
+from cosfly.formats.sentences import sentences_of
 from cosfly.geometry import box_corners
 from cosfly.look.frame_views import View, small_jpeg
-from cosfly.products.boxes import BoxMap
-from cosfly.products.captions import Coc, Language
-from cosfly.products.kinds import GROUND_KINDS, KIND_NAMES
-from cosfly.products.sentences import sentences_of
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
 from release.columns import BOX, CAPTION, FIELDS, FRAME, LANGUAGES, POINT, TARGET_PICTURE, Column

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from cosfly.formats.boxes import read_boxes
+from cosfly.formats.captions import Caption, read_captions
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import frame_path
+from cosfly.formats.places import folder_name, place_of, town_folder
+from cosfly.formats.playback import Flight, read_flight
+from cosfly.formats.review import read_settled
 from cosfly.look.frame_views import VIEW_FILES, View, read_view
-from cosfly.products.boxes import read_boxes
-from cosfly.products.captions import Caption, read_captions
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import frame_path
-from cosfly.products.places import folder_name, place_of, town_folder
-from cosfly.products.playback import Flight, read_flight
-from cosfly.products.review import read_settled
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
 from release.columns import Placement, caption_values, scalar_row

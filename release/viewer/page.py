@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 import pyarrow as pa
 
+from cosfly.formats.frames import FrameFile, depth_values
 from cosfly.look.frame_views import View, depth_colors, segmentation_colors
 from cosfly.look.page import page, scripts
-from cosfly.products.frames import FrameFile, depth_values
 from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.escaping import for_terminal

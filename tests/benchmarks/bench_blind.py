@@ -25,16 +25,16 @@ from caption.run.windows import current_frames, cut_future, label_motion, order_
 from caption.schema import WindowConfig
 from caption.truth.actions import TABLE, measure
 from cosfly.app.settings import RunConfig
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.playback import Flight
+from cosfly.formats.traces import DroneTrace
+from cosfly.formats.walks import walk_id
 from cosfly.geometry import look_at, wrap_deg
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.stage import make_walk
 from cosfly.pedestrians.walkable import walkable_ground
 from cosfly.planners.reacquire import screens_of
 from cosfly.planners.stage import draw_styles_of, plan_flight
-from cosfly.products.actions import TOKENS
-from cosfly.products.playback import Flight
-from cosfly.products.traces import DroneTrace
-from cosfly.products.walks import walk_id
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import load, shipped
 from cosfly.simplify.passes import simplify

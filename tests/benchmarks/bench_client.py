@@ -35,8 +35,8 @@ from caption.teachers.images import FrameEncoder
 from caption.teachers.teacher import SharedFrames
 from cosfly.chat import client
 from cosfly.chat.protocol import encode_body
+from cosfly.formats.frames import SKY_DEPTH_M
 from cosfly.look.frame_views import VIEW_FILES
-from cosfly.products.frames import SKY_DEPTH_M
 from specimens import make_playback_tree
 
 WIDTH, HEIGHT, DELAY_S = 640, 360, 0.2

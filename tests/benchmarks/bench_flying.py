@@ -21,11 +21,11 @@ from caption.schema import CaptionConfig
 from cosfly import load_map
 from cosfly.closed_loop import stage
 from cosfly.closed_loop.settings import FlyConfig
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.boxes import write_boxes
 from cosfly.pedestrians import stage as pedestrians
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners.contract import PlanConfig
-from cosfly.products.actions import TOKENS
-from cosfly.products.boxes import write_boxes
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.stage_folder import read_manifest
 from cosfly.simplify.passes import SimplifyConfig, simplify

@@ -16,10 +16,10 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from browser import Page, browser
 from census_town import census_town
 
+from cosfly.formats.boxes import write_boxes
 from cosfly.look.scene_page import run as write_scene
 from cosfly.pedestrians.roi_editor import open_editor
 from cosfly.pedestrians.walkable import PedestriansConfig
-from cosfly.products.boxes import write_boxes
 from cosfly.simplify.passes import SimplifyConfig, simplify
 
 READY = "document.body.dataset.ready === 'yes'"

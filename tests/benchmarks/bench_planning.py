@@ -18,14 +18,14 @@ from scipy.optimize import minimize
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from cosfly.formats.boxes import BoxMap, write_boxes
+from cosfly.formats.kinds import KINDS
 from cosfly.pedestrians.astar import find_route, route_cost
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, run, walkable_ground
 from cosfly.planners.contract import PLANNERS, PlanConfig, Scenario, load_planner
 from cosfly.planners.muco import muco
 from cosfly.planners.muco.loss import evaluate, make_state
 from cosfly.planners.stage import make_scenario
-from cosfly.products.boxes import BoxMap, write_boxes
-from cosfly.products.kinds import KINDS
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import NoPathError
 from cosfly.simplify.passes import SimplifyConfig, clusters, simplify

@@ -32,9 +32,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from specimens_distill import make_captions
 
-from cosfly.products.flights import find_flights
-from cosfly.products.frames import FILE_NAMES, FrameFile, depth_bytes, frame_name, instance_bytes, rgb_bytes
-from cosfly.products.playback import Flight, write_flight
+from cosfly.formats.flights import find_flights
+from cosfly.formats.frames import FILE_NAMES, FrameFile, depth_bytes, frame_name, instance_bytes, rgb_bytes
+from cosfly.formats.playback import Flight, write_flight
 from cosfly.runtime.store import CHECKSUMS, checksum_lines, sha256_bytes
 from release.package.config import ReleaseConfig
 from release.package.sources import Source

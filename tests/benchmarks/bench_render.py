@@ -31,12 +31,12 @@ import numpy as np
 import scenes
 
 from cosfly.app.bench import row_of
+from cosfly.formats import frames
+from cosfly.formats.boxes import BoxMap, read_boxes, write_boxes
+from cosfly.formats.traces import DroneTrace, read_traces, write_traces
 from cosfly.geometry import intrinsic_matrix, world_from_camera
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_flight
-from cosfly.products import frames
-from cosfly.products.boxes import BoxMap, read_boxes, write_boxes
-from cosfly.products.traces import DroneTrace, read_traces, write_traces
 from cosfly.render import flight
 from cosfly.render import stage as render_stage
 from cosfly.render.contract import Renderer
@@ -59,8 +59,8 @@ WORKER = """
 import json, os, sys, tempfile, time
 from dataclasses import replace
 from pathlib import Path
-from cosfly.products.boxes import read_boxes
-from cosfly.products.traces import read_traces
+from cosfly.formats.boxes import read_boxes
+from cosfly.formats.traces import read_traces
 from cosfly.render.flight import Writing, render_flight
 from cosfly.render.stage import RenderConfig, open_renderer, script_flight  # where older checkouts have them all
 boxes, traces, out, number = *map(Path, sys.argv[1:4]), int(sys.argv[4])

@@ -12,8 +12,8 @@ import itertools
 
 import numpy as np
 
+from cosfly.formats.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
 from cosfly.maps.boxlist import BoxList
-from cosfly.products.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
 from cosfly.runtime.chance import rng_for
 
 # tab:box_categories: boxes of each kind before simplification, 65,614 together.

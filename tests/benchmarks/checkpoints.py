@@ -20,12 +20,12 @@ from cosfly.app.settings import RunConfig
 from cosfly.closed_loop import stage
 from cosfly.closed_loop.measures import score_pursuits
 from cosfly.closed_loop.pilots import Outlook, PilotAnswer, open_pilot
+from cosfly.formats.actions import TOKENS
+from cosfly.formats.captions import read_captions
+from cosfly.formats.flight_scores import SCORE, SCORE_FORMAT
+from cosfly.formats.pursuits import PURSUITS, read_pursuit
+from cosfly.formats.traces import read_traces
 from cosfly.planners import stage as planning
-from cosfly.products.actions import TOKENS
-from cosfly.products.captions import read_captions
-from cosfly.products.flight_scores import SCORE, SCORE_FORMAT
-from cosfly.products.pursuits import PURSUITS, read_pursuit
-from cosfly.products.traces import read_traces
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.runner import Item
 from cosfly.runtime.store import write_model

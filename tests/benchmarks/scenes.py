@@ -13,10 +13,10 @@ import numpy as np
 from census_town import census_town
 from threadpoolctl import threadpool_limits
 
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.walks import Walk
 from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, walkable_ground
-from cosfly.products.boxes import BoxMap
-from cosfly.products.walks import Walk
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import build
 from cosfly.simplify.passes import SimplifyConfig, simplify

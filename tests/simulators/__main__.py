@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 sys.path[0] = str(Path(__file__).parents[1])  # this folder's own name is the package's
-from cosfly.products.boxes import read_boxes  # noqa: E402
+from cosfly.formats.boxes import read_boxes  # noqa: E402
 from simulators.carla_server import CarlaServer  # noqa: E402
 from simulators.unrealcv_server import UnrealCvServer  # noqa: E402
 

@@ -13,9 +13,9 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from cosfly.products.boxes import BoxMap
-from cosfly.products.others import BUILDS
-from cosfly.products.weather import WeatherParams
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.others import BUILDS
+from cosfly.formats.weather import WeatherParams
 from cosfly.unreal.conventions import CARLA_VERSION, DEPTH_RANGE_M, DEPTH_STEPS, SIMULATED_STEP_S, unreal_pose
 from simulators.scene import Mover, Server, listen, send
 

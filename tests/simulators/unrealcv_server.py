@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterable, Sequence
 import cv2
 import numpy as np
 
-from cosfly.products.boxes import BoxMap
-from cosfly.products.kinds import KIND_NAMES, KINDS
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.kinds import KIND_NAMES, KINDS
 from cosfly.unreal.assets import is_person
 from cosfly.unreal.conventions import CM_PER_M, FAR_CM, unreal_pose
 from simulators.scene import Mover, Server, listen, send

@@ -13,10 +13,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from cosfly.products.boxes import BoxMap
-from cosfly.products.frames import SKY_DEPTH_M, Look
-from cosfly.products.kinds import KINDS
-from cosfly.products.weather import WeatherParams
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.frames import SKY_DEPTH_M, Look
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.weather import WeatherParams
 from cosfly.render.contract import FAR_M, NEAR_M, Frame, PosedOther, PosedPerson, check_pose, far_as_sky
 from cosfly.render.gl import meshes
 from cosfly.render.gl import parts as part_tables

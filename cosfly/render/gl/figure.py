@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.walks import TARGET_HEIGHT_M
 from cosfly.geometry import rotation_matrix
-from cosfly.products.kinds import KINDS
-from cosfly.products.walks import TARGET_HEIGHT_M
 from cosfly.render.contract import LAYER_STEP, PERSON_ID, STANDING_LAYER, PosedCar, PosedOther, PosedPerson
 from cosfly.render.figure import figure_of
 from cosfly.render.gl import meshes

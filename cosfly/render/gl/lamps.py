@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.kinds import KINDS
 from cosfly.geometry import rotation_matrices
-from cosfly.products.boxes import BoxMap
-from cosfly.products.kinds import KINDS
 from cosfly.render.gl.parts import LAMP, Parts
 
 MAP_PX = 384

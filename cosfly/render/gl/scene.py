@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.ground import Ground
+from cosfly.formats.kinds import KINDS
 from cosfly.geometry import rotation_matrices
-from cosfly.products.boxes import BoxMap
-from cosfly.products.ground import Ground
-from cosfly.products.kinds import KINDS
 from cosfly.render.contract import (
     LAYER_STEP,
     NO_INSTANCE,

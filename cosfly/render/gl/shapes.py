@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cosfly.products.kinds import KINDS, LAYERS
+from cosfly.formats.kinds import KINDS, LAYERS
 from cosfly.render import contract
 from cosfly.render.gl import meshes, parts
 from cosfly.render.gl.parts import FAR_PX, Boxes, PartBuilder

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from cosfly.products.weather import SUN_IS_DOWN_DEG, WeatherParams
+from cosfly.formats.weather import SUN_IS_DOWN_DEG, WeatherParams
 from cosfly.render.contract import MAX_BOX_ID, PosedPerson
 from cosfly.render.gl import lamps as street_lamps
 from cosfly.render.gl.parts import Parts

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 from functools import lru_cache
 
-from cosfly.products.captions import Coc
+from cosfly.formats.captions import Coc
 
 # A point after these ends no sentence, nor does one inside a number.
 _ABBREVIATIONS = ("approx", "ca", "vs", "deg", "i\\.e", "e\\.g", "resp", "max", "min", "avg", "horiz")

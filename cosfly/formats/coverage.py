@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field, field_validator
 
-from cosfly.products.playback import Flight
-from cosfly.products.walks import TARGET_HEIGHT_M
-from cosfly.products.weather import preset_token
+from cosfly.formats.playback import Flight
+from cosfly.formats.walks import TARGET_HEIGHT_M
+from cosfly.formats.weather import preset_token
 from cosfly.runtime.documents import Record, read_json, validated
 
 DEFAULT = Path(__file__).with_name("default_coverage.json")

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from cosfly.products.columns import is_number
+from cosfly.formats.columns import is_number
 from cosfly.runtime.documents import validated
 from cosfly.runtime.errors import InputError
 

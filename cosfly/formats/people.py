@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from cosfly.products.captions import Language
+from cosfly.formats.captions import Language
 
 Words = dict[Language, str]
 

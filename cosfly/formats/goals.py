@@ -13,10 +13,10 @@ from itertools import combinations
 import cv2
 import numpy as np
 
-from cosfly.products.captions import Language
-from cosfly.products.frames import PERSON_ID
-from cosfly.products.kinds import KINDS
-from cosfly.products.people import COLORS, FIGURES, GARMENTS, Appearance, Words
+from cosfly.formats.captions import Language
+from cosfly.formats.frames import PERSON_ID
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.people import COLORS, FIGURES, GARMENTS, Appearance, Words
 from cosfly.runtime.errors import InputError
 
 # What is large is said first. Slot -> how Chinese says that it is worn; what both languages say of nothing there.

@@ -12,11 +12,11 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 
+from cosfly.formats.columns import LARGEST, rounded
+from cosfly.formats.ground import Ground, GroundGrid
+from cosfly.formats.kinds import GROUND_KINDS, KIND_COLORS, KIND_NAMES, KINDS
+from cosfly.formats.meshes import Meshes, MeshRef
 from cosfly.geometry import axis_aligned_half_extents
-from cosfly.products.columns import LARGEST, rounded
-from cosfly.products.ground import Ground, GroundGrid
-from cosfly.products.kinds import GROUND_KINDS, KIND_COLORS, KIND_NAMES, KINDS
-from cosfly.products.meshes import Meshes, MeshRef
 from cosfly.runtime.documents import MISSING, FileFormat, check_schema, read_json, validated
 from cosfly.runtime.errors import InputError, nearest
 from cosfly.runtime.store import dump_json, write_bytes

@@ -11,8 +11,8 @@ import shapely
 from pydantic import BaseModel
 from shapely.geometry.base import BaseGeometry
 
-from cosfly.products.boxes import AXES, BoxMap
-from cosfly.products.columns import numbers
+from cosfly.formats.boxes import AXES, BoxMap
+from cosfly.formats.columns import numbers
 from cosfly.runtime.documents import parse_document, validated
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import over_limit, read_bytes

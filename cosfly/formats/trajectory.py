@@ -9,9 +9,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from cosfly.formats.columns import is_number, numbers
+from cosfly.formats.frames import ANGLES, XYZ, Camera
 from cosfly.geometry import step_s
-from cosfly.products.columns import is_number, numbers
-from cosfly.products.frames import ANGLES, XYZ, Camera
 from cosfly.runtime.arrays import check_pixels
 from cosfly.runtime.documents import MISSING
 from cosfly.runtime.errors import InputError

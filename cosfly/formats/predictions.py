@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from cosfly.products.captions import Coc, Language
-from cosfly.products.splits import Split
+from cosfly.formats.captions import Coc, Language
+from cosfly.formats.splits import Split
 from cosfly.runtime.documents import Record, model_lines
 from cosfly.runtime.errors import InputError
 

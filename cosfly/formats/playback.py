@@ -20,9 +20,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from cosfly.geometry import mirror_positions, mirror_rotations
-from cosfly.products.columns import is_number
-from cosfly.products.frames import (
+from cosfly.formats.columns import is_number
+from cosfly.formats.frames import (
     ANGLES,
     COMPANY,
     COORDINATES,
@@ -33,12 +32,12 @@ from cosfly.products.frames import (
     frame_name,
     frame_path,
 )
-from cosfly.products.goals import Goal
-from cosfly.products.motion import PlannedMotion, without_perturbation
-from cosfly.products.people import People
-from cosfly.products.places import place_of, tree_of_flight
-from cosfly.products.segments import FOLLOW, Mission, Segment, flown_as_json, mirrored, read_flown
-from cosfly.products.trajectory import (
+from cosfly.formats.goals import Goal
+from cosfly.formats.motion import PlannedMotion, without_perturbation
+from cosfly.formats.people import People
+from cosfly.formats.places import place_of, tree_of_flight
+from cosfly.formats.segments import FOLLOW, Mission, Segment, flown_as_json, mirrored, read_flown
+from cosfly.formats.trajectory import (
     BBOX,
     SCHEMA,
     SCHEMA_VERSION,
@@ -50,8 +49,9 @@ from cosfly.products.trajectory import (
     offsets_of,
     vectors_of,
 )
-from cosfly.products.walks import pace_of
-from cosfly.products.weather import WeatherRecord
+from cosfly.formats.walks import pace_of
+from cosfly.formats.weather import WeatherRecord
+from cosfly.geometry import mirror_positions, mirror_rotations
 from cosfly.runtime.documents import read_json, validated
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import read_bytes

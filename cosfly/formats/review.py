@@ -16,7 +16,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from cosfly.products.inspection import FlightInspection, Inspection, count_trajectories, read_inspection
+from cosfly.formats.inspection import FlightInspection, Inspection, count_trajectories, read_inspection
 from cosfly.runtime.documents import Record
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import sha256_file

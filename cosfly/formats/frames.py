@@ -19,12 +19,12 @@ import cv2
 import numpy as np
 from pydantic import Field
 
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.people import People
+from cosfly.formats.places import tree_of_flight
+from cosfly.formats.png import areas_png, colours_png, floats_of, floats_png
+from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry import mirror_positions, mirror_rotations, world_from_camera
-from cosfly.products.kinds import KINDS
-from cosfly.products.people import People
-from cosfly.products.places import tree_of_flight
-from cosfly.products.png import areas_png, colours_png, floats_of, floats_png
-from cosfly.products.weather import WeatherRecord
 from cosfly.runtime.arrays import PNG_SIGNATURE, parse_array_header, read_array, read_picture
 from cosfly.runtime.config import Config
 from cosfly.runtime.documents import FileFormat, Record, read_model

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.products.columns import column, read_items, records, rounded, text_id, write_items
-from cosfly.products.kinds import KINDS
-from cosfly.products.walks import PERSON_HALF_EXTENTS_M
+from cosfly.formats.columns import column, read_items, records, rounded, text_id, write_items
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
 from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import InputError
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from cosfly.products.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader
+from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader
 from cosfly.runtime.documents import FileFormat, Record, read_model
 from cosfly.runtime.store import write_model
 

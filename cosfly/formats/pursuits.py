@@ -12,7 +12,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, NonNegativeInt, model_validator
 
-from cosfly.products.motion import ACTION
+from cosfly.formats.motion import ACTION
 from cosfly.runtime.documents import FileFormat, Record, read_model
 from cosfly.runtime.store import write_model
 
@@ -33,7 +33,7 @@ _Least = Annotated[FiniteFloat, Field(ge=0)]
 
 
 class PursuitFrame(Record):
-    """One frame. command: as ACTION (cosfly/products/motion.py), None of the last. answer_s: how long the student took,
+    """One frame. command: as ACTION (cosfly/formats/motion.py), None of the last. answer_s: how long the student took,
     None where nobody was asked. words: what it said, its reasons or, where they cannot be read, the raw answer.
 
     in_view: some of the target's box is in the picture; visible: and enough of it is not hidden, `visibility` its

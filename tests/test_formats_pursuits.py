@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from cosfly.products.pursuits import Pursuit, PursuitFrame, WalkStyle, pursuit_file, read_pursuit, write_pursuit
+from cosfly.formats.pursuits import Pursuit, PursuitFrame, WalkStyle, pursuit_file, read_pursuit, write_pursuit
 from cosfly.runtime.errors import InputError
 
 

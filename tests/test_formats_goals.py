@@ -6,10 +6,10 @@ from itertools import chain, combinations
 import numpy as np
 import pytest
 
-from cosfly.products.frames import PERSON_ID
-from cosfly.products.goals import LANDMARKS, ORDER, SIDES, SLOTS, Goal, SeenFrame, find_says, meant, words_of
-from cosfly.products.kinds import KINDS
-from cosfly.products.people import COLORS, FIGURES, GARMENTS, Appearance, draw_appearance, look_alike
+from cosfly.formats.frames import PERSON_ID
+from cosfly.formats.goals import LANDMARKS, ORDER, SIDES, SLOTS, Goal, SeenFrame, find_says, meant, words_of
+from cosfly.formats.kinds import KINDS
+from cosfly.formats.people import COLORS, FIGURES, GARMENTS, Appearance, draw_appearance, look_alike
 from cosfly.runtime.errors import InputError
 
 RELATIONS = {*SIDES, *LANDMARKS}

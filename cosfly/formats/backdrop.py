@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from cosfly.products.boxes import BoxMap
-from cosfly.products.columns import LARGEST
+from cosfly.formats.boxes import BoxMap
+from cosfly.formats.columns import LARGEST
 from cosfly.runtime.arrays import read_picture
 from cosfly.runtime.documents import FileFormat, Record, read_model
 from cosfly.runtime.store import write_bytes, write_model

@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from cosfly.products.boxes import MapHeader, make_box_map, read_boxes, write_boxes
-from cosfly.products.roi import read_roi
-from cosfly.products.traces import DroneTrace, read_traces, write_traces
-from cosfly.products.walks import Walk, read_paths, write_paths
+from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
+from cosfly.formats.roi import read_roi
+from cosfly.formats.traces import DroneTrace, read_traces, write_traces
+from cosfly.formats.walks import Walk, read_paths, write_paths
 from cosfly.runtime.errors import InputError
 
 

@@ -8,8 +8,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from cosfly.products.actions import BY_LETTERS, TOKENS
-from cosfly.products.captions import FIELDS, Coc, Language
+from cosfly.formats.actions import BY_LETTERS, TOKENS
+from cosfly.formats.captions import FIELDS, Coc, Language
 from cosfly.runtime.objects import find_object
 
 _DECISION = re.compile(

@@ -11,7 +11,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, model_validator
 
-from cosfly.products.columns import LARGEST
+from cosfly.formats.columns import LARGEST
 from cosfly.runtime.documents import Record
 
 Height = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]

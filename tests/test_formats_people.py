@@ -5,7 +5,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from cosfly.products.people import COLORS, HAIR, Appearance, People, draw_appearance, look_alike
+from cosfly.formats.people import COLORS, HAIR, Appearance, People, draw_appearance, look_alike
 from cosfly.runtime.documents import validated
 from cosfly.runtime.errors import InputError
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.products.columns import column, matrix, read_items, rounded, step_field, text_id, write_items
+from cosfly.formats.columns import column, matrix, read_items, rounded, step_field, text_id, write_items
 from cosfly.runtime.chance import draw_to_quota, rng_for
 from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import InputError

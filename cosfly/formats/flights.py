@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.products.places import ALL_FLIGHTS, TRACKS, FlightChoice, Track
-from cosfly.products.playback import ORIGINAL, Flight, read_flight
+from cosfly.formats.places import ALL_FLIGHTS, TRACKS, FlightChoice, Track
+from cosfly.formats.playback import ORIGINAL, Flight, read_flight
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.files import files_named
 

@@ -12,8 +12,8 @@ from typing import Annotated, Self
 
 from pydantic import Field, FiniteFloat, NonNegativeInt, model_validator
 
-from cosfly.products.figures import Figure
-from cosfly.products.pursuits import Answer, Ended
+from cosfly.formats.figures import Figure
+from cosfly.formats.pursuits import Answer, Ended
 from cosfly.runtime.documents import FileFormat, Record, read_model
 
 SCORE, SCORE_FORMAT = "score.json", FileFormat("cosfly.score", "1.0", "score")

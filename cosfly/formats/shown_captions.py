@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cosfly.products.captions import Language
-from cosfly.products.playback import Flight
+from cosfly.formats.captions import Language
+from cosfly.formats.playback import Flight
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 from pydantic import Field, FiniteFloat
 
-from cosfly.products.coverage import Coverage
-from cosfly.products.issues import Issue
-from cosfly.products.playback import ORIGINAL
+from cosfly.formats.coverage import Coverage
+from cosfly.formats.issues import Issue
+from cosfly.formats.playback import ORIGINAL
 from cosfly.runtime.documents import FileFormat, Record, read_model
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import write_model
