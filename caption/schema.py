@@ -23,8 +23,8 @@ from cosfly.chat.wire import check_url
 from cosfly.formats.captions import KeyframeRecord, LabelFrom, Language, SentenceState, TeacherKind, Verdict, Writing
 from cosfly.formats.places import FlightChoice
 from cosfly.formats.predictions import PREDICTIONS
-from cosfly.look.frame_views import DEPTH_RANGE_M, Layout, View
 from cosfly.runtime.config import Config, MayDiffer
+from cosfly.viz.frame_views import DEPTH_RANGE_M, Layout, View
 
 Strategy = Literal["anchored", "hint", "multi_sample", "cascade"]
 Treatment = Literal["keep", "repair", "drop"]

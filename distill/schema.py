@@ -19,12 +19,12 @@ import pyarrow.parquet as pq
 from cosfly.formats.captions import Language, Prompt
 from cosfly.formats.frames import frame_name
 from cosfly.formats.splits import SPLITS, Split
-from cosfly.look.frame_views import VIEW_FILES, Pictures, View
 from cosfly.runtime.documents import FileFormat, Record, read_model, validated
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.provenance import fingerprint
 from cosfly.runtime.store import atomic_file, write_bytes, write_model
 from cosfly.runtime.tables import TableRows
+from cosfly.viz.frame_views import VIEW_FILES, Pictures, View
 
 RECORD, RECORD_FORMAT = "training_set.json", FileFormat("cosfly.training_set", "4.0", "training set")
 PAGE = "README.md"

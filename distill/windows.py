@@ -22,13 +22,13 @@ from pydantic import BaseModel
 from cosfly.formats.captions import FIELDS, Language, Prompt, read_captions
 from cosfly.formats.frames import frame_name
 from cosfly.formats.playback import Flight, read_flight
-from cosfly.look.frame_views import VIEW_FILES, Pictures, read_view, scaled_size
 from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.documents import read_object, validated
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError, nearest
 from cosfly.runtime.files import check_stays_below
 from cosfly.runtime.store import inside
 from cosfly.runtime.tables import TableRows, open_table, rows_of
+from cosfly.viz.frame_views import VIEW_FILES, Pictures, read_view, scaled_size
 
 # What is known of each frame, as the columns of a release are called: members of a struct, "" for a number.
 FACTS: dict[str, tuple[str, ...]] = {

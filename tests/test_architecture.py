@@ -16,7 +16,7 @@ PACKAGES = ("cosfly", "caption", "distill", "release")
 STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")  # a folder each
 # From the ground up: a room may import what stands before it, and itself; stages do not import each other, nor do
 # siblings.
-ROOMS = ("runtime", "root", "formats", "space", "look", "chat", "unreal", "stages", "siblings", "app", "cli")
+ROOMS = ("runtime", "root", "formats", "space", "viz", "chat", "unreal", "stages", "siblings", "app", "cli")
 ASSEMBLY = ("app", "closed_loop", "envs", "studies", "worlds")  # what may know all stages and siblings
 HEAVY = {
     *("torch", "transformers", "peft", "accelerate", "bert_score", "datasets"),
@@ -288,7 +288,7 @@ def test_foreign_text_is_escaped_in_one_place():
     assert [
         name
         for name, text in texts.items()
-        if name not in ("cosfly.runtime.escaping", "cosfly.look.page") and page.search(text)
+        if name not in ("cosfly.runtime.escaping", "cosfly.viz.page") and page.search(text)
     ] == []
     assert [name for name, text in texts.items() if name != "cosfly.runtime.console" and console.search(text)] == []
 

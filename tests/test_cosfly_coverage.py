@@ -14,7 +14,7 @@ from cosfly.formats.actions import TOKENS
 from cosfly.formats.coverage import AXES, Coverage, azimuths_deg, coverage_of, default_coverage
 from cosfly.formats.flights import find_flights
 from cosfly.formats.playback import read_flight
-from cosfly.look.coverage_page import coverage_html, ranges, shares
+from cosfly.viz.coverage_page import coverage_html, ranges, shares
 from specimens import make_playback_tree
 
 

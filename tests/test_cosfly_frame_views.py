@@ -19,8 +19,8 @@ from caption.teachers.teacher import RuleTeacher
 from cosfly.formats.captions import PICTURES_MARK, Language
 from cosfly.formats.flights import find_flights
 from cosfly.formats.playback import read_flight
-from cosfly.look.frame_views import PEDESTRIAN_RGB, Pictures
 from cosfly.runtime.errors import InputError
+from cosfly.viz.frame_views import PEDESTRIAN_RGB, Pictures
 from distill.inference.stage import InferConfig, make_request
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample

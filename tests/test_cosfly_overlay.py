@@ -1,4 +1,4 @@
-"""cosfly/look/overlay.py and `cosfly view --frame`: boxes, ids and distances over a frame."""
+"""cosfly/viz/overlay.py and `cosfly view --frame`: boxes, ids and distances over a frame."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from cosfly.formats.playback import read_flight
 from cosfly.formats.town import read_instance_ids
 from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
 from cosfly.geometry import box_corners, intrinsic_matrix, project, world_from_camera
-from cosfly.look.gallery import four_panels
-from cosfly.look.overlay import TARGET_COLOR, Overlay, _lines
 from cosfly.render.contract import instance_ids
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import read_checksums
+from cosfly.viz.gallery import four_panels
+from cosfly.viz.overlay import TARGET_COLOR, Overlay, _lines
 
 SETTINGS = {
     "width_px": 320,

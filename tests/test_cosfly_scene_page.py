@@ -20,7 +20,7 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback import read_flight
 from cosfly.formats.traces import write_traces
 from cosfly.geometry import box_corners
-from cosfly.look.scene_page import run
+from cosfly.viz.scene_page import run
 from specimens import make_playback_tree
 
 EVIL = "</script><script>window.hacked=1</script><img src=x onerror='window.hacked=2'>"

@@ -21,8 +21,8 @@ from cosfly.formats.captions import write_captions
 from cosfly.formats.flights import find_flights
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback import read_flight
-from cosfly.look.frame_views import read_view
 from cosfly.runtime.tables import rows_of
+from cosfly.viz.frame_views import read_view
 from release.columns import PLACE, POINT
 from release.record import read_record
 from release.stats import stats

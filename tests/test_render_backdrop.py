@@ -15,10 +15,10 @@ from cosfly.formats.backdrop import Backdrop
 from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, write_boxes
 from cosfly.formats.kinds import KINDS
 from cosfly.geometry import box_corners
-from cosfly.look.topview import TopView
 from cosfly.render.backdrop import draw_backdrop, run
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.errors import ConfigError
+from cosfly.viz.topview import TopView
 
 
 def pond(ground_z_m: float, yaw_deg: float) -> BoxMap:

@@ -36,7 +36,6 @@ from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
 from cosfly.geometry import box_corners, intrinsic_matrix, look_at, project, rotation_matrices, world_from_camera
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run as inspect_tree
-from cosfly.look.frame_views import PEDESTRIAN_RGB, read_view
 from cosfly.render.camera import hidden_shares, rendered_visibility, view_target
 from cosfly.render.carla_backend import CarlaRenderConfig
 from cosfly.render.contract import (
@@ -59,6 +58,7 @@ from cosfly.render.settings import ENGINES, RenderConfig
 from cosfly.render.stage import RENDERERS, open_renderer, run
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import EnvironmentMissing, RenderError
+from cosfly.viz.frame_views import PEDESTRIAN_RGB, read_view
 
 SIZE = (320, 180)
 DEPTH_TOLERANCE_M = 0.001  # within 60 m

@@ -14,10 +14,10 @@ from cosfly.formats.captions import Caption, Language
 from cosfly.formats.frames import frame_name
 from cosfly.formats.places import flight_of
 from cosfly.formats.sentences import sentences_of
-from cosfly.look.frame_views import thumbnail
-from cosfly.look.page import page, run_name
 from cosfly.runtime.files import read_text
 from cosfly.runtime.store import write_bytes
+from cosfly.viz.frame_views import thumbnail
+from cosfly.viz.page import page, run_name
 
 PICTURE_WIDTH_PX = 240
 VERDICTS = {  # what it means

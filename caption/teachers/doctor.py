@@ -32,9 +32,9 @@ from cosfly.chat.contract import Reply
 from cosfly.chat.protocol import read_body, request_body, response_format, thoughts_of
 from cosfly.chat.refusals import MEANINGS, Refusal
 from cosfly.formats.answer_text import answer_schema
-from cosfly.look.frame_views import VIEW_FILES
 from cosfly.runtime.documents import parse_json
 from cosfly.runtime.errors import TeacherError
+from cosfly.viz.frame_views import VIEW_FILES
 
 State = Literal["ok", "warning", "unusable"]
 

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from caption.schema import ImageConfig, ObservedWindow
-from cosfly.look.frame_views import VIEW_FILES, Pictures, encode_picture, scaled_size
+from cosfly.viz.frame_views import VIEW_FILES, Pictures, encode_picture, scaled_size
 
 CACHE_FRAMES = 256  # encoded ones kept in memory for the windows that share them
 JPEG_QUALITY = 90

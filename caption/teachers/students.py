@@ -33,8 +33,8 @@ from cosfly.chat.student_chat import (
 )
 from cosfly.formats.answer_text import answer_schema
 from cosfly.formats.captions import Language, Prompt
-from cosfly.look.frame_views import Pictures
 from cosfly.runtime.errors import ConfigError, TeacherError
+from cosfly.viz.frame_views import Pictures
 
 
 def as_taught(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfig:

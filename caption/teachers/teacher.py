@@ -36,8 +36,8 @@ from cosfly.chat.vllm_engine import VllmEngine
 from cosfly.formats.answer_text import answer_schema
 from cosfly.formats.captions import TeacherRecord, TeacherSettings, Writing
 from cosfly.formats.places import flight_of
-from cosfly.look.frame_views import Pictures
 from cosfly.runtime.chance import draws_for, rng_for
+from cosfly.viz.frame_views import Pictures
 
 ENCODING_THREADS = 4
 

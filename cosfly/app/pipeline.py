@@ -26,12 +26,12 @@ import cosfly.simplify.stage
 import release.package.stage
 from cosfly.app.settings import RunConfig, manner_of_work
 from cosfly.formats.others import OTHERS_FILE
-from cosfly.look.gallery import contact_sheet, preview_gif
 from cosfly.runtime.documents import read_object
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError, ResumeError
 from cosfly.runtime.folder_lock import hold_folder
 from cosfly.runtime.stage_folder import Manifest, Resume, read_manifest
 from cosfly.runtime.store import refuse_link, write_bytes, write_json
+from cosfly.viz.gallery import contact_sheet, preview_gif
 from release.package.sources import Source, choose_licence
 
 log = logging.getLogger(__name__)

@@ -27,9 +27,6 @@ from cosfly.app.settings import RunConfig, manner_of_work
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.captions import FIELDS, read_captions
 from cosfly.formats.segments import FOLLOW
-from cosfly.look.frame_views import small_jpeg
-from cosfly.look.gallery import four_panels
-from cosfly.look.page import page, run_name
 from cosfly.planners import compare
 from cosfly.runtime.arrays import read_picture
 from cosfly.runtime.config import build, read_yaml
@@ -41,6 +38,9 @@ from cosfly.runtime.stage_events import read_events
 from cosfly.runtime.stage_folder import Resume, read_manifest
 from cosfly.runtime.store import write_bytes, write_json
 from cosfly.studies import beam, depth, weather, zoom
+from cosfly.viz.frame_views import small_jpeg
+from cosfly.viz.gallery import four_panels
+from cosfly.viz.page import page, run_name
 from distill.prepare.dual_track import windows_of
 from release.stats.stats import TABLE_LOOK
 from release.stats.stats import run as release_stats

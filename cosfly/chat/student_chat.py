@@ -20,10 +20,10 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 from cosfly.chat.client import EndpointConfig
 from cosfly.chat.contract import Request
 from cosfly.formats.captions import Language, Prompt
-from cosfly.look.frame_views import View, encode_picture, frame_label
 from cosfly.runtime.documents import FileFormat, read_model
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import sha256_bytes, write_model
+from cosfly.viz.frame_views import View, encode_picture, frame_label
 
 IMAGE_ENCODING: Literal["png"] = "png"
 IMAGE_PART: dict[str, Any] = {"type": "image"}  # a picture as chat templates know it

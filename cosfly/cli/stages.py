@@ -242,11 +242,11 @@ def render(
     gif_name: Annotated[str, Option(help="Its name, in the folder.")] = "preview.gif",
 ) -> None:
     """Step 5: RGB, depth and instance frames of the clean and the perturbed flight."""
-    from cosfly.look.gallery import preview_gif
     from cosfly.render import stage
     from cosfly.render.settings import RenderConfig
     from cosfly.runtime.config import build
     from cosfly.runtime.store import inside
+    from cosfly.viz.gallery import preview_gif
 
     wanted = {"rgb": require_rgb, "depth": require_depth}
     modalities: list[str] = [name for name in job.cfg.render.modalities if wanted.get(name) is not False]

@@ -31,8 +31,8 @@ def study_depth(
     ] = None,
 ) -> None:
     """The ways to store depth on one frame: errors, entropy, edges and size, with a figure."""
-    from cosfly.look.gallery import best_frame, frame_in
     from cosfly.studies import depth
+    from cosfly.viz.gallery import best_frame, frame_in
 
     if frame is None:
         frame = best_frame(job.tree(data), "depth.npy")

@@ -42,12 +42,12 @@ def view(
     """Make a page or a picture of a map, a playback tree, a run or a release; pages work offline."""
     source = job.cfg.opened(source)
     if source.is_file():
-        from cosfly.look import scene_page
+        from cosfly.viz import scene_page
 
         scene_page.run(source, out, paths=paths, traces=traces or [], data=data, picture_px=picture_px, max_mb=max_mb)
     elif out.suffix in (".png", ".gif"):
         from cosfly.formats.boxes import read_boxes
-        from cosfly.look import gallery
+        from cosfly.viz import gallery
 
         choice = job.cfg.inspect.flights
         if frame is not None:

@@ -27,14 +27,14 @@ from cosfly.formats.flight_scores import Score, read_score
 from cosfly.formats.flights import find_flights
 from cosfly.formats.playback import read_flight
 from cosfly.formats.pursuits import Pursuit, pursuit_file, read_pursuit
-from cosfly.look.frame_views import thumbnail
-from cosfly.look.page import page
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import Config
 from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
 from cosfly.runtime.store import sha256_bytes, write_bytes, write_model
+from cosfly.viz.frame_views import thumbnail
+from cosfly.viz.page import page
 from distill.evaluation.pages import COLORS, STYLE, bars, shown_as
 
 HEADLINE = ("success", "in_view", "tracked_frames", "kept_s", "lost", "crashed")

@@ -11,9 +11,9 @@ import numpy as np
 from cosfly.formats.inspection import RESULTS, FlightInspection, Inspection
 from cosfly.formats.playback import STATES
 from cosfly.inspection.view import PLOTS, FlightView, in_question
-from cosfly.look.coverage_page import coverage_html
-from cosfly.look.page import fragment, page
 from cosfly.runtime.files import read_text
+from cosfly.viz.coverage_page import coverage_html
+from cosfly.viz.page import fragment, page
 
 STYLE = "\n" + read_text(Path(__file__).with_name("report.css"))
 MB = 1_000_000

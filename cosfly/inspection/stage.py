@@ -32,12 +32,12 @@ from cosfly.inspection.flight import InspectedFlight, inspect_flight, trace_id
 from cosfly.inspection.report import report_html
 from cosfly.inspection.settings import PAGE_MB, InspectConfig
 from cosfly.inspection.view import FlightView
-from cosfly.look.page import run_name
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.provenance import recorded_digests
 from cosfly.runtime.runner import Item, ItemOutcomes, Outcome, Watch, Work, run_items
 from cosfly.runtime.stage_folder import Failed, Resume, StageFolder, result_of
 from cosfly.runtime.store import write_bytes
+from cosfly.viz.page import run_name
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,6 @@ from pydantic import Field
 
 from cosfly.formats.boxes import BoxMap, check_ground, write_boxes
 from cosfly.formats.meshes import MESHES_FILE
-from cosfly.look.topview import TopView, draw_map, png_bytes
 from cosfly.maps import boxfile, carla_export, cityjson, simworld, synthetic, unrealcv_export
 from cosfly.maps.boxfile import BoxesConfig
 from cosfly.maps.carla_export import CarlaMapConfig
@@ -25,6 +24,7 @@ from cosfly.runtime.config import Config
 from cosfly.runtime.files import LinkedPath
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
 from cosfly.runtime.store import write_bytes
+from cosfly.viz.topview import TopView, draw_map, png_bytes
 
 log = logging.getLogger(__name__)
 

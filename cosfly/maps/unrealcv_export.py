@@ -189,7 +189,7 @@ def _unturned(half_m: np.ndarray, rotation_deg: tuple[float, ...]) -> tuple[np.n
 
 def write_beside(box_map: BoxMap, out: Path) -> list[Path]:
     """Write what is known of each box's object, and the page to look at the map; gives both paths."""
-    from cosfly.look import scene_page  # it reads flights and frames too, which `maps` has no use for
+    from cosfly.viz import scene_page  # it reads flights and frames too, which `maps` has no use for
 
     assert isinstance(box_map, LevelMap)
     header = box_map.header

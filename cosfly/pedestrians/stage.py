@@ -31,7 +31,6 @@ from cosfly.formats.ground import Ground
 from cosfly.formats.others import OTHERS_FILE, Company, write_others
 from cosfly.formats.roi import read_roi
 from cosfly.formats.walks import Walk, pace_field, paces_of, walk_id, write_paths
-from cosfly.look.topview import INK, TopView, draw_dot, draw_line, draw_text, png_bytes
 from cosfly.pedestrians.astar import route_cost
 from cosfly.pedestrians.crossings import CROSSING, ROAD, where_walked
 from cosfly.pedestrians.lanes import Lane, lanes_of
@@ -51,6 +50,7 @@ from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.runtime.stage_folder import Resume, StageFolder, result_of
 from cosfly.runtime.store import write_bytes, write_json
+from cosfly.viz.topview import INK, TopView, draw_dot, draw_line, draw_text, png_bytes
 
 # --- overview ---------------------------------------------------------------------------------------------------------
 # The pedestrian stage from above: obstacles, region of interest, usable ground and every walk, for a look before going

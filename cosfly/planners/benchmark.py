@@ -22,7 +22,6 @@ from pydantic import BaseModel, Field
 
 from cosfly.formats.boxes import BoxMap, read_boxes
 from cosfly.formats.walks import read_paths
-from cosfly.look.tables import TextTable
 from cosfly.planners import compare
 from cosfly.planners.compare import AXES, FIGURES, INTERVAL_PERCENT, NUM_RESAMPLES, CompareConfig
 from cosfly.planners.contract import ALL_PLANNERS, title_of
@@ -33,6 +32,7 @@ from cosfly.runtime.errors import EnvironmentMissing, InputError
 from cosfly.runtime.runner import Item, Watch, run_items
 from cosfly.runtime.stage_folder import Resume, StageFolder, result_of
 from cosfly.runtime.store import write_bytes, write_model
+from cosfly.viz.tables import TextTable
 
 log = logging.getLogger(__name__)
 

@@ -20,8 +20,6 @@ from pydantic import BaseModel, Field, field_validator
 from cosfly.formats.boxes import BoxMap, read_boxes
 from cosfly.formats.traces import DroneTrace, write_traces
 from cosfly.formats.walks import Walk, read_paths
-from cosfly.look.tables import TextTable
-from cosfly.look.topview import add_caption, draw_dot, draw_line, draw_text, png_bytes
 from cosfly.planners.contract import ALL_PLANNERS, PLANNERS, PlanConfig, known_planner, title_of
 from cosfly.planners.overview import draw_walks
 from cosfly.planners.stage import check_ids, draw_styles_of, plan_flight, warm_up
@@ -31,6 +29,8 @@ from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.runtime.stage_folder import Dropped, Failed, ItemRecord, Resume, StageFolder, read_manifest, result_of
 from cosfly.runtime.store import write_bytes, write_json
+from cosfly.viz.tables import TextTable
+from cosfly.viz.topview import add_caption, draw_dot, draw_line, draw_text, png_bytes
 
 FORMAT = FileFormat("cosfly.plan_compare", "2.1")
 CLEARANCE_SCALE_M = 5.0  # a clearance of this or more is full safety

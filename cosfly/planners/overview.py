@@ -8,7 +8,7 @@ import numpy as np
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.walks import Walk
-from cosfly.look.topview import HALO, TopView, add_caption, draw_dot, draw_line, draw_map, draw_text, png_bytes
+from cosfly.viz.topview import HALO, TopView, add_caption, draw_dot, draw_line, draw_map, draw_text, png_bytes
 
 MARGIN_M, SIZE_PX = 27.0, 1400
 WALK_COLOR, SIGHT_COLOR = (20, 20, 30), (70, 90, 110)

@@ -13,11 +13,11 @@ import numpy as np
 from cosfly.formats.backdrop import WorldFrame, write_backdrop
 from cosfly.formats.boxes import BoxMap, check_ground, read_boxes
 from cosfly.geometry import intrinsic_matrix, world_from_camera
-from cosfly.look.topview import TopView, png_bytes
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import renderer_of
 from cosfly.runtime.arrays import LONGEST_SIDE_PX
 from cosfly.runtime.errors import ConfigError
+from cosfly.viz.topview import TopView, png_bytes
 
 HEIGHT_M, TILE_M = 400.0, 50.0  # of the camera over the ground, and of a tile
 NORTH_UP_DEG = np.array([-90.0, 90.0, 0.0])

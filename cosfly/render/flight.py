@@ -26,7 +26,6 @@ from cosfly.formats.traces import DroneTrace
 from cosfly.formats.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry import mask_box, world_from_camera
-from cosfly.look.overlay import Overlay
 from cosfly.render.camera import (
     TargetView,
     contrast_of,
@@ -44,6 +43,7 @@ from cosfly.runtime.files import sha256_file
 from cosfly.runtime.runner import advance
 from cosfly.runtime.store import sha256_bytes, storage_errors, write_checksums, write_json
 from cosfly.space.kernels import signed_distances
+from cosfly.viz.overlay import Overlay
 
 MOST_TRIED = 8  # frames of a flight, the first in which the target is legible
 # Two looks are told apart by so many pixels, and such a share of a person's, of so much colour difference (CIE76).

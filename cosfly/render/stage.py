@@ -25,7 +25,6 @@ from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.walks import pace_field
 from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry import step_s
-from cosfly.look.overlay import Overlay
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids, other_id
 from cosfly.render.flight import FlightScript, Writing, check_flight, render_flight
 from cosfly.render.lens import cameras_of
@@ -41,6 +40,7 @@ from cosfly.runtime.provenance import checked_inputs, fingerprint
 from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.runtime.stage_folder import Kept, Resume, StageFolder, Tally, result_of
 from cosfly.runtime.store import CHECKSUMS, atomic_folder, dump_json, inside, sha256_bytes, write_json
+from cosfly.viz.overlay import Overlay
 
 log = logging.getLogger(__name__)
 

@@ -1,4 +1,4 @@
-"""Foreign text on its way to people: escaped and cut here for terminal and Markdown; for HTML in `cosfly/look/page.py`.
+"""Foreign text on its way to people: escaped and cut here for terminal and Markdown; for HTML in `cosfly/viz/page.py`.
 
 Names of folders, contents of files and words of servers may hold escape sequences, tags, table bars, or 200 MB.
 """

@@ -13,8 +13,6 @@ from cosfly.formats.boxes import check_ground, read_boxes
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.weather import TIMES, WEATHERS, resolved
 from cosfly.geometry import intrinsic_matrix, world_from_camera
-from cosfly.look.frame_views import encode_picture
-from cosfly.look.topview import PAPER, draw_text
 from cosfly.render.contract import PosedPerson, Renderer
 from cosfly.render.flight import MARGIN_M
 from cosfly.render.person import choose_clothes, gait_of
@@ -23,6 +21,8 @@ from cosfly.render.stage import renderer_of
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import write_bytes
+from cosfly.viz.frame_views import encode_picture
+from cosfly.viz.topview import PAPER, draw_text
 
 FIGURE = (  # fig:weather_gallery
     ("clear", "morning"), ("clear", "noon"), ("clear", "dusk"),

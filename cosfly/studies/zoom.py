@@ -21,8 +21,6 @@ from cosfly.formats.boxes import check_ground, read_boxes
 from cosfly.formats.frames import Camera, level_name, rgb_bytes
 from cosfly.formats.traces import read_traces
 from cosfly.geometry import box_iou, intrinsic_matrix
-from cosfly.look.tables import TextTable
-from cosfly.look.topview import add_caption
 from cosfly.render.contract import Renderer
 from cosfly.render.flight import MARGIN_M, FlightScript, check_flight, draw_frame
 from cosfly.render.perturbation import Surroundings
@@ -32,6 +30,8 @@ from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.runtime.stage_folder import Resume, StageFolder, result_of
 from cosfly.runtime.store import write_bytes, write_json
+from cosfly.viz.tables import TextTable
+from cosfly.viz.topview import add_caption
 
 FORMAT = FileFormat("cosfly.zoom_study", "2.0")
 STAGE = "zoom_study"

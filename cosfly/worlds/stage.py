@@ -23,7 +23,6 @@ from cosfly.chat.client import ChatClient, EndpointConfig
 from cosfly.chat.contract import NoAnswer, Reply, started
 from cosfly.formats.boxes import OUR_LICENCE, BoxMap
 from cosfly.formats.kinds import GROUND_KINDS
-from cosfly.look.topview import TopView, draw_map, png_bytes
 from cosfly.maps.simworld import PLACEHOLDER_CM
 from cosfly.runtime.config import read_yaml, shipped
 from cosfly.runtime.documents import FileFormat, validated
@@ -32,6 +31,7 @@ from cosfly.runtime.folder_lock import hold_folder
 from cosfly.runtime.objects import find_object
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
 from cosfly.runtime.store import sha256_bytes, write_bytes, write_json, write_model
+from cosfly.viz.topview import TopView, draw_map, png_bytes
 from cosfly.worlds.objects import OBJECTS, assets
 from cosfly.worlds.plan import PLAN_FORMAT, WorldPlan
 from cosfly.worlds.rules import check_prompt, plan_by_rules

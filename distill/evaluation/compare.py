@@ -12,7 +12,6 @@ from typing import Any
 
 from pydantic import Field
 
-from cosfly.look.page import page
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import Config
 from cosfly.runtime.documents import FileFormat, Record
@@ -20,6 +19,7 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import for_markdown
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
 from cosfly.runtime.store import write_bytes, write_model
+from cosfly.viz.page import page
 from distill.evaluation.measure import STUDENT, Evaluation, FigureSet, read_report
 from distill.evaluation.pages import (
     COLORS,

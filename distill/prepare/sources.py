@@ -14,11 +14,11 @@ from cosfly.formats.frames import frame_name, frame_path
 from cosfly.formats.places import TRACKS, FlightChoice, Place, flight_ids, folder_name, sample_id
 from cosfly.formats.playback import read_flight
 from cosfly.formats.splits import Course, walks_of
-from cosfly.look.frame_views import VIEW_FILES, View
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.files import check_stays_below
 from cosfly.runtime.provenance import was_made_of
 from cosfly.runtime.store import inside
+from cosfly.viz.frame_views import VIEW_FILES, View
 
 log = logging.getLogger(__name__)
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cosfly.look.frame_views import VIEW_FILES, Pictures, View
 from cosfly.runtime.store import inside
+from cosfly.viz.frame_views import VIEW_FILES, Pictures, View
 from distill.schema import Sample
 from distill.student.encoding import patches_of, picture_grid
 from distill.student.model import Processor, Student

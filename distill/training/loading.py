@@ -17,11 +17,11 @@ import numpy as np
 
 from cosfly.formats.frames import frame_path
 from cosfly.formats.places import flight_of
-from cosfly.look.frame_views import VIEW_FILES
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import CosflyError, EnvironmentMissing, InputError
 from cosfly.runtime.store import inside
 from cosfly.runtime.worker import end_with_parent
+from cosfly.viz.frame_views import VIEW_FILES
 from distill.schema import Sample
 from distill.student.encoding import EncodedSample, encode_text, image_size, special_token_in
 from distill.student.features import FramePicture, PictureData, PictureReader, VisionFeatures, pictures_of

@@ -19,10 +19,10 @@ from typing import IO, Any, Literal, NamedTuple
 from cosfly.formats.captions import FIELDS, Language, Prompt, read_captions
 from cosfly.formats.frames import FILE_NAMES, frame_name
 from cosfly.formats.places import Place
-from cosfly.look.frame_views import Pictures, frame_label
 from cosfly.runtime.errors import InputError, NothingKept, StorageError
 from cosfly.runtime.files import check_stays_below
 from cosfly.runtime.store import atomic_file, dump_json, inside
+from cosfly.viz.frame_views import Pictures, frame_label
 from release.columns import LANGUAGES, SplitName, caption_values
 from release.export.source import open_release, rows_of_flight, scan
 from release.export.tree import tree_folder

@@ -14,11 +14,11 @@ import numpy as np
 
 from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile, depth_values
 from cosfly.formats.kinds import KIND_NAMES
-from cosfly.look.frame_views import small_jpeg
 from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.tables import arrow_errors, open_table, row_groups
+from cosfly.viz.frame_views import small_jpeg
 from release.card.numbers import check_columns
 from release.columns import PICTURES
 from release.record import ReleaseRecord

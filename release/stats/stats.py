@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.formats.coverage import Coverage
-from cosfly.look.coverage_page import coverage_html
-from cosfly.look.page import page
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.escaping import for_markdown
 from cosfly.runtime.store import write_bytes, write_json
+from cosfly.viz.coverage_page import coverage_html
+from cosfly.viz.page import page
 from release.card.numbers import RowCounts, check_rows, row_lists
 from release.columns import SHORT_NAMES
 from release.record import ReleaseRecord, read_record, release_folder

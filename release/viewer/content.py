@@ -17,9 +17,9 @@ from cosfly.formats.captions import Coc, Language
 from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES
 from cosfly.formats.sentences import sentences_of
 from cosfly.geometry import box_corners
-from cosfly.look.frame_views import View, small_jpeg
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
+from cosfly.viz.frame_views import View, small_jpeg
 from release.columns import BOX, CAPTION, FIELDS, FRAME, LANGUAGES, POINT, TARGET_PICTURE, Column
 
 Point2 = tuple[float, float]  # x, y, m

@@ -17,9 +17,9 @@ from cosfly.formats.frames import frame_path
 from cosfly.formats.places import folder_name, place_of, town_folder
 from cosfly.formats.playback import Flight, read_flight
 from cosfly.formats.review import read_settled
-from cosfly.look.frame_views import VIEW_FILES, View, read_view
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
+from cosfly.viz.frame_views import VIEW_FILES, View, read_view
 from release.columns import Placement, caption_values, scalar_row
 from release.viewer.content import (
     PageBox,

@@ -16,14 +16,14 @@ import numpy as np
 import pyarrow as pa
 
 from cosfly.formats.frames import FrameFile, depth_values
-from cosfly.look.frame_views import View, depth_colors, segmentation_colors
-from cosfly.look.page import page, scripts
 from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.escaping import for_terminal
 from cosfly.runtime.files import read_text
 from cosfly.runtime.store import write_bytes
 from cosfly.runtime.tables import arrow_errors, row_groups
+from cosfly.viz.frame_views import View, depth_colors, segmentation_colors
+from cosfly.viz.page import page, scripts
 from release.card.numbers import bounded, check_columns, check_rows, row_lists
 from release.columns import PICTURES as COLUMNS
 from release.columns import PLACE, POINT, SHORT_NAMES

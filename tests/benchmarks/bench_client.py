@@ -36,7 +36,7 @@ from caption.teachers.teacher import SharedFrames
 from cosfly.chat import client
 from cosfly.chat.protocol import encode_body
 from cosfly.formats.frames import SKY_DEPTH_M
-from cosfly.look.frame_views import VIEW_FILES
+from cosfly.viz.frame_views import VIEW_FILES
 from specimens import make_playback_tree
 
 WIDTH, HEIGHT, DELAY_S = 640, 360, 0.2

@@ -17,10 +17,10 @@ from browser import Page, browser
 from census_town import census_town
 
 from cosfly.formats.boxes import write_boxes
-from cosfly.look.scene_page import run as write_scene
 from cosfly.pedestrians.roi_editor import open_editor
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.simplify.passes import SimplifyConfig, simplify
+from cosfly.viz.scene_page import run as write_scene
 
 READY = "document.body.dataset.ready === 'yes'"
 TURNS = 3

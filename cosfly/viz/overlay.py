@@ -17,7 +17,7 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import FrameMeta
 from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES
 from cosfly.geometry import box_corners, rotation_matrices
-from cosfly.look.topview import COLORS, FONT, OTHER_COLOR, Color, draw_text
+from cosfly.viz.topview import COLORS, FONT, OTHER_COLOR, Color, draw_text
 
 TARGET_COLOR, OTHERS_COLOR = (255, 214, 10), (90, 220, 255)
 LEAST_SHARE = 5e-4  # of the picture: boxes of which less is seen are left out

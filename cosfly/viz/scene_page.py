@@ -22,13 +22,13 @@ from cosfly.formats.playback import Flight, read_flight
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.walks import read_paths
 from cosfly.geometry import rotation_matrices
-from cosfly.look.frame_views import thumbnail
-from cosfly.look.page import page, scripts
-from cosfly.look.topview import COLORS, OTHER_COLOR
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import for_terminal
 from cosfly.runtime.store import write_bytes
 from cosfly.space.grid import occupancy
+from cosfly.viz.frame_views import thumbnail
+from cosfly.viz.page import page, scripts
+from cosfly.viz.topview import COLORS, OTHER_COLOR
 
 MB = 1024 * 1024
 # How much of a kind one sees through: 1 is opaque.
@@ -116,7 +116,7 @@ def run(
 def page_html(name: str, notes: Sequence[str], content: dict[str, Any]) -> str:
     """Give the page's text."""
     script = scripts("tools.js", "canvas.js", "space.js", "scene.js")
-    style, template = scripts("scene.css"), "cosfly/look/templates/scene.html"
+    style, template = scripts("scene.css"), "cosfly/viz/templates/scene.html"
     return page(template, title=name, style=style, script=script, notes=notes, data=content)
 
 

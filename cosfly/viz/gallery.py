@@ -15,12 +15,12 @@ from cosfly.formats.frames import DEBUG_FILE, FRAME_FILES, frame_path, read_inst
 from cosfly.formats.places import ALL_FLIGHTS, FlightChoice
 from cosfly.formats.playback import Flight, read_flight
 from cosfly.formats.town import read_instance_ids
-from cosfly.look.frame_views import DEPTH_RANGE_M, VIEW_FILES, read_view
-from cosfly.look.overlay import Overlay
-from cosfly.look.topview import add_caption, draw_text
 from cosfly.runtime.arrays import read_picture
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import inside, write_bytes
+from cosfly.viz.frame_views import DEPTH_RANGE_M, VIEW_FILES, read_view
+from cosfly.viz.overlay import Overlay
+from cosfly.viz.topview import add_caption, draw_text
 
 TILE_PX = (320, 180)
 NUM_RGB_TILES = 4

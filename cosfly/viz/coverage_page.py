@@ -6,10 +6,10 @@ from typing import Any
 
 from cosfly.formats.coverage import AXES, NAMED, PAIR, Axis, Coverage, default_coverage
 from cosfly.formats.weather import TIMES, WEATHERS, resolved, sky_kind
-from cosfly.look.page import fragment
+from cosfly.viz.page import fragment
 
 WIDTH_PX, HEIGHT_PX = 300.0, 110.0
-TEMPLATE = "cosfly/look/templates/coverage.html"
+TEMPLATE = "cosfly/viz/templates/coverage.html"
 
 
 def coverage_html(coverage: Coverage) -> str:
