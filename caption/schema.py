@@ -15,14 +15,14 @@ from typing import Any, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from cosfly.chat.budget import BudgetConfig
-from cosfly.chat.client import EndpointConfig
-from cosfly.chat.student_chat import MAX_ANSWER_TOKENS
-from cosfly.chat.vllm_engine import VllmConfig
-from cosfly.chat.wire import check_url
 from cosfly.formats.captions import KeyframeRecord, LabelFrom, Language, SentenceState, TeacherKind, Verdict, Writing
 from cosfly.formats.places import FlightChoice
 from cosfly.formats.predictions import PREDICTIONS
+from cosfly.llm.budget import BudgetConfig
+from cosfly.llm.client import EndpointConfig
+from cosfly.llm.student_chat import MAX_ANSWER_TOKENS
+from cosfly.llm.vllm_engine import VllmConfig
+from cosfly.llm.wire import check_url
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.viz.frame_views import DEPTH_RANGE_M, Layout, View
 

@@ -6,12 +6,12 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from cosfly.chat.student_chat import FrameLook, Taught, write_taught
 from cosfly.formats.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
 from cosfly.formats.flights import find_flights
 from cosfly.formats.places import sample_id
 from cosfly.formats.playback import read_flight
 from cosfly.formats.splits import Split
+from cosfly.llm.student_chat import FrameLook, Taught, write_taught
 from cosfly.runtime.provenance import fingerprint
 from cosfly.runtime.store import write_json
 from distill.prepare import stage as prepare

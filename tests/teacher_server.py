@@ -19,8 +19,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import BinaryIO
 
-from cosfly.chat import client
 from cosfly.formats.actions import TOKENS
+from cosfly.llm import client
 from cosfly.runtime.journal import Journal
 
 client.FIRST_PAUSE_S, client.LONGEST_PAUSE_S = 0.01, 0.02  # no test waits for a server that fails

@@ -16,7 +16,7 @@ PACKAGES = ("cosfly", "caption", "distill", "release")
 STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")  # a folder each
 # From the ground up: a room may import what stands before it, and itself; stages do not import each other, nor do
 # siblings.
-ROOMS = ("runtime", "root", "formats", "space", "viz", "chat", "unreal", "stages", "siblings", "app", "cli")
+ROOMS = ("runtime", "root", "formats", "space", "viz", "llm", "unreal", "stages", "siblings", "app", "cli")
 ASSEMBLY = ("app", "closed_loop", "envs", "studies", "worlds")  # what may know all stages and siblings
 HEAVY = {
     *("torch", "transformers", "peft", "accelerate", "bert_score", "datasets"),
@@ -164,7 +164,7 @@ ALLOWED_TO_READ = {
     ("cosfly.runtime.ray_engine", "loads"),  # what a worker says, as `multiprocessing` reads it from a pipe
     ("cosfly.runtime.stage_events", "read_bytes"),  # /proc, whose files have no size
     ("cosfly.formats.png", "decompress"),  # of a picture, up to the size that its header gives
-    ("cosfly.chat.protocol", "loads"),  # the reply, of a bounded size
+    ("cosfly.llm.protocol", "loads"),  # the reply, of a bounded size
     ("cosfly.closed_loop.policy", "loads"),  # the answer of a process that it started, of a bounded size
     ("distill.student.random_student", "loads"),  # what the tokenizer's own library gives
     ("distill.student.checkpoint", "load_file"),  # tensors, whose checksums were compared

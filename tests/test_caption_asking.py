@@ -16,9 +16,9 @@ from specimens_captions import deciding, report_of, settings
 from teacher_server import is_mirror, kept_answers
 
 from caption.run.stage import run
-from cosfly.chat import client
-from cosfly.chat.answers import Answer, AnswerBook
 from cosfly.formats.captions import read_captions
+from cosfly.llm import client
+from cosfly.llm.answers import Answer, AnswerBook
 from cosfly.runtime.errors import TeacherError
 from specimens import make_playback_tree
 

@@ -23,7 +23,7 @@ from teacher_server import MODEL, Sent, Wild, obedient_answer
 
 from caption.run.stage import run
 from caption.schema import CaptionConfig
-from cosfly.chat.client import KEY_VARIABLE
+from cosfly.llm.client import KEY_VARIABLE
 from cosfly.runtime.errors import NothingKept, TeacherError
 
 TRIES = 2
@@ -37,7 +37,7 @@ def settings(url: str, **changes) -> CaptionConfig:
 
 @pytest.fixture(autouse=True)
 def small_replies(monkeypatch):
-    monkeypatch.setattr("cosfly.chat.client.MOST_REPLY_MB", 0.5)
+    monkeypatch.setattr("cosfly.llm.client.MOST_REPLY_MB", 0.5)
 
 
 @pytest.fixture(scope="module")

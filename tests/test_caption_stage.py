@@ -17,10 +17,10 @@ from caption.run.stage import run
 from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig
 from caption.truth.actions import TABLE, measure
-from cosfly.chat.budget import BudgetConfig
 from cosfly.formats.captions import read_captions
 from cosfly.formats.flights import find_flights
 from cosfly.formats.playback import read_flight, write_flight
+from cosfly.llm.budget import BudgetConfig
 from cosfly.runtime.errors import NothingKept, ResumeError
 from specimens import make_playback_tree
 

@@ -18,8 +18,8 @@ from teacher_server import TeacherServer
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.students import as_taught
-from cosfly.chat.student_chat import TAUGHT, read_taught, write_taught
 from cosfly.formats.captions import Caption, read_captions
+from cosfly.llm.student_chat import TAUGHT, read_taught, write_taught
 from cosfly.runtime.errors import ConfigError, NothingKept, ResumeError
 from distill.inference import stage as infer
 from distill.schema import Sample, open_split

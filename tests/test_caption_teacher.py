@@ -18,10 +18,10 @@ from teacher_server import TeacherServer
 from caption.run.reasons import REASONS
 from caption.run.stage import run
 from caption.schema import CaptionConfig
-from cosfly.chat.client import KEY_VARIABLE
-from cosfly.chat.throttle import Throttle
-from cosfly.chat.wire import base_url
 from cosfly.formats.captions import read_captions
+from cosfly.llm.client import KEY_VARIABLE
+from cosfly.llm.throttle import Throttle
+from cosfly.llm.wire import base_url
 from cosfly.runtime.errors import CosflyError, NothingKept, TeacherError
 
 KEEP = {"hard_conflict": "keep"}

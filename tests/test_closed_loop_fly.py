@@ -11,11 +11,11 @@ from teacher_server import TeacherServer
 
 from caption.run.stage import run as caption_tree
 from caption.schema import CaptionConfig
-from cosfly.chat.student_chat import write_taught
 from cosfly.formats.captions import read_captions
 from cosfly.formats.flights import find_flights
 from cosfly.formats.playback import read_flight
 from cosfly.formats.pursuits import PURSUITS, Pursuit, read_pursuit
+from cosfly.llm.student_chat import write_taught
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample, open_split
 from distill.student.random_student import make_tiny_student

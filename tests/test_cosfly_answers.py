@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosfly.chat.contract import Reply
-from cosfly.chat.protocol import error_words, read_body, read_completion, read_models
-from cosfly.chat.wire import Response
 from cosfly.formats.answer_text import normalize_action, parse_answer
 from cosfly.formats.captions import Coc
+from cosfly.llm.contract import Reply
+from cosfly.llm.protocol import error_words, read_body, read_completion, read_models
+from cosfly.llm.wire import Response
 from cosfly.runtime.objects import find_object
 
 GOOD = {

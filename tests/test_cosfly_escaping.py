@@ -20,11 +20,11 @@ from rich.table import Table
 from caption.run.report import page_html
 from caption.run.stage import run as caption
 from caption.schema import CaptionConfig
-from cosfly.chat.budget import BudgetConfig
 from cosfly.formats.captions import Caption, read_captions
 from cosfly.formats.inspection import Inspection, read_inspection
 from cosfly.inspection.report import report_html
 from cosfly.inspection.stage import run as inspect
+from cosfly.llm.budget import BudgetConfig
 from cosfly.runtime import console as shared
 from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import InputError

@@ -16,8 +16,8 @@ from teacher_server import kept_answers
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
-from cosfly.chat.student_chat import TAUGHT  # noqa: E402
 from cosfly.formats.predictions import Prediction, read_predictions  # noqa: E402
+from cosfly.llm.student_chat import TAUGHT  # noqa: E402
 from distill.inference import merge  # noqa: E402
 from distill.inference import stage as infer  # noqa: E402
 from distill.schema import Sample, open_split, resolve_trees  # noqa: E402

@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save_file  # noqa: E402
 from specimens_distill import TEACHING, make_adapter  # noqa: E402
 from specimens_students import inputs_of, samples_of, trees_of  # noqa: E402
 
-from cosfly.chat.student_chat import TAUGHT, read_taught  # noqa: E402
+from cosfly.llm.student_chat import TAUGHT, read_taught  # noqa: E402
 from cosfly.runtime.errors import InputError  # noqa: E402
 from cosfly.runtime.store import write_json  # noqa: E402
 from distill.inference import merge  # noqa: E402

@@ -26,13 +26,13 @@ from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers import teacher
 from caption.teachers.teacher import make_engine
-from cosfly.chat.answers import AnswerBook, KeptAnswers
-from cosfly.chat.client import ChatClient, EndpointConfig
-from cosfly.chat.contract import NoAnswer, Reply, Request, started
-from cosfly.chat.vllm_engine import VllmEngine
 from cosfly.formats.answer_text import answer_schema, parse_answer
 from cosfly.formats.captions import Usage, read_captions
 from cosfly.formats.predictions import read_predictions
+from cosfly.llm.answers import AnswerBook, KeptAnswers
+from cosfly.llm.client import ChatClient, EndpointConfig
+from cosfly.llm.contract import NoAnswer, Reply, Request, started
+from cosfly.llm.vllm_engine import VllmEngine
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, TeacherError
 from distill.inference import stage as infer
 from distill.schema import open_split

@@ -24,11 +24,11 @@ from caption.schema import CaptionConfig, Window
 from caption.teachers.judge import open_judge
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
 from caption.truth.vocabulary import Vocabulary
-from cosfly.chat.answers import AnswerBook
-from cosfly.chat.budget import BudgetSpent
-from cosfly.chat.contract import NoAnswer, Troubles
 from cosfly.formats.captions import Caption, Usage, read_captions, write_captions
 from cosfly.formats.places import flight_of
+from cosfly.llm.answers import AnswerBook
+from cosfly.llm.budget import BudgetSpent
+from cosfly.llm.contract import NoAnswer, Troubles
 from cosfly.runtime.console import SECONDS_BETWEEN_LINES
 from cosfly.runtime.errors import CosflyError, InputError, TeacherError
 from cosfly.runtime.stage_folder import Failed, StageFolder, Tally, read_failures, write_failures

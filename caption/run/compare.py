@@ -24,10 +24,10 @@ from caption.schema import CaptionConfig, Strategy, Window
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.teacher import Teacher, first_budget, open_teacher
 from caption.truth.vocabulary import Vocabulary
-from cosfly.chat.answers import AnswerBook
-from cosfly.chat.contract import NoAnswer
-from cosfly.chat.interrupts import run_until_interrupted
 from cosfly.formats.captions import Coc
+from cosfly.llm.answers import AnswerBook
+from cosfly.llm.contract import NoAnswer
+from cosfly.llm.interrupts import run_until_interrupted
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.store import refuse_links, write_json
 

@@ -19,10 +19,10 @@ from caption.schema import CaptionConfig
 from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import first_budget, open_teacher
-from cosfly.chat.answers import AnswerBook
-from cosfly.chat.interrupts import run_until_interrupted
 from cosfly.formats.captions import Caption, Usage
 from cosfly.formats.places import flight_of
+from cosfly.llm.answers import AnswerBook
+from cosfly.llm.interrupts import run_until_interrupted
 from cosfly.runtime.errors import ConfigError, InputError, TeacherError
 from cosfly.runtime.stage_folder import Resume
 

@@ -17,9 +17,9 @@ from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
-from cosfly.chat.budget import Budget
-from cosfly.chat.contract import Troubles
 from cosfly.formats.captions import Caption
+from cosfly.llm.budget import Budget
+from cosfly.llm.contract import Troubles
 from cosfly.runtime.console import SECONDS_BETWEEN_LINES, console
 
 log = logging.getLogger(__name__)

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from caption.run.ledger import CaptionReport
-from cosfly.chat.budget import BudgetConfig
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.captions import Caption, Language
 from cosfly.formats.frames import frame_name
 from cosfly.formats.places import flight_of
 from cosfly.formats.sentences import sentences_of
+from cosfly.llm.budget import BudgetConfig
 from cosfly.runtime.files import read_text
 from cosfly.runtime.store import write_bytes
 from cosfly.viz.frame_views import thumbnail

@@ -26,10 +26,10 @@ from caption.teachers.students import as_taught
 from caption.teachers.teacher import EMBEDDED, Teacher, embedded_teacher
 from caption.truth.glossary import GLOSSARY_FILE
 from caption.truth.vocabulary import Vocabulary
-from cosfly.chat.interrupts import run_until_interrupted
-from cosfly.chat.student_chat import student_files
 from cosfly.formats.captions import caption_lines, line_of, write_caption_lines
 from cosfly.formats.places import flight_of
+from cosfly.llm.interrupts import run_until_interrupted
+from cosfly.llm.student_chat import student_files
 from cosfly.runtime.errors import ConfigError, ResumeError, TeacherError
 from cosfly.runtime.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally, read_manifest

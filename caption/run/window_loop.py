@@ -22,7 +22,6 @@ from caption.truth.mirror import check_translation
 from caption.truth.references import measured_series
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft, Refused, refuse_decision
-from cosfly.chat.contract import NoAnswer, Reply
 from cosfly.formats.actions import ACTIONS
 from cosfly.formats.answer_text import Parsed, parse_answer
 from cosfly.formats.captions import (
@@ -35,6 +34,7 @@ from cosfly.formats.captions import (
     Usage,
     Verdict,
 )
+from cosfly.llm.contract import NoAnswer, Reply
 from cosfly.runtime.errors import InputError, RenderError
 from cosfly.runtime.objects import CONTEXT_FULL
 from cosfly.runtime.store import dump_json

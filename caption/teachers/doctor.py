@@ -27,11 +27,11 @@ from caption.teachers.prompts import (
 )
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import more_fields, way_of
-from cosfly.chat.client import ChatClient
-from cosfly.chat.contract import Reply
-from cosfly.chat.protocol import read_body, request_body, response_format, thoughts_of
-from cosfly.chat.refusals import MEANINGS, Refusal
 from cosfly.formats.answer_text import answer_schema
+from cosfly.llm.client import ChatClient
+from cosfly.llm.contract import Reply
+from cosfly.llm.protocol import read_body, request_body, response_format, thoughts_of
+from cosfly.llm.refusals import MEANINGS, Refusal
 from cosfly.runtime.documents import parse_json
 from cosfly.runtime.errors import TeacherError
 from cosfly.viz.frame_views import VIEW_FILES

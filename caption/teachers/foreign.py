@@ -13,9 +13,9 @@ from pathlib import Path
 from caption.schema import CaptionConfig
 from caption.teachers.prompts import Question
 from caption.writing.contract import Draft
-from cosfly.chat.contract import NoAnswer, Reply
 from cosfly.formats.captions import Coc, Language, TeacherRecord, TeacherSettings, Writing
 from cosfly.formats.predictions import FAILED, Prediction, read_predictions
+from cosfly.llm.contract import NoAnswer, Reply
 from cosfly.runtime.documents import Record, model_lines
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import dump_json

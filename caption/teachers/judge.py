@@ -19,12 +19,12 @@ from rich.table import Table
 from caption.schema import JudgeConfig, Judgement
 from caption.truth.facts import Facts
 from caption.truth.vocabulary import Vocabulary
-from cosfly.chat.answers import AnswerBook, KeptAnswers
-from cosfly.chat.budget import Budget
-from cosfly.chat.client import ChatClient, EndpointConfig
-from cosfly.chat.contract import NoAnswer, Request, Troubles, started
 from cosfly.formats.captions import Coc, JudgeRecord, Language
 from cosfly.formats.places import flight_of
+from cosfly.llm.answers import AnswerBook, KeptAnswers
+from cosfly.llm.budget import Budget
+from cosfly.llm.client import ChatClient, EndpointConfig
+from cosfly.llm.contract import NoAnswer, Request, Troubles, started
 from cosfly.runtime.documents import Record, parse_document, validated
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import read_unpacked

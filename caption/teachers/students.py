@@ -20,9 +20,11 @@ from caption.teachers.images import EncodedImage
 from caption.teachers.prompts import Question, decision_words, system_prompt
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft
-from cosfly.chat.client import EndpointConfig
-from cosfly.chat.contract import Request
-from cosfly.chat.student_chat import (
+from cosfly.formats.answer_text import answer_schema
+from cosfly.formats.captions import Language, Prompt
+from cosfly.llm.client import EndpointConfig
+from cosfly.llm.contract import Request
+from cosfly.llm.student_chat import (
     IMAGE_ENCODING,
     SentPicture,
     StudentEndpointConfig,
@@ -31,8 +33,6 @@ from cosfly.chat.student_chat import (
     read_taught,
     student_request,
 )
-from cosfly.formats.answer_text import answer_schema
-from cosfly.formats.captions import Language, Prompt
 from cosfly.runtime.errors import ConfigError, TeacherError
 from cosfly.viz.frame_views import Pictures
 

@@ -1,6 +1,6 @@
 """Teachers: who answers a `Question`.
 
-`RuleTeacher` is embedded and deterministic. `AskingTeacher` asks a language model through an engine (cosfly/chat);
+`RuleTeacher` is embedded and deterministic. `AskingTeacher` asks a language model through an engine (cosfly/llm);
 every answer is journaled before it is handed on.
 """
 
@@ -28,14 +28,14 @@ from caption.teachers.rules import MODEL, write_templates
 from caption.teachers.students import TaughtStudent
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft, more_fields, way_of
-from cosfly.chat.answers import AnswerBook, KeptAnswers
-from cosfly.chat.budget import BYTES_PER_TOKEN, PIXELS_PER_TOKEN, Budget
-from cosfly.chat.client import ChatClient
-from cosfly.chat.contract import Engine, Reply, Request, Troubles
-from cosfly.chat.vllm_engine import VllmEngine
 from cosfly.formats.answer_text import answer_schema
 from cosfly.formats.captions import TeacherRecord, TeacherSettings, Writing
 from cosfly.formats.places import flight_of
+from cosfly.llm.answers import AnswerBook, KeptAnswers
+from cosfly.llm.budget import BYTES_PER_TOKEN, PIXELS_PER_TOKEN, Budget
+from cosfly.llm.client import ChatClient
+from cosfly.llm.contract import Engine, Reply, Request, Troubles
+from cosfly.llm.vllm_engine import VllmEngine
 from cosfly.runtime.chance import draws_for, rng_for
 from cosfly.viz.frame_views import Pictures
 

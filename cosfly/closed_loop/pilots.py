@@ -24,10 +24,6 @@ from caption.teachers.prompts import Question, make_question
 from caption.teachers.students import as_taught
 from caption.teachers.teacher import first_budget, open_teacher
 from caption.writing.contract import Draft, more_fields
-from cosfly.chat.answers import Answer as BookAnswer
-from cosfly.chat.answers import AnswerBook
-from cosfly.chat.contract import NoAnswer
-from cosfly.chat.student_chat import TAUGHT
 from cosfly.closed_loop.settings import FLOORS, FlyConfig
 from cosfly.closed_loop.stepper import ClosedLoopFlight, Moment
 from cosfly.formats.actions import TOKENS
@@ -37,6 +33,10 @@ from cosfly.formats.motion import in_axes_of
 from cosfly.formats.places import sample_id
 from cosfly.formats.pursuits import MOST_WORDS, Answer
 from cosfly.geometry import wrap_deg
+from cosfly.llm.answers import Answer as BookAnswer
+from cosfly.llm.answers import AnswerBook
+from cosfly.llm.contract import NoAnswer
+from cosfly.llm.student_chat import TAUGHT
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import CosflyError
 from distill.inference.stage import InferConfig, Inputs, local_answers

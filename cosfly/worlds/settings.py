@@ -6,8 +6,8 @@ from pathlib import Path
 
 from pydantic import Field
 
-from cosfly.chat.budget import BudgetConfig
-from cosfly.chat.client import EndpointConfig
+from cosfly.llm.budget import BudgetConfig
+from cosfly.llm.client import EndpointConfig
 from cosfly.runtime.config import Config, MayDiffer
 
 

@@ -17,12 +17,12 @@ import shapely
 import yaml
 
 import cosfly
-from cosfly.chat.answers import AnswerBook, KeptAnswers
-from cosfly.chat.budget import Budget, BudgetConfig
-from cosfly.chat.client import ChatClient, EndpointConfig
-from cosfly.chat.contract import NoAnswer, Reply, started
 from cosfly.formats.boxes import OUR_LICENCE, BoxMap
 from cosfly.formats.kinds import GROUND_KINDS
+from cosfly.llm.answers import AnswerBook, KeptAnswers
+from cosfly.llm.budget import Budget, BudgetConfig
+from cosfly.llm.client import ChatClient, EndpointConfig
+from cosfly.llm.contract import NoAnswer, Reply, started
 from cosfly.maps.simworld import PLACEHOLDER_CM
 from cosfly.runtime.config import read_yaml, shipped
 from cosfly.runtime.documents import FileFormat, validated

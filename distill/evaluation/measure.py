@@ -10,12 +10,12 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel
 
-from cosfly.chat.answers import read_answers
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.captions import FIELDS, Coc, Language, SentenceState, read_captions
 from cosfly.formats.figures import Figure, draw_walks
 from cosfly.formats.predictions import FAILED, Prediction
 from cosfly.formats.splits import Split
+from cosfly.llm.answers import read_answers
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.documents import FileFormat, Record, read_model, read_object, validated
 from cosfly.runtime.errors import InputError

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.chat.answers import Answer, AnswerBook
 from cosfly.formats.answer_text import answer_schema
 from cosfly.formats.captions import Language
 from cosfly.formats.places import flight_of
+from cosfly.llm.answers import Answer, AnswerBook
 from cosfly.runtime.console import Advance
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.store import dump_json, sha256_bytes

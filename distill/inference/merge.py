@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
-from cosfly.chat.student_chat import TAUGHT
+from cosfly.llm.student_chat import TAUGHT
 from cosfly.runtime.config import Config
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.documents import read_json, read_object, validated

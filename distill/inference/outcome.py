@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from cosfly.chat.answers import Answer, AnswerBook
 from cosfly.formats.answer_text import parse_answer
 from cosfly.formats.places import flight_of
 from cosfly.formats.predictions import FAILED, PREDICTIONS, Prediction, Split
+from cosfly.llm.answers import Answer, AnswerBook
 from cosfly.runtime.objects import CONTEXT_FULL
 from cosfly.runtime.stage_folder import Failed, Tally, write_failures
 from cosfly.runtime.store import atomic_file, dump_json

@@ -13,13 +13,13 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from cosfly.chat.answers import Answer, AnswerBook, KeptAnswers, answer_key
-from cosfly.chat.client import ChatClient
-from cosfly.chat.contract import Engine, NoAnswer, Request, started
-from cosfly.chat.student_chat import TAUGHT, StudentEndpointConfig, picture_to_send, read_taught, student_request
-from cosfly.chat.vllm_engine import VllmConfig, VllmEngine
 from cosfly.formats.answer_text import answer_schema
 from cosfly.formats.predictions import PREDICTIONS, Split
+from cosfly.llm.answers import Answer, AnswerBook, KeptAnswers, answer_key
+from cosfly.llm.client import ChatClient
+from cosfly.llm.contract import Engine, NoAnswer, Request, started
+from cosfly.llm.student_chat import TAUGHT, StudentEndpointConfig, picture_to_send, read_taught, student_request
+from cosfly.llm.vllm_engine import VllmConfig, VllmEngine
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.console import Advance, progress_bar
 from cosfly.runtime.errors import ConfigError, InputError, TeacherError

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from cosfly.chat.student_chat import IMAGE_PART, chat_messages
 from cosfly.formats.frames import tree_of
+from cosfly.llm.student_chat import IMAGE_PART, chat_messages
 from cosfly.runtime.arrays import array_header, picture_size
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import inside

@@ -16,7 +16,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from cosfly.chat.student_chat import TAUGHT
+from cosfly.llm.student_chat import TAUGHT
 from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError
 from distill.student.kernels import fuse_norms, look_at_equal_sizes_at_once, use_kernels_for

@@ -11,8 +11,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from cosfly.chat.student_chat import FrameLook, Taught, write_taught
 from cosfly.formats.captions import Language, Prompt
+from cosfly.llm.student_chat import FrameLook, Taught, write_taught
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally

@@ -33,9 +33,9 @@ from caption.run.stage import open_stage
 from caption.schema import CaptionConfig
 from caption.teachers.images import FrameEncoder
 from caption.teachers.teacher import SharedFrames
-from cosfly.chat import client
-from cosfly.chat.protocol import encode_body
 from cosfly.formats.frames import SKY_DEPTH_M
+from cosfly.llm import client
+from cosfly.llm.protocol import encode_body
 from cosfly.viz.frame_views import VIEW_FILES
 from specimens import make_playback_tree
 

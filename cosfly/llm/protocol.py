@@ -7,9 +7,9 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from cosfly.chat.contract import MOST_TOKENS, Reply, Request
-from cosfly.chat.wire import Response
 from cosfly.formats.captions import Usage
+from cosfly.llm.contract import MOST_TOKENS, Reply, Request
+from cosfly.llm.wire import Response
 from cosfly.runtime.store import dump_json
 
 _IMAGE_MARK = re.compile(rb'"\\u0000(\d+)"')

@@ -17,9 +17,9 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from cosfly.chat.client import EndpointConfig
-from cosfly.chat.contract import NoAnswer, Reply, Request
 from cosfly.formats.captions import Usage
+from cosfly.llm.client import EndpointConfig
+from cosfly.llm.contract import NoAnswer, Reply, Request
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError, TeacherError
 

@@ -17,9 +17,9 @@ import numpy as np
 from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
-from cosfly.chat.client import EndpointConfig
-from cosfly.chat.contract import Request
 from cosfly.formats.captions import Language, Prompt
+from cosfly.llm.client import EndpointConfig
+from cosfly.llm.contract import Request
 from cosfly.runtime.documents import FileFormat, read_model
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import sha256_bytes, write_model

@@ -21,9 +21,9 @@ from weakref import WeakValueDictionary
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from cosfly.chat.budget import Budget
-from cosfly.chat.contract import MOST_TOKENS, CountName, Engine, NoAnswer, Reply, Request
 from cosfly.formats.captions import Usage
+from cosfly.llm.budget import Budget
+from cosfly.llm.contract import MOST_TOKENS, CountName, Engine, NoAnswer, Reply, Request
 from cosfly.runtime.errors import CosflyError
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.objects import CONTEXT_FULL

@@ -18,8 +18,8 @@ from typing import Any, Literal
 import httpx
 from pydantic import Field
 
-from cosfly.chat.contract import NoAnswer, Reply, Request, Troubles
-from cosfly.chat.protocol import (
+from cosfly.llm.contract import NoAnswer, Reply, Request, Troubles
+from cosfly.llm.protocol import (
     ERROR_INSTEAD,
     encode_body,
     error_words,
@@ -29,9 +29,9 @@ from cosfly.chat.protocol import (
     request_body,
     response_format,
 )
-from cosfly.chat.refusals import MEANINGS, Refusal, kind_of
-from cosfly.chat.throttle import Throttle
-from cosfly.chat.wire import KEY_VARIABLE, Connections, Response, base_url, check_url
+from cosfly.llm.refusals import MEANINGS, Refusal, kind_of
+from cosfly.llm.throttle import Throttle
+from cosfly.llm.wire import KEY_VARIABLE, Connections, Response, base_url, check_url
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.errors import TeacherError
 from cosfly.runtime.objects import CONTEXT_FULL
