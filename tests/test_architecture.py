@@ -16,7 +16,7 @@ PACKAGES = ("cosfly", "caption", "distill", "release")
 STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")  # a folder each
 # From the ground up: a room may import what stands before it, and itself; stages do not import each other, nor do
 # siblings.
-ROOMS = ("runtime", "root", "formats", "space", "viz", "llm", "unreal", "stages", "siblings", "app", "cli")
+ROOMS = ("runtime", "root", "formats", "space", "viz", "llm", "simulators", "stages", "siblings", "app", "cli")
 ASSEMBLY = ("app", "closed_loop", "envs", "studies", "worlds")  # what may know all stages and siblings
 HEAVY = {
     *("torch", "transformers", "peft", "accelerate", "bert_score", "datasets"),
@@ -138,7 +138,7 @@ def test_axes_of_the_tree_are_converted_where_its_files_are_read_and_written():
     importers = {
         name for name, path in SOURCES.items() if re.search(r"^from .*\bmirror_(pos|rot)", path.read_text(), re.M)
     }
-    assert importers == {"cosfly.formats.frames", "cosfly.formats.playback", "cosfly.unreal.conventions"}
+    assert importers == {"cosfly.formats.frames", "cosfly.formats.playback", "cosfly.simulators.conventions"}
 
 
 def test_heavy_packages_are_imported_where_they_are_used():
@@ -168,7 +168,7 @@ ALLOWED_TO_READ = {
     ("cosfly.closed_loop.policy", "loads"),  # the answer of a process that it started, of a bounded size
     ("distill.student.random_student", "loads"),  # what the tokenizer's own library gives
     ("distill.student.checkpoint", "load_file"),  # tensors, whose checksums were compared
-    ("cosfly.unreal.guard", "loads"),  # lines of the process that started it
+    ("cosfly.simulators.guard", "loads"),  # lines of the process that started it
 }
 
 

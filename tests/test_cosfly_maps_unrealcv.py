@@ -23,7 +23,7 @@ from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig, level_map
 from cosfly.runtime.errors import EnvironmentMissing, InputError
-from cosfly.unreal.assets import id_of, kind_of
+from cosfly.simulators.assets import id_of, kind_of
 
 pytest.importorskip("unrealcv")
 

@@ -28,7 +28,7 @@ from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import EnvironmentMissing, RenderError
-from cosfly.unreal.conventions import DEPTH_STEP_M
+from cosfly.simulators.conventions import DEPTH_STEP_M
 
 pytest.importorskip("carla")
 FRAMES = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0], "town": "Street", "first_timestamp": 1776000000}

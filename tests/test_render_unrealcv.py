@@ -29,7 +29,7 @@ from cosfly.render.stage import open_renderer, run
 from cosfly.render.unrealcv_backend import UnrealCvRenderConfig
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import EnvironmentMissing, RenderError
-from cosfly.unreal.unrealcv_client import UnrealCvConfig, connect
+from cosfly.simulators.unrealcv_client import UnrealCvConfig, connect
 
 pytest.importorskip("unrealcv")
 CLEAN = {**FRAMES, "tracks": ["clean"]}

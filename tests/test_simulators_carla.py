@@ -15,7 +15,7 @@ from test_renderers_contract import street
 from cosfly.formats.kinds import KINDS
 from cosfly.geometry import intrinsic_matrix, world_from_camera
 from cosfly.render.stage import open_renderer
-from cosfly.unreal.conventions import (
+from cosfly.simulators.conventions import (
     DEPTH_STEP_M,
     camera_rotation_deg,
     depth_of,

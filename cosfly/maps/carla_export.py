@@ -23,8 +23,8 @@ from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_b
 from cosfly.formats.kinds import KINDS
 from cosfly.runtime.errors import EnvironmentMissing, InputError
 from cosfly.runtime.store import sha256_bytes
-from cosfly.unreal.carla_client import CarlaConfig, connect
-from cosfly.unreal.conventions import world_pose
+from cosfly.simulators.carla_client import CarlaConfig, connect
+from cosfly.simulators.conventions import world_pose
 
 log = logging.getLogger(__name__)
 

@@ -27,7 +27,7 @@ from cosfly.maps.boxlist import BoxList
 from cosfly.runtime.config import Config
 from cosfly.runtime.documents import read_json, validated
 from cosfly.runtime.errors import ConfigError, InputError
-from cosfly.unreal.assets import Asset, asset_of, kind_of
+from cosfly.simulators.assets import Asset, asset_of, kind_of
 
 log = logging.getLogger(__name__)
 
@@ -229,7 +229,10 @@ def read_sizes(paths: list[Path]) -> dict[str, np.ndarray]:
 def _unknown(cfg: SimWorldConfig, node: _Node, what: str) -> int:
     """Count an asset that cannot be placed, or stop because of it."""
     if cfg.unknown == "error":
-        to_size, to_kinds = "a size table that has it to maps.simworld.sizes", "it to ASSETS in cosfly/unreal/assets.py"
+        to_size, to_kinds = (
+            "a size table that has it to maps.simworld.sizes",
+            "it to ASSETS in cosfly/simulators/assets.py",
+        )
         raise InputError(
             f"an asset without a {what}", where=f"{cfg.world}: {node.id}.instance_name", got=node.instance_name,
             fix=f"add {to_size if what == 'size' else to_kinds}, or leave such out: --set maps.simworld.unknown=drop",

@@ -42,8 +42,8 @@ from cosfly.runtime.config import MayDiffer
 from cosfly.runtime.errors import InputError, RenderError
 from cosfly.runtime.items import worker_place
 from cosfly.runtime.store import dump_json, sha256_bytes
-from cosfly.unreal.carla_client import CarlaConfig, CarlaConnection, connect
-from cosfly.unreal.conventions import (
+from cosfly.simulators.carla_client import CarlaConfig, CarlaConnection, connect
+from cosfly.simulators.conventions import (
     ACTOR_BITS,
     SIMULATED_STEP_S,
     camera_rotation_deg,
@@ -52,7 +52,7 @@ from cosfly.unreal.conventions import (
     unreal_pose,
     world_pose,
 )
-from cosfly.unreal.guard import EngineGuard, values_of, with_values
+from cosfly.simulators.guard import EngineGuard, values_of, with_values
 
 log = logging.getLogger(__name__)
 

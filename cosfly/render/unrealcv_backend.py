@@ -3,7 +3,7 @@
 
 A frame: everybody and the camera are put in their places, the engine goes on for the settle delay, and is paused while
 its three pictures are read. Whose a pixel is, its colour in the object mask tells, and a box's id the object's name
-(`cosfly.unreal.assets.id_of`); of an object that has no box the id is NO_INSTANCE.
+(`cosfly.simulators.assets.id_of`); of an object that has no box the id is NO_INSTANCE.
 
 A flight whose lengths were not converted is one of people's legs, with a camera at ground level. So the level is held
 against the map before anything is drawn, and the camera against its place in each frame.
@@ -43,10 +43,10 @@ from cosfly.runtime.arrays import parse_array, parse_picture
 from cosfly.runtime.config import MayDiffer
 from cosfly.runtime.errors import ConfigError, InputError, RenderError
 from cosfly.runtime.items import worker_place
-from cosfly.unreal.assets import id_of, kind_of
-from cosfly.unreal.conventions import FAR_CM, camera_rotation_deg, unreal_pose, world_pose
-from cosfly.unreal.guard import EngineGuard
-from cosfly.unreal.unrealcv_client import OURS, NoAnswerError, UnrealCvConfig, connect, is_refusal, ours
+from cosfly.simulators.assets import id_of, kind_of
+from cosfly.simulators.conventions import FAR_CM, camera_rotation_deg, unreal_pose, world_pose
+from cosfly.simulators.guard import EngineGuard
+from cosfly.simulators.unrealcv_client import OURS, NoAnswerError, UnrealCvConfig, connect, is_refusal, ours
 
 log = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ from typing import Literal
 
 from cosfly.runtime.config import read_yaml
 from cosfly.runtime.documents import Record
-from cosfly.unreal.assets import ASSETS
+from cosfly.simulators.assets import ASSETS
 
 Where = Literal["open", "quay", "water", "layout"]
 Part = tuple[str, float, float, float, float, float, float]  # kind, middle x y, size x y, low, high, m

@@ -16,7 +16,7 @@ import numpy as np
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.others import BUILDS
 from cosfly.formats.weather import WeatherParams
-from cosfly.unreal.conventions import CARLA_VERSION, DEPTH_RANGE_M, DEPTH_STEPS, SIMULATED_STEP_S, unreal_pose
+from cosfly.simulators.conventions import CARLA_VERSION, DEPTH_RANGE_M, DEPTH_STEPS, SIMULATED_STEP_S, unreal_pose
 from simulators.scene import Mover, Server, listen, send
 
 EPISODE_STREAM, EPISODE_OBSERVER = 1, 17  # the stream of the world's state, and its number as a sensor

@@ -21,7 +21,7 @@ from cosfly.render.contract import PERSON_ID, Frame, PosedCar, PosedOther, Posed
 from cosfly.render.person import SLOW_MPS, choose_clothes
 from cosfly.render.stage import open_renderer
 from cosfly.runtime.chance import rng_for
-from cosfly.unreal.conventions import SIMULATED_STEP_S, world_pose
+from cosfly.simulators.conventions import SIMULATED_STEP_S, world_pose
 
 MOST_MOVERS = 64
 FAULT = re.compile(r"(\w+)(?::(\w+))?@(\d+)(\+?)(?:=([\d.]+))?")  # NAME[:SENSOR]@TICK[+][=SECONDS]

@@ -15,8 +15,8 @@ import numpy as np
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import KIND_NAMES, KINDS
-from cosfly.unreal.assets import is_person
-from cosfly.unreal.conventions import CM_PER_M, FAR_CM, unreal_pose
+from cosfly.simulators.assets import is_person
+from cosfly.simulators.conventions import CM_PER_M, FAR_CM, unreal_pose
 from simulators.scene import Mover, Server, listen, send
 
 MAGIC = 0x9E2B83C1  # before each message, with its length

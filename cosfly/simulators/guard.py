@@ -33,7 +33,7 @@ class EngineGuard:
 
     def __init__(self, engine: str, host: str, port: int, command: str, patience_s: float) -> None:
         filled = command.replace("{port}", str(port))
-        words = [sys.executable, "-m", "cosfly.unreal.guard", engine, host, str(port), filled]
+        words = [sys.executable, "-m", "cosfly.simulators.guard", engine, host, str(port), filled]
         # A session of its own: Ctrl-C is not for it.
         self._process = subprocess.Popen(words, stdin=subprocess.PIPE, text=True, start_new_session=True)
         if command:
@@ -89,7 +89,7 @@ def _put_back_carla(host: str, port: int, found: dict[str, Any], actors: list[in
 
 
 def _put_back_unrealcv(host: str, port: int, commands: list[str]) -> None:
-    from cosfly.unreal.unrealcv_client import UnrealCvConfig, connect, ours
+    from cosfly.simulators.unrealcv_client import UnrealCvConfig, connect, ours
 
     connection = connect(UnrealCvConfig(host=host, timeout_s=PATIENCE_S), port)
     with connection.asking("the level was not put in order"):
