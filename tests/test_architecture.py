@@ -17,7 +17,7 @@ STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")
 # From the ground up: a room may import what stands before it, and itself; stages do not import each other, nor do
 # siblings.
 ROOMS = ("runtime", "root", "formats", "space", "viz", "llm", "simulators", "stages", "siblings", "app", "cli")
-ASSEMBLY = ("app", "closed_loop", "envs", "studies", "worlds")  # what may know all stages and siblings
+ASSEMBLY = ("app", "closed_loop", "envs", "studies", "worldgen")  # what may know all stages and siblings
 HEAVY = {
     *("torch", "transformers", "peft", "accelerate", "bert_score", "datasets"),
     *("vllm", "pyrender", "trimesh", "carla", "ray"),

@@ -15,12 +15,12 @@ from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.runtime.documents import read_json, read_model
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.stage_folder import read_manifest
-from cosfly.worlds.objects import OBJECTS, assets
-from cosfly.worlds.plan import PLAN_FORMAT, NamedObject, WorldPlan
-from cosfly.worlds.rules import plan_by_rules
-from cosfly.worlds.settings import WorldConfig
-from cosfly.worlds.stage import check_world, run
-from cosfly.worlds.town import build, footprints, of_kinds
+from cosfly.worldgen.objects import OBJECTS, assets
+from cosfly.worldgen.plan import PLAN_FORMAT, NamedObject, WorldPlan
+from cosfly.worldgen.rules import plan_by_rules
+from cosfly.worldgen.settings import WorldConfig
+from cosfly.worldgen.stage import check_world, run
+from cosfly.worldgen.town import build, footprints, of_kinds
 
 PROMPTS = list(csv.DictReader(Path(__file__).with_name("world_prompts.tsv").open(), delimiter="\t"))
 SMALL = WorldPlan(blocks_along=2, block_m=46.0, objects=[NamedObject(name="fountain")])

@@ -23,7 +23,7 @@ from cosfly.runtime.files import LinkedPath
 from cosfly.runtime.ray_engine import ALL_ROOM, RayConfig
 from cosfly.runtime.worker_pool import Watch
 from cosfly.simplify.passes import SimplifyConfig
-from cosfly.worlds.settings import WorldConfig
+from cosfly.worldgen.settings import WorldConfig
 from distill.evaluation.compare import ReportConfig
 from distill.evaluation.stage import EvaluateConfig
 from distill.inference.merge import MergeConfig

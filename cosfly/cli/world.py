@@ -34,7 +34,7 @@ def world(
     ] = False,
 ) -> None:
     """Text to world: a town that a prompt describes, as SimWorld's combined_world.json."""
-    from cosfly.worlds import stage
+    from cosfly.worldgen import stage
 
     words = "-".join(re.findall(r"[a-z0-9]+", prompt.lower())[:5]) or "world"
     out = out or Path("worlds") / f"{words[:40]}-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -51,7 +51,7 @@ def _go_on(job: Job, folder: Path, seed: int) -> None:
     from cosfly.app import pipeline
     from cosfly.cli.run import _closing_table
     from cosfly.pedestrians.roi_editor import run_propose
-    from cosfly.worlds.stage import LOOP_FILE
+    from cosfly.worldgen.stage import LOOP_FILE
 
     told = list(job.overrides)
     where: dict[str, Any] = {"workers": job.cfg.workers, "engine": job.cfg.engine, "ray.address": job.cfg.ray.address}

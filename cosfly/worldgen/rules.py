@@ -13,8 +13,8 @@ from typing import Any
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import read_yaml
 from cosfly.runtime.errors import InputError
-from cosfly.worlds.objects import OBJECTS
-from cosfly.worlds.plan import NamedObject, WorldPlan
+from cosfly.worldgen.objects import OBJECTS
+from cosfly.worldgen.plan import NamedObject, WorldPlan
 
 WORDS = read_yaml(Path(__file__).with_name("words.yaml"))
 NUMBERS = {word: number for number, word in enumerate(WORDS["numbers"], 1)}

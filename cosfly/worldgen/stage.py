@@ -32,11 +32,11 @@ from cosfly.runtime.objects import find_object
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
 from cosfly.runtime.store import sha256_bytes, write_bytes, write_json, write_model
 from cosfly.viz.topview import TopView, draw_map, png_bytes
-from cosfly.worlds.objects import OBJECTS, assets
-from cosfly.worlds.plan import PLAN_FORMAT, WorldPlan
-from cosfly.worlds.rules import check_prompt, plan_by_rules
-from cosfly.worlds.settings import WorldConfig
-from cosfly.worlds.town import CM_PER_M, Town, build, footprints, land_m2, of_kinds, road_nodes, trees_of, world_nodes
+from cosfly.worldgen.objects import OBJECTS, assets
+from cosfly.worldgen.plan import PLAN_FORMAT, WorldPlan
+from cosfly.worldgen.rules import check_prompt, plan_by_rules
+from cosfly.worldgen.settings import WorldConfig
+from cosfly.worldgen.town import CM_PER_M, Town, build, footprints, land_m2, of_kinds, road_nodes, trees_of, world_nodes
 
 CELL_M = 0.5
 HEAD_M = 2.0  # what is higher does not stand in a walker's way

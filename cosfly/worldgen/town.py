@@ -24,8 +24,8 @@ from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.town_blocks import LAWN_TOP_M, PAVED_TOP_M, SLAB_M
 from cosfly.runtime.chance import rng_for
-from cosfly.worlds.objects import Object, asset_for, assets
-from cosfly.worlds.plan import SPACE_M, WorldPlan, objects_of, town_settings, unknown_objects
+from cosfly.worldgen.objects import Object, asset_for, assets
+from cosfly.worldgen.plan import SPACE_M, WorldPlan, objects_of, town_settings, unknown_objects
 
 CM_PER_M = 100.0
 ROAD_PIECE_M, ROAD_SCALE = 200.0, (0.95, 0.9, 1.0)  # of SimWorld's piece of road: its length, and the scale it has then
