@@ -7,7 +7,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cosfly.app.library import load_map, plan, read_captions, render_frames
+    from cosfly.pipeline.library import load_map, plan, read_captions, render_frames
 
 __all__ = ["__version__", "load_map", "plan", "read_captions", "render_frames"]
 
@@ -18,4 +18,4 @@ def __getattr__(name: str) -> Any:
     """Give a name of the library; nothing is loaded before."""
     if name not in __all__:
         raise AttributeError(f"module 'cosfly' has no attribute {name!r}")
-    return getattr(importlib.import_module("cosfly.app.library"), name)
+    return getattr(importlib.import_module("cosfly.pipeline.library"), name)

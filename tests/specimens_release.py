@@ -9,8 +9,6 @@ from unittest import mock
 
 from specimens_distill import make_caption as caption_of_frame
 
-from cosfly.app import pipeline
-from cosfly.app.settings import RunConfig
 from cosfly.formats.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
 from cosfly.formats.flights import find_flights
 from cosfly.formats.inspection import (
@@ -24,6 +22,8 @@ from cosfly.formats.inspection import (
 )  # fmt: skip
 from cosfly.formats.issues import Issue
 from cosfly.formats.playback import read_flight
+from cosfly.pipeline import run as pipeline
+from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
 from release.export.source import open_release, read_span, scan
 from release.package.config import ReleaseConfig

@@ -16,8 +16,8 @@ PACKAGES = ("cosfly", "caption", "distill", "release")
 STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")  # a folder each
 # From the ground up: a room may import what stands before it, and itself; stages do not import each other, nor do
 # siblings.
-ROOMS = ("runtime", "root", "formats", "space", "viz", "llm", "simulators", "stages", "siblings", "app", "cli")
-ASSEMBLY = ("app", "closed_loop", "envs", "studies", "worldgen")  # what may know all stages and siblings
+ROOMS = ("runtime", "root", "formats", "space", "viz", "llm", "simulators", "stages", "siblings", "pipeline", "cli")
+ASSEMBLY = ("pipeline", "closed_loop", "envs", "studies", "worldgen")  # what may know all stages and siblings
 HEAVY = {
     *("torch", "transformers", "peft", "accelerate", "bert_score", "datasets"),
     *("vllm", "pyrender", "trimesh", "carla", "ray"),
@@ -70,7 +70,7 @@ def room(name: str) -> str:
     if package != "cosfly":
         return "siblings"
     if first in ASSEMBLY:
-        return "app"
+        return "pipeline"
     if first in STAGES:
         return "stages"
     if first in ("", "__main__"):  # the front door: `import cosfly`, `python -m cosfly`
@@ -256,7 +256,7 @@ def test_help_is_instant():
 
 def test_settings_bring_no_solver_along():
     """Every command but help reads the settings of all stages: what these need to work is imported when they do."""
-    program = "import sys, cosfly.app.settings; print('LOADED', *sorted(sys.modules))"
+    program = "import sys, cosfly.pipeline.settings; print('LOADED', *sorted(sys.modules))"
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     loaded = set(result.stdout.split("LOADED")[1].split())
     assert not loaded & {"scipy.interpolate", "scipy.spatial", "scipy.optimize", "matplotlib", "torch", "transformers"}

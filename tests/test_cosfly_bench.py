@@ -4,9 +4,9 @@ import pytest
 from toy_workers import make_counting_worker, stage_in
 from typer.testing import CliRunner
 
-from cosfly.app.bench import Bench, row_of, run, stage_rows, tables
-from cosfly.app.settings import RunConfig
 from cosfly.cli import app
+from cosfly.pipeline.bench import Bench, row_of, run, stage_rows, tables
+from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.errors import ConfigError, ResumeError
 from cosfly.runtime.runner import Item, run_items
 from cosfly.runtime.stage_events import Event, read_events

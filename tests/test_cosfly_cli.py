@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from cosfly import cli
-from cosfly.app.settings import RunConfig
 from cosfly.cli.options import Job, resolve
 from cosfly.llm.client import ChatClient, EndpointConfig
 from cosfly.llm.wire import base_url
+from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.errors import InputError, TeacherError
 from cosfly.runtime.stage_folder import StageFolder, Tally
 from cosfly.runtime.store import write_json

@@ -3,8 +3,8 @@
 import pytest
 from pydantic import BaseModel, Field
 
-from cosfly.app.settings import RunConfig
-from cosfly.app.settings_guide import explain, nested
+from cosfly.pipeline.settings import RunConfig
+from cosfly.pipeline.settings_guide import explain, nested
 from cosfly.runtime.config import Config, load
 from cosfly.runtime.errors import ConfigError
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from cosfly.app.settings import RunConfig
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.walks import Walk
 from cosfly.maps.boxlist import BoxList
@@ -12,6 +11,7 @@ from cosfly.pedestrians.crossings import CROSSING, ROAD, where_walked
 from cosfly.pedestrians.others import company_of
 from cosfly.pedestrians.stage import make_walk
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
+from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import load, shipped
 from cosfly.simplify.passes import simplify

@@ -10,13 +10,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 import cosfly
-from cosfly.app import library
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.maps import stage as maps_stage
 from cosfly.maps.stage import MapsConfig
 from cosfly.pedestrians import stage as pedestrians_stage
 from cosfly.pedestrians.walkable import PedestriansConfig
+from cosfly.pipeline import library
 from cosfly.planners import stage as plan_stage
 from cosfly.planners.contract import PLANNERS, PlanConfig
 from cosfly.render.contract import PERSON_ID

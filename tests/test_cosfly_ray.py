@@ -16,8 +16,8 @@ from crashes import contents, differences
 from teacher_server import TeacherServer
 from toy_workers import make_talking_worker, make_worker, stage_in
 
-from cosfly.app import pipeline
-from cosfly.app.settings import RunConfig
+from cosfly.pipeline import run as pipeline
+from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
 from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.ray_engine import ALL_ROOM, ENVIRONMENT, STORE_BYTES, RayConfig

@@ -2,7 +2,7 @@
 
 import pytest
 
-from cosfly.app.reproduce import OF_RELEASE, MissingFile, Paper, Places, read_paper
+from cosfly.pipeline.reproduce import OF_RELEASE, MissingFile, Paper, Places, read_paper
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.store import write_json

@@ -11,7 +11,6 @@ import pytest
 from test_cosfly_render import needs_gl
 from test_renderers_contract import HIP, circling, opened, pose_towards, street, write_inputs
 
-from cosfly.app.settings import RunConfig
 from cosfly.formats.boxes import MapHeader, make_box_map
 from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import read_depth, read_instance, read_meta, read_rgb
@@ -19,6 +18,7 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback import read_flight
 from cosfly.formats.weather import TIMES, WEATHER_GROUPS, WEATHERS, WeatherParams, resolved, sky_kind
 from cosfly.geometry import intrinsic_matrix
+from cosfly.pipeline.settings import RunConfig
 from cosfly.render.contract import PosedPerson
 from cosfly.render.gl.weather_pass import light_direction, lights_on
 from cosfly.render.person import choose_clothes

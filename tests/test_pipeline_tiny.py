@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from cosfly.app import pipeline
-from cosfly.app.estimate import estimate
-from cosfly.app.settings import RunConfig
 from cosfly.cli import app
 from cosfly.formats.captions import read_captions
 from cosfly.formats.flights import find_flights
 from cosfly.formats.playback import read_flight
+from cosfly.pipeline import run as pipeline
+from cosfly.pipeline.estimate import estimate
+from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
 from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import ConfigError, ResumeError, VerifyError

@@ -13,7 +13,6 @@ from specimens_planning import WORLDS, assert_safe, town_of, walk_along
 from caption.schema import FutureMotion
 from caption.truth.actions import TABLE as ACTION_TABLE
 from caption.truth.actions import measure
-from cosfly.app.settings import RunConfig
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.boxes import write_boxes
 from cosfly.formats.frames import LEGIBLE_HEIGHT_PX, Camera
@@ -23,6 +22,7 @@ from cosfly.geometry import intrinsic_matrix, look_at, world_from_camera, wrap_d
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.stage import make_walk
 from cosfly.pedestrians.walkable import walkable_ground
+from cosfly.pipeline.settings import RunConfig
 from cosfly.planners.contract import PLANNERS, PlanConfig
 from cosfly.planners.courses import wish_of
 from cosfly.planners.intent import draw_intent, draw_styles

@@ -24,9 +24,9 @@ from release_tampering import depth_of, errors_in, forge, set_depth
 from teacher_server import TeacherServer
 
 from caption.run.released import read_released
-from cosfly.app import pipeline
-from cosfly.app.settings import RunConfig
 from cosfly.formats.captions import write_captions
+from cosfly.pipeline import run as pipeline
+from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
 from release.package import stage as package
 from release.package.sources import Source

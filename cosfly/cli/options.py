@@ -18,7 +18,7 @@ from cosfly.runtime.errors import ConfigError, InputError, nearest
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
-    from cosfly.app.settings import RunConfig
+    from cosfly.pipeline.settings import RunConfig
     from cosfly.runtime.stage_folder import Resume, Tally
 
 log = logging.getLogger(__name__)
@@ -94,7 +94,7 @@ class Job:
     @property
     def manner(self) -> dict[str, Any]:
         """How a stage works, whatever it makes: arguments that all stages with workers take."""
-        from cosfly.app.settings import manner_of_work
+        from cosfly.pipeline.settings import manner_of_work
 
         return manner_of_work(self.cfg) | {"resume": self.resume}
 
@@ -210,7 +210,7 @@ def stage_group(text: str) -> typer.Typer:
 
 def resolve(config: Path | None, overrides: list[str] | None, given: Mapping[str, Any] = {}) -> RunConfig:
     """Resolve the settings: defaults, file, --set, then `given`: what options say of single settings."""
-    from cosfly.app.settings import RunConfig
+    from cosfly.pipeline.settings import RunConfig
     from cosfly.runtime.config import config_file, load
     from cosfly.runtime.store import dump_json
 

@@ -80,7 +80,7 @@ def release_verify(
 ) -> None:
     """Check that a release is what its records say and can be true, from cheap to dear. Exit 1 if anything is wrong."""
     from caption.run.released import read_released
-    from cosfly.app.settings import manner_of_work
+    from cosfly.pipeline.settings import manner_of_work
     from cosfly.runtime.store import write_json
     from release.verify.verify import LEVELS, verify
 

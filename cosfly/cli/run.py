@@ -13,8 +13,8 @@ from cosfly.cli import options
 from cosfly.cli.options import WORKERS, Job, takes
 
 if TYPE_CHECKING:
-    from cosfly.app.pipeline import StageResult
-    from cosfly.app.settings import RunConfig
+    from cosfly.pipeline.run import StageResult
+    from cosfly.pipeline.settings import RunConfig
 
 app = typer.Typer()
 CONFIG = "YAML file, one that ships (quickstart, diverse, learning, simworld, delft), or a run folder, to continue."
@@ -34,7 +34,7 @@ def run(
     until: Annotated[Until, Option(help="The last stage that is done.")] = "release",
 ) -> None:
     """Make a data set from a configuration: all stages in order. Run it again to continue."""
-    from cosfly.app import pipeline
+    from cosfly.pipeline import run as pipeline
 
     if (config / "run.yaml").is_file():
         out = out or config
@@ -58,7 +58,7 @@ def _is_begun(config: Path, cfg: RunConfig) -> bool:
 
 def _tell_estimate(cfg: RunConfig, out: Path) -> None:
     from caption.run.progress import duration
-    from cosfly.app import estimate
+    from cosfly.pipeline import estimate
     from cosfly.runtime.console import answer_console
 
     rows, told = estimate.estimate(cfg, out), []
@@ -92,9 +92,9 @@ def _closing_table(results: list[StageResult], out: Path) -> None:
 @app.command()
 def show(run: Annotated[Path, Argument(metavar="RUN", help="A run folder.")]) -> None:
     """Show a run: its stages, what they kept and take on the disk, the settings that are not the defaults."""
-    from cosfly.app.estimate import in_words as size
-    from cosfly.app.runs import look
     from cosfly.formats.review import how_to_decide
+    from cosfly.pipeline.estimate import in_words as size
+    from cosfly.pipeline.runs import look
     from cosfly.runtime.console import answer_console
     from cosfly.runtime.store import dump_json
 
@@ -130,8 +130,8 @@ def show(run: Annotated[Path, Argument(metavar="RUN", help="A run folder.")]) ->
 @app.command("list")
 def list_runs(root: Annotated[Path, Argument(metavar="[DIR]", help="Where runs are.")] = Path("runs")) -> None:
     """List the runs in a folder: how far they are, flights, captions, size."""
-    from cosfly.app.estimate import in_words as size
-    from cosfly.app.runs import looks
+    from cosfly.pipeline.estimate import in_words as size
+    from cosfly.pipeline.runs import looks
     from cosfly.runtime.console import answer_console
     from cosfly.runtime.errors import CosflyError
 
@@ -166,7 +166,7 @@ def bench(
     """Measure a stage with one worker process and more: the paper's tables of scaling and of reliability."""
     from rich.box import SIMPLE_HEAD
 
-    from cosfly.app import bench as benchmark
+    from cosfly.pipeline import bench as benchmark
     from cosfly.runtime.console import console
 
     counts = [int(word) if word.isdecimal() else 0 for word in workers.split(",")]
@@ -187,7 +187,7 @@ def reproduce(
     walks: Annotated[int, Option(min=1, help="Walks on the run's map that planners are measured on.")] = 20,
 ) -> None:
     """The paper's tables and figures from one run, beside the paper's own, on one page. Run it again to continue."""
-    from cosfly.app import reproduce as reproduction
+    from cosfly.pipeline import reproduce as reproduction
 
     out = out or config / "reproduce"
     typer.echo(reproduction.run(job.cfg, config, out, walks=walks, resume=job.resume))
@@ -201,7 +201,8 @@ app.add_typer(config_app, name="config")
 @takes()
 def config_check(job: Job, config: Annotated[Path, Argument(help="YAML file, or the name of one that ships.")]) -> None:
     """Check a configuration without running it: all problems at once, also missing files and licences."""
-    from cosfly.app import estimate, pipeline
+    from cosfly.pipeline import estimate
+    from cosfly.pipeline import run as pipeline
 
     pipeline.check_with_files(job.cfg)
     for line in estimate.caveats(job.cfg):
@@ -222,7 +223,7 @@ def config_show(
     """Print the resolved configuration: every setting with its value, and with --describe what it means."""
     import yaml
 
-    from cosfly.app import settings_guide
+    from cosfly.pipeline import settings_guide
     from cosfly.runtime.console import answer_console
 
     if section is None and config is not None and _is_section(config):
@@ -250,7 +251,7 @@ def doctor(
     out: Annotated[Path, Option(help="Where runs will be written.")] = Path("runs"),
 ) -> None:
     """What works here: GL, GPU, packages, disk. Exit 1 if the main job cannot run."""
-    from cosfly.app import doctor as examination
+    from cosfly.pipeline import doctor as examination
     from cosfly.runtime.console import answer_console
 
     options.tell_checks(examination.examine(out), answer_console)

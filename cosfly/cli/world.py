@@ -48,9 +48,9 @@ def world(
 
 def _go_on(job: Job, folder: Path, seed: int) -> None:
     """Do the rest of the loop: a first region is proposed from the simplified map, then all stages follow."""
-    from cosfly.app import pipeline
     from cosfly.cli.run import _closing_table
     from cosfly.pedestrians.roi_editor import run_propose
+    from cosfly.pipeline import run as pipeline
     from cosfly.worldgen.stage import LOOP_FILE
 
     told = list(job.overrides)

@@ -24,7 +24,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from caption.run.windows import current_frames, cut_future, label_motion, order_comes_within
 from caption.schema import WindowConfig
 from caption.truth.actions import TABLE, measure
-from cosfly.app.settings import RunConfig
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.playback import Flight
 from cosfly.formats.traces import DroneTrace
@@ -33,6 +32,7 @@ from cosfly.geometry import look_at, wrap_deg
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.stage import make_walk
 from cosfly.pedestrians.walkable import walkable_ground
+from cosfly.pipeline.settings import RunConfig
 from cosfly.planners.reacquire import screens_of
 from cosfly.planners.stage import draw_styles_of, plan_flight
 from cosfly.runtime.chance import rng_for

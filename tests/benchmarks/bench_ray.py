@@ -30,8 +30,8 @@ from crashes import differences
 from test_cosfly_ray import Nodes, products
 from toy_workers import make_talking_worker, stage_in
 
-from cosfly.app import pipeline
-from cosfly.app.settings import RunConfig
+from cosfly.pipeline import run as pipeline
+from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
 from cosfly.runtime.ray_engine import RayConfig, connected
 from cosfly.runtime.runner import Item, Watch, run_items

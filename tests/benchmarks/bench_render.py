@@ -30,11 +30,11 @@ import cv2
 import numpy as np
 import scenes
 
-from cosfly.app.bench import row_of
 from cosfly.formats import frames
 from cosfly.formats.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
 from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.pipeline.bench import row_of
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_flight
 from cosfly.render import flight

@@ -16,7 +16,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cosfly.app.settings import RunConfig
 from cosfly.closed_loop import stage
 from cosfly.closed_loop.measures import score_pursuits
 from cosfly.closed_loop.pilots import Outlook, PilotAnswer, open_pilot
@@ -25,6 +24,7 @@ from cosfly.formats.captions import read_captions
 from cosfly.formats.flight_scores import SCORE, SCORE_FORMAT
 from cosfly.formats.pursuits import PURSUITS, read_pursuit
 from cosfly.formats.traces import read_traces
+from cosfly.pipeline.settings import RunConfig
 from cosfly.planners import stage as planning
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.runner import Item

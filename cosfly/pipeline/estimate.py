@@ -10,11 +10,11 @@ from functools import partial
 from pathlib import Path
 
 from caption.run.progress import duration
-from cosfly.app.runs import STAGES
-from cosfly.app.settings import RunConfig
 from cosfly.formats.traces import read_traces
 from cosfly.formats.walks import read_paths, walk_id
 from cosfly.maps.stage import load_map
+from cosfly.pipeline.runs import STAGES
+from cosfly.pipeline.settings import RunConfig
 from cosfly.render.weather import dark_flights
 
 UNITS = {

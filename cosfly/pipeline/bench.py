@@ -21,7 +21,7 @@ from cosfly.runtime.stage_folder import Manifest, read_manifest
 from cosfly.runtime.store import write_model
 
 if TYPE_CHECKING:
-    from cosfly.app.settings import RunConfig
+    from cosfly.pipeline.settings import RunConfig
 
 log = logging.getLogger(__name__)
 
@@ -99,7 +99,7 @@ def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterab
 
 def _measured(cfg: RunConfig, run_folder: Path, folder: Path, stage: str, workers: int) -> BenchRun:
     """Run the stage once; gives its figures."""
-    from cosfly.app.pipeline import stages
+    from cosfly.pipeline.run import stages
 
     log.info("bench: %s with %d worker%s", stage, workers, "s" if workers > 1 else "")
     cfg = cfg.model_copy(update={"workers": workers})

@@ -21,12 +21,12 @@ from pydantic import BaseModel, Field
 
 import cosfly
 import cosfly.pedestrians.stage
-from cosfly.app import bench as benchmark
-from cosfly.app.runs import look
-from cosfly.app.settings import RunConfig, manner_of_work
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.captions import FIELDS, read_captions
 from cosfly.formats.segments import FOLLOW
+from cosfly.pipeline import bench as benchmark
+from cosfly.pipeline.runs import look
+from cosfly.pipeline.settings import RunConfig, manner_of_work
 from cosfly.planners import compare
 from cosfly.runtime.arrays import read_picture
 from cosfly.runtime.config import build, read_yaml
@@ -132,7 +132,7 @@ def run(cfg: RunConfig, folder: Path, out: Path, *, walks: int = 20, resume: Res
     told = {"run": name, "made_by": machine, "walks": walks, "left_out": left_out}
     listed = [one.model_dump(mode="json") for one in parts]
     write_json(out / "reproduction.json", {**FORMAT.header, **told, "parts": listed})
-    text = page("cosfly/app/reproduce.html", title=name, style=STYLE, told=told, parts=parts, look=TABLE_LOOK)
+    text = page("cosfly/pipeline/reproduce.html", title=name, style=STYLE, told=told, parts=parts, look=TABLE_LOOK)
     write_bytes(out / "reproduction.html", text.encode())
     return out / "reproduction.html"
 

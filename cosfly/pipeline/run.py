@@ -24,8 +24,8 @@ import cosfly.planners.stage
 import cosfly.render.stage
 import cosfly.simplify.stage
 import release.package.stage
-from cosfly.app.settings import RunConfig, manner_of_work
 from cosfly.formats.others import OTHERS_FILE
+from cosfly.pipeline.settings import RunConfig, manner_of_work
 from cosfly.runtime.documents import read_object
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError, ResumeError
 from cosfly.runtime.folder_lock import hold_folder

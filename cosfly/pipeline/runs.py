@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from cosfly.app.settings import RunConfig
-from cosfly.app.settings_guide import Setting, changed
 from cosfly.formats.review import undecided
+from cosfly.pipeline.settings import RunConfig
+from cosfly.pipeline.settings_guide import Setting, changed
 from cosfly.runtime.config import load
 from cosfly.runtime.errors import CosflyError, InputError
 from cosfly.runtime.folder_lock import is_held
