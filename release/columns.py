@@ -34,7 +34,7 @@ from cosfly.formats.motion import ACTION
 from cosfly.formats.places import sample_id
 from cosfly.formats.playback import EVENTS, Flight
 from cosfly.formats.weather import WeatherMode, WeatherParams
-from cosfly.geometry import BODY_FROM_CAMERA
+from cosfly.geometry.axes import BODY_FROM_CAMERA
 from cosfly.runtime.escaping import published_name
 from cosfly.runtime.store import dump_json
 

@@ -154,7 +154,7 @@ class Repairs(Strict):
 
 
 class Ceilings(Strict):
-    """What is told of labels without a picture (cosfly/space/blind.py), shares of `tested` ones of `split`, fitted on
+    """What labels can be told without a picture (geometry/blind.py), shares of `tested` ones of `split`, fitted on
     some of train; null where these are too few. drawn_ahead: share of `known` ones that may hang on what came later."""
 
     split: str

@@ -14,7 +14,7 @@ import numpy as np
 from release_tampering import depth_of, pixels_of, png, set_depth
 
 from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
-from cosfly.geometry import box_corners, project, world_from_camera
+from cosfly.geometry.axes import box_corners, project, world_from_camera
 
 Row = dict[str, Any]
 Rows = list[Row]

@@ -31,7 +31,7 @@ from cosfly.formats.frames import (
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback import Flight, write_flight
 from cosfly.formats.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
-from cosfly.geometry import DT_S, box_corners, intrinsic_matrix, look_at, project, world_from_camera
+from cosfly.geometry.axes import DT_S, box_corners, intrinsic_matrix, look_at, project, world_from_camera
 
 PERSON_ID = 0x1234  # two different bytes, so that a swap of the channels shows
 FIRST_SECOND = 1_776_047_127

@@ -7,10 +7,10 @@ import numpy as np
 from cosfly.formats.boxes import MapHeader, make_box_map
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.walks import Walk
-from cosfly.geometry import DT_S
+from cosfly.geometry import kernels
+from cosfly.geometry.axes import DT_S
 from cosfly.planners.contract import PlanConfig, Wish
 from cosfly.planners.stage import make_scenario
-from cosfly.space import kernels
 
 
 def walk_along(path_id, corners, speed_mps=1.2, dt_s=DT_S):

@@ -16,7 +16,7 @@ PACKAGES = ("cosfly", "caption", "distill", "release")
 STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")  # a folder each
 # From the ground up: a room may import what stands before it, and itself; stages do not import each other, nor do
 # siblings.
-ROOMS = ("runtime", "root", "formats", "space", "viz", "llm", "simulators", "stages", "siblings", "pipeline", "cli")
+ROOMS = ("runtime", "axes", "formats", "geometry", "viz", "llm", "simulators", "stages", "siblings", "pipeline", "cli")
 ASSEMBLY = ("pipeline", "closed_loop", "envs", "studies", "worldgen")  # what may know all stages and siblings
 HEAVY = {
     *("torch", "transformers", "peft", "accelerate", "bert_score", "datasets"),
@@ -64,7 +64,7 @@ def _imports(name: str, path: Path, top_level_only: bool) -> set[str]:
 
 
 def room(name: str) -> str:
-    """Where a module stands: one of ROOMS, of which `root` has the geometry that all others know."""
+    """Return the layer of a module, one of ROOMS; `axes` is the convention that formats and geometry share."""
     package, _, rest = name.partition(".")
     first = rest.partition(".")[0]
     if package != "cosfly":
@@ -75,7 +75,7 @@ def room(name: str) -> str:
         return "stages"
     if first in ("", "__main__"):  # the front door: `import cosfly`, `python -m cosfly`
         return "cli"
-    return first if first in ROOMS else "root"
+    return "axes" if name == "cosfly.geometry.axes" else first  # what formats and geometry share
 
 
 def house(name: str) -> str:
@@ -84,7 +84,7 @@ def house(name: str) -> str:
 
 
 def folder(name: str) -> str:
-    return SOURCES[name].parent.relative_to(ROOT).as_posix()
+    return room(name) if room(name) == "axes" else SOURCES[name].parent.relative_to(ROOT).as_posix()
 
 
 def ours(name: str) -> set[str]:
@@ -95,9 +95,7 @@ def ours(name: str) -> set[str]:
 def test_the_sources_were_found():
     assert {"cosfly.cli", "cosfly.runtime.store", "caption", "distill", "release"} <= SOURCES.keys()
     assert {room(name) for name in SOURCES} == set(ROOMS)
-    assert {path.name for path in (ROOT / "cosfly").glob("*.py")} == {
-        "__init__.py", "__main__.py", "geometry.py",
-    }  # fmt: skip
+    assert {path.name for path in (ROOT / "cosfly").glob("*.py")} == {"__init__.py", "__main__.py"}
 
 
 def may_import(name: str, other: str) -> bool:

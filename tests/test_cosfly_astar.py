@@ -5,8 +5,8 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from cosfly.geometry.grid import connected_parts
 from cosfly.pedestrians.astar import SQRT2, UNIFORM, find_route, route_cost
-from cosfly.space.grid import connected_parts
 
 
 def free_cells(text: str) -> np.ndarray:

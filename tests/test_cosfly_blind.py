@@ -1,4 +1,4 @@
-"""cosfly/space/blind.py: a past without places, what was drawn after it, and deciders that beat the most frequent."""
+"""cosfly/geometry/blind.py: a past without places, what was drawn after it, and deciders that beat the most frequent."""
 
 from dataclasses import replace
 
@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cosfly.formats.segments import Segment
-from cosfly.geometry import rotation_matrices
-from cosfly.space.blind import decide, fit_network, fit_rule, is_drawn_ahead, past_of
+from cosfly.geometry.axes import rotation_matrices
+from cosfly.geometry.blind import decide, fit_network, fit_rule, is_drawn_ahead, past_of
 from specimens import make_flight
 
 NUM = 12

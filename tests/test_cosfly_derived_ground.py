@@ -9,6 +9,7 @@ from specimens_slopes import on_ground, sampled, sloped_city
 
 from cosfly.formats.boxes import BoxMap, read_boxes
 from cosfly.formats.kinds import GROUND_KINDS, KINDS
+from cosfly.geometry.grid import empty_grid, lies_off_ground, surface_kinds
 from cosfly.maps.boxfile import BoxesConfig
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.cityjson import CityJsonConfig
@@ -19,7 +20,6 @@ from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
 from cosfly.render.draping import drape, is_draped
 from cosfly.runtime.chance import rng_for
 from cosfly.simplify.passes import SimplifyConfig, simplify
-from cosfly.space.grid import empty_grid, lies_off_ground, surface_kinds
 
 ROADS, SIDEWALKS, TERRAIN = (KINDS[name] for name in ("Roads", "Sidewalks", "Terrain"))
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from specimens_planning import WORLDS, scenario_of, town_of, walk_along
 
+from cosfly.geometry import flight_metrics, kernels
 from cosfly.planners import foresight, smoothing
 from cosfly.planners.contract import PlanConfig, load_planner
 from cosfly.planners.stage import make_scenario, plan_on
 from cosfly.runtime.chance import rng_for
-from cosfly.space import flight_metrics, kernels
 
 CFG = PlanConfig()
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from cosfly.geometry import (
+from cosfly.geometry.axes import (
     axis_aligned_half_extents,
     box_corners,
     intrinsic_matrix,

@@ -9,8 +9,8 @@ from scipy.optimize import linprog
 from cosfly.formats.boxes import make_box_map
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.roi import Roi
-from cosfly.geometry import rotation_matrix
-from cosfly.space.grid import (
+from cosfly.geometry.axes import rotation_matrix
+from cosfly.geometry.grid import (
     OccupancyGrid,
     blocks_walking,
     connected_parts,

@@ -30,7 +30,8 @@ from cosfly.formats.issues import Report
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback import read_flight, write_flight
 from cosfly.formats.traces import DroneTrace, write_traces
-from cosfly.geometry import mask_box
+from cosfly.geometry.axes import mask_box
+from cosfly.geometry.kernels import obstacle_index, signed_distances
 from cosfly.inspection import frames
 from cosfly.inspection.files import check_recorded
 from cosfly.inspection.flight import check_plan, is_shifted
@@ -41,7 +42,6 @@ from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import NothingKept
 from cosfly.runtime.files import sha256_file
 from cosfly.runtime.store import CHECKSUMS, write_checksums, write_json
-from cosfly.space.kernels import obstacle_index, signed_distances
 from release.verify.verify import verify
 from specimens import make_playback_tree
 

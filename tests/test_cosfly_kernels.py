@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from cosfly.geometry import rotation_matrices, rotation_matrix
-from cosfly.space import kernels
+from cosfly.geometry import kernels
+from cosfly.geometry.axes import rotation_matrices, rotation_matrix
 
 NO_TURN = np.eye(3)[None]
 

@@ -13,9 +13,9 @@ from specimens_slopes import CITY_EAST_M, CITY_NORTH_M, city_height_m, sloped_ci
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import GROUND_KINDS, KINDS
+from cosfly.geometry.grid import lies_off_ground
 from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.stage import MapsConfig, load_map
-from cosfly.space.grid import lies_off_ground
 
 Model = dict
 

@@ -18,7 +18,7 @@ from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.formats.frames import Look
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.meshes import MESHES_FILE, Meshes, MeshRef, write_meshes
-from cosfly.geometry import intrinsic_matrix, look_at, world_from_camera
+from cosfly.geometry.axes import intrinsic_matrix, look_at, world_from_camera
 from cosfly.maps import cityjson
 from cosfly.maps.cityjson import CityJsonConfig, solid_mesh, top_within, triangles_of
 from cosfly.maps.footprints import Rectangle

@@ -13,7 +13,7 @@ from cosfly.formats.motion import PlannedMotion
 from cosfly.formats.playback import read_flight, write_flight
 from cosfly.formats.segments import Mission, Segment
 from cosfly.formats.traces import DroneTrace
-from cosfly.geometry import rotation_matrices
+from cosfly.geometry.axes import rotation_matrices
 from cosfly.render.perturbation import Surroundings
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import script_flight

@@ -6,10 +6,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solveh_banded
 
+from cosfly.geometry import kernels
 from cosfly.planners.contract import PlanConfig, Scenario
 from cosfly.planners.courses import follow
 from cosfly.planners.muco import loss, muco, nearby, step
-from cosfly.space import kernels
 
 
 def random_boxes(rng, count, size_m=40.0):

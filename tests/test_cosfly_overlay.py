@@ -17,7 +17,7 @@ from cosfly.formats.frames import read_instance, read_meta, read_rgb
 from cosfly.formats.playback import read_flight
 from cosfly.formats.town import read_instance_ids
 from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
-from cosfly.geometry import box_corners, intrinsic_matrix, project, world_from_camera
+from cosfly.geometry.axes import box_corners, intrinsic_matrix, project, world_from_camera
 from cosfly.render.contract import instance_ids
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run

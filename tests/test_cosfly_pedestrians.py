@@ -10,7 +10,8 @@ from cosfly.formats.ground import Ground
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.roi import Roi
 from cosfly.formats.walks import paces_of, read_paths
-from cosfly.geometry import DT_S
+from cosfly.geometry.axes import DT_S
+from cosfly.geometry.grid import OccupancyGrid
 from cosfly.pedestrians.crossings import costs_of
 from cosfly.pedestrians.stage import (
     PedestriansConfig,
@@ -23,7 +24,6 @@ from cosfly.pedestrians.stage import (
 )
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.store import dump_json
-from cosfly.space.grid import OccupancyGrid
 
 BUILDINGS, ROADS, WATER = KINDS["Buildings"], KINDS["Roads"], KINDS["Water"]
 

@@ -14,13 +14,13 @@ import cosfly.planners.stage as planners
 from cosfly.formats.boxes import write_boxes
 from cosfly.formats.traces import read_traces
 from cosfly.formats.walks import write_paths
-from cosfly.geometry import DT_S, look_at
+from cosfly.geometry import flight_metrics as metrics
+from cosfly.geometry import kernels
+from cosfly.geometry.axes import DT_S, look_at
 from cosfly.planners.contract import MucoConfig, PlanConfig, Wish
 from cosfly.planners.muco import loss, muco, step
 from cosfly.planners.muco.nearby import nothing_nearby
 from cosfly.runtime.errors import ResumeError
-from cosfly.space import flight_metrics as metrics
-from cosfly.space import kernels
 
 CFG = PlanConfig()
 

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import read_instance
 from cosfly.formats.playback import read_flight, write_flight
-from cosfly.geometry import project, world_from_camera
+from cosfly.geometry.axes import project, world_from_camera
 from cosfly.runtime.errors import InputError
 from specimens import PERSON_ID, make_playback_tree
 

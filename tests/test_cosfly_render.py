@@ -21,7 +21,8 @@ from cosfly.formats.others import Other
 from cosfly.formats.people import draw_appearance
 from cosfly.formats.playback import read_flight
 from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
-from cosfly.geometry import focal_px, intrinsic_matrix, look_at, world_from_camera
+from cosfly.geometry.axes import focal_px, intrinsic_matrix, look_at, world_from_camera
+from cosfly.geometry.kernels import obstacle_index, signed_distances
 from cosfly.render.camera import rendered_visibility, view_target
 from cosfly.render.contract import (
     FAR_M,
@@ -50,7 +51,6 @@ from cosfly.runtime.config import build
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing
 from cosfly.runtime.files import sha256_file
 from cosfly.runtime.store import read_checksums
-from cosfly.space.kernels import obstacle_index, signed_distances
 
 LARGER = (640, 360)
 CAMERA = Camera(320, 180, intrinsic_matrix(320, 180, 90.0))

@@ -16,7 +16,7 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.others import Company, Other, write_others
 from cosfly.formats.people import Appearance, People
 from cosfly.formats.playback import TARGET_FILE, read_flight
-from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
 from cosfly.render.contract import Frame, PosedOther, PosedPerson, other_id
 from cosfly.render.flight import are_told_apart, find_goal
 from cosfly.render.person import choose_clothes

@@ -1,10 +1,10 @@
-"""cosfly/space/reprojection.py: what two frames say of each other."""
+"""cosfly/geometry/reprojection.py: what two frames say of each other."""
 
 import numpy as np
 import pytest
 
 from cosfly.formats.kinds import KINDS, LAYERS
-from cosfly.space.reprojection import COLUMNS, FLAT, GRID_ROWS, View, compare_views, median_of
+from cosfly.geometry.reprojection import COLUMNS, FLAT, GRID_ROWS, View, compare_views, median_of
 
 
 def test_flat_is_what_renderers_lay_in_layers():

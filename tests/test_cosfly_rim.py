@@ -13,7 +13,7 @@ from specimens_slopes import sloped_town
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.traces import DroneTrace
-from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
 from cosfly.maps.stage import MapsConfig
 from cosfly.maps.stage import load_map as load_source
 from cosfly.render.contract import NO_INSTANCE, instance_ids

@@ -20,9 +20,9 @@ from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, read_boxes, wr
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.roi import read_roi
 from cosfly.formats.walks import read_paths
+from cosfly.geometry.grid import roi_mask
 from cosfly.pedestrians.roi_editor import Server, open_editor
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
-from cosfly.space.grid import roi_mask
 
 CFG = PedestriansConfig(num_paths=2, min_distance_m=20, max_distance_m=40, min_component_cells=50)
 SQUARE = [[10, 10], [90, 10], [90, 70], [10, 70]]

@@ -19,7 +19,7 @@ from cosfly.formats.flights import find_flights
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback import read_flight
 from cosfly.formats.traces import write_traces
-from cosfly.geometry import box_corners
+from cosfly.geometry.axes import box_corners
 from cosfly.viz.scene_page import run
 from specimens import make_playback_tree
 

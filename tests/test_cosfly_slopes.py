@@ -13,15 +13,15 @@ from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.formats.ground import Ground
 from cosfly.formats.kinds import GROUND_KINDS, KINDS
 from cosfly.formats.walks import Walk
-from cosfly.geometry import DT_S, intrinsic_matrix, world_from_camera
+from cosfly.geometry.axes import DT_S, intrinsic_matrix, world_from_camera
+from cosfly.geometry.grid import blocks_walking
+from cosfly.geometry.kernels import index_boxes, obstacle_index, signed_distances
 from cosfly.pedestrians.stage import PedestriansConfig, walkable_ground
 from cosfly.planners.contract import PLANNERS, PlanConfig
 from cosfly.planners.stage import plan_flight
 from cosfly.render.draping import BARE_GROUND, drape, is_draped
 from cosfly.render.stage import open_renderer
 from cosfly.simplify.passes import SimplifyConfig, simplify
-from cosfly.space.grid import blocks_walking
-from cosfly.space.kernels import index_boxes, obstacle_index, signed_distances
 
 
 @pytest.fixture(scope="module", params=SHAPES)

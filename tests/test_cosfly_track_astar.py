@@ -7,9 +7,9 @@ import pytest
 from specimens_planning import WORLDS, first_points, scenario_of, town_of, walk_along
 
 import cosfly.planners.stage as planners
+from cosfly.geometry import kernels
 from cosfly.planners import sight, track_astar
 from cosfly.planners.contract import PlanConfig, TrackAStarConfig
-from cosfly.space import kernels
 
 CFG = PlanConfig(planner="track_astar")
 

@@ -17,7 +17,7 @@ from cosfly.formats.frames import read_depth, read_instance, read_meta, read_rgb
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback import read_flight
 from cosfly.formats.weather import TIMES, WEATHER_GROUPS, WEATHERS, WeatherParams, resolved, sky_kind
-from cosfly.geometry import intrinsic_matrix
+from cosfly.geometry.axes import intrinsic_matrix
 from cosfly.pipeline.settings import RunConfig
 from cosfly.render.contract import PosedPerson
 from cosfly.render.gl.weather_pass import light_direction, lights_on

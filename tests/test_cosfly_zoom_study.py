@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.formats.frames import Camera
-from cosfly.geometry import intrinsic_matrix
+from cosfly.geometry.axes import intrinsic_matrix
 from cosfly.runtime.stage_folder import read_manifest
 from cosfly.studies.zoom import enlarged_camera
 

@@ -24,8 +24,8 @@ from cosfly.formats.answer_text import parse_answer
 from cosfly.formats.captions import write_captions
 from cosfly.formats.playback import read_flight
 from cosfly.formats.splits import SPLITS
+from cosfly.geometry.blind import past_of
 from cosfly.runtime.errors import ResumeError, VerifyError
-from cosfly.space.blind import past_of
 from distill.prepare import stage
 from distill.prepare.sources import RunSource
 from distill.prepare.splitting import check_no_leak

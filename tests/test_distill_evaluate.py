@@ -16,9 +16,9 @@ from specimens_distill import make_caption, write_set
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.figures import draw_walks
 from cosfly.formats.predictions import Prediction, read_predictions
+from cosfly.geometry.blind import LEAST_WINDOWS
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import dump_json
-from cosfly.space.blind import LEAST_WINDOWS
 from distill.evaluation import compare
 from distill.evaluation.bertscore import BertScoreConfig, Scorer
 from distill.evaluation.floors import Floors, coc_of, majority

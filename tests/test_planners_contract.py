@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from specimens_planning import CANYON, WORLDS, assert_safe, town_of, walk_along
 
-from cosfly.geometry import look_at
+from cosfly.geometry import kernels
+from cosfly.geometry.axes import look_at
 from cosfly.planners import contract
 from cosfly.planners.contract import ALL_PLANNERS, REFERENCES, Plan, PlanConfig, load_planner
 from cosfly.planners.stage import make_scenario, plan_flight
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import NoPathError
-from cosfly.space import kernels
 
 UP_M = 30.0
 ON_A_HILL = {"on_a_hill": (town_of(*CANYON), [(0, 0), (40, 0)])}  # lifted by UP_M, walk and all

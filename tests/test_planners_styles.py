@@ -18,7 +18,8 @@ from cosfly.formats.boxes import write_boxes
 from cosfly.formats.frames import LEGIBLE_HEIGHT_PX, Camera
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.walks import paces_of, walk_id, write_paths
-from cosfly.geometry import intrinsic_matrix, look_at, world_from_camera, wrap_deg
+from cosfly.geometry import kernels
+from cosfly.geometry.axes import intrinsic_matrix, look_at, world_from_camera, wrap_deg
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.stage import make_walk
 from cosfly.pedestrians.walkable import walkable_ground
@@ -35,7 +36,6 @@ from cosfly.runtime.config import load, shipped
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.stage_folder import read_manifest
 from cosfly.simplify.passes import simplify
-from cosfly.space import kernels
 
 OPEN = kernels.obstacle_index(town_of())
 STRAIGHT = walk_along("straight", [(0, 0), (90, 0)])

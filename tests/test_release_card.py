@@ -122,7 +122,7 @@ def test_what_is_told_without_a_picture_stands_on_the_card_and_is_measured_again
     assert (few.ceilings.fitted_on, few.ceilings.blind, few.ceilings.drawn_ahead) == (28, None, None)
     assert "only after the window is not known" in render_card(few)
     monkeypatch.setattr("release.flight_rows.FlightRows.is_foreign", False)  # as if cosfly had drawn it
-    for module in ("cosfly.space.blind", "release.card.ceilings"):
+    for module in ("cosfly.geometry.blind", "release.card.ceilings"):
         monkeypatch.setattr(f"{module}.LEAST_WINDOWS", 10)
     path = make_release(tmp_path / "enough", **TWO_SPLITS) / "release.json"
     record = read_record(path)

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_array_equal
 from tables import each
 
-from cosfly.space.reprojection import Agreement
+from cosfly.geometry.reprojection import Agreement
 from release.flight_rows import FlightRows
 from release.verify import scene
 from release.verify.across import Summary, check_across

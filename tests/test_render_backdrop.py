@@ -14,7 +14,7 @@ from test_renderers_contract import street
 from cosfly.formats.backdrop import Backdrop
 from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, write_boxes
 from cosfly.formats.kinds import KINDS
-from cosfly.geometry import box_corners
+from cosfly.geometry.axes import box_corners
 from cosfly.render.backdrop import draw_backdrop, run
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.errors import ConfigError

@@ -21,7 +21,7 @@ from cosfly.formats.frames import read_depth, read_instance, read_meta, read_rgb
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.weather import WeatherParams
-from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
 from cosfly.render.carla_backend import CarlaRenderConfig
 from cosfly.render.contract import PERSON_ID, PosedPerson
 from cosfly.render.settings import RenderConfig
@@ -251,7 +251,7 @@ def test_weather_goes_over_the_wire_and_back(tmp_path):
 
 _WORKER = """
 import sys, time, numpy as np, test_render_carla as t
-from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
 settings = t.build(t.CarlaRenderConfig, {"port": int(sys.argv[1]), **t.QUICK}, "test")
 renderer = t.open_renderer("carla", t.street(), 160, 90, settings=settings)
 renderer.prepare(*t.street().bounds(), t.RAINY_NIGHT)

@@ -20,7 +20,7 @@ from cosfly.cli import app
 from cosfly.formats.boxes import BoxMap, write_boxes
 from cosfly.formats.flights import find_flights
 from cosfly.formats.kinds import KINDS
-from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
 from cosfly.maps import unrealcv_export
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig
 from cosfly.render.contract import PERSON_ID, PosedCar, PosedOther, PosedPerson, other_id

@@ -33,7 +33,7 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.others import Company, Other, write_others
 from cosfly.formats.traces import DroneTrace, write_traces
 from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
-from cosfly.geometry import box_corners, intrinsic_matrix, look_at, project, rotation_matrices, world_from_camera
+from cosfly.geometry.axes import box_corners, intrinsic_matrix, look_at, project, rotation_matrices, world_from_camera
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run as inspect_tree
 from cosfly.render.camera import hidden_shares, rendered_visibility, view_target

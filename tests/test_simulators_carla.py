@@ -13,7 +13,7 @@ from simulators.carla_server import depth_picture
 from test_renderers_contract import street
 
 from cosfly.formats.kinds import KINDS
-from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
 from cosfly.render.stage import open_renderer
 from cosfly.simulators.conventions import (
     DEPTH_STEP_M,

@@ -18,10 +18,10 @@ import numpy as np
 from cosfly.formats.figures import Figure, draw_walks, figure_of_draws
 from cosfly.formats.flight_scores import FlightScore, Score
 from cosfly.formats.pursuits import Pursuit
+from cosfly.geometry.flight_metrics import RELAXED_SAFETY_M, derivative_rms
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import dump_json, sha256_bytes
-from cosfly.space.flight_metrics import RELAXED_SAFETY_M, derivative_rms
 
 LOSS_S = 2.0  # unseen for so long the person is lost; for less it is hidden by a tree or a lamp
 BAND_M = (5.0, 40.0)  # over ground: a quarter and twice of what plans keep (plan.behind_distance_m)

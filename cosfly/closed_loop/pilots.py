@@ -32,7 +32,7 @@ from cosfly.formats.frames import COMPANY, FILE_NAMES, depth_file, frame_name, i
 from cosfly.formats.motion import in_axes_of
 from cosfly.formats.places import sample_id
 from cosfly.formats.pursuits import MOST_WORDS, Answer
-from cosfly.geometry import wrap_deg
+from cosfly.geometry.axes import wrap_deg
 from cosfly.llm.answers import Answer as BookAnswer
 from cosfly.llm.answers import AnswerBook
 from cosfly.llm.contract import NoAnswer

@@ -27,7 +27,7 @@ from cosfly.formats.actions import TOKENS
 from cosfly.formats.goals import SLOTS, words_of
 from cosfly.formats.motion import in_axes_of
 from cosfly.formats.pursuits import MOST_WORDS, Answer
-from cosfly.geometry import wrap_deg
+from cosfly.geometry.axes import wrap_deg
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.worker import end_with_parent
 

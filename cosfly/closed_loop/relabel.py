@@ -28,7 +28,9 @@ from cosfly.formats.boxes import read_boxes
 from cosfly.formats.flight_scores import read_score
 from cosfly.formats.pursuits import Pursuit, PursuitFrame, pursuit_file, read_pursuit
 from cosfly.formats.traces import ARRAYS, DroneTrace, Excerpt, read_traces, write_traces
-from cosfly.geometry import look_at, step_s
+from cosfly.geometry.axes import look_at, step_s
+from cosfly.geometry.flight_metrics import CLEARANCE_CAP_M
+from cosfly.geometry.kernels import signed_distances, swept_distances
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_on
 from cosfly.render import stage as rendering
@@ -36,8 +38,6 @@ from cosfly.runtime.errors import ConfigError, InputError, NoPathError
 from cosfly.runtime.provenance import read_stage_record
 from cosfly.runtime.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.runtime.stage_folder import Resume, StageFolder, flattened
-from cosfly.space.flight_metrics import CLEARANCE_CAP_M
-from cosfly.space.kernels import signed_distances, swept_distances
 
 CAPTIONS = "caption"
 

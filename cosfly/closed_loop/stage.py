@@ -29,7 +29,9 @@ from cosfly.formats.flight_scores import SCORE, SCORE_FORMAT
 from cosfly.formats.motion import PlannedMotion
 from cosfly.formats.pursuits import Pursuit, PursuitFrame, WalkStyle, pursuit_file, read_pursuit, write_pursuit
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
-from cosfly.geometry import headings_of, step_s
+from cosfly.geometry.axes import headings_of, step_s
+from cosfly.geometry.flight_metrics import flight_metrics
+from cosfly.geometry.kernels import BoxIndex, obstacle_index, visibility
 from cosfly.planners import stage as planning
 from cosfly.planners.contract import PlanConfig
 from cosfly.render import stage as rendering
@@ -40,8 +42,6 @@ from cosfly.runtime.files import sha256_file
 from cosfly.runtime.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
 from cosfly.runtime.store import write_model
-from cosfly.space.flight_metrics import flight_metrics
-from cosfly.space.kernels import BoxIndex, obstacle_index, visibility
 from distill.inference.stage import InferConfig
 
 log = logging.getLogger(__name__)

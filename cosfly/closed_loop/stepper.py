@@ -20,7 +20,9 @@ from cosfly.formats.pursuits import Ended
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.walks import TARGET_HEIGHT_M
 from cosfly.formats.weather import WeatherParams
-from cosfly.geometry import step_s, wrap_deg
+from cosfly.geometry.axes import step_s, wrap_deg
+from cosfly.geometry.flight_metrics import CLEARANCE_CAP_M
+from cosfly.geometry.kernels import swept_distances
 from cosfly.render.camera import contrast_of, legibility
 from cosfly.render.contract import PERSON_ID, Frame
 from cosfly.render.flight import annotation, draw_frame
@@ -28,8 +30,6 @@ from cosfly.render.perturbation import PerturbedTrack, Poses, Surroundings
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import renderer_of, script_flight
 from cosfly.render.weather import read_pools, weather_of
-from cosfly.space.flight_metrics import CLEARANCE_CAP_M
-from cosfly.space.kernels import swept_distances
 
 RATE_HZ = 20.0  # of the autopilot, which follows a command
 LEAVES_M = 100.0  # beyond the map's bounds

@@ -17,6 +17,7 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.others import Other
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.walks import walk_id
+from cosfly.geometry.kernels import BoxIndex, obstacle_index
 from cosfly.maps.synthetic import PRESETS, SyntheticConfig, load
 from cosfly.pedestrians.lanes import Lane, lanes_of
 from cosfly.pedestrians.others import company_of
@@ -32,7 +33,6 @@ from cosfly.runtime.documents import FileFormat, Record, read_model
 from cosfly.runtime.errors import InputError, NoPathError, nearest
 from cosfly.runtime.store import dump_json, sha256_bytes
 from cosfly.simplify.passes import SimplifyConfig, simplify
-from cosfly.space.kernels import BoxIndex, obstacle_index
 
 EPISODES_FILE = Path(__file__).with_name("episodes.json")
 EPISODES_FORMAT = FileFormat("cosfly.episodes", "1.0", "episodes")

@@ -16,7 +16,7 @@ from cosfly.formats.columns import LARGEST, rounded
 from cosfly.formats.ground import Ground, GroundGrid
 from cosfly.formats.kinds import GROUND_KINDS, KIND_COLORS, KIND_NAMES, KINDS
 from cosfly.formats.meshes import Meshes, MeshRef
-from cosfly.geometry import axis_aligned_half_extents
+from cosfly.geometry.axes import axis_aligned_half_extents
 from cosfly.runtime.documents import MISSING, FileFormat, check_schema, read_json, validated
 from cosfly.runtime.errors import InputError, nearest
 from cosfly.runtime.store import dump_json, write_bytes

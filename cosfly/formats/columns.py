@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from cosfly.geometry import step_s
+from cosfly.geometry.axes import step_s
 from cosfly.runtime.documents import MISSING, FileFormat, check_schema, read_json
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import write_json

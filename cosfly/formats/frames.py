@@ -24,7 +24,7 @@ from cosfly.formats.people import People
 from cosfly.formats.places import tree_of_flight
 from cosfly.formats.png import areas_png, colours_png, floats_of, floats_png
 from cosfly.formats.weather import WeatherRecord
-from cosfly.geometry import mirror_positions, mirror_rotations, world_from_camera
+from cosfly.geometry.axes import mirror_positions, mirror_rotations, world_from_camera
 from cosfly.runtime.arrays import PNG_SIGNATURE, parse_array_header, read_array, read_picture
 from cosfly.runtime.config import Config
 from cosfly.runtime.documents import FileFormat, Record, read_model

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from cosfly.geometry import look_at, wrap_deg
+from cosfly.geometry.axes import look_at, wrap_deg
 
 # Level axes of the drone: forward is where the camera looks, without pitch. Yaw is counter-clockwise from above.
 ACTION = ("forward_mps", "left_mps", "up_mps", "yaw_rate_degps", "gimbal_pitch_deg")

@@ -51,7 +51,7 @@ from cosfly.formats.trajectory import (
 )
 from cosfly.formats.walks import pace_of
 from cosfly.formats.weather import WeatherRecord
-from cosfly.geometry import mirror_positions, mirror_rotations
+from cosfly.geometry.axes import mirror_positions, mirror_rotations
 from cosfly.runtime.documents import read_json, validated
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import read_bytes

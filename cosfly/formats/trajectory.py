@@ -11,7 +11,7 @@ import numpy as np
 
 from cosfly.formats.columns import is_number, numbers
 from cosfly.formats.frames import ANGLES, XYZ, Camera
-from cosfly.geometry import step_s
+from cosfly.geometry.axes import step_s
 from cosfly.runtime.arrays import check_pixels
 from cosfly.runtime.documents import MISSING
 from cosfly.runtime.errors import InputError

@@ -22,7 +22,15 @@ from cosfly.formats.issues import Report
 from cosfly.formats.playback import STATES, Flight, read_flight
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.walks import TARGET_HEIGHT_M
-from cosfly.geometry import project, step_s, world_from_camera, wrap_deg
+from cosfly.geometry.axes import project, step_s, world_from_camera, wrap_deg
+from cosfly.geometry.flight_metrics import (
+    CLEARANCE_CAP_M,
+    CLEARANCE_TOLERANCE_M,
+    accel_rms,
+    jerk_rms,
+    length_m,
+    smoothness_score,
+)
 from cosfly.inspection.files import Checksums, check_files, check_recorded
 from cosfly.inspection.frames import FrameNumbers, check_frames, check_others, choose_frames, others_told, target_box
 from cosfly.inspection.settings import (
@@ -39,18 +47,10 @@ from cosfly.inspection.settings import (
 from cosfly.inspection.view import FlightView, draw_flight
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.provenance import digest_of, folder_digests
-from cosfly.space.flight_metrics import (
-    CLEARANCE_CAP_M,
-    CLEARANCE_TOLERANCE_M,
-    accel_rms,
-    jerk_rms,
-    length_m,
-    smoothness_score,
-)
 
 if TYPE_CHECKING:
     from cosfly.formats.boxes import BoxMap
-    from cosfly.space.kernels import BoxIndex
+    from cosfly.geometry.kernels import BoxIndex
 
 TIME_TOLERANCE_S = 1e-3
 
@@ -164,7 +164,7 @@ def check_surroundings(
     """Measure the poses of a flight against the map: clearance of the drone, five-ray visibility, a person in an
     obstacle; gives the first, (n,) m: of the way to the next pose, of the poses alone where shifts moved them.
     """
-    from cosfly.space.kernels import signed_distances, swept_distances, visibility
+    from cosfly.geometry.kernels import signed_distances, swept_distances, visibility
 
     gaps_m = signed_distances(obstacles, flight.positions_m, CLEARANCE_CAP_M)[0]
     if flight.is_original:

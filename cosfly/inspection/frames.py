@@ -30,7 +30,9 @@ from cosfly.formats.others import BUILDS, Other, distances_to_boxes_m
 from cosfly.formats.places import tree_of_flight
 from cosfly.formats.playback import Flight
 from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
-from cosfly.geometry import box_corners, box_iou, mask_box, project, world_from_camera
+from cosfly.geometry.axes import box_corners, box_iou, mask_box, project, world_from_camera
+from cosfly.geometry.flight_metrics import CLEARANCE_TOLERANCE_M
+from cosfly.geometry.reprojection import LEAST_SEEN, Agreement, View, compare_views
 from cosfly.inspection.files import Checksums
 from cosfly.inspection.pixels import NUM_IDS, Picture, PixelFigures, look_at, unpack
 from cosfly.inspection.settings import (
@@ -45,12 +47,10 @@ from cosfly.inspection.settings import (
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import read_bytes
 from cosfly.runtime.runner import advance
-from cosfly.space.flight_metrics import CLEARANCE_TOLERANCE_M
-from cosfly.space.reprojection import LEAST_SEEN, Agreement, View, compare_views
 
 # --- jumps ------------------------------------------------------------------------------------------------------------
 # Do the frames of a flight show one world? What stands still is carried from each frame into the next
-# (`cosfly/space/reprojection.py`), and what comes out otherwise than the poses say is a jump: something vanished, or
+# (`cosfly/geometry/reprojection.py`), and what comes out otherwise than the poses say is a jump: something vanished, or
 # another place.
 
 

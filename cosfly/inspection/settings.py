@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from cosfly.formats.places import FlightChoice
+from cosfly.geometry.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3, RELAXED_SAFETY_M
 from cosfly.runtime.config import Config
-from cosfly.space.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3, RELAXED_SAFETY_M
 
 Share = Annotated[float, Field(ge=0, le=1)]
 

@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 
 def make_worker(cfg: InspectConfig, simplified: Path | None, traces: Path | None, data: Path) -> Work:
     """Worker factory: give the function that inspects one flight folder."""
-    from cosfly.space.kernels import obstacle_index
+    from cosfly.geometry.kernels import obstacle_index
 
     box_map = None if simplified is None else read_boxes(simplified)
     obstacles = None if box_map is None else obstacle_index(box_map)

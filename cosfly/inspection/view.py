@@ -13,7 +13,7 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.flights import read_tracks_beside
 from cosfly.formats.issues import Issue, sort_key
 from cosfly.formats.playback import Flight
-from cosfly.space.flight_metrics import CLEARANCE_CAP_M
+from cosfly.geometry.flight_metrics import CLEARANCE_CAP_M
 from cosfly.viz.frame_views import small_jpeg, thumbnail
 from cosfly.viz.topview import INK, PAPER, TopView, draw_dot, draw_line, draw_map, draw_text
 

@@ -14,9 +14,9 @@ import shapely
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import KINDS, PAVED_KINDS
+from cosfly.geometry.grid import blocks_walking
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.footprints import Rectangle, cover, polygons_of, rectangle_polygon, united
-from cosfly.space.grid import blocks_walking
 
 PAVEMENT_M = 2.5  # walkers keep half a metre off walls
 NEAR_M = 25.0  # between facades that are no farther apart lies asphalt

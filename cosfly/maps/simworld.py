@@ -22,7 +22,7 @@ from pydantic import BaseModel, Field, FiniteFloat, field_validator
 from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.formats.columns import LARGEST
 from cosfly.formats.kinds import KIND_NAMES
-from cosfly.geometry import box_corners
+from cosfly.geometry.axes import box_corners
 from cosfly.maps.boxlist import BoxList
 from cosfly.runtime.config import Config
 from cosfly.runtime.documents import read_json, validated

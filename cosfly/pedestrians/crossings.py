@@ -18,8 +18,8 @@ import numpy as np
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import GROUND_KINDS, KINDS
 from cosfly.formats.walks import Walk
+from cosfly.geometry.grid import OccupancyGrid, surface, surface_kinds
 from cosfly.runtime.compiled import njit
-from cosfly.space.grid import OccupancyGrid, surface, surface_kinds
 
 MARKED_M, GAP_M = 2.0, 2.0
 ACROSS_SHARE = 0.5

@@ -60,7 +60,7 @@ class Lane:
 
 def lanes_of(box_map: BoxMap) -> list[Lane]:
     """Find the lanes of a map on which nothing stands; empty where it has no straight roads."""
-    from cosfly.space.kernels import obstacle_index, signed_distances
+    from cosfly.geometry.kernels import obstacle_index, signed_distances
 
     roads = box_map.select(box_map.kinds == KINDS["Roads"])
     streets = _streets(roads)

@@ -16,7 +16,7 @@ import numpy as np
 from cosfly.formats.ground import Ground
 from cosfly.formats.others import Company, Other, gaps_m
 from cosfly.formats.walks import Walk
-from cosfly.geometry import headings_of
+from cosfly.geometry.axes import headings_of
 from cosfly.pedestrians.lanes import Lane
 from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, sample_goal
 from cosfly.pedestrians.walking import (

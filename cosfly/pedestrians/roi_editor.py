@@ -26,6 +26,7 @@ from shapely.geometry.base import BaseGeometry
 from cosfly.formats.backdrop import Backdrop
 from cosfly.formats.boxes import AXES, BoxMap, check_ground, read_boxes
 from cosfly.formats.roi import Roi, RoiPolygon, parse_roi, write_roi
+from cosfly.geometry.grid import OccupancyGrid, empty_grid
 from cosfly.pedestrians.walkable import (
     ROI_SHARE_MIN,
     PedestriansConfig,
@@ -36,7 +37,6 @@ from cosfly.pedestrians.walkable import (
 from cosfly.runtime.errors import CosflyError, EnvironmentMissing, InputError, StorageError
 from cosfly.runtime.files import read_bytes, read_text
 from cosfly.runtime.store import sha256_bytes
-from cosfly.space.grid import OccupancyGrid, empty_grid
 from cosfly.viz.page import page, scripts
 from cosfly.viz.topview import TopView, draw_map, png_bytes
 

@@ -24,13 +24,8 @@ from cosfly.formats.ground import Ground
 from cosfly.formats.kinds import GROUND_KINDS, PAVED_KINDS
 from cosfly.formats.roi import MOST_VERTICES, Roi
 from cosfly.formats.walks import PLAIN_PACE
-from cosfly.geometry import DT_S
-from cosfly.pedestrians.astar import find_route
-from cosfly.pedestrians.crossings import CROSSING, ROAD, costs_of, footing_of
-from cosfly.pedestrians.walking import PACES, SLOWEST_SPEED_MPS
-from cosfly.runtime.config import Config, MayDiffer
-from cosfly.runtime.errors import NoPathError, nearest
-from cosfly.space.grid import (
+from cosfly.geometry.axes import DT_S
+from cosfly.geometry.grid import (
     SURFACE_REACH_M,
     OccupancyGrid,
     blocks_walking,
@@ -42,6 +37,11 @@ from cosfly.space.grid import (
     roi_mask,
     surface,
 )
+from cosfly.pedestrians.astar import find_route
+from cosfly.pedestrians.crossings import CROSSING, ROAD, costs_of, footing_of
+from cosfly.pedestrians.walking import PACES, SLOWEST_SPEED_MPS
+from cosfly.runtime.config import Config, MayDiffer
+from cosfly.runtime.errors import NoPathError, nearest
 
 log = logging.getLogger(__name__)
 

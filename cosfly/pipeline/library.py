@@ -15,7 +15,7 @@ import numpy as np
 from cosfly.formats.boxes import BoxMap, read_boxes
 from cosfly.formats.captions import read_captions
 from cosfly.formats.traces import DroneTrace
-from cosfly.geometry import intrinsic_matrix, look_at, world_from_camera
+from cosfly.geometry.axes import intrinsic_matrix, look_at, world_from_camera
 from cosfly.maps.stage import SOURCES, MapsConfig
 from cosfly.maps.stage import load_map as load_source
 from cosfly.pedestrians.stage import make_walk, walk_along
@@ -89,8 +89,8 @@ def plan(
     Raises:
         NoPathError: there is no way, or no flight.
     """
+    from cosfly.geometry.kernels import obstacle_index
     from cosfly.planners.reacquire import screens_of
-    from cosfly.space.kernels import obstacle_index
 
     walking = build(PedestriansConfig, walk or {}, "plan: walk")
     _check_taken(walk or {}, OF_WALK if way_m is None else OF_PACE, "plan: walk")

@@ -12,11 +12,11 @@ import numpy as np
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.walks import TARGET_HEIGHT_M
-from cosfly.geometry import rotation_matrices
+from cosfly.geometry.axes import rotation_matrices
+from cosfly.geometry.kernels import NO_OBSTACLE_KINDS
 from cosfly.planners.benchmark import PAPER, Benchmark, Flown
 from cosfly.planners.compare import AXES, FIGURES, color_of
 from cosfly.planners.contract import PLANNERS, title_of
-from cosfly.space.kernels import NO_OBSTACLE_KINDS
 
 GRAY = "#9a9a9a"
 # Scenarios in 3D; how far round flights, and from which height on, boxes are drawn.

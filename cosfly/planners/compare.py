@@ -191,8 +191,8 @@ def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int, keeps_all: 
 
     keeps_all: a walk that one of them does not fly is kept, with the others' flights.
     """
+    from cosfly.geometry.kernels import obstacle_index
     from cosfly.planners.reacquire import screens_of
-    from cosfly.space.kernels import obstacle_index
 
     box_map = read_boxes(simplified_map)
     obstacles, screens = obstacle_index(box_map), screens_of(box_map)

@@ -20,20 +20,20 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from cosfly.formats.segments import FOLLOW
-from cosfly.geometry import DT_S
-from cosfly.planners.styles import ALTITUDE_LEAST_M, NAMES, OTHER_SIDE, ROWS, Range, Style, with_ranges
-from cosfly.runtime.config import Config
-from cosfly.runtime.errors import NoPathError, nearest
-from cosfly.space.flight_metrics import (
+from cosfly.geometry.axes import DT_S
+from cosfly.geometry.flight_metrics import (
     ACCEL_RMS_MAX_MPS2,
     FIVE_RAY_MEAN_MIN,
     JERK_RMS_MAX_MPS3,
     RELAXED_SAFETY_M,
     SAFETY_DISTANCE_M,
 )
+from cosfly.planners.styles import ALTITUDE_LEAST_M, NAMES, OTHER_SIDE, ROWS, Range, Style, with_ranges
+from cosfly.runtime.config import Config
+from cosfly.runtime.errors import NoPathError, nearest
 
 if TYPE_CHECKING:
-    from cosfly.space.kernels import BoxIndex
+    from cosfly.geometry.kernels import BoxIndex
 
 # In the order of comparisons, which hold the first against each of the others.
 PLANNERS = {

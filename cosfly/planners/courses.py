@@ -12,12 +12,12 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from cosfly.formats.segments import FOLLOW
-from cosfly.geometry import DT_S
+from cosfly.geometry.axes import DT_S
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
 from cosfly.planners.styles import Range, Style
 
 if TYPE_CHECKING:
-    from cosfly.space.kernels import BoxIndex
+    from cosfly.geometry.kernels import BoxIndex
 
 
 # How fast the wish goes from one part to the next, relative to the walker; within the drone's 10 m/s.
@@ -106,7 +106,7 @@ def _best_course(
     rng: np.random.Generator,
 ) -> np.ndarray:  # fmt: skip
     """Draw the parameters of a part until its places see the walker and are free, or take the best of DRAWS; (k, 3)."""
-    from cosfly.space.kernels import signed_distances, visibility
+    from cosfly.geometry.kernels import signed_distances, visibility
 
     targets_m = scenario.targets_m[part]
     best, best_score = np.empty(0), -np.inf

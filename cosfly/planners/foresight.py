@@ -11,11 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosfly.planners.contract import Plan, PlanConfig, Scenario
-from cosfly.planners.sight import FOOT_LOW_M, look, make_horizon
-from cosfly.planners.smoothing import smooth_flight, unsafe
-from cosfly.runtime.compiled import njit
-from cosfly.space.kernels import (
+from cosfly.geometry.kernels import (
     HIGH_X,
     HIGH_Y,
     HIGH_Z,
@@ -29,6 +25,10 @@ from cosfly.space.kernels import (
     squared_gap,
     visibility,
 )
+from cosfly.planners.contract import Plan, PlanConfig, Scenario
+from cosfly.planners.sight import FOOT_LOW_M, look, make_horizon
+from cosfly.planners.smoothing import smooth_flight, unsafe
+from cosfly.runtime.compiled import njit
 
 # --- the places that the search may choose from: rings round the walker, counted from the wished place ----------------
 

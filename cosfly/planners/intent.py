@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from cosfly.formats.segments import FOLLOW, MISSION_KINDS, Mission, Segment
 from cosfly.formats.walks import Walk
-from cosfly.geometry import look_at
+from cosfly.geometry.axes import look_at
 from cosfly.planners.contract import PlanConfig, Scenario, Wish
 from cosfly.planners.courses import ROUNDING_S, wish_of
 from cosfly.planners.reacquire import finds_again, wish_of_reacquire
@@ -20,7 +20,7 @@ from cosfly.planners.styles import OTHER_SIDE, REACQUIRE, RETURN_HOME, ROWS, WHO
 from cosfly.runtime.chance import draw_to_quota
 
 if TYPE_CHECKING:
-    from cosfly.space.kernels import BoxIndex
+    from cosfly.geometry.kernels import BoxIndex
 
 
 # A flight holds its style where the walker sees it within this angle of the wished place and within this ratio of its
@@ -168,7 +168,7 @@ def tell_not_held(
     intent: Intent, scenario: Scenario, positions_m: np.ndarray, obstacles: BoxIndex, cfg: PlanConfig
 ) -> str:
     """Say of the part that is held least what was asked, what was flown, and what was in the way."""
-    from cosfly.space.kernels import signed_distances, visibility
+    from cosfly.geometry.kernels import signed_distances, visibility
 
     is_held, targets, wish = _is_held(intent.wish, scenario, positions_m), scenario.targets_m, intent.wish
     part = min(
@@ -242,7 +242,7 @@ def _legs_home(
 ) -> list[np.ndarray]:
     """Give the way from the end of a trail (k, 3) away from the target, and then home: along the trail, but straight
     where that is free."""
-    from cosfly.space.kernels import segments_hit
+    from cosfly.geometry.kernels import segments_hit
 
     def are_free(start: np.ndarray, ends: np.ndarray) -> np.ndarray:
         return ~segments_hit(obstacles, np.broadcast_to(start, ends.shape), ends, cfg.safety_distance_m)

@@ -19,7 +19,7 @@ from cosfly.planners.styles import REACQUIRE, Style
 
 if TYPE_CHECKING:
     from cosfly.formats.boxes import BoxMap
-    from cosfly.space.kernels import BoxIndex
+    from cosfly.geometry.kernels import BoxIndex
 
 TRIES = 120
 LOST_LEAST_S, LOST_MOST_S = 1.5, 15.0  # longest time without sight
@@ -34,7 +34,7 @@ FREE_SHARE = 1.0  # of the wished places that keep the safety distance
 
 def screens_of(box_map: BoxMap) -> BoxIndex:
     """Index what hides a person for certain: the obstacles, but of a crown's box only the box within its ellipsoid."""
-    from cosfly.space.kernels import obstacle_index
+    from cosfly.geometry.kernels import obstacle_index
 
     is_crown = box_map.is_any_of({KINDS["Vegetation"]})
     half_extents = np.where(is_crown[:, None], CROWN_SHARE * box_map.half_extents, box_map.half_extents)
@@ -45,7 +45,7 @@ def wish_of_reacquire(
     scenario: Scenario, obstacles: BoxIndex, screens: BoxIndex, cfg: PlanConfig, rng: np.random.Generator
 ) -> Wish | None:
     """Look for a flight that loses the walker and finds again; None where the map hides nobody on this walk."""
-    from cosfly.space.kernels import signed_distances, visibility
+    from cosfly.geometry.kernels import signed_distances, visibility
 
     targets, ground, dt_s, style = scenario.targets_m, scenario.ground_m, scenario.dt_s, cfg.style(REACQUIRE)
     for _ in range(TRIES):

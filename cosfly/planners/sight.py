@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.runtime.compiled import njit
-from cosfly.space.kernels import (
+from cosfly.geometry.kernels import (
     CELL,
     HALF_X,
     HALF_Y,
@@ -25,6 +24,7 @@ from cosfly.space.kernels import (
     touches,
     turned,
 )
+from cosfly.runtime.compiled import njit
 
 NUM_SECTORS = 128  # of the horizon round a target
 

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
 
+from cosfly.geometry.flight_metrics import CLEARANCE_TOLERANCE_M
+from cosfly.geometry.kernels import BoxIndex, normals, swept_distances, visibility
 from cosfly.planners.contract import PlanConfig, Scenario
-from cosfly.space.flight_metrics import CLEARANCE_TOLERANCE_M
-from cosfly.space.kernels import BoxIndex, normals, swept_distances, visibility
 
 # Weights of the squared distance to the raw flight: where any bearing will do; where the wished one counts, and there
 # at wished places, whose halts are part of what is wished; at most for the sake of sight.

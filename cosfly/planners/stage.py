@@ -19,18 +19,18 @@ from cosfly.formats.boxes import BoxMap, read_boxes
 from cosfly.formats.segments import FOLLOW
 from cosfly.formats.traces import DroneTrace, write_traces
 from cosfly.formats.walks import TARGET_HEIGHT_M, Walk, read_paths
-from cosfly.geometry import DT_S, step_s
+from cosfly.geometry.axes import DT_S, step_s
+from cosfly.geometry.flight_metrics import CLEARANCE_CAP_M, CLEARANCE_TOLERANCE_M, flight_metrics
 from cosfly.planners.contract import PlanConfig, Scenario, load_planner
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import InputError, NoPathError
 from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.runtime.stage_folder import Failed, Resume, StageFolder
 from cosfly.runtime.store import write_bytes
-from cosfly.space.flight_metrics import CLEARANCE_CAP_M, CLEARANCE_TOLERANCE_M, flight_metrics
 
 if TYPE_CHECKING:
+    from cosfly.geometry.kernels import BoxIndex
     from cosfly.planners.intent import Intent
-    from cosfly.space.kernels import BoxIndex
 
 log = logging.getLogger(__name__)
 
@@ -43,8 +43,8 @@ COORDINATE_MAX_M = 1e6  # beyond, float32 depth and four decimals of a metre in 
 
 def make_scenario(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig) -> Scenario:
     """Check a walk and give the scenario of it, with the paper's wish."""
+    from cosfly.geometry.kernels import segments_hit
     from cosfly.planners.courses import follow
-    from cosfly.space.kernels import segments_hit
 
     targets = walk.positions_m + np.array([0.0, 0.0, TARGET_HEIGHT_M])
     if len(targets) < 2:
@@ -151,8 +151,8 @@ def style_rng(walk: Walk, seed: int, attempt: int = 0) -> np.random.Generator:
 def _fly(
     walk: Walk, scenario: Scenario, intent: Intent, obstacles: BoxIndex, screens: BoxIndex, cfg: PlanConfig, seed: int
 ) -> DroneTrace:
+    from cosfly.geometry.kernels import swept_distances, visibility
     from cosfly.planners.intent import NOT_HELD, ended_by_order, tell_not_held, view_of, why_not_held
-    from cosfly.space.kernels import swept_distances, visibility
 
     scenario = replace(scenario, wish=intent.wish)
     made = load_planner(cfg.planner)(scenario, obstacles, cfg, rng_for(seed, "plan", walk.path_id))
@@ -215,8 +215,8 @@ def drop_reason(
 
 def make_worker(cfg: PlanConfig, simplified_map: Path, seed: int) -> Work:
     """Load and index the map once; give the function that plans one walk."""
+    from cosfly.geometry.kernels import obstacle_index
     from cosfly.planners.reacquire import screens_of
-    from cosfly.space.kernels import obstacle_index
 
     box_map = read_boxes(simplified_map)
     obstacles, screens = obstacle_index(box_map), screens_of(box_map)
@@ -232,7 +232,7 @@ def make_worker(cfg: PlanConfig, simplified_map: Path, seed: int) -> Work:
 
 def warm_up(cfg: PlanConfig) -> None:
     """Compile or load compiled code before the first walk, so that times per walk are planning times."""
-    from cosfly.space.kernels import index_boxes
+    from cosfly.geometry.kernels import index_boxes
 
     walk = np.arange(8.0)
     positions = np.column_stack([0.5 * walk, np.zeros(8), np.zeros(8)])

@@ -25,13 +25,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.geometry import DT_S
+from cosfly.geometry.axes import DT_S
+from cosfly.geometry.kernels import BoxIndex, collect_hits, nearest_box
 from cosfly.planners.contract import Plan, PlanConfig, Scenario
 from cosfly.planners.sight import look, make_horizon
 from cosfly.planners.smoothing import smooth_flight
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import NoPathError
-from cosfly.space.kernels import BoxIndex, collect_hits, nearest_box
 
 # --- search -----------------------------------------------------------------------------------------------------------
 # The search of TA*+Smooth, compiled: layer by layer over voxels, the cheapest states kept. Its terms: track_astar.py.

@@ -12,7 +12,7 @@ import numpy as np
 
 from cosfly.formats.backdrop import WorldFrame, write_backdrop
 from cosfly.formats.boxes import BoxMap, check_ground, read_boxes
-from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import renderer_of
 from cosfly.runtime.arrays import LONGEST_SIDE_PX

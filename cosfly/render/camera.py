@@ -9,7 +9,7 @@ import numpy as np
 
 from cosfly.formats.frames import LEGIBLE_CONTRAST, LEGIBLE_HEIGHT_PX, LEGIBLE_SHARE, Camera, TargetMeta
 from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
-from cosfly.geometry import box_corners, mask_box, project
+from cosfly.geometry.axes import box_corners, mask_box, project
 from cosfly.render.contract import NEAR_M, PERSON_ID, Frame
 
 DEPTH_TOLERANCE_M = 0.05  # something this little in front of the target's box does not hide it

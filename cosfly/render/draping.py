@@ -14,8 +14,8 @@ import shapely
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import GROUND_KINDS, KINDS, LAYERS
+from cosfly.geometry.grid import lies_off_ground
 from cosfly.render.contract import GROUND_PLANE_HALF_M, LAWN_HALF_M, STANDING_LAYER
-from cosfly.space.grid import lies_off_ground
 
 DRAPED_KINDS = GROUND_KINDS | {KINDS["Water"]}
 BARE_GROUND = -1  # the row of triangles that are no box's

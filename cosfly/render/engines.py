@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from cosfly.formats.frames import Camera
-from cosfly.geometry import focal_px
+from cosfly.geometry.axes import focal_px
 from cosfly.render.contract import Frame
 from cosfly.runtime.errors import EnvironmentMissing, RenderError
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cosfly.formats.walks import TARGET_HEIGHT_M
-from cosfly.geometry import rotation_matrices, rotation_matrix
+from cosfly.geometry.axes import rotation_matrices, rotation_matrix
 from cosfly.render.contract import Clothes, PosedPerson
 
 HIP_SWING_RAD, ARM_SWING_RAD, KNEE_BEND_RAD = 0.25, 0.38, 0.65

@@ -25,7 +25,8 @@ from cosfly.formats.segments import Mission, Segment
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.formats.weather import WeatherRecord
-from cosfly.geometry import mask_box, world_from_camera
+from cosfly.geometry.axes import mask_box, world_from_camera
+from cosfly.geometry.kernels import signed_distances
 from cosfly.render.camera import (
     TargetView,
     contrast_of,
@@ -42,7 +43,6 @@ from cosfly.runtime.errors import RenderError
 from cosfly.runtime.files import sha256_file
 from cosfly.runtime.runner import advance
 from cosfly.runtime.store import sha256_bytes, storage_errors, write_checksums, write_json
-from cosfly.space.kernels import signed_distances
 from cosfly.viz.overlay import Overlay
 
 MOST_TRIED = 8  # frames of a flight, the first in which the target is legible

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from cosfly.formats.frames import Camera
 from cosfly.formats.segments import Segment
-from cosfly.geometry import focal_px, intrinsic_matrix
+from cosfly.geometry.axes import focal_px, intrinsic_matrix
 from cosfly.runtime.config import Config
 
 

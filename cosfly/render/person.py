@@ -9,7 +9,7 @@ import numpy as np
 from cosfly.formats.frames import OtherMeta, OthersMeta, tree_position, tree_yaw
 from cosfly.formats.others import Other, distances_to_boxes_m
 from cosfly.formats.people import Appearance, People, draw_appearance, look_alike
-from cosfly.geometry import headings_of
+from cosfly.geometry.axes import headings_of
 from cosfly.render.contract import Clothes, Frame, PosedCar, PosedOther, PosedPerson, other_id
 
 STRIDE_M = 1.35  # two steps

@@ -21,12 +21,12 @@ from cosfly.formats.frames import Camera
 from cosfly.formats.kinds import GROUND_KINDS
 from cosfly.formats.shift_draws import ShiftDraw, shift_draws
 from cosfly.formats.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
-from cosfly.geometry import look_at, project, rotation_matrices, world_from_camera, wrap_deg
+from cosfly.geometry.axes import look_at, project, rotation_matrices, world_from_camera, wrap_deg
+from cosfly.geometry.flight_metrics import CLEARANCE_CAP_M, SAFETY_DISTANCE_M
+from cosfly.geometry.kernels import obstacle_index, signed_distances
 from cosfly.render.contract import plane_z_m
 from cosfly.render.person import NOBODY, Cast
 from cosfly.runtime.config import Config
-from cosfly.space.flight_metrics import CLEARANCE_CAP_M, SAFETY_DISTANCE_M
-from cosfly.space.kernels import obstacle_index, signed_distances
 
 HEAD_OFFSET_M = np.array([0.0, 0.0, 0.6])  # from the hip point: where branches and signs may be in the way
 NONE, APPLIED = "none", "applied"

@@ -21,7 +21,7 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import SKY_DEPTH_M, Look
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.weather import WeatherParams
-from cosfly.geometry import rotation_matrices, rotation_matrix
+from cosfly.geometry.axes import rotation_matrices, rotation_matrix
 from cosfly.render import contract
 from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, PosedCar, PosedOther, PosedPerson
 from cosfly.render.draping import drape, is_draped, layers_of

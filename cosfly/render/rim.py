@@ -16,7 +16,7 @@ import numpy as np
 from cosfly.formats.boxes import BoxMap, make_box_map
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.traces import DroneTrace
-from cosfly.geometry import axis_aligned_half_extents
+from cosfly.geometry.axes import axis_aligned_half_extents
 from cosfly.render.contract import FAR_M, ground_plane
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import RenderError

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cosfly.formats.boxes import BoxMap
-from cosfly.geometry import rotation_matrices
+from cosfly.geometry.axes import rotation_matrices
 
 
 @dataclass(frozen=True)

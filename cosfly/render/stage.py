@@ -24,7 +24,7 @@ from cosfly.formats.town import IDS_FILE, IDS_FORMAT, write_town_map
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.walks import pace_field
 from cosfly.formats.weather import WeatherRecord
-from cosfly.geometry import step_s
+from cosfly.geometry.axes import step_s
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids, other_id
 from cosfly.render.flight import FlightScript, Writing, check_flight, render_flight
 from cosfly.render.lens import cameras_of

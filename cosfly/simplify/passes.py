@@ -24,7 +24,7 @@ from pydantic import Field
 from cosfly.formats.boxes import BoxMap, SimplifyPass
 from cosfly.formats.kinds import KINDS, SURFACE_KINDS
 from cosfly.formats.meshes import Meshes
-from cosfly.geometry import axis_aligned_half_extents
+from cosfly.geometry.axes import axis_aligned_half_extents
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.config import Config
 

@@ -9,12 +9,12 @@ import numpy as np
 
 from cosfly.formats.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.formats.kinds import KINDS, SURFACE_KINDS
+from cosfly.geometry.grid import blocks_walking, compare, connected_parts, empty_grid, inflate, occupancy
 from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
 from cosfly.runtime.store import write_bytes, write_json
 from cosfly.simplify.passes import Simplification, SimplifyConfig, simplify
-from cosfly.space.grid import blocks_walking, compare, connected_parts, empty_grid, inflate, occupancy
 from cosfly.viz.topview import TopView, add_caption, draw_map, png_bytes
 
 SAFETY_RADIUS_M = 0.5  # tab:ped_params; for the walkable area in the report

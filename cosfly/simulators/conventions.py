@@ -1,6 +1,6 @@
 """What CARLA and Unreal say in other words than we do: axes, pictures of depth and of tags. Converted here alone.
 
-Their axes are left-handed (`cosfly.geometry`); a pose is x, y, z, pitch, yaw, roll, m and degrees. Pictures come as
+Their axes are left-handed (`cosfly.geometry.axes`); a pose is x, y, z, pitch, yaw, roll in m and degrees. Pictures are
 BGRA bytes: depth in 24 bits up to 1000 m, tags as the semantic number in red and an actor's number in green (low byte)
 and blue (high byte).
 """
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cosfly.geometry import BODY_FROM_CAMERA, mirror_positions, mirror_rotations
+from cosfly.geometry.axes import BODY_FROM_CAMERA, mirror_positions, mirror_rotations
 
 CARLA_VERSION = "0.9.16"
 SIMULATED_STEP_S = 0.05  # of synchronous mode (sec:step5)

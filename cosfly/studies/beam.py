@@ -58,10 +58,10 @@ class _Walk(BaseModel):
 
 def make_worker(cfg: BeamConfig, simplified_map: Path, seed: int) -> Work:
     """Load and index the map once; return the function that plans one walk at each beam."""
+    from cosfly.geometry.kernels import obstacle_index
     from cosfly.planners.reacquire import screens_of
     from cosfly.planners.smoothing import smooth_flight
     from cosfly.planners.track_astar import search_flight
-    from cosfly.space.kernels import obstacle_index
 
     box_map = read_boxes(simplified_map)
     obstacles, screens = obstacle_index(box_map), screens_of(box_map)

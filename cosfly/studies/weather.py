@@ -12,7 +12,7 @@ import numpy as np
 from cosfly.formats.boxes import check_ground, read_boxes
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.weather import TIMES, WEATHERS, resolved
-from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
 from cosfly.render.contract import PosedPerson, Renderer
 from cosfly.render.flight import MARGIN_M
 from cosfly.render.person import choose_clothes, gait_of

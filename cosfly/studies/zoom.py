@@ -20,7 +20,7 @@ from pydantic import BaseModel, Field
 from cosfly.formats.boxes import check_ground, read_boxes
 from cosfly.formats.frames import Camera, level_name, rgb_bytes
 from cosfly.formats.traces import read_traces
-from cosfly.geometry import box_iou, intrinsic_matrix
+from cosfly.geometry.axes import box_iou, intrinsic_matrix
 from cosfly.render.contract import Renderer
 from cosfly.render.flight import MARGIN_M, FlightScript, check_flight, draw_frame
 from cosfly.render.perturbation import Surroundings

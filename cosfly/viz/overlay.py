@@ -16,7 +16,7 @@ import numpy as np
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import FrameMeta
 from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES
-from cosfly.geometry import box_corners, rotation_matrices
+from cosfly.geometry.axes import box_corners, rotation_matrices
 from cosfly.viz.topview import COLORS, FONT, OTHER_COLOR, Color, draw_text
 
 TARGET_COLOR, OTHERS_COLOR = (255, 214, 10), (90, 220, 255)

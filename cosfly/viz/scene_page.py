@@ -21,11 +21,11 @@ from cosfly.formats.places import town_folder
 from cosfly.formats.playback import Flight, read_flight
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.walks import read_paths
-from cosfly.geometry import rotation_matrices
+from cosfly.geometry.axes import rotation_matrices
+from cosfly.geometry.grid import occupancy
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import for_terminal
 from cosfly.runtime.store import write_bytes
-from cosfly.space.grid import occupancy
 from cosfly.viz.frame_views import thumbnail
 from cosfly.viz.page import page, scripts
 from cosfly.viz.topview import COLORS, OTHER_COLOR

@@ -15,7 +15,7 @@ import numpy as np
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import KIND_NAMES
-from cosfly.geometry import box_corners
+from cosfly.geometry.axes import box_corners
 
 # Softer than CARLA's palette, which is made for masks and not for eyes; RGB. Other kinds: OTHER_COLOR.
 COLORS: dict[str, tuple[int, int, int]] = {

@@ -17,7 +17,7 @@ from shapely.geometry.base import BaseGeometry
 
 from cosfly.formats.boxes import BoxMap, make_box_map
 from cosfly.formats.kinds import KIND_NAMES, KINDS
-from cosfly.geometry import box_corners
+from cosfly.geometry.axes import box_corners
 from cosfly.maps import synthetic
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.stage import MapsConfig, load_map

@@ -15,6 +15,7 @@ from cosfly.formats.captions import FIELDS, Coc, Language, SentenceState, read_c
 from cosfly.formats.figures import Figure, draw_walks
 from cosfly.formats.predictions import FAILED, Prediction
 from cosfly.formats.splits import Split
+from cosfly.geometry.blind import DRAWN_AHEAD, FITTED_ON, LEAST_WINDOWS, LOOKS_BACK
 from cosfly.llm.answers import read_answers
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.documents import FileFormat, Record, read_model, read_object, validated
@@ -22,7 +23,6 @@ from cosfly.runtime.errors import InputError
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.provenance import MANIFEST_FORMAT
 from cosfly.runtime.stage_folder import read_manifest
-from cosfly.space.blind import DRAWN_AHEAD, FITTED_ON, LEAST_WINDOWS, LOOKS_BACK
 from distill.evaluation.bertscore import Metric, score_beside_floors
 from distill.evaluation.floors import WITH_TEXT, Floors, coc_of
 from distill.evaluation.scores import UNPARSED, ScoredAnswer, Scores, figures_of, score_answers

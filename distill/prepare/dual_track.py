@@ -19,7 +19,7 @@ from cosfly.formats.flights import find_flights, read_twin
 from cosfly.formats.places import Place, flight_ids, place_of, sample_id
 from cosfly.formats.playback import ORIGINAL, Flight, read_flight
 from cosfly.formats.splits import SPLITS, Course, Split, walks_of
-from cosfly.geometry import step_s
+from cosfly.geometry.axes import step_s
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.documents import FileFormat, Record, read_model, validated
 from cosfly.runtime.errors import InputError, VerifyError

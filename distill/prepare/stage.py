@@ -27,12 +27,12 @@ from cosfly.formats.captions import PICTURES_MARK, Caption, Language, Verdict, r
 from cosfly.formats.places import FlightChoice
 from cosfly.formats.playback import read_flight
 from cosfly.formats.splits import SPLITS, Split
+from cosfly.geometry.blind import is_drawn_ahead, past_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.provenance import fingerprint
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
 from cosfly.runtime.store import dump_json
-from cosfly.space.blind import is_drawn_ahead, past_of
 from cosfly.viz.frame_views import DEPTH_RANGE_M, Pictures, View, scaled_size
 from distill.prepare.sources import CaptionedFlight, Flights, RunSource, check_sources, inputs_of
 from distill.prepare.splitting import SplitConfig, check_no_leak

@@ -26,7 +26,7 @@ import pyarrow.parquet as pq
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.frames import FrameFile
 from cosfly.formats.motion import ACTION, PlannedMotion
-from cosfly.geometry import step_s
+from cosfly.geometry.axes import step_s
 from cosfly.runtime.arrays import parse_array, parse_picture
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.runner import advance

@@ -12,7 +12,7 @@ import numpy as np
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.frames import LEGIBLE_CONTRAST, LEGIBLE_HEIGHT_PX, LEGIBLE_SHARE
 from cosfly.formats.shown_captions import CaptionReader
-from cosfly.geometry import BODY_FROM_CAMERA
+from cosfly.geometry.axes import BODY_FROM_CAMERA
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.items import Item, Outcome
 from release.columns import CAPTION, CAPTION_NAMES, LANGUAGES, REQUIRED, SCALARS, TARGET_PICTURE, WINDOW

@@ -1,4 +1,4 @@
-"""Compare the pictures of a flight with each other by reprojection (cosfly/space/reprojection.py): depth, poses and
+"""Compare the pictures of a flight with each other by reprojection (cosfly/geometry/reprojection.py): depth, poses and
 cameras of neighbouring frames show one world. Colours are not compared: weather, light and renderers change them.
 """
 
@@ -15,11 +15,8 @@ from cosfly.formats.goals import LANDMARKS, SeenFrame, meant, target_picture, wo
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.png import colours_of
 from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
-from cosfly.geometry import BODY_FROM_CAMERA
-from cosfly.runtime.compiled import njit
-from cosfly.runtime.errors import InputError
-from cosfly.runtime.items import advance
-from cosfly.space.reprojection import (
+from cosfly.geometry.axes import BODY_FROM_CAMERA
+from cosfly.geometry.reprojection import (
     COLUMNS,
     GRID_ROWS,
     LEAST_SEEN,
@@ -29,6 +26,9 @@ from cosfly.space.reprojection import (
     compare_views,
     median_of,
 )
+from cosfly.runtime.compiled import njit
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.items import advance
 from release.columns import PICTURES, TARGET_PICTURE, matrices_of
 from release.flight_rows import FlightRows
 from release.verify.findings import Findings

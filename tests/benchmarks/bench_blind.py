@@ -28,7 +28,9 @@ from cosfly.formats.actions import TOKENS
 from cosfly.formats.playback import Flight
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.walks import walk_id
-from cosfly.geometry import look_at, wrap_deg
+from cosfly.geometry.axes import look_at, wrap_deg
+from cosfly.geometry.blind import FITTED_ON, fit_deciders, is_drawn_ahead, past_of
+from cosfly.geometry.kernels import obstacle_index
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.stage import make_walk
 from cosfly.pedestrians.walkable import walkable_ground
@@ -38,8 +40,6 @@ from cosfly.planners.stage import draw_styles_of, plan_flight
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import load, shipped
 from cosfly.simplify.passes import simplify
-from cosfly.space.blind import FITTED_ON, fit_deciders, is_drawn_ahead, past_of
-from cosfly.space.kernels import obstacle_index
 from specimens import make_flight
 
 UNSEEN = ("old_town", "market")

@@ -20,6 +20,8 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from cosfly.formats.boxes import BoxMap, write_boxes
 from cosfly.formats.kinds import KINDS
+from cosfly.geometry import flight_metrics as metrics
+from cosfly.geometry.kernels import BoxIndex, obstacle_index, segments_hit, signed_distances, visibility
 from cosfly.pedestrians.astar import find_route, route_cost
 from cosfly.pedestrians.stage import PedestriansConfig, make_walk, run, walkable_ground
 from cosfly.planners.contract import PLANNERS, PlanConfig, Scenario, load_planner
@@ -29,8 +31,6 @@ from cosfly.planners.stage import make_scenario
 from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import NoPathError
 from cosfly.simplify.passes import SimplifyConfig, clusters, simplify
-from cosfly.space import flight_metrics as metrics
-from cosfly.space.kernels import BoxIndex, obstacle_index, segments_hit, signed_distances, visibility
 
 SHORT_POINTS = 121  # the paper's SimWorld flight
 

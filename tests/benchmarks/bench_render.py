@@ -33,7 +33,8 @@ import scenes
 from cosfly.formats import frames
 from cosfly.formats.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
-from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
+from cosfly.geometry.kernels import obstacle_index
 from cosfly.pipeline.bench import row_of
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_flight
@@ -47,7 +48,6 @@ from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, script_flight
 from cosfly.runtime.stage_events import read_events
 from cosfly.runtime.stage_folder import read_manifest
-from cosfly.space.kernels import obstacle_index
 
 SIZE = (1280, 720)
 PAPER = {1: (1.07, 46.3, 7.5), 2: (1.43, 58.6, 10.6), 4: (2.55, 86.8, 24.3), 6: (2.68, 91.6, 34.0)}  # frames/s, %, GiB

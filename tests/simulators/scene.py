@@ -16,7 +16,7 @@ import numpy as np
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.others import BUILDS
-from cosfly.geometry import intrinsic_matrix, world_from_camera
+from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
 from cosfly.render.contract import PERSON_ID, Frame, PosedCar, PosedOther, PosedPerson, instance_ids, other_id
 from cosfly.render.person import SLOW_MPS, choose_clothes
 from cosfly.render.stage import open_renderer

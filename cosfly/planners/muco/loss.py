@@ -13,9 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosfly.planners.muco.nearby import Nearby, hits_among, known, nearest_among, nothing_nearby, remember
-from cosfly.runtime.compiled import int64, njit
-from cosfly.space.kernels import (
+from cosfly.geometry.kernels import (
     HALF_X,
     RAY_OFFSETS_M,
     RAY_SPREAD_M,
@@ -25,6 +23,8 @@ from cosfly.space.kernels import (
     nearest_box,
     normal_of_box,
 )
+from cosfly.planners.muco.nearby import Nearby, hits_among, known, nearest_among, nothing_nearby, remember
+from cosfly.runtime.compiled import int64, njit
 
 # --- window of frames -------------------------------------------------------------------------------------------------
 # What the five rays see from a waypoint and its neighbours half a metre away: the difference window of MuCO's

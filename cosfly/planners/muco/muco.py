@@ -11,13 +11,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from cosfly.geometry.kernels import RAY_SPREAD_M, BoxIndex, collect_hits, free_rays, nearest_box, visibility
 from cosfly.planners.contract import MucoConfig, Plan, PlanConfig, Scenario
 from cosfly.planners.muco.loss import TERM_NAMES, Problem, make_state
 from cosfly.planners.muco.nearby import nothing_nearby
 from cosfly.planners.muco.step import STOP_REASONS, Rules, descend, descend_as_the_paper, is_feasible, project
 from cosfly.planners.smoothing import within_limits
 from cosfly.runtime.compiled import njit
-from cosfly.space.kernels import RAY_SPREAD_M, BoxIndex, collect_hits, free_rays, nearest_box, visibility
 
 # --- start ------------------------------------------------------------------------------------------------------------
 # Where a flight begins its life: at the wished places where that works, else the best of a coarse search round the

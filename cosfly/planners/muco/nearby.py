@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosfly.geometry.kernels import collect_hits, distance_to_box, nearest_box, segment_hits_box, squared_gap
 from cosfly.runtime.compiled import njit
-from cosfly.space.kernels import collect_hits, distance_to_box, nearest_box, segment_hits_box, squared_gap
 
 MARGIN_M = 1.5  # three steps of the default cap; more would remember more boxes, less would look up more often
 MOVED_M = 0.9  # looked up anew beyond this, so that the trial steps of the next iteration stay within MARGIN_M

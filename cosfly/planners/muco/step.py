@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosfly.geometry.kernels import collect_hits, nearest_box, normal_of_box
 from cosfly.planners.muco.loss import BAND_ROWS, GREATEST, LEAST, difference_gradient, evaluate, remember_boxes
 from cosfly.planners.muco.nearby import known, nearest_among, nearest_of
 from cosfly.runtime.compiled import boolean, int64, njit
-from cosfly.space.kernels import collect_hits, nearest_box, normal_of_box
 
 TRIES, TRIES_WITH_VISIBILITY = 10, 3  # of one step
 REST_MAX = 8  # iterations at most without the visibility slope after it has led nowhere

@@ -11,10 +11,10 @@ from functools import partial
 
 import numpy as np
 
+from cosfly.geometry.kernels import collect_hits
 from cosfly.planners.reference.task import Task, planner
 from cosfly.planners.track_astar import MOVES
 from cosfly.runtime.compiled import njit
-from cosfly.space.kernels import collect_hits
 
 VOXEL_M = 4.0  # as for TA*
 WEIGHT = 2.0  # of weighted A*

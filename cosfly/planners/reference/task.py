@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cosfly.geometry.kernels import BoxIndex, normals, segments_hit, signed_distances
 from cosfly.planners.contract import Plan, PlanConfig, Planner, Scenario
 from cosfly.planners.smoothing import within_limits
-from cosfly.space.kernels import BoxIndex, normals, segments_hit, signed_distances
 
 FREE_STEP_M, FREE_REACH_M = 2.0, 40.0  # of the search for a free place near one that is not
 

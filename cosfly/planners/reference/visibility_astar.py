@@ -10,8 +10,8 @@ import heapq
 
 import numpy as np
 
+from cosfly.geometry.kernels import HALF_X, HALF_Y, HIGH_X, HIGH_Y, HIGH_Z, LOW_X, LOW_Y, XU, YW
 from cosfly.planners.reference.task import Task, planner
-from cosfly.space.kernels import HALF_X, HALF_Y, HIGH_X, HIGH_Y, HIGH_Z, LOW_X, LOW_Y, XU, YW
 
 BEYOND_M = 0.05  # corners stand so far outside of what is closed
 MOST_CORNERS = 6000

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.walks import TARGET_HEIGHT_M
-from cosfly.geometry import rotation_matrix
+from cosfly.geometry.axes import rotation_matrix
 from cosfly.render.contract import LAYER_STEP, PERSON_ID, STANDING_LAYER, PosedCar, PosedOther, PosedPerson
 from cosfly.render.figure import figure_of
 from cosfly.render.gl import meshes

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import KINDS
-from cosfly.geometry import rotation_matrices
+from cosfly.geometry.axes import rotation_matrices
 from cosfly.render.gl.parts import LAMP, Parts
 
 MAP_PX = 384

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.ground import Ground
 from cosfly.formats.kinds import KINDS
-from cosfly.geometry import rotation_matrices
+from cosfly.geometry.axes import rotation_matrices
 from cosfly.render.contract import (
     LAYER_STEP,
     NO_INSTANCE,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosfly.geometry import box_corners
+from cosfly.geometry.axes import box_corners
 from cosfly.render.gl.view import CameraView
 
 PERSON_REACH_M = 30.0**0.5  # the shader follows the person's shadow so far from the hip

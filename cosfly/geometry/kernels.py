@@ -13,7 +13,7 @@ import numpy as np
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import GROUND_KINDS, KINDS
-from cosfly.geometry import rotation_matrices
+from cosfly.geometry.axes import rotation_matrices
 from cosfly.runtime.compiled import njit
 
 CELL_M = 8.0  # about the influence radius of obstacles: a distance query looks at nine cells

@@ -10,7 +10,7 @@ import numpy as np
 
 from cosfly.formats.motion import in_axes_of
 from cosfly.formats.playback import Flight
-from cosfly.geometry import wrap_deg
+from cosfly.geometry.axes import wrap_deg
 
 LOOKS_BACK = 3  # frames: of fewer nothing turns, of five it tells no more
 FITTED_ON, LEAST_WINDOWS = 20_000, 100  # windows that a network is fitted on: at most, and at least

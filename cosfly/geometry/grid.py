@@ -18,7 +18,7 @@ import shapely
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import GROUND_KINDS, KINDS, LAYERS
 from cosfly.formats.roi import Roi
-from cosfly.geometry import rotation_matrices
+from cosfly.geometry.axes import rotation_matrices
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import InputError
 
