@@ -62,7 +62,7 @@ class ObservedFrame:
 
 
 def observed_frames(*columns: np.ndarray) -> tuple[ObservedFrame, ...]:
-    """Give the frames of n rows, from an array (n, ...) for each of their fields in order."""
+    """Return the frames of n rows, from an array (n, ...) for each of their fields in order."""
     return tuple([ObservedFrame(*row) for row in zip(*[column.tolist() for column in columns], strict=True)])
 
 
@@ -210,7 +210,7 @@ class RepairConfig(Config):
     max_asks: int = Field(3, ge=0, le=10, description="asks per rejected sample; 0 drops it at once")
 
     def treatment_of(self, verdict: Verdict | None) -> Treatment:
-        """Say what becomes of an answer with this verdict."""
+        """Return what becomes of an answer with this verdict."""
         return {"HARD_CONFLICT": self.hard_conflict, "SOFT_CONFLICT": self.soft_conflict}.get(str(verdict), "keep")
 
 

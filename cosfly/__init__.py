@@ -15,7 +15,7 @@ __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:
-    """Give a name of the library; nothing is loaded before."""
+    """Return a name of the library; nothing is loaded before."""
     if name not in __all__:
         raise AttributeError(f"module 'cosfly' has no attribute {name!r}")
     return getattr(importlib.import_module("cosfly.pipeline.library"), name)

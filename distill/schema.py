@@ -118,7 +118,7 @@ def read_training_set(dataset: Path) -> TrainingSet:
 
 
 def resolve_trees(dataset: Path, data: Sequence[Path]) -> dict[str, Path]:
-    """Tell which of the given playback trees belongs to which run of a training set: run -> tree."""
+    """Return which of the given playback trees belongs to which run of a training set: run -> tree."""
     record = read_training_set(dataset)
     run_of = {tree.sha256: tree.run for tree in record.trees}
     trees: dict[str, Path] = {}
@@ -143,7 +143,7 @@ def tree_inputs(trees: Mapping[str, Path]) -> dict[str, Path]:
 
 
 def arrow_type(of: Any) -> pa.DataType:
-    """Give the type of a column that holds values of a field: text, number, flag, a tuple of one, or nothing."""
+    """Return the type of a column that holds values of a field: text, number, flag, a tuple of one, or nothing."""
     if (parts := get_args(of)) and get_origin(of) is not Literal:
         first = parts[0]
         if get_origin(of) is tuple:
@@ -153,7 +153,7 @@ def arrow_type(of: Any) -> pa.DataType:
 
 
 def columns_of(model: type[SplitMember], **changed: pa.DataType) -> pa.Schema:
-    """Give the columns of a file of samples: their fields, and where a file holds something else its type."""
+    """Return the columns of a file of samples: their fields, and where a file holds something else its type."""
     own = {name: field.annotation for name, field in model.model_fields.items()}
     types = {name: arrow_type(of) for name, of in own.items()} | changed
     return pa.schema([pa.field(n, of, nullable=type(None) in get_args(own.get(n))) for n, of in types.items()])
@@ -163,7 +163,7 @@ COLUMNS = columns_of(Sample, prompt=pa.string(), system=pa.int32())  # system: n
 
 
 def split_path(dataset: Path, split: str) -> Path:
-    """Give the file of a split: `train`, `validation` or `test`."""
+    """Return the file of a split: `train`, `validation` or `test`."""
     return dataset / f"{split}.parquet"
 
 
@@ -278,7 +278,7 @@ _SPLIT_NAMES = {"train": "train", "val": "validation", "test": "test"}  # as `da
 
 
 def page_of(title: str, samples: Mapping[Split, int], text: str) -> bytes:
-    """Give the README.md of a folder of splits, whose header lets `datasets.load_dataset` open it."""
+    """Return the README.md of a folder of splits, whose header lets `datasets.load_dataset` open it."""
     found = [split for split in SPLITS if samples[split]]
     files = "".join(f"  - split: {_SPLIT_NAMES[split]}\n    path: {split}.parquet\n" for split in found)
     counts = "".join(f"- {_SPLIT_NAMES[split]}: {samples[split]} samples\n" for split in found)

@@ -138,7 +138,7 @@ class _Tree:
 
 
 def _frames_in(folder: Path) -> set[int]:
-    """The frames of a flight that have a picture; none where it has no trajectory.json."""
+    """Return the frames of a flight that have a picture; none where it has no trajectory.json."""
     if not (folder / "trajectory.json").is_file():
         return set()
     frames = (folder / frame_name(0)).parent.glob("frame_*")
@@ -146,7 +146,7 @@ def _frames_in(folder: Path) -> set[int]:
 
 
 def facts_of(flight: Flight, window: Sequence[int]) -> dict[str, np.ndarray]:
-    """Give FACTS of some frames of a flight."""
+    """Return FACTS of some frames of a flight."""
     if max(window) >= len(flight):
         raise InputError("a caption of a frame that is not in its flight", where=flight.folder, got=str(max(window)))
     at, mask = list(window), flight.target_mask_bbox

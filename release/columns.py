@@ -186,7 +186,7 @@ class Column:
 
 
 def _knobs(flight: Flight) -> np.ndarray | None:
-    """The six knobs of weather, (6,), None where the file has none."""
+    """Return the six knobs of weather, (6,), None where the file has none."""
     record = flight.weather_record
     return None if record is None else np.array([getattr(record.params, name) for name in WEATHER_PARAMS])
 
@@ -393,12 +393,12 @@ REQUIRED = frozenset(column.name for column in FRAME if column.required)
 
 
 def caption_values(caption: Caption) -> ReleasedCaption:
-    """Give what a row holds of a caption."""
+    """Return what a row holds of a caption."""
     return {column.name: column.of_caption(caption) for column in SCALARS if column.of_caption is not None}
 
 
 def between_of(rows: Collection[Mapping[str, Any]]) -> np.ndarray | None:
-    """Give `Flight.between` of the rows of a flight; None where it was planned at the rate of its frames."""
+    """Return `Flight.between` of the rows of a flight; None where it was planned at the rate of its frames."""
     found = [row.get("poses_between") for row in rows]
     most = max((len(one) // len(POSE) for one in found if one), default=0)
     nothing = np.full(most * len(POSE), np.nan)
@@ -408,7 +408,7 @@ def between_of(rows: Collection[Mapping[str, Any]]) -> np.ndarray | None:
 
 
 def matrices_of(intrinsics: np.ndarray) -> np.ndarray:
-    """Give camera matrices, (n, 3, 3), of INTRINSICS (n, 4)."""
+    """Return camera matrices, (n, 3, 3), of INTRINSICS (n, 4)."""
     matrices = np.zeros((len(intrinsics), 3, 3))
     matrices[:, [0, 1, 0, 1], [0, 1, 2, 2]] = intrinsics
     matrices[:, 2, 2] = 1.0
@@ -416,12 +416,12 @@ def matrices_of(intrinsics: np.ndarray) -> np.ndarray:
 
 
 def columns_of(files: Collection[FrameFile]) -> list[Column]:
-    """Give the columns in their order; of the pictures those of the wanted files."""
+    """Return the columns in their order; of the pictures those of the wanted files."""
     return [*(column for file, column in PICTURES.items() if file in files), *SCALARS]
 
 
 def schema(files: Collection[FrameFile]) -> pa.Schema:
-    """Give the parquet schema, features for HuggingFace `datasets` in its metadata."""
+    """Return the parquet schema, features for HuggingFace `datasets` in its metadata."""
     fields: list[pa.Field] = []
     features: dict[str, Any] = {}
     for column in columns_of(files):
@@ -435,7 +435,7 @@ def schema(files: Collection[FrameFile]) -> pa.Schema:
 
 
 def scalar_row(flight: Flight, i: int, caption: ReleasedCaption | None, placement: Placement) -> dict[str, Any]:
-    """Give the row of one frame without its pictures, right-handed axes."""
+    """Return the row of one frame without its pictures, right-handed axes."""
     return {column.name: column.cell(flight, i, caption, placement) for column in SCALARS}
 
 
@@ -443,12 +443,12 @@ def scalar_row(flight: Flight, i: int, caption: ReleasedCaption | None, placemen
 
 
 def flight_spans(rows: pa.Table) -> list[tuple[Place, int, int]]:
-    """Give the rows that stand together by flight: its PLACE, its first row, and the one after its last."""
+    """Return the rows that stand together by flight: its PLACE, its first row, and the one after its last."""
     places: list[Place] = list(zip(*(rows.column(name).to_pylist() for name in PLACE), strict=True))
     begins = [i for i in range(len(places)) if i == 0 or places[i] != places[i - 1]]
     return [(places[begin], begin, end) for begin, end in zip(begins, [*begins[1:], len(places)], strict=True)]
 
 
 def flight_name(place: Place) -> str:
-    """Give the name of a flight in the records."""
+    """Return the name of a flight in the records."""
     return "/".join(map(str, place))

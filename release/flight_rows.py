@@ -28,7 +28,7 @@ LEAST_ZOOMED = 3  # rows whose camera is not that of most rows
 
 
 def vectors(rows: Sequence[Row], name: str, members: tuple[str, ...]) -> np.ndarray:
-    """Give a column of groups, (n, members) float64, NaN where null or incomplete."""
+    """Return a column of groups, (n, members) float64, NaN where null or incomplete."""
     groups = (row.get(name) or {} for row in rows)
     return np.array([[group.get(m) for m in members] for group in groups], dtype=np.float64).reshape(-1, len(members))
 
@@ -63,7 +63,7 @@ class FlightRows:
         return [row.get(name) for row in self.rows]
 
     def numbers(self, name: str) -> np.ndarray:
-        """A column of numbers, (n,) float64, NaN where null."""
+        """Return a column of numbers, (n,) float64, NaN where null."""
         return np.array([np.nan if value is None else value for value in self.column(name)], dtype=np.float64)
 
     def flags(self, name: str) -> np.ndarray:

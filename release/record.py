@@ -305,7 +305,7 @@ class ReleaseRecord(Strict):
 
 
 def numbers_of_splits(flights: Sequence[ReleasedFlight], captions: Mapping[str, int]) -> dict[SplitName, SplitNumbers]:
-    """Give the numbers of each split that has flights. captions: of each split."""
+    """Return the numbers of each split that has flights. captions: of each split."""
     found = {}
     for split in SPLIT_NAMES:
         if own := [flight for flight in flights if flight.split == split]:
@@ -324,13 +324,13 @@ DIGEST_CHARACTERS = 12  # of the content's digest, in the names of shards
 
 
 def content_digest(shards: Iterable[tuple[SplitName, str]]) -> str:
-    """Give the sha256 of a release's content, of the split and sha256 of each shard in order: other rows, another
+    """Return the sha256 of a release's content, of the split and sha256 of each shard in order: other rows, another
     digest."""
     return sha256_bytes("".join(f"{split} {sha256}\n" for split, sha256 in shards).encode())
 
 
 def shard_paths(splits: Sequence[SplitName], digest: str) -> list[str]:
-    """Give the names of shards in their release, of which the splits are told: each has its number in its split."""
+    """Return the names of shards in their release, of which the splits are told: each has its number in its split."""
     counts, numbers, paths = Counter(splits), Counter[str](), list[str]()
     for split in splits:
         paths.append(f"data/{split}-{digest[:DIGEST_CHARACTERS]}-{numbers[split]:05d}-of-{counts[split]:05d}.parquet")
@@ -339,13 +339,13 @@ def shard_paths(splits: Sequence[SplitName], digest: str) -> list[str]:
 
 
 def shard_pattern(split: SplitName, digest: str) -> str:
-    """Give the pattern that the card names for a split. The library's cache goes by it: without the digest a new
+    """Return the pattern that the card names for a split. The library's cache goes by it: without the digest a new
     release shows old rows."""
     return f"data/{split}-{digest[:DIGEST_CHARACTERS]}-*.parquet"
 
 
 def release_folder(folder: Path) -> Path:
-    """Give the folder that holds the files of a release: this one, or where `release build` and `cosfly run` put them
+    """Return the folder that holds the files of a release: this one, or where `release build` and `cosfly run` put them
     below it.
 
     A folder that holds none is given as it is, for its reader to say so.

@@ -48,7 +48,7 @@ def select_frames(num_points: int, num_frames: int | None, window_frames: int, u
 
 
 def is_whole(window: Iterable[int], selected: set[int]) -> bool:
-    """Tell whether all frames of a caption's window are released."""
+    """Return whether all frames of a caption's window are released."""
     return selected.issuperset(window)
 
 
@@ -64,8 +64,8 @@ SPLIT_RULE = (
 def split_groups(
     groups: Iterable[str], fractions: Mapping[SplitName, float], seed: int, what: str
 ) -> dict[str, SplitName]:
-    """Give each group, a walk or a family of towns, its split. Those of which no flight is released are not among them,
-    and have no rank.
+    """Return each group, a walk or a family of towns, its split. Those of which no flight is released are not among
+    them, and have no rank.
     """
     shares: dict[Split, float] = {"val": fractions["validation"], "test": fractions["test"]}
     splits = assign_splits(groups, shares, seed, too_few="fill", what=what)

@@ -289,7 +289,7 @@ class Asking:
 
 
 def read_quarantine(stage_path: Path) -> dict[str, Failed]:
-    """Give the windows that no answer came for or that the server refused, by sample id."""
+    """Return the windows that no answer came for or that the server refused, by sample id."""
     path = stage_path / QUARANTINE
     return {failure.id: failure for failure in read_failures(path)} if path.exists() else {}
 
@@ -306,7 +306,7 @@ def _has_accepted(part: Path) -> bool:
 
 
 def common_causes(failures: list[Failed]) -> str:
-    """Give the three most common causes with their counts."""
+    """Return the three most common causes with their counts."""
     counts = Counter(failure.code for failure in failures)
     ordered = sorted(counts.items(), key=lambda pair: (-pair[1], pair[0]))
     return ", ".join(f"{cause} {count}" for cause, count in ordered[:3])

@@ -52,7 +52,7 @@ class Comparison:
 
 
 def text_distance(one: Coc, two: Coc) -> float:
-    """Give 0 for the same words in the same order, 1 where no word is shared."""
+    """Return 0 for the same words in the same order, 1 where no word is shared."""
     a, b = (f"{coc.critical_components} {coc.reasoning_trace}".split() for coc in (one, two))
     return 1.0 - SequenceMatcher(None, a, b, autojunk=False).ratio()
 
@@ -122,7 +122,7 @@ async def _try_all(
 async def _try_each(
     window: Window, teacher: Teacher, cfg: CaptionConfig, vocabulary: Vocabulary
 ) -> dict[Strategy, Trial] | None:
-    """Give a trial per strategy; None where the first answer is no conflict or an answer is missing."""
+    """Return a trial per strategy; None where the first answer is no conflict or an answer is missing."""
     found: dict[Strategy, Trial] = {}
     for strategy in STRATEGIES:
         try:
@@ -141,7 +141,7 @@ def _windows(cfg: CaptionConfig, data: Path) -> Iterable[Window]:
 
 
 def comparison_table(comparisons: list[Comparison]) -> Table:
-    """Give the comparison as a table for the terminal."""
+    """Return the comparison as a table for the terminal."""
     table = Table(title=f"Re-generation of the same {comparisons[0].num_conflicts} conflicts", title_justify="left")
     for column in ("strategy", "repaired", "consistent", "text distance", "asks each", "tokens each"):
         table.add_column(column, justify="left" if column == "strategy" else "right", no_wrap=column == "strategy")

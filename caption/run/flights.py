@@ -78,7 +78,7 @@ def _twin_of(flight: Flight) -> Flight | None:
 
 
 def named_flights(data: Path, choice: FlightChoice = ALL_FLIGHTS) -> list[tuple[str, Path]]:
-    """Give (flight id, folder) in the order of the product."""
+    """Return (flight id, folder) in the order of the product."""
     folders = find_flights(data, choice)
     ids = flight_ids([place_of(folder) for folder in folders])
     named = [(ids[place_of(folder)], folder) for folder in folders]
@@ -86,7 +86,7 @@ def named_flights(data: Path, choice: FlightChoice = ALL_FLIGHTS) -> list[tuple[
 
 
 def allot(flights: list[tuple[str, Path]], cfg: CaptionConfig) -> tuple[list[Allotted], bool]:
-    """Say which windows of each flight `limit` leaves, independent of the order of work; and whether it leaves any
+    """Return which windows of each flight `limit` leaves, independent of the order of work; and whether it leaves any
     out."""
     if cfg.limit is None:
         return [Allotted(name, folder) for name, folder in flights], False
@@ -108,7 +108,7 @@ def allot(flights: list[tuple[str, Path]], cfg: CaptionConfig) -> tuple[list[All
 
 
 def parts_of(stage_path: Path, allotted: list[Allotted], with_gaps: bool) -> list[Path]:
-    """Give the part files of a run in the order of the product, which is that of the flights."""
+    """Return the part files of a run in the order of the product, which is that of the flights."""
     found: list[Path] = []
     for flight in allotted:
         part, gap = flight.part(stage_path), flight.gap(stage_path)

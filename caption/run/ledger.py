@@ -111,7 +111,7 @@ class Shelf:
             del shelf[self.per_kind :]
 
     def cards(self) -> list[Caption]:
-        """Give up to `per_kind` captions in order of their ids, the kinds taking turns."""
+        """Return up to `per_kind` captions in order of their ids, the kinds taking turns."""
         left = [list(self._kinds[kind]) for kind in sorted(self._kinds)]
         chosen: list[Caption] = []
         while len(chosen) < self.per_kind and any(left):
@@ -186,7 +186,7 @@ class Ledger:
         self.words["structured"][caption.teacher.structured or "none"] += 1
 
     def tally(self, num_unanswered: int) -> Tally:
-        """Give the windows' tally and check that nothing was lost."""
+        """Return the windows' tally and check that nothing was lost."""
         assert self.repairs.total() == self.repair_asks.total()
         failed = Counter({"no_answer": num_unanswered} if num_unanswered else {})
         tally = self.windows.model_copy(update={"input": self.windows.input + num_unanswered, "failed": failed})

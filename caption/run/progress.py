@@ -120,7 +120,7 @@ class Display:
         return num_left * statistics.fmean(self._durations_s) / self.num_open
 
     def tokens(self) -> tuple[int, int]:
-        """Give the prompt and answer tokens of this run."""
+        """Return the prompt and answer tokens of this run."""
         now, before = self.budget.totals, self._answers_before
         return now["prompt_tokens"] - before["prompt_tokens"], now["completion_tokens"] - before["completion_tokens"]
 
@@ -141,7 +141,7 @@ class Display:
         return parts + ([self._trouble()] if self.troubles.num else [])
 
     def _trouble(self) -> str:
-        """Give how many tries failed and, while no answer comes, for how long and what the server said last."""
+        """Return how many tries failed and, while no answer comes, for how long and what the server said last."""
         tries = f"{self.troubles.num:,} failed tries"
         if self.troubles.last is None:
             return tries
@@ -160,7 +160,7 @@ class Display:
             log.info("%s", self.line())
 
     def panel(self) -> RenderableType:
-        """Give what stands on a terminal: the bar, which counts windows, and the figures below it."""
+        """Return what stands on a terminal: the bar, which counts windows, and the figures below it."""
         grid = Table.grid()
         grid.add_column(overflow="fold")
         grid.add_row(ProgressBar(total=max(self.total, 1), completed=self.num_done, width=48))
@@ -184,7 +184,7 @@ class Display:
 
 
 def duration(seconds: float) -> str:
-    """Give a time as people say it: 42 s, 7 min, 3.4 h, 2.1 days."""
+    """Return a time as people say it: 42 s, 7 min, 3.4 h, 2.1 days."""
     for limit, unit_s, unit in ((90, 1, "s"), (5400, 60, "min"), (172_800, 3600, "h")):
         if seconds < limit:
             return f"{seconds / unit_s:.0f} {unit}" if unit != "h" else f"{seconds / unit_s:.1f} h"

@@ -49,12 +49,12 @@ REASONS = {
 
 
 def meaning_of(reason: str) -> str:
-    """Say what a code of `drop_reason` means."""
+    """Return what a code of `drop_reason` means."""
     beginnings = [code for code in REASONS if reason == code or (code.endswith("_") and reason.startswith(code))]
     return REASONS[max(beginnings, key=len)] if beginnings else "docs/captions.md explains no such code"
 
 
 def explained(dropped: Mapping[str, int], most: int = 3) -> str:
-    """Give the commonest reasons with their counts and meanings."""
+    """Return the commonest reasons with their counts and meanings."""
     ordered = sorted(dropped.items(), key=lambda pair: (-pair[1], pair[0]))[:most]
     return "; ".join(f"{count} {reason} ({meaning_of(reason)})" for reason, count in ordered)

@@ -54,7 +54,7 @@ def page_html(
     budget: BudgetConfig,
     name: str,
 ) -> str:
-    """Give the page's text; name: of the run."""
+    """Return the page's text; name: of the run."""
     teacher = report.teacher
     verdicts = [("First answers", report.verdicts_of_first_answers), ("Accepted captions", report.verdicts_of_accepted)]
     return page(
@@ -153,7 +153,7 @@ def _card(caption: Caption, folders: Mapping[str, Path]) -> dict[str, Any]:
 
 
 def _texts(caption: Caption, language: Language) -> dict[str, Any] | None:
-    """Give sentences, each with what was read of it; None where there is no text."""
+    """Return sentences, each with what was read of it; None where there is no text."""
     coc = caption.en if language == "en" else caption.zh
     if coc is None:
         return None

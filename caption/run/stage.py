@@ -148,7 +148,7 @@ def open_stage(cfg: CaptionConfig, data: Path, out: Path, seed: int, resume: Res
 
 
 def _has_more(stage: StageFolder, cfg: CaptionConfig) -> bool:
-    """Tell whether a complete folder was cut by a limit smaller than the one now; it is then open again."""
+    """Return whether a complete folder was cut by a limit smaller than the one now; it is then open again."""
     limit = read_manifest(stage.path).facts.get("limit")
     if limit is None or (cfg.limit is not None and cfg.limit <= limit):
         return False
@@ -157,7 +157,7 @@ def _has_more(stage: StageFolder, cfg: CaptionConfig) -> bool:
 
 
 def _has_refused(stage: StageFolder, cfg: CaptionConfig) -> bool:
-    """Tell whether the server refused windows of a complete folder; it is then open again."""
+    """Return whether the server refused windows of a complete folder; it is then open again."""
     if not read_quarantine(stage.path):
         return False
     num_windows = read_manifest(stage.path).counts.input
@@ -180,7 +180,7 @@ def _take_back(stage: StageFolder, allotted: list[Allotted]) -> None:
 
 
 def _tell_what_is_left(cfg: CaptionConfig, asked: Asked, tally: Tally) -> None:
-    """Say why the product is not whole."""
+    """Return why the product is not whole."""
     missed = [failure for failure in asked.unanswered if failure.code != "not_asked"]
     if asked.stopped:
         raise TeacherError(

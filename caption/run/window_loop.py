@@ -112,7 +112,7 @@ async def caption_prepared(
 
 
 def _record(prepared: Prepared, teacher: Teacher, loop: _Loop, reason: str | None) -> Caption:
-    """Give what is kept of a window. reason: to drop it."""
+    """Return what is kept of a window. reason: to drop it."""
     window, question = prepared.window, prepared.question
     observed, pictures, answered = window.observed, question.pictures, teacher.record
     if answered.structured != loop.structured:
@@ -176,7 +176,7 @@ async def try_strategy(
 
 
 def _rungs(strategy: Strategy, max_asks: int) -> list[str]:
-    """Give the kind of each ask: a cascade climbs from the freest to the surest."""
+    """Return the kind of each ask: a cascade climbs from the freest to the surest."""
     if strategy == "cascade":
         return ["hint", "multi_sample", *["anchored"] * max(0, max_asks - 2)][:max_asks]
     return [strategy] * max_asks
@@ -235,13 +235,13 @@ class _Loop:
         return reason
 
     def _facts_against(self, facts: Facts) -> str:
-        """Say what was measured of all that a text states and that is not so."""
+        """Return what was measured of all that a text states and that is not so."""
         problems = self.checks["evidence"]
         named = [line for line in measured_series(facts) if any(line.partition(":")[0] in one for one in problems)]
         return f"It contradicts the facts: {'; '.join(problems[:MAX_COMPLAINTS])}. Measured: {'; '.join(named)}."
 
     def drafts(self) -> dict[str, Any]:
-        """Give what was written, as fields of the record."""
+        """Return what was written, as fields of the record."""
         english, chinese = self.english, self.chinese
         if english is None:
             return {"writing": self.terms.writing}
@@ -335,7 +335,7 @@ class _Loop:
         return verdict != "ACCEPT_ALTERNATIVE" or self.verdict == "HARD_CONFLICT"
 
     def _states_decision(self, fixed: Draft, before: Coc, facts: Facts) -> bool:
-        """Tell whether the text states the decision that it was written for, so that another one would make it a
+        """Return whether the text states the decision that it was written for, so that another one would make it a
         lie."""
         if ACTIONS[before.flight_decision].en in before.reasoning_trace.lower():
             return True

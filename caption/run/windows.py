@@ -30,7 +30,7 @@ from cosfly.formats.segments import Mission
 
 
 def current_frames(num_points: int, cfg: WindowConfig) -> range:
-    """Give the indices that have a whole past and a whole future."""
+    """Return the indices that have a whole past and a whole future."""
     return range(cfg.num_frames - 1, num_points - cfg.future_frames, cfg.stride)
 
 
@@ -81,12 +81,12 @@ def choose_keyframes(labels: list[str | None], stride: int) -> dict[int, Keyfram
 
 
 def missed_changes(labels: list[str | None], chosen: set[int]) -> list[int]:
-    """Give the windows at which the label changes and that were not chosen."""
+    """Return the windows at which the label changes and that were not chosen."""
     return [i for i in range(1, len(labels)) if labels[i] != labels[i - 1] and i not in chosen]
 
 
 def frames_of(flight: Flight) -> tuple[ObservedFrame, ...]:
-    """Give what was known at each frame of a flight."""
+    """Return what was known at each frame of a flight."""
     return observed_frames(
         flight.time_s,
         flight.positions_m,
@@ -103,7 +103,7 @@ def frames_of(flight: Flight) -> tuple[ObservedFrame, ...]:
 
 
 def goal_of(flight: Flight) -> dict[Language, str] | None:
-    """Give the goal in words, of a flight in which there are other people."""
+    """Return the goal in words, of a flight in which there are other people."""
     return None if flight.goal is None or flight.company is None else {"en": flight.goal.en, "zh": flight.goal.zh}
 
 
@@ -128,18 +128,20 @@ def _observe(
 
 
 def known_of(mission: Mission | None, frame: int) -> str | None:
-    """Give the kind of a mission at a frame at which its order stands; before, nobody knows that there will be one."""
+    """Return the kind of a mission at a frame at which its order stands; before, nobody knows that there will be
+    one."""
     return None if mission is None or mission.order_at(frame) is None else mission.kind
 
 
 def order_comes_within(mission: Mission | None, current: int, future_frames: int) -> bool:
-    """Tell whether an order of which nobody knows at frame `current` moves the drone after it: no label could be told
+    """Return whether an order of which nobody knows at frame `current` moves the drone after it: no label could be told
     from what is seen."""
     return mission is not None and current < mission.at_frame <= current + future_frames
 
 
 def cut_future(flight: Flight, motion: LabelMotion, current: int, future_frames: int) -> FutureMotion:
-    """Give the motion after frame `current`: as it is without perturbation, or as it was flown where that is not known.
+    """Return the motion after frame `current`: as it is without perturbation, or as it was flown where that is not
+    known.
 
     Args:
         motion: of the whole flight; what was visible comes from the flight itself.
@@ -186,12 +188,12 @@ class LabelMotion:
 
 
 def as_flown(flight: Flight, label_from: LabelFrom) -> LabelMotion:
-    """Give the motion of a flight as it was flown, perturbation and all."""
+    """Return the motion of a flight as it was flown, perturbation and all."""
     return LabelMotion(label_from, flight.positions_m, flight.rotations_deg[:, 1], flight.targets_m)
 
 
 def label_motion(flight: Flight, twin: Flight | None = None) -> LabelMotion:
-    """Give a flight's motion without perturbation, in the best way there is.
+    """Return a flight's motion without perturbation, in the best way there is.
 
     Args:
         twin: the clean flight of the same frames (`read_twin`), None where there is none.

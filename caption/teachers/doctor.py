@@ -200,7 +200,7 @@ class _Examination:
 
 
 def largest_messages(cfg: CaptionConfig, vocabulary: Vocabulary, pictures: list[dict]) -> list[dict]:
-    """Give messages as long as ours get: a made-up window whose numbers have many digits."""
+    """Return messages as long as ours get: a made-up window whose numbers have many digits."""
     count = cfg.window.num_frames
     far = np.full((count, 3), -12345.67) + np.arange(count)[:, None]
     window = ObservedWindow(

@@ -147,7 +147,7 @@ def read_student(path: Path, run: str | None = None) -> dict[str, Prediction]:
 
 
 def given_samples(cfg: CaptionConfig, path: Path) -> set[str]:
-    """Give the windows that a file of captions or predictions speaks of; raises as its reader."""
+    """Return the windows that a file of captions or predictions speaks of; raises as its reader."""
     if cfg.teacher_kind == "student":
         return {key.rpartition("/")[0] for key in read_student(path, cfg.student.run)}
     return set(read_foreign(path))

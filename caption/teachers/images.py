@@ -35,7 +35,7 @@ class FrameSource(Protocol):
 
 
 def pictures_of(window: ObservedWindow, cfg: ImageConfig) -> Pictures:
-    """Tell what is shown of a window: the wanted views that every observed frame has (public trees can lack depth).
+    """Return what is shown of a window: the wanted views that every observed frame has (public trees can lack depth).
 
     Without any, pixels are the camera's, or where none is wanted those that the settings name.
     """
@@ -60,11 +60,11 @@ class FrameEncoder:
         self._lock = threading.Lock()  # frames are encoded on several threads
 
     def holds(self, frame: Path, pictures: Pictures) -> bool:
-        """Tell whether a frame is encoded already."""
+        """Return whether a frame is encoded already."""
         return (frame, pictures) in self._cache
 
     def encode(self, frame: Path, pictures: Pictures) -> list[EncodedImage]:
-        """Give the pictures of one frame: one per view, or one in all when tiled.
+        """Return the pictures of one frame: one per view, or one in all when tiled.
 
         Raises:
             InputError: a file is missing or not an image.

@@ -43,7 +43,7 @@ class PlantedError(Record):
     new: str
 
     def in_text(self, coc: Coc) -> Coc:
-        """Give the caption with the error in its text."""
+        """Return the caption with the error in its text."""
         return coc.model_copy(update={self.field: getattr(coc, self.field).replace(self.old, self.new, 1)})
 
 
@@ -95,7 +95,7 @@ class Case:
 
 
 def judge_messages(case: Case, vocabulary: Vocabulary, order: Sequence[Judgement] = JUDGEMENTS) -> list[dict]:
-    """Give the chat messages; `order` is the order in which the options are named."""
+    """Return the chat messages; `order` is the order in which the options are named."""
     options = "\n".join(f"- {name}: {_MEANINGS[name]}." for name in order)
     system = vocabulary.templates["judge_system"].substitute(options=options, names=", ".join(order))
     record = dump_json(case.answer.model_dump(), indent=1)
@@ -272,7 +272,7 @@ async def check_judge(
 
 
 def judge_check_table(check: JudgeCheck) -> Table:
-    """Give the figures as a table for the terminal."""
+    """Return the figures as a table for the terminal."""
     table = Table("figure", "value", "meaning", title=f"Judge {check.model}", title_justify="left")
     asks = f"of {check.num_asks} asks ({check.num_cases} cases, three orders of the options)"
     table.add_row("agreement", f"{100 * check.agreement:.1f} %", f"with the gold judgement, {asks}; chance is 33.3 %")

@@ -27,7 +27,7 @@ SUFFIX, VERSION = ".txt", "# version: "
 
 @cache
 def shipped_prompts() -> dict[str, str]:
-    """Give the files that ship, name without suffix -> text with its version line."""
+    """Return the files that ship, name without suffix -> text with its version line."""
     return {path.stem: read_text(path) for path in sorted(PROMPTS.glob(f"*{SUFFIX}"))}
 
 
@@ -62,7 +62,7 @@ def own_prompts(folder: Path) -> dict[str, str]:
 
 
 def _problems(path: Path, text: str) -> Iterator[str]:
-    """Say what is wrong with a file of somebody's own, a line each."""
+    """Return what is wrong with a file of somebody's own, a line each."""
     shipped = shipped_prompts().get(path.stem)
     if shipped is None:
         yield f"{path}: no prompt has this name{nearest(path.stem, shipped_prompts())}"
@@ -85,7 +85,7 @@ def slots_of(text: str) -> list[str]:
 
 @lru_cache
 def prompt_format(name: str, vocabulary: Vocabulary) -> str:
-    """Give a prompt as a format for `%`, which is ten times faster than a template."""
+    """Return a prompt as a format for `%`, which is ten times faster than a template."""
     template, pieces, end = vocabulary.templates[name].template, list[str](), 0
     for match in Template.pattern.finditer(template):
         pieces.append(template[end : match.start()].replace("%", "%%"))
@@ -111,7 +111,7 @@ def export_prompts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
 
 
 def _is_another(path: Path, text: str) -> bool:
-    """Tell whether something else stands where a text is to be written; the text itself may, of an export that was
+    """Return whether something else stands where a text is to be written; the text itself may, of an export that was
     killed."""
     return path.exists() and not (path.is_file() and read_text(path) == text)
 

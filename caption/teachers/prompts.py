@@ -77,14 +77,14 @@ def system_prompt(language: Language, vocabulary: Vocabulary) -> str:
 
 
 def way_prompt(way: WayOfWriting, decision: str | None = None) -> str:
-    """Give the system prompt of a way of writing; a decision is a hard constraint (the anchored strategy of
+    """Return the system prompt of a way of writing; a decision is a hard constraint (the anchored strategy of
     sec:appendix_e)."""
     prompt = _with_actions(way.system, way.vocabulary)
     return prompt if decision is None else f"{prompt}\n{decision_words(decision, way.vocabulary)}"
 
 
 def decision_words(decision: str, vocabulary: Vocabulary) -> str:
-    """Give the words that tie an answer to a decision."""
+    """Return the words that tie an answer to a decision."""
     words = ACTIONS[decision].en
     return vocabulary.templates["anchored_en"].substitute(decision=decision, decision_words=words)
 
@@ -103,12 +103,12 @@ def user_prompts(window: ObservedWindow, facts: Facts, vocabulary: Vocabulary) -
 
 
 def mission_lines(language: Language) -> dict[str, str]:
-    """Give the last line of a prompt that tells of an order, by its kind."""
+    """Return the last line of a prompt that tells of an order, by its kind."""
     return _MISSION[language]
 
 
 def prompt_hash(question: Question) -> str:
-    """Give the hash of the plain question and of how its answer is to be written."""
+    """Return the hash of the plain question and of how its answer is to be written."""
     standing = _standing_hash(*[prompt.system for prompt in question.prompts.values()], way_prompt(question.way))
     users = [
         prompt.user.replace(PICTURES_MARK, question.pictures.sentence(language))
@@ -119,7 +119,7 @@ def prompt_hash(question: Question) -> str:
 
 @lru_cache(maxsize=16)
 def _standing_hash(*texts: str) -> str:
-    """Give the hash of the texts that are the same in every question."""
+    """Return the hash of the texts that are the same in every question."""
     return sha256_bytes("\x00".join(texts).encode())
 
 
@@ -177,7 +177,7 @@ _WORDS_OF_NUMBERS: dict[Language, tuple[str, str]] = {"en": ("unknown", " m/s"),
 
 
 def _numbers(window: ObservedWindow, facts: Facts) -> dict[str, str]:
-    """Give the numbers of a prompt, which are the same in both languages."""
+    """Return the numbers of a prompt, which are the same in both languages."""
     frames = window.frames
     step_s = (frames[-1].time_s - frames[0].time_s) / (len(frames) - 1)
     return {
@@ -200,7 +200,7 @@ def _pose_text(frame: ObservedFrame) -> str:
 
 @lru_cache(maxsize=64)
 def _target_text(frame: ObservedFrame) -> str:
-    """Give the target's position, "" where it is not known."""
+    """Return the target's position, "" where it is not known."""
     x, y, z = frame.target_m
     return "" if x != x else f"({x:z.2f}, {y:z.2f}, {z:z.2f})"
 
@@ -209,7 +209,7 @@ def _target_text(frame: ObservedFrame) -> str:
 
 
 def question_messages(question: Question, encoder: FrameSource) -> tuple[list[dict], list[str]]:
-    """Give the chat messages of a question and the digests of its pictures.
+    """Return the chat messages of a question and the digests of its pictures.
 
     The pictures come first, oldest first, each frame under its name, then the flight data: windows of one flight share
     the system prompt as a prefix and four of five frames as identical pictures.
@@ -231,13 +231,13 @@ def question_messages(question: Question, encoder: FrameSource) -> tuple[list[di
 
 
 def text_of(question: Question) -> str:
-    """Give the text of a question: the flight data, and what its way of writing shows beside them."""
+    """Return the text of a question: the flight data, and what its way of writing shows beside them."""
     table = question.way.table(question.facts)
     return question.asked["en"].user + ("\n" + table if table else "")
 
 
 def correction_messages(correction: Correction | None, vocabulary: Vocabulary) -> list[dict]:
-    """Give the messages that follow a question whose answer was refused: that answer, and what was wrong."""
+    """Return the messages that follow a question whose answer was refused: that answer, and what was wrong."""
     if correction is None:
         return []
     text = vocabulary.templates["correction_en"].substitute(complaint=correction.complaint)
@@ -248,7 +248,7 @@ def correction_messages(correction: Correction | None, vocabulary: Vocabulary) -
 
 
 def mirror_messages(english: Draft, way: WayOfWriting, complaint: str | None = None) -> list[dict]:
-    """Give the chat messages that ask for the Chinese mirror of an English answer.
+    """Return the chat messages that ask for the Chinese mirror of an English answer.
 
     Args:
         complaint: what was wrong with an earlier one.

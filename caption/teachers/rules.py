@@ -22,7 +22,7 @@ BEND_DEG = 15.0  # a change of the walker's heading that is worth a word
 
 
 def word_of(f: Facts, address: str) -> str | None:
-    """Give the word that is true at an address, None where none is known."""
+    """Return the word that is true at an address, None where none is known."""
     fact = f.found.get(address)
     if fact is None:
         reference = parse_reference(address)
@@ -32,7 +32,7 @@ def word_of(f: Facts, address: str) -> str | None:
 
 
 def describe(f: Facts) -> list[tuple[Both, ...]]:
-    """Give the statements about a window, each as a tuple of wordings; those of the last state different facts."""
+    """Return the statements about a window, each as a tuple of wordings; those of the last state different facts."""
     parts = [_seen(f)]
     if f.is_legible_now:
         parts += [_box(f), _position(f)]
@@ -120,7 +120,7 @@ def _others(f: Facts) -> tuple[Both, ...]:
 
 
 def _more(f: Facts) -> tuple[Both, ...]:
-    """Give statements of which a caption makes one."""
+    """Return statements of which a caption makes one."""
     is_walking = word_of(f, "target_motion") == "walking" and word_of(f, "target_travelled") is not None
     known = {
         "flown": bool(f.travelled_m),
@@ -175,7 +175,7 @@ def find_cues(facts: Facts) -> Cues:
 
 
 def _slope(values: Sequence[float]) -> float:
-    """Give the change per step of the straight line nearest to a series."""
+    """Return the change per step of the straight line nearest to a series."""
     weights, norm = _slope_weights(len(values))
     return sum([w * v for w, v in zip(weights, values, strict=True)]) / norm
 
@@ -214,7 +214,7 @@ def _decided(facts: Facts, cues: Cues) -> str:
 
 
 def _goes_one_way(values: Sequence[float | None]) -> bool:
-    """Tell whether a series never turns back; not where a value is unknown."""
+    """Return whether a series never turns back; not where a value is unknown."""
     known = [value for value in values if value is not None]
     return len(known) == len(values) and known in (sorted(known), sorted(known, reverse=True))
 
@@ -251,7 +251,7 @@ _CONCLUSIONS: tuple[Both, ...] = (
 
 
 def _causes(f: Facts, cues: Cues, token: str) -> list[Both]:
-    """Give the reasons for a decision that the facts hold, else its general reason, which claims nothing measurable."""
+    """Return the reasons for a decision that the facts hold, else its general reason, which claims nothing measurable."""
     found = [wording for wording in (cause(f, cues) for cause in _EVIDENCE.get(token, ())) if wording]
     return found[:2] or [_GENERAL[token]]
 

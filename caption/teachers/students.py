@@ -38,8 +38,8 @@ from cosfly.viz.frame_views import Pictures
 
 
 def as_taught(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfig:
-    """Give the settings of a run that asks a student, from what its folder says: windows, pictures, way of writing and
-    sampling.
+    """Return the settings of a run that asks a student, from what its folder says: windows, pictures, way of writing
+    and sampling.
 
     Where nobody is asked as a student they stay as they are.
     """
@@ -141,14 +141,14 @@ class TaughtStudent:
             )
 
     def request(self, question: Question, frames: Sequence[Sequence[EncodedImage]], seed: int) -> Request:
-        """Give the English question."""
+        """Return the English question."""
         prompt = self._reworked(question.asked["en"], question)
         return self._request(prompt, frames, answer_schema(question.decision), seed)
 
     def mirror_request(
         self, question: Question, english: Draft, frames: Sequence[Sequence[EncodedImage]], seed: int
     ) -> Request:
-        """Give the Chinese question, which is of the window as the English one is: a student translates nothing.
+        """Return the Chinese question, which is of the window as the English one is: a student translates nothing.
 
         The Chinese of an answer whose decision was given must hold that decision.
         """

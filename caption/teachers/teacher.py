@@ -97,7 +97,7 @@ class SharedFrames:
         self._underway: dict[tuple[Path, Pictures], asyncio.Future] = {}
 
     async def messages(self, question: Question) -> tuple[list[dict], list[str]]:
-        """Give the chat messages of a question and the digests of its pictures.
+        """Return the chat messages of a question and the digests of its pictures.
 
         Raises:
             InputError, RenderError: a picture cannot be read or encoded.
@@ -106,7 +106,7 @@ class SharedFrames:
         return question_messages(question, self.encoder)
 
     async def pictures(self, question: Question) -> list[list[EncodedImage]]:
-        """Give the pictures of each frame of a question; raises as `messages`."""
+        """Return the pictures of each frame of a question; raises as `messages`."""
         if not question.pictures.views:
             return [[] for _ in question.window.frame_folders]
         frames = [(folder, question.pictures) for folder in question.window.frame_folders]
@@ -128,7 +128,7 @@ class SharedFrames:
 
 
 def sampling_seed(seed: int, sample_id: str, purpose: str) -> int:
-    """Give the seed of one ask: the same in every run, another for every ask of a window."""
+    """Return the seed of one ask: the same in every run, another for every ask of a window."""
     return int(rng_for(seed, "teacher", f"{sample_id}/{purpose}").integers(1 << 31))
 
 
@@ -202,7 +202,7 @@ class AskingTeacher:
         return await self.kept.ask(request, flight_of(sample_id), sample_id, purpose)
 
     async def request(self, question: Question) -> Request:
-        """Give what is asked of the engine.
+        """Return what is asked of the engine.
 
         Raises:
             InputError, RenderError: a picture cannot be read or encoded.
@@ -254,7 +254,7 @@ def open_teacher(
 
 
 def terms_of(teacher: Teacher, sample_id: str, cfg: CaptionConfig, vocabulary: Vocabulary) -> Terms:
-    """Give the terms under which a teacher answers for a window."""
+    """Return the terms under which a teacher answers for a window."""
     if isinstance(teacher, FileTeacher | StudentTeacher):
         return teacher.terms(sample_id)
     if isinstance(teacher, AskingTeacher) and teacher.student is not None:

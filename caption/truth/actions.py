@@ -163,7 +163,8 @@ def _implied(t: Thresholds) -> tuple[tuple[tuple[str, Measure], ...], ...]:
         return _least(-m.forward_m / t.forward_m, -m.closing_m / t.forward_m)
 
     def strafes(side: int) -> Measure:
-        """A drone that swings round the person shifts to one side and turns to the other to keep its aim. That is one
+        """Return a drone that swings round the person shifts to one side and turns to the other to keep its aim.
+        That is one
         motion, a turn to follow: which of its parts is more thresholds tells only the distance (1 m is 3 degrees at
         19 m)."""
         return lambda m: (
@@ -204,7 +205,7 @@ class ActionTable:
         self.implied, self.shown = _implied(thresholds), _shown(thresholds)
 
     def label_of(self, motion: Motion) -> str | None:
-        """Give the ground-truth decision, None where neither an order nor geometry tells."""
+        """Return the ground-truth decision, None where neither an order nor geometry tells."""
         for group in self.implied:
             sizes = [(size(motion), token) for token, size in group]
             found = [pair for pair in sizes if pair[0] >= 1.0]
@@ -213,7 +214,7 @@ class ActionTable:
         return None
 
     def is_contradicted(self, decision: str, motion: Motion) -> bool:
-        """Tell whether a motion shows too little of a decision, or its opposite."""
+        """Return whether a motion shows too little of a decision, or its opposite."""
         shown, limit = self.shown[decision]
         return shown(motion) < limit
 
@@ -226,7 +227,7 @@ class ActionTable:
         return "ABSTAIN" if label is None else "SOFT_CONFLICT"
 
     def contradicted_by(self, motion: Motion, label: str | None) -> list[str]:
-        """Give the decisions that the actual future contradicts: what a guess would have run into."""
+        """Return the decisions that the actual future contradicts: what a guess would have run into."""
         return [token for token, (size, limit) in self.shown.items() if token != label and size(motion) < limit]
 
 

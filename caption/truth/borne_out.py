@@ -23,7 +23,7 @@ _SIDED = ("yaw", "bearing", "offset_x", "target_heading")
 
 
 def bears_out_number(numeral: Numeral, facts: Facts) -> bool:
-    """Tell whether any value, change or rate of the window has a numeral's size and unit."""
+    """Return whether any value, change or rate of the window has a numeral's size and unit."""
     if numeral.kind == "clock":
         return _is_at_hour(numeral.value, facts)
     if numeral.value == 1.0 and not any(map(str.isdigit, numeral.text)):
@@ -71,7 +71,7 @@ def _between(unit: str, facts: Facts) -> Iterator[float]:
 
 
 def _is_at_hour(hour: float, facts: Facts) -> bool:
-    """Tell whether the person was at an hour of the clock, by bearing or, where that is not known, by the side in the
+    """Return whether the person was at an hour of the clock, by bearing or, where that is not known, by the side in the
     picture."""
     angle = wrapped(-30.0 * (hour % 12))
     bearings = [bearing for bearing in facts.bearing_deg if bearing is not None]
@@ -109,7 +109,7 @@ def _known(quantity: Quantity, facts: Facts) -> list[tuple[int, float]]:
 
 
 def bears_out_pole(pole: Pole, facts: Facts) -> bool:
-    """Tell whether a word of side, course, state ... is true of the window in a way that its sentence could mean."""
+    """Return whether a word of side, course, state ... is true of the window in a way that its sentence could mean."""
     match pole.dimension, pole.value:
         case "visibility", _:
             return _is_seen(pole, facts)
@@ -133,7 +133,7 @@ def bears_out_pole(pole: Pole, facts: Facts) -> bool:
 
 
 def bears_out_own(pole: Pole, facts: Facts) -> bool:
-    """Tell whether a word that names its quantity ("lost altitude") is true of just that."""
+    """Return whether a word that names its quantity ("lost altitude") is true of just that."""
     return (
         pole.value in _TRENDS
         and bool(mentions("of_height").search(pole.word))
@@ -146,7 +146,7 @@ def _holds_any(word: str, names: Iterable[str], facts: Facts, aspect: str = "") 
 
 
 def _was_at_side(side: str, facts: Facts) -> bool:
-    """Tell whether in a frame or a step something was on a side, or turned to it."""
+    """Return whether in a frame or a step something was on a side, or turned to it."""
     sign = 1 if side == "left" else -1
     places = [-value for value in facts.offset_x_px if value is not None]
     turns = [b - a for a, b in pairwise(facts.yaw_deg)]
@@ -170,7 +170,7 @@ def _is_seen(pole: Pole, facts: Facts) -> bool:
 
 
 def _has_trend(word: str, names: Iterable[str], facts: Facts) -> bool:
-    """Tell whether a quantity goes so over the whole window or in a step of it."""
+    """Return whether a quantity goes so over the whole window or in a step of it."""
     for name in names:
         fact = look_up(Reference(name, "trend"), facts)
         if isinstance(fact, Fact) and fact.value == word:

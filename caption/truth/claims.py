@@ -66,7 +66,7 @@ def judge_sentence(
 
 
 def _compare(claim: Claim, decision: str, facts: Facts, is_about: bool, numeral: Numeral | None) -> tuple[str, str]:
-    """Give what became of a claim, proved | unread | contradicted | not_compared, and the problem, if it is one."""
+    """Return what became of a claim, proved | unread | contradicted | not_compared, and the problem, if it is one."""
     if claim.quantity == SCENE or claim.modality == "hypothetical":
         return "not_compared", ""
     if claim.quantity == "decision" or claim.modality == "predicted":
@@ -84,7 +84,7 @@ def _compare(claim: Claim, decision: str, facts: Facts, is_about: bool, numeral:
 
 
 def references_of(claim: Claim) -> list[Reference]:
-    """Give the addresses that a claim names, [] where it names nothing that can be measured. A value at a span is one
+    """Return the addresses that a claim names, [] where it names nothing that can be measured. A value at a span is one
     of each frame."""
     if claim.at is None or not claim.at.strip():
         reference = parse_reference(claim.quantity)
@@ -163,7 +163,7 @@ def _judge_at(
 
 
 def _slack(value: float, unit: str, is_about: bool) -> float:
-    """Give how far a number may lie from its fact beyond its own rounding."""
+    """Return how far a number may lie from its fact beyond its own rounding."""
     if unit == "percent":  # of numbers that are rounded themselves
         return 5.0 if is_about else 1.0
     if unit == "times":
@@ -188,7 +188,7 @@ _AGAINST: dict[tuple[str, str], tuple[str, ...]] = {
 
 
 def goes_against(claim: Claim, decision: str) -> bool:
-    """Tell whether a predicted claim contradicts the decision."""
+    """Return whether a predicted claim contradicts the decision."""
     if claim.quantity == "decision":
         return claim.modality != "hypothetical" and normalize_action(str(claim.value)) != decision
     aspect, _, name = claim.quantity.rpartition(":")

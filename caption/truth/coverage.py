@@ -47,7 +47,8 @@ class ClaimCoverage:
 
 
 def cover(text: str, claims: Sequence[Claim], facts: Facts, language: Language) -> ClaimCoverage:
-    """Say what of a sentence neither a claim covers nor the facts bear out, and which claims it says the opposite of.
+    """Return what of a sentence neither a claim covers nor the facts bear out, and which claims it says the opposite
+    of.
 
     A word or a number without a claim is no problem where it is true of the window, unless a claim of its kind is
     missing in the
@@ -84,7 +85,7 @@ def _wrong_numerals(stated: Stated, said: Said, uncovered: Sequence[Numeral]) ->
 
 
 def _is_repeated(numeral: Numeral, in_place_of: Sequence[Claim], stated: Stated, said: Said) -> bool:
-    """Tell whether a number stands more often in the text than in the claims, where a value of its kind is missing."""
+    """Return whether a number stands more often in the text than in the claims, where a value of its kind is missing."""
     if not any(claim.quantity in QUANTITIES for claim in in_place_of):
         return False
     same = [n for n in stated.numerals if (n.value, n.unit, n.kind) == (numeral.value, numeral.unit, "number")]
@@ -92,7 +93,7 @@ def _is_repeated(numeral: Numeral, in_place_of: Sequence[Claim], stated: Stated,
 
 
 def _is_said_otherwise(numeral: Numeral, missing: Sequence[Claim], said: Said) -> bool:
-    """Tell whether a number says what a missing claim says: "from 20.5 to 17 m" where the change is claimed, or the
+    """Return whether a number says what a missing claim says: "from 20.5 to 17 m" where the change is claimed, or the
     other way round."""
     return any(
         same_size(numeral, one)
@@ -103,7 +104,7 @@ def _is_said_otherwise(numeral: Numeral, missing: Sequence[Claim], said: Said) -
 
 
 def _is_of_kind(numeral: Numeral, claim: Claim) -> bool:
-    """Tell whether a numeral could stand where a claim's number should."""
+    """Return whether a numeral could stand where a claim's number should."""
     if numeral.kind == "ratio" or numeral.unit in ("percent", "times"):
         return claim.unit in ("percent", "times")
     return not numeral.unit or not claim.unit or numeral.unit == claim.unit or may_mean(numeral.unit, claim.unit)
@@ -166,7 +167,7 @@ def _uncovered_poles(stated: Stated, said: Said, facts: Facts, language: Languag
 
 
 def _is_led(pole: Pole, said: Said, facts: Facts) -> bool | None:
-    """Tell whether the number that "fell by" or "climbed to" leads bears the word out; None where it is no claim's."""
+    """Return whether the number that "fell by" or "climbed to" leads bears the word out; None where it is no claim's."""
     if pole.number is None or pole.is_negated or pole.value not in ("increasing", "decreasing", "steady"):
         return None
     claims = [claim for claim in said.numbers if same_size(pole.number, claim)]
@@ -182,7 +183,7 @@ def _is_led(pole: Pole, said: Said, facts: Facts) -> bool | None:
 
 
 def _has_come(word: str, claim: Claim, facts: Facts) -> bool | None:
-    """Tell whether a quantity came up or down to its value at a frame, from the frame before or from the first; None:
+    """Return whether a quantity came up or down to its value at a frame, from the frame before or from the first; None:
     not known."""
     quantity = QUANTITIES.get(claim.quantity)
     if quantity is None or quantity.sides or claim.modality != "observed":
@@ -199,7 +200,7 @@ def _has_come(word: str, claim: Claim, facts: Facts) -> bool | None:
 
 
 def _denies(pole: Pole, covers: set[str]) -> bool:
-    """Tell whether claims say only what a negated word denies."""
+    """Return whether claims say only what a negated word denies."""
     same = {"visible", "full"} if pole.value in ("visible", "full") else {pole.value}
     if pole.dimension in ("side", "centre", "level", "gap", "pace", "bend"):
         return False  # "no turn to the left is needed": claims say why, not what is not
@@ -207,8 +208,8 @@ def _denies(pole: Pole, covers: set[str]) -> bool:
 
 
 def _covers_pace(pole: Pole, said: Said) -> bool:
-    """Tell whether claims cover "faster" or "slower": said of the target, a comparison of drone and target is the other
-    way round."""
+    """Return whether claims cover "faster" or "slower": said of the target, a comparison of drone and target is the
+    other way round."""
     other = {"faster": "slower", "slower": "faster"}
     if mentions("of_change").search(pole.word):
         return ("paced", pole.value) in said.poles
@@ -259,7 +260,7 @@ def _is_wish(pole: Pole) -> bool:
 
 
 def _is_off_somewhere(said: Said) -> bool:
-    """Tell whether a claim says that the person is, was or will be out of the middle of the picture."""
+    """Return whether a claim says that the person is, was or will be out of the middle of the picture."""
     places = [
         claim for claim in said.claims if claim.quantity.rpartition(":")[2] in ("offset_x", "offset_y", "bearing")
     ]
@@ -293,7 +294,7 @@ def _denied_numbers(stated: Stated, said: Said) -> Iterator[str]:
 
 
 def _side_of(numeral: Numeral, stated: Stated) -> Pole | None:
-    """Give the word of a side that stands directly beside a number, after it or before it."""
+    """Return the word of a side that stands directly beside a number, after it or before it."""
     end = numeral.start + len(numeral.text)
     poles = [pole for pole in stated.poles if pole.dimension in ("side", "level") and not pole.is_negated]
     for pole in poles:
@@ -310,7 +311,7 @@ def _has_side(claim: Claim, pole: Pole, said: Said) -> bool:
 
 
 def _is_turned(first: Numeral, second: Numeral, said: Said) -> bool:
-    """Tell whether two numbers are values of one quantity at frames in the other order, by every reading of the
+    """Return whether two numbers are values of one quantity at frames in the other order, by every reading of the
     claims."""
     orders = [
         min(frames_of(one), default=0) < min(frames_of(other), default=0)

@@ -78,12 +78,12 @@ class Facts:
 
     @property
     def is_visible_now(self) -> bool:
-        """Tell whether nothing hides the person: what labels go by, as the flight was planned."""
+        """Return whether nothing hides the person: what labels go by, as the flight was planned."""
         return self.visibility[-1] in ("visible", "partly_occluded", "illegible")
 
     @property
     def is_legible_now(self) -> bool:
-        """Tell whether somebody could see the person in the picture: what claims of sight go by."""
+        """Return whether somebody could see the person in the picture: what claims of sight go by."""
         return self.visibility[-1] in ("visible", "partly_occluded")
 
     @cached_property
@@ -202,7 +202,7 @@ def _measure_step(before: ObservedFrame, after: ObservedFrame) -> tuple[Any, ...
 
 
 def wrapped(angle_deg: float) -> float:
-    """Give an angle in [-180, 180)."""
+    """Return an angle in [-180, 180)."""
     return (angle_deg + 180.0) % 360.0 - 180.0
 
 

@@ -86,7 +86,7 @@ class Glossary:
         self._idioms = {one: re.compile("|".join(lists["idioms"][one]), re.IGNORECASE) for one in LANGUAGES}
 
     def spellings(self, language: Language) -> dict[str, str]:
-        """Give every spelling of a unit and the unit."""
+        """Return every spelling of a unit and the unit."""
         return self._units[language]
 
     def without_idioms(self, text: str, language: Language) -> str:
@@ -110,14 +110,14 @@ class Glossary:
         return found
 
     def is_negated(self, text: str, start: int, language: Language) -> bool:
-        """Tell whether a negation stands just before a place of a text (English in small letters)."""
+        """Return whether a negation stands just before a place of a text (English in small letters)."""
         if language == "zh":
             return text[max(0, start - 4) : start].endswith(tuple(self._denials.zh))
         words = re.findall(r"[a-z']+", re.split(r"[.,;:]", text[max(0, start - 24) : start])[-1])
         return bool(set(self._denials.en).intersection(words[-2:]))
 
     def pairs(self) -> list[tuple[str, str]]:
-        """Give its words of visibility and its units, English and Chinese, as they are written."""
+        """Return its words of visibility and its units, English and Chinese, as they are written."""
         pairs = [(pair["en"], pair["zh"]) for pair in self.visibility.values()]
         units = {unit: spelling for spelling, unit in reversed(self._units["zh"].items())}
         english = {unit: spelling for spelling, unit in reversed(self._units["en"].items())}
@@ -125,7 +125,7 @@ class Glossary:
 
 
 def _opposites(file: GlossaryFile, language: Language) -> dict[str, tuple[str, int]]:
-    """Give the spellings of opposites: word -> its notion, and 1 for the first of the two, -1 for the other."""
+    """Return the spellings of opposites: word -> its notion, and 1 for the first of the two, -1 for the other."""
     return {
         word: (notion, sign)
         for notion, values in file.notions.items()
@@ -135,7 +135,7 @@ def _opposites(file: GlossaryFile, language: Language) -> dict[str, tuple[str, i
 
 
 def term_pattern(words: Iterable[str], language: Language) -> re.Pattern[str]:
-    """Give the pattern of any of some words, the longest first."""
+    """Return the pattern of any of some words, the longest first."""
     options = "|".join(re.escape(word) for word in sorted(words, key=len, reverse=True))
     return re.compile(rf"(?<![a-z_])(?:{options})(?![a-z_])" if language == "en" else options)
 
@@ -146,21 +146,21 @@ def glossary_file() -> GlossaryFile:
 
 
 def listed(name: str, language: Language) -> str:
-    """Give the words of a list as one pattern, whole words in English."""
+    """Return the words of a list as one pattern, whole words in English."""
     options = "|".join(glossary_file().lists[name][language])
     return rf"\b(?:{options})\b" if language == "en" else f"(?:{options})"
 
 
 @cache
 def mentions(name: str, language: Language | None = None) -> re.Pattern[str]:
-    """Give what finds a word of a list; without a language one of either, also within other words."""
+    """Return what finds a word of a list; without a language one of either, also within other words."""
     both = (words for one in LANGUAGES for words in glossary_file().lists[name][one])
     return re.compile("|".join(both) if language is None else listed(name, language), re.I)
 
 
 @cache
 def written_units(language: Language) -> dict[str, Unit]:
-    """Give every spelling of a unit in running text, foreign ones too."""
+    """Return every spelling of a unit in running text, foreign ones too."""
     units: dict[str, Unit] = {}
     for name, factors in getattr(glossary_file().written_units, language).items():
         for factor, spellings in factors.items():
@@ -171,7 +171,7 @@ def written_units(language: Language) -> dict[str, Unit]:
 
 @cache
 def words_beside(language: Language) -> dict[str, tuple[str, frozenset[str]]]:
-    """Give the words with which a sentence with slots may be proved: word -> kind, and the quantities that it speaks
+    """Return the words with which a sentence with slots may be proved: word -> kind, and the quantities that it speaks
     of."""
     notions, found = glossary_file().notions, dict[str, tuple[str, frozenset[str]]]()
     for names, one in (notions["subject"] | notions["kind"]).items():

@@ -23,12 +23,12 @@ TEXTS = ("critical_components", "reasoning_trace")
 
 
 def check_script(coc: Coc, language: Language) -> bool:
-    """Tell whether every sentence of both texts is written in its language."""
+    """Return whether every sentence of both texts is written in its language."""
     return all(is_in_script(part, language) for name in TEXTS for part in cut_sentences(getattr(coc, name)))
 
 
 def flight_numbers(facts: Facts) -> dict[str, list[Series]]:
-    """Give the window's flight data per unit, as the prompt prints it."""
+    """Return the window's flight data per unit, as the prompt prints it."""
     return {
         "mps": [(0.0, *facts.speed_mps[1:]), (facts.target_speed_mps,)],
         "m": [facts.altitude_m, facts.distance_m, facts.slant_m],
@@ -67,7 +67,7 @@ def check_mirror(english: Coc, chinese: Coc, flight: dict[str, list[Series]]) ->
 
 
 def _numbers(coc: Coc, language: Language) -> list[Numeral]:
-    """Give the numbers in digits; the other language may write one in words otherwise."""
+    """Return the numbers in digits; the other language may write one in words otherwise."""
     found = (numeral for name in TEXTS for numeral in read_numerals(getattr(coc, name), language))
     return [numeral for numeral in found if numeral.kind == "number" and any(map(str.isdigit, numeral.text))]
 

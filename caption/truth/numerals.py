@@ -207,7 +207,7 @@ def read_numerals(text: str, language: Language) -> list[Numeral]:
 
 
 def numbers_in(text: str, language: Language) -> set[float]:
-    """Give every number that a text names, counts, frames and durations too."""
+    """Return every number that a text names, counts, frames and durations too."""
     found = {numeral.value for numeral in read_numerals(text, language)} | {
         float(n) for n in re.findall(r"\d+(?:\.\d+)?", text)
     }
@@ -217,7 +217,7 @@ def numbers_in(text: str, language: Language) -> set[float]:
 
 
 def _is_rest_of(numeral: Numeral, last: Numeral, before: str) -> bool:
-    """Tell whether a numeral is the centimetres of the metres before it: "one metre and thirty centimetres"."""
+    """Return whether a numeral is the centimetres of the metres before it: "one metre and thirty centimetres"."""
     is_length = (last.unit, last.factor, last.digits, numeral.unit, numeral.factor) == ("m", 1.0, 0, "m", 0.01)
     between = before[last.start + len(last.text) :]
     return is_length and numeral.value < 1.0 and _AND.fullmatch(between) is not None
@@ -232,7 +232,7 @@ def _is_about(before: str, after: str) -> bool:
 
 
 def _is_difference(before: str, after: str, language: Language) -> bool:
-    """Tell whether a share is what something is more or less by, not what it is of something."""
+    """Return whether a share is what something is more or less by, not what it is of something."""
     if language == "en":
         return bool(_BY.search(before) or _MORE_OR_LESS.match(after))
     return bool(_ZH_BY.search(before))

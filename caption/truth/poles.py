@@ -48,7 +48,7 @@ ACTION_WORDS = {
 
 
 def poles_of(claim: Claim) -> set[Pair]:
-    """Give the opposites that a claim stands for."""
+    """Return the opposites that a claim stands for."""
     aspect, _, name = claim.quantity.rpartition(":")
     value = claim.value
     if name == "decision":
@@ -112,7 +112,7 @@ def side_word(name: str, value: float) -> str:
 
 
 def number_poles(aspect: str, name: str, value: float) -> set[Pair]:
-    """Give the opposites that a number of a quantity stands for; of 0 those of rest."""
+    """Return the opposites that a number of a quantity stands for; of 0 those of rest."""
     found: set[Pair] = set()
     sign = (value > 0) - (value < 0)
     if not sign:
@@ -143,7 +143,7 @@ def number_poles(aspect: str, name: str, value: float) -> set[Pair]:
 
 
 def _course_poles(name: str, sign: int) -> set[Pair]:
-    """Give the opposites of a quantity that grows or falls. Where its sign is a side, "grows" may mean its size."""
+    """Return the opposites of a quantity that grows or falls. Where its sign is a side, "grows" may mean its size."""
     found: set[Pair] = {("trend", "increasing" if sign > 0 else "decreasing")}
     if name in _SIDED or name in ("offset_y", "pitch", "climb_rate", "speed_difference"):
         found.add(("trend", "decreasing" if sign > 0 else "increasing"))

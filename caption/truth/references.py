@@ -56,7 +56,7 @@ TURNS = ("left", "right", "straight")
 
 
 def _steps(values: Series, step_s: float, digits: int) -> Series:
-    """Give the change per second from each frame to the next."""
+    """Return the change per second from each frame to the next."""
     rates = [None if a is None or b is None else round((b - a) / step_s, digits) + 0.0 for a, b in pairwise(values)]
     return (None, *rates)
 
@@ -167,7 +167,7 @@ def parse_reference(text: str) -> Reference | None:
 
 
 def look_up(reference: Reference, facts: Facts) -> Fact | Missing:
-    """Give the fact at an address, or why there is none."""
+    """Return the fact at an address, or why there is none."""
     if not reference.aspect and reference.quantity in QUANTITIES:  # as quick to read as to remember
         return find_fact(reference, facts)
     found = facts.found.get(reference)
@@ -210,7 +210,7 @@ def _at(series: Series, frame: int) -> float | None:
 
 
 def span_of(reference: Reference, facts: Facts) -> list[float] | None:
-    """Give the known values of a reference's span; None where an end that it names is not known."""
+    """Return the known values of a reference's span; None where an end that it names is not known."""
     name, _, first, last = reference
     series = QUANTITIES[name].read(facts)
     if not series:
@@ -288,7 +288,7 @@ def trend_of(quantity: Quantity, values: Sequence[float]) -> str:
 
 
 def dead_band_of(reference: Reference, facts: Facts) -> float:
-    """Give how far a quantity may be off and still be steady or centred, in its unit."""
+    """Return how far a quantity may be off and still be steady or centred, in its unit."""
     if reference.quantity in ("offset_x", "offset_y"):
         return max(2.0, CENTRED_SHARE * facts.width_px)
     return QUANTITIES[reference.quantity].steady
@@ -308,7 +308,7 @@ def _framing(facts: Facts, frame: int | None) -> Fact | Missing:
 
 
 def _walking(facts: Facts, frame: int | None) -> Fact | Missing:
-    """Give whether the target walks towards the drone, away from it or across its line of sight."""
+    """Return whether the target walks towards the drone, away from it or across its line of sight."""
     at = -1 if frame is None else frame
     course, heading, bearing = (
         _at(series, at) for series in (facts.target_headings_deg, facts.heading_deg, facts.bearing_deg)
@@ -326,7 +326,7 @@ def _motion(name: str, facts: Facts, frame: int | None) -> Fact | Missing:
 
 
 def motion_speeds_of(name: str, facts: Facts, frame: int | None) -> list[float]:
-    """Give the speeds by which something moves or not."""
+    """Return the speeds by which something moves or not."""
     if name == "drone_motion":
         speed = facts.speed_mps[-1 if frame is None else frame]
         return [] if speed is None else [speed]
@@ -355,7 +355,7 @@ def speeds_of(facts: Facts, frame: int | None) -> list[tuple[float, float]]:
 
 
 def facts_meant(reference: Reference, facts: Facts) -> list[Fact]:
-    """Give the facts that a writer may mean by an address: where the target's speed is in it, that of the step and of
+    """Return the facts that a writer may mean by an address: where the target's speed is in it, that of the step and of
     the window."""
     fact = look_up(reference, facts)
     found = [fact] if isinstance(fact, Fact) else []
@@ -380,7 +380,7 @@ _VOCABULARY = {"trend": TRENDS, "comparison": COMPARISONS, "compared": COMPARISO
 
 
 def number_holds(value: float, digits: int, fact: Fact, slack: float = 0.0) -> bool:
-    """Tell whether a number written with so many digits is a fact's, or within `slack` of it."""
+    """Return whether a number written with so many digits is a fact's, or within `slack` of it."""
     assert not isinstance(fact.value, str)
     # Half a unit of the coarser print: "24 m" is true of 23.7, "23.70" of a fact that is printed as 23.7.
     rounding = 0.5 * 10.0 ** -min(digits, fact.digits)
@@ -388,7 +388,7 @@ def number_holds(value: float, digits: int, fact: Fact, slack: float = 0.0) -> b
 
 
 def word_holds(word: str, reference: Reference, facts: Facts) -> bool | None:
-    """Tell whether a word is true at an address; None between true and false, or where the fact is not known.
+    """Return whether a word is true at an address; None between true and false, or where the fact is not known.
 
     Borders are wide: "steady" is false only of twice the spread that counts as steady, "left" only of what lies right.
     """

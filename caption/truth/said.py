@@ -25,14 +25,14 @@ SPEEDS = {"speed", "target_speed"}
 
 
 def frames_of(claim: Claim) -> Iterator[int]:
-    """Give the observed frames that a claim is of, 0 the first; none where it names no frame."""
+    """Return the observed frames that a claim is of, 0 the first; none where it names no frame."""
     reference = parse_reference(f"speed@{claim.at}") or parse_reference(f"change:speed@{claim.at}")
     if reference is not None and reference.first is not None:
         yield from range(reference.first, (reference.last or reference.first) + 1)
 
 
 def _is_expected(claim: Claim, pole: Pair) -> bool:
-    """Tell whether a sentence with a claim in words is likely to have this word of it."""
+    """Return whether a sentence with a claim in words is likely to have this word of it."""
     if claim.modality != "observed":
         return pole[0] == "side" and claim.modality == "predicted"
     return pole[0] != "bend" or claim.quantity.rpartition(":")[2] in TURNING
@@ -70,11 +70,11 @@ class Said:
         return poles_of(claim)
 
     def names_frames(self, pole: Pole) -> bool:
-        """Tell whether a claim of visibility is of a frame that stands beside a word of it."""
+        """Return whether a claim of visibility is of a frame that stands beside a word of it."""
         return any(c.quantity == "visibility" and pole.frames.intersection(frames_of(c)) for c in self.words)
 
     def denies_frames(self, pole: Pole) -> bool:
-        """Tell whether claims of the frames that stand beside a word of visibility say another."""
+        """Return whether claims of the frames that stand beside a word of visibility say another."""
         of_frames = [c for c in self.words if c.quantity == "visibility" and pole.frames.intersection(frames_of(c))]
         return bool(of_frames) and not any(("visibility", pole.value) in self.poles_of(claim) for claim in of_frames)
 
@@ -124,8 +124,8 @@ class Said:
         return any("clock" in text or "点" in text or _number_in(text) == hour for text in self.scene)
 
     def _ratios(self, numeral: Numeral) -> list[float]:
-        """Give the shares and multiples that a numeral may be, by the claims: of a growth, of two speeds, of two values
-        of a quantity."""
+        """Return the shares and multiples that a numeral may be, by the claims: of a growth, of two speeds, of two
+        values of a quantity."""
         found = [r for ratio in self._speed_ratios() for r in ways(ratio, numeral)]
         multiples = [1.0 + float(claim.value) / 100.0 for claim in self.numbers if claim.unit == "percent"]
         spanned = [claim for claim in self.numbers if claim.quantity.startswith("change:")]
@@ -143,7 +143,7 @@ class Said:
         return found + [r for multiple in multiples for r in both_ways(multiple, numeral)]
 
     def _speed_ratios(self) -> list[float]:
-        """Give the multiples of the target's speed that the drone's is, by the claims."""
+        """Return the multiples of the target's speed that the drone's is, by the claims."""
         found = [abs(float(claim.value)) for claim in self.numbers if claim.unit == "times"]
         for claim in self.words:
             if claim.quantity == "comparison:speed":
@@ -154,14 +154,14 @@ class Said:
         return found
 
     def _multiple(self, claim: Claim) -> float | None:
-        """Give what a quantity has become of its first value, where a change or a trend of it is claimed."""
+        """Return what a quantity has become of its first value, where a change or a trend of it is claimed."""
         aspect, _, name = claim.quantity.partition(":")
         reference = parse_reference(f"growth:{name}" + (f"@{claim.at}" if claim.at else ""))
         fact = look_up(reference, self.facts) if reference and aspect in ("change", "trend") else None
         return None if not isinstance(fact, Fact) or isinstance(fact.value, str) else 1.0 + fact.value / 100.0
 
     def is_written(self, claim: Claim, stated: Stated) -> bool:
-        """Tell whether a claim's number stands in the text as it is; a share or a multiple in any of its forms."""
+        """Return whether a claim's number stands in the text as it is; a share or a multiple in any of its forms."""
         value = float(claim.value)
         if value == 0 or claim.quantity.endswith("bearing"):
             return True  # "dead ahead", "no change", "twelve o'clock": checked as words

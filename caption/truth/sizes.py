@@ -16,7 +16,7 @@ BOUND_SHARE = 0.12  # how far "more than 20 m" reaches
 
 
 def same_size(numeral: Numeral, claim: Claim) -> bool:
-    """Tell whether a numeral is a claim's size, to the digits of the numeral."""
+    """Return whether a numeral is a claim's size, to the digits of the numeral."""
     value = float(claim.value)
     unit = claim.unit or ""
     if numeral.unit and unit and numeral.unit != unit and not may_mean(numeral.unit, unit):
@@ -38,7 +38,7 @@ def same_size(numeral: Numeral, claim: Claim) -> bool:
 
 
 def numeral_of(sentence: str, claim: Claim, language: Language) -> Numeral | None:
-    """Give the numeral by which a claim's number stands in its sentence, None where it does not."""
+    """Return the numeral by which a claim's number stands in its sentence, None where it does not."""
     found = [n for n in read_stated(sentence, language).numerals if n.kind == "number" and same_size(n, claim)]
     return max(found, key=lambda numeral: numeral.digits, default=None)
 
@@ -49,7 +49,7 @@ def about_share(value: float) -> float:
 
 
 def may_mean(written: str, unit: str) -> bool:
-    """Tell whether a number written in one unit may be meant in another: people drop "per second"."""
+    """Return whether a number written in one unit may be meant in another: people drop "per second"."""
     return (written, unit) in (("deg", "dps"), ("m", "mps"), ("times", "percent"))
 
 
@@ -59,7 +59,7 @@ def written_digits(value: float) -> int:
 
 
 def ways(ratio: float, numeral: Numeral) -> list[float]:
-    """Give a multiple of the drone's speed as a numeral may say it: of drone, target or either, and how much more or
+    """Return a multiple of the drone's speed as a numeral may say it: of drone, target or either, and how much more or
     less that is."""
     if not numeral.about or ratio <= 0:
         return both_ways(ratio, numeral)
@@ -68,8 +68,8 @@ def ways(ratio: float, numeral: Numeral) -> list[float]:
 
 
 def both_ways(ratio: float, numeral: Numeral | None = None) -> list[float]:
-    """Give the shares and multiples by which a multiple is told, from either side; only the differences where a numeral
-    is one."""
+    """Return the shares and multiples by which a multiple is told, from either side; only the differences where a
+    numeral is one."""
     if ratio <= 0:
         return [abs(ratio), abs(1.0 - ratio)]
     differences = [abs(ratio - 1.0), abs(1.0 / ratio - 1.0)]
@@ -78,7 +78,7 @@ def both_ways(ratio: float, numeral: Numeral | None = None) -> list[float]:
 
 
 def is_share(numeral: Numeral, ratios: Iterable[float], stated: Stated) -> bool:
-    """Tell whether a share or multiple is one of these, or on the side of it that "more than" or "less than" says."""
+    """Return whether a share or multiple is one of these, or on the side of it that "more than" or "less than" says."""
     share = numeral.value / 100.0 if numeral.unit == "percent" else numeral.value
     if numeral.unit == "percent":
         slack = ABOUT_PERCENT if numeral.is_about else EXACT_PERCENT

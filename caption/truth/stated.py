@@ -223,7 +223,7 @@ class Lexicon:
 
 
 def _frames_round(sentence: str, start: int, end: int) -> frozenset[int]:
-    """Give the frames that the clause round a word names, none where it speaks of those before or after them."""
+    """Return the frames that the clause round a word names, none where it speaks of those before or after them."""
     first = max((mark.end() for mark in _PART.finditer(sentence, 0, start)), default=0)
     last = _PART.search(sentence, end)
     clause = sentence[first : last.start() if last else len(sentence)]
@@ -236,7 +236,7 @@ def lexicon_of(language: Language) -> Lexicon:
 
 
 def subject_before(text: str, end: int, language: Language) -> str:
-    """Give who was named last before a place of a text: drone | target, "" where nobody was."""
+    """Return who was named last before a place of a text: drone | target, "" where nobody was."""
     found = [
         (match.start(), who)
         for who, words in lexicon_of(language).subjects.items()

@@ -77,7 +77,7 @@ class WayOfWriting(Protocol):
         self.vocabulary = vocabulary
 
     def table(self, facts: Facts) -> str:
-        """Give what the question shows beside the flight data; "" for nothing."""
+        """Return what the question shows beside the flight data; "" for nothing."""
 
     def read(self, answer: Parsed, facts: Facts) -> Draft | Refused:
         """Make an English draft of an answer of the right structure."""
@@ -86,7 +86,7 @@ class WayOfWriting(Protocol):
         """Make the Chinese draft, and hold it against the English one."""
 
     def judge(self, draft: Draft, facts: Facts, language: Language) -> list[Judged]:
-        """Give the state of every sentence of both texts, in order."""
+        """Return the state of every sentence of both texts, in order."""
 
 
 @lru_cache
@@ -96,7 +96,7 @@ def way_of(name: Writing, vocabulary: Vocabulary) -> WayOfWriting:
 
 
 def more_fields(way: WayOfWriting) -> dict[str, dict]:
-    """Give the fields of an answer beyond the paper's three. `therefore` is free even where the decision is given."""
+    """Return the fields of an answer beyond the paper's three. `therefore` is free even where the decision is given."""
     return {**way.fields, **way.optional, "therefore": {"type": "string", "enum": list(TOKENS)}}
 
 

@@ -61,7 +61,7 @@ def is_earned(
     language: Language,
     claimed: Mapping[int, str] = MappingProxyType({}),
 ) -> bool:
-    """Tell whether a sentence is proved by its slots, and by claims of the words that they leave over.
+    """Return whether a sentence is proved by its slots, and by claims of the words that they leave over.
 
     Args:
         beside: its text, a mark in the place of each slot. references: of the slots, in order; None: the decision.
@@ -137,7 +137,7 @@ class _Word:
         return all(rule(reference) for rule in rules)
 
     def _has_series(self, series: str) -> bool:
-        """Tell whether the series of a claimed trend is named, and no other in its clause or else before it."""
+        """Return whether the series of a claimed trend is named, and no other in its clause or else before it."""
 
         def names(tokens: Sequence[Token]) -> list[bool]:
             named = [one.names for one in tokens if one.kind == "quantity"]
@@ -154,7 +154,7 @@ class _Word:
         return is_claimed or any(reference.quantity in self.token.names for reference in self.references)
 
     def _middle(self) -> bool:
-        """Tell whether the image centre is that from which something is measured, not where it is."""
+        """Return whether the image centre is that from which something is measured, not where it is."""
         is_followed = self.next.reference is not None and self.next.reference.quantity in _PLACES
         is_off = not set(_PLACES).isdisjoint(self.last.names | self.next.names)
         return self._quantity() and (is_followed or is_off or self.last.kind in ("of", "from"))
@@ -169,7 +169,7 @@ class _Word:
         return self.next.reference is not None and self.next.reference.quantity in QUANTITIES
 
     def _sight(self) -> bool:
-        """Tell whether sight is a purpose, or a slot says it."""
+        """Return whether sight is a purpose, or a slot says it."""
         is_purpose = any(one.kind == "plan" for one in self.before)
         return is_purpose or any(reference.quantity in _IN_PICTURE for reference in self.references)
 
@@ -177,19 +177,19 @@ class _Word:
         return [one.kind for one in self.before if one.kind in _OTHER][-1:] != ["target"]
 
     def _motion(self) -> bool:
-        """Tell whether nothing says where a motion goes but a turn."""
+        """Return whether nothing says where a motion goes but a turn."""
         return self._is_turn() or not any(reference.aspect == "side" for reference in self.references)
 
     _claimed = _motion
 
     def _to(self) -> bool:
-        """Tell whether it leads to a value, or is of a distance to somebody; "turned to the walker" is neither."""
+        """Return whether it leads to a value, or is of a distance to somebody; "turned to the walker" is neither."""
         return self.next.kind not in _OTHER or any(
             "distance" in one.names or "slant" in one.names for one in self.before
         )
 
     def _from(self) -> bool:
-        """Tell whether the earliest value of a quantity follows, the others in their order; or a distance to
+        """Return whether the earliest value of a quantity follows, the others in their order; or a distance to
         somebody."""
         if self.next.kind in _OTHER:
             last = self.last.reference
@@ -218,7 +218,7 @@ class _Word:
         return self._now() and all(_start(reference) is None for reference in self.spoken_of)
 
     def _frame(self) -> bool:
-        """Tell whether a value of this frame stands beside, or behind "from" and "since" one that is counted from
+        """Return whether a value of this frame stands beside, or behind "from" and "since" one that is counted from
         it."""
         if self.last.kind in ("from", "since"):
             return any(_start(reference) == self.token.frame for reference in self.spoken_of)
@@ -229,7 +229,7 @@ class _Word:
         )
 
     def _whole(self) -> bool:
-        """Tell whether something is counted from the first frame on, and no state is of one frame."""
+        """Return whether something is counted from the first frame on, and no state is of one frame."""
         starts = [_start(reference) for reference in self.spoken_of]
         is_counted = any(start is not None for start in starts) and all(start in (0, None) for start in starts)
         return is_counted and not any(reference.quantity in _STATES for reference in self.spoken_of)
@@ -244,7 +244,7 @@ class _Word:
         return any("turned" in one.names for one in self.beside)
 
     def _has_owner(self, reference: Reference) -> bool:
-        """Tell whether it stands behind its owner: last in its clause, else, where its name is anybody's, in the
+        """Return whether it stands behind its owner: last in its clause, else, where its name is anybody's, in the
         sentence."""
         names = [one.names for one in self.beside if one.kind == "quantity" and reference.quantity in one.names]
         is_anybodys = not names or any(
@@ -274,7 +274,7 @@ class _Word:
         return owners[-1:] != [wrong]
 
     def _has_name(self, reference: Reference) -> bool:
-        """Tell whether the name nearest to a value, before it in its clause or else after it, is its own."""
+        """Return whether the name nearest to a value, before it in its clause or else after it, is its own."""
         if reference.aspect in _SIDED or reference.quantity in _STATES:
             return True
         named = ("quantity", "away", "middle")
@@ -291,7 +291,7 @@ class _Word:
         return is_named or (bool(earlier) and reference.quantity in earlier[-1])
 
     def _has_date(self, reference: Reference) -> bool:
-        """Tell whether the frames of a value stand in its sentence where they are not the current one or the whole
+        """Return whether the frames of a value stand in its sentence where they are not the current one or the whole
         window."""
         frames = {one.frame for one in (*self.earlier, *self.later) if one.kind == "frame"}
         end, start = self._end(reference), _start(reference)
@@ -299,7 +299,8 @@ class _Word:
         return is_dated and (start in (None, 0, *frames))
 
     def _has_aspect(self, reference: Reference) -> bool:
-        """Tell whether a word says what a number is of its quantity; and beside a trend, where that ends or begins."""
+        """Return whether a word says what a number is of its quantity; and beside a trend, where that ends or
+        begins."""
         aspect, end, start = reference.aspect, self._end(reference), _start(reference)
         trends = [one for one in self.references if one[:2] == (reference.quantity, "trend")]
         is_change = self.last.kind == "by" or (
@@ -320,7 +321,7 @@ class _Word:
         return all(end in (_start(one), _start(one) or first) if is_start else end == self._end(one) for one in trends)
 
     def _has_side(self, reference: Reference) -> bool:
-        """Tell whether a side is no way of a motion, of a turn that is named, and that of the value before it."""
+        """Return whether a side is no way of a motion, of a turn that is named, and that of the value before it."""
         if reference.aspect != "side":
             return True
         own = [one.names for one in self.beside if one.kind == "quantity" and reference.quantity in one.names]
@@ -337,7 +338,7 @@ class _Word:
 
 
 def _start(reference: Reference) -> int | None:
-    """Give the frame from which a value is counted, None where it is of one frame alone."""
+    """Return the frame from which a value is counted, None where it is of one frame alone."""
     is_of_frame = reference.aspect in ("", *_SIDED) and reference.quantity not in _SINCE_START
     if is_of_frame or (reference.aspect == "side" and reference.quantity not in TURNING):
         return None

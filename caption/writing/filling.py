@@ -27,7 +27,7 @@ class Filler:
         self._found, self._units, self._forms = facts.found, units_behind(language), words_of(language)
 
     def fill(self, sentence: Sentence, *, is_reasoning: bool = False) -> str | Refused:
-        """Give the plain text of a sentence."""
+        """Return the plain text of a sentence."""
         if is_reasoning and self.decision in sentence.opposed:
             complaint = (
                 f'it argues against {self.decision}, and "flight_decision" says {self.decision}; let the '
@@ -109,14 +109,14 @@ class Filler:
         return "unknown_fact" if side is None else Fact(side)
 
     def _shaped(self, reference: Reference, fact: Fact) -> Fact | Missing:
-        """Give a fact as a text takes it: a box as both its sides, a trend as that of the size."""
+        """Return a fact as a text takes it: a box as both its sides, a trend as that of the size."""
         if reference.aspect == "trend":
             return self._trend_of_size(reference, fact)
         width = look_up(reference._replace(quantity="box_width"), self.facts)
         return Fact(f"{width.value} x {fact.value}", "px") if isinstance(width, Fact) else width
 
     def _trend_of_size(self, reference: Reference, trend: Fact) -> Fact | Missing:
-        """Give the trend as a reader takes it: an offset to the left that shrinks is no increase."""
+        """Return the trend as a reader takes it: an offset to the left that shrinks is no increase."""
         values = span_of(reference, self.facts)
         assert values
         if trend.value not in _DIRECTIONS or min(values) >= 0:
@@ -154,7 +154,7 @@ class Filler:
         return Refused("slots_sign_differs", f"{{{number.name}}} beside a direction of other frames: {fix}")
 
     def _exact_side(self, slot: Slot, side: Fact) -> Fact:
-        """Give the side of the very number where "straight" or "centred" would say neither."""
+        """Return the side of the very number where "straight" or "centred" would say neither."""
         if side.value not in NEITHER:
             return side
         assert slot.reference is not None
@@ -166,7 +166,7 @@ class Filler:
 
 
 def facts_of(facts: Facts, names: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Give (name, how it is filled in) of the slots among these whose fact is known."""
+    """Return (name, how it is filled in) of the slots among these whose fact is known."""
     filler = Filler(facts, "", "en")
     for name in names:
         sentence = read_sentence(f"it {{{name}}} it", "en", len(facts), facts.step_s)

@@ -49,7 +49,7 @@ _NUMBER = re.compile(r"[\d０-９][\d０-９.,]*")
 
 
 def check_outside(text: str, language: Language, num_frames: int, step_s: float) -> Refused | None:
-    """Say what of a text without its slots (each a SLOT_MARK) may not stand there; None where nothing is wrong."""
+    """Return what of a text without its slots (each a SLOT_MARK) may not stand there; None where nothing is wrong."""
     for match in _FRAME.finditer(text):
         if int(match[1]) >= num_frames:
             fix = f"frames are t0 to t{num_frames - 1}"
@@ -82,7 +82,7 @@ def _is_too_much(match: re.Match[str], num_frames: int, step_s: float) -> bool:
 
 
 def states_beside(text: str, language: Language) -> tuple[str, ...]:
-    """Give the words of a text for what a slot could have said: they may stand there, but nobody compared them."""
+    """Return the words of a text for what a slot could have said: they may stand there, but nobody compared them."""
     glossary = load_glossary()
     return tuple(glossary.states(glossary.without_idioms(text, language), language))
 
@@ -103,7 +103,7 @@ _UNASKED = re.compile(
 
 
 def decisions_opposed(text: str) -> tuple[str, ...]:
-    """Give the decisions that an English sentence of a reasoning plainly argues against: "braking is the safe choice"
+    """Return the decisions that an English sentence of a reasoning plainly argues against: "braking is the safe choice"
     against speed_up."""
     if _UNASKED.search(text):
         return ()
@@ -120,7 +120,7 @@ def decisions_opposed(text: str) -> tuple[str, ...]:
 
 
 def decisions_named(text: str) -> tuple[str, ...]:
-    """Give the actions, in words or as tokens, that an English text says to take."""
+    """Return the actions, in words or as tokens, that an English text says to take."""
     return tuple((match["words"] or match["token"]).lower() for match in _named().finditer(text))
 
 

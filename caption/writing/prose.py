@@ -36,7 +36,7 @@ def _asks(language: Language) -> re.Pattern[str]:
 
 
 def judge_prose(coc: Coc, facts: Facts, language: Language) -> list[Judged]:
-    """Give the state of every sentence of both texts, contradicted or unread, in order."""
+    """Return the state of every sentence of both texts, contradicted or unread, in order."""
     judged = []
     for name, text in sentences_of(coc):
         problems: tuple[str, ...] = ()
@@ -67,7 +67,7 @@ def _is_of_nothing(numeral: Numeral, facts: Facts) -> bool:
 
 
 def _runs_against(pole: Pole, stated: Stated, language: Language) -> bool:
-    """Tell whether "decreases from 20 m to 21 m" contradicts itself."""
+    """Return whether "decreases from 20 m to 21 m" contradicts itself."""
     sign = _RISES.get(pole.value, 0) if pole.dimension == "trend" and not pole.is_negated else 0
     pairs = list(zip(stated.numerals, stated.numerals[1:], strict=False))
     if not sign or len(pairs) != 1:
@@ -80,7 +80,7 @@ def _runs_against(pole: Pole, stated: Stated, language: Language) -> bool:
 
 
 def _compares_against(pole: Pole, stated: Stated, language: Language) -> bool:
-    """Tell whether "faster" stands beside two speeds, the drone's and the target's, of which the other is larger."""
+    """Return whether "faster" stands beside two speeds, the drone's and the target's, of which the other is larger."""
     if pole.dimension != "pace" or pole.value not in ("faster", "slower") or pole.is_negated or not pole.is_compared:
         return False
     speeds = [numeral for numeral in stated.numerals if numeral.unit == "mps" and numeral.kind == "number"]
@@ -94,7 +94,8 @@ def _compares_against(pole: Pole, stated: Stated, language: Language) -> bool:
 
 
 def _plans_other_side(stated: Stated, language: Language, decision: str) -> bool:
-    """Tell whether a sentence plainly asks for the other side than the decision, and never names the decision's own."""
+    """Return whether a sentence plainly asks for the other side than the decision, and never names the decision's
+    own."""
     side = next((side for side in ("left", "right") if side in decision), None)
     sides = {pole.value for pole in stated.poles if pole.dimension == "side"}
     is_plain = not any(pole.is_negated for pole in stated.poles if pole.dimension == "side")

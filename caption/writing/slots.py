@@ -80,7 +80,7 @@ def read_quoted(value: Any, sentences: Mapping[str, str], language: Language) ->
 
 
 def _is_quoted(claim: Claim, quote: str, language: Language) -> bool:
-    """Tell whether a claim's number stands in its quote."""
+    """Return whether a claim's number stands in its quote."""
     if isinstance(claim.value, str):
         return True
     return any(same_size(numeral, claim) for numeral in read_stated(quote, language).numerals)
@@ -244,7 +244,7 @@ def _judge_beside(name: str, sentence: Sentence, claims: Sequence[Claim], filler
 
 
 def _words_of(claim: Claim, beside: str, poles: Sequence[Pole]) -> list[Pole]:
-    """Give the measurable words of a claim's quote; none where one is of another kind or another's, denied or
+    """Return the measurable words of a claim's quote; none where one is of another kind or another's, denied or
     wished."""
     start, quote = beside.find(claim.quote or ""), claim.quote or ""
     own = [pole for pole in poles if start <= pole.start and pole.start + len(pole.word) <= start + len(quote)]
@@ -256,7 +256,7 @@ def _words_of(claim: Claim, beside: str, poles: Sequence[Pole]) -> list[Pole]:
 
 
 def _terms(english: Template, facts: Facts) -> list[tuple[str, str]]:
-    """Give the glossary's terms of an English template, slots aside: these are filled in from the glossary."""
+    """Return the glossary's terms of an English template, slots aside: these are filled in from the glossary."""
     found: list[tuple[str, str]] = []
     for name in TEXTS:
         for sentence in read_text(getattr(english, name), "en", len(facts), facts.step_s):
@@ -306,7 +306,7 @@ _WORDS = (
 
 
 def fact_table(facts: Facts) -> str:
-    """Give the facts of a window with the names of their slots, as they are filled in; what is not known is left
+    """Return the facts of a window with the names of their slots, as they are filled in; what is not known is left
     out."""
     last = len(facts) - 1
     lines = []

@@ -68,7 +68,7 @@ class Slot:
 
     @cached_property
     def quantity(self) -> Quantity | None:
-        """Give the series of which it is a plain value, None where it is something else."""
+        """Return the series of which it is a plain value, None where it is something else."""
         reference = self.reference
         if reference is None or reference.aspect or self.is_shaped:
             return None
@@ -80,7 +80,7 @@ class Slot:
 
     @cached_property
     def is_shaped(self) -> bool:
-        """Tell whether it is written otherwise than the fact at its reference: a box, a trend of what has sides."""
+        """Return whether it is written otherwise than the fact at its reference: a box, a trend of what has sides."""
         if self.reference is not None and self.reference.aspect == "trend":
             return has_sides(self.reference.quantity)
         return self.name.partition("@")[0] == "box"
@@ -226,7 +226,7 @@ def _place(slot: Slot, language: Language) -> SlotPlace:
 
 @lru_cache
 def _words_written(language: Language, form: Form, with_neither: bool) -> dict[float | str, str]:
-    """Give how words are written in a form; without those that are neither side where a side may be needed."""
+    """Return how words are written in a form; without those that are neither side where a side may be needed."""
     left_out = () if with_neither else NEITHER
     words = {word: forms for word, forms in words_of(language).items() if word not in left_out}
     return {word: forms[min(form, len(forms) - 1)] for word, forms in words.items()}
@@ -234,7 +234,7 @@ def _words_written(language: Language, form: Form, with_neither: bool) -> dict[f
 
 @lru_cache
 def words_of(language: Language) -> dict[str, tuple[str, ...]]:
-    """Give the forms of every word that is true somewhere: slot words, kinds of visibility, decisions."""
+    """Return the forms of every word that is true somewhere: slot words, kinds of visibility, decisions."""
     glossary = load_glossary()
     seen = {name: (pair[language],) for name, pair in glossary.visibility.items()}
     names = {token: (action.en if language == "en" else action.zh,) for token, action in ACTIONS.items()}
@@ -243,7 +243,7 @@ def words_of(language: Language) -> dict[str, tuple[str, ...]]:
 
 @cache
 def units_behind(language: Language) -> dict[str, str]:
-    """Give what stands behind a number: its unit, a space before it where one belongs there."""
+    """Return what stands behind a number: its unit, a space before it where one belongs there."""
     units = load_glossary().written_units[language]
     return {unit: f"{'' if unit == 'percent' else ' '}{written}" for unit, written in units.items()}
 
@@ -315,7 +315,7 @@ _TO = re.compile(r"\b(?:to|will|would|should|must|can|could|may|might|does|did|d
 
 
 def _form_after(before: str) -> Form:
-    """Give the form of an English verb after these words; Chinese has one."""
+    """Return the form of an English verb after these words; Chinese has one."""
     for pattern, form in ((_HAS, 2), (_TO, 3), (_BE, 1)):
         if pattern.search(before):
             return form  # type: ignore[return-value]
@@ -333,7 +333,7 @@ def _needs_side(before: str, after: str, language: Language) -> bool:
 
 
 def _compares(after: str, language: Language) -> bool:
-    """Tell whether what the drone is compared with stands behind the slot."""
+    """Return whether what the drone is compared with stands behind the slot."""
     after = after.lstrip()
     if language == "zh":
         return after.startswith(

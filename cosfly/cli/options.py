@@ -99,7 +99,8 @@ class Job:
         return manner_of_work(self.cfg) | {"resume": self.resume}
 
     def tree(self, data: list[Path] | None) -> Path:
-        """The playback tree: given, or that of the run folder one stands in; InputError where there is not one."""
+        """Return the playback tree: given, or that of the run folder one stands in; InputError where there is not
+        one."""
         trees = self.trees(data)
         if len(trees) > 1:
             what, got = "this command takes one playback tree", f"{len(trees)}: {', '.join(map(str, trees))}"
@@ -108,7 +109,7 @@ class Job:
         return trees[0]
 
     def trees(self, data: list[Path] | None) -> list[Path]:
-        """The playback trees: given, or that of the run folder one stands in."""
+        """Return the playback trees: given, or that of the run folder one stands in."""
         if data:
             return data
         for candidate in (Path("render"), Path()):
@@ -134,7 +135,7 @@ class Job:
 
 
 def takes(*names: str, flights: str | None = None) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of a configuration and the named ones of SHARED; its function takes a Job first.
+    """Return a command the options of a configuration and the named ones of SHARED; its function takes a Job first.
 
     An option of its own with `Sets` beside its type is a setting; one that is called as a shared one stands for it.
     Of a command with further commands below it, nothing is done where one of those is called.
@@ -184,7 +185,7 @@ def takes(*names: str, flights: str | None = None) -> Callable[[Callable[..., No
 
 
 def _opened(cfg: RunConfig, given: Any) -> Any:
-    """Give a path, or a list of them, as the settings have links followed; anything else as it is."""
+    """Return a path, or a list of them, as the settings have links followed; anything else as it is."""
     if isinstance(given, list):
         return [_opened(cfg, one) for one in given]
     return cfg.opened(given) if isinstance(given, Path) else given
@@ -220,7 +221,7 @@ def resolve(config: Path | None, overrides: list[str] | None, given: Mapping[str
 
 
 def _town_of(cfg: RunConfig, name: str | None) -> RunConfig:
-    """Give the settings of a town; where none is named, what towns have in common, which is none of them."""
+    """Return the settings of a town; where none is named, what towns have in common, which is none of them."""
     names = ", ".join(cfg.towns)
     if name is None:
         if cfg.towns:

@@ -51,7 +51,7 @@ def run(
 
 
 def _is_begun(config: Path, cfg: RunConfig) -> bool:
-    """Tell whether stages of a run, or of its towns, stand beside its settings."""
+    """Return whether stages of a run, or of its towns, stand beside its settings."""
     places = [config.parent, *(config.parent / town for town in cfg.towns)]
     return config.name == "run.yaml" and any(any(place.glob("*/stage.json")) for place in places)
 
@@ -239,7 +239,7 @@ def config_show(
 
 
 def _is_section(word: str) -> bool:
-    """Tell whether a word is no file and no configuration that ships."""
+    """Return whether a word is no file and no configuration that ships."""
     from cosfly.runtime.config import shipped
 
     path = Path(word)

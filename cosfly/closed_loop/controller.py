@@ -68,7 +68,7 @@ class Controller:
         self._side = 1.0
 
     def command(self, action: str | None, now: Moment) -> np.ndarray:
-        """Give what is flown, (5,) as ACTION; None, where no decision came, hovers and keeps the pace in mind."""
+        """Return what is flown, (5,) as ACTION; None, where no decision came, hovers and keeps the pace in mind."""
         row = self.controls[action] if action is not None else Control(source="hovers")
         self.pace_mps = 0.0 if row.stops else max(0.0, self.pace_mps + row.pace_step_mps)
         self.pace_mps = min(self.pace_mps, self.drone.speed_max_mps)

@@ -131,7 +131,7 @@ def tables_of(flown: Mapping[str, Flown], cfg: LeaderboardConfig, seed: int) -> 
 
 
 def gains(before: Score, after: Score, seed: int) -> dict[str, Figure]:
-    """Give by how much figures changed from one to another who flew the same walks."""
+    """Return by how much figures changed from one to another who flew the same walks."""
     (walks, one), (_, other) = (walk_sums(score.flights, list(MEASURES)) for score in (before, after))
     draws = draws_of(len(walks), rng_for(seed, "leaderboard", "gains"))
     return figures_of(ratios(draws, other) - ratios(draws, one), [len(walks)] * len(MEASURES), len(walks))
@@ -141,7 +141,7 @@ def gains(before: Score, after: Score, seed: int) -> dict[str, Figure]:
 
 
 def shown(name: str, figure: Figure, *, signed: bool = False) -> str:
-    """Give a figure with its interval in words."""
+    """Return a figure with its interval in words."""
     sign, digits = "+" if signed else "", ".1%" if name in SHARES else ".2f"
     return shown_as(f"{{:{sign}{digits}}}", figure)
 
@@ -150,7 +150,7 @@ Pursuits = dict[tuple[str, str], tuple[Pursuit, Path]]  # by town and episode, a
 
 
 def page_of(board: Leaderboard, flown: Mapping[str, Flown]) -> str:
-    """Give the page; a student whose folders have no flights any more is shown by its figures alone."""
+    """Return the page; a student whose folders have no flights any more is shown by its figures alone."""
     drawn = []
     for table in board.tables:
         standings = table.standings
@@ -173,7 +173,7 @@ def _pursuits(own: Flown) -> Pursuits:
 
 
 def _strips(one: Standing, own: Pursuits) -> list[dict[str, Any]]:
-    """Give the best and the worst flight of a student, by how much of the walk shows the person: frames and words."""
+    """Return the best and the worst flight of a student, by how much of the walk shows the person: frames and words."""
     shares = {(f.town, f.episode): f.sums["in_view"][0] / f.sums["in_view"][1] for f in one.score.flights}
     ranked, found = sorted(shares, key=lambda key: (shares[key], key[1])), []
     for title, key in (("best", ranked[-1]), ("worst", ranked[0])):

@@ -167,7 +167,7 @@ def score_flights(
 
 
 def walk_sums(flights: Sequence[FlightScore], names: Sequence[str]) -> tuple[list[str], np.ndarray]:
-    """Give the walks, and what their flights add to some figures: (walks, figures, 2)."""
+    """Return the walks, and what their flights add to some figures: (walks, figures, 2)."""
     walks = sorted({flight.walk for flight in flights})
     sums = np.zeros((len(walks), len(names), 2))
     for flight in flights:
@@ -176,7 +176,7 @@ def walk_sums(flights: Sequence[FlightScore], names: Sequence[str]) -> tuple[lis
 
 
 def ratios(draws: np.ndarray, sums: np.ndarray) -> np.ndarray:
-    """Give figures on draws of walks, (draws, figures), NaN of nothing; draws: (draws, walks) how often each."""
+    """Return figures on draws of walks, (draws, figures), NaN of nothing; draws: (draws, walks) how often each."""
     totals = np.tensordot(draws, sums, axes=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(totals[..., 1] > 0, totals[..., 0] / totals[..., 1], np.nan)
@@ -188,7 +188,7 @@ def draws_of(num_walks: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def figures_of(drawn: np.ndarray, counts: Sequence[int], num_walks: int) -> dict[str, Figure]:
-    """Give all figures of their values on `draws_of` walks, (draws, figures); counts: what each is of."""
+    """Return all figures of their values on `draws_of` walks, (draws, figures); counts: what each is of."""
     return {
         name: figure_of_draws(float(drawn[0, k]), drawn[1:, k], counts[k], num_walks, CONFIDENCE)
         for k, name in enumerate(MEASURES)
@@ -196,7 +196,7 @@ def figures_of(drawn: np.ndarray, counts: Sequence[int], num_walks: int) -> dict
 
 
 def figures_of_flights(flights: Sequence[FlightScore], seed: int = 0) -> dict[str, Figure]:
-    """Give all figures of some flights with their intervals, by bootstrap over walks."""
+    """Return all figures of some flights with their intervals, by bootstrap over walks."""
     walks, sums = walk_sums(flights, list(MEASURES))
     drawn = ratios(draws_of(len(walks), rng_for(seed, "score", "draws")), sums)
     return figures_of(drawn, [sum(flight.sums[name][1] > 0 for flight in flights) for name in MEASURES], len(walks))

@@ -119,7 +119,7 @@ class Ceiling:
 
     @staticmethod
     def to_next(flight: ClosedLoopFlight, now: Moment) -> np.ndarray:
-        """Give the command that leads to the plan's next pose, or as near as the drone's bounds allow."""
+        """Return the command that leads to the plan's next pose, or as near as the drone's bounds allow."""
         planned, i = flight.planned, now.index + 1
         velocity = in_axes_of(now.rotation_deg[1], planned.positions_m[i] - now.position_m) / flight.dt_s
         turn_degps = float(wrap_deg(planned.rotations_deg[i, 1] - now.rotation_deg[1])) / flight.dt_s
@@ -205,7 +205,8 @@ class AskedPilot:
         return make_question(window, self.cfg.image, self.cfg.writing, self.vocabulary)
 
     def _folder(self, flight: ClosedLoopFlight, moment: Moment) -> Path:
-        """Give the folder of a frame, written for whoever looks at pictures; those that nobody asks for any more go."""
+        """Return the folder of a frame, written for whoever looks at pictures; those that nobody asks for any more
+        go."""
         if self._is_rules:  # which look at none
             return Path()
         above = Path(self._scratch.name, *flight.place)
@@ -221,7 +222,7 @@ class AskedPilot:
 
 
 def _taught_folder(cfg: FlyConfig) -> Path | None:
-    """Give the folder that says how a student was taught, if one does."""
+    """Return the folder that says how a student was taught, if one does."""
     place = Path(cfg.student.partition(":")[2])
     if cfg.engine == "transformers":
         return cfg.adapter or place

@@ -42,7 +42,8 @@ STATE_HIGH = np.array([40, 40, 40, 1000, 180, 90, 3600], dtype=np.float32)
 
 
 def observe(flight: ClosedLoopFlight, now: Moment, *, depth: bool = False) -> dict[str, Any]:
-    """Give what a policy sees, which is what a real drone has, and no more: rgb (h, w, 3) uint8, state (7,) float32 as
+    """Return what a policy sees, which is what a real drone has, and no more: rgb (h, w, 3) uint8, state (7,)
+    float32 as
     STATE, depth (h, w) float32 m, and goal: all that the person wears, which a look-alike does but for one thing."""
     ground_m = float(flight.airspace.ground.height_at(now.position_m[None])[0])
     pitch_deg, yaw_deg, _ = now.rotation_deg
@@ -96,7 +97,7 @@ class Policy:
         return process.wait()
 
     def decide(self, outlooks: Sequence[Outlook]) -> list[PilotAnswer]:
-        """Give what it answers."""
+        """Return what it answers."""
         return [self._decide(outlook) for outlook in outlooks]
 
     def _decide(self, outlook: Outlook) -> PilotAnswer:
@@ -133,7 +134,7 @@ class Policy:
         return PilotAnswer("invalid", words=repr(said)[:MOST_WORDS], answer_s=answer_s)
 
     def _ask(self, call: tuple | None, limit_s: float) -> tuple[Answer, Any]:
-        """Give what it answers; call None: what it says once it is made."""
+        """Return what it answers; call None: what it says once it is made."""
         until_s, told = time.monotonic() + limit_s, None
         try:
             if self._awaits:  # it may still think about what it was asked before
@@ -198,7 +199,7 @@ def serve(fd: int, parent_pid: int, spec: str) -> None:
 
 
 def _plain(said: Any) -> tuple[str, Any]:
-    """Give a decision's number or token, or a list of numbers; of all else that it cannot be read."""
+    """Return a decision's number or token, or a list of numbers; of all else that it cannot be read."""
     if isinstance(said, str):
         return "ok", said[:MOST_WORDS]
     numbers = np.asarray(said)

@@ -89,7 +89,8 @@ def run(
 
 
 def _seed_of(flown: Path, cfg: FlightsConfig) -> int:
-    """Give the seed of a flown folder, by which clothes and weather were drawn; see that the pictures are the same."""
+    """Return the seed of a flown folder, by which clothes and weather were drawn; see that the pictures are the
+    same."""
     begun, fix = read_stage_record(flown), "give the settings that it was flown with"
     if begun.stage != "fly":
         raise InputError("not what `cosfly fly --map --paths` wrote", where=flown, got=f"stage {begun.stage}")
@@ -169,7 +170,7 @@ def make_worker(cfg: FlightsConfig, flown: Path, boxes: Path, simplified: Path, 
 
 
 def _planned_on(plan: DroneTrace, flown: Sequence[PursuitFrame], space: Airspace, cfg: PlanConfig) -> DroneTrace:
-    """Give a plan for the walk that begins with what a student has flown; raises as `plan_on`."""
+    """Return a plan for the walk that begins with what a student has flown; raises as `plan_on`."""
     poses, obstacles = np.array([frame.pose for frame in flown]), space.surroundings.obstacles
     positions_m = plan_on(plan.path_id, plan.targets_m, step_s(plan.time_s), poses[:, :3], obstacles, cfg)
     pitch_rad, yaw_rad = look_at(positions_m, plan.targets_m)
@@ -183,7 +184,7 @@ def _planned_on(plan: DroneTrace, flown: Sequence[PursuitFrame], space: Airspace
 def _reasons(
     pursuit: Pursuit, i: int, action: str | None, verdict_of: Any, motion: Any, label: str | None
 ) -> list[str]:
-    """Say what was wrong at frame i, if anything."""
+    """Return what was wrong at frame i, if anything."""
     soon = pursuit.frames[i : i + round(LOSS_S / pursuit.dt_s) + 1]
     found = ["nearly_lost"] if not all(frame.visible for frame in soon) else []
     conflicts = action is not None and verdict_of(action, motion, label) == "HARD_CONFLICT"

@@ -36,7 +36,7 @@ class Drone:
         return np.array([*[-value for value in high[:4]], self.gimbal_deg[0]]), np.array(high)
 
     def problem_of(self, command: np.ndarray) -> str | None:
-        """Say what of a command cannot be flown, None where all can."""
+        """Return what of a command cannot be flown, None where all can."""
         command = np.asarray(command, dtype=np.float64)
         if command.shape != (len(ACTION),) or not np.isfinite(command).all():
             return f"a command is {len(ACTION)} finite numbers: {', '.join(ACTION)}"

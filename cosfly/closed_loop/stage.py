@@ -258,12 +258,12 @@ def make_worker(
 
 
 def _cut(trace: DroneTrace, cfg: FlyConfig) -> DroneTrace:
-    """Give a plan as far as it is flown."""
+    """Return a plan as far as it is flown."""
     return trace.until(cfg.lead_frames + cfg.most_decisions) if cfg.most_decisions else trace
 
 
 def style_of(plan: DroneTrace, start: int, obstacles: BoxIndex) -> WalkStyle:
-    """Tell how hard a walk is to follow; of its plan only the pose counts at which the student takes over."""
+    """Return how hard a walk is to follow; of its plan only the pose counts at which the student takes over."""
     headings = headings_of(plan.targets_m, plan.time_s)
     turn_rad = np.abs(np.diff(np.unwrap(headings))).sum()
     away = plan.positions_m[start] - plan.targets_m[start]
@@ -275,7 +275,7 @@ def style_of(plan: DroneTrace, start: int, obstacles: BoxIndex) -> WalkStyle:
 
 
 def trace_of(pursuit: Pursuit, obstacles: BoxIndex) -> DroneTrace:
-    """Give what was flown as step 4 gives a plan, for `render` and `inspect`."""
+    """Return what was flown as step 4 gives a plan, for `render` and `inspect`."""
     time_s = np.array([frame.time_s for frame in pursuit.frames])
     poses = np.array([frame.pose for frame in pursuit.frames])
     targets_m = np.array([frame.target_m for frame in pursuit.frames])
@@ -299,7 +299,7 @@ def flown_trace(
     solver: dict,
     pace: str,
 ) -> DroneTrace:
-    """Give a flight of n frames as step 4 gives a plan. poses: (n, 6); targets_m: (n, 3); others (n,)."""
+    """Return a flight of n frames as step 4 gives a plan. poses: (n, 6); targets_m: (n, 3); others (n,)."""
     seen = visibility(obstacles, poses[:, :3], targets_m)
     metrics = flight_metrics(poses[:, :3], targets_m, seen, clearances_m, ground_m, step_s(time_s))
     return DroneTrace(

@@ -37,7 +37,7 @@ AREA_M, AREA_STEP_M = 420.0, 200.0  # lit at once, and how far apart the middles
 
 
 def as_drawn(cfg: RenderConfig, seed: int) -> RenderConfig:
-    """Give the settings of what a student sees, and of its tree: no weather is drawn that is not the seed's."""
+    """Return the settings of what a student sees, and of its tree: no weather is drawn that is not the seed's."""
     return cfg.model_copy(
         update={"tracks": ("clean",), "weather_seed": cfg.weather_seed if cfg.weather_seed >= 0 else seed}
     )
@@ -61,8 +61,8 @@ class Airspace:
 
     @staticmethod
     def area_of(targets_m: np.ndarray) -> tuple[float, float]:
-        """Give the middle of the area that a walk is lit with, of a grid: neighbours share it, and none looks otherwise
-        for those that are flown beside it."""
+        """Return the middle of the area that a walk is lit with, of a grid: neighbours share it, and none looks
+        otherwise for those that are flown beside it."""
         x, y = np.round(targets_m.mean(axis=0)[:2] / AREA_STEP_M) * AREA_STEP_M + 0.0
         return float(x), float(y)
 
@@ -76,7 +76,7 @@ class Airspace:
             self._lit = wanted
 
     def has_left(self, position_m: np.ndarray) -> bool:
-        """Tell whether a drone is far out of the map."""
+        """Return whether a drone is far out of the map."""
         low, high = self.bounds_m
         outside = np.maximum(low - position_m, position_m - high)[:2]
         return bool((outside > LEAVES_M).any())
@@ -189,7 +189,7 @@ class ClosedLoopFlight:
         return moment
 
     def _way(self, command: np.ndarray) -> tuple[np.ndarray, float, float]:
-        """Give the places on the way of one step, (k + 1, 3), and yaw and pitch at its end, degrees."""
+        """Return the places on the way of one step, (k + 1, 3), and yaw and pitch at its end, degrees."""
         place, (pitch_deg, yaw_deg, _) = self.poses.positions_m[self.index], self.poses.rotations_deg[self.index]
         num, drone = max(1, round(self.dt_s * RATE_HZ)), self.drone
         part_s, yaw_rad = self.dt_s / num, np.radians(yaw_deg)

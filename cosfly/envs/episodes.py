@@ -79,7 +79,7 @@ class EpisodeLists(Record):
 
 
 def read_list(name: str) -> tuple[str, tuple[tuple[str, int], ...], str]:
-    """Give environment, episodes and digest of a list, `cosfly/Follow-v0/test`, or of an environment's `test`."""
+    """Return environment, episodes and digest of a list, `cosfly/Follow-v0/test`, or of an environment's `test`."""
     env, _, listed = name.partition("-v0")
     env, listed = f"{env}-v0", listed.strip("/") or "test"
     known = read_model(EPISODES_FILE, EpisodeLists, EPISODES_FORMAT).lists
@@ -149,7 +149,7 @@ class BenchmarkEpisode:
         return episode_id(self.world.town.name, self.number)
 
     def begins_well(self, now: Moment) -> bool:
-        """Tell whether the first frame is as the task has it: the person is in sight, or is to be found again."""
+        """Return whether the first frame is as the task has it: the person is in sight, or is to be found again."""
         return now.target.visible != (self.task == REACQUIRES)
 
     def flight(self, airspace: Airspace) -> ClosedLoopFlight:

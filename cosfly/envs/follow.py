@@ -33,7 +33,7 @@ CRASH_REWARD = -10.0
 
 
 def reward_of(now: Moment, ended: str | None) -> float:
-    """Give what a step is worth: 1 where the frame shows the person from up to FULL_REWARD_M, falling to 0 at
+    """Return what a step is worth: 1 where the frame shows the person from up to FULL_REWARD_M, falling to 0 at
     NO_REWARD_M; 0 where it does not; a crash CRASH_REWARD. No step but a crash costs anything, so an end never pays."""
     if ended == "crashed":
         return CRASH_REWARD
@@ -147,7 +147,7 @@ class FollowEnv(gymnasium.Env):
         }  # fmt: skip
 
     def render(self) -> np.ndarray | None:
-        """Give the present frame, (h, w, 3) uint8."""
+        """Return the present frame, (h, w, 3) uint8."""
         return self._now.frame.rgb.copy() if self.render_mode == "rgb_array" and self._flight else None
 
     def close(self) -> None:

@@ -54,7 +54,7 @@ def run(
 
 
 def make_worker(cfg: ListConfig, out: Path, seed: int, num: int) -> Work:
-    """Give the function that flies some episodes of a town."""
+    """Return the function that flies some episodes of a town."""
     task, _, digest = read_list(cfg.env)
     fleet = Fleet(cfg, out, seed, num, list_sha256=digest)
 

@@ -27,7 +27,7 @@ MAX_CHARACTERS = {"critical_components": 1200, "reasoning_trace": 1600}  # bound
 
 
 def normalize_action(text: str) -> str | None:
-    """Give the token for any spelling (spaces, hyphens, case; quotes, brackets; `Decision:` before it), else None."""
+    """Return the token for any spelling (spaces, hyphens, case; quotes, brackets; `Decision:` before it), else None."""
     if BY_LETTERS.get(text.replace("_", "")) == text:
         return text
     if len(text) > MAX_DECISION_CHARACTERS:
@@ -40,7 +40,7 @@ def normalize_action(text: str) -> str | None:
 def answer_schema(
     decision: str | None = None, language: Language = "en", more: Mapping[str, dict] | None = None
 ) -> dict:
-    """Give the JSON schema of an answer; a given decision is the enum's one value.
+    """Return the JSON schema of an answer; a given decision is the enum's one value.
 
     Args:
         more: further fields and their schemas; they stand after the texts and before the decision.
@@ -140,7 +140,7 @@ def _checked(value: dict[str, Any], language: Language, names: Collection[str], 
 
 
 def _problem_of(text: str, language: Language, min_characters: int) -> str | None:
-    """Say what makes a text none of a caption: it is short, stands for another one, or is in another language."""
+    """Return what makes a text none of a caption: it is short, stands for another one, or is in another language."""
     if len(text) < min_characters:
         return "too_short"
     if (text[0], text[-1]) in (("<", ">"), ("[", "]")) or (
@@ -151,13 +151,13 @@ def _problem_of(text: str, language: Language, min_characters: int) -> str | Non
 
 
 def _is_left_out(text: str, min_characters: int) -> bool:
-    """Tell whether dots stand for the text, or for its beginning or end."""
+    """Return whether dots stand for the text, or for its beginning or end."""
     at_an_end = _LEFT_OUT.match(text) or _LEFT_OUT.search(text, len(text) - 3)
     return at_an_end is not None or len(_LEFT_OUT.sub("", text).strip()) < min_characters
 
 
 def is_in_script(text: str, language: Language) -> bool:
-    """Tell whether a text is written in its language: Chinese has no more Latin words than characters.
+    """Return whether a text is written in its language: Chinese has no more Latin words than characters.
 
     Letters of other scripts are of neither. The names in slots are no words.
     """

@@ -42,12 +42,12 @@ class Backdrop:
         return cls(read_picture(path)[..., ::-1], read_model(path.with_suffix(".json"), WorldFrame, FORMAT))
 
     def frame(self) -> dict[str, float]:
-        """Give west, north, width and height, m."""
+        """Return west, north, width and height, m."""
         height, width = (side * self.world.metres_per_px for side in self.picture.shape[:2])
         return {"west": self.world.west_m, "north": self.world.north_m, "width": width, "height": height}
 
     def covers(self, box_map: BoxMap) -> bool:
-        """Tell whether any of the map lies in the picture."""
+        """Return whether any of the map lies in the picture."""
         (low, high), frame = box_map.bounds(), self.frame()
         is_beside = frame["west"] > high[0] or frame["west"] + frame["width"] < low[0]
         return not (is_beside or frame["north"] < low[1] or frame["north"] - frame["height"] > high[1])

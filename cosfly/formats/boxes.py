@@ -135,16 +135,16 @@ class BoxMap:
         return self.mins.min(axis=0), self.maxs.max(axis=0)
 
     def select(self, index: np.ndarray) -> BoxMap:
-        """Give the boxes at an index or mask, header unchanged."""
+        """Return the boxes at an index or mask, header unchanged."""
         return replace(self, **{name: getattr(self, name)[index] for name in ARRAYS})
 
     def joined(self, other: BoxMap) -> BoxMap:
-        """Give these boxes and then the other's, under this header."""
+        """Return these boxes and then the other's, under this header."""
         both: dict[str, Any] = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in ARRAYS}
         return replace(self, **both)
 
     def is_any_of(self, kinds: Collection[int]) -> np.ndarray:
-        """Tell which boxes are of one of some kinds, (n,) bool."""
+        """Return which boxes are of one of some kinds, (n,) bool."""
         return np.isin(self.kinds, np.array(sorted(kinds), dtype=np.uint8))
 
     def counts(self) -> dict[str, int]:

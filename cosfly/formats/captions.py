@@ -56,7 +56,7 @@ class Coc(Record):
 
 
 def verdict_on(decision: str, label: str | None, contradicted: Collection[str]) -> Verdict:
-    """Give the verdict on a decision from what a caption's record says of its window's future, whoever decided."""
+    """Return the verdict on a decision from what a caption's record says of its window's future, whoever decided."""
     if decision == label:
         return "CONSISTENT"
     if decision in contradicted:
@@ -84,7 +84,7 @@ class Prompt(Record):
     user: str
 
     def told(self, pictures: str, *, measured: bool = True) -> Prompt:
-        """Give the question with the sentence about the pictures at its mark, with or without what was measured; the
+        """Return the question with the sentence about the pictures at its mark, with or without what was measured; the
         goal stays."""
         begin, mark, end = self.user.partition(PICTURES_MARK)
         first, *lines = end.split("\n")
@@ -261,7 +261,7 @@ class Caption(BaseModel):
 
 
 def line_of(caption: Caption) -> bytes:
-    """Give a caption as its line of `captions.jsonl`, end included."""
+    """Return a caption as its line of `captions.jsonl`, end included."""
     # Three quarters of the time of pydantic_core.to_json.
     return Caption.__pydantic_serializer__.to_json(caption) + b"\n"
 
@@ -275,7 +275,7 @@ def write_captions(path: Path, captions: Iterable[Caption]) -> int:
 
 
 def write_caption_lines(path: Path, lines: Iterable[bytes]) -> int:
-    """The same for captions that are lines already (`line_of`)."""
+    """Return the same for captions that are lines already (`line_of`)."""
     count = 0
     with atomic_file(path) as file:
         for line in lines:

@@ -19,12 +19,12 @@ LARGEST = 1e18  # no length or time is larger in any unit, and no square or sum 
 
 
 def is_number(value: Any) -> bool:
-    """Tell whether a JSON value is a number no larger than a length or a time can be; true and false are none."""
+    """Return whether a JSON value is a number no larger than a length or a time can be; true and false are none."""
     return type(value) in (int, float) and abs(value) <= LARGEST
 
 
 def rounded(vector: np.ndarray, digits: int = 6) -> list[float]:
-    """Give a vector, (n,) m, for a file: micrometres are enough for a map, and short numbers keep files small."""
+    """Return a vector, (n,) m, for a file: micrometres are enough for a map, and short numbers keep files small."""
     return [round(float(v), digits) + 0.0 for v in vector]  # + 0.0 turns -0.0 into 0.0
 
 
@@ -48,7 +48,7 @@ def write_items(path: Path, form: FileFormat, name: str, items: list[Any], heade
 
 
 def step_field(items: list[Any]) -> dict[str, float | None]:
-    """Give what a product says of the step of its items' times."""
+    """Return what a product says of the step of its items' times."""
     return {"dt_s": round(step_s(items[0].time_s), 6) if items else None}
 
 
@@ -62,7 +62,7 @@ def text_id(record: dict, where: str) -> str:
 
 
 def numbers(value: Any, *shape: int | None) -> np.ndarray | None:
-    """Give lists of numbers, one in another, as float64 of a shape, in which None is any length; None where they are
+    """Return lists of numbers, one in another, as float64 of a shape, in which None is any length; None where they are
     something else, or a number is not finite or too large."""
     try:
         found = np.array(value, dtype=np.float64)

@@ -41,7 +41,7 @@ class Axis:
         return np.bincount(bins, minlength=self.num_bins).tolist()
 
     def percentile(self, counts: list[int], share: float) -> float | None:
-        """Give the value that a share of the frames stay below, to a part of a bin; None without any."""
+        """Return the value that a share of the frames stay below, to a part of a bin; None without any."""
         total = sum(counts)
         if not total:
             return None
@@ -119,13 +119,13 @@ class Coverage(Record):
         return cls(frames=sum(part.frames for part in parts), bins=bins, **named)
 
     def range_of(self, name: str) -> tuple[float | None, float | None]:
-        """Give the 5th and the 95th percentile of an axis."""
+        """Return the 5th and the 95th percentile of an axis."""
         counts = self.bins.get(name, [])
         return AXES[name].percentile(counts, 0.05), AXES[name].percentile(counts, 0.95)
 
 
 def azimuths_deg(offsets_m: np.ndarray, headings_deg: np.ndarray) -> np.ndarray:
-    """Give where the drone stands as seen from the walker: (n,) degrees from the heading, -180 to 180, left positive.
+    """Return where the drone stands as seen from the walker: (n,) degrees from the heading, -180 to 180, left positive.
 
     Args:
         offsets_m: (n, 3) from person to drone. headings_deg: (n,), whither the person walks.
@@ -137,7 +137,7 @@ def azimuths_deg(offsets_m: np.ndarray, headings_deg: np.ndarray) -> np.ndarray:
 def axis_values(
     offsets_m: np.ndarray, headings_deg: np.ndarray, target_heights_px: np.ndarray, visibility: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Give the value of each axis at each frame, NaN where unknown.
+    """Return the value of each axis at each frame, NaN where unknown.
 
     Args:
         offsets_m: (n, 3) from person to drone. headings_deg: (n,), of the walk. target_heights_px, visibility: (n,).
@@ -162,5 +162,5 @@ def coverage_of(flight: Flight) -> Coverage:
 
 @cache
 def default_coverage() -> Coverage:
-    """Give what the plain run that ships covers (`configs/quickstart.yaml`)."""
+    """Return what the plain run that ships covers (`configs/quickstart.yaml`)."""
     return validated(Coverage, read_json(DEFAULT), DEFAULT)

@@ -26,7 +26,7 @@ def draw_walks(num_walks: int, resamples: int, rng: np.random.Generator) -> np.n
 
 
 def figure_of_draws(value: float, drawn: np.ndarray, count: int, num_walks: int, confidence: float) -> Figure:
-    """Give a figure whose value on each draw is `drawn`, (draws,); NaN: of nothing."""
+    """Return a figure whose value on each draw is `drawn`, (draws,); NaN: of nothing."""
     if count == 0 or np.isnan(value):
         return Figure(value=None, low=None, high=None, count=count)
     low, high = interval_of(drawn, confidence) if num_walks > 1 else (None, None)  # one walk tells nothing of others
@@ -34,7 +34,7 @@ def figure_of_draws(value: float, drawn: np.ndarray, count: int, num_walks: int,
 
 
 def interval_of(drawn: np.ndarray, confidence: float) -> tuple[float | None, float | None]:
-    """Give the percentiles between which `confidence` of what was drawn lies, NaN left out."""
+    """Return the percentiles between which `confidence` of what was drawn lies, NaN left out."""
     drawn = drawn[~np.isnan(drawn)]  # draws in which nothing of the kind occurs
     if not len(drawn):
         return None, None

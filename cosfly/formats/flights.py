@@ -35,7 +35,7 @@ def find_flights(root: Path, choice: FlightChoice = ALL_FLIGHTS) -> list[Path]:
 
 
 def chosen_flights(folders: Sequence[Path], root: Path, choice: FlightChoice) -> list[Path]:
-    """Give the flights of a tree that are chosen."""
+    """Return the flights of a tree that are chosen."""
     chosen = [folder for folder in folders if choice.names(folder.relative_to(root).as_posix())]
     if folders and not chosen:
         what, expected = "no flight of the tree has such a name", folders[0].relative_to(root).as_posix()

@@ -86,7 +86,7 @@ class Camera:
 
 
 def level_name(fov_deg: float) -> str:
-    """Give the paper's name of a level of zoom, "" for one that is not among them."""
+    """Return the paper's name of a level of zoom, "" for one that is not among them."""
     return LEVEL_NAMES.get(round(fov_deg, 3), "")
 
 
@@ -140,23 +140,23 @@ class TreePose(TreeAngles, TreePosition):
 
 
 def tree_position(position_m: np.ndarray) -> TreePosition:
-    """Give a position, (3,) m, in the tree's axes."""
+    """Return a position, (3,) m, in the tree's axes."""
     x, y, z = (mirror_positions(position_m) + 0.0).tolist()  # + 0.0: no minus zero
     return TreePosition(x=x, y=y, z=z)
 
 
 def tree_angles(rotation_deg: np.ndarray) -> TreeAngles:
-    """Give pitch, yaw, roll, (3,) degrees, in the tree's axes."""
+    """Return pitch, yaw, roll, (3,) degrees, in the tree's axes."""
     return TreeAngles(**dict(zip(ANGLES, (mirror_rotations(rotation_deg) + 0.0).tolist(), strict=True)))
 
 
 def tree_yaw(yaw_deg: float) -> float:
-    """Give a yaw, degrees, in the tree's axes."""
+    """Return a yaw, degrees, in the tree's axes."""
     return float(mirror_rotations(np.array([0.0, yaw_deg, 0.0]))[1]) + 0.0
 
 
 def tree_pose(position_m: np.ndarray, rotation_deg: np.ndarray) -> TreePose:
-    """Give a pose, (3,) m and (3,) degrees, in the tree's axes."""
+    """Return a pose, (3,) m and (3,) degrees, in the tree's axes."""
     return TreePose(**dict(tree_position(position_m)), **dict(tree_angles(rotation_deg)))
 
 
@@ -174,7 +174,7 @@ class CameraMeta(Record):
 
 
 def camera_meta(camera: Camera, near_m: float, far_m: float) -> CameraMeta:
-    """Give what a frame says of its camera; clip planes in m."""
+    """Return what a frame says of its camera; clip planes in m."""
     return CameraMeta(
         width=camera.width_px,
         height=camera.height_px,
@@ -280,7 +280,7 @@ class FrameMeta(Record):
     weather: WeatherRecord | None = Field(None, exclude_if=lambda weather: weather is None)  # in the place of `look`
 
     def to_bytes(self) -> bytes:
-        """The content of the file."""
+        """Return the content of the file."""
         record = {**META_FORMAT.header, **self.model_dump()}
         return (dump_json(record, indent=1) + "\n").encode()
 
@@ -294,23 +294,24 @@ def read_meta(frame: Path) -> FrameMeta:
 
 
 def frame_name(index: int) -> str:
-    """Give a frame's folder below its flight's: `frames_playback/frame_00000`."""
+    """Return a frame's folder below its flight's: `frames_playback/frame_00000`."""
     return f"{FRAMES_DIR}/frame_{index:05d}"
 
 
 def public_name(name: str) -> str:
-    """Give the name that a frame's file has in the public layout."""
+    """Return the name that a frame's file has in the public layout."""
     return DEPTH_NPY if name == DEPTH_PNG else name
 
 
 def frame_path(frame: Path, name: str) -> Path:
-    """Give the path of a frame's file by its name in the public layout; of depth the packed one where there is one."""
+    """Return the path of a frame's file by its name in the public layout; of depth the packed one where there is
+    one."""
     packed = frame / DEPTH_PNG
     return packed if name == DEPTH_NPY and packed.exists() else frame / name
 
 
 def files_in(frame: Path) -> frozenset[str]:
-    """Give the names, in the public layout, of the files of a frame folder; none where there is no such folder."""
+    """Return the names, in the public layout, of the files of a frame folder; none where there is no such folder."""
     try:
         return frozenset(public_name(name) for name in os.listdir(frame))
     except OSError:
@@ -318,7 +319,7 @@ def files_in(frame: Path) -> frozenset[str]:
 
 
 def tree_of(frame: Path) -> Path:
-    """Give the playback tree that a frame stands in."""
+    """Return the playback tree that a frame stands in."""
     return tree_of_flight(frame.absolute().parents[1])
 
 
@@ -351,14 +352,14 @@ def read_depth(frame: Path) -> np.ndarray:
 
 
 def far_clipped(depth: np.ndarray) -> np.ndarray:
-    """Give depths, m, of which those beyond SKY_DEPTH_M are the sky's; unchanged where one is not finite."""
+    """Return depths, m, of which those beyond SKY_DEPTH_M are the sky's; unchanged where one is not finite."""
     is_beyond = SKY_DEPTH_M < depth.max(initial=0.0) < np.inf
     return np.minimum(depth, np.float32(SKY_DEPTH_M)) if is_beyond else depth
 
 
 def depth_values(data: bytes | memoryview, where: Path) -> np.ndarray:
-    """Give the numbers of a depth image's bytes, of either form, (h, w) float32 as `read_depth`; of a `.npy` without a
-    copy.
+    """Return the numbers of a depth image's bytes, of either form, (h, w) float32 as `read_depth`; of a `.npy`
+    without a copy.
     """
     if is_packed(data):
         return far_clipped(floats_of(data, where))
@@ -370,17 +371,17 @@ def depth_values(data: bytes | memoryview, where: Path) -> np.ndarray:
 
 
 def rgb_bytes(rgb: np.ndarray) -> bytes:
-    """The content of `rgb.png`, of (h, w, 3) uint8."""
+    """Return the content of `rgb.png`, of (h, w, 3) uint8."""
     return colours_png(rgb)
 
 
 def instance_bytes(kinds: np.ndarray, ids: np.ndarray) -> bytes:
-    """The content of `instance.png` in CARLA's encoding: R the kind, G the low and B the high byte of the id."""
+    """Return the content of `instance.png` in CARLA's encoding: R the kind, G the low and B the high byte of the id."""
     return areas_png(kinds, (ids & 0xFF).astype(np.uint8), (ids >> 8).astype(np.uint8))
 
 
 def is_packed(data: bytes | memoryview) -> bool:
-    """Tell whether a depth image's bytes are those of a `depth_float32.png`."""
+    """Return whether a depth image's bytes are those of a `depth_float32.png`."""
     return data[: len(PNG_SIGNATURE)] == PNG_SIGNATURE
 
 
@@ -390,7 +391,7 @@ def depth_file(depth: np.ndarray, form: DepthFormat) -> tuple[str, bytes]:
 
 
 def depth_bytes(depth: np.ndarray) -> bytes:
-    """The content of `depth.npy`, of (h, w) float32."""
+    """Return the content of `depth.npy`, of (h, w) float32."""
     buffer = io.BytesIO()
     np.lib.format.write_array(buffer, np.ascontiguousarray(depth), version=(1, 0), allow_pickle=False)
     return buffer.getvalue()

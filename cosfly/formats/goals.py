@@ -104,7 +104,7 @@ def meant(says: Iterable[str], looks: Appearance, people: Mapping[int, Appearanc
 
 
 def _off(relation: str, numbers: Collection[int], picture: SeenFrame) -> dict[int, float]:
-    """Tell how far people are from a relation, not above 0 where it holds: m, or shares of the picture's width."""
+    """Return how far people are from a relation, not above 0 where it holds: m, or shares of the picture's width."""
     if relation in LANDMARKS:
         return {n: picture.distance_m(n, relation) - BY_M for n in numbers}
     sign = -1.0 if relation in ("right", "far") else 1.0
@@ -144,7 +144,7 @@ def find_says(
 
 
 def otherwise(looks: Appearance, slot: str) -> Appearance:
-    """Give the same person without what is in a slot, or in another colour."""
+    """Return the same person without what is in a slot, or in another colour."""
     if slot == "figure":
         return replace(looks, figure=next(one for one in FIGURES if one != looks.figure))
     worn, colors = getattr(looks, slot), list(COLORS)

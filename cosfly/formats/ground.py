@@ -41,7 +41,7 @@ class Ground:
         return self.heights_m.size == 1
 
     def height_at(self, points_m: np.ndarray) -> np.ndarray:
-        """Give the height under each of (n, 2 or 3) points, (n,)."""
+        """Return the height under each of (n, 2 or 3) points, (n,)."""
         points = np.asarray(points_m, dtype=np.float64)
         if self.is_flat:
             return np.full(len(points), self.heights_m[0, 0])
@@ -50,7 +50,7 @@ class Ground:
         return np.where(u >= v, low + u * (east - low) + v * (far - east), low + v * (north - low) + u * (far - north))
 
     def slope_at(self, points_m: np.ndarray) -> np.ndarray:
-        """Give rise over run under each of (n, 2 or 3) points, (n,); beyond the grid only along its border."""
+        """Return rise over run under each of (n, 2 or 3) points, (n,); beyond the grid only along its border."""
         points = np.asarray(points_m, dtype=np.float64)
         if self.is_flat:
             return np.zeros(len(points))
@@ -79,7 +79,7 @@ class Ground:
         return x - ix, y - iy, corners
 
     def triangles(self, reach_m: float = 0.0) -> np.ndarray:
-        """Give the triangles, (2 cells, 3, 3) m, counter-clockwise from above.
+        """Return the triangles, (2 cells, 3, 3) m, counter-clockwise from above.
 
         Args:
             reach_m: how far the border's heights go on beyond the grid, in cells of their own; 0 for not at all.
@@ -99,7 +99,7 @@ class Ground:
         return pairs.reshape(-1, 3, 3)
 
     def slabs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Give boxes that fill the ground from below, one to a cell: centers, half_extents (k, 3), world_from_box (k,
+        """Return boxes that fill the ground from below, one to a cell: centers, half_extents (k, 3), world_from_box (k,
         3, 3).
 
         A box follows the plane through its cell's corners; where they lie in none it is lower, by a quarter of the
@@ -149,6 +149,6 @@ class GroundGrid(Record):
 
     @classmethod
     def of(cls, ground: Ground) -> GroundGrid:
-        """The record of a ground, heights to a millimetre."""
+        """Return the record of a ground, heights to a millimetre."""
         rows = np.round(ground.heights_m, 3).tolist()
         return cls(west_m=ground.west_m, south_m=ground.south_m, cell_m=ground.cell_m, heights_m=rows)

@@ -60,7 +60,7 @@ class Report:
         return sum(issue.count for issue in self.issues if issue.severity == severity)
 
     def merged(self) -> list[Issue]:
-        """Give one issue per severity and code, the first occurrence's, with the number of occurrences; sorted."""
+        """Return one issue per severity and code, the first occurrence's, with the number of occurrences; sorted."""
         first: dict[tuple[str, str], Issue] = {}
         for issue in self.issues:
             key = (issue.severity, issue.code)

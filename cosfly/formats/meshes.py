@@ -68,7 +68,7 @@ class Meshes:
     made: dict[str, Mesh] = field(default_factory=dict)
 
     def files(self) -> dict[str, Path]:
-        """The files that boxes name, by name."""
+        """Return the files that boxes name, by name."""
         names = sorted({ref.file for ref in self.refs.values()})
         return {name: self.folder / name for name in names} if self.folder is not None else {}
 
@@ -91,7 +91,7 @@ class Meshes:
         return found
 
     def beside(self, folder: Path) -> Meshes:
-        """The same, all in MESHES_FILE of a folder, which is written unless these stand there already."""
+        """Return the same, all in MESHES_FILE of a folder, which is written unless these stand there already."""
         if not self.refs or (self.folder == folder and not self.made):
             return self
         names: dict[MeshRef, str] = {}

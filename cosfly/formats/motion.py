@@ -80,11 +80,11 @@ class PlannedMotion:
         return np.concatenate([self.actions[..., :4].mean(axis=1), self.actions[:, -1, 4:]], axis=1)
 
     def waypoints(self, i: int) -> np.ndarray:
-        """Give the planned places of the next NUM_WAYPOINTS frames, fewer at the end, (m, 4) as WAYPOINT."""
+        """Return the planned places of the next NUM_WAYPOINTS frames, fewer at the end, (m, 4) as WAYPOINT."""
         return self.poses[i + 1 : i + 1 + NUM_WAYPOINTS, [0, 1, 2, 4]]
 
     def body_waypoints(self, i: int) -> np.ndarray:
-        """Give the same as seen from the frame, (m, 4) as BODY_WAYPOINT."""
+        """Return the same as seen from the frame, (m, 4) as BODY_WAYPOINT."""
         ahead = self.waypoints(i)
         moved = in_axes_of(self.yaw_deg[i], ahead[:, :3] - self.positions_m[i])
         return np.concatenate([moved, np.reshape(wrap_deg(ahead[:, 3:] - self.yaw_deg[i]), (-1, 1))], axis=1)

@@ -71,11 +71,11 @@ class Other:
         return float(apart) - self.build.disc_radius_m - BUILDS["Pedestrians"].disc_radius_m
 
     def at(self, i: int) -> Other:
-        """The same at one time alone."""
+        """Return the same at one time alone."""
         return replace(self, positions_m=self.positions_m[i : i + 1], headings_rad=self.headings_rad[i : i + 1])
 
     def every(self, stride: int) -> Other:
-        """The same at every so many times."""
+        """Return the same at every so many times."""
         return replace(self, positions_m=self.positions_m[::stride], headings_rad=self.headings_rad[::stride])
 
     def as_json(self) -> dict:

@@ -100,7 +100,7 @@ class People:
     others: dict[int, Appearance]
 
     def most_alike(self, numbers: Iterable[int]) -> tuple[int, int] | tuple[None, None]:
-        """Give who of some others looks most like the target, the greatest id of several, and in how many things that
+        """Return who of some others looks most like the target, the greatest id of several, and in how many things that
         one differs; nobody of nobody."""
         differing = [(len(self.target.differences(self.others[number])), -number) for number in numbers]
         if not differing:

@@ -38,7 +38,7 @@ class FlightChoice(Config):
     tracks: tuple[Track, ...] = Field(TRACKS, min_length=1, description="clean, perturbed, or both")
 
     def names(self, folder: str) -> bool:
-        """Tell whether a pattern names a flight by its folder in the tree, or by a folder above it."""
+        """Return whether a pattern names a flight by its folder in the tree, or by a folder above it."""
         parts = folder.split("/")
         heads = ["/".join(parts[:count]) for count in range(1, len(parts) + 1)]
         return not self.match or any(fnmatchcase(head, pattern.strip("/")) for pattern in self.match for head in heads)
@@ -75,7 +75,7 @@ def place_of(folder: Path, run: str = "") -> Place:
 
 
 def tree_of_flight(folder: Path) -> Path:
-    """Give the tree that a flight's folder stands in by its name: no link in it may lead out of that.
+    """Return the tree that a flight's folder stands in by its name: no link in it may lead out of that.
 
     Of a flight that stands elsewhere inside the tree's parent folder, and in the tree by a link, the folder itself: its
     files must be its own.
@@ -91,7 +91,7 @@ def tree_of_flight(folder: Path) -> Path:
 
 
 def flight_ids(places: Collection[Place]) -> dict[Place, str]:
-    """Give each flight an id of its own: `trajectory_1776047127_ORI`.
+    """Return each flight an id of its own: `trajectory_1776047127_ORI`.
 
     Trajectories of one name in several towns get the town in front, and where that does not tell them apart the run and
     the town: all flights of a trajectory the same, for training sets know by it what belongs together.
@@ -121,5 +121,5 @@ def sample_id(flight_id: str, frame_index: int) -> str:
 
 
 def flight_of(sample_id: str) -> str:
-    """Give the flight id of a sample id."""
+    """Return the flight id of a sample id."""
     return sample_id.rpartition("_frame_")[0]

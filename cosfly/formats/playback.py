@@ -141,7 +141,7 @@ class Flight:
         return self.given_id or f"{self.trajectory}_{self.variant}"
 
     def camera_at(self, index: int) -> Camera:
-        """The camera that frame `index` was drawn with."""
+        """Return the camera that frame `index` was drawn with."""
         return self.camera if self.intrinsics is None else replace(self.camera, intrinsic=self.intrinsics[index])
 
     @property
@@ -210,7 +210,7 @@ class Flight:
             return None
 
     def told_legibility(self, index: int) -> dict[str, float | bool | None]:
-        """Give what a point tells of LEGIBILITY; None where it says nothing."""
+        """Return what a point tells of LEGIBILITY; None where it says nothing."""
         points = self.raw.get("points", [])
         told = object_of(points[index], "target") if index < len(points) else {}
         return {name: one if isinstance(one := told.get(name), bool) or is_number(one) else None for name in LEGIBILITY}
@@ -229,7 +229,7 @@ class Flight:
         return self.raw.get("dataset_format") == DATASET_FORMAT
 
     def target_picture(self, index: int) -> dict[str, str | bytes] | None:
-        """Give the picture of the target and its name, at the frame of the goal alone and where there is one."""
+        """Return the picture of the target and its name, at the frame of the goal alone and where there is one."""
         if self.goal is None or self.goal.frame != index or self.folder is None:
             return None
         if not (path := self.folder / TARGET_FILE).is_file():
@@ -242,7 +242,8 @@ class Flight:
         return self.folder / frame_name(index)
 
     def events(self, index: int) -> dict[str, str] | None:
-        """Give what became of a point's EVENTS (none, applied, why it fell back); None where the file does not say."""
+        """Return what became of a point's EVENTS (none, applied, why it fell back); None where the file does not
+        say."""
         points = self.raw.get("points", [])
         told = object_of(points[index], "perturbation") if index < len(points) else {}
         return {event: told[event] for event in EVENTS} if all(isinstance(told.get(e), str) for e in EVENTS) else None
@@ -265,7 +266,7 @@ class Flight:
 
 
 def _was_moved(offsets: tuple[np.ndarray, ...], told: object) -> bool | None:
-    """Tell whether any offset is not zero; where they are not known, what the file says of the first; None where it
+    """Return whether any offset is not zero; where they are not known, what the file says of the first; None where it
     says nothing."""
     if any((offset != 0).any() and not np.isnan(offset).any() for offset in offsets):
         return True
@@ -420,7 +421,7 @@ def _mirrored_poses(poses: np.ndarray | None) -> np.ndarray | None:
 
 
 def _tree_action(action: np.ndarray) -> dict[str, float] | None:
-    """Give an action in the tree's axes: to the right, and clockwise."""
+    """Return an action in the tree's axes: to the right, and clockwise."""
     if np.isnan(action).any():
         return None
     return dict(zip(TREE_ACTION, (action * [1.0, -1.0, 1.0, -1.0, 1.0] + 0.0).tolist(), strict=True))
@@ -435,7 +436,7 @@ def _focal(camera: Camera) -> dict:
 
 
 def _target(group: dict, flight: Flight, i: int) -> dict:
-    """Give the target of point i without its vectors; what else the file says of it stays."""
+    """Return the target of point i without its vectors; what else the file says of it stays."""
     target = {"enabled": True} | group
     target["visible"] = bool(flight.target_visible[i])
     target["in_view"] = bool(flight.target_in_view[i])

@@ -164,7 +164,7 @@ def _chunks(data: bytes | memoryview, where: object) -> tuple[int, int, int, byt
 
 @njit(cache=True, nogil=True)
 def _nearest(left, up, corner):  # type: ignore[no-untyped-def]
-    """Give Paeth's guess of a byte."""
+    """Return Paeth's guess of a byte."""
     a, b, c = abs(up - corner), abs(left - corner), abs(left + up - 2 * corner)
     return left if a <= b and a <= c else up if b <= c else corner
 

@@ -93,7 +93,7 @@ def summary(inspected: Path) -> str:
 
 
 def how_to_decide(folder: Path) -> str:
-    """Say how a person decides the flights that an inspection, in `folder`, left in review."""
+    """Return how a person decides the flights that an inspection, in `folder`, left in review."""
     return (
         f"look at {folder}/report.html, then cosfly inspect review --inspect {folder} --accept FLIGHT (or --reject) "
         f"--by NAME --reason TEXT"
@@ -128,7 +128,7 @@ def add_decisions(inspected: Path, choices: Iterable[Choice], by: str) -> list[D
 
 
 def _chosen(choice: Choice, flights: list[FlightInspection], inspected: Path) -> list[FlightInspection]:
-    """Give the flights that a choice means; those of a trajectory that need nobody stay as they are."""
+    """Return the flights that a choice means; those of a trajectory that need nobody stay as they are."""
     name = choice.folder.strip("/")
     named = [flight for flight in flights if flight.folder == name]
     below = [flight for flight in flights if flight.folder.rpartition("/")[0] == name]

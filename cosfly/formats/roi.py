@@ -76,7 +76,7 @@ def read_roi(path: Path, most_vertices: int = MOST_VERTICES) -> Roi:
 
 
 def parse_roi(data: bytes, path: Path, most_vertices: int = MOST_VERTICES) -> Roi:
-    """Give the region of interest of a file's bytes."""
+    """Return the region of interest of a file's bytes."""
     value = parse_document(data, path, what=WHAT)
     if is_geojson(value):
         value = {"polygons": _polygons_of(features_of(value, path), path)}
@@ -107,7 +107,7 @@ def parse_roi(data: bytes, path: Path, most_vertices: int = MOST_VERTICES) -> Ro
 
 
 def _polygons_of(features: list[Feature], path: Path) -> list[dict[str, Any]]:
-    """Give polygons of GeoJSON, whose rings repeat their first point, in the form of this file; tells all that is
+    """Return polygons of GeoJSON, whose rings repeat their first point, in the form of this file; tells all that is
     wrong."""
     problems, polygons = [], []
     for feature in features:

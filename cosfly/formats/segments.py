@@ -42,7 +42,7 @@ class Mission:
     home_m: tuple[float, float, float]
 
     def order_at(self, frame: int) -> str | None:
-        """Give the decision that stands as an order at a frame, None before the first."""
+        """Return the decision that stands as an order at a frame, None before the first."""
         return None if frame < self.at_frame else "break_off" if frame < self.home_frame else "return_to_home"
 
     def as_json(self) -> dict:
@@ -51,7 +51,7 @@ class Mission:
 
 
 def flown_as_json(segments: tuple[Segment, ...], mission: Mission | None) -> dict:
-    """Give the keys that a record has of them: none for a flight that follows from end to end."""
+    """Return the keys that a record has of them: none for a flight that follows from end to end."""
     record: dict = {"segments": [asdict(part) for part in segments]} if segments else {}
     return record | ({"mission": mission.as_json()} if mission is not None else {})
 

@@ -41,12 +41,12 @@ def shift_draws(
 
 
 def rng_of_shifts(seed: int, path_id: str) -> np.random.Generator:
-    """Give the generator of the perturbed flight of a walk."""
+    """Return the generator of the perturbed flight of a walk."""
     return rng_for(seed, "render", f"{path_id}/{PERTURBED}")
 
 
 def _offset(rng: np.random.Generator, radius_m: float, num_axes: int, is_cubic: bool) -> np.ndarray:
-    """An offset evenly distributed in a cube or a ball, (3,); z is 0 for two axes."""
+    """Return an offset evenly distributed in a cube or a ball, (3,); z is 0 for two axes."""
     in_cube = radius_m * rng.uniform(-1.0, 1.0, num_axes)
     direction, share = rng.normal(size=num_axes), rng.random()
     in_ball = radius_m * direction / np.linalg.norm(direction) * share ** (1.0 / num_axes)

@@ -44,7 +44,7 @@ class Course:
     target_m: np.ndarray
 
     def at_seconds(self) -> Course:
-        """Give the course at the full seconds that it knows, at most MOST_GAP_S between points apart."""
+        """Return the course at the full seconds that it knows, at most MOST_GAP_S between points apart."""
         known = ~np.isnan(self.target_m[:, :2]).any(axis=1)
         time_s, places_m = self.time_s[known], self.target_m[known]
         begun = np.floor(time_s + ON_TIME_S)
@@ -69,7 +69,7 @@ class Course:
 
 
 def town_family(town: str) -> str:
-    """Give the name that a town has in all of its builds: `Town03` and `Town03_Opt` are one map."""
+    """Return the name that a town has in all of its builds: `Town03` and `Town03_Opt` are one map."""
     while town.endswith(OTHER_BUILD):
         town = town.removesuffix(OTHER_BUILD)
     return town
@@ -79,7 +79,7 @@ def town_family(town: str) -> str:
 
 
 def walks_of(courses: Iterable[Course]) -> dict[str, str]:
-    """Tell which courses are of one walk: name -> walk.
+    """Return which courses are of one walk: name -> walk.
 
     Those are that are of one family of towns and within NEAR_M of each other on the map, in NEAR_SHARE of the full
     seconds that both know and FEW_S at least, or in all of them; and all that are so joined one by one. A walk is

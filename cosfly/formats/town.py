@@ -51,7 +51,7 @@ class InstanceIds(Record):
     boxes: list[tuple[int, int]]
 
     def of_boxes(self, box_map: BoxMap) -> np.ndarray:
-        """Give the ids of a map's boxes, (n,); `shared` for a box that is not listed."""
+        """Return the ids of a map's boxes, (n,); `shared` for a box that is not listed."""
         own = {box_id: instance_id for instance_id, box_id in self.boxes}
         return np.array([own.get(int(box_id), self.shared) for box_id in box_map.ids.tolist()])
 

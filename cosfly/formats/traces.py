@@ -75,16 +75,16 @@ class DroneTrace:
     part_of: Excerpt | None = None
 
     def drawn_as(self, number: int) -> Excerpt:
-        """Give what decides how it looks, of the flight of that number."""
+        """Return what decides how it looks, of the flight of that number."""
         return self.part_of or Excerpt(self.path_id, number, self.targets_m[:1])
 
     def until(self, end: int) -> DroneTrace:
-        """Give the flight up to that point, which is left out, without its parts and its order."""
+        """Return the flight up to that point, which is left out, without its parts and its order."""
         cut = {name: getattr(self, name)[:end] for name in (*ARRAYS, "clearances_m")}
         return replace(self, **cut, segments=(), mission=None)
 
     def every(self, stride: int) -> DroneTrace:
-        """Give the flight at every so many of its points; clearances are the least until the next of them."""
+        """Return the flight at every so many of its points; clearances are the least until the next of them."""
         if stride == 1:
             return self
         points, order = np.arange(0, len(self.time_s), stride), self.mission
@@ -100,8 +100,8 @@ class DroneTrace:
         )
 
     def between(self, stride: int) -> np.ndarray | None:
-        """Give the poses that `every` leaves out, (n, stride - 1, 6) after each that it takes, NaN after the last; None
-        where it takes all."""
+        """Return the poses that `every` leaves out, (n, stride - 1, 6) after each that it takes, NaN after the last;
+        None where it takes all."""
         if stride == 1:
             return None
         points = np.arange(0, len(self.time_s), stride)

@@ -158,7 +158,7 @@ class FieldReader:
 
 
 def object_of(group: dict, key: str) -> dict:
-    """Give the object under a key; an empty one where there is none, or something else."""
+    """Return the object under a key; an empty one where there is none, or something else."""
     value = group.get(key)
     return value if isinstance(value, dict) else {}
 

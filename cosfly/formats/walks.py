@@ -64,7 +64,7 @@ class Walk:
 
 
 def walk_id(number: int) -> str:
-    """Give the id of the walk that is made as that one of a map, counted from 0."""
+    """Return the id of the walk that is made as that one of a map, counted from 0."""
     return f"path_{number:05d}"
 
 
@@ -74,7 +74,7 @@ def paces_of(num_walks: int, shares: Mapping[str, float], seed: int) -> list[str
 
 
 def pace_field(pace: str) -> dict[str, str]:
-    """Give what stands of a pace in the record of a walk or a flight."""
+    """Return what stands of a pace in the record of a walk or a flight."""
     return {} if pace == PLAIN_PACE else {"pace": pace}
 
 

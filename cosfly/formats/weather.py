@@ -87,7 +87,7 @@ TIMES = {
 
 
 def preset_token(text: str) -> str:
-    """Give the name of a preset as the tables here spell it: `Heavy rain` is `heavy_rain`."""
+    """Return the name of a preset as the tables here spell it: `Heavy rain` is `heavy_rain`."""
     return text.strip().lower().replace(" ", "_").replace("-", "_")
 
 
@@ -97,7 +97,7 @@ def resolved(weather: WeatherPreset, time: TimePreset) -> WeatherParams:
 
 
 def sky_kind(knobs: WeatherParams) -> str:
-    """Give the kind of a sky, one of SkyKind, by its knobs: presets of one's own have one too."""
+    """Return the kind of a sky, one of SkyKind, by its knobs: presets of one's own have one too."""
     sun_deg = knobs.sun_altitude_angle
     light = "night" if sun_deg <= SUN_IS_DOWN_DEG else "dusk" if sun_deg < DAY_FROM_DEG else "day"
     return f"{light}_{'rain' if knobs.precipitation else 'fog' if knobs.fog_density else 'dry'}"

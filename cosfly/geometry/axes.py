@@ -21,12 +21,12 @@ CORNER_SIGNS = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).r
 
 
 def rotation_matrix(pitch_rad: float, yaw_rad: float, roll_rad: float) -> np.ndarray:
-    """Give world_from_body, (3, 3) float64."""
+    """Return world_from_body, (3, 3) float64."""
     return rotation_matrices(np.array([[pitch_rad, yaw_rad, roll_rad]]))[0]
 
 
 def rotation_matrices(rotations_rad: np.ndarray) -> np.ndarray:
-    """Give world_from_body for many rotations.
+    """Return world_from_body for many rotations.
 
     Args:
         rotations_rad: (n, 3) pitch, yaw, roll.
@@ -60,7 +60,7 @@ def axis_aligned_half_extents(half_extents: np.ndarray, rotations_deg: np.ndarra
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give (pitch_rad, yaw_rad) that point the body's x axis from eye to target; works on (..., 3) arrays."""
+    """Return (pitch_rad, yaw_rad) that point the body's x axis from eye to target; works on (..., 3) arrays."""
     d = np.asarray(target, dtype=np.float64) - np.asarray(eye, dtype=np.float64)
     return np.arctan2(d[..., 2], np.hypot(d[..., 0], d[..., 1])), np.arctan2(d[..., 1], d[..., 0])
 
@@ -71,13 +71,13 @@ def focal_px(width_px: int, fov_deg: float) -> float:
 
 
 def intrinsic_matrix(width_px: int, height_px: int, fov_deg: float) -> np.ndarray:
-    """Give K, (3, 3), square pixels, principal point in the middle (app:zoom)."""
+    """Return K, (3, 3), square pixels, principal point in the middle (app:zoom)."""
     f = focal_px(width_px, fov_deg)
     return np.array([[f, 0.0, width_px / 2.0], [0.0, f, height_px / 2.0], [0.0, 0.0, 1.0]])
 
 
 def world_from_camera(position_m: np.ndarray, rotation_deg: np.ndarray) -> np.ndarray:
-    """Give the (4, 4) transform of a camera at a body pose.
+    """Return the (4, 4) transform of a camera at a body pose.
 
     Args:
         position_m: (3,); rotation_deg: (3,) pitch, yaw, roll.
@@ -107,12 +107,12 @@ def project(points_m: np.ndarray, camera_pose: np.ndarray, intrinsic: np.ndarray
 
 
 def box_corners(center: np.ndarray, half_extents: np.ndarray, yaw_rad: float = 0.0) -> np.ndarray:
-    """Give the eight corners of a box that is turned about z, (8, 3)."""
+    """Return the eight corners of a box that is turned about z, (8, 3)."""
     return CORNER_SIGNS * half_extents @ rotation_matrix(0.0, yaw_rad, 0.0).T + center
 
 
 def mask_box(mask: np.ndarray) -> np.ndarray:
-    """Give the box round a mask (h, w) bool: (4,) xmin, ymin, xmax, ymax px, at pixel borders; NaN without pixels."""
+    """Return the box round a mask (h, w) bool: (4,) xmin, ymin, xmax, ymax px, at pixel borders; NaN without pixels."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return np.full(4, np.nan)
@@ -146,12 +146,12 @@ def mirror_rotations(rotations_deg: np.ndarray) -> np.ndarray:
 
 
 def step_s(time_s: np.ndarray) -> float:
-    """Give the time step of even time stamps, (n,) s; DT_S where there is one."""
+    """Return the time step of even time stamps, (n,) s; DT_S where there is one."""
     return float(np.median(np.diff(time_s))) if len(time_s) > 1 else DT_S
 
 
 def headings_of(positions_m: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-    """Which way somebody goes at each time, (n,) rad counter-clockwise from +x.
+    """Return which way somebody goes at each time, (n,) rad counter-clockwise from +x.
 
     Args:
         positions_m: (n, 2 or more), n >= 2; time_s: (n,), increasing.

@@ -25,7 +25,8 @@ Rule = int | tuple[int, float, "Rule", "Rule"]
 
 
 def past_of(flight: Flight, window: Sequence[int], is_ordered: bool) -> np.ndarray:
-    """Give what the last LOOKS_BACK frames of a window tell, (d,), wherever and whenever they were: no place, no time.
+    """Return what the last LOOKS_BACK frames of a window tell, (d,), wherever and whenever they were: no place, no
+    time.
 
     Exact, and without perturbation where that is known; 0 where something is not. In the level axes of the drone at the
     last frame: velocities and speeds of drone and walker, yaw and pitch, where the walker is and how far; from where it
@@ -50,7 +51,7 @@ def past_of(flight: Flight, window: Sequence[int], is_ordered: bool) -> np.ndarr
 
 
 def is_drawn_ahead(flight: Flight, now: int, last: int, is_ordered: bool) -> bool | None:
-    """Tell whether DRAWN_AHEAD holds after frame `now`, within the frames up to `last` of which a label is made.
+    """Return whether DRAWN_AHEAD holds after frame `now`, within the frames up to `last` of which a label is made.
 
     What is drawn within a part (when a drone that hops does) is on no record and not counted. Where an order stands
     nothing is drawn; None where the walker's way is not known.
@@ -131,7 +132,7 @@ def fit_rule(table: np.ndarray, labels: np.ndarray, depth: int = 2) -> Rule:
 
 
 def decide(rule: Rule, row: np.ndarray) -> int:
-    """Give the number of the decision that a rule makes of a row of numbers."""
+    """Return the number of the decision that a rule makes of a row of numbers."""
     while isinstance(rule, tuple):
         column, threshold, low, high = rule
         rule = low if row[column] <= threshold else high

@@ -42,7 +42,7 @@ def jerk_rms(positions_m: np.ndarray, dt_s: float = DT_S) -> float:
 
 
 def smoothness_score(accel_rms_mps2: float, jerk_rms_mps3: float) -> float:
-    """Give S in (0, 1], 1 for uniform motion (eq:smoothness_score)."""
+    """Return S in (0, 1], 1 for uniform motion (eq:smoothness_score)."""
     return float(np.exp(-0.5 * (accel_rms_mps2 / ACCEL_SCALE_MPS2 + jerk_rms_mps3 / JERK_SCALE_MPS3)))
 
 

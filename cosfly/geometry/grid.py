@@ -54,12 +54,12 @@ class OccupancyGrid:
         return self.occupied.shape[1], self.occupied.shape[0]
 
     def cells_at(self, points_m: np.ndarray) -> np.ndarray:
-        """Give (..., 2) int64 x and y indices of (..., 2) world points, which may lie outside."""
+        """Return (..., 2) int64 x and y indices of (..., 2) world points, which may lie outside."""
         origin = np.array([self.x_min_m, self.y_min_m])
         return np.floor((np.asarray(points_m, dtype=np.float64)[..., :2] - origin) / self.resolution_m).astype(np.int64)
 
     def centers_of(self, cells: np.ndarray) -> np.ndarray:
-        """Give (..., 2) world points in the middle of (..., 2) cells (x index, y index)."""
+        """Return (..., 2) world points in the middle of (..., 2) cells (x index, y index)."""
         origin = np.array([self.x_min_m, self.y_min_m])
         return (np.asarray(cells, dtype=np.float64) + 0.5) * self.resolution_m + origin
 
@@ -68,7 +68,7 @@ class OccupancyGrid:
 
 
 def empty_grid(box_map: BoxMap, resolution_m: float = RESOLUTION_M) -> OccupancyGrid:
-    """Give a free grid over the bounds of all boxes, whatever their kind."""
+    """Return a free grid over the bounds of all boxes, whatever their kind."""
     if len(box_map) == 0:
         raise ValueError("a grid needs at least one box")
     if not resolution_m > 0:
@@ -83,7 +83,7 @@ def empty_grid(box_map: BoxMap, resolution_m: float = RESOLUTION_M) -> Occupancy
 
 
 def blocks_walking(box_map: BoxMap, *, height_m: float = HUMAN_HEIGHT_M) -> np.ndarray:
-    """Tell which boxes stand in a person's way, (n,) bool.
+    """Return which boxes stand in a person's way, (n,) bool.
 
     A box does if it reaches into the interval from the ground to `height_m` above it; touching an end of the interval
     does not count. Where the ground slopes, the interval is that of all the ground under the box. Surfaces
@@ -125,7 +125,7 @@ def occupancy(
 
 
 def lies_off_ground(box_map: BoxMap, kinds: Collection[int]) -> np.ndarray:
-    """Tell which boxes of some kinds have their top more than SURFACE_REACH_M off the ground below, (n,) bool."""
+    """Return which boxes of some kinds have their top more than SURFACE_REACH_M off the ground below, (n,) bool."""
     over_m = box_map.maxs[:, 2] - box_map.ground.height_at(box_map.centers)
     return box_map.is_any_of(kinds) & (np.abs(over_m) > SURFACE_REACH_M)
 
@@ -284,7 +284,7 @@ def inflate(grid: OccupancyGrid, radius_m: float) -> OccupancyGrid:
 
 
 def roi_mask(grid: OccupancyGrid, roi: Roi) -> np.ndarray:
-    """Tell which cells have their centre in a region of interest, (ny, nx) bool."""
+    """Return which cells have their centre in a region of interest, (ny, nx) bool."""
     region, (num_x, num_y) = roi.region(), grid.size
     shapely.prepare(region)
     x = grid.centers_of(np.stack([np.arange(num_x), np.zeros(num_x)], axis=1))[:, 0]

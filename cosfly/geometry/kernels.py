@@ -98,7 +98,7 @@ def obstacle_index(box_map: BoxMap) -> BoxIndex:
 
 @njit(cache=True)
 def _fill_cells(first, last, shape):
-    """Give starts and members: a counting sort of boxes by cell, boxes in order within each cell."""
+    """Return starts and members: a counting sort of boxes by cell, boxes in order within each cell."""
     starts = np.zeros(shape[0] * shape[1] + 1, dtype=np.int64)
     for box in range(len(first)):
         for ix in range(first[box, 0], last[box, 0] + 1):
@@ -125,7 +125,7 @@ def _fill_cells(first, last, shape):
 
 @njit(cache=True, inline="always")
 def in_box_frame(rows, box, x, y, z):
-    """Give the coordinates of a world point in a box's frame."""
+    """Return the coordinates of a world point in a box's frame."""
     return turned(rows, box, x - rows[box, CENTER_X], y - rows[box, CENTER_Y], z - rows[box, CENTER_Z])
 
 
@@ -197,7 +197,7 @@ def clip(origin, direction, half, enter, leave):
 
 @njit(cache=True, inline="always")
 def touches(rows, box, a, b, c, u, v, w, inflate_m):
-    """Tell whether a segment in a box's frame touches the box grown by `inflate_m` (slabs, Kay and Kajiya 1986)."""
+    """Return whether a segment in a box's frame touches the box grown by `inflate_m` (slabs, Kay and Kajiya 1986)."""
     enter, leave = clip(a, u - a, rows[box, HALF_X] + inflate_m, 0.0, 1.0)
     enter, leave = clip(b, v - b, rows[box, HALF_Y] + inflate_m, enter, leave)
     enter, leave = clip(c, w - c, rows[box, HALF_Z] + inflate_m, enter, leave)
@@ -206,7 +206,7 @@ def touches(rows, box, a, b, c, u, v, w, inflate_m):
 
 @njit(cache=True)
 def segment_hits_box(rows, box, ax, ay, az, bx, by, bz, inflate_m):
-    """Tell whether a segment touches a box grown by `inflate_m` on every side."""
+    """Return whether a segment touches a box grown by `inflate_m` on every side."""
     if min(ax, bx) > rows[box, HIGH_X] + inflate_m or max(ax, bx) < rows[box, LOW_X] - inflate_m:
         return False
     if min(ay, by) > rows[box, HIGH_Y] + inflate_m or max(ay, by) < rows[box, LOW_Y] - inflate_m:
@@ -220,7 +220,7 @@ def segment_hits_box(rows, box, ax, ay, az, bx, by, bz, inflate_m):
 
 @njit(cache=True)
 def segment_to_box(rows, box, ax, ay, az, bx, by, bz):
-    """Give the least distance of a segment to a box, m, 0 where it touches, and the share of its way where that is.
+    """Return the least distance of a segment to a box, m, 0 where it touches, and the share of its way where that is.
 
     Along a line the squared distance is convex, and a parabola between the places where it crosses the planes of the
     six faces: its slope is straight there, and zero where the distance is least.
@@ -261,7 +261,7 @@ def segment_to_box(rows, box, ax, ay, az, bx, by, bz):
 
 @njit(cache=True)
 def nearest_box(index, x, y, z, reach_m):
-    """Give (signed distance, box) of the nearest box, or (reach_m, -1) if none is nearer than `reach_m`.
+    """Return (signed distance, box) of the nearest box, or (reach_m, -1) if none is nearer than `reach_m`.
 
     Rings of cells are searched outwards until no unseen box can be nearer.
     """
@@ -337,7 +337,7 @@ def collect_hits(index, ax, ay, az, bx, by, bz, inflate_m, out):
 
 @njit(cache=True)
 def free_rays(index, boxes, num_boxes, x, y, z, target):
-    """Give the fraction of the five rays from a point to a target that none of `boxes[:num_boxes]` touches."""
+    """Return the fraction of the five rays from a point to a target that none of `boxes[:num_boxes]` touches."""
     free = 0
     for ray in range(5):
         tx, ty = target[0] + RAY_OFFSETS_M[ray, 0], target[1] + RAY_OFFSETS_M[ray, 1]
@@ -374,7 +374,7 @@ def _signed_distances(index, points, reach_m):
 
 
 def normals(index: BoxIndex, points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Give the unit vectors away from boxes (k,) at points (k, 3), (k, 3), as `normal_of_box` does."""
+    """Return the unit vectors away from boxes (k,) at points (k, 3), (k, 3), as `normal_of_box` does."""
     return _normals(index, _points(points, "points"), np.ascontiguousarray(boxes, dtype=np.int64))
 
 
@@ -388,7 +388,7 @@ def _normals(index, points, boxes):
 
 
 def segments_hit(index: BoxIndex, starts: np.ndarray, ends: np.ndarray, inflate_m: float = 0.0) -> np.ndarray:
-    """Tell which segments touch any box grown by `inflate_m` on every side.
+    """Return which segments touch any box grown by `inflate_m` on every side.
 
     Args:
         starts, ends: (n, 3) m.

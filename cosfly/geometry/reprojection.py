@@ -111,14 +111,14 @@ def _error_of(errors: np.ndarray) -> float:
 
 
 def median_of(values: np.ndarray) -> float:
-    """Give what `np.median` does of numbers, in a quarter of its time for few."""
+    """Return what `np.median` does of numbers, in a quarter of its time for few."""
     middle = len(values) // 2
     found = np.partition(values, (middle - 1, middle))
     return float(found[middle] if len(values) % 2 else (found[middle - 1] + found[middle]) / 2.0)
 
 
 def _most_of_one(firm: np.ndarray, odd: np.ndarray) -> int:
-    """Give the points of the thing most of whose points are odd. firm, odd: ids at points well inside one thing."""
+    """Return the points of the thing most of whose points are odd. firm, odd: ids at points well inside one thing."""
     if len(odd) < LEAST_SHIFTED:
         return 0
     counts = np.bincount(odd, minlength=SHARED_ID + 1)

@@ -61,7 +61,7 @@ def check_files(flight: Flight, report: Report) -> dict[int, FrameMeta | None]:
 
 
 def _lists(flight: Flight, names: Collection[str]) -> bool:
-    """Tell whether the checksums of a flight list a file of these names; where they cannot be read, they may."""
+    """Return whether the checksums of a flight list a file of these names; where they cannot be read, they may."""
     assert flight.folder is not None
     if not (flight.folder / CHECKSUMS).is_file():
         return False

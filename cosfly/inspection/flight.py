@@ -118,7 +118,8 @@ def inspect_flight(
 
 
 def _digest(folder: Path) -> str | None:
-    """Give the digest of a flight's files; None where its checksums cannot be read, which `check_checksums` reports."""
+    """Return the digest of a flight's files; None where its checksums cannot be read, which `check_checksums`
+    reports."""
     try:
         return digest_of(folder_digests(folder))
     except InputError:
@@ -126,7 +127,7 @@ def _digest(folder: Path) -> str | None:
 
 
 def trace_id(flight: Flight) -> str:
-    """Give the id of the plan that a flight says it was rendered from."""
+    """Return the id of the plan that a flight says it was rendered from."""
     return str(flight.source.get("scenario_id", ""))
 
 
@@ -214,7 +215,7 @@ def check_shifts(flight: Flight, report: Report, metrics: dict[str, float | int 
 
 
 def is_shifted(flight: Flight) -> np.ndarray:
-    """Tell where drone or person were moved from their plan, (n,) bool; an offset that no file tells counts."""
+    """Return where drone or person were moved from their plan, (n,) bool; an offset that no file tells counts."""
     return (flight.drone_offsets_m != 0).any(axis=1) | (flight.target_offsets_m != 0).any(axis=1)
 
 

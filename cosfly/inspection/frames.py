@@ -90,7 +90,8 @@ class Jumps:
         return len(self._found)
 
     def _is_one_world(self) -> bool:
-        """Tell whether most pairs of frames agree: rough depth agrees with nothing, and is equally rough everywhere."""
+        """Return whether most pairs of frames agree: rough depth agrees with nothing, and is equally rough
+        everywhere."""
         pairs = [pair for pair in self._found if pair.seen >= LEAST_SEEN]
         agree = [pair.agree / pair.seen for pair in pairs]
         errors = [pair.error for pair in pairs if np.isfinite(pair.error)]
@@ -103,7 +104,7 @@ class Jumps:
 
 
 def others_told(flight: Flight, metas: Mapping[int, FrameMeta | None]) -> dict[int, OthersMeta]:
-    """Give what the annotations of frames tell of others, by frame; empty for foreign flights."""
+    """Return what the annotations of frames tell of others, by frame; empty for foreign flights."""
     if not flight.is_ours:
         return {}
     return {i: meta.others for i, meta in metas.items() if meta is not None and meta.others is not None}
@@ -143,7 +144,7 @@ def check_others(
 
 
 def _other(line: OtherMeta) -> Other | None:
-    """The other of an annotation in right-handed axes; None of an unknown kind."""
+    """Return the other of an annotation in right-handed axes; None of an unknown kind."""
     kind = KIND_NAMES.get(line.semantic_id, "")
     if kind not in BUILDS:
         return None
@@ -169,7 +170,7 @@ class FrameNumbers:
 
 
 def choose_frames(indices: list[int], setting: str, num_sample: int) -> list[int]:
-    """Give the frames whose pixels are looked at: all, none, or `num_sample` evenly spread with both ends."""
+    """Return the frames whose pixels are looked at: all, none, or `num_sample` evenly spread with both ends."""
     if setting == "none" or not indices:
         return []
     if setting == "all" or num_sample >= len(indices):
@@ -241,7 +242,7 @@ def _ids_of(told: OthersMeta | None) -> np.ndarray:
 
 
 def _check_surfaces(look: PixelFigures, where: str, cfg: InspectConfig, report: Report) -> None:
-    """Say where a texture may be missing, and where surfaces fight for pixels."""
+    """Return where a texture may be missing, and where surfaces fight for pixels."""
     if look.flat > FLAT_SURFACE_MAX:
         got = (
             f"{look.flat:.1%} of the picture is a surface of one colour "
@@ -256,7 +257,7 @@ def _check_surfaces(look: PixelFigures, where: str, cfg: InspectConfig, report: 
 
 
 def _moved(flight: Flight, i: int, k: int) -> bool:
-    """Tell whether the camera changed so much between two frames that equal pictures are an error."""
+    """Return whether the camera changed so much between two frames that equal pictures are an error."""
     shift_m = np.linalg.norm(flight.positions_m[k] - flight.positions_m[i])
     turn_deg = np.abs(flight.rotations_deg[k] - flight.rotations_deg[i]).max()
     return bool(shift_m > 0.5 or turn_deg > 2.0)
@@ -327,7 +328,7 @@ def _check_mask(
 
 
 def pixels_iou(box: np.ndarray, found: np.ndarray) -> float:
-    """Give the IoU of a box and that of the pixels in it, (4,) px each.
+    """Return the IoU of a box and that of the pixels in it, (4,) px each.
 
     A pixel is seen at its middle, so that each edge of the pixels may be half a pixel off: of a person of three pixels
     that is a third. So much is forgiven at any size.
@@ -336,7 +337,7 @@ def pixels_iou(box: np.ndarray, found: np.ndarray) -> float:
 
 
 def _kinds_without(instance: np.ndarray, left_out: np.ndarray) -> np.ndarray:
-    """Give the kinds of pixels, (h, w); those of ids left out are NONE: the pedestrian who stays is the target."""
+    """Return the kinds of pixels, (h, w); those of ids left out are NONE: the pedestrian who stays is the target."""
     ids = instance[..., 1].astype(np.uint16) | (instance[..., 2].astype(np.uint16) << 8)
     return np.where(left_out[ids], KINDS["NONE"], instance[..., 0])
 
@@ -354,7 +355,7 @@ def target_box(flight: Flight, i: int) -> np.ndarray:
 
 
 def pedestrian_region(kinds: np.ndarray, box: np.ndarray) -> np.ndarray | None:
-    """Give the region of pedestrian pixels that shares most pixels with a box, (h, w) bool; None if none does."""
+    """Return the region of pedestrian pixels that shares most pixels with a box, (h, w) bool; None if none does."""
     is_person = (kinds == KINDS["Pedestrians"]).astype(np.uint8)
     if not is_person.any():
         return None

@@ -110,7 +110,7 @@ def look_at(picture: Picture, left_out: np.ndarray, flat_share: float) -> PixelF
 
 @njit(cache=True, nogil=True)
 def _is_plane(depth, y0, x0, y1, x1):  # type: ignore[no-untyped-def]
-    """Tell whether the depth between two pixels of a row or a column is that of one plane."""
+    """Return whether the depth between two pixels of a row or a column is that of one plane."""
     first, last = float(depth[y0, x0]), float(depth[y1, x1])
     if not (INVALID_DEPTH_M < first < SKY_DEPTH_M and INVALID_DEPTH_M < last < SKY_DEPTH_M):
         return False
@@ -127,7 +127,7 @@ def _is_plane(depth, y0, x0, y1, x1):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _differs(colours, instance, y0, x0, y1, x1):  # type: ignore[no-untyped-def]
-    """Tell whether an eye or a mask of kinds tells two pixels apart."""
+    """Return whether an eye or a mask of kinds tells two pixels apart."""
     step = np.int64(0)
     for c in range(3):
         step += abs(np.int64(colours[y0, x0, c]) - np.int64(colours[y1, x1, c]))

@@ -37,7 +37,7 @@ OPENING_PICTURES = 4
 
 
 def report_html(name: str, inspection: Inspection, views: Mapping[str, FlightView], page_mb: float) -> str:
-    """Give the page. Flights that need a look come first, and are the last to lose their pictures.
+    """Return the page. Flights that need a look come first, and are the last to lose their pictures.
 
     Args:
         name: of the run. views: pictures and curves by flight folder, of which as many are shown as the page may hold.
@@ -92,7 +92,7 @@ def _card(flight: FlightInspection, view: FlightView | None) -> str:
 
 
 def _plot(name: str, view: FlightView) -> dict[str, Any] | None:
-    """Give a curve over time and its range; a gap where a value is unknown. None where all are."""
+    """Return a curve over time and its range; a gap where a value is unknown. None where all are."""
     title, unit, span = PLOTS[name]
     values, time_s = view.curves.get(name, []), view.time_s
     known = [value for value in values if value is not None]

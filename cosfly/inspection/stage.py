@@ -103,7 +103,7 @@ def run(
 
 
 def _tell_review(flights: FlightFunnel, out: Path) -> None:
-    """Say which flights wait for a person: loudly where no other is left, so that a release would be empty."""
+    """Return which flights wait for a person: loudly where no other is left, so that a release would be empty."""
     if flights.review:
         level = logging.INFO if flights.accepted else logging.WARNING
         reasons = ", ".join(f"{code} {count}" for code, count in flights.reasons.items())
@@ -146,7 +146,7 @@ def assemble(
 
 
 def _unreadable(outcome: Failed, planned: list[DroneTrace], data: Path) -> FlightInspection:
-    """Give the record of a flight whose inspection failed: rejected, for the reason that the error names."""
+    """Return the record of a flight whose inspection failed: rejected, for the reason that the error names."""
     town, trajectory, variant = ("", "", *outcome.id.split("/"))[-3:]
     report = Report()
     report.error("unreadable", outcome.id, outcome.message.replace(f"{data}/", ""), "a flight that can be read")
@@ -166,7 +166,7 @@ def _planned_id(folder: Path, planned: list[DroneTrace]) -> str | None:
 
 
 def _with_twins_trace(flights: list[FlightInspection]) -> list[FlightInspection]:
-    """Give an unreadable flight the trace of its twin, so that the funnel counts it there."""
+    """Return an unreadable flight the trace of its twin, so that the funnel counts it there."""
     known = {Path(flight.folder).parent: flight.trace_id for flight in flights if flight.trace_id is not None}
     return [
         flight.model_copy(update={"trace_id": flight.trace_id or known.get(Path(flight.folder).parent)})

@@ -59,7 +59,7 @@ def draw_flight(
     width_px: int,
     issues: Sequence[Issue] = (),
 ) -> FlightView:
-    """Give what a page shows of a flight.
+    """Return what a page shows of a flight.
 
     Args:
         heights_m: (n,) of the drone over the person. clearance_m: (n,) to obstacles; None where there is no map.
@@ -87,7 +87,7 @@ def draw_flight(
 
 
 def in_question(issues: Sequence[Issue], num_frames: int) -> list[int]:
-    """Give the frames that findings are about, of the worst first; of a jump the one before too."""
+    """Return the frames that findings are about, of the worst first; of a jump the one before too."""
     found: dict[int, None] = {}
     for issue in sorted(issues, key=sort_key):
         named = OF_FRAME.search(issue.where) if issue.severity != "note" else None

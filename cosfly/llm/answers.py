@@ -36,7 +36,7 @@ _PLAIN_NAME = re.compile(r"\w[\w.+-]*")
 
 
 def journal_name(flight: str) -> str:
-    """Give the file name of a flight's journal: its own name where that is a plain one, else one made from its
+    """Return the file name of a flight's journal: its own name where that is a plain one, else one made from its
     digest."""
     is_plain = _PLAIN_NAME.fullmatch(flight) is not None and len(flight.encode()) <= 200
     return f"{flight if is_plain else f'flight-{sha256_bytes(flight.encode())}'}.jsonl"
@@ -114,7 +114,7 @@ class AnswerBook:
         return self._open(flight).answers.get(key)
 
     def latency_s(self, flight: str, sample_id: str) -> float:
-        """Give the time that the answers about one window took, one after the other."""
+        """Return the time that the answers about one window took, one after the other."""
         kept = self._open(flight).answers.values()
         return sum(answer.latency_s for answer in kept if answer.sample_id == sample_id)
 

@@ -91,7 +91,7 @@ class Budget:
             self._freed.set()
 
     def _spent_by_another(self, num_pictures: int) -> BudgetSpent | None:
-        """Say which limit one more request might pass, beside those in flight."""
+        """Return which limit one more request might pass, beside those in flight."""
         if num_pictures > self._most_pictures:  # what a judge or a mirror took tells nothing of a request with pictures
             self._most_pictures, self._is_measured = num_pictures, False
             self._largest = _larger(self._first, self._largest)

@@ -70,12 +70,12 @@ class EndpointConfig(Config):
     )
 
     def request(self, messages: list[dict], digests: list[str], schema: dict, seed: int) -> Request:
-        """Give a conversation as these settings sample it."""
+        """Return a conversation as these settings sample it."""
         sampling = {"temperature": self.temperature, "top_p": self.top_p, "max_tokens": self.max_tokens, "seed": seed}
         return Request(messages, digests, schema, self.with_extra(sampling))
 
     def with_extra(self, fields: dict[str, Any]) -> dict[str, Any]:
-        """Give fields of a request with `extra_body`; a null there leaves one out."""
+        """Return fields of a request with `extra_body`; a null there leaves one out."""
         return {name: value for name, value in (fields | self.extra_body).items() if value is not None}
 
 
@@ -209,7 +209,7 @@ class ChatClient:
         return self._with_full_context(found, request)
 
     def _refused(self, refusal: Refusal, given_s: float, wait_s: float | None) -> Failure:
-        """Give what a refusal is to the request: a failure of now, NoAnswer, or TeacherError where it is to all."""
+        """Return what a refusal is to the request: a failure of now, NoAnswer, or TeacherError where it is to all."""
         status = refusal.status
         if refusal.meaning.ends_run:
             raise self.error(refusal.meaning.what, got=refusal.said, fix=refusal.meaning.fix)
@@ -289,7 +289,7 @@ class ChatClient:
         )
 
     def read(self, response: Response, *, is_structured: bool) -> Reply | Refusal | str:
-        """Give what a response says: a reply, what it refuses (some servers do so with status 200), or a word on what
+        """Return what a response says: a reply, what it refuses (some servers do so with status 200), or a word on what
         is wrong with it."""
         if response.status != 200:
             return self.refusal(response)
@@ -320,7 +320,7 @@ class ChatClient:
         return TeacherError(what, where=self.where, **parts)
 
     def detail(self, response: Response) -> str:
-        """Give a server's error text, short and without the key."""
+        """Return a server's error text, short and without the key."""
         try:
             text = error_words(read_body(response.body))
         except ValueError:

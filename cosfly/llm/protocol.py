@@ -27,7 +27,7 @@ MOST_NAME = 256  # characters of a name that is kept: of a model, of why an answ
 
 
 def response_format(schema: dict) -> dict:
-    """Give the field of a request that asks for an answer of a JSON schema."""
+    """Return the field of a request that asks for an answer of a JSON schema."""
     return {"type": "json_schema", "json_schema": {"name": "chain_of_cause", "strict": True, "schema": schema}}
 
 
@@ -51,7 +51,7 @@ def _marked_part(part: dict, urls: list[str]) -> dict:
 
 
 def request_body(model: str, request: Request) -> dict[str, Any]:
-    """Give a request's body without its response format."""
+    """Return a request's body without its response format."""
     return {"model": model, "messages": request.messages, **request.sampling}
 
 
@@ -92,13 +92,13 @@ def _writable(value: Any) -> Any:
 
 
 def error_words(value: Any) -> str:
-    """Give what a server's JSON says of an error: its `error`, or all of it."""
+    """Return what a server's JSON says of an error: its `error`, or all of it."""
     error = value.get("error", value) if isinstance(value, dict) else value
     return str(error.get("message", error) if isinstance(error, dict) else error)
 
 
 def read_completion(response: Response, structured: str) -> Reply | str:
-    """Give the reply to a request of which the shape was enforced in this way, or a word on what is wrong with it.
+    """Return the reply to a request of which the shape was enforced in this way, or a word on what is wrong with it.
 
     Nothing of it is taken on trust: what is kept has the type and size that it should have.
     """
@@ -121,7 +121,7 @@ def read_completion(response: Response, structured: str) -> Reply | str:
 
 
 def _name(value: Any) -> str | None:
-    """Give a name that can stand in a record, None where it is none."""
+    """Return a name that can stand in a record, None where it is none."""
     return value if isinstance(value, str) and value.isprintable() and 0 < len(value) <= MOST_NAME else None
 
 

@@ -42,7 +42,7 @@ class StudentEndpointConfig(EndpointConfig):
 
 
 def chat_messages(prompt: Prompt, frames: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
-    """Give the chat of a sample: the system text, then each frame's pictures under its name, and the question.
+    """Return the chat of a sample: the system text, then each frame's pictures under its name, and the question.
 
     Args:
         frames: the parts that stand for the pictures of each frame, oldest first; a frame without any is not named.
@@ -77,7 +77,7 @@ def picture_to_send(rgb: np.ndarray, max_pixels: int) -> SentPicture:
 def student_request(
     prompt: Prompt, frames: Sequence[Sequence[SentPicture]], schema: dict, sampling: EndpointConfig, seed: int = 0
 ) -> Request:
-    """Give what an engine is asked.
+    """Return what an engine is asked.
 
     Args:
         frames: the pictures of each frame, oldest first.
@@ -139,7 +139,8 @@ def read_taught(folder: Path) -> Taught:
 
 
 def student_files(folder: Path) -> dict[str, Path]:
-    """Give what decides who a student is, what it was taught and its weights, for the inputs of a stage: name -> path.
+    """Return what decides who a student is, what it was taught and its weights, for the inputs of a stage: name ->
+    path.
 
     A server tells a name only, and under one name may serve another student tomorrow.
     """

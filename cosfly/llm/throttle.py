@@ -30,7 +30,7 @@ class Throttle:
         self._grows_at_s = float("inf")  # from the first request on
 
     def has_room(self) -> bool:
-        """Tell whether one more may be in flight; where that is asked and it is time, the limit grows."""
+        """Return whether one more may be in flight; where that is asked and it is time, the limit grows."""
         now_s = self._clock()
         if self._grows_at_s == float("inf"):
             self._grows_at_s = now_s + RAMP_S
@@ -42,7 +42,7 @@ class Throttle:
         return self.num_active < int(self.limit)
 
     def room_in_s(self) -> float:
-        """Give the time after which there may be room though nothing was answered, s; infinite: never."""
+        """Return the time after which there may be room though nothing was answered, s; infinite: never."""
         now_s = self._clock()
         if now_s < self._held_until_s:
             return self._held_until_s - now_s

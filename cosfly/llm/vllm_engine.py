@@ -107,7 +107,7 @@ class VllmEngine:
             raise EnvironmentMissing("the vLLM engine does not start", where=self.where, got=reason) from None
 
     def arguments(self) -> dict[str, Any]:
-        """Give the keyword arguments of `vllm.LLM`."""
+        """Return the keyword arguments of `vllm.LLM`."""
         cfg = self.cfg
         arguments: dict[str, Any] = {
             "model": str(self.folder),
@@ -122,7 +122,7 @@ class VllmEngine:
         return arguments | cfg.engine
 
     def parameters(self, request: Request) -> Any:
-        """Give vLLM's own parameters of a request."""
+        """Return vLLM's own parameters of a request."""
         from vllm import SamplingParams
         from vllm.sampling_params import StructuredOutputsParams
 
@@ -143,7 +143,7 @@ class VllmEngine:
                 self._break(error)
 
     def _take(self) -> list[tuple[Request, Future[Reply]]]:
-        """Give requests that came meanwhile; waits for one where there is nothing else to do."""
+        """Return requests that came meanwhile; waits for one where there is nothing else to do."""
         taken: list[tuple[Request, Future[Reply]]] = []
         while len(taken) < min(ADDED_PER_STEP, self.cfg.batch - len(self._open)):
             try:

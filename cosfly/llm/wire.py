@@ -46,7 +46,7 @@ def check_url(url: str) -> None:
 
 
 def base_url(url: str) -> str:
-    """Give the API root of whatever form of URL a user has: host, host/v1, or the whole chat-completions path."""
+    """Return the API root of whatever form of URL a user has: host, host/v1, or the whole chat-completions path."""
     root = url.rstrip("/").removesuffix("/chat/completions").rstrip("/")
     return root if re.search(r"/v\d+(beta)?(/openai)?$", root) else f"{root}/v1"
 

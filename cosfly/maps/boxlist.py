@@ -36,7 +36,7 @@ class BoxList:
         self.add(kind, center, (high_xy[0] - low_xy[0], high_xy[1] - low_xy[1]), low_m, high_m)
 
     def box_map(self, header: MapHeader | None = None) -> BoxMap:
-        """Give the map of everything added so far."""
+        """Return the map of everything added so far."""
         rows = np.array(self._rows, dtype=np.float64).reshape(-1, 7)
         rotations_deg = np.zeros((len(rows), 3))
         rotations_deg[:, 1] = rows[:, 6]

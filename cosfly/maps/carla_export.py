@@ -81,7 +81,7 @@ def ask(cfg: CarlaConfig) -> CarlaTown:
 
 
 def load(cfg: CarlaMapConfig, seed: int) -> BoxMap:
-    """Give the town's boxes; the seed changes nothing."""
+    """Return the town's boxes; the seed changes nothing."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         try:
             told = pool.submit(ask, cfg).result()
@@ -146,7 +146,7 @@ def _unfit(label: str, box: np.ndarray, cfg: CarlaMapConfig) -> str:
 
 
 def _tell(told: CarlaTown, box_map: BoxMap, where: str, tops_m: np.ndarray) -> None:
-    """Tell what is known to be odd in such exports, where it is so."""
+    """Return what is known to be odd in such exports, where it is so."""
     header = box_map.header
     if told.empty_labels:
         log.info("%s: no objects of %s", where, ", ".join(told.empty_labels))

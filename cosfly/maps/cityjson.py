@@ -244,7 +244,8 @@ def load(cfg: CityJsonConfig, seed: int = 0) -> BoxMap:
 
 
 def _over_ground(item: CityObject, ground: Ground) -> CityObject:
-    """An object with heights over the ground under each vertex; solids keep theirs, or their roofs would slope."""
+    """Return an object with heights over the ground under each vertex; solids keep theirs, or their roofs would
+    slope."""
     if item.rule.form == "solid":
         return item
     rings = [[r - np.outer(ground.height_at(r), [0.0, 0.0, 1.0]) for r in surface] for surface in item.surfaces]

@@ -147,7 +147,7 @@ def _check_vertices(item: CityObject, most: int, where: str) -> None:
 
 
 def _city_object(object_id: str, value: Any, part: _Part, templates: _Templates) -> CityObject | str:
-    """Give an object, or the reason why it is left out."""
+    """Return an object, or the reason why it is left out."""
     where = f"{part.where}: CityObjects.{object_id}"
     if not isinstance(value, dict) or not isinstance(value.get("type"), str):
         got, expected = type(value).__name__, "an object with a type"
@@ -170,7 +170,8 @@ def _city_object(object_id: str, value: Any, part: _Part, templates: _Templates)
 
 
 def _has_parts(value: dict, part: _Part) -> bool:
-    """Tell whether an object's parts stand in the file; one that names absent ones has nothing but its own geometry."""
+    """Return whether an object's parts stand in the file; one that names absent ones has nothing but its own
+    geometry."""
     children = value.get("children")
     names = children if isinstance(children, list) else []
     return any(isinstance(name, str) and name in part.objects for name in names)
@@ -187,7 +188,7 @@ def rule_of(object_type: str, attributes: dict) -> ObjectRule | None:
 
 
 def _read_json(path: Path) -> tuple[dict, list[tuple[str, dict]]]:
-    """Give the document, and the features of a sequence with their places in the file."""
+    """Return the document, and the features of a sequence with their places in the file."""
     data = read_unpacked(path, what="city model", most_mb=CITY_MB)
     lines = data.replace(RECORD_SEPARATOR, b"").splitlines()
     is_sequence = len(lines) > 1 and b'"CityJSONFeature"' in data and _is_whole(lines[0])
@@ -206,7 +207,7 @@ def _read_json(path: Path) -> tuple[dict, list[tuple[str, dict]]]:
 
 
 def _is_whole(line: bytes) -> bool:
-    """Tell whether a line is JSON by itself: a document over several lines is not."""
+    """Return whether a line is JSON by itself: a document over several lines is not."""
     try:
         parse_json(line)
     except ValueError:
@@ -234,7 +235,8 @@ def _document(model: Any, path: Path) -> dict:
 
 
 def _parts(head: dict, features: list[tuple[str, dict]], path: Path) -> list[_Part]:
-    """The document's own objects, where it has any, and those of each feature; all share the document's transform."""
+    """Return the document's own objects, where it has any, and those of each feature; all share the document's
+    transform."""
     transform = _transform(head, path)
     parts = []
     for where, value in [(str(path), head)] * bool(head["CityObjects"]) + features:
@@ -282,7 +284,8 @@ def _templates(model: dict, path: Path) -> _Templates:
 def _surfaces(
     geometries: Any, vertices: np.ndarray, templates: _Templates, where: str
 ) -> tuple[list[list[np.ndarray]], list[list[np.ndarray]], float]:
-    """The surfaces of the plainest geometry with a height, those of the most detailed one, the former's level."""
+    """Return the surfaces of the plainest geometry with a height, those of the most detailed one, the former's
+    level."""
     if not isinstance(geometries, list) or not all(isinstance(g, dict) for g in geometries):
         raise InputError("not a list of geometries", where=where, got=type(geometries).__name__)
     placed = [_placed(g, vertices, templates, f"{where}[{k}]") for k, g in enumerate(geometries)]
@@ -296,7 +299,7 @@ def _surfaces(
 
 
 def _surfaces_of(geometry: dict, corners: np.ndarray, where: str) -> list[list[np.ndarray]]:
-    """The surfaces of one geometry; of a solid those of its outer shell."""
+    """Return the surfaces of one geometry; of a solid those of its outer shell."""
     lists, nesting = geometry.get("boundaries"), NESTING[geometry["type"]]
     solids = lists if nesting == 2 else [lists] if nesting == 1 else [[lists]]
     found: list = []
@@ -307,7 +310,7 @@ def _surfaces_of(geometry: dict, corners: np.ndarray, where: str) -> list[list[n
 
 
 def _placed(geometry: dict, vertices: np.ndarray, templates: _Templates, where: str) -> tuple[dict, np.ndarray]:
-    """A geometry and the vertices that it counts in; an instance gives its template, moved to its place."""
+    """Return a geometry and the vertices that it counts in; an instance gives its template, moved to its place."""
     if geometry.get("type") != "GeometryInstance":
         return geometry, vertices
     number, anchor = geometry.get("template"), geometry.get("boundaries")

@@ -27,7 +27,8 @@ CREDITS = "Streets, pavements and lawn are derived by cosfly from the buildings,
 
 
 def with_derived_ground(box_map: BoxMap) -> BoxMap:
-    """Give a map with derived ground; the same map if it has streets, pavements or squares, or nothing stands on it."""
+    """Return a map with derived ground; the same map if it has streets, pavements or squares, or nothing stands on
+    it."""
     standing = box_map.select(blocks_walking(box_map) & (box_map.kinds == KINDS["Buildings"]))
     if len(standing) == 0 or box_map.is_any_of(PAVED_KINDS).any():
         return box_map

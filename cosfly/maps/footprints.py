@@ -30,14 +30,14 @@ class Rectangle(NamedTuple):
 
 
 def polygons_of(geometry: BaseGeometry) -> list[Polygon]:
-    """Give the polygons with an area in any geometry; lines and points fall away."""
+    """Return the polygons with an area in any geometry; lines and points fall away."""
     if isinstance(geometry, Polygon):
         return [geometry] if geometry.area > MIN_AREA_M2 else []
     return [part for child in getattr(geometry, "geoms", ()) for part in polygons_of(child)]
 
 
 def oriented_rectangle(polygon: Polygon) -> Rectangle:
-    """Give the smallest rectangle round a polygon; one side of it lies along a side of the convex hull."""
+    """Return the smallest rectangle round a polygon; one side of it lies along a side of the convex hull."""
     hull = np.asarray(polygon.convex_hull.exterior.coords)
     edges = np.diff(hull, axis=0)
     angles = np.unique(np.round(np.mod(np.arctan2(edges[:, 1], edges[:, 0]), np.pi / 2), 9))
@@ -52,7 +52,7 @@ def oriented_rectangle(polygon: Polygon) -> Rectangle:
 
 
 def rectangle_polygon(rectangle: Rectangle, along: Share = (-0.5, 0.5), across: Share = (-0.5, 0.5)) -> Polygon:
-    """Give a rectangle, or a part of it in shares of its sizes from the middle, as a polygon; may reach out of it."""
+    """Return a rectangle, or a part of it in shares of its sizes from the middle, as a polygon; may reach out of it."""
     yaw = np.radians(rectangle.yaw_deg)
     x = np.array([np.cos(yaw), np.sin(yaw)]) * rectangle.size[0]
     y = np.array([-np.sin(yaw), np.cos(yaw)]) * rectangle.size[1]

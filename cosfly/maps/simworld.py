@@ -210,7 +210,7 @@ def _read_nodes(path: Path) -> list[_Node]:
 
 
 def read_sizes(paths: list[Path]) -> dict[str, np.ndarray]:
-    """Give full sizes in cm by asset name; groups (buildings, elements, details) are joined."""
+    """Return full sizes in cm by asset name; groups (buildings, elements, details) are joined."""
     sizes: dict[str, np.ndarray] = {}
     for path in paths:
         table = read_json(path, what="asset size table")

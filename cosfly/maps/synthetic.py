@@ -182,7 +182,7 @@ class Streets:
         return self.columns if axis else self.rows
 
     def stretches(self, axis: int) -> list[tuple[float, float]]:
-        """The stretches of a street along an axis between the carriageways that cross it."""
+        """Return the stretches of a street along an axis between the carriageways that cross it."""
         return [(a.road[1], b.road[0]) for a, b in itertools.pairwise(self.along(1 - axis))]
 
 
@@ -216,7 +216,7 @@ def load(cfg: SyntheticConfig, seed: int) -> BoxMap:
 
 
 def street_grid(cfg: SyntheticConfig, seed: int) -> Streets:
-    """Give the streets of a town, and its river."""
+    """Return the streets of a town, and its river."""
     wide = 1 if cfg.num_blocks > 1 else 0  # the boulevard's place
     rows = _strips(cfg, cfg.river_m or cfg.boulevard_m, wide, rng_for(seed, "maps", "rows"))
     columns = _strips(cfg, cfg.boulevard_m, wide, rng_for(seed, "maps", "columns"))
@@ -224,7 +224,7 @@ def street_grid(cfg: SyntheticConfig, seed: int) -> Streets:
 
 
 def _strips(cfg: SyntheticConfig, widest_m: float, wide: int, rng: np.random.Generator) -> list[Strip]:
-    """The streets across one axis, low to high; number `wide` is the widest."""
+    """Return the streets across one axis, low to high; number `wide` is the widest."""
     widths = [cfg.street_m] * (cfg.num_blocks + 1)
     widths[wide] = widest_m
     parts = 1.0 + cfg.unevenness * rng.uniform(-1.0, 1.0, cfg.num_blocks)

@@ -72,7 +72,7 @@ def tree(
 
 
 def point(axis: int, along: float, across: float) -> tuple[float, float]:
-    """A point of a street along x (axis 0) or along y (axis 1)."""
+    """Return a point of a street along x (axis 0) or along y (axis 1)."""
     return (along, across) if axis == 0 else (across, along)
 
 

@@ -76,7 +76,7 @@ class _Object:
 
 
 def load(cfg: UnrealCvMapConfig, seed: int) -> BoxMap:
-    """Give the level's boxes; the seed changes nothing."""
+    """Return the level's boxes; the seed changes nothing."""
     connection = connect(cfg, cfg.port)
     try:
         with connection.asking("the objects were not given"):

@@ -64,7 +64,7 @@ def find_route(
 
 
 def route_cost(cells: np.ndarray) -> float:
-    """Give the octile length of a route of neighbouring cells, (k, 2), in cell widths: its cost where all cost 1."""
+    """Return the octile length of a route of neighbouring cells, (k, 2), in cell widths: its cost where all cost 1."""
     is_diagonal = (np.diff(cells, axis=0) != 0).all(axis=1)
     num_diagonal = int(np.count_nonzero(is_diagonal))
     return len(is_diagonal) - num_diagonal + num_diagonal * SQRT2

@@ -35,7 +35,7 @@ PAINT = KINDS["RoadLines"]
 
 
 def footing_of(box_map: BoxMap, grid: OccupancyGrid) -> np.ndarray:
-    """Tell what each cell of a grid is to a walker, by the topmost ground there, (ny, nx) uint8."""
+    """Return what each cell of a grid is to a walker, by the topmost ground there, (ny, nx) uint8."""
     footing = OF_KIND[surface_kinds(box_map, GROUND_KINDS - {PAINT}, like=grid)]
     is_road = footing == ROAD
     if not is_road.any():

@@ -117,7 +117,7 @@ def _reach_m(roads: BoxMap, end_m: np.ndarray, direction: np.ndarray, most_m: fl
 
 
 def _on_road(roads: BoxMap, points_m: np.ndarray) -> np.ndarray:
-    """Tell which points lie on a box of road, (n,) bool."""
+    """Return which points lie on a box of road, (n,) bool."""
     yaws = np.radians(roads.rotations_deg[:, 1])
     offset = points_m[:, None] - roads.centers[None, :, :2]
     x = offset[..., 0] * np.cos(yaws) + offset[..., 1] * np.sin(yaws)
@@ -156,7 +156,7 @@ def _junctions(streets: list[Street]) -> tuple[list[Junction], list[list[tuple[f
 
 
 def _number_of(place_m: np.ndarray, width_m: float, junctions: list[Junction]) -> int:
-    """The junction at a place, made or widened in the list."""
+    """Return the junction at a place, made or widened in the list."""
     for number, known in enumerate(junctions):
         if np.linalg.norm(known.place_m - place_m) < SAME_PLACE_M:
             junctions[number] = Junction(known.place_m, max(width_m, known.width_m))
@@ -174,12 +174,12 @@ class _Way:
     last: tuple[float, int]
 
     def leads_to(self, after: _Way) -> bool:
-        """Tell whether one gets onto another way at its end; nobody turns on the spot."""
+        """Return whether one gets onto another way at its end; nobody turns on the spot."""
         is_back = after.street is self.street and after.last == self.first
         return self.last[1] >= 0 and after.first[1] == self.last[1] and not is_back
 
     def line(self, junctions: list[Junction], is_free: IsFree) -> np.ndarray | None:
-        """Its lane, on the right, as far from the middle as nothing stands there, (k, 2) m; None if blocked."""
+        """Return its lane, on the right, as far from the middle as nothing stands there, (k, 2) m; None if blocked."""
         sign = np.sign(self.last[0] - self.first[0])
         (start, end) = (
             along + toward * sign * (junctions[number].width_m / 2.0 + BEFORE_CURVE_M if number >= 0 else 3.0)
@@ -222,7 +222,7 @@ def _cross(one: np.ndarray, two: np.ndarray) -> float:
 
 
 def _curve(one_m: np.ndarray, two_m: np.ndarray) -> np.ndarray:
-    """A curve from the end of a lane to the start of another, tangent to both, (j, 2) m without its two ends.
+    """Return a curve from the end of a lane to the start of another, tangent to both, (j, 2) m without its two ends.
 
     A cubic Bezier: its inner points lie on the lanes' lines, at 0.55 of the distance of a quarter circle.
     """

@@ -75,7 +75,7 @@ class Trip:
         ][:, 0]
 
     def waiting(self, before_m: float) -> Trip:
-        """The same with a stop of WAIT_S, or a longer one, at least KEEP_BACK_M before a place of the way."""
+        """Return the same with a stop of WAIT_S, or a longer one, at least KEEP_BACK_M before a place of the way."""
         at = max(0, int(np.searchsorted(self.way.along_m, before_m - KEEP_BACK_M[self.kind], side="right")) - 1)
         near = slice(max(0, at - STOP_GAP_MIN + 1), at + STOP_GAP_MIN)
         stops_s = self.way.stops_s.copy()
@@ -162,7 +162,7 @@ def draw_stroll(
 
 
 def and_back(course: Trip) -> Trip:
-    """The same, and back to its start after a stop: at its end, or where it stops just before."""
+    """Return the same, and back to its start after a stop: at its end, or where it stops just before."""
     way = course.way
     stops_s = np.concatenate([way.stops_s, way.stops_s[-2::-1]])
     end = len(way.stops_s) - 1

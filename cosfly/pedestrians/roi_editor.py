@@ -156,7 +156,7 @@ class Editor:
             self.digest = sha256_bytes(data)
 
     def page_html(self) -> str:
-        """Give the page."""
+        """Return the page."""
         folder, grid = Path(__file__).parent, self.bare.grid
         data = {
             "map": self.box_map.name, "most_bytes": MOST_BYTES, "axes": AXES, "roi": self.opened,
@@ -188,7 +188,7 @@ class Editor:
         return {"roi": roi.model_dump(), **self.cells(roi, where)}
 
     def cells(self, roi: Roi | None, where: str | Path = "region of interest") -> dict[str, Any]:
-        """Give the cells of a region, a PNG over the backdrop in base64, and its figures."""
+        """Return the cells of a region, a PNG over the backdrop in base64, and its figures."""
         ground = self.bare
         if roi is not None:
             ground = walkable_ground(self.box_map, self.cfg, roi, where=self.where, roi_where=where)
@@ -312,7 +312,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(404, b"", "text/plain")
 
     def _name(self) -> str | None:
-        """Give what is asked for below our address; None where the address is not ours, whatever name led here."""
+        """Return what is asked for below our address; None where the address is not ours, whatever name led here."""
         begin = f"/{self.ours.token}/"
         is_ours = hmac.compare_digest(self.path[: len(begin)].encode(), begin.encode())
         return self.path[len(begin) :] if is_ours and self.headers.get("Host") == self.ours.host else None

@@ -87,7 +87,7 @@ def draw_overview(ground: WalkableGround, paths: list[Walk]) -> bytes:
 
 
 def path_color(number: int) -> tuple[int, int, int]:
-    """Give a strong RGB colour, neighbours far apart on the colour circle (golden ratio)."""
+    """Return a strong RGB colour, neighbours far apart on the colour circle (golden ratio)."""
     red, green, blue = colorsys.hsv_to_rgb((0.02 + number * 0.618034) % 1.0, 0.85, (0.62, 0.85)[number % 2])
     return round(red * 255), round(green * 255), round(blue * 255)
 

@@ -184,7 +184,7 @@ class WalkableGround:
         return np.cumsum(np.count_nonzero(self.may_end, axis=1))
 
     def route(self, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray:
-        """Give the cells of a cheapest route between two of one part, (k, 2)."""
+        """Return the cells of a cheapest route between two of one part, (k, 2)."""
         cells = find_route(self.walkable, start, goal, self.footing, self.costs)
         assert cells is not None, "two cells of one part have no route between them"
         return cells
@@ -280,7 +280,7 @@ def _count(mask: np.ndarray) -> int:
 
 
 def _steep(ground: Ground, grid: OccupancyGrid) -> np.ndarray | None:
-    """Tell which cells are too steep to walk on, (ny, nx) bool; None where the ground is flat."""
+    """Return which cells are too steep to walk on, (ny, nx) bool; None where the ground is flat."""
     if ground.is_flat:
         return None
     columns, rows = np.meshgrid(*(np.arange(size) for size in grid.size))
@@ -289,7 +289,7 @@ def _steep(ground: Ground, grid: OccupancyGrid) -> np.ndarray | None:
 
 
 def _surface(box_map: BoxMap, ground: str, grid: OccupancyGrid, free: np.ndarray) -> np.ndarray | None:
-    """Tell where there is ground as the settings want it; None for everywhere, also if the map does not say where its
+    """Return where there is ground as the settings want it; None for everywhere, also if the map does not say where its
     ground is.
 
     It does not if it has no ground boxes, or neither streets nor squares and other ground under a small part of it

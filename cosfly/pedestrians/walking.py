@@ -96,7 +96,7 @@ def resample(
 def sample(
     polyline_m: np.ndarray, speeds_mps: np.ndarray, times_s: np.ndarray, stops_s: np.ndarray, time_s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Give positions (n, 2) and speeds (n,) at any times, (n,) s, of a timed polyline; after its end, the end."""
+    """Return positions (n, 2) and speeds (n,) at any times, (n,) s, of a timed polyline; after its end, the end."""
     now_s = np.minimum(time_s - stood_s(time_s, times_s, stops_s), times_s[-1])
     piece = np.clip(np.searchsorted(times_s, now_s, side="right") - 1, 0, len(times_s) - 2)
     duration_s = times_s[piece + 1] - times_s[piece]

@@ -111,7 +111,7 @@ def _measured(cfg: RunConfig, run_folder: Path, folder: Path, stage: str, worker
 
 
 def row_of(events: list[Event], manifest: Manifest, workers: int, *, counts_frames: bool) -> BenchRun:
-    """Give the figures of one run from what its events and its manifest say."""
+    """Return the figures of one run from what its events and its manifest say."""
     done = [event for event in events if event.event == "item_done"]
     lost = [event for event in events if event.event in LOSSES]
     probes = [event for event in events if event.event == "probe"]
@@ -132,7 +132,7 @@ def row_of(events: list[Event], manifest: Manifest, workers: int, *, counts_fram
 
 
 def stage_rows(run_folder: Path, names: Iterable[str]) -> list[StageRow]:
-    """Give what the events of the finished stages of a run say."""
+    """Return what the events of the finished stages of a run say."""
     rows = []
     for name in names:
         folder = run_folder / name

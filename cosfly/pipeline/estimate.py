@@ -134,7 +134,7 @@ def _stage(name: str, count: int, cfg: RunConfig, out: Path) -> StageEstimate:
 
 
 def time_left(rows: list[StageEstimate]) -> str:
-    """Give the time of all that is not done, in words; what nobody knows is named."""
+    """Return the time of all that is not done, in words; what nobody knows is named."""
     unknown = dict.fromkeys(row.name for row in rows if row.seconds is None)
     text = duration(sum(row.seconds or 0.0 for row in rows))
     return f"{text}, and {', '.join(unknown)}, whose time depends on its teacher" if unknown else text
@@ -147,7 +147,7 @@ def free_bytes(out: Path) -> int:
 
 
 def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
-    """Say what the figures rest on, what they come to in all, and what stands in the way of the run."""
+    """Return what the figures rest on, what they come to in all, and what stands in the way of the run."""
     needed = sum(row.bytes for row in rows)
     disk = f"{in_words(needed)} of disk, {in_words(free_bytes(out))} are free"
     lines = [f"figures: {BASIS}", f"in all about {time_left(rows)}; {disk}", *caveats(cfg)]
@@ -159,7 +159,7 @@ def remarks(cfg: RunConfig, out: Path, rows: list[StageEstimate]) -> list[str]:
 
 
 def caveats(cfg: RunConfig) -> list[str]:
-    """Say which settings hold for some flights alone, and which flights nobody will see anything on; maps are read
+    """Return which settings hold for some flights alone, and which flights nobody will see anything on; maps are read
     where a flight is by night.
     """
     lines = cfg.plan.remarks()
@@ -176,5 +176,5 @@ def caveats(cfg: RunConfig) -> list[str]:
 
 
 def in_words(num_bytes: float) -> str:
-    """Give a size in words."""
+    """Return a size in words."""
     return f"{num_bytes / 1e9:.2f} GB" if num_bytes >= 1e9 else f"{num_bytes / 1e6:.1f} MB"

@@ -181,7 +181,7 @@ def _check_taken(settings: dict[str, Any], taken: Collection[str], where: str) -
 
 
 def _places(values: Any, name: str, count: int | None = None) -> np.ndarray:
-    """Give (n, 3) of one row or n."""
+    """Return (n, 3) of one row or n."""
     places = np.atleast_2d(np.asarray(values, dtype=np.float64))
     if places.ndim != 2 or places.shape[1] != 3 or len(places) == 0 or count not in (None, len(places)):
         expected = "(3,) or (n, 3)" if count is None else f"({count}, 3), as position_m"

@@ -163,7 +163,7 @@ class Places:
         return found
 
     def figures(self, place: str) -> list[Any]:
-        """Give the figures of a place of `paper.yaml`; None where a part of one is not there."""
+        """Return the figures of a place of `paper.yaml`; None where a part of one is not there."""
         found = list[Any]()
         for one in place.split(" + "):
             path, _, functions = one.partition("|")
@@ -249,7 +249,7 @@ def _values(row: Any) -> list[Any]:
 
 
 def _cell(value: Any) -> Cell:
-    """Give what a cell shows: numbers and words as they are, counts by a word and lists as words."""
+    """Return what a cell shows: numbers and words as they are, counts by a word and lists as words."""
     if isinstance(value, dict):
         return ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in value.items()) or "none"
     if isinstance(value, list | tuple):
@@ -314,7 +314,7 @@ def measure(
 
 
 def work(cfg: RunConfig, run: Path, places: Places, done: Sequence[str]) -> dict[str, Any]:
-    """Give `work`: what is put together of several files, or of none."""
+    """Return `work`: what is put together of several files, or of none."""
     manifests = {name: read_manifest(run / name) for name in benchmark.STAGES if name in done}
     watched = benchmark.stage_rows(run, benchmark.STAGES)
     lens = build(zoom.ZoomStudyConfig, {"width_px": 1280, "height_px": 720}, "lenses")

@@ -58,7 +58,7 @@ class StageResult:
 
 
 def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path | None = None) -> list[Stage]:
-    """Give the stages of a run in order; each works in the folder of its name, of the run or of `into`."""
+    """Return the stages of a run in order; each works in the folder of its name, of the run or of `into`."""
     seed, working = cfg.seed, manner_of_work(cfg)
     boxes, simplified = out / "maps/boxes_3d.json", out / "simplify/step2_simplified.json"
     walks, traces, tree = out / "pedestrians/path.json", out / "plan/drone_trace.json", out / "render"
@@ -85,7 +85,7 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path 
 
 
 def joint_release(cfg: RunConfig, sources: list[Source], out: Path, resume: Resume) -> Stage:
-    """Give the stage that releases runs together."""
+    """Return the stage that releases runs together."""
     work = partial(
         release.package.stage.run, cfg.release, sources, out / "release", resume=resume, **manner_of_work(cfg)
     )
@@ -240,7 +240,7 @@ def _summary(path: Path) -> dict[str, Any]:
 
 
 def _is_summed_up(results: list[StageResult], out: Path) -> bool:
-    """Tell whether a run came to its end with these very stages: `summary.json` is written after the pictures."""
+    """Return whether a run came to its end with these very stages: `summary.json` is written after the pictures."""
     return _summary(out / SUMMARY).get("stages") == _rows(results)
 
 

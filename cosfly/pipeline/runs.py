@@ -77,7 +77,8 @@ class RunLook:
         return sum((one.tally for one in self.stages if one.stage == stage and one.tally), Tally())
 
     def waiting(self) -> dict[Path, int]:
-        """Give the folders of finished inspections that left flights to a person, and how many are still undecided."""
+        """Return the folders of finished inspections that left flights to a person, and how many are still
+        undecided."""
         done = [one.folder for one in self.stages if one.stage == "inspect" and one.state == "complete"]
         counts = {folder: len(undecided(folder / "inspect.json")) for folder in done}
         return {folder: count for folder, count in counts.items() if count}

@@ -100,7 +100,7 @@ class RunConfig(Config):
     distill: DistillConfig = Field(default_factory=DistillConfig, description="students; not part of `cosfly run`")
 
     def opened(self, path: Path) -> Path:
-        """Give a path that a command was given as one whose links are followed, if they are."""
+        """Return a path that a command was given as one whose links are followed, if they are."""
         return LinkedPath(path) if self.follow_links else path
 
     @model_validator(mode="after")
@@ -127,7 +127,7 @@ class RunConfig(Config):
         return self
 
     def of_town(self, name: str) -> RunConfig:
-        """Give the settings of one town's run. Its seed derives from the run's and its name; its map has its name.
+        """Return the settings of one town's run. Its seed derives from the run's and its name; its map has its name.
 
         Raises:
             ConfigError: what is set for it cannot be; names the town and the setting.
@@ -151,7 +151,7 @@ def _mapping(value: Any, where: str) -> dict[str, Any]:
 
 
 def merged(group: Config, settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """Give a group's settings with the changes in them; a mapping that is one value, as shares are, is replaced."""
+    """Return a group's settings with the changes in them; a mapping that is one value, as shares are, is replaced."""
     result = dict(settings)
     for name, value in changes.items():
         within = getattr(group, name, None)
@@ -162,7 +162,7 @@ def merged(group: Config, settings: dict[str, Any], changes: dict[str, Any]) -> 
 
 
 def manner_of_work(cfg: RunConfig) -> dict[str, Any]:
-    """Give the arguments that all stages with items take: how many workers, where, and when one counts as stalled."""
+    """Return the arguments that all stages with items take: how many workers, where, and when one counts as stalled."""
     cluster = cfg.ray if cfg.engine == "ray" else None
     workers = cfg.workers or (len(os.sched_getaffinity(0)) if cluster is None else ALL_ROOM)
     return {"workers": workers, "watch": Watch(cluster, cfg.item_limit_s)}

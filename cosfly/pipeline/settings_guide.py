@@ -69,7 +69,7 @@ def _explain(
 
 
 def _model_of(field: Mapping[str, Any], models: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """Give the schema of a group of settings, None of a single one."""
+    """Return the schema of a group of settings, None of a single one."""
     model = models.get(field.get("$ref", "").rpartition("/")[2])
     return model if model is not None and "properties" in model else None
 
@@ -79,7 +79,7 @@ _BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusive
 
 
 def _kind_of(field: Mapping[str, Any], models: Mapping[str, Any]) -> str:
-    """Say what a setting may be: `number > 0`, `one of a, b`, `list of texts`, `text, as a, b`."""
+    """Return what a setting may be: `number > 0`, `one of a, b`, `list of texts`, `text, as a, b`."""
     if "examples" in field:
         names = {name: value for name, value in field.items() if name != "examples"}
         return f"{_kind_of(names, models)}, as {', '.join(map(str, field['examples']))}"
@@ -111,7 +111,7 @@ def _kind_of(field: Mapping[str, Any], models: Mapping[str, Any]) -> str:
 
 
 def nested(settings: list[Setting]) -> dict[str, Any]:
-    """Give the values group within group, as a configuration file holds them."""
+    """Return the values group within group, as a configuration file holds them."""
     values: dict[str, Any] = {}
     for setting in settings:
         *above, last = setting.name.split(".")

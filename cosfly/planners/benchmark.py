@@ -252,7 +252,7 @@ def _deltas(means: dict[str, dict[str, float]]) -> dict[str, dict[str, float | N
 
 
 def _row(flight: dict[str, float] | None) -> list[float]:
-    """Give the figures of a flight in the order of NAMES, NaN where one that was not flown has none."""
+    """Return the figures of a flight in the order of NAMES, NaN where one that was not flown has none."""
     return [flight[name] if flight else INFEASIBLE.get(name, np.nan) for name in NAMES]
 
 
@@ -268,7 +268,7 @@ def _means(tables: dict[str, np.ndarray], draw: np.ndarray) -> dict[str, dict[st
 
 
 def _normalized(means: dict[str, dict[str, float]]) -> np.ndarray:
-    """Give (planners, criteria) from 0, the worst, to 1, the best; all 1 where there is no difference."""
+    """Return (planners, criteria) from 0, the worst, to 1, the best; all 1 where there is no difference."""
     columns = []
     for figure, more_is_better in CRITERIA.values():
         values = np.array([row[figure] for row in means.values()])
@@ -316,7 +316,7 @@ def _number(value: float | None) -> float | None:
 
 
 def text_tables(found: Benchmark) -> list[TextTable]:
-    """Give the tables of the paper with its figures beside ours."""
+    """Return the tables of the paper with its figures beside ours."""
     try:
         return [table for table in _tables(found) if table.rows]
     except KeyError as error:
@@ -324,7 +324,7 @@ def text_tables(found: Benchmark) -> list[TextTable]:
 
 
 def markdown(found: Benchmark) -> str:
-    """Give the tables as a page of text."""
+    """Return the tables as a page of text."""
     parts = [f"# Planners on {len(found.scenarios)} scenarios of {found.map}, seed {found.seed}"]
     parts += ["## " + table.title.replace("*", "\\*") + f"\n\n{table.markdown()}" for table in text_tables(found)]
     return "\n\n".join(parts)
@@ -335,7 +335,7 @@ def _cells(values: Iterable[float | None], digits: int = 3) -> list[str]:
 
 
 def _printed(planner: str, *names: str) -> list[str]:
-    """Give what the paper prints of a planner."""
+    """Return what the paper prints of a planner."""
     digits = {"num_free": 0, "clearance_m": 2}
     row = PAPER.get(planner)
     return [cell for name in names for cell in _cells([getattr(row, name, None)], digits.get(name, 3))]

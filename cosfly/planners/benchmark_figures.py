@@ -26,7 +26,7 @@ SIGNS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (
 
 
 def draw(found: Benchmark, flown: Flown, box_map: BoxMap) -> dict[str, bytes]:
-    """Give the figures, name -> PNG; those of TA*+Smooth against MuCO only where both took part."""
+    """Return the figures, name -> PNG; those of TA*+Smooth against MuCO only where both took part."""
     scores = {p: row.scores for p, row in found.axes.items()}
     primary = {p: row for p, row in scores.items() if p not in PAPER or PAPER[p].axes_mean is not None}
     pictures = {"axes_radar.png": _radar(primary or scores)}  # the paper's seven and ours, where there are any

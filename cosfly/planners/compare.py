@@ -57,7 +57,7 @@ NUM_RESAMPLES, INTERVAL_PERCENT = 1000, (2.5, 97.5)  # of walks, for the interva
 
 
 def flight_figures(trace: DroneTrace) -> dict[str, float]:
-    """Give the figures of FIGURES of one flight."""
+    """Return the figures of FIGURES of one flight."""
     figures = {name: float(trace.metrics[name]) for name, _, _ in FIGURES if name in trace.metrics}
     figures["blocked_fraction"] = round(1.0 - figures["five_ray_mean"], 4)
     figures["collision_fraction"] = round(float((trace.clearances_m < 0).mean()), 4)
@@ -70,7 +70,7 @@ def mean_figures(flights: list[dict[str, float]]) -> dict[str, float]:
 
 
 def axis_scores(means: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
-    """Give the four axis scores and their mean for each planner (tab:appendix_h_four_axis_scores).
+    """Return the four axis scores and their mean for each planner (tab:appendix_h_four_axis_scores).
 
     Args:
         means: planner -> mean figures.
@@ -94,8 +94,8 @@ def axis_scores(means: dict[str, dict[str, float]]) -> dict[str, dict[str, float
 def axis_differences(
     figures: dict[str, list[dict[str, float]]], rng: np.random.Generator
 ) -> dict[str, dict[str, dict]]:
-    """Give the first planner's axis scores less each other's, with the 95 % interval over walks drawn with replacement
-    (Efron 1979).
+    """Return the first planner's axis scores less each other's, with the 95 % interval over walks drawn with
+    replacement (Efron 1979).
 
     Args:
         figures: planner -> figures of the same walks in the same order.
@@ -119,7 +119,7 @@ def axis_differences(
 
 
 def deltas(first: dict[str, float], second: dict[str, float]) -> dict[str, dict[str, float | None]]:
-    """Give difference and relative difference in percent for each figure; none where the second's is 0."""
+    """Return difference and relative difference in percent for each figure; none where the second's is 0."""
     table: dict[str, dict[str, float | None]] = {}
     for name, _, _ in FIGURES:
         change = first[name] - second[name]
@@ -302,7 +302,8 @@ def _left_out(records: Iterable[ItemRecord]) -> list[dict[str, str]]:
 
 
 def timings(shared: Collection[FlightsOfWalk], planners: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Give planning times over the compared walks: they differ from run to run, so they stand in the manifest alone."""
+    """Return planning times over the compared walks: they differ from run to run, so they stand in the manifest
+    alone."""
     table = {}
     for name in planners:
         times_ms = np.array([found.times_ms.get(name, 0.0) for found in shared])
@@ -323,7 +324,7 @@ LEGEND_PX = 160  # of one planner
 
 
 def color_of(planner: str) -> tuple[int, int, int]:
-    """Give a planner's color, the same in every comparison."""
+    """Return a planner's color, the same in every comparison."""
     return PALETTE[list(ALL_PLANNERS).index(planner) % len(PALETTE)]
 
 

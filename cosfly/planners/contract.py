@@ -66,12 +66,12 @@ TITLES = {
 
 
 def title_of(name: str) -> str:
-    """Give a planner's name for people."""
+    """Return a planner's name for people."""
     return TITLES.get(name, name.replace("_", " "))
 
 
 def known_planner(name: str) -> str:
-    """Give the name back.
+    """Return the name back.
 
     Raises:
         ValueError: it is not in ALL_PLANNERS.
@@ -233,7 +233,7 @@ class PlanConfig(Config):
         return self
 
     def style(self, name: str) -> Style:
-        """Give a row of the table of styles with the ranges of the settings."""
+        """Return a row of the table of styles with the ranges of the settings."""
         plain = name.removeprefix(OTHER_SIDE)
         row = with_ranges(ROWS[plain], self.style_ranges.get(plain, {}))
         if name.startswith(OTHER_SIDE) and row.bearing_deg is not None:
@@ -250,7 +250,7 @@ class PlanConfig(Config):
         return min(ALTITUDE_LEAST_M, self.altitude_min_m, *lows)
 
     def remarks(self) -> list[str]:
-        """Say which settings of heights and distances hold for a part of the flights alone."""
+        """Return which settings of heights and distances hold for a part of the flights alone."""
         fields = ("altitude_min_m", "altitude_preferred_m", "behind_distance_m") if self._rows() else ()
         return [
             f"plan.{field} = {getattr(self, field):g} holds for the style follow alone; for others plan.style_ranges"
@@ -300,7 +300,7 @@ class Wish:
         return self.heading_rad + (self.bearing_rad - np.pi)
 
     def places_m(self, targets_m: np.ndarray, ground_m: np.ndarray) -> np.ndarray:
-        """Give the wished places, (n, 3), for hip points (n, 3) and the ground below them (n,)."""
+        """Return the wished places, (n, 3), for hip points (n, 3) and the ground below them (n,)."""
         back = -self.ground_distance_m[:, None] * np.stack([np.cos(self.view_rad), np.sin(self.view_rad)], axis=1)
         return np.column_stack([targets_m[:, :2] + back, ground_m + self.altitude_m])
 
@@ -328,11 +328,11 @@ class Scenario:
         return max(len(self.flown_m) - 1, 0)
 
     def as_flown(self, points_m: np.ndarray) -> np.ndarray:
-        """Give a flight, (n, 3), with what is flown already as its begin."""
+        """Return a flight, (n, 3), with what is flown already as its begin."""
         return np.vstack([self.flown_m, points_m[len(self.flown_m) :]])
 
     def key_frames(self, stride: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Give every stride-th frame from the start on and the last, and the least, preferred and greatest z at each,
+        """Return every stride-th frame from the start on and the last, and the least, preferred and greatest z at each,
         all (m,).
 
         Between key frames a flight is straight while the ground may rise and fall: a key frame keeps the bounds of all
@@ -349,12 +349,12 @@ class Scenario:
         return frames, least, preferred, minimum_filter1d(highest_m, 2 * stride + 1, mode="nearest")[frames]
 
     def between(self, frames: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Give the flight that is straight between places at key frames, (m, 3): (n, 3)."""
+        """Return the flight that is straight between places at key frames, (m, 3): (n, 3)."""
         every = np.arange(len(self.targets_m))
         return self.as_flown(np.stack([np.interp(every, frames, places[:, axis]) for axis in range(3)], axis=1))
 
     def no_way(self, what: str, floor_m: float) -> NoPathError:
-        """Give the error of a planner that finds nothing. floor_m: distance to boxes that it keeps at least."""
+        """Return the error of a planner that finds nothing. floor_m: distance to boxes that it keeps at least."""
         low_m, high_m = self.wish.altitude_min_m.min(), self.wish.altitude_max_m.max()
         expected = f"places from {low_m:g} to {high_m:g} m up, {floor_m:g} m from all boxes"
         fix = "is the walk roofed over? raise plan.altitude_max_m or leave the path out"

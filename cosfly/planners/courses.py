@@ -36,7 +36,7 @@ WAY_ROUND = 0.2  # of that is the price of half the way round the walker from th
 def wish_of(
     names: list[str], scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator
 ) -> Wish:
-    """Give the wish of a flight of equally long parts in these styles; the wish of `follow` is the scenario's own."""
+    """Return the wish of a flight of equally long parts in these styles; the wish of `follow` is the scenario's own."""
     num, paper = len(scenario.targets_m), scenario.wish
     course, paces_mps = np.empty((num, 3)), np.full(num, APART_MPS)
     cuts = np.linspace(0, num, len(names) + 1).round().astype(int).tolist()
@@ -78,13 +78,13 @@ def without_jumps(
 
 
 def places_of(course: np.ndarray, targets_m: np.ndarray, ground_m: np.ndarray) -> np.ndarray:
-    """Give the places of a course as it is drawn, jumps and all, (n, 3)."""
+    """Return the places of a course as it is drawn, jumps and all, (n, 3)."""
     away = course[:, 1:2] * np.column_stack([np.cos(course[:, 0]), np.sin(course[:, 0])])
     return np.column_stack([targets_m[:, :2] + away, ground_m + course[:, 2]])
 
 
 def going_on(scenario: Scenario, cfg: PlanConfig) -> Wish:
-    """Give the wish of a flight that is to come from where the drone is (`flown_m`) to where the scenario wishes it,
+    """Return the wish of a flight that is to come from where the drone is (`flown_m`) to where the scenario wishes it,
     as from one style to the next; altitudes that it comes from are no breach."""
     paper, num_flown = scenario.wish, len(scenario.flown_m)
     away = scenario.flown_m[-1] - scenario.targets_m[num_flown - 1]
@@ -184,7 +184,7 @@ def _slew(values: np.ndarray, steps_max: np.ndarray) -> np.ndarray:
 
 
 def follow(targets_m: np.ndarray, cfg: PlanConfig, dt_s: float = DT_S) -> Wish:
-    """The paper's wish: behind the walker, the settings' height, distance and pitch throughout.
+    """Return the paper's wish: behind the walker, the settings' height, distance and pitch throughout.
 
     Args:
         targets_m: (n, 3), n >= 2. dt_s: between points.

@@ -104,7 +104,7 @@ def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
 
 
 def _links(rings: np.ndarray) -> np.ndarray:
-    """Give the rings next to each, outwards and up, (r, r): numbers, itself first, then -1."""
+    """Return the rings next to each, outwards and up, (r, r): numbers, itself first, then -1."""
     levels = np.searchsorted(np.unique(rings[:, 1]), rings[:, 1])
     links = np.full((len(rings), len(rings)), -1)
     for ring in range(len(rings)):
@@ -204,7 +204,7 @@ def _survey(places, targets, index, aloft, clearance_m, reach_m, gaps, hidden):
 
 @njit(cache=True)
 def _cheapest(places, own, gaps, longest_m, index, clearance_m, links, num_azimuths, max_turn, way_cost):
-    """Give the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
+    """Return the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
 
     places: (m, c, 3), c = rings * azimuths. own: (m, c) cost of a place. gaps: (m, c) m. longest_m: (m,) move into each
     key frame.
@@ -263,7 +263,7 @@ def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.rando
 
 
 def raw_flight(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> tuple[np.ndarray, str, float]:
-    """Give the flight to be smoothed, its kind (`wished`, `search` or `climbing search`), and the clearance that it
+    """Return the flight to be smoothed, its kind (`wished`, `search` or `climbing search`), and the clearance that it
     keeps, m.
 
     Where the wished places are free and see all that they are to see, nothing is searched.

@@ -141,7 +141,7 @@ def draw_intent(
 
 
 def why_not_held(intent: Intent, scenario: Scenario, positions_m: np.ndarray, seen: np.ndarray) -> str | None:
-    """Say why a flight is not what it was meant to be, None where it is.
+    """Return why a flight is not what it was meant to be, None where it is.
 
     Args:
         positions_m: (n, 3), as flown. seen: (n,) five-ray visibility past the screens.
@@ -240,7 +240,7 @@ def ended_by_order(
 def _legs_home(
     trail_m: np.ndarray, target_m: np.ndarray, obstacles: BoxIndex, cfg: PlanConfig, dt_s: float
 ) -> list[np.ndarray]:
-    """Give the way from the end of a trail (k, 3) away from the target, and then home: along the trail, but straight
+    """Return the way from the end of a trail (k, 3) away from the target, and then home: along the trail, but straight
     where that is free."""
     from cosfly.geometry.kernels import segments_hit
 
@@ -263,7 +263,7 @@ def _legs_home(
 
 
 def _flown_along(corners_m: np.ndarray, most_mps: float, dt_s: float) -> np.ndarray:
-    """Give the places (k, 3), dt_s apart, of a drone that starts and stops at the ends of a polyline, without its
+    """Return the places (k, 3), dt_s apart, of a drone that starts and stops at the ends of a polyline, without its
     first."""
     along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners_m, axis=0), axis=1))])
     speed_mps = min(most_mps, np.sqrt(HOME_MPS2 * along_m[-1]))
@@ -290,7 +290,7 @@ GOES_ON_S, SWEEP_DEG, SWEEP_S = 2.0, 18.0, 6.0
 def view_of(
     intent: Intent, positions_m: np.ndarray, targets_m: np.ndarray, seen: np.ndarray, dt_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Give pitch and yaw of the camera, (n,) each, radians.
+    """Return pitch and yaw of the camera, (n,) each, radians.
 
     Args:
         positions_m, targets_m: (n, 3). seen: (n,) five-ray visibility.

@@ -84,7 +84,7 @@ def _watching(style: Style, scenario: Scenario, rng: np.random.Generator) -> np.
 
 
 def first_loss(seen: np.ndarray, dt_s: float, least_s: float = LOST_LEAST_S) -> int | None:
-    """Give the first frame of a loss of at least `least_s` that follows a time of sight; None where there is none."""
+    """Return the first frame of a loss of at least `least_s` that follows a time of sight; None where there is none."""
     before = max(1, round(BEFORE_S / dt_s))
     for begin, end in _hidden_runs(seen):
         if begin >= before and (end - begin) * dt_s >= least_s and seen[begin - before : begin].mean() >= SEEN:
@@ -93,7 +93,7 @@ def first_loss(seen: np.ndarray, dt_s: float, least_s: float = LOST_LEAST_S) -> 
 
 
 def finds_again(seen: np.ndarray, dt_s: float) -> bool:
-    """Tell whether a walker is seen, lost, and seen at the end again; seen: (n,) five-ray visibility."""
+    """Return whether a walker is seen, lost, and seen at the end again; seen: (n,) five-ray visibility."""
     if first_loss(seen, dt_s) is None:
         return False
     longest_s = max(end - begin for begin, end in _hidden_runs(seen)) * dt_s

@@ -76,7 +76,8 @@ def make_horizon(index, target, reach_m, least_slope):
 
 @njit(cache=True)
 def _boxes_round(index, target, reach_m, least_slope):
-    """Give the boxes in reach that are steep enough, their distance, slope, and span of azimuth (2,), first <= last."""
+    """Return the boxes in reach that are steep enough, their distance, slope, and span of azimuth (2,), first <=
+    last."""
     boxes = np.empty(len(index.rows), dtype=np.int64)
     near, slopes, spans, num = np.empty(len(boxes)), np.empty(len(boxes)), np.empty((len(boxes), 2)), 0
     if len(index.rows) == 0:
@@ -111,7 +112,7 @@ def _boxes_round(index, target, reach_m, least_slope):
 
 @njit(cache=True)
 def _span(rows, target, distance_m):
-    """Give the azimuths under which rays to a target may touch a box: those of its bounds, and the feet's spread."""
+    """Return the azimuths under which rays to a target may touch a box: those of its bounds, and the feet's spread."""
     if distance_m < 1.0:
         return 0.0, 2.0 * np.pi
     middle = np.arctan2(0.5 * (rows[LOW_Y] + rows[HIGH_Y]) - target[1], 0.5 * (rows[LOW_X] + rows[HIGH_X]) - target[0])
@@ -127,7 +128,7 @@ def _span(rows, target, distance_m):
 
 @njit(cache=True, inline="always")
 def look(index, horizon, target, x, y, z):
-    """Give the five-ray visibility of the horizon's target from a point above it, as `kernels.visibility` does."""
+    """Return the five-ray visibility of the horizon's target from a point above it, as `kernels.visibility` does."""
     dx, dy = x - target[0], y - target[1]
     away, rise = np.sqrt(dx * dx + dy * dy), z - target[2] - FOOT_LOW_M
     sector = int(np.floor(np.arctan2(dy, dx) / (2.0 * np.pi) * NUM_SECTORS)) % NUM_SECTORS

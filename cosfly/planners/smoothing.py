@@ -70,7 +70,7 @@ def smooth_flight(
 
 
 def within_limits(points: np.ndarray, scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> np.ndarray:
-    """Give a flight (n, 3) that keeps the limits of speed, acceleration and clearance as it will be written; itself
+    """Return a flight (n, 3) that keeps the limits of speed, acceleration and clearance as it will be written; itself
     where it keeps them.
     """
     goal, pulls, band = points.copy(), np.full(len(points), PULL_STAYS), smoothness_band(len(points), scenario.dt_s)
@@ -94,7 +94,8 @@ def within_limits(points: np.ndarray, scenario: Scenario, obstacles: BoxIndex, c
 
 
 def _drawn_to(goal: np.ndarray, pulls: np.ndarray, band: np.ndarray, scenario: Scenario) -> np.ndarray:
-    """Give the smooth flight, (n, 3), that is drawn to a goal, (n, 3), with pulls (n,), within the wished altitudes."""
+    """Return the smooth flight, (n, 3), that is drawn to a goal, (n, 3), with pulls (n,), within the wished
+    altitudes."""
     system, goal = band.copy(), scenario.as_flown(goal)
     low, high = (scenario.ground_m + bound for bound in (scenario.wish.altitude_min_m, scenario.wish.altitude_max_m))
     pulls = np.where(np.arange(len(pulls)) < len(scenario.flown_m), PULL_FLOWN, pulls)
@@ -105,8 +106,8 @@ def _drawn_to(goal: np.ndarray, pulls: np.ndarray, band: np.ndarray, scenario: S
 
 
 def hurries(points: np.ndarray, cfg: PlanConfig, dt_s: float, num_flown: int = 0) -> np.ndarray:
-    """Tell which waypoints (n, 3) are at an end of a step too fast or of a change of speed too great, (n,) bool. Those
-    among the first `num_flown` are past."""
+    """Return which waypoints (n, 3) are at an end of a step too fast or of a change of speed too great, (n,) bool.
+    Those among the first `num_flown` are past."""
     found = np.zeros(len(points), dtype=bool)
     for order, most in ((1, cfg.speed_max_mps), (2, cfg.accel_max_mps2)):
         over = np.linalg.norm(np.diff(points, n=order, axis=0), axis=1) > most * dt_s**order + 1e-9
@@ -117,7 +118,7 @@ def hurries(points: np.ndarray, cfg: PlanConfig, dt_s: float, num_flown: int = 0
 
 
 def first_pulls(raw: np.ndarray, scenario: Scenario) -> np.ndarray:
-    """Give the pull of each waypoint of a raw flight (n, 3) before anything is lost, (n,)."""
+    """Return the pull of each waypoint of a raw flight (n, 3) before anything is lost, (n,)."""
     if scenario.wish.any_bearing:
         return np.full(len(raw), PULL_ANY_BEARING)
     off_m = np.linalg.norm(raw - scenario.wish.places_m(scenario.targets_m, scenario.ground_m), axis=1)
@@ -125,7 +126,7 @@ def first_pulls(raw: np.ndarray, scenario: Scenario) -> np.ndarray:
 
 
 def smoothness_band(num_points: int, dt_s: float) -> np.ndarray:
-    """Give the lower band of the matrix of squared derivatives of n points `dt_s` apart, (4, n)."""
+    """Return the lower band of the matrix of squared derivatives of n points `dt_s` apart, (4, n)."""
     band = np.zeros((4, num_points))
     for weight, coefficients in DIFFERENCES:
         order, num = len(coefficients) - 1, max(num_points - len(coefficients) + 1, 0)
@@ -136,7 +137,7 @@ def smoothness_band(num_points: int, dt_s: float) -> np.ndarray:
 
 
 def unsafe(points: np.ndarray, obstacles: BoxIndex, clearance_m: float, step_max_m: float) -> np.ndarray:
-    """Tell which waypoints are at an end of a step too long or too near a box, (n,) bool."""
+    """Return which waypoints are at an end of a step too long or too near a box, (n,) bool."""
     found = swept_distances(obstacles, points, clearance_m)[0] < clearance_m - ROUNDING_M
     steps = found[:-1] | (np.linalg.norm(np.diff(points, axis=0), axis=1) > step_max_m * (1.0 + ROUNDING_M))
     found[:-1] |= steps

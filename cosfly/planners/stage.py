@@ -143,7 +143,7 @@ def plan_on(
 
 
 def style_rng(walk: Walk, seed: int, attempt: int = 0) -> np.random.Generator:
-    """Give the generator of how a flight's styles are flown, by the walk's begin too."""
+    """Return the generator of how a flight's styles are flown, by the walk's begin too."""
     x_m, y_m = np.round(walk.positions_m[0, :2], 2) + 0.0
     return rng_for(seed, "style", f"{walk.path_id}/{x_m:.2f}/{y_m:.2f}" + (f"/{attempt}" if attempt else ""))
 
@@ -198,7 +198,7 @@ def _fly(
 def drop_reason(
     metrics: dict[str, float], cfg: PlanConfig, is_converged: bool, *, is_judged_by_sight: bool = True
 ) -> str | None:
-    """Give why the prefilter before rendering rejects a flight, None if it passes (sec:step6, sec:dataset_stats)."""
+    """Return why the prefilter before rendering rejects a flight, None if it passes (sec:step6, sec:dataset_stats)."""
     if not is_converged:
         return "not_converged"
     if is_judged_by_sight and metrics["five_ray_mean"] < cfg.five_ray_mean_min:

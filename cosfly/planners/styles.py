@@ -83,7 +83,7 @@ WHOLE = (REACQUIRE, RETURN_HOME)  # take a whole flight; the others may take par
 
 
 def suits(name: str) -> str:
-    """Tell what walker a style suits, by its name."""
+    """Return what walker a style suits, by its name."""
     row = ROWS.get(name.removeprefix(OTHER_SIDE))
     return "" if row is None else row.suits
 

@@ -84,7 +84,7 @@ class Costs(NamedTuple):
 
 @njit(cache=True)
 def search_layers(targets, reaches_m, voxels, costs, index, beam, corridor_m):
-    """Give the cell of each layer, (m,), all -1 if there is no way; the cost of the way; the number of places looked
+    """Return the cell of each layer, (m,), all -1 if there is no way; the cost of the way; the number of places looked
     from.
 
     targets: (m, 3) hip points of the layers. reaches_m: (m,) longest move into each layer.
@@ -125,7 +125,7 @@ def search_layers(targets, reaches_m, voxels, costs, index, beam, corridor_m):
 
 @njit(cache=True)
 def _move_tables(size):
-    """Give the length of each move, m, and the squared change between each two, in voxels."""
+    """Return the length of each move, m, and the squared change between each two, in voxels."""
     lengths, bends = np.empty(len(MOVES)), np.empty((len(MOVES), len(MOVES)))
     for m in range(len(MOVES)):
         lengths[m] = np.sqrt(((MOVES[m] * size) ** 2).sum())
@@ -230,7 +230,7 @@ def _choose(touched, best, target, layer, voxels, costs, index, beam):
 
 @njit(cache=True, inline="always")
 def _is_in_bounds(z, costs, layer):
-    """Tell whether a height keeps the altitudes of a layer."""
+    """Return whether a height keeps the altitudes of a layer."""
     return costs.least_z[layer] - ALTITUDE_ROUNDING_M <= z <= costs.greatest_z[layer] + ALTITUDE_ROUNDING_M
 
 
@@ -263,7 +263,7 @@ def _clearance(cell, voxels, costs, index):
 
 @njit(cache=True)
 def _edge_is_free(cell, there, voxels, costs, index):
-    """Tell whether the line between two cells keeps the safety distance."""
+    """Return whether the line between two cells keeps the safety distance."""
     a, b = _clearance(cell, voxels, costs, index), _clearance(there, voxels, costs, index)
     if a < costs.safety_m or b < costs.safety_m:
         return False
@@ -357,7 +357,7 @@ def make_voxels(scenario: Scenario, cfg: PlanConfig) -> Voxels:
 
 @njit(cache=True)
 def _corridor(low, shape, size, flat, margin_m):
-    """Tell which columns are within `margin_m` of a point of the walk."""
+    """Return which columns are within `margin_m` of a point of the walk."""
     inside = np.zeros((shape[0], shape[1]), dtype=np.bool_)
     for ix in range(shape[0]):
         for iy in range(shape[1]):

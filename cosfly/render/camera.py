@@ -108,7 +108,7 @@ def rendered_visibility(
 def hidden_shares(
     frame: Frame, target_m: np.ndarray, view: TargetView, camera_pose: np.ndarray, camera: Camera, other_ids: np.ndarray
 ) -> tuple[float, float]:
-    """Tell what hides the target's box: the shares of it, in [0, 1], that others hide and that the map hides."""
+    """Return what hides the target's box: the shares of it, in [0, 1], that others hide and that the map hides."""
     num_rays, hiding = _rays_to_box(frame, target_m, view, camera_pose, camera)
     if num_rays == 0:
         return 0.0, 0.0
@@ -168,7 +168,7 @@ def contrast_of(rgb: np.ndarray, is_person: np.ndarray) -> float | None:
 
 
 def legibility(meta: TargetMeta, contrast: float | None) -> dict[str, float | bool | None]:
-    """Give `height_px`, `contrast` and `legible` of a target in a frame: whether a person can be made out, beside
+    """Return `height_px`, `contrast` and `legible` of a target in a frame: whether a person can be made out, beside
     `visible`, which geometry tells."""
     height_px = 0.0 if meta.bbox_2d is None else round(meta.bbox_2d[3] - meta.bbox_2d[1], 2)
     contrast = None if contrast is None else round(contrast, 2)

@@ -324,7 +324,7 @@ class CarlaRenderer:
         return actor
 
     def _far_up(self) -> Any:
-        """A place of its own over the map, so that nothing that is spawned stands in another's way."""
+        """Return a place of its own over the map, so that nothing that is spawned stands in another's way."""
         x, y, z = self._map.bounds()[1]
         return self._transform(np.array([x + 10.0 * len(self._movers), y, z + SPAWN_M]), np.zeros(3))
 

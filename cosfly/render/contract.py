@@ -153,7 +153,7 @@ class Renderer(Protocol):
         ...
 
     def close(self) -> None:
-        """Give the device back."""
+        """Return the device back."""
 
 
 # --- the same for all -------------------------------------------------------------------------------------------------
@@ -169,17 +169,17 @@ def far_as_sky(frame: Frame) -> Frame:
 
 
 def other_id(number: int) -> int:
-    """Give the id of the other of this number: from MAX_BOX_ID downwards, which boxes leave free."""
+    """Return the id of the other of this number: from MAX_BOX_ID downwards, which boxes leave free."""
     return MAX_BOX_ID - number
 
 
 def has_own_ids(box_map: BoxMap, num_others: int = 0) -> bool:
-    """Tell whether boxes can keep their ids in `instance.png`: all in 1..MAX_BOX_ID, and none an other's."""
+    """Return whether boxes can keep their ids in `instance.png`: all in 1..MAX_BOX_ID, and none an other's."""
     return bool(((box_map.ids >= 1) & (box_map.ids <= MAX_BOX_ID - num_others)).all())
 
 
 def instance_ids(box_map: BoxMap, num_others: int = 0) -> np.ndarray:
-    """Give every box its id for `instance.png`, (n,) uint16 in the map's order.
+    """Return every box its id for `instance.png`, (n,) uint16 in the map's order.
 
     The boxes' own ids are used if they can be. Otherwise ids are counted from 1, first through the boxes that are not
     vegetation, then through the vegetation, each in the map's order; boxes left over share SHARED_ID.
@@ -194,7 +194,7 @@ def instance_ids(box_map: BoxMap, num_others: int = 0) -> np.ndarray:
 
 
 def with_rim(box_map: BoxMap, num_others: int, rim: BoxMap | None) -> tuple[BoxMap, np.ndarray]:
-    """Give all boxes to draw, n, and the id of each for `instance.png`, (n,) uint16: NO_INSTANCE of the rim's."""
+    """Return all boxes to draw, n, and the id of each for `instance.png`, (n,) uint16: NO_INSTANCE of the rim's."""
     ids = instance_ids(box_map, num_others)
     if rim is None:
         return box_map, ids
@@ -202,7 +202,8 @@ def with_rim(box_map: BoxMap, num_others: int, rim: BoxMap | None) -> tuple[BoxM
 
 
 def scene_origin(box_map: BoxMap) -> np.ndarray:
-    """A whole-metre place in the middle of a map, (3,) world: what a GPU computes in float32 is best relative to it."""
+    """Return a whole-metre place in the middle of a map, (3,) world: what a GPU computes in float32 is best relative
+    to it."""
     low, high = box_map.bounds() if len(box_map) else (np.zeros(3), np.zeros(3))
     return np.round((low + high) / 2.0)
 
@@ -255,7 +256,7 @@ def stem_radius_m(half_m: np.ndarray) -> np.ndarray:
 
 
 def _over_a_trunk(centers_m: np.ndarray, half_m: np.ndarray, is_trunk: np.ndarray) -> np.ndarray:
-    """Tell which boxes hang beside or over a trunk that the map keeps as a box of its own, (n,) bool."""
+    """Return which boxes hang beside or over a trunk that the map keeps as a box of its own, (n,) bool."""
     if not is_trunk.any():
         return np.zeros(len(centers_m), dtype=bool)
     from scipy.spatial import cKDTree  # half a second, which every command would pay for the settings beside it
@@ -266,7 +267,7 @@ def _over_a_trunk(centers_m: np.ndarray, half_m: np.ndarray, is_trunk: np.ndarra
 
 
 def seeds_of(ids: np.ndarray) -> np.ndarray:
-    """A fixed number in [0, 1) for each box id, so that a house keeps its colour between runs (splitmix64)."""
+    """Return a fixed number in [0, 1) for each box id, so that a house keeps its colour between runs (splitmix64)."""
     with np.errstate(over="ignore"):
         x = np.asarray(ids, dtype=np.uint64) + np.uint64(0x9E3779B97F4A7C15)
         x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -275,7 +276,7 @@ def seeds_of(ids: np.ndarray) -> np.ndarray:
 
 
 def chance(seeds: np.ndarray, number: int) -> np.ndarray:
-    """A further fixed number in [0, 1) for each seed."""
+    """Return a further fixed number in [0, 1) for each seed."""
     return np.mod(seeds * 9973.0 + number * 0.61803399, 1.0)
 
 

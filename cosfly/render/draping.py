@@ -39,7 +39,7 @@ class DrapedSurfaces:
 
 
 def is_draped(box_map: BoxMap) -> np.ndarray:
-    """Tell which boxes lie on sloping ground, (n,) bool: not a flyover's deck, and no box of a flat map."""
+    """Return which boxes lie on sloping ground, (n,) bool: not a flyover's deck, and no box of a flat map."""
     if box_map.ground.is_flat:
         return np.zeros(len(box_map), dtype=bool)
     return box_map.is_any_of(DRAPED_KINDS) & ~lies_off_ground(box_map, DRAPED_KINDS)
@@ -114,7 +114,7 @@ CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
 def layers_of(box_map: BoxMap) -> np.ndarray:
-    """The layer of each box and, in fractions, its tier there, (n,); of two in one plane the greater is seen."""
+    """Return the layer of each box and, in fractions, its tier there, (n,); of two in one plane the greater is seen."""
     table = np.full(256, STANDING_LAYER)
     table[[KINDS[name] for name in LAYERS]] = list(LAYERS.values())
     is_lawn = (box_map.kinds == KINDS["Vegetation"]) & (box_map.half_extents[:, 2] < LAWN_HALF_M)
@@ -123,7 +123,8 @@ def layers_of(box_map: BoxMap) -> np.ndarray:
 
 
 def _tiers(box_map: BoxMap, layers: np.ndarray) -> np.ndarray:
-    """Give each surface the lowest tier that is free of earlier ones, (n,) in [0, 1); beyond MOST_TIERS the highest."""
+    """Return each surface the lowest tier that is free of earlier ones, (n,) in [0, 1); beyond MOST_TIERS the
+    highest."""
     tiers = np.zeros(len(box_map), dtype=int)
     for row, others in _overlaps(box_map, layers).items():  # in the map's order, so that those before have theirs
         free = np.setdiff1d(np.arange(MOST_TIERS), tiers[others])
@@ -132,7 +133,7 @@ def _tiers(box_map: BoxMap, layers: np.ndarray) -> np.ndarray:
 
 
 def _overlaps(box_map: BoxMap, layers: np.ndarray) -> dict[int, list[int]]:
-    """Give of surfaces that overlap others the earlier ones in the same layer, plane and place, in order."""
+    """Return of surfaces that overlap others the earlier ones in the same layer, plane and place, in order."""
     rows = np.flatnonzero((layers < STANDING_LAYER) & ~box_map.rotations_deg[:, [0, 2]].any(axis=1))
     yaws = np.radians(box_map.rotations_deg[rows, 1])[:, None]
     x, y = np.moveaxis(np.maximum(box_map.half_extents[rows, None, :2] - EDGE_M, 0.0) * CORNERS, 2, 0)

@@ -41,7 +41,7 @@ def keep_asking(draw: Callable[[], Frame], mend: Callable[[Exception], None], re
 
 
 def fov_of(intrinsic: np.ndarray, size_px: tuple[int, int], device: str) -> float:
-    """Give the horizontal field of view, degrees, which is all that an engine is told of a lens."""
+    """Return the horizontal field of view, degrees, which is all that an engine is told of a lens."""
     width, height = size_px
     fov_deg = round(Camera(width, height, intrinsic).fov_deg, 6)
     f = focal_px(width, fov_deg)

@@ -101,7 +101,7 @@ def figure_of(person: PosedPerson) -> PersonFigure:
 
 
 def _swung(angle_rad: float, length: float) -> np.ndarray:
-    """A vector hanging down, turned forward by an angle."""
+    """Return a vector hanging down, turned forward by an angle."""
     return length * np.array([np.sin(angle_rad), 0.0, -np.cos(angle_rad)])
 
 

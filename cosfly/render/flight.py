@@ -78,7 +78,7 @@ def find_goal(
 
 
 def are_told_apart(frame: Frame, other: Frame) -> bool:
-    """Tell whether the target of two frames that differ in its look alone is another one to the eye."""
+    """Return whether the target of two frames that differ in its look alone is another one to the eye."""
     is_person = (frame.ids == PERSON_ID) | (other.ids == PERSON_ID)
     colors = [cv2.cvtColor(one.rgb.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[is_person] for one in (frame, other)]
     num_px = np.count_nonzero(np.linalg.norm(colors[0] - colors[1], axis=-1) >= TOLD_CONTRAST)

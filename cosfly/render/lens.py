@@ -38,7 +38,7 @@ def cameras_of(
     segments: Sequence[Segment],
     rng: np.random.Generator,
 ) -> tuple[Camera, ...]:
-    """Give the camera of each frame of a flight.
+    """Return the camera of each frame of a flight.
 
     Args:
         size_px: (width, height). first_deg: the level that the flight drew. fovs_deg: all levels. time_s: (n,). rng:
@@ -58,7 +58,7 @@ def zoomed_deg(
     segments: Sequence[Segment],
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Give fields of view, (n,) degrees, that go from part to part to another level, if there is one.
+    """Return fields of view, (n,) degrees, that go from part to part to another level, if there is one.
 
     Equal times of a change make the picture grow by equal factors, but for a gentle begin and end.
     """
@@ -76,7 +76,7 @@ def zoomed_deg(
 
 
 def _begins_s(zoom: ZoomConfig, time_s: np.ndarray, segments: Sequence[Segment]) -> list[float]:
-    """Give the times at which parts begin, the first part's left out."""
+    """Return the times at which parts begin, the first part's left out."""
     if segments:
         return [float(time_s[segment.begin]) for segment in segments if segment.begin > 0]
     return np.arange(time_s[0] + zoom.part_s, time_s[-1], zoom.part_s).tolist()

@@ -35,11 +35,11 @@ class Gait:
     swings: np.ndarray
 
     def since(self, first: int) -> Gait:
-        """The same from a frame on."""
+        """Return the same from a frame on."""
         return Gait(self.headings_rad[first:], self.phases_rad[first:], self.swings[first:])
 
     def posed(self, i: int, hip_m: np.ndarray, clothes: Clothes) -> PosedPerson:
-        """The person of frame i, at a hip point, (3,) world."""
+        """Return the person of frame i, at a hip point, (3,) world."""
         return PosedPerson(
             hip_m, float(self.headings_rad[i]), float(self.phases_rad[i]), float(self.swings[i]), clothes
         )
@@ -117,7 +117,7 @@ class Cast:
         return min((float(distances_to_boxes_m(point_m, other.at(i))[0]) for other in self.others), default=np.inf)
 
     def are_in_the_way(self, i: int, person_m: np.ndarray) -> bool:
-        """Tell whether a person at a hip point, (3,), would touch somebody."""
+        """Return whether a person at a hip point, (3,), would touch somebody."""
         return any(other.at(i).gap_to_person_m(person_m) < 0.0 for other in self.others)
 
 

@@ -97,7 +97,7 @@ class PerturbedTrack:
 
     @classmethod
     def nothing(cls, planned: Poses) -> PerturbedTrack:
-        """The poses as they were planned."""
+        """Return the poses as they were planned."""
         n = len(planned.positions_m)
         states = [{"position": NONE, "rotation": NONE} for _ in range(n)]
         return cls(copy.deepcopy(planned), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3)), states)
@@ -148,7 +148,7 @@ class Surroundings:
         return max(0.0, self._plane_m - z_m, float(self._tops[inside].max(initial=-np.inf)) - z_m)
 
     def _slabs_at(self, x_m: float, y_m: float) -> np.ndarray:
-        """Tell which slabs of the ground are over or under a place, (n,) bool."""
+        """Return which slabs of the ground are over or under a place, (n,) bool."""
         offset = np.column_stack([x_m - self._centers[:, 0], y_m - self._centers[:, 1], np.zeros(len(self._centers))])
         local = np.einsum("nji,nj->ni", self._turns, offset)
         return (np.abs(local[:, :2]) <= self._half[:, :2]).all(axis=1)
@@ -239,7 +239,7 @@ def _aim_deg(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 def in_frame(
     target_m: np.ndarray, drone_m: np.ndarray, rotation_deg: np.ndarray, camera: Camera, margin: float
 ) -> bool:
-    """Tell whether the target's hip point is inside the image by a margin (a share of width and height)."""
+    """Return whether the target's hip point is inside the image by a margin (a share of width and height)."""
     uv, z = project(np.asarray(target_m)[None], world_from_camera(drone_m, rotation_deg), camera.intrinsic)
     size = np.array([camera.width_px, camera.height_px])
     return bool(z[0] > 0.3 and (uv[0] >= margin * size).all() and (uv[0] <= (1.0 - margin) * size).all())

@@ -35,7 +35,7 @@ CLUSTERS, BLOCKS = 6, 12  # of the skyline
 
 
 def rim_of(box_map: BoxMap, seed: int) -> BoxMap:
-    """Give the boxes beyond a map, with ids that no box of it has: the same for the same map and seed."""
+    """Return the boxes beyond a map, with ids that no box of it has: the same for the same map and seed."""
     from scipy.spatial import cKDTree  # half a second, as in contract.py
 
     rng = rng_for(seed, "render", f"rim/{box_map.name}")

@@ -33,7 +33,7 @@ class Solids:
 
 
 def are_solids(box_map: BoxMap) -> np.ndarray:
-    """Tell which boxes are drawn as meshes, (n,) bool."""
+    """Return which boxes are drawn as meshes, (n,) bool."""
     return np.isin(box_map.ids, np.array(sorted(box_map.meshes.refs), dtype=np.uint64))
 
 

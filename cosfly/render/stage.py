@@ -231,7 +231,7 @@ def _item(number: int, trace: DroneTrace, track: str) -> Item:
 
 
 def _passed(stage: StageFolder, traces: list[DroneTrace], chosen: int | None) -> list[tuple[int, DroneTrace]]:
-    """Give the flights that are drawn, all or the chosen one, each with its number among all."""
+    """Return the flights that are drawn, all or the chosen one, each with its number among all."""
     passed = [(n, trace) for n, trace in enumerate(traces) if trace.drop_reason is None and chosen in (None, n)]
     if not passed:
         tally = Tally(input=len(traces), dropped=Counter(str(trace.drop_reason) for trace in traces))
@@ -298,7 +298,7 @@ def num_others_of(companies: dict[str, Company]) -> int:
 def _names(
     stage: StageFolder, cfg: RenderConfig, map_name: str, traces: Path, others: Path | None, seed: int
 ) -> tuple[str, int]:
-    """Give the town's folder and the number of the first trajectory; a tree that was begun keeps its own."""
+    """Return the town's folder and the number of the first trajectory; a tree that was begun keeps its own."""
     numbers = {trace.path_id: number for number, trace in enumerate(read_traces(traces))}
     for record in stage.items():
         number = numbers.get(record.id.rpartition("/")[0])
@@ -315,7 +315,7 @@ def _names(
 
 
 def _weather_seed(stage: StageFolder, cfg: RenderConfig) -> int:
-    """Give the seed of the weather; a drawn one stays what it was when the tree was begun."""
+    """Return the seed of the weather; a drawn one stays what it was when the tree was begun."""
     if cfg.weather_seed >= 0:
         return cfg.weather_seed
     begun = (result_of(record, _RenderedFlight).weather_seed for record in stage.items() if isinstance(record, Kept))
@@ -328,7 +328,7 @@ def _check_ids(traces: list[DroneTrace], path: Path) -> None:
 
 
 def _ids_record(box_map: BoxMap, num_others: int) -> dict:
-    """Which box an id of `instance.png` stands for, rows of (instance id, box id), and the ids of others."""
+    """Return which box an id of `instance.png` stands for, rows of (instance id, box id), and the ids of others."""
     ids = instance_ids(box_map, num_others)
     return {
         **IDS_FORMAT.header,

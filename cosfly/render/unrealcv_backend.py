@@ -251,7 +251,7 @@ class UnrealCvRenderer:
             raise NoPictureError(f"camera {self._cfg.camera}: {error}") from None
 
     def _there(self, position_m: np.ndarray, rotation_deg: np.ndarray) -> tuple[str, str]:
-        """A place in the level's units and its rotation, as words of commands."""
+        """Return a place in the level's units and its rotation, as words of commands."""
         x, y, z, *turn = unreal_pose(position_m + np.array([0.0, 0.0, self._cfg.coord_z_offset]), rotation_deg)
         place = (f"{part * self._cfg.coord_scale:.6f}" for part in (x, y, z))
         return " ".join(place), " ".join(f"{part:.6f}" for part in turn)

@@ -102,12 +102,12 @@ class WeatherConfig(Config):
         return self
 
     def recorded(self) -> dict[str, Any]:
-        """Give the settings that decide what is made. Without weather none of them does."""
+        """Return the settings that decide what is made. Without weather none of them does."""
         unused = {"off": {*WeatherConfig.model_fields}, "by_weight": set[str]()}.get(self.weather_mode, {"sky_shares"})
         return {name: value for name, value in super().recorded().items() if name not in unused}
 
     def pool_files(self) -> dict[str, Path]:
-        """The files of presets, which are inputs of the stage."""
+        """Return the files of presets, which are inputs of the stage."""
         files = {"weather_pool": self.weather_pool, "tod_pool": self.tod_pool}
         return {name: path for name, path in files.items() if path is not None}
 
@@ -134,7 +134,7 @@ class Pools:
     times: Mapping[str, TimePreset]
 
     def of_kind(self) -> dict[str, list[tuple[str, str]]]:
-        """Give the pairs of weather and time of each kind of sky."""
+        """Return the pairs of weather and time of each kind of sky."""
         pairs = {(a, b): sky_kind(resolved(self.weathers[a], self.times[b])) for a in self.weathers for b in self.times}
         return {kind: [pair for pair, own in pairs.items() if own == kind] for kind in dict.fromkeys(pairs.values())}
 
@@ -167,14 +167,14 @@ def read_pools(cfg: WeatherConfig) -> Pools:
 
 
 def _unknown(name: str, presets: Mapping[str, Any], field: str) -> list[str]:
-    """Say what is wrong with the name of a preset, nothing where there is such a one."""
+    """Return what is wrong with the name of a preset, nothing where there is such a one."""
     if preset_token(name) in presets:
         return []
     return [f"{field}: unknown preset {name!r}{nearest(preset_token(name), presets)}; there are {', '.join(presets)}"]
 
 
 def path_seed(weather_seed: int, path_index: int) -> int:
-    """Give the seed of one trajectory (eq:weather_seed)."""
+    """Return the seed of one trajectory (eq:weather_seed)."""
     return weather_seed * 1_000_003 + path_index * 7_919 + 11
 
 
@@ -184,7 +184,7 @@ def drawn_seed() -> int:
 
 
 def weather_of(cfg: WeatherConfig, pools: Pools, path_index: int) -> WeatherRecord | None:
-    """Give the weather of a trajectory, None where the mode is off. `weather_seed` is not negative."""
+    """Return the weather of a trajectory, None where the mode is off. `weather_seed` is not negative."""
     if cfg.weather_mode == "off":
         return None
     if cfg.weather_mode == "fixed":
@@ -201,7 +201,7 @@ def weather_of(cfg: WeatherConfig, pools: Pools, path_index: int) -> WeatherReco
 
 
 def dark_flights(cfg: WeatherConfig, num_flights: int, read_map: Callable[[], BoxMap]) -> list[int]:
-    """Give the numbers of the flights on whose pictures nobody sees anything: by night, on a map without lamps.
+    """Return the numbers of the flights on whose pictures nobody sees anything: by night, on a map without lamps.
 
     Args:
         read_map: asked only where a flight is by night. A drawn `weather_seed` is not known before: then there is none.
@@ -221,7 +221,7 @@ def fog_extinction(params: WeatherParams) -> float:
 
 
 def fog_hides(sky: WeatherRecord | None, distance_m: float) -> bool:
-    """Tell whether a sky takes so much of the colours at a distance that nobody can be made out there."""
+    """Return whether a sky takes so much of the colours at a distance that nobody can be made out there."""
     thick = 0.0 if sky is None else fog_extinction(sky.params) * max(0.0, distance_m - sky.params.fog_distance)
     return math.exp(-CONTRAST_POWER * thick) * STRONGEST_CONTRAST < LEGIBLE_CONTRAST
 

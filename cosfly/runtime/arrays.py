@@ -140,7 +140,7 @@ def check_pixels(num_pixels: float, where: str | Path, got: str) -> None:
 
 
 def png_size(data: bytes) -> tuple[int, int] | None:
-    """Give (width, height) px of a PNG from its first bytes, None if it is none."""
+    """Return (width, height) px of a PNG from its first bytes, None if it is none."""
     if len(data) < PNG_HEADER_BYTES or not data.startswith(PNG_SIGNATURE) or data[12:16] != b"IHDR":
         return None
     width, height = struct.unpack_from(">II", data, 16)
@@ -148,7 +148,7 @@ def png_size(data: bytes) -> tuple[int, int] | None:
 
 
 def picture_size(path: Path, *, tree: Path | None = None) -> tuple[int, int] | None:
-    """Give (width, height) px of a PNG file from its header, None if it is none; raises as `open_file`."""
+    """Return (width, height) px of a PNG file from its header, None if it is none; raises as `open_file`."""
     with open_file(path, what="image", tree=tree) as file, disk_errors(path, "image"):
         return png_size(file.read(PNG_HEADER_BYTES))
 
@@ -178,8 +178,8 @@ def parse_picture(data: bytes, where: str | Path, *, flags: int = cv2.IMREAD_COL
 
 
 def _holds_its_chunks(data: bytes) -> bool:
-    """Tell whether no chunk of a PNG says that it goes on beyond the file: OpenCV makes room for what a chunk says, up
-    to gigabytes.
+    """Return whether no chunk of a PNG says that it goes on beyond the file: OpenCV makes room for what a chunk
+    says, up to gigabytes.
     """
     place = len(PNG_SIGNATURE)
     while place + 8 <= len(data):

@@ -10,12 +10,12 @@ import numpy as np
 
 
 def rng_for(seed: int, stage: str, item_id: str) -> np.random.Generator:
-    """Give the random generator of one item."""
+    """Return the random generator of one item."""
     return np.random.default_rng(int.from_bytes(draws_for(seed, stage, item_id)[:16], "little"))
 
 
 def draws_for(seed: int, stage: str, item_id: str) -> bytes:
-    """Give 32 random bytes of one item: enough for a few choices, and made in a twentieth of a generator's time."""
+    """Return 32 random bytes of one item: enough for a few choices, and made in a twentieth of a generator's time."""
     return hashlib.sha256(f"{seed}/{stage}/{item_id}".encode()).digest()
 
 
@@ -43,7 +43,7 @@ def draw_by_share(shares: Mapping[str, float], rng: np.random.Generator) -> str:
 
 
 def _ends(shares: Mapping[str, float]) -> tuple[list[str], np.ndarray]:
-    """Give the names in order, and where the share of each ends when they stand one after the other."""
+    """Return the names in order, and where the share of each ends when they stand one after the other."""
     names = sorted(shares)
     weights = np.array([shares[name] for name in names], dtype=np.float64)
     if not ((weights >= 0).all() and weights.sum() > 0):

@@ -81,7 +81,7 @@ def read_yaml(path: Path) -> dict:
 
 
 def apply_overrides(data: dict, overrides: Iterable[str]) -> dict:
-    """Give a copy of `data` with `a.b=c` assignments applied; values are read as YAML."""
+    """Return a copy of `data` with `a.b=c` assignments applied; values are read as YAML."""
     data = copy.deepcopy(data)
     for override in overrides:
         key, equals, text = override.partition("=")
@@ -152,7 +152,7 @@ def _names(model: Any, above: str = "") -> Iterator[str]:
 
 
 def _group(model: Any, parents: Iterable[Any]) -> Any:
-    """Give the model of the group of settings at `parents`, None where there is none."""
+    """Return the model of the group of settings at `parents`, None where there is none."""
     for parent in parents:
         field = getattr(model, "model_fields", {}).get(parent)
         if field is None:
@@ -163,12 +163,12 @@ def _group(model: Any, parents: Iterable[Any]) -> Any:
 
 
 def shipped(name: str) -> Path:
-    """Give the path of a file that ships in `configs/`, wherever cosfly is installed."""
+    """Return the path of a file that ships in `configs/`, wherever cosfly is installed."""
     return Path(str(importlib.resources.files("cosfly_configs") / name))
 
 
 def config_file(config: Path | None) -> Path | None:
-    """Give the file of a configuration: that of a path, of a run folder, or of the bare name of one that ships."""
+    """Return the file of a configuration: that of a path, of a run folder, or of the bare name of one that ships."""
     if config is None or config.is_file():
         return config
     if (config / "run.yaml").is_file():

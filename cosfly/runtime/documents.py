@@ -95,7 +95,7 @@ def parse_json(text: str | bytes, *, each_key_once: bool = False) -> Any:
 
 
 def is_deep(value: Any) -> bool:
-    """Tell whether lists and objects are nested deeper than DEPTH."""
+    """Return whether lists and objects are nested deeper than DEPTH."""
     level = [value]
     for _ in range(DEPTH + 1):
         level = [
@@ -182,7 +182,7 @@ def _validator(kind: type) -> SchemaValidator:
 
 
 def _ending_early(schema: Any) -> Any:
-    """Give a schema of pydantic's with `fail_fast` in all that has members."""
+    """Return a schema of pydantic's with `fail_fast` in all that has members."""
     if isinstance(schema, list):
         return [_ending_early(one) for one in schema]
     if not isinstance(schema, dict):
@@ -194,7 +194,7 @@ def _ending_early(schema: Any) -> Any:
 
 
 def _shown(value: Any) -> str:
-    """A value in a message; of one with members the first few."""
+    """Return a value in a message; of one with members the first few."""
     return (reprlib if isinstance(value, dict | list) else builtins).repr(value)[:80]
 
 
@@ -236,7 +236,7 @@ class FileFormat(NamedTuple):
 
 
 def check_schema(value: Any, form: FileFormat, path: Path | str) -> dict:
-    """Give a JSON value that is an object of the wanted schema and major version."""
+    """Return a JSON value that is an object of the wanted schema and major version."""
     schema, version, _ = form
     if not isinstance(value, dict):
         raise InputError(
@@ -259,7 +259,7 @@ def check_schema(value: Any, form: FileFormat, path: Path | str) -> dict:
 
 
 def model_of(value: Any, model: type[Model], form: FileFormat, where: Path | str) -> Model:
-    """Give what a JSON value of the wanted schema and major version says as a model."""
+    """Return what a JSON value of the wanted schema and major version says as a model."""
     value = check_schema(value, form, where)
     return validated(model, {key: v for key, v in value.items() if key not in form.header}, where)
 

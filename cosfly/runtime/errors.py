@@ -68,7 +68,7 @@ class CosflyError(Exception):
 
     @classmethod
     def of_all(cls, problems: Sequence[str], *, where: str | Path, expected: str | None = None) -> Self:
-        """Give one error of all that is wrong with a file: the first of them, and how many there are."""
+        """Return one error of all that is wrong with a file: the first of them, and how many there are."""
         more = f"; and {len(problems) - MOST_TOLD} more" if len(problems) > MOST_TOLD else ""
         count = f"{len(problems)} to mend" if len(problems) > 1 else None
         return cls("; ".join(problems[:MOST_TOLD]) + more, where=where, expected=expected, fix=count)
@@ -127,7 +127,7 @@ NEAR, SHARED_WORD = 0.6, 0.15
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Give ' (did you mean X?)' for the nearest known name, or the empty string."""
+    """Return ' (did you mean X?)' for the nearest known name, or the empty string."""
     found = max(known, key=partial(_nearness, name), default="")
     return f" (did you mean {found!r}?)" if found and _nearness(name, found) >= NEAR else ""
 
@@ -140,5 +140,5 @@ def _nearness(name: str, known: str) -> float:
 
 
 def plain(message: str) -> str:
-    """Give what a validator of ours said, without what pydantic puts before it."""
+    """Return what a validator of ours said, without what pydantic puts before it."""
     return message.removeprefix("Value error, ")

@@ -19,7 +19,8 @@ _MARKDOWN = re.compile(r"([\\`*\[\]|~#]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9]))")  #
 
 
 def cut(text: str, longest: int = LONGEST) -> str:
-    """Give a text of at most about `longest` characters: the middle of a longer one is left out, and says how much."""
+    """Return a text of at most about `longest` characters: the middle of a longer one is left out, and says how
+    much."""
     if len(text) <= longest:
         return text
     head = longest * 2 // 3
@@ -27,18 +28,18 @@ def cut(text: str, longest: int = LONGEST) -> str:
 
 
 def for_terminal(text: str, longest: int = LONGEST) -> str:
-    """Give text that a terminal prints and never obeys: control characters as `\\x1b`."""
+    """Return text that a terminal prints and never obeys: control characters as `\\x1b`."""
     return _CONTROLS.sub(lambda match: ascii(match[0])[1:-1], cut(text, longest))
 
 
 def for_markdown(text: str) -> str:
-    """Give text that Markdown shows as it is, on one line, also in a table: no tag, link, emphasis or bar works."""
+    """Return text that Markdown shows as it is, on one line, also in a table: no tag, link, emphasis or bar works."""
     line = " ".join(for_terminal(text).split())
     return _MARKDOWN.sub(r"\\\1", html.escape(line, quote=False))
 
 
 def markdown_code(text: str) -> str:
-    """Give text as a code span of Markdown, on one line: the fence is longer than any run of backticks in it."""
+    """Return text as a code span of Markdown, on one line: the fence is longer than any run of backticks in it."""
     line = " ".join(for_terminal(text).split()).replace("|", "\\|")
     runs = re.findall("`+", line)
     fence = "`" * (max(map(len, runs), default=0) + 1)
@@ -57,7 +58,7 @@ RELATIVE = re.compile(r"\.{1,2}[\\/]\S*|[\w.-]+(?:[\\/][\w.-]+){2,}[\\/]?|[\w.-]
 
 
 def published_name(text: str) -> str:
-    """Give a text with the last name in the place of each path, and `an address` in that of each URL."""
+    """Return a text with the last name in the place of each path, and `an address` in that of each URL."""
     if IS_ABSOLUTE.match(text) or RELATIVE.fullmatch(text):
         return _last_name(text)
     text = ADDRESS.sub("an address", text)
@@ -65,7 +66,7 @@ def published_name(text: str) -> str:
 
 
 def published(value: Any) -> Any:
-    """Give settings with published names."""
+    """Return settings with published names."""
     if isinstance(value, str):
         return published_name(value)
     if isinstance(value, dict):

@@ -46,7 +46,7 @@ class LinkedPath(PosixPath):
 
 
 def over_limit(where: object, got: str, expected: str, fix: str) -> InputError:
-    """Give the error of what is larger than its reader takes."""
+    """Return the error of what is larger than its reader takes."""
     return InputError("over the limit", where=str(where), got=got, expected=f"at most {expected}", fix=fix)
 
 
@@ -124,7 +124,7 @@ def read_span(path: Path, first: int, size: int, *, what: str = "file", fix: str
 
 
 def _size_within(file: io.BufferedReader, path: Path, most_mb: float = FILE_MB, split: str = SPLIT) -> int:
-    """Give the size of an open file; InputError where it is larger."""
+    """Return the size of an open file; InputError where it is larger."""
     size = os.fstat(file.fileno()).st_size
     if size > most_mb * MB:
         raise over_limit(path, f"{size / MB:,.3g} MB", f"{most_mb:,g} MB in one piece", split)
@@ -137,7 +137,7 @@ def read_text(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Pa
 
 
 def decoded(data: bytes, where: object) -> str:
-    """Give UTF-8 bytes as text."""
+    """Return UTF-8 bytes as text."""
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -145,7 +145,7 @@ def decoded(data: bytes, where: object) -> str:
 
 
 def not_utf8(error: UnicodeDecodeError, where: object) -> InputError:
-    """Say which byte of which line is no UTF-8, and what to do."""
+    """Return which byte of which line is no UTF-8, and what to do."""
     line = error.object[: error.start].count(b"\n") + 1
     got = f"the byte 0x{error.object[error.start]:02x} in line {line}"
     return InputError("not UTF-8 text", where=str(where), got=got, fix="if it is text, save it as UTF-8")
@@ -188,7 +188,7 @@ def read_unpacked(path: Path, *, what: str = "file", most_mb: float = FILE_MB) -
 
 
 def sha256_file(path: Path, *, tree: Path | None = None) -> str:
-    """Give the hex digest of a file; raises as `open_file`."""
+    """Return the hex digest of a file; raises as `open_file`."""
     with open_file(path, tree=tree) as file, disk_errors(path, "file"):
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -267,7 +267,7 @@ def is_below(path: str, root: str) -> bool:
 
 
 def _blobs(root: Path) -> list[str]:
-    """The folder of blobs of a tree in the hub client's cache: `<repository>/snapshots/<revision>/...` links to
+    """Return the folder of blobs of a tree in the hub client's cache: `<repository>/snapshots/<revision>/...` links to
     `<repository>/blobs`.
     """
     snapshots = next((folder for folder in root.parents if folder.name == "snapshots"), None)

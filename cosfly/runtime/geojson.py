@@ -30,7 +30,7 @@ class Feature(NamedTuple):
 
 
 def is_geojson(value: Any) -> bool:
-    """Tell whether a JSON document says that it is GeoJSON."""
+    """Return whether a JSON document says that it is GeoJSON."""
     return isinstance(value, dict) and value.get("type") in ("FeatureCollection", "Feature", *GEOMETRIES)
 
 
@@ -42,7 +42,7 @@ def read_features(path: Path, *, what: str = "GeoJSON") -> list[Feature]:
 
 
 def features_of(value: Any, path: Path) -> list[Feature]:
-    """Give the features of a document; `path` is for messages. Raises InputError where it is no GeoJSON."""
+    """Return the features of a document; `path` is for messages. Raises InputError where it is no GeoJSON."""
     if not is_geojson(value):
         raise InputError(
             "not GeoJSON", where=f"{path}: type", expected="FeatureCollection, Feature, Polygon or MultiPolygon"

@@ -44,7 +44,7 @@ _num_steps = 0
 
 
 def worker_place() -> int:
-    """Which of a stage's workers this process is, from 0; one that replaces another has its place."""
+    """Return which of a stage's workers this process is, from 0; one that replaces another has its place."""
     return _place
 
 

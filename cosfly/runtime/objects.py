@@ -188,7 +188,7 @@ class _Reader:
 
 
 def _without_names(text: str, message: _Message) -> Found:
-    """Say why there is no object, or give one of other names."""
+    """Return why there is no object, or give one of other names."""
     if message.broken_at >= 0:
         return Found(None, "broken_json", is_end=False)
     if message.objects:
@@ -203,14 +203,15 @@ def _without_names(text: str, message: _Message) -> Found:
 
 
 def _plain(name: str) -> str:
-    """Give the letters of a name, however it is spelled: criticalComponents, Critical-Components, **critical
+    """Return the letters of a name, however it is spelled: criticalComponents, Critical-Components, **critical
     components**.
     """
     return re.sub(r"[\W_]+", "", name).lower()
 
 
 def _unwrapped(value: dict[str, Any], plain_names: Collection[str], wrappers: int = 0) -> dict[str, Any] | None:
-    """Give the object that has one of the names: this one, or the only one in it, as in a function call; else None."""
+    """Return the object that has one of the names: this one, or the only one in it, as in a function call; else
+    None."""
     if any(_plain(key) in plain_names for key in value):
         return value
     if wrappers == MAX_WRAPPERS:
@@ -221,7 +222,7 @@ def _unwrapped(value: dict[str, Any], plain_names: Collection[str], wrappers: in
 
 
 def _object_of(member: Any) -> dict[str, Any] | None:
-    """Give a member that is an object, or one as a JSON text."""
+    """Return a member that is an object, or one as a JSON text."""
     if isinstance(member, str) and member.lstrip().startswith("{"):
         try:
             found = _Reader().read(member.strip(), 0)

@@ -81,7 +81,7 @@ def read_stage_record(folder: Path) -> StageRecord:
 
 
 def fingerprint(path: Path) -> str:
-    """Give one digest for an input: a file's bytes, a finished stage's products, or a playback tree's trajectory
+    """Return one digest for an input: a file's bytes, a finished stage's products, or a playback tree's trajectory
     files."""
     if not path.exists():
         raise InputError(
@@ -99,7 +99,7 @@ def fingerprint(path: Path) -> str:
 
 
 def folder_digests(folder: Path) -> dict[str, str]:
-    """Give the sha256 of each file of a flight by its name: as `checksums.sha256` has it, else its own."""
+    """Return the sha256 of each file of a flight by its name: as `checksums.sha256` has it, else its own."""
     listed = read_checksums(folder) if (folder / CHECKSUMS).is_file() else {}
     known, root = listed.keys() | {CHECKSUMS}, f"{folder}{os.sep}"
     found = (  # of thousands of files: as text, paths take three times as long
@@ -113,7 +113,7 @@ def folder_digests(folder: Path) -> dict[str, str]:
 
 
 def recorded_digests(folder: Path) -> dict[str, str]:
-    """Give the sha256 of a finished stage's products by their paths; empty where there is no manifest of ours."""
+    """Return the sha256 of a finished stage's products by their paths; empty where there is no manifest of ours."""
     if not _has_record(folder, "manifest.json", MANIFEST_FORMAT.schema):
         return {}
     made = read_model(folder / "manifest.json", _Made, MANIFEST_FORMAT, tree=folder)
@@ -121,7 +121,7 @@ def recorded_digests(folder: Path) -> dict[str, str]:
 
 
 def digest_of(digests: Mapping[str, str]) -> str:
-    """Give one digest for the files of a folder."""
+    """Return one digest for the files of a folder."""
     return sha256_bytes(checksum_lines(digests).encode())
 
 
@@ -163,7 +163,7 @@ def _stage_folder(path: Path) -> Path | None:
 
 
 def _has_record(folder: Path, name: str, schema: str) -> bool:
-    """Tell whether a folder has a record of ours; others write files of these names too."""
+    """Return whether a folder has a record of ours; others write files of these names too."""
     value = read_json(folder / name) if (folder / name).is_file() else None
     return isinstance(value, dict) and value.get("schema") == schema
 
@@ -232,19 +232,19 @@ def _role(name: str) -> str:
 
 
 def is_bound(product: Path) -> bool:
-    """Tell whether a record binds a product to what it was made of."""
+    """Return whether a record binds a product to what it was made of."""
     return _record_of(product) is not None
 
 
 def was_made_of(product: Path, name: str) -> str | None:
-    """Give the fingerprint that an input of a product's stage had; None where there is no record of it."""
+    """Return the fingerprint that an input of a product's stage had; None where there is no record of it."""
     begun = _record_of(product)
     found = begun.inputs.get(name) if begun is not None else None
     return None if found is None else found.sha256
 
 
 def stages_behind(products: Iterable[Path]) -> list[StageRecord]:
-    """Give the records of the stages that made some products, before each those that made its inputs, as far as these
+    """Return the records of the stages that made some products, before each those that made its inputs, as far as these
     still stand as they were.
     """
     found: set[str] = set()

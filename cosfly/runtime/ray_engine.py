@@ -174,7 +174,7 @@ def _host() -> type:
             self.inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()  # a worker that still imports reads nothing
 
         def begin(self, folder: str, record: str, cwd: str, path: list[str], version: str) -> tuple:
-            """Give the node's name, the worker's process id, and what is wrong with the node."""
+            """Return the node's name, the worker's process id, and what is wrong with the node."""
             import os
             import socket
             import sys

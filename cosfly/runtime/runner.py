@@ -103,7 +103,8 @@ def run_items(
 
 
 def _finished_before(stage: StageFolder, items: Sequence[Item]) -> np.ndarray:
-    """Give of each item the byte from which the journal tells that it is finished, (n,) int64; -1 where it does not."""
+    """Return of each item the byte from which the journal tells that it is finished, (n,) int64; -1 where it does
+    not."""
     indices = {item.item_id: index for index, item in enumerate(items)}
     assert len(indices) == len(items), "item ids must be unique"
     line_bytes, journal = np.full(len(items), -1), stage.journal

@@ -134,7 +134,7 @@ def lost_steps(folder: Path) -> int:
 
 
 def cpu_seconds(pid: int) -> float:
-    """Give the processor time of a process and all its threads; 0 where the system does not tell, or it is gone."""
+    """Return the processor time of a process and all its threads; 0 where the system does not tell, or it is gone."""
     fields = process_stat(pid)
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK") if fields else 0.0  # utime, stime: proc(5)
 
@@ -157,7 +157,7 @@ def gpu_use() -> dict[str, float]:
 
 @lru_cache(maxsize=1)
 def _nvml() -> Any:
-    """Give the library of the NVIDIA driver; None where there is none, or no device."""
+    """Return the library of the NVIDIA driver; None where there is none, or no device."""
     import pynvml
 
     try:
@@ -186,7 +186,7 @@ def process_stat(pid: int) -> list[bytes]:
 
 
 def rss_mib(pid: int) -> float:
-    """Give the resident memory of a process, MiB; 0 where the system does not tell, or it is gone."""
+    """Return the resident memory of a process, MiB; 0 where the system does not tell, or it is gone."""
     try:
         pages = int(Path(f"/proc/{pid}/statm").read_bytes().split()[1])
     except OSError:

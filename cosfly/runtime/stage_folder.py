@@ -91,7 +91,7 @@ ItemRecord = Kept | Dropped | Failed
 
 
 def result_of(record: Kept | Dropped, model: type[Model]) -> Model:
-    """Give the result of an item, which may have been done by an earlier run, as the stage's own model."""
+    """Return the result of an item, which may have been done by an earlier run, as the stage's own model."""
     return validated(model, record.result, f"items.jsonl: {record.id}: result")
 
 
@@ -230,7 +230,8 @@ class StageFolder:
 
     @classmethod
     def _complete(cls, out: Path, record: StageRecord, resume: Resume) -> StageFolder | None:
-        """Give a folder that is complete as `record` says, which takes no lock; None where there is something to do."""
+        """Return a folder that is complete as `record` says, which takes no lock; None where there is something to
+        do."""
         manifest = read_manifest(out)
         _check_same(out, record, resume)
         if manifest.counts.failed:
@@ -293,7 +294,8 @@ class StageFolder:
     def nothing_kept(
         self, tally: Tally, *, expected: str | None = None, where: Path | None = None, fix: str | None = None
     ) -> NothingKept:
-        """Give the error of a stage that has nothing for the next one: how often what happened, and the first failure.
+        """Return the error of a stage that has nothing for the next one: how often what happened, and the first
+        failure.
 
         Args:
             where: what stands on disk and says why; else the stage's folder. fix: what to do, where more is known of
@@ -346,7 +348,7 @@ def _check_same(out: Path, record: StageRecord, resume: Resume) -> None:
 
 
 def _holds_work(out: Path, begun: Collection[str]) -> bool:
-    """Tell whether a stage folder holds anything that was finished, and not only the records of failures."""
+    """Return whether a stage folder holds anything that was finished, and not only the records of failures."""
     if any(not isinstance(item, Failed) for item in Journal(out / "items.jsonl").read_as(read_item)):
         return True
     files = (path.relative_to(out) for path in out.rglob("*") if path.is_file())
@@ -357,7 +359,7 @@ def _holds_work(out: Path, begun: Collection[str]) -> bool:
 
 
 def _differences(found: StageRecord, wanted: StageRecord) -> list[str]:
-    """Say which settings, inputs or seed differ."""
+    """Return which settings, inputs or seed differ."""
     before, after = flattened(found.config), flattened(wanted.config)
     changed = [
         f"{key} was {before.get(key)!r}, is {after.get(key)!r}"
@@ -378,7 +380,7 @@ def _differences(found: StageRecord, wanted: StageRecord) -> list[str]:
 
 
 def _digest(path: Path) -> str:
-    """Give one digest for a file or for the files of a folder."""
+    """Return one digest for a file or for the files of a folder."""
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     return sha256_bytes("".join(f"{file.name} {sha256_file(file)}\n" for file in files if file.is_file()).encode())
 

@@ -43,7 +43,8 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 
 def _concerns(error: OSError, path: Path) -> bool:
-    """Tell whether an error is about the file that is being written or a folder above it, not about something read."""
+    """Return whether an error is about the file that is being written or a folder above it, not about something
+    read."""
     return error.filename is not None and path.absolute().is_relative_to(Path(os.fsdecode(error.filename)).absolute())
 
 
@@ -70,7 +71,7 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
 
 
 def _partial(path: Path) -> Path:
-    """Give the temporary name of a file or folder; `remove_partials` knows it."""
+    """Return the temporary name of a file or folder; `remove_partials` knows it."""
     return path.with_name(f".{path.name}.{os.getpid()}.partial")
 
 
@@ -86,7 +87,7 @@ def remove_left(path: Path) -> None:
 
 
 def _is_another(pid: int) -> bool:
-    """Tell whether another process has this id."""
+    """Return whether another process has this id."""
     try:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):
@@ -104,7 +105,7 @@ def _remove(path: Path) -> None:
 
 
 def is_partial_of(name: str, path: Path) -> bool:
-    """Tell whether a path is the temporary name of a file or folder, of any process."""
+    """Return whether a path is the temporary name of a file or folder, of any process."""
     return fnmatch(path.name, f".{name}.*.partial")
 
 
@@ -118,7 +119,7 @@ _COMPACT = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(","
 
 
 def dump_json(value: Any, *, indent: int | None = None) -> str:
-    """Give JSON text; NaN and infinity are an error, never a value."""
+    """Return JSON text; NaN and infinity are an error, never a value."""
     encoder = _COMPACT if indent is None else json.JSONEncoder(ensure_ascii=False, allow_nan=False, indent=indent)
     return encoder.encode(value)
 
@@ -189,7 +190,7 @@ def inside(root: Path, name: str, *, beside: bool = False) -> Path:
 
 
 def _plain_name(root: Path, name: str) -> str:
-    """Give a name without detours; raises as `inside`, but looks at no link."""
+    """Return a name without detours; raises as `inside`, but looks at no link."""
     plain = os.path.normpath(name)
     if "\0" in name or max(len(part.encode("utf-8", "surrogatepass")) for part in plain.split(os.sep)) > LONGEST_NAME:
         raise InputError(
@@ -209,7 +210,7 @@ def write_checksums(folder: Path, digests: dict[str, str]) -> None:
 
 
 def checksum_lines(digests: Mapping[str, str]) -> str:
-    """Give the lines of `checksums.sha256`."""
+    """Return the lines of `checksums.sha256`."""
     return "".join(f"{digest}  {name}\n" for name, digest in sorted(digests.items()))
 
 
@@ -234,7 +235,7 @@ def read_checksums(folder: Path) -> dict[str, str]:
 
 
 def _is_plain_folder(root: str, name: str, known: set[str]) -> bool:
-    """Tell whether no part of a folder's name is a link; `known` are those of which that is known, each looked at
+    """Return whether no part of a folder's name is a link; `known` are those of which that is known, each looked at
     once."""
     if name not in known:
         if not _is_plain_folder(root, os.path.dirname(name), known) or os.path.islink(root + name):

@@ -48,8 +48,8 @@ class _Table(pq.ParquetFile):
         self.packed = pq.ParquetFile(file, metadata=self.metadata, read_dictionary=texts, **how)
 
     def _repeats(self, j: int) -> bool:
-        """Whether a column holds bytes of any kind by a dictionary; pictures stand plainly, and looking for equal ones
-        would take long."""
+        """Return whether a column holds bytes of any kind by a dictionary; pictures stand plainly, and looking for
+        equal ones would take long."""
         groups = (self.metadata.row_group(k).column(j) for k in range(self.num_row_groups))
         return any(one.physical_type == "BYTE_ARRAY" and one.has_dictionary_page for one in groups)
 
@@ -69,7 +69,7 @@ def open_table(path: Path, *, tree: Path | None = None) -> Iterator[_Table]:
 
 
 def num_rows(path: Path) -> int:
-    """Give the number of rows; raises as `open_table`."""
+    """Return the number of rows; raises as `open_table`."""
     with open_table(path) as table:
         return table.metadata.num_rows
 
@@ -104,7 +104,7 @@ def read_row_group(path: Path | str, table: _Table, k: int, columns: list[str] |
 
 
 def _text_bytes(values: pa.Array) -> int:
-    """Give the bytes of packed texts, also inside of lists and structs."""
+    """Return the bytes of packed texts, also inside of lists and structs."""
     if pa.types.is_dictionary(values.type):
         lengths = pc.binary_length(values.dictionary).cast(pa.int64())
         return pc.sum(lengths.take(values.indices)).as_py() or 0
@@ -114,7 +114,7 @@ def _text_bytes(values: pa.Array) -> int:
 
 
 def _plain(kind: pa.DataType) -> pa.DataType:
-    """Give the type with its texts unpacked."""
+    """Return the type with its texts unpacked."""
     if pa.types.is_struct(kind):
         return pa.struct([member.with_type(_plain(member.type)) for member in kind])
     if pa.types.is_list(kind):

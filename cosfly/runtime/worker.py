@@ -102,7 +102,7 @@ def keep_freed_memory() -> None:
 
 
 def return_freed_memory() -> None:
-    """Give the system all that this process has freed: glibc keeps for good what lies between pieces still in use.
+    """Return the system all that this process has freed: glibc keeps for good what lies between pieces still in use.
 
     Where another C library allocates, nothing changes.
     """

@@ -61,7 +61,7 @@ class Watch:
 
 
 def limit_s(watch: Watch, seconds: Collection[float], attempt: int, has_begun: bool) -> float:
-    """Give how long an item may go without getting on.
+    """Return how long an item may go without getting on.
 
     Args:
         seconds: what items took that are done.
@@ -87,13 +87,13 @@ class Post(Protocol):
     node: str | None
 
     def send(self, what: Start | Item | None) -> None:
-        """Give it its Start, then items one by one, at last None; may wait for as long as it likes."""
+        """Return it its Start, then items one by one, at last None; may wait for as long as it likes."""
 
     def receive(self) -> Message:
         """Wait for what it says next. Raises EOFError or OSError when it is gone."""
 
     def look(self) -> Vitals | None:
-        """Give what its system says of it, at once; None: it is gone."""
+        """Return what its system says of it, at once; None: it is gone."""
 
     def kill(self, patience_s: float) -> None:
         """End it: by itself, if it has been given None and can within the time. It is gone, or out of reach, then."""
@@ -222,7 +222,7 @@ class WorkerPool:
         return [worker for worker in self._workers.values() if worker.attempt is not None]
 
     def _hand_out(self) -> None:
-        """Give every free worker an item, and start those that are missing."""
+        """Return every free worker an item, and start those that are missing."""
         for place in range(self.num_workers):
             worker = self._workers.get(place) or (self._start(place) if self._is_short() else None)
             if worker is None or worker.attempt is not None or worker.post.pid is None:
@@ -235,7 +235,7 @@ class WorkerPool:
                 worker.give(attempt)
 
     def _is_short(self) -> bool:
-        """Tell whether there is more to do now than workers without an item, those that still start among them."""
+        """Return whether there is more to do now than workers without an item, those that still start among them."""
         num_idle = len(self._workers) - len(self._busy())
         return num_idle < (self._num_fresh + len(self._again) or int(bool(self._alone) and not self._busy()))
 

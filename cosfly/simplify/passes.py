@@ -441,7 +441,8 @@ def crop_tree_adaptive(box_map: BoxMap, cfg: SimplifyConfig, used_ids: np.ndarra
 
 
 def _free_ids(used: np.ndarray, count: int) -> np.ndarray:
-    """Give the smallest positive numbers that are not used, (count,) uint64. Not max + 1: CARLA's ids fill 64 bits."""
+    """Return the smallest positive numbers that are not used, (count,) uint64. Not max + 1: CARLA's ids fill 64
+    bits."""
     candidates = np.arange(1, len(used) + count + 1, dtype=np.uint64)
     return candidates[~np.isin(candidates, used)][:count]
 

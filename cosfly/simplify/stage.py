@@ -54,7 +54,7 @@ def _cell_by_cell(before: np.ndarray, after: np.ndarray) -> dict[str, int]:
 
 
 def report(raw: BoxMap, result: Simplification, cfg: SimplifyConfig) -> dict:
-    """Give the content of `simplify_report.json`."""
+    """Return the content of `simplify_report.json`."""
     return {
         **REPORT_FORMAT.header,
         "name": raw.name,

@@ -63,15 +63,16 @@ def kind_of(class_name: str) -> str | None:
 
 
 def is_nothing(class_name: str) -> bool:
-    """Tell whether a class is one of NOTHING."""
+    """Return whether a class is one of NOTHING."""
     return any(fnmatchcase(class_name, pattern) for pattern in NOTHING)
 
 
 def is_person(path: str) -> bool:
-    """Tell whether an asset is one of people, by its path."""
+    """Return whether an asset is one of people, by its path."""
     return any(fnmatchcase(path, pattern) for pattern in PEOPLE)
 
 
 def id_of(name: str) -> int:
-    """Give the id of an object's box: 48 bits of its name's hash, so that everybody who asks a level finds the same."""
+    """Return the id of an object's box: 48 bits of its name's hash, so that everybody who asks a level finds the
+    same."""
     return int(sha256_bytes(name.encode())[:12], 16)

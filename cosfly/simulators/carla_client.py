@@ -78,7 +78,7 @@ def connect(cfg: CarlaConfig, port: int) -> CarlaConnection:
 
 
 def _short(name: str) -> str:
-    """The last part of a map's path."""
+    """Return the last part of a map's path."""
     return name.rpartition("/")[2]
 
 

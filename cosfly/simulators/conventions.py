@@ -23,12 +23,12 @@ FAR_CM = 65504.0  # the largest of half precision, in which UnrealCV's depth com
 
 
 def unreal_pose(position_m: np.ndarray, rotation_deg: np.ndarray) -> list[float]:
-    """Give a pose of ours, (3,) m and (3,) pitch, yaw, roll in degrees, as x, y, z, pitch, yaw, roll of theirs."""
+    """Return a pose of ours, (3,) m and (3,) pitch, yaw, roll in degrees, as x, y, z, pitch, yaw, roll of theirs."""
     return [*(mirror_positions(position_m) + 0.0).tolist(), *(mirror_rotations(rotation_deg) + 0.0).tolist()]
 
 
 def world_pose(pose: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Give a pose of theirs as position, (3,) m, and rotation, (3,) degrees, of ours."""
+    """Return a pose of theirs as position, (3,) m, and rotation, (3,) degrees, of ours."""
     return mirror_positions(np.array(pose[:3])) + 0.0, mirror_rotations(np.array(pose[3:])) + 0.0
 
 

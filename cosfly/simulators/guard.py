@@ -52,7 +52,7 @@ class EngineGuard:
 
 
 def values_of(thing: Any) -> dict[str, Any]:
-    """Give the plain values of the client's object, as of settings, by name."""
+    """Return the plain values of the client's object, as of settings, by name."""
     names = [name for name in dir(thing) if not name.startswith("_")]
     return {name: getattr(thing, name) for name in names if isinstance(getattr(thing, name), bool | int | float | None)}
 
@@ -128,7 +128,7 @@ def _end_server(server: subprocess.Popen) -> None:
 
 
 def _descendants() -> list[int]:
-    """Give the processes below this one, without those that have ended."""
+    """Return the processes below this one, without those that have ended."""
     children = defaultdict[int, list[int]](list)
     for path in Path("/proc").glob("[0-9]*"):
         if (stat := process_stat(int(path.name))) and stat[0] != b"Z":

@@ -62,7 +62,7 @@ class UnrealCvConnection:
         return f"{self.endpoint} (UnrealCV {self.version})" + (f", {self.level}" if self.level else "")
 
     def ask(self, *commands: str) -> list[str | bytes]:
-        """Give the answers, in order: text, or bytes of pictures. An answer that begins with `error` is one too."""
+        """Return the answers, in order: text, or bytes of pictures. An answer that begins with `error` is one too."""
         answers: list[str | bytes] = []
         for first in range(0, len(commands), MOST_AT_ONCE):
             if self._client.ended:  # nobody reads any more, and the package would wait for ever
@@ -150,7 +150,7 @@ def _opened(cfg: UnrealCvConfig, port: int, connection: UnrealCvConnection) -> U
 
 
 def _client(cfg: UnrealCvConfig, port: int) -> Any:
-    """Give a connected client of the package; None: nobody greeted it."""
+    """Return a connected client of the package; None: nobody greeted it."""
     try:
         import unrealcv
     except ModuleNotFoundError as error:

@@ -109,7 +109,7 @@ def _walker(trace: DroneTrace, index: int, seed: int) -> PosedPerson:
 
 
 def _tile(picture: np.ndarray, pair: tuple[str, str], size_px: tuple[int, int]) -> np.ndarray:
-    """A picture of the grid with its presets under it."""
+    """Return a picture of the grid with its presets under it."""
     strip = np.full((STRIP_PX, size_px[0], 3), PAPER, np.uint8)
     draw_text(strip, ", ".join(pair).replace("_", " "), size_px[0] / 2.0, 18, 0.5, align=0.5)
     return np.vstack([cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA), strip])

@@ -13,7 +13,7 @@ TEMPLATE = "cosfly/viz/templates/coverage.html"
 
 
 def coverage_html(coverage: Coverage) -> str:
-    """Give histograms, one an axis, with where 5 % to 95 % of the frames lie, and a table for each kind of name."""
+    """Return histograms, one an axis, with where 5 % to 95 % of the frames lie, and a table for each kind of name."""
     plain = default_coverage()
     histograms = [
         _histogram(axis, coverage.bins.get(name, []), plain.bins[name])
@@ -29,7 +29,7 @@ def _title(axis: Axis) -> str:
 
 
 def _skies(frames: dict[str, int]) -> dict[str, Any] | None:
-    """Give a table of frames, weather by time of day: the paper's 15 x 4, and presets of somebody's own."""
+    """Return a table of frames, weather by time of day: the paper's 15 x 4, and presets of somebody's own."""
     if not frames:
         return None
     counts = {tuple(name.split(PAIR)): count for name, count in frames.items()}
@@ -44,13 +44,13 @@ def _skies(frames: dict[str, int]) -> dict[str, Any] | None:
 
 
 def ranges(coverage: Coverage) -> list[tuple[str, str, str]]:
-    """Give a row for each axis: title, 5 % to 95 % of the frames, the same of the plain run."""
+    """Return a row for each axis: title, 5 % to 95 % of the frames, the same of the plain run."""
     plain = default_coverage()
     return [(_title(axis), _range(coverage, name), _range(plain, name)) for name, axis in AXES.items()]
 
 
 def shares(coverage: Coverage, kind: str) -> list[tuple[str, int, str, str]]:
-    """Give a row for each name of a kind of NAMED: name, frames, share of them, share in the plain run; empty where
+    """Return a row for each name of a kind of NAMED: name, frames, share of them, share in the plain run; empty where
     none is known."""
     counts, plain = getattr(coverage, kind), getattr(default_coverage(), kind)
     if not counts:
@@ -65,7 +65,7 @@ def _share(counts: dict[str, int], name: str) -> str:
 
 
 def _range(coverage: Coverage, name: str) -> str:
-    """Say where 5 % to 95 % of the frames lie; of a circle, how they are shared out."""
+    """Return where 5 % to 95 % of the frames lie; of a circle, how they are shared out."""
     if name == "azimuth_deg":
         return _sides(coverage.bins.get(name, []))
     low, high = coverage.range_of(name)
@@ -85,7 +85,7 @@ def _sides(counts: list[int]) -> str:
 
 
 def _histogram(axis: Axis, counts: list[int], beside: list[int]) -> dict[str, Any]:
-    """Give shares of frames by bin as bars; the plain run's as a line of steps."""
+    """Return shares of frames by bin as bars; the plain run's as a line of steps."""
     heights = [[value / (sum(row) or 1) for value in row] for row in (counts, beside) if row]
     top = max((max(row) for row in heights), default=0.0) or 1.0
     filled = [k for row in (counts, beside) for k, value in enumerate(row) if value] or [0]

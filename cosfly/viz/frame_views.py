@@ -77,7 +77,7 @@ class Pictures:
             )
 
     def sentence(self, language: Language) -> str:
-        """Give the words of a prompt for these pictures."""
+        """Return the words of a prompt for these pictures."""
         return _sentence(self, language)
 
 
@@ -136,12 +136,12 @@ def _sentence(pictures: Pictures, language: Language) -> str:
 
 
 def frame_label(number: int) -> str:
-    """Give the text before the pictures of a window's frame: answers name frames so."""
+    """Return the text before the pictures of a window's frame: answers name frames so."""
     return f"t{number}:"
 
 
 def scaled_size(width_px: int, height_px: int, max_side_px: int | None) -> tuple[int, int]:
-    """Give (width, height) px of a picture scaled down to a longest side; None and a larger one keep the size."""
+    """Return (width, height) px of a picture scaled down to a longest side; None and a larger one keep the size."""
     if max_side_px is None or max_side_px >= max(width_px, height_px):
         return width_px, height_px
     scale = max_side_px / max(width_px, height_px)
@@ -217,7 +217,7 @@ def encode_picture(rgb: np.ndarray, encoding: Literal["jpeg", "png"], jpeg_quali
 
 
 def thumbnail(frame: Path, width_px: int, jpeg_quality: int = 80) -> str | None:
-    """Give `rgb.png` of a frame folder as a small JPEG in base64, for a page; None where it cannot be read."""
+    """Return `rgb.png` of a frame folder as a small JPEG in base64, for a page; None where it cannot be read."""
     try:
         rgb = read_rgb(frame)
     except InputError:
@@ -226,7 +226,7 @@ def thumbnail(frame: Path, width_px: int, jpeg_quality: int = 80) -> str | None:
 
 
 def small_jpeg(rgb: np.ndarray, width_px: int, jpeg_quality: int = 80) -> str:
-    """Give a picture, (h, w, 3) uint8 RGB, as a JPEG of a width in base64, for a page."""
+    """Return a picture, (h, w, 3) uint8 RGB, as a JPEG of a width in base64, for a page."""
     height_px = max(1, round(width_px * rgb.shape[0] / rgb.shape[1]))
     small = cv2.resize(rgb, (width_px, height_px), interpolation=cv2.INTER_AREA)
     return base64.b64encode(encode_picture(small, "jpeg", jpeg_quality)).decode("ascii")

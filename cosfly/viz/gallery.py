@@ -92,7 +92,7 @@ def four_panels(tree: Path, out_png: Path, *, frame: str | None = None, box_map:
 
 
 def frame_in(tree: Path, frame: str | Path) -> Path:
-    """Give the folder of a frame of a tree, which is named from the tree on, or by a path that leads into it."""
+    """Return the folder of a frame of a tree, which is named from the tree on, or by a path that leads into it."""
     place = Path(frame).resolve()
     if place.is_dir() and place.is_relative_to(tree.resolve()):
         return tree / place.relative_to(tree.resolve())
@@ -100,7 +100,7 @@ def frame_in(tree: Path, frame: str | Path) -> Path:
 
 
 def best_frame(tree: Path, *names: str) -> Path:
-    """Give the frame folder of a tree's first clean flight that shows most of the target and has these files."""
+    """Return the frame folder of a tree's first clean flight that shows most of the target and has these files."""
     folders = find_flights(tree)
     flight = read_flight(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
     frames = _frames_with(flight, *names)

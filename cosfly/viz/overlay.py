@@ -44,7 +44,7 @@ class Overlay:
     instance_ids: np.ndarray
 
     def draw(self, rgb: np.ndarray, ids: np.ndarray, meta: FrameMeta) -> np.ndarray:
-        """Give the picture with boxes, ids and distances drawn in, (h, w, 3) uint8.
+        """Return the picture with boxes, ids and distances drawn in, (h, w, 3) uint8.
 
         Args:
             rgb: (h, w, 3) uint8; ids: (h, w) of `instance.png`, which tell what of the map is seen.
@@ -66,7 +66,7 @@ class Overlay:
         return picture
 
     def _seen(self, ids: np.ndarray) -> list[_Box]:
-        """Give the boxes that take enough of the picture, without ground, the largest last: labels on top."""
+        """Return the boxes that take enough of the picture, without ground, the largest last: labels on top."""
         found, counts = np.unique(ids, return_counts=True)
         pixels = dict(zip(found.tolist(), counts.tolist(), strict=True))
         seen = np.array([pixels.get(int(one), 0) for one in self.instance_ids.tolist()])
@@ -83,12 +83,12 @@ class Overlay:
 
 
 def _bright(color: Color) -> Color:
-    """A tone that stands out from a picture."""
+    """Return a tone that stands out from a picture."""
     return tuple(round(255 - 0.55 * (255 - value)) for value in color)
 
 
 def _moving(meta: FrameMeta) -> list[_Box]:
-    """Give the boxes of who moves, the target last."""
+    """Return the boxes of who moves, the target last."""
     boxes = []
     for other in meta.others.others if meta.others else ():
         corners_m = box_corners(other.center_m, np.array(other.half_extents_m), other.heading_rad)

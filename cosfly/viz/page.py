@@ -25,7 +25,7 @@ ROOT = Path(cosfly.__file__).parents[1]  # cosfly, caption, distill and release 
 
 
 def page(template: str, *, title: str, style: str = "", script: str = "", asks: bool = False, **values: Any) -> str:
-    """Give a page.
+    """Return a page.
 
     Args:
         template: its path from the folder of the packages. title: the name of what it shows. style, script: our own,
@@ -38,22 +38,22 @@ def page(template: str, *, title: str, style: str = "", script: str = "", asks: 
 
 
 def scripts(*names: str) -> str:
-    """Give what several pages share, one after the other: `tools.js`, `canvas.js` (a map), `space.js` (WebGL)."""
+    """Return what several pages share, one after the other: `tools.js`, `canvas.js` (a map), `space.js` (WebGL)."""
     return "".join(read_text(Path(__file__).with_name("templates") / name) for name in names)
 
 
 def fragment(template: str, **values: Any) -> str:
-    """Give a part of a page, which another template prints as it is."""
+    """Return a part of a page, which another template prints as it is."""
     return Markup(_environment().get_template(template).render(**values))
 
 
 def markdown(template: str, **values: Any) -> str:
-    """Give a page of Markdown, of a template by its path from the folder of the packages."""
+    """Return a page of Markdown, of a template by its path from the folder of the packages."""
     return _markdown_environment().get_template(template).render(**values)
 
 
 def run_name(folder: Path) -> str:
-    """Give the name that a person knows a stage's folder by: the run's, where it stands in one."""
+    """Return the name that a person knows a stage's folder by: the run's, where it stands in one."""
     folder = folder.resolve()
     return folder.parent.name if (folder.parent / "run.yaml").is_file() else folder.name
 

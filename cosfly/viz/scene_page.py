@@ -114,7 +114,7 @@ def run(
 
 
 def page_html(name: str, notes: Sequence[str], content: dict[str, Any]) -> str:
-    """Give the page's text."""
+    """Return the page's text."""
     script = scripts("tools.js", "canvas.js", "space.js", "scene.js")
     style, template = scripts("scene.css"), "cosfly/viz/templates/scene.html"
     return page(template, title=name, style=style, script=script, notes=notes, data=content)
@@ -141,7 +141,7 @@ def _packed(values: np.ndarray) -> str:
 
 
 def _boxes(box_map: BoxMap) -> dict[str, Any]:
-    """Give boxes as the page draws them: the middle of each and its three half axes, (n, 12) float32, kind by kind,
+    """Return boxes as the page draws them: the middle of each and its three half axes, (n, 12) float32, kind by kind,
     surfaces first."""
     lift_m = np.array([LAYERS.get(KIND_NAMES[kind], 0) * LAYER_M for kind in range(len(KINDS))])
     is_ground = box_map.is_any_of(GROUND_KINDS)
@@ -167,7 +167,7 @@ def _boxes(box_map: BoxMap) -> dict[str, Any]:
 
 
 def _matrix(box_map: BoxMap) -> dict[str, Any] | None:
-    """Give the planning matrix, north up; None where it is too large for a page."""
+    """Return the planning matrix, north up; None where it is too large for a page."""
     grid = occupancy(box_map)
     if grid.occupied.size > MOST_MATRIX_CELLS:
         return None

@@ -50,7 +50,7 @@ class TopView:
         return cls(float(low[0]), float(high[1]), float(scale), (width, height))
 
     def pixels(self, points_m: np.ndarray) -> np.ndarray:
-        """Give the places of (n, 2 or 3) m on the picture, (n, 2)."""
+        """Return the places of (n, 2 or 3) m on the picture, (n, 2)."""
         offsets_m = np.stack([points_m[:, 0] - self.west_m, self.north_m - points_m[:, 1]], axis=1)
         return _fixed(offsets_m * self.pixels_per_m) / 2**FRACTION_BITS
 
@@ -116,7 +116,7 @@ def draw_text(
 
 
 def add_caption(picture: np.ndarray, text: str) -> np.ndarray:
-    """Give the picture with one line of text in a strip on top."""
+    """Return the picture with one line of text in a strip on top."""
     strip = np.full((36, picture.shape[1], 3), PAPER, dtype=np.uint8)
     draw_text(strip, text, 10, 25, 0.6)
     return np.vstack([strip, picture])

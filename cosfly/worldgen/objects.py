@@ -43,7 +43,7 @@ class Object(Record):
 
 @cache
 def assets() -> dict[str, tuple[float, float, float]]:
-    """Give SimWorld's buildings and trees: name -> full size at yaw 0, m."""
+    """Return SimWorld's buildings and trees: name -> full size at yaw 0, m."""
     sizes = read_yaml(Path(__file__).with_name("assets.yaml"))
     return {f"BP_{name}_C": tuple(map(float, size)) for name, size in sizes.items()}  # type: ignore[misc]
 
@@ -72,7 +72,7 @@ OBJECTS = _objects()
 
 
 def asset_for(kind: str, size_m: Iterable[float]) -> tuple[str, tuple[float, float, float]]:
-    """Give the asset whose box is most like a box, and its size; one named after the kind where none is."""
+    """Return the asset whose box is most like a box, and its size; one named after the kind where none is."""
     size = tuple(size_m)
     families = {
         "Buildings": ("BP_Building", assets()),

@@ -73,7 +73,7 @@ class WorldPlan(BaseModel):
 
 
 def objects_of(plan: WorldPlan) -> list[tuple[Object, int]]:
-    """Give the objects that a plan names and the table has, with their counts; of a name twice, the sum."""
+    """Return the objects that a plan names and the table has, with their counts; of a name twice, the sum."""
     counts: dict[str, int] = {}
     for wanted in plan.objects:
         counts[wanted.name] = counts.get(wanted.name, 0) + wanted.count
@@ -81,12 +81,12 @@ def objects_of(plan: WorldPlan) -> list[tuple[Object, int]]:
 
 
 def unknown_objects(plan: WorldPlan) -> list[str]:
-    """Give what a plan names and no table has, an entry for each."""
+    """Return what a plan names and no table has, an entry for each."""
     return [one.name for one in plan.objects if one.name not in OBJECTS for _ in range(one.count)] + plan.not_in_table
 
 
 def town_settings(plan: WorldPlan, name: str) -> SyntheticConfig:
-    """Give the town generator's settings for a plan: open blocks enough, and large enough, for its objects."""
+    """Return the town generator's settings for a plan: open blocks enough, and large enough, for its objects."""
     block_m, along = plan.block_m, plan.blocks_along
     placed = [(one, count) for one, count in objects_of(plan) if one.where == "open"]
     for one, _ in placed:

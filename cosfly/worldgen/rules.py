@@ -30,7 +30,7 @@ MOST_CHARACTERS = 2000
 
 
 def check_prompt(prompt: str) -> str:
-    """Give a prompt on one line."""
+    """Return a prompt on one line."""
     text = " ".join(prompt.split())
     if not re.search(r"\w", text) or len(text) > MOST_CHARACTERS:
         expected = f"1 to {MOST_CHARACTERS} characters, as in 'a small village with a church'"
@@ -124,7 +124,7 @@ def _objects(text: str) -> tuple[list[NamedObject], str]:
 
 
 def _said(rest: str, words: list[str]) -> dict[str, str]:
-    """Tell which word of each group is said of the settlement."""
+    """Return which word of each group is said of the settlement."""
     said: dict[str, str] = {}
     for group, choices in WORDS["groups"].items():
         found: dict[str, str] = {}
@@ -180,7 +180,7 @@ def _open_and_water(words: list[str], objects: list[NamedObject], plan: dict[str
 
 
 def _known() -> set[str]:
-    """Give all words of the tables but the objects'."""
+    """Return all words of the tables but the objects'."""
     known = {*WORDS["ordinary"], *WORDS["open"], *WORDS["water"], *WORDS["sized"]}
     for table in (WORDS["settlements"], *WORDS["groups"].values()):
         known |= {word for one in table.values() for word in one["words"].split()}
@@ -188,7 +188,8 @@ def _known() -> set[str]:
 
 
 def _unknown(rest: str) -> list[str]:
-    """Give what the text names and no table has: the last word of a phrase that begins with an article or a number."""
+    """Return what the text names and no table has: the last word of a phrase that begins with an article or a
+    number."""
     known, found = _known(), []
     for chunk in _STOPS.split(rest):
         words = re.findall(r"[a-z0-9][a-z0-9'-]*", chunk)

@@ -65,7 +65,7 @@ def buildings_of(box_map: BoxMap) -> Buildings:
 
 
 def check_world(town: Town, plan: WorldPlan) -> list[dict[str, Any]]:
-    """Give each check of a world: its name, what was found, what is expected, whether it holds."""
+    """Return each check of a world: its name, what was found, what is expected, whether it holds."""
     world, buildings = town.boxes, buildings_of(town.boxes)
     own = buildings_of(town.layout)
     reached, component_m, share = _reach(world, buildings)
@@ -101,7 +101,7 @@ def _num_overlaps(box_map: BoxMap) -> int:
 
 
 def _reach(box_map: BoxMap, buildings: Buildings) -> tuple[int, float, float]:
-    """Give how many buildings stand at the largest walkable component, its length, its share of all that is walkable.
+    """Return how many buildings stand at the largest walkable component, its length, its share of all that is walkable.
 
     Walkable is what is paved, roads with it, and free up to a walker's head.
     """
@@ -285,7 +285,7 @@ def _write_world(town: Town, out: Path, seed: int) -> None:
 
 
 def _loop_settings(cfg: WorldConfig, out: Path) -> str:
-    """Give the settings of a run on the world: those that ship for SimWorld (the appendix's), with this world."""
+    """Return the settings of a run on the world: those that ship for SimWorld (the appendix's), with this world."""
     settings = read_yaml(shipped("simworld.yaml"))
     world = {
         "name": cfg.name, "world": str((out / WORLD_FILE).resolve()), "tool": f"cosfly world {cosfly.__version__}",

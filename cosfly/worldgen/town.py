@@ -74,7 +74,7 @@ class Town:
 
 
 def footprints(box_map: BoxMap) -> np.ndarray:
-    """Give the footprint of every box as a polygon, (n,)."""
+    """Return the footprint of every box as a polygon, (n,)."""
     corners = [
         box_corners(center, half, math.radians(yaw))[[0, 2, 6, 4], :2]
         for center, half, yaw in zip(box_map.centers, box_map.half_extents, box_map.rotations_deg[:, 1], strict=True)
@@ -87,7 +87,7 @@ def of_kinds(box_map: BoxMap, *names: str) -> np.ndarray:
 
 
 def trees_of(box_map: BoxMap) -> np.ndarray:
-    """Tell which boxes are trees, (n,) bool: green, higher than a hedge, and not long."""
+    """Return which boxes are trees, (n,) bool: green, higher than a hedge, and not long."""
     sizes = 2 * box_map.half_extents
     return of_kinds(box_map, "Vegetation") & (sizes[:, 2] > TREE_M) & (sizes[:, :2].max(1) < 3 * sizes[:, :2].min(1))
 
@@ -173,7 +173,7 @@ def _open_blocks(town: Town) -> list[BaseGeometry]:
 def _place(
     one: Object, free: BaseGeometry, hard: np.ndarray, taken: list[BaseGeometry]
 ) -> tuple[BaseGeometry, float, float] | None:
-    """Give the outline, nearest to the middle of the town, in which an object fits whole, its yaw and its scale."""
+    """Return the outline, nearest to the middle of the town, in which an object fits whole, its yaw and its scale."""
     if free.is_empty:
         return None
     by_water = one.where != "open"
@@ -217,7 +217,7 @@ def _add_path(boxes: BoxList, outline: BaseGeometry, pavements: BaseGeometry) ->
 
 
 def land_m2(town: Town) -> float:
-    """The town's area without its river, m2."""
+    """Return the town's area without its river, m2."""
     return town.settings.size_m * (town.settings.size_m - town.settings.river_m)
 
 
@@ -239,7 +239,7 @@ def _set_trees(town: Town, plan: WorldPlan, rng: np.random.Generator) -> None:
 
 
 def _planted(town: Town, count: int, rng: np.random.Generator) -> BoxMap:
-    """Give new trees on lawns, gardens and edges of pavements, clear of all that stands there and of the ways."""
+    """Return new trees on lawns, gardens and edges of pavements, clear of all that stands there and of the ways."""
     world, boxes = town.boxes, BoxList()
     outlines = footprints(world)
     lawns = outlines[of_kinds(world, "Terrain") & (np.abs(world.maxs[:, 2] - LAWN_TOP_M) < 0.005)]
@@ -265,7 +265,8 @@ def _planted(town: Town, count: int, rng: np.random.Generator) -> BoxMap:
 def world_nodes(
     box_map: BoxMap, ids: Sequence[str] = (), named_assets: Sequence[str | None] = ()
 ) -> list[dict[str, Any]]:
-    """Give a node of SimWorld's world format for every box: Unreal's axes, cm; the foot of an asset at the location."""
+    """Return a node of SimWorld's world format for every box: Unreal's axes, cm; the foot of an asset at the
+    location."""
     nodes = []
     for row in range(len(box_map)):
         kind, size = KIND_NAMES[int(box_map.kinds[row])], 2 * box_map.half_extents[row]
@@ -279,7 +280,8 @@ def world_nodes(
 
 
 def road_nodes(settings: SyntheticConfig, seed: int) -> list[dict[str, Any]]:
-    """Give a piece of road for every stretch of a street: what SimWorld draws; its surfaces are nodes of their own."""
+    """Return a piece of road for every stretch of a street: what SimWorld draws; its surfaces are nodes of their
+    own."""
     streets, nodes = synthetic.street_grid(settings, seed), list[dict[str, Any]]()
     for axis in (0, 1):
         crossings = [strip.middle_m for strip in streets.along(1 - axis)]

@@ -58,7 +58,7 @@ class Metric(Record):
 
 
 def deciding_files(folder: Path) -> list[Path]:
-    """Give the files of a model's folder that decide its scores: configuration, tokenizer, weights."""
+    """Return the files of a model's folder that decide its scores: configuration, tokenizer, weights."""
     kinds = ("*.json", "*.txt", "*.safetensors", "*.bin", "*.model")
     return sorted({path for kind in kinds for path in folder.glob(kind) if path.is_file()})
 

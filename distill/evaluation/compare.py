@@ -147,7 +147,7 @@ def _check_references(first: str, one: Scores, second: str, other: Scores) -> No
 
 
 def _mismatches(reports: Names) -> list[str]:
-    """Say which scores were measured in different ways."""
+    """Return which scores were measured in different ways."""
     found = []
     for first, second in combinations(reports, 2):
         one, other = reports[first], reports[second]
@@ -167,7 +167,7 @@ _TABLE = (
 
 
 def everyone_of(comparison: StudentComparison) -> dict[str, FigureSet]:
-    """Give the students and the floors, by what they are called."""
+    """Return the students and the floors, by what they are called."""
     return comparison.students | {column_name(name): own for name, own in comparison.floors.items()}
 
 
@@ -206,7 +206,7 @@ _HEADER = ["", "difference", "interval", "p", "better"]
 
 
 def markdown_of(comparison: StudentComparison, reports: Names) -> str:
-    """Give the comparison as a Markdown page."""
+    """Return the comparison as a Markdown page."""
     header, rows = _rows(comparison, reports)
     lines = ["# Students side by side", "", *table(header, [[for_markdown(cell) for cell in row] for row in rows]), ""]
     lines += [f"- {for_markdown(name)}: {for_markdown(model)}" for name, model in comparison.models.items()]
@@ -224,7 +224,7 @@ def _how(comparison: StudentComparison, pairing: Pairing) -> str:
 
 
 def page_of(comparison: StudentComparison, reports: Names) -> str:
-    """Give the comparison as a page that needs nothing but itself."""
+    """Return the comparison as a page that needs nothing but itself."""
     header, rows = _rows(comparison, reports)
     charts = [("Accuracy by decision", decision_bars(comparison.students))]
     histograms = {name: found for name, report in reports.items() if (found := report.all.histogram_f1) is not None}

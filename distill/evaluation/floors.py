@@ -30,12 +30,12 @@ WITH_TEXT = ("shuffled", "constant")  # floors that have texts
 
 
 def coc_of(sample: Sample) -> Coc:
-    """Give a sample's answer."""
+    """Return a sample's answer."""
     return validated(Coc, parse_document(sample.answer, sample.key, what="answer"), sample.key)
 
 
 def majority(decisions: Iterable[str]) -> str | None:
-    """Give the most frequent decision; a tie goes to the first in the order of the action table."""
+    """Return the most frequent decision; a tie goes to the first in the order of the action table."""
     counts = Counter(decisions)
     return max(TOKENS, key=lambda action: counts[action]) if counts else None
 
@@ -46,7 +46,7 @@ def shuffled_groups(count: int, rng: np.random.Generator) -> list[np.ndarray]:
 
 
 def shuffled_places(groups: Sequence[np.ndarray]) -> np.ndarray:
-    """Give each place another place of its group, (count,): one cycle through each group."""
+    """Return each place another place of its group, (count,): one cycle through each group."""
     others = np.empty(sum(map(len, groups)), dtype=int)
     for group in groups:
         others[group] = np.roll(group, 1)
@@ -58,7 +58,7 @@ def _bare(decision: str) -> ScoredAnswer:
 
 
 def _pasts(samples: Sequence[Sample]) -> np.ndarray | None:
-    """Give the pasts of samples, (n, d); None where one has none."""
+    """Return the pasts of samples, (n, d); None where one has none."""
     return np.array([sample.past for sample in samples]) if samples and all(s.past for s in samples) else None
 
 
@@ -92,7 +92,7 @@ class Floors:
         return shuffled_groups(count, rng_for(self._seed, "distill.floor", "shuffled"))
 
     def answers(self, samples: Sequence[Sample], references: Sequence[Coc]) -> dict[str, list[ScoredAnswer]]:
-        """Give what each floor answers to samples with their references, of which there is one at least."""
+        """Return what each floor answers to samples with their references, of which there is one at least."""
         found: dict[str, list[ScoredAnswer]] = {"teacher": [ScoredAnswer(reference) for reference in references]}
         if self._constant is not None and self.decision is not None:
             found["majority"] = [_bare(self.decision)] * len(references)

@@ -70,7 +70,7 @@ def _latency(times_s: np.ndarray) -> dict[str, float]:
 
 
 def _last_start(folder: Path) -> tuple[float | None, int]:
-    """Give the seconds of the last start of `distill infer`, and how many answers it made."""
+    """Return the seconds of the last start of `distill infer`, and how many answers it made."""
     path = folder / "manifest.json"
     if not path.is_file() or read_object(path, what="manifest").get("schema") != MANIFEST_FORMAT.schema:
         return None, 0
@@ -154,7 +154,7 @@ def read_report(folder: Path) -> Evaluation:
 
 
 def pair_up(samples: Sequence[Sample], predictions: Sequence[Prediction]) -> list[tuple[Sample, Prediction]]:
-    """Give each sample that was asked its prediction, in the order of the samples."""
+    """Return each sample that was asked its prediction, in the order of the samples."""
     by_key = {prediction.key: prediction for prediction in predictions}
     if unknown := by_key.keys() - {sample.key for sample in samples}:
         words, fix = "a prediction is for a sample that the split does not have", "give the training set that it is of"

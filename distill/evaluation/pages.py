@@ -26,13 +26,13 @@ CELL_PX = 58  # of a confusion table
 
 
 def shown(name: str, figure: Figure, *, interval: bool = True) -> str:
-    """Give a figure in words: its value and, in brackets, its interval."""
+    """Return a figure in words: its value and, in brackets, its interval."""
     digits = "{:.2%}" if name in SHARES or name not in FIGURES else "{:.1f}" if name == "tokens" else "{:.4f}"
     return shown_as(digits, figure, interval=interval)
 
 
 def shown_as(digits: str, figure: Figure, *, interval: bool = True) -> str:
-    """Give a figure in words, its numbers as `digits` has them ("{:.1%}")."""
+    """Return a figure in words, its numbers as `digits` has them ("{:.1%}")."""
     if figure.value is None:
         return NOTHING
     text = digits.format(figure.value)
@@ -42,12 +42,12 @@ def shown_as(digits: str, figure: Figure, *, interval: bool = True) -> str:
 
 
 def color_of(number: int) -> str:
-    """Give the colour of one of several who stand side by side."""
+    """Return the colour of one of several who stand side by side."""
     return COLORS[number % len(COLORS)]
 
 
 def metric_lines(report: Evaluation) -> list[str]:
-    """Say what BERTScore was measured with."""
+    """Return what BERTScore was measured with."""
     lines = []
     for language, metric in report.metrics.items():
         if metric is None:
@@ -91,12 +91,12 @@ def column_name(name: str) -> str:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Give the lines of a Markdown table; its cells are Markdown."""
+    """Return the lines of a Markdown table; its cells are Markdown."""
     return [f"| {' | '.join(cells)} |" for cells in (header, ["---"] * len(header), *rows)]
 
 
 def figure_table(who: Mapping[str, FigureSet], *, intervals: Collection[str]) -> dict[str, Any]:
-    """Give the figures of those who answered, one a column, of some with their intervals: header and rows."""
+    """Return the figures of those who answered, one a column, of some with their intervals: header and rows."""
     rows = [
         [words, *(shown(name, own.figures[name], interval=called in intervals) for called, own in who.items())]
         for name, words in FIGURES.items()
@@ -106,7 +106,7 @@ def figure_table(who: Mapping[str, FigureSet], *, intervals: Collection[str]) ->
 
 
 def markdown_of(report: Evaluation) -> str:
-    """Give the report as a Markdown page."""
+    """Return the report as a Markdown page."""
     lines = [f"# {for_markdown(report.model)} on {report.split}", ""]
     for title, part in _parts(report).items():
         lines += [f"## {title}: {part.samples} samples of {part.walks} walks", ""]
@@ -125,7 +125,7 @@ def _decisions(part: Measurement) -> list[str]:
 
 
 def page_of(report: Evaluation, pictures: Mapping[str, Sequence[str]]) -> str:
-    """Give the report as a page that needs nothing but itself.
+    """Return the report as a page that needs nothing but itself.
 
     Args:
         pictures: key of an example -> the frames of its window, JPEG in base64.
@@ -150,7 +150,7 @@ def page_of(report: Evaluation, pictures: Mapping[str, Sequence[str]]) -> str:
 
 
 def _tiles(part: Measurement) -> list[tuple[str, str]]:
-    """Give what a person asks first: how much was asked, how good the answers are, and how good those of floors."""
+    """Return what a person asks first: how much was asked, how good the answers are, and how good those of floors."""
     tiles = [(f"{part.samples:,}", "samples"), (f"{part.walks:,}", "walks")]
     for figure, who, words in (
         ("accuracy", STUDENT, "decisions right"),
@@ -168,7 +168,7 @@ def _tiles(part: Measurement) -> list[tuple[str, str]]:
 
 
 def _beside(part: Measurement, *names: str) -> dict[str, FigureSet]:
-    """Give those who answered, all or some, by what their columns are called."""
+    """Return those who answered, all or some, by what their columns are called."""
     return {column_name(name): own for name, own in part.who.items() if name in names or not names}
 
 
@@ -176,12 +176,12 @@ Chart = dict[str, Any]  # as charts.html draws it: view, width, names of its col
 
 
 def _shape(**values: Any) -> dict[str, Any]:
-    """Give a line, rectangle or text of a chart, its numbers rounded."""
+    """Return a line, rectangle or text of a chart, its numbers rounded."""
     return {name: round(value, 3) if isinstance(value, float) else value for name, value in values.items()}
 
 
 def bars(groups: Mapping[str, Mapping[str, Figure]], low: float = 0.0) -> Chart:
-    """Give grouped bars with their intervals; groups: label -> who -> figure, values from `low` to 1."""
+    """Return grouped bars with their intervals; groups: label -> who -> figure, values from `low` to 1."""
     names = list(dict.fromkeys(name for group in groups.values() for name in group))
     width, height = 18, 200
     step = max(60, width * len(names) + 26)
@@ -211,7 +211,7 @@ def bars(groups: Mapping[str, Mapping[str, Figure]], low: float = 0.0) -> Chart:
 
 
 def decision_bars(who: Mapping[str, FigureSet]) -> Chart:
-    """Give the accuracy by decision, the most frequent first."""
+    """Return the accuracy by decision, the most frequent first."""
     counts: dict[str, int] = {}
     for own in who.values():
         for token, figure in own.by_decision.items():
@@ -224,7 +224,7 @@ def decision_bars(who: Mapping[str, FigureSet]) -> Chart:
 
 
 def score_bars(who: Mapping[str, FigureSet]) -> Chart:
-    """Give BERTScore's precision, recall and F1; the axis begins below the least of them."""
+    """Return BERTScore's precision, recall and F1; the axis begins below the least of them."""
     names = {"precision": "bertscore_precision", "recall": "bertscore_recall", "F1": "bertscore_f1"}
     groups = {label: {n: own.figures[name] for n, own in who.items()} for label, name in names.items()}
     values = [figure.value for group in groups.values() for figure in group.values() if figure.value is not None]
@@ -232,7 +232,7 @@ def score_bars(who: Mapping[str, FigureSet]) -> Chart:
 
 
 def histogram(who: Mapping[str, Sequence[int]]) -> Chart:
-    """Give how often which F1 occurs; who -> counts in equal bins from 0 to 1. Empty low bins are left out."""
+    """Return how often which F1 occurs; who -> counts in equal bins from 0 to 1. Empty low bins are left out."""
     num_bins, kinds = len(next(iter(who.values()))), len(who)
     first = min(next((k for k, count in enumerate(counts) if count), num_bins - 1) for counts in who.values())
     first = min(first, num_bins - 5)
@@ -252,7 +252,7 @@ def histogram(who: Mapping[str, Sequence[int]]) -> Chart:
 
 
 def heat_map(who: FigureSet) -> Chart:
-    """Give the confusion of decisions: rows are references, columns answers, colours the share of the row."""
+    """Return the confusion of decisions: rows are references, columns answers, colours the share of the row."""
     rows = [token for token in TOKENS if token in who.confusion]
     answers = {name for row in rows for name in who.confusion[row]}
     columns = [name for name in (*TOKENS, UNPARSED_NAME) if name in rows or name in answers]

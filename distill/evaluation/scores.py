@@ -87,7 +87,7 @@ class Scores:
         return len(self.key)
 
     def at(self, where: np.ndarray) -> Scores:
-        """Give the samples at some places."""
+        """Return the samples at some places."""
         return replace(self, **{name: getattr(self, name)[where] for name in COLUMNS})
 
 
@@ -106,7 +106,7 @@ def join(parts: Sequence[Mapping[str, Scores]]) -> dict[str, Scores]:
 
 
 def number_of(decision: str, sample: Sample) -> int:
-    """Give the number of a decision."""
+    """Return the number of a decision."""
     if decision not in TOKENS:
         raise not_in_set(decision, sample.key)
     return TOKENS.index(decision)
@@ -259,7 +259,7 @@ class _Sums:
 
 
 def _terms(scores: Scores) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Give of each mean what a sample adds to it, and of how many: two (n,) arrays."""
+    """Return of each mean what a sample adds to it, and of how many: two (n,) arrays."""
     answered = scores.answered
     parsed = answered & (scores.answer != UNPARSED)
     right = parsed & (scores.answer == scores.reference)
@@ -306,7 +306,7 @@ def _sums(scores: Scores, walk: np.ndarray, num_walks: int) -> _Sums:
 
 
 def macro_f1(confusion: np.ndarray) -> np.ndarray:
-    """Give the mean F1 over the decisions that references have, (...,) from (..., a, a + 1) counts; NaN without any.
+    """Return the mean F1 over the decisions that references have, (...,) from (..., a, a + 1) counts; NaN without any.
 
     F1 = 2 tp / (2 tp + fp + fn); an answer that does not parse is a miss of its reference and nobody's false alarm.
     """
@@ -318,7 +318,7 @@ def macro_f1(confusion: np.ndarray) -> np.ndarray:
 
 
 def _values(sums: _Sums, draws: np.ndarray) -> dict[str, np.ndarray]:
-    """Give each figure on each draw, (draws,); draws: (draws, walks) how often each walk was drawn."""
+    """Return each figure on each draw, (draws,); draws: (draws, walks) how often each walk was drawn."""
     numerators, denominators = draws @ sums.numerators, draws @ sums.denominators
     with np.errstate(invalid="ignore", divide="ignore"):
         shares = np.where(denominators > 0, numerators / denominators, np.nan)
@@ -332,7 +332,8 @@ def _values(sums: _Sums, draws: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def figures_of(scores: Scores, draws: np.ndarray, *, confidence: float) -> tuple[dict[str, Figure], dict[str, Figure]]:
-    """Give all figures, and the accuracy of each decision that references have; draws: of the walks (`draw_walks`)."""
+    """Return all figures, and the accuracy of each decision that references have; draws: of the walks
+    (`draw_walks`)."""
     names, walk = np.unique(scores.walk.astype(str), return_inverse=True)
     sums = _sums(scores, walk, len(names))
     whole = _values(sums, np.ones((1, len(names))))

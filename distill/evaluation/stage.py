@@ -113,7 +113,7 @@ def run(
 
 
 def _pictures_of(sample: Sample, trees: Mapping[str, Path]) -> list[str]:
-    """Give the frames of a sample's window that can be read as small JPEGs in base64."""
+    """Return the frames of a sample's window that can be read as small JPEGs in base64."""
     found = (thumbnail(inside(trees[sample.run], frame), THUMBNAIL_PX) for frame in sample.frames)
     return [picture for picture in found if picture is not None]
 

@@ -162,7 +162,7 @@ class LocalAnswers:
         shelf.features.take(loaded)
 
     def _fails(self, shelf: _Shelf, sample: Sample) -> bool:
-        """Tell whether a picture of a sample cannot be read; it has then failed, and no other with it."""
+        """Return whether a picture of a sample cannot be read; it has then failed, and no other with it."""
         error = next((shelf.damaged[picture] for picture in pictures_of(sample) if picture in shelf.damaged), None)
         if error is not None:
             shelf.found[sample.key] = failed(sample, error.code, error)

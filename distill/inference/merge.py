@@ -93,7 +93,7 @@ def run(cfg: MergeConfig, model: Path, adapter: Path, out: Path, *, resume: Resu
 
 
 def adapter_files(adapter: Path) -> dict[str, Path]:
-    """Give the files of an adapter, for the inputs of a stage: name -> path."""
+    """Return the files of an adapter, for the inputs of a stage: name -> path."""
     names = ("adapter_config.json", "adapter_model.safetensors")
     if not all((adapter / name).is_file() for name in names):
         if (adapter / "config.json").is_file():
@@ -127,7 +127,7 @@ class Updates:
         return name in self._pairs
 
     def add_to(self, name: str, weight: Any) -> Any:
-        """Give a weight (m, n) with its update, in float32."""
+        """Return a weight (m, n) with its update, in float32."""
         down, up = self._pairs[name]
         if weight.shape != (found := (up.shape[0], down.shape[1])):
             words = "an update of another shape than its layer"

@@ -32,7 +32,7 @@ class SampleOutcome:
 
 
 def failed(sample: Sample, code: str, error: Exception) -> SampleOutcome:
-    """Give what became of a sample that got no answer."""
+    """Return what became of a sample that got no answer."""
     return SampleOutcome(sample, Failed(id=sample.key, code=code, message=str(error)))
 
 
@@ -55,12 +55,12 @@ def make_prediction(sample: Sample, split: Split, text: str, num_tokens: int, is
 
 
 def failed_prediction(sample: Sample, split: Split, code: str) -> Prediction:
-    """Give the record of a sample without an answer: empty, and its reason says that it is no wrong one."""
+    """Return the record of a sample without an answer: empty, and its reason says that it is no wrong one."""
     return make_prediction(sample, split, "", 0, False).model_copy(update={"reason": f"{FAILED}{code}"})
 
 
 def prediction_of(answered: SampleOutcome, split: Split) -> Prediction:
-    """Give the record of a sample."""
+    """Return the record of a sample."""
     found = answered.found
     if isinstance(found, Failed):
         return failed_prediction(answered.sample, split, found.code)
@@ -113,7 +113,7 @@ class OpenFlights:
         self._idle: dict[str, None] = {}  # in the order in which they became idle
 
     def begun(self, sample: Sample) -> str:
-        """Give the flight of a sample that is worked on from now on."""
+        """Return the flight of a sample that is worked on from now on."""
         flight = flight_of(sample.sample_id)
         self._pending[flight] += 1
         self._idle.pop(flight, None)

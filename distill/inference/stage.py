@@ -39,7 +39,7 @@ WAITING = 4
 def make_request(
     sample: Sample, trees: Mapping[str, Path], sampling: StudentEndpointConfig, max_pixels: int
 ) -> Request:
-    """Give a sample as chat messages: its pictures as the student was taught to see them, then the question."""
+    """Return a sample as chat messages: its pictures as the student was taught to see them, then the question."""
     pictures = iter([picture_to_send(picture, max_pixels) for picture in load_pictures(sample, trees)])
     frames = [[next(pictures) for _ in sample.views] for _ in sample.frames]
     return student_request(sample.prompt, frames, answer_schema(language=sample.language), sampling)

@@ -209,7 +209,7 @@ def _read_pair(folder: Path, cfg: DualTrackConfig) -> tuple[Flight, Flight] | st
 
 
 def windows_of(num_frames: int, cfg: DualTrackConfig) -> range:
-    """Give the first frames of the windows of a flight."""
+    """Return the first frames of the windows of a flight."""
     return range(0, num_frames - cfg.length + 1, cfg.stride)
 
 
@@ -279,5 +279,5 @@ def samples_of(
 
 
 def _vectors(rows: np.ndarray) -> tuple[Any, ...]:
-    """Give vectors (k, 3), those of nobody as None."""
+    """Return vectors (k, 3), those of nobody as None."""
     return tuple(None if np.isnan(row).any() else tuple(row.tolist()) for row in rows + 0.0)

@@ -113,7 +113,7 @@ class CaptionedFlight:
         return caption.sample_id if self.flight_id is None else sample_id(self.flight_id, caption.frame_index)
 
     def whole_frames(self, views: Sequence[View]) -> set[int]:
-        """Give the frames that have the files of all views; without views, those of the flight's record."""
+        """Return the frames that have the files of all views; without views, those of the flight's record."""
         if not views:
             return set(range(self.num_frames))
         found = set()

@@ -43,7 +43,7 @@ class SplitConfig(Config):
     def assigned(
         self, keys: Collection[str], walks: Mapping[str, str], seed: int, what: str, fix: str
     ) -> dict[str, tuple[str, Split]]:
-        """Give each flight, by its key `run/town/trajectory`, its walk or town and the split that has all of this.
+        """Return each flight, by its key `run/town/trajectory`, its walk or town and the split that has all of this.
 
         Args:
             walks: key -> walk. what: those with what are split; fix: what to do where they are too few.

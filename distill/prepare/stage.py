@@ -44,7 +44,7 @@ def _rank(sample_id: str, seed: int) -> int:
 
 
 def keeps(last_rank: Mapping[str, int], seed: int, decision: str, sample_id: str) -> bool:
-    """Tell whether a window stays; last_rank: decision -> rank of the last window that does, none where all do."""
+    """Return whether a window stays; last_rank: decision -> rank of the last window that does, none where all do."""
     return decision not in last_rank or _rank(sample_id, seed) <= last_rank[decision]
 
 
@@ -76,7 +76,7 @@ class WindowRanks:
 
 
 def _last(ranks: list[np.ndarray], count: int) -> int:
-    """Give the rank of the window that is the last of so many; -1 for none."""
+    """Return the rank of the window that is the last of so many; -1 for none."""
     return int(np.partition(np.concatenate(ranks), count - 1)[count - 1]) if count else -1
 
 
@@ -92,7 +92,8 @@ class Balance:
     last_rank: Mapping[str, int]
 
     def cost(self, samples_left_out: int) -> dict[str, Any]:
-        """Give `balance` of the manifest. effective_decisions: as many equally frequent ones have the same entropy."""
+        """Return `balance` of the manifest. effective_decisions: as many equally frequent ones have the same
+        entropy."""
         after = {decision: min(count, self.most_windows) for decision, count in self.windows.items()}
         return {
             "most_windows": self.most_windows,
@@ -149,7 +150,7 @@ def limit_to(
 
 
 def _effective(counts: Mapping[str, int]) -> float:
-    """Give the effective number of kinds, the exponential of Shannon's entropy (Hill 1973, order 1)."""
+    """Return the effective number of kinds, the exponential of Shannon's entropy (Hill 1973, order 1)."""
     total = sum(counts.values())
     return round(math.exp(-sum(count / total * math.log(count / total) for count in counts.values())), 2)
 
@@ -204,7 +205,7 @@ def make_sample(
     walk: str = "",
     sample_id: str = "",
 ) -> Sample | str:
-    """Give the sample of a caption in one language, or the word for why there is none.
+    """Return the sample of a caption in one language, or the word for why there is none.
 
     Args:
         run, walk: of its flight. sample_id: unique among the samples of all runs; "" takes the caption's.
@@ -246,7 +247,7 @@ def make_sample(
 
 
 def _reason_to_leave_out(caption: Caption, language: Language, cfg: PrepareConfig) -> str | None:
-    """Give the word for why the settings leave a caption out, by its record alone; None: they take it."""
+    """Return the word for why the settings leave a caption out, by its record alone; None: they take it."""
     if caption.status != "accepted":
         return f"dropped_{caption.drop_reason or 'unknown'}"
     if caption.repair is not None and cfg.repaired == "exclude":
@@ -312,7 +313,8 @@ class _Windows:
         return window
 
     def _without_pictures(self, flight: CaptionedFlight, caption: Caption) -> dict[str, Any]:
-        """Give what is known of a window beside its pictures: its past in numbers, and whether any was drawn after."""
+        """Return what is known of a window beside its pictures: its past in numbers, and whether any was drawn
+        after."""
         read, now = self._read(flight), caption.window[-1]
         is_ordered = read.mission is not None and read.mission.order_at(now) is not None
         ahead = is_drawn_ahead(read, now, max(caption.future), is_ordered) if read.is_ours and caption.future else None
@@ -320,7 +322,7 @@ class _Windows:
         return {"past": tuple(past.tolist()), "drawn_ahead": ahead}
 
     def _unfit(self, flight: CaptionedFlight, sample: Sample) -> str | None:
-        """Say why the frames of a flight are not those that a sample speaks of."""
+        """Return why the frames of a flight are not those that a sample speaks of."""
         if not self._frames_of(flight).issuperset(sample.window):
             return "missing_image"
         assert flight.size_px is not None, "frames of a flight that nobody read"
@@ -339,7 +341,7 @@ class _Selection:
     seed: int
 
     def left_out(self, window: _Window) -> str | None:
-        """Give the reason for which a window is left out of its split."""
+        """Return the reason for which a window is left out of its split."""
         balance = self.balance if self.split_of[window.flight.key] == "train" else None
         if balance is not None and not keeps(balance.last_rank, self.seed, window.decision, window.sample_id):
             return "balance"

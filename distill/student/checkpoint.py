@@ -46,7 +46,7 @@ class Progress(BaseModel):
 
 
 def learning_weights(student: Student) -> dict[str, Any]:
-    """Give what learns, by name: the matrices of an adapter, or the weights."""
+    """Return what learns, by name: the matrices of an adapter, or the weights."""
     return {name: p for name, p in student.model.named_parameters() if p.requires_grad}
 
 
@@ -87,7 +87,7 @@ def save_tensors(path: Path, tensors: dict[str, Any], metadata: dict[str, str] |
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
-    """Give the newest undamaged checkpoint; a damaged one is reported and passed over."""
+    """Return the newest undamaged checkpoint; a damaged one is reported and passed over."""
     for path in sorted(folder.glob("step_*"), reverse=True):
         damaged = _damage_of(path)
         if damaged is None:
@@ -105,7 +105,7 @@ def check_whole(checkpoint: Path) -> None:
 
 
 def _damage_of(checkpoint: Path) -> str | None:
-    """Say what is damaged of a checkpoint; None: it is whole."""
+    """Return what is damaged of a checkpoint; None: it is whole."""
     try:
         digests = read_checksums(checkpoint).items()
         return next((name for name, digest in digests if sha256_file(checkpoint / name) != digest), None)
@@ -156,7 +156,7 @@ def drop_old_checkpoints(folder: Path, keep: int, best_step: int) -> None:
 
 
 def checkpoint_path(folder: Path, step: int) -> Path:
-    """Give the folder of a checkpoint, named so that they sort by step."""
+    """Return the folder of a checkpoint, named so that they sort by step."""
     return folder / f"step_{step:08d}"
 
 
@@ -167,7 +167,7 @@ def cut_log(path: Path, num_steps: int) -> None:
 
 
 def _is_of_steps(line: bytes, num_steps: int) -> bool:
-    """Tell whether a line of the log is of the first steps; one that a kill cut short is of none."""
+    """Return whether a line of the log is of the first steps; one that a kill cut short is of none."""
     try:
         record = parse_json(line) if line.endswith(b"\n") else None
     except ValueError:
@@ -177,7 +177,7 @@ def _is_of_steps(line: bytes, num_steps: int) -> bool:
 
 
 def adapter_facts(student: Student, max_pixels: int, model: Path) -> dict[str, Any]:
-    """Say what an adapter was trained on and how, for those who load it."""
+    """Return what an adapter was trained on and how, for those who load it."""
     import peft
     import torch
     import transformers
@@ -225,7 +225,7 @@ def write_model_folder(student: Student, folder: Path, base: Path) -> None:
 
 
 def base_digests(model: Path) -> dict[str, str]:
-    """Give the digests of the weight files that an adapter belongs to."""
+    """Return the digests of the weight files that an adapter belongs to."""
     return {path.name: sha256_file(path) for path in weight_files(model).values() if path.suffix == ".safetensors"}
 
 

@@ -25,7 +25,7 @@ Record = Callable[[Callable[[], None]], Play | None]
 
 
 def recorder_for(student: Student) -> Record | None:
-    """Give what records the steps of a student; None where nothing can be recorded, as on a CPU."""
+    """Return what records the steps of a student; None where nothing can be recorded, as on a CPU."""
     return record_graph if student.device == "cuda" else None
 
 
@@ -70,7 +70,8 @@ class Constraint(Protocol):
     """Says which tokens may come next; rows are counted as they were given to `decode`."""
 
     def allowed(self, rows: Sequence[int], num_tokens: int) -> np.ndarray:
-        """Give (len(rows), num_tokens / 8, rounded up) uint8, a bit a token, the lowest first; each row allows one."""
+        """Return (len(rows), num_tokens / 8, rounded up) uint8, a bit a token, the lowest first; each row allows
+        one."""
 
     def consume(self, row: int, token: int) -> None:
         """Note the token that a row was continued with."""
@@ -192,7 +193,7 @@ class _Batch:
         return [place for place, is_live in enumerate(self.is_live) if is_live]
 
     def tokens_of(self, place: int) -> list[int]:
-        """Give the tokens chosen so far."""
+        """Return the tokens chosen so far."""
         return self._chosen[place, : int(self._place) - self._num_prompt + 1].tolist()
 
     def drop_ended(self) -> None:
@@ -251,7 +252,7 @@ class _Batch:
 
 
 def _prompt_mask(mask: Any, room: int) -> Any:
-    """Give what each token of the prompts may look at, (b, 1, n, room) bool, from the mask of their tokens, (b, n).
+    """Return what each token of the prompts may look at, (b, 1, n, room) bool, from the mask of their tokens, (b, n).
 
     A token of the padding looks at itself, since attention to nothing at all is not a number.
     """

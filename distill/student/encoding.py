@@ -44,7 +44,7 @@ class EncodedSample:
 
 
 def messages_of(sample: Sample) -> list[dict[str, Any]]:
-    """Give the chat of a sample, with a mark for every picture."""
+    """Return the chat of a sample, with a mark for every picture."""
     return chat_messages(sample.prompt, [[IMAGE_PART] * len(sample.views) for _ in sample.frames])
 
 
@@ -59,12 +59,12 @@ def load_pictures(sample: Sample, trees: Mapping[str, Path]) -> list[np.ndarray]
 
 
 def most_pixels(samples: Sequence[Sample]) -> int:
-    """Give the pixels of the largest picture."""
+    """Return the pixels of the largest picture."""
     return max(width_px * height_px for width_px, height_px in (sample.picture_px for sample in samples))
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Give (width, height) px of a file of a frame, from its header alone."""
+    """Return (width, height) px of a file of a frame, from its header alone."""
     if path.name == "depth.npy":
         height_px, width_px = array_header(path, tree=tree_of(path.parent)).shape
         return width_px, height_px
@@ -75,7 +75,8 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def prompt_text(processor: Processor, sample: Sample, tokens_per_image: Sequence[int]) -> str:
-    """Give the prompt as the chat template writes it, without thinking, each picture's mark repeated for its tokens."""
+    """Return the prompt as the chat template writes it, without thinking, each picture's mark repeated for its
+    tokens."""
     text = processor.tokenizer.apply_chat_template(
         messages_of(sample), tokenize=False, add_generation_prompt=True, enable_thinking=False
     )
@@ -88,7 +89,7 @@ def prompt_text(processor: Processor, sample: Sample, tokens_per_image: Sequence
 
 
 def chat_text(processor: Processor, sample: Sample) -> str:
-    """Give the whole chat as the chat template writes it: what prompt, answer and end must add up to."""
+    """Return the whole chat as the chat template writes it: what prompt, answer and end must add up to."""
     answered = [*messages_of(sample), {"role": "assistant", "content": sample.answer}]
     return processor.tokenizer.apply_chat_template(answered, tokenize=False, enable_thinking=False)
 
@@ -101,7 +102,7 @@ def special_token_in(processor: Processor, sample: Sample) -> str | None:
 
 
 def picture_grid(processor: Processor, size_px: tuple[int, int]) -> tuple[int, int, int]:
-    """Give the grid of patches (1, rows, columns) that a picture of (width, height) px becomes."""
+    """Return the grid of patches (1, rows, columns) that a picture of (width, height) px becomes."""
     from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import smart_resize
 
     images, (width_px, height_px) = processor.image_processor, size_px
@@ -133,7 +134,7 @@ def patches_of(processor: Processor, pictures: Sequence[np.ndarray]) -> np.ndarr
 
 
 def positions_of(processor: Processor, ids: np.ndarray, grids: np.ndarray) -> np.ndarray:
-    """Give the rotary positions of a row's tokens, (3, n) int64: time, height, width.
+    """Return the rotary positions of a row's tokens, (3, n) int64: time, height, width.
 
     Text counts on by one in all three. A picture's tokens share the time at which it begins and count its rows and
     columns from there; what follows begins after the longer side.

@@ -44,7 +44,7 @@ class PictureData:
 
 
 def pictures_of(sample: Sample) -> list[FramePicture]:
-    """Give the pictures of a sample in the order of its prompt."""
+    """Return the pictures of a sample in the order of its prompt."""
     return [
         FramePicture(sample.run, frame, view, sample.picture_px, sample.depth_range_m)
         for frame in sample.frames
@@ -93,7 +93,7 @@ class VisionFeatures:
         self.num_encoded = 0
 
     def bytes_of(self, picture: FramePicture) -> int:
-        """Give what the features of a picture take."""
+        """Return what the features of a picture take."""
         width = self.student.core.config.text_config.hidden_size
         return self._tokens_of(picture) * width * self.student.dtype.itemsize
 
@@ -106,7 +106,7 @@ class VisionFeatures:
         return set(self._kept)
 
     def wanted(self, plan: set[FramePicture], pictures: Iterable[FramePicture]) -> list[FramePicture]:
-        """Give those of a step's pictures that must be read, and add to the plan those of them that will stay.
+        """Return those of a step's pictures that must be read, and add to the plan those of them that will stay.
 
         The steps of one plan are asked about in their order; earlier ones need not have been taken yet.
         """
@@ -149,7 +149,8 @@ class VisionFeatures:
         return torch.cat(tuple(found)).to(student.dtype).split(counts)
 
     def of(self, pictures: Sequence[FramePicture]) -> Any:
-        """Give the features of pictures that were taken, below each other: (tokens, width) on the student's device."""
+        """Return the features of pictures that were taken, below each other: (tokens, width) on the student's
+        device."""
         import torch
 
         if not pictures:

@@ -62,7 +62,7 @@ def fuse_norms(model: Any) -> None:
 
 @cache
 def _fused_norms() -> dict[type, type]:
-    """Give the library's classes of norms, and those that take their place."""
+    """Return the library's classes of norms, and those that take their place."""
     import torch
     from transformers.models.qwen3_5.modeling_qwen3_5 import Qwen3_5RMSNorm, Qwen3_5RMSNormGated
 

@@ -95,7 +95,7 @@ class Student(Processor):
         return self.core.model.visual
 
     def embedded(self, ids: Any, features: Any) -> Any:
-        """Give what the language model reads of tokens (b, n), with features of the pictures (image tokens, width) in
+        """Return what the language model reads of tokens (b, n), with features of the pictures (image tokens, width) in
         them."""
         found = self.core.get_input_embeddings()(ids).to(self.dtype)
         if not len(features):
@@ -112,12 +112,12 @@ class Student(Processor):
 
 
 def is_hub_name(name: str) -> bool:
-    """Tell whether a student is named as a repository of a hub, and not as a folder."""
+    """Return whether a student is named as a repository of a hub, and not as a folder."""
     return HUB_NAME.fullmatch(name) is not None and not name.startswith(".") and not Path(name).is_dir()
 
 
 def student_folder(name: str) -> Path:
-    """Give the folder of a student: a folder as it is; of a repository's name, as `Qwen/Qwen3.5-2B`, the copy in the
+    """Return the folder of a student: a folder as it is; of a repository's name, as `Qwen/Qwen3.5-2B`, the copy in the
     hub's cache.
     """
     if not is_hub_name(name):
@@ -134,7 +134,7 @@ def student_folder(name: str) -> Path:
 
 
 def weight_files(folder: Path) -> dict[str, Path]:
-    """Give the files that decide what a model folder computes, for the inputs of a stage: name -> path."""
+    """Return the files that decide what a model folder computes, for the inputs of a stage: name -> path."""
     config = read_json(folder / "config.json", what="student model (a folder with config.json)")
     found = config.get("model_type") if isinstance(config, dict) else None
     if found != MODEL_TYPE:
@@ -149,7 +149,7 @@ def weight_files(folder: Path) -> dict[str, Path]:
 
 
 def pick_device(wanted: Device) -> str:
-    """Give the device to use: `cuda` if there is one, unless told otherwise."""
+    """Return the device to use: `cuda` if there is one, unless told otherwise."""
     require("torch")
     import torch
 
@@ -159,7 +159,7 @@ def pick_device(wanted: Device) -> str:
 
 
 def compute_dtype(wanted: Dtype, device: str) -> Any:
-    """Give torch's name of what to compute in: bfloat16 on an accelerator and float32 on a CPU, unless told
+    """Return torch's name of what to compute in: bfloat16 on an accelerator and float32 on a CPU, unless told
     otherwise."""
     import torch
 

@@ -66,8 +66,8 @@ PRESETS = {
 
 
 def random_student_settings(name: str, given: RandomStudent) -> RandomStudent | None:
-    """Give the settings of a student of random weights: of a preset's name, or `given` for `random`; None for any other
-    name.
+    """Return the settings of a student of random weights: of a preset's name, or `given` for `random`; None for any
+    other name.
     """
     if name == RANDOM:
         return given
@@ -138,7 +138,7 @@ def _tokenizer(lines: Iterable[str], vocabulary: int) -> Any:
 
 
 def model_config(cfg: RandomStudent, tokenizer: Any) -> Any:
-    """Give the library's configuration of a student: heads and rotary sections as wide as its width allows."""
+    """Return the library's configuration of a student: heads and rotary sections as wide as its width allows."""
     from transformers import Qwen3_5Config
 
     ids = {token: tokenizer.convert_tokens_to_ids(token) for token in _SPECIAL_TOKENS}

@@ -65,7 +65,7 @@ class Validation(BaseModel):
     parsed: float | None = None
 
     def score(self, best_by: str) -> tuple[float, float]:
-        """Give what the best checkpoint has most of: decisions or verdicts first, then likelihood."""
+        """Return what the best checkpoint has most of: decisions or verdicts first, then likelihood."""
         return ((self.accuracy if best_by == "decision" else self.consistent) or 0.0, -self.loss)
 
     def __str__(self) -> str:
@@ -114,7 +114,7 @@ def _validate_batch(student: Student, rows: Sequence[Row], supply: Supply, cfg: 
 
 
 def _judged_answer(sample: Sample, answer: Completion) -> Any:
-    """Give what an answer adds to the counts: parsed, right, with a known future, consistent with it."""
+    """Return what an answer adds to the counts: parsed, right, with a known future, consistent with it."""
     finish_reason = None if answer.is_finished else "length"
     coc = parse_answer(answer.text, sample.language, finish_reason=finish_reason).coc
     decision, ruled_out = coc and coc.flight_decision, sample.contradicted
@@ -146,7 +146,7 @@ class Lesson:
         return validate(self.student, self.validation_samples, census, self.supply, self.cfg, self.ranks)
 
     def is_validated(self, done: int) -> bool:
-        """Tell whether there is a validation after so many steps."""
+        """Return whether there is a validation after so many steps."""
         every = self.cfg.validate_every_steps or self.steps.steps_per_epoch
         return done == self.steps.num_steps or done % every == 0
 
@@ -300,7 +300,7 @@ def _save(student: Student, optimizer: Any, progress: Progress, folder: Path, cf
 
 
 def _speed(lesson: Lesson, facts: dict[str, Any], seconds: float, left_s: float) -> dict[str, float]:
-    """Give what a step took: seconds with the wait for its data, rates over all processes, memory of this one."""
+    """Return what a step took: seconds with the wait for its data, rates over all processes, memory of this one."""
     seconds = max(seconds, 1e-9)
     return {
         "seconds": round(seconds, 4),
@@ -314,7 +314,7 @@ def _speed(lesson: Lesson, facts: dict[str, Any], seconds: float, left_s: float)
 
 @contextlib.contextmanager
 def _notebook(path: Path | None) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Give a function that appends a record to the log; None: it keeps nothing, as in all processes but the first."""
+    """Return a function that appends a record to the log; None: it keeps nothing, as in all processes but the first."""
     if path is None:
         yield lambda record: None
         return

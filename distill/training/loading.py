@@ -38,7 +38,7 @@ ResultT = TypeVar("ResultT")
 
 
 def num_workers(wanted: int) -> int:
-    """Give how many workers to start: one a core, at most MOST_WORKERS, unless told otherwise."""
+    """Return how many workers to start: one a core, at most MOST_WORKERS, unless told otherwise."""
     return wanted if wanted >= 0 else min(MOST_WORKERS, len(os.sched_getaffinity(0)))
 
 
@@ -325,7 +325,7 @@ class Census:
         return self.prompt_tokens + self.answer_tokens
 
     def pictures_of(self, index: int) -> list[FramePicture]:
-        """Give the pictures of the sample at a place of the split."""
+        """Return the pictures of the sample at a place of the split."""
         return [self.pictures[place] for place in self._places[int(np.searchsorted(self.indices, index))]]
 
 

@@ -19,7 +19,7 @@ from distill.student.model import Student
 
 @cache
 def _chunked_loss() -> Any:
-    """Give the function of autograd; made on first use, because torch is imported where it is used."""
+    """Return the function of autograd; made on first use, because torch is imported where it is used."""
     import torch
 
     class ChunkedLoss(torch.autograd.Function):
@@ -80,7 +80,7 @@ def chunked_loss(hidden: Any, head: Any, targets: Any, weights: Any, *, chunk: i
 
 
 def output_head(student: Student) -> Any:
-    """Give the weights of the head, (vocabulary, width)."""
+    """Return the weights of the head, (vocabulary, width)."""
     import torch
 
     head = student.core.get_output_embeddings()

@@ -108,7 +108,7 @@ def estimate(student: Student, cfg: TrainConfig, longest: int, picture_bytes: fl
 
 
 def available_bytes(device: str) -> float:
-    """Give the memory of the device: the accelerator's, or the machine's."""
+    """Return the memory of the device: the accelerator's, or the machine's."""
     import torch
 
     if device == "cuda":
@@ -117,7 +117,7 @@ def available_bytes(device: str) -> float:
 
 
 def used_gb(device: str) -> float:
-    """Give the most memory used so far: of the accelerator, or of this process."""
+    """Return the most memory used so far: of the accelerator, or of this process."""
     import torch
 
     if device == "cuda":
@@ -127,7 +127,7 @@ def used_gb(device: str) -> float:
 
 @contextlib.contextmanager
 def memory_errors(cfg: TrainConfig) -> Iterator[None]:
-    """Say what helps where the memory was too small, on an accelerator or a CPU."""
+    """Return what helps where the memory was too small, on an accelerator or a CPU."""
     import torch
 
     try:

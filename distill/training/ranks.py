@@ -62,7 +62,7 @@ class Ranks:
                 gradient.copy_(part.view_as(gradient))
 
     def gathered(self, value: T) -> list[T]:
-        """Give every process the values of all, in the order of their ranks."""
+        """Return every process the values of all, in the order of their ranks."""
         if self.size == 1:
             return [value]
         import torch
@@ -116,7 +116,7 @@ def _collective(call: Callable[..., Any], *arguments: Any) -> None:
 
 
 def is_first_process() -> bool:
-    """Tell whether this process is the one of those that were started together that speaks for all."""
+    """Return whether this process is the one of those that were started together that speaks for all."""
     return _number("RANK", 0) == 0
 
 

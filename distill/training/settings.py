@@ -112,14 +112,14 @@ class Steps:
         return math.ceil(self.num_samples / self.samples_per_step)
 
     def samples_of(self, step: int) -> list[int]:
-        """Give the sample indices of a step; the last step of an epoch may be smaller."""
+        """Return the sample indices of a step; the last step of an epoch may be smaller."""
         epoch, position = divmod(step, self.steps_per_epoch)
         order = rng_for(self.seed, STAGE, f"epoch_{epoch}").permutation(self.num_samples)
         return order[position * self.samples_per_step : (position + 1) * self.samples_per_step].tolist()
 
 
 def share_of(chosen: Sequence[int], lengths: np.ndarray, rank: int, num_ranks: int) -> list[int]:
-    """Give a process's samples of a step, longest first: dealt out by length, so that all have about the same to do.
+    """Return a process's samples of a step, longest first: dealt out by length, so that all have about the same to do.
 
     Args:
         chosen: the step's samples. lengths: (n,) tokens of every sample.

@@ -30,7 +30,7 @@ from distill.training.settings import STAGE, TrainConfig
 
 
 def taught_by(samples: Iterable[Sample], max_pixels: int) -> Taught:
-    """Tell what samples teach.
+    """Return what samples teach.
 
     Args:
         max_pixels: most that the student's image processor keeps of a picture.

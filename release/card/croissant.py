@@ -43,7 +43,7 @@ TYPES = {
 
 
 def render_croissant(record: ReleaseRecord) -> str:
-    """Give the text of `croissant.json` for a release.json."""
+    """Return the text of `croissant.json` for a release.json."""
     names = ", ".join(dict.fromkeys(entry.name for entry in record.maps))
     value = {
         "@context": CONTEXT,

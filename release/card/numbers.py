@@ -123,7 +123,7 @@ class Sum:
             self.high = other.high if self.high is None else max(self.high, other.high)
 
     def spread(self) -> Spread:
-        """Give the sums as the record has them."""
+        """Return the sums as the record has them."""
         if not self.count or self.low is None or self.high is None:
             return Spread(count=0, mean=None, std=None, min=None, max=None)
         std = math.sqrt(self.count * self.squares - self.total * self.total) / self.count
@@ -133,12 +133,12 @@ class Sum:
 
 
 def millionths(value: float) -> int:
-    """Give a value in whole millionths; raises as `Sum.add`."""
+    """Return a value in whole millionths; raises as `Sum.add`."""
     return round(bounded(value) * MILLION)
 
 
 def bounded(value: float) -> float:
-    """Give a value that a flight can have; raises as `Sum.add`."""
+    """Return a value that a flight can have; raises as `Sum.add`."""
     if not -LARGEST < value < LARGEST:  # NaN is not
         raise InputError("not a number of a flight", where="data", got=str(value), expected=f"within {LARGEST:g}")
     return value
@@ -169,7 +169,7 @@ class FlightCount:
 
 
 def clean_place(row: Mapping[str, Any]) -> Place3 | None:
-    """Give where the drone would be without the frame's perturbation, m; None where the row does not say."""
+    """Return where the drone would be without the frame's perturbation, m; None where the row does not say."""
     offset = row["drone_offset"]
     if offset is None:
         return None
@@ -252,7 +252,7 @@ class RowCounts:
         self.characters.update({name: len(text or "") for name, text in texts.items()})
 
     def numbers(self, shards: list[Path], num_frames: int | None) -> Numbers:
-        """Give the numbers of the rows of these shards."""
+        """Return the numbers of the rows of these shards."""
         self.counts["fov_deg"] = Counter()
         for frames in self.fovs.values():
             self.counts["fov_deg"][_fov_of(frames)] += frames.total()
@@ -302,7 +302,7 @@ class RowCounts:
 
 
 def spread_of(values: Iterable[float]) -> Spread:
-    """Give the spread of some values."""
+    """Return the spread of some values."""
     added = Sum()
     for value in values:
         added.add(value)
@@ -310,7 +310,8 @@ def spread_of(values: Iterable[float]) -> Spread:
 
 
 def stored_bytes(shards: Iterable[Path]) -> dict[str, int]:
-    """Give the bytes of each picture column, from the parquet footers; all small columns together as `annotations`."""
+    """Return the bytes of each picture column, from the parquet footers; all small columns together as
+    `annotations`."""
     owner = {column.name: file for file, column in PICTURES.items()}
     sizes: Counter[str] = Counter()
     for shard in shards:

@@ -39,7 +39,7 @@ FEW_WALKS = 10
 
 
 def render_card(record: ReleaseRecord) -> str:
-    """Give README.md for a release.json."""
+    """Return README.md for a release.json."""
     numbers, splits = record.numbers, record.splits.splits
     captions = numbers.captions
     by_kind: dict[str, list[str]] = defaultdict(list)
@@ -96,24 +96,24 @@ def _map_kind(source: SourceRecord) -> str:
 
 
 def _is_rendered_by_us(source: SourceRecord) -> bool:
-    """Tell whether a stage of cosfly drew the frames of a source."""
+    """Return whether a stage of cosfly drew the frames of a source."""
     return any(stage.stage == "render" for stage in source.stages)
 
 
 def first_split(record: ReleaseRecord) -> str:
-    """Give the first split that has rows."""
+    """Return the first split that has rows."""
     return next((name for name in SPLIT_NAMES if name in record.splits.splits), SPLIT_NAMES[0])
 
 
 def size_category(num_frames: int) -> str:
-    """Give the hub's size category."""
+    """Return the hub's size category."""
     limits = ("1K", "10K", "100K", "1M", "10M")
     k = sum(num_frames >= 10 ** (3 + i) for i in range(len(limits)))
     return f"n<{limits[0]}" if k == 0 else f"n>{limits[-1]}" if k == len(limits) else f"{limits[k - 1]}<n<{limits[k]}"
 
 
 def _front_matter(record: ReleaseRecord) -> str:
-    """Give what the hub reads. `synthetic`: only where all pictures are known to be rendered. The patterns of shards
+    """Return what the hub reads. `synthetic`: only where all pictures are known to be rendered. The patterns of shards
     name the content: by it the library's cache tells one release from another."""
     rendered = all(_is_rendered_by_us(source) for source in record.provenance.sources)
     tags = ["uav", "aerial-tracking", *(["synthetic"] if rendered else [])]
@@ -134,7 +134,7 @@ def _front_matter(record: ReleaseRecord) -> str:
 
 
 def _coordinates(record: ReleaseRecord) -> str:
-    """Give the coordinates as a block that a program reads: YAML."""
+    """Return the coordinates as a block that a program reads: YAML."""
     values: dict[str, Any] = {"coordinates": record.coordinates}
     if record.depth is not None:
         values["depth"] = record.depth.model_dump(mode="json")
@@ -164,7 +164,7 @@ def _funnel(history: History) -> list[tuple[str, int]]:
 
 
 def _columns(files: list[FrameFile]) -> Iterable[tuple[str, str, str]]:
-    """Give of each column its name, type, and the words that it may hold."""
+    """Return of each column its name, type, and the words that it may hold."""
     words = {column.name: column.words for column in SCALARS}
     for member in schema(files):
         kind = "float64" if str(member.type) == "double" else str(member.type)

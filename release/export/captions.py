@@ -65,7 +65,7 @@ class CaptionLine:
     prompts: dict[Language, Prompt]
 
     def question(self, language: Language, shown: ImageChoice) -> Prompt:
-        """Give the prompt with the sentence about the pictures that are shown."""
+        """Return the prompt with the sentence about the pictures that are shown."""
         if shown == "last":
             return self.prompts[language].told(LAST[language].format(*self.picture_px))
         return self.prompts[language].told(Pictures(("rgb",), self.picture_px).sentence(language))
@@ -276,7 +276,7 @@ def _csv(file: IO[bytes], lines: Iterable[CaptionLine], wanted: Wanted, told: Ca
 
 
 def cell(value: Any) -> str:
-    """Give a value as a spreadsheet may show it: a list as JSON, nothing for None, and no text that it would
+    """Return a value as a spreadsheet may show it: a list as JSON, nothing for None, and no text that it would
     calculate.
     """
     text = "" if value is None else value if isinstance(value, str) else dump_json(value)

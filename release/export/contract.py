@@ -88,7 +88,7 @@ class Format(Protocol):
 
 
 def format_of(name: FormatName) -> Format:
-    """Give the module of a format, loaded when it is asked for."""
+    """Return the module of a format, loaded when it is asked for."""
     return cast(Format, importlib.import_module(FORMATS[name]))
 
 

@@ -49,12 +49,12 @@ Summary = dict[str, list]  # name of the statistic -> values, nested as LeRobot 
 
 
 def sampled(num_frames: int) -> set[int]:
-    """Give the frames of an episode whose pictures count."""
+    """Return the frames of an episode whose pictures count."""
     return {int(i) for i in np.linspace(0, num_frames - 1, min(num_frames, SAMPLED_FRAMES)).round()}
 
 
 def thinned(picture: np.ndarray) -> np.ndarray:
-    """Give every fourth pixel of a picture, (k, channels) float64: colours from 0 to 1, depth (two dimensions) as it
+    """Return every fourth pixel of a picture, (k, channels) float64: colours from 0 to 1, depth (two dimensions) as it
     is.
     """
     few = picture[::PIXEL_STEP, ::PIXEL_STEP]
@@ -160,7 +160,7 @@ class LeRobotFeature:
 
 
 def features_of(modalities: Collection[FrameFile], size_px: tuple[int, int]) -> dict[str, LeRobotFeature]:
-    """Give the features of frames whose pictures are (width, height) px."""
+    """Return the features of frames whose pictures are (width, height) px."""
     width, height = size_px
     found: dict[str, LeRobotFeature] = {}
     for file in modalities:
@@ -178,7 +178,7 @@ def features_of(modalities: Collection[FrameFile], size_px: tuple[int, int]) -> 
 
 
 def schema_of(features: dict[str, LeRobotFeature]) -> pa.Schema:
-    """Give the parquet schema, with what `datasets` wants to know in its metadata."""
+    """Return the parquet schema, with what `datasets` wants to know in its metadata."""
     about = {"info": {"features": {name: feature.hub for name, feature in features.items()}}}
     return pa.schema(
         [(name, feature.arrow) for name, feature in features.items()], {b"huggingface": json.dumps(about).encode()}
@@ -186,8 +186,8 @@ def schema_of(features: dict[str, LeRobotFeature]) -> pa.Schema:
 
 
 def values_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Give the values of all features of an episode but pictures and LeRobot's own: arrays (n,) or (n, d), and lists of
-    texts.
+    """Return the values of all features of an episode but pictures and LeRobot's own: arrays (n,) or (n, d), and
+    lists of texts.
 
     What a frame does not have is NaN, or the empty text.
     """
@@ -204,7 +204,7 @@ def values_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def states(rows: list[dict[str, Any]]) -> np.ndarray:
-    """Give what a drone knows of its own motion at each frame, (n, 5) as ACTION: the mean velocities of the step that
+    """Return what a drone knows of its own motion at each frame, (n, 5) as ACTION: the mean velocities of the step that
     led there, and the camera's pitch. At the first frame it has not moved."""
     pose = vectors(rows, "pose", POSE)
     time_s, nothing = np.array([row["time_s"] for row in rows]), np.empty((len(rows), 0, 6))
@@ -551,7 +551,7 @@ def _info(release: Release, units: Sequence[ExportUnit], counts: list[int], cfg:
 
 
 def _tasks_table(tasks: list[str]) -> pa.Table:
-    """The table of tasks as pandas reads it: the text is the index."""
+    """Return the table of tasks as pandas reads it: the text is the index."""
     named = {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
     about = {"index_columns": ["task"], "column_indexes": [], "columns": [named], "pandas_version": "2.0.0"}
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": tasks})

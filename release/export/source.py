@@ -114,7 +114,7 @@ def open_release(folder: Path) -> Release:
 
 
 def split_of(shard: str) -> SplitName:
-    """Give the split that a shard's name says: train, validation or test."""
+    """Return the split that a shard's name says: train, validation or test."""
     match = SHARD_NAME.fullmatch(shard)
     assert match is not None, shard
     return cast(SplitName, match[1])
@@ -211,7 +211,7 @@ def rows_of_flight(
 
 
 def picture(row: dict[str, Any], file: FrameFile) -> bytes:
-    """Give the bytes of a picture of a row."""
+    """Return the bytes of a picture of a row."""
     value = row[PICTURES[file].name]
     data = value if file == "depth" else value and value["bytes"]
     if not data or (file != "depth" and png_size(data) is None):

@@ -64,7 +64,7 @@ class ExportRecord(Strict):
 
 
 def describe(release: Release, facts: FormatFacts, cfg: ExportConfig, *, frames: int, num_bytes: int) -> ExportRecord:
-    """Give the record of an export."""
+    """Return the record of an export."""
     record = release.record
     return ExportRecord(
         format=cfg.format,
@@ -95,7 +95,7 @@ def write_export(path: Path, record: ExportRecord) -> str:
 
 
 def render_readme(record: ExportRecord) -> str:
-    """Give README.md: front matter as the hub reads it, and what `export.json` says in words."""
+    """Return README.md: front matter as the hub reads it, and what `export.json` says in words."""
     front: dict[str, Any] = {
         "license": record.licence,
         "pretty_name": record.release.name,

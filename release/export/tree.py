@@ -42,7 +42,7 @@ Row = dict[str, Any]
 
 
 def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> list[ExportUnit]:
-    """A unit is one flight."""
+    """Return a unit is one flight."""
     wrong = [] if "rgb" in release.modalities else ["no colour pictures, which every frame of the layout has"]
     wrong += [
         f"{flight.name}: a town's folder begins with {TOWN}" for flight in flights if not flight.town.startswith(TOWN)
@@ -65,7 +65,7 @@ def plan(release: Release, flights: list[ReleasedRows], cfg: ExportConfig) -> li
 
 
 def tree_folder(flight: ReleasedRows, has_runs: bool) -> Path:
-    """Give the folder of a flight, relative to the tree; has_runs: the release is of several runs."""
+    """Return the folder of a flight, relative to the tree; has_runs: the release is of several runs."""
     return Path(flight.run if has_runs else "", flight.town, flight.trajectory, flight.variant)
 
 
@@ -147,7 +147,7 @@ def _notes(units: Sequence[ExportUnit], written: Sequence[UnitFiles]) -> Iterato
 
 
 def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight:
-    """Give the flight that released rows are of; `number` is its trajectory's among those of the release."""
+    """Return the flight that released rows are of; `number` is its trajectory's among those of the release."""
     sizes = {(r["width_px"], r["height_px"]) for r in rows}
     if len(sizes) != 1:
         raise InputError("a flight has pictures of one size", where=placed.name, got=f"{len(sizes)} sizes")
@@ -169,7 +169,7 @@ def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight
 
 
 def _goal(rows: FlightRows, placed: ReleasedRows) -> Goal | None:
-    """Give the goal where its frame is released, under the number that this has in the tree."""
+    """Return the goal where its frame is released, under the number that this has in the tree."""
     at = np.flatnonzero(placed.frame_index == (rows.goal.frame if rows.goal else -1))
     return replace(rows.goal, frame=int(at[0])) if rows.goal and len(at) else None
 
@@ -196,7 +196,7 @@ def _weather(row: Row) -> dict[str, Any]:
 
 
 def _segments(styles: list[str]) -> tuple[Segment, ...]:
-    """Give the parts of a flight by style; none where it follows from end to end."""
+    """Return the parts of a flight by style; none where it follows from end to end."""
     if set(styles) == {FOLLOW}:
         return ()
     parts, begin = [], 0

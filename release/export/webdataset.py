@@ -70,7 +70,7 @@ def write(release: Release, unit: ExportUnit, folder: Path, cfg: ExportConfig) -
 
 
 def members(row: dict[str, Any], release: Release) -> list[tuple[str, bytes]]:
-    """Give the files of one frame, by their endings in order."""
+    """Return the files of one frame, by their endings in order."""
     scalars = {name: value for name, value in row.items() if name not in PICTURE_COLUMNS}
     pictures = {ENDINGS[file]: picture(row, file) for file in release.modalities}
     if (target := scalars.pop(TARGET_PICTURE)) is not None:
@@ -87,7 +87,7 @@ def _header(name: str, size: int) -> tarfile.TarInfo:
 def finish(
     release: Release, units: Sequence[ExportUnit], written: Sequence[UnitFiles], folder: Path, cfg: ExportConfig
 ) -> FormatFacts:
-    """Say how the shards are opened."""
+    """Return how the shards are opened."""
     codings = {file: f"{ENDINGS[file]}, the released bytes" for file in release.modalities}
     if "depth" in codings:
         codings["depth"] = DEPTH_CODING.format(codings["depth"])

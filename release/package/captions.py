@@ -127,7 +127,7 @@ def index_captions(
 def _no_place(
     caption: Caption, key: FlightKey, lengths: dict[FlightKey, int], others: set[FlightKey], where: str
 ) -> InputError | None:
-    """Say why a caption is of no frame of the tree, None if it is of one."""
+    """Return why a caption is of no frame of the tree, None if it is of one."""
     if key not in lengths and key not in others:
         return InputError(
             "a caption of a flight that is not there", where=where, got="/".join(key),
@@ -146,7 +146,7 @@ def _no_place(
 
 
 def _no_caption(caption: Caption, where: str) -> InputError | None:
-    """Say why an accepted caption cannot be released, None if it can."""
+    """Return why an accepted caption cannot be released, None if it can."""
     if caption.en is None or caption.zh is None:
         fix = "release captions in both languages; English alone can be reported and train students"
         return InputError("an accepted caption lacks a language", where=where, fix=fix)

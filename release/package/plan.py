@@ -105,7 +105,7 @@ def _size(path: Path) -> int:
 def shards_of(
     flights: list[tuple[Surveyed, FlightCaptions, int, int]], placements: dict[str, Placement], target_bytes: int
 ) -> list[PlannedShard]:
-    """Give the shards in the order of the release: split by split, and in each the flights as they come.
+    """Return the shards in the order of the release: split by split, and in each the flights as they come.
 
     Args:
         flights: each with its captions, number of selected frames, and their bytes.

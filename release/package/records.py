@@ -52,7 +52,7 @@ from release.rules import RULE, SPLIT_RULE
 
 
 def provenance_of(sources: list[Source], inputs: Mapping[str, StageInput], account: CaptionAccount) -> Provenance:
-    """Give what the record says of the sources and of all their captions.
+    """Return what the record says of the sources and of all their captions.
 
     Args:
         inputs: of the stage, by their names (`input_names`).
@@ -102,7 +102,7 @@ def _source(source: Source, names: dict[str, str], inputs: Mapping[str, StageInp
 
 
 def account_for(plan: ReleasePlan, written: list[ShardResult]) -> History:
-    """Say where all flights and captions went; every sum is checked here and again by `release verify`."""
+    """Return where all flights and captions went; every sum is checked here and again by `release verify`."""
     flights = [flight for result in written for flight in result.flights]
     account = plan.account
     captions = CaptionHistory(
@@ -129,7 +129,7 @@ def account_for(plan: ReleasePlan, written: list[ShardResult]) -> History:
 def splits_of(
     cfg: ReleaseConfig, plan: ReleasePlan, written: list[ShardResult], flights: list[ReleasedFlight]
 ) -> Splits:
-    """Give what the record says of its splits."""
+    """Return what the record says of its splits."""
     captions = Counter[str]()
     for flight in (flight for result in written for flight in result.flights):
         captions[plan.placements[flight.name].split] += flight.captions
@@ -146,7 +146,7 @@ def make_record(
     provenance: Provenance,
     prompts: dict[str, dict[str, str]],
 ) -> ReleaseRecord:
-    """Give what release.json says of its shards. prompts: as the record has them."""
+    """Return what release.json says of its shards. prompts: as the record has them."""
     five_ray = {flight.name: flight.candidate.five_ray_mean for flight, *_ in plan.flights}
     flights = [
         ReleasedFlight(

@@ -175,7 +175,8 @@ def _write_flight(part: FlightPart, plan: ShardPlan, rows: Rows, problems: _Prob
 
 
 def _captions_of(captions: FlightCaptions, selected: set[int]) -> tuple[dict[int, ReleasedCaption], int, int]:
-    """Give the captions whose whole window is released, by frame, and how many lack their own frame or another one."""
+    """Return the captions whose whole window is released, by frame, and how many lack their own frame or another
+    one."""
     found: dict[int, ReleasedCaption] = {}
     not_selected = not_whole = 0
     for caption in captions.read():
@@ -217,7 +218,7 @@ class _Problems:
 
 
 def _digests(candidate: Candidate) -> dict[str, str]:
-    """Give the sha256 of each file of a flight, as far as they are known, once it is clear that they are those that
+    """Return the sha256 of each file of a flight, as far as they are known, once it is clear that they are those that
     were inspected.
     """
     folder = candidate.folder

@@ -73,8 +73,8 @@ class Source:
 
 
 def told_apart(sources: list[Source]) -> list[Source]:
-    """Give runs of one name, as trees in one folder are, the name of their tree too: rows and records know a run by its
-    name alone."""
+    """Return runs of one name, as trees in one folder are, the name of their tree too: rows and records know a run
+    by its name alone."""
     counts = Counter(source.run for source in sources)
     return [
         replace(source, run=folder_name(f"{source.run}_{source.data.absolute().name}"))
@@ -85,7 +85,7 @@ def told_apart(sources: list[Source]) -> list[Source]:
 
 
 def input_names(sources: list[Source]) -> list[dict[str, str]]:
-    """Give of each source role -> name among the stage's inputs: of several with a number in front."""
+    """Return of each source role -> name among the stage's inputs: of several with a number in front."""
     return [
         {role: f"{number}.{role}" if len(sources) > 1 else role for role in source.files}
         for number, source in enumerate(sources, 1)
@@ -185,7 +185,7 @@ def _not_chosen(choice: FlightChoice, folder: str) -> str | None:
 
 
 def maps_of(candidates: list[Candidate]) -> list[ReleasedMap]:
-    """Give the maps that flights show, each once."""
+    """Return the maps that flights show, each once."""
     towns = {(flight.place.town, flight.folder.parent.parent) for flight in candidates}
     shown = {ReleasedMap(town=town, **dict(read_town_map(folder))) for town, folder in towns}
     return sorted(shown, key=lambda one: (one.town, one.name, one.licence, one.credits))
@@ -221,7 +221,7 @@ def _sum_of(inspections: list[Inspection]) -> TrajectoryFunnel:
 
 
 def choose_licence(licence: str | None, maps: list[tuple[str, str]]) -> str:
-    """Give the licence of the data set: `licence` where it is given, else that of the maps, of each its name and
+    """Return the licence of the data set: `licence` where it is given, else that of the maps, of each its name and
     licence.
     """
     chosen = licence or maps[0][1]

@@ -37,7 +37,7 @@ from release.verify.verify import verify
 
 
 def part_path(parts: Path, name: str) -> Path:
-    """Give the file of a shard while its release is being built."""
+    """Return the file of a shard while its release is being built."""
     return parts / f"{name}.parquet"
 
 
@@ -115,7 +115,7 @@ def _write_parts(
 
 
 def _finished(plan: ReleasePlan, written: list[ShardResult], parts: Path) -> list[tuple[Path, Shard]]:
-    """Give the shards that are written, and where they stand until the release has its name."""
+    """Return the shards that are written, and where they stand until the release has its name."""
     return [
         (part_path(parts, shard.name), Shard(path="", split=shard.split, **result.model_dump(include=OF_SHARD)))
         for shard, result in zip(plan.shards, written, strict=True)

@@ -99,7 +99,7 @@ def open_flight(candidate: Candidate) -> Flight:
 
 
 def look_of(flight: Flight, i: int) -> np.ndarray | None:
-    """Give sun and air of a frame, (4,), None where there is no annotation or it does not say."""
+    """Return sun and air of a frame, (4,), None where there is no annotation or it does not say."""
     folder = flight.frame_folder(i)
     if not (folder / "meta.json").is_file():
         return None

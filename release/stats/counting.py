@@ -109,7 +109,7 @@ class FlightSums:
 
 
 def clean_target(row: Mapping[str, Any]) -> Place3 | None:
-    """Give where the person would be without the frame's perturbation, m; None where that is not known."""
+    """Return where the person would be without the frame's perturbation, m; None where that is not known."""
     target, offset = row["target"], row["target_offset"]
     if target is None or offset is None:
         return None

@@ -53,13 +53,13 @@ class Pixels:
         self.frames_with += counts > 0
 
     def percentiles_m(self) -> list[tuple[float, float]]:
-        """Give (share, m) of SHARES, to BIN_M; empty where no depth is known."""
+        """Return (share, m) of SHARES, to BIN_M; empty where no depth is known."""
         total = int(self.depths.sum())
         ends = np.cumsum(self.depths)
         return [(share, float((np.searchsorted(ends, share * total) + 1) * BIN_M)) for share in SHARES] if total else []
 
     def by_kind(self) -> list[tuple[str, float, float]]:
-        """Give kind, share of all pixels, share of the frames that show it; the largest first."""
+        """Return kind, share of all pixels, share of the frames that show it; the largest first."""
         order = sorted(np.flatnonzero(self.kinds).tolist(), key=lambda kind: -self.kinds[kind])
         total = int(self.kinds.sum())
         return [
@@ -87,7 +87,7 @@ def look_at(dataset: Path, record: ReleaseRecord, most: int) -> Pixels:
 
 
 def middle_picture(dataset: Path, record: ReleaseRecord) -> str | None:
-    """Give the colour picture of the middle frame, JPEG in base64; None where there is none, or it cannot be read."""
+    """Return the colour picture of the middle frame, JPEG in base64; None where there is none, or it cannot be read."""
     if "rgb" not in record.settings.modalities:
         return None
     total = sum(shard.rows for shard in record.shards)

@@ -60,7 +60,7 @@ STYLE = """
 def page_html(
     stats: Stats, coverage: Coverage, tiles: Sequence[tuple[str, str]] = (), picture: str | None = None
 ) -> str:
-    """Give the page's text.
+    """Return the page's text.
 
     Args:
         tiles: what a person asks first, how much and how good. picture: of one frame, JPEG in base64.
@@ -72,7 +72,7 @@ def page_html(
 
 
 def tiles_of(record: ReleaseRecord, stats: Stats) -> list[tuple[str, str]]:
-    """Give what a person asks first: how much there is, and how good it is."""
+    """Return what a person asks first: how much there is, and how good it is."""
     numbers, captions, found = record.numbers, record.numbers.captions, record.history.flights
     quality = {row[0]: row[1] for table in stats.tables if table.key == "quality_stats" for row in table.rows}
     seen, proved = numbers.visibility.mean, captions.mean_proved["proved_en"]
@@ -103,13 +103,13 @@ def _numeric_columns(table: Table) -> list[bool]:
 
 
 def _greatest(table: Table) -> float:
-    """Give what fills a bar, or a cell of a map: the greatest number there is; 1 where there is none."""
+    """Return what fills a bar, or a cell of a map: the greatest number there is; 1 where there is none."""
     cells = [cell for row in table.rows for cell in (row[1:] if table.plot == "heat" else row[1:2])]
     return max((float(cell) for cell in cells if isinstance(cell, int | float)), default=0.0) or 1.0
 
 
 def shown(cell: Cell) -> str:
-    """Give a number for people: no digits that say nothing."""
+    """Return a number for people: no digits that say nothing."""
     if cell is None:
         return "-"
     if isinstance(cell, str):
@@ -121,7 +121,7 @@ TABLE_LOOK = {"shown": shown, "numeric_columns": _numeric_columns, "greatest": _
 
 
 def markdown(stats: Stats) -> str:
-    """Give the tables as Markdown."""
+    """Return the tables as Markdown."""
     parts = [f"# {for_markdown(stats.name)}: statistics", f"Content {for_markdown(stats.content_digest[:12])}."]
     for table in stats.tables:
         parts.append(f"## {for_markdown(table.title)}" + (f" ({for_markdown(table.paper)})" if table.paper else ""))

@@ -106,7 +106,7 @@ def make_stats(record: ReleaseRecord, counts: Counts, pixels: Pixels | None) -> 
 
 
 def _table(key: str, rows: Rows, note: str = "", more: Iterable[str] = (), title: str = "") -> Table:
-    """Give a table by its shape. more: of its head, behind what stands there."""
+    """Return a table by its shape. more: of its head, behind what stands there."""
     name, paper, head, plot = SHAPES[key]
     heads = [*head.split("|"), *more]
     return Table(key=key, title=title or name, head=heads, rows=rows, paper=paper or None, note=note, plot=plot)
@@ -124,7 +124,7 @@ def _shares(counted: Iterable[tuple[str, int]], total: int) -> Rows:
 
 
 def _spread_row(title: str, spread: Spread) -> list[Cell]:
-    """Give a row under the head SPREAD."""
+    """Return a row under the head SPREAD."""
     return [title, spread.mean, spread.std, spread.min, spread.max, spread.count]
 
 
@@ -200,8 +200,8 @@ def _quality(record: ReleaseRecord, counts: Counts) -> Table:
 
 
 def smoothness(counts: Counts) -> tuple[list[tuple[float, float]], int, list[float]]:
-    """Give acceleration and jerk of the trajectories whose motion is known, how many are within the paper's bounds, and
-    their scores."""
+    """Return acceleration and jerk of the trajectories whose motion is known, how many are within the paper's
+    bounds, and their scores."""
     dynamics = [(flight.accel_rms_mps2, flight.jerk_rms_mps3) for flight in _trajectories(counts)]
     known = [(accel, jerk) for accel, jerk in dynamics if accel is not None and jerk is not None]
     within = sum(accel <= ACCEL_RMS_MAX_MPS2 and jerk <= JERK_RMS_MAX_MPS3 for accel, jerk in known)
@@ -209,7 +209,7 @@ def smoothness(counts: Counts) -> tuple[list[tuple[float, float]], int, list[flo
 
 
 def _trajectories(counts: Counts) -> list[FlightSums]:
-    """Give one flight of each trajectory: the clean one where it is released."""
+    """Return one flight of each trajectory: the clean one where it is released."""
     chosen: dict[tuple[str, ...], FlightSums] = {}
     for place, flight in counts.flights.items():
         held = chosen.get(place[:-1])
@@ -219,7 +219,7 @@ def _trajectories(counts: Counts) -> list[FlightSums]:
 
 
 def _five_ray(record: ReleaseRecord, counts: Counts) -> list[float]:
-    """Give the five-ray visibility of the clean flights, of those that were inspected."""
+    """Return the five-ray visibility of the clean flights, of those that were inspected."""
     means = {flight.flight: flight.five_ray_mean for flight in record.flights}
     clean = (means.get("/".join(place)) for place, flight in counts.flights.items() if flight.track == "clean")
     return [bounded(mean) for mean in clean if mean is not None]
@@ -345,7 +345,7 @@ def _fovs(counts: Counts) -> Table:
 
 
 def _fov_of(flight: FlightSums) -> float:
-    """Its field of view, degrees; 0 for one that zooms."""
+    """Return its field of view, degrees; 0 for one that zooms."""
     return 0.0 if flight.zooms else round(flight.fov_deg, 1)
 
 

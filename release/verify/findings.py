@@ -65,7 +65,7 @@ class Findings(Report):
         return [kind.model_dump() for kind in self.kinds.values()]
 
     def report(self, level: str = "") -> Verified:
-        """Give the report of all that was found."""
+        """Return the report of all that was found."""
         return Verified(facts=self.facts, kinds=sorted(self.kinds.values(), key=sort_key), level=level)
 
 
@@ -80,7 +80,7 @@ class Verified(Report):
         self.issues = [*self.kinds]
 
     def as_json(self) -> dict[str, Any]:
-        """Give what `--json` writes."""
+        """Return what `--json` writes."""
         return {
             "schema": "cosfly.verification", "schema_version": "1.0", "level": self.level, "ok": self.is_ok,
             "facts": self.facts, "findings": [kind.model_dump(exclude={"where"}) for kind in self.kinds],

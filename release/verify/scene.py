@@ -157,7 +157,7 @@ def new_kinds(instance: np.ndarray, known: np.ndarray) -> list[int]:
 
 
 def depths_of_person(depth: np.ndarray, instance: np.ndarray, box: np.ndarray, is_ours: bool) -> np.ndarray:
-    """Give the depths, (k,) float32 m, of the person's pixels in a box (4,) of whole pixels. is_ours: those of the
+    """Return the depths, (k,) float32 m, of the person's pixels in a box (4,) of whole pixels. is_ours: those of the
     person's id alone."""
     x0, y0, x1, y1 = box
     part = instance[y0:y1, x0:x1]
@@ -167,7 +167,7 @@ def depths_of_person(depth: np.ndarray, instance: np.ndarray, box: np.ndarray, i
 
 @njit(cache=True, nogil=True)
 def _survey(depth, instance):  # type: ignore[no-untyped-def]
-    """Give the counts of a `Survey` (4,), and its box."""
+    """Return the counts of a `Survey` (4,), and its box."""
     num_odd_sky, num_person, num_odd_person, most_kind = 0, 0, 0, 0
     box = np.array([1 << 30, 1 << 30, -1, -1], np.int64)
     for y in range(len(instance)):
@@ -298,7 +298,7 @@ def _judge_pairs(flight: FlightRows, pairs: list[Pair], findings: Findings) -> N
 
 
 def _odd_pair(pair: Agreement, is_near: bool) -> tuple[str, str, str] | None:
-    """Give code, got and expected of two frames that do not show one world, else None."""
+    """Return code, got and expected of two frames that do not show one world, else None."""
     if pair.error > ERROR_MOST or (is_near and pair.gone > GONE_MOST):
         off = f", planes {pair.error:.2%} off" if np.isfinite(pair.error) else ""
         got = f"{pair.gone:.1%} of the points before what this frame or the one before draws{off}"

@@ -67,7 +67,7 @@ Comparison = tuple[str, str, object, object]  # code, name, got, expected
 
 
 def _contract(record: ReleaseRecord) -> Iterator[Comparison]:
-    """The convention of axes is one for all releases, and readers go by it."""
+    """Return the convention of axes is one for all releases, and readers go by it."""
     for name in sorted(record.coordinates.keys() | columns.CONTRACT.keys()):
         yield "coordinates", f"coordinates.{name}", record.coordinates.get(name), columns.CONTRACT.get(name)
     yield "rule", "frame_selection", record.frame_selection, RULE

@@ -125,7 +125,7 @@ TEXTS = {"C": "critical_components", "R": "reasoning_trace"}  # by the letter of
 
 
 def frame_of(row: Mapping[str, Any], pictures: dict[View, str], caption: PageCaption | None) -> PageFrame:
-    """Give a frame of its row."""
+    """Return a frame of its row."""
     pose, target, seen = row["pose"], row["target"], row["visibility"]
     x, y, z, yaw = (round(float(pose[name]), 2) for name in (*POINT, "yaw_deg"))
     return PageFrame(
@@ -146,7 +146,7 @@ def frame_of(row: Mapping[str, Any], pictures: dict[View, str], caption: PageCap
 
 
 def caption_of(row: Mapping[str, Any]) -> PageCaption:
-    """Give a caption of its columns."""
+    """Return a caption of its columns."""
     texts = {}
     for language in LANGUAGES:
         coc = Coc(**{name: row[f"caption_{language}_{name}"] or "" for name in FIELDS})
@@ -171,7 +171,7 @@ def _facts(columns: Sequence[Column], row: Mapping[str, Any]) -> dict[str, str]:
 
 
 def page_sentences(coc: Coc, states: Sequence[str] | None) -> list[PageSentence]:
-    """Give the sentences of an answer, each with its state; None where the states are those of another number of
+    """Return the sentences of an answer, each with its state; None where the states are those of another number of
     sentences.
     """
     named = list(sentences_of(coc))
@@ -183,7 +183,7 @@ def page_sentences(coc: Coc, states: Sequence[str] | None) -> list[PageSentence]
 
 
 def box_of(box: Mapping[str, Any] | None, width_px: int, height_px: int) -> tuple[float, float, float, float] | None:
-    """Give a box, px, as shares of the picture; None where it is not known."""
+    """Return a box, px, as shares of the picture; None where it is not known."""
     corners = np.array([(box or {}).get(name) for name in BOX], np.float64) / np.maximum(1, (width_px, height_px) * 2)
     xmin, ymin, xmax, ymax = corners.round(4).tolist()
     return (xmin, ymin, xmax, ymax) if np.isfinite(corners).all() else None
@@ -207,7 +207,7 @@ class PagePictures:
         self.left_out = self.unreadable = 0
 
     def of_frame(self, views: Mapping[View, Callable[[], np.ndarray]]) -> dict[View, str]:
-        """Give a frame's pictures; none where there is no room for them.
+        """Return a frame's pictures; none where there is no room for them.
 
         Args:
             views: what reads each view as (h, w, 3) uint8 RGB; a view that cannot be read is left out.
@@ -235,7 +235,7 @@ class PagePictures:
         return pictures
 
     def notes(self) -> list[str]:
-        """Say what the page lacks."""
+        """Return what the page lacks."""
         notes = []
         if self.left_out:
             notes.append(
@@ -255,7 +255,7 @@ Flight = TypeVar("Flight")
 
 
 def spread(count: int, most: int) -> list[int]:
-    """Give at most `most` of the numbers below `count`, evenly, first and last included."""
+    """Return at most `most` of the numbers below `count`, evenly, first and last included."""
     return sorted({int(i) for i in np.linspace(0, count - 1, min(count, most)).round()})
 
 
@@ -294,7 +294,7 @@ def choose_frames(frames: Sequence[int], kinds: Mapping[int, Hashable], most: in
 
 
 def path_of(points_m: np.ndarray) -> list[Point2]:
-    """Give a path from above, (n, 2 or 3) m, by at most PATH_POINTS of its points; those that are not known are left
+    """Return a path from above, (n, 2 or 3) m, by at most PATH_POINTS of its points; those that are not known are left
     out.
     """
     known = points_m[~np.isnan(points_m).any(axis=1)]
@@ -302,7 +302,7 @@ def path_of(points_m: np.ndarray) -> list[Point2]:
 
 
 def boxes_of(box_map: BoxMap, near: Sequence[Point2]) -> list[PageBox]:
-    """Give the footprints of the boxes of a map round some places, the largest ones, those that lie below others
+    """Return the footprints of the boxes of a map round some places, the largest ones, those that lie below others
     first.
     """
     places = np.array(near, dtype=np.float64).reshape(-1, 2)

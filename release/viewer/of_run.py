@@ -53,7 +53,7 @@ class Tree:
 
 
 def find_trees(folder: Path, captions: Path | None = None) -> list[Tree]:
-    """Tell what a folder is: a run, a run of several towns, or a playback tree.
+    """Return what a folder is: a run, a run of several towns, or a playback tree.
 
     Args:
         captions: of a tree; a run has its own.
@@ -178,7 +178,7 @@ def _frame(flight: Flight, index: int, caption: Caption | None, pictures: PagePi
 
 
 def _caption(caption: Caption, row: Mapping[str, Any]) -> PageCaption:
-    """Give a caption of a run, of which more is known than a release tells."""
+    """Return a caption of a run, of which more is known than a release tells."""
     shown, repair = caption_of(row), caption.repair
     if repair is not None:
         told = f"{repair.rung or repair.outcome}, first {repair.first_decision} ({repair.first_verdict})"

@@ -143,7 +143,7 @@ def _frame(row: Mapping[str, Any], record: ReleaseRecord, pictures: PagePictures
 
 
 def picture(row: Mapping[str, Any], file: FrameFile, record: ReleaseRecord) -> np.ndarray:
-    """Give a picture of a row as colours, (h, w, 3) uint8 RGB."""
+    """Return a picture of a row as colours, (h, w, 3) uint8 RGB."""
     where, cell = f"{row['sample_id']}: {COLUMNS[file].name}", row[COLUMNS[file].name]
     if file == "depth":
         return depth_colors(depth_values(cell or b"", Path(where)))
@@ -191,7 +191,7 @@ def run(folder: Path, out: Path, cfg: ViewerConfig, captions: Path | None = None
 
 
 def page_html(shown: ViewerPage) -> str:
-    """Give the page's text."""
+    """Return the page's text."""
     style, script = (read_text(Path(__file__).with_name(name)) for name in ("viewer.css", "viewer.js"))
     script = scripts("tools.js", "canvas.js") + script
     data = _printable(shown.model_dump(mode="json", exclude_defaults=False))
@@ -201,7 +201,7 @@ def page_html(shown: ViewerPage) -> str:
 
 
 def _printable(value: Any) -> Any:
-    """Give a value whose texts are cut and free of control characters; pictures, which are ours, stay."""
+    """Return a value whose texts are cut and free of control characters; pictures, which are ours, stay."""
     if isinstance(value, str):
         return for_terminal(value)
     if isinstance(value, list):

@@ -136,7 +136,7 @@ class State(NamedTuple):
 
 
 def make_state(num_points: int, num_boxes: int) -> State:
-    """Give empty room for evaluations."""
+    """Return empty room for evaluations."""
     return State(
         np.zeros(len(TERM_NAMES)), np.zeros((num_points, 3)), np.zeros((num_points, 3)),
         np.zeros((BAND_ROWS, 3 * num_points)), np.zeros(num_points), np.zeros(num_points),

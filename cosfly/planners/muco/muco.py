@@ -78,7 +78,7 @@ def search_start(
 
 
 def _rings(distances_m: np.ndarray, preferred_m: np.ndarray, greatest_m: np.ndarray, climbing: bool) -> np.ndarray:
-    """Give (m, r, 2): horizontal distance and z of the rings of each key frame, the normal one first."""
+    """Return (m, r, 2): horizontal distance and z of the rings of each key frame, the normal one first."""
     all_rings = []
     columns = (distances_m.tolist(), preferred_m.tolist(), greatest_m.tolist())
     for distance_m, preferred, greatest in zip(*columns, strict=True):
@@ -90,7 +90,7 @@ def _rings(distances_m: np.ndarray, preferred_m: np.ndarray, greatest_m: np.ndar
 
 @njit(cache=True)
 def _search(places, targets, times, extra, sight, index, clearance_m, speed_max_mps):
-    """Give the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
+    """Return the chosen place of each key frame, (m,), all -1 if no sequence of places is free.
 
     places: (m, c, 3), c = rings * azimuths. targets: (m, 3). times: (m,) s. extra: (rings, azimuths) cost of a place
     whatever is seen from it. sight: (m,) bool, whether what is seen counts.
@@ -201,7 +201,7 @@ def make_problem(scenario: Scenario, cfg: PlanConfig) -> Problem:
 def start_trajectory(
     scenario: Scenario, problem: Problem, obstacles: BoxIndex, cfg: PlanConfig
 ) -> tuple[np.ndarray, str]:
-    """Give a feasible trajectory to start from and its kind: `behind`, the wished places, or `search` where they are
+    """Return a feasible trajectory to start from and its kind: `behind`, the wished places, or `search` where they are
     blocked or blind.
     """
     targets = problem.targets

@@ -37,7 +37,7 @@ class Nearby(NamedTuple):
 
 @njit(cache=True)
 def nothing_nearby(num_points):
-    """Give a memory that holds nothing yet: every question goes to the index."""
+    """Return a memory that holds nothing yet: every question goes to the index."""
     return Nearby(
         np.full((num_points, 3), np.inf),
         np.zeros((num_points, ROOM), dtype=np.int64),

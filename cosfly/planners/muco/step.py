@@ -61,7 +61,7 @@ def hold_bounds(points, problem, contacts, band, gradient):
 
 @njit(cache=True)
 def solve_band(band, damping, gradient):
-    """Give the step -(H + damping)^-1 g of the interior waypoints, (n - 2, 3), by Cholesky's factors of a band.
+    """Return the step -(H + damping)^-1 g of the interior waypoints, (n - 2, 3), by Cholesky's factors of a band.
 
     Args:
         band: (BAND_ROWS, 3 n) lower band of H. damping: (n,) per waypoint. gradient: (n, 3).
@@ -221,7 +221,8 @@ def descend_as_the_paper(points, problem, index, rules, states, history):
 
 @njit(cache=True)
 def mask(points, problem, index, rules, masked, state):
-    """Give the waypoints in low-visibility runs, (n,); gradient and model in `state` change with them, not the loss."""
+    """Return the waypoints in low-visibility runs, (n,); gradient and model in `state` change with them, not the
+    loss."""
     found = low_visibility_runs(state.visibility, rules.low_visibility, rules.low_visibility_frames)
     for i in range(len(found)):
         if found[i] != masked[i]:
@@ -232,7 +233,7 @@ def mask(points, problem, index, rules, masked, state):
 
 @njit(cache=True)
 def _scaled_sum(one, other, factor):
-    """Give factor * (one + other), (n, 3)."""
+    """Return factor * (one + other), (n, 3)."""
     total = np.empty_like(one)
     for i in range(len(one)):
         for axis in range(3):
@@ -358,7 +359,8 @@ def project(points, problem, index, begin, end, nearby):
 
 @njit(cache=True)
 def is_feasible(points, problem, index, nearby):
-    """Tell whether a trajectory keeps altitude bounds, step cap, relaxed floor, and hits nothing between waypoints."""
+    """Return whether a trajectory keeps altitude bounds, step cap, relaxed floor, and hits nothing between
+    waypoints."""
     one, before = np.empty(1, dtype=np.int64), 0.0
     step_max = problem.step_max_m
     anchors, around, num_around, rows = nearby.anchors, nearby.around, nearby.num_around, index.rows

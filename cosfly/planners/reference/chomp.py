@@ -18,7 +18,7 @@ BEYOND_M = 2.0  # the cost of a place begins so far beyond the clearance
 
 
 def descended(task: Task) -> np.ndarray:
-    """Give the flight after ITERATIONS, (num, 3), whatever still stands in its way."""
+    """Return the flight after ITERATIONS, (num, 3), whatever still stands in its way."""
     line, reach_m = task.line(), task.clearance_m + BEYOND_M
     metric = smoothness_band(task.num, task.dt_s)
     metric[0, [0, -1]] += PULL_STAYS  # both ends stay

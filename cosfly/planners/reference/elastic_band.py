@@ -13,7 +13,7 @@ INFLUENCE_M = 2.0  # beyond the clearance
 
 
 def tightened(task: Task) -> np.ndarray | None:
-    """Give the band at rest, or as it is after ITERATIONS, (num, 3); None if A* finds no way."""
+    """Return the band at rest, or as it is after ITERATIONS, (num, 3); None if A* finds no way."""
     band = along_voxels(task)
     if band is None:
         return None

@@ -33,7 +33,8 @@ def along_voxels(task: Task, *, weight: float = 1.0, any_angle: bool = False) ->
 
 @njit(cache=True)
 def _search(places, shape, start, voxel_m, index, clearance_m, weight, any_angle):
-    """Give the numbers of the places of the way from `start` to the last one, the goal, (m,), none if there is none."""
+    """Return the numbers of the places of the way from `start` to the last one, the goal, (m,), none if there is
+    none."""
     goal, one = len(places) - 1, np.empty(1, dtype=np.int64)
     cost, done = np.full(goal + 1, np.inf), np.zeros(goal + 1, dtype=np.bool_)
     parent = np.full(goal + 1, -1, dtype=np.int64)

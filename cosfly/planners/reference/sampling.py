@@ -22,7 +22,7 @@ EXACT_M = 1e-6
 
 
 def sampled(task: Task, method: str, *, is_spline: bool = False) -> np.ndarray | None:
-    """Give the flight along the way that a planner of OMPL finds, (num, 3); None if it does not reach the goal."""
+    """Return the flight along the way that a planner of OMPL finds, (num, 3); None if it does not reach the goal."""
     base, geometric, util = load_ompl()
     util.RNG.setSeed(int(task.rng.integers(1, 2**31)))
     space, bounds = base.RealVectorStateSpace(3), base.RealVectorBounds(3)
@@ -80,7 +80,7 @@ def load_ompl() -> tuple[Any, Any, Any]:
 
 
 def splined(route: np.ndarray) -> np.ndarray:
-    """Give the cubic B-spline whose control points lie on a route (m, 3), CONTROL_M apart at most."""
+    """Return the cubic B-spline whose control points lie on a route (m, 3), CONTROL_M apart at most."""
     from scipy.interpolate import BSpline
 
     counts = np.maximum(np.ceil(np.linalg.norm(np.diff(route, axis=0), axis=1) / CONTROL_M), 1).astype(int)

@@ -37,11 +37,11 @@ class Task:
     rng: np.random.Generator
 
     def hits(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """Tell which ways between (n, 3) points are not free, (n,) bool."""
+        """Return which ways between (n, 3) points are not free, (n,) bool."""
         return segments_hit(self.obstacles, starts, ends, self.clearance_m)
 
     def near(self, points: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Give the distance of points (n, 3) to boxes, (n,) m, at most `reach_m`, and unit vectors away from the
+        """Return the distance of points (n, 3) to boxes, (n,) m, at most `reach_m`, and unit vectors away from the
         nearest, (n, 3), zero where none is in reach.
         """
         gaps_m, boxes = signed_distances(self.obstacles, points, reach_m)
@@ -50,11 +50,11 @@ class Task:
         return gaps_m, away
 
     def line(self) -> np.ndarray:
-        """Give the straight flight of even speed, (num, 3)."""
+        """Return the straight flight of even speed, (num, 3)."""
         return self.start + np.linspace(0.0, 1.0, self.num)[:, None] * (self.goal - self.start)
 
     def along(self, route: np.ndarray) -> np.ndarray:
-        """Give the flight of even speed along a route (m, 3), (num, 3)."""
+        """Return the flight of even speed along a route (m, 3), (num, 3)."""
         lengths_m = np.linalg.norm(np.diff(route, axis=0), axis=1)
         far_m = np.concatenate([[0.0], np.cumsum(lengths_m)])
         wanted_m = np.linspace(0.0, far_m[-1], self.num)
@@ -64,7 +64,7 @@ class Task:
 def make_task(
     scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator, clearance_m: float
 ) -> Task | None:
-    """Give the task of a scenario; None where no free place is near its first or last wished one."""
+    """Return the task of a scenario; None where no free place is near its first or last wished one."""
     wish, targets = scenario.wish, scenario.targets_m
     margin_m = cfg.track_astar.corridor_m
     low_z, high_z = (scenario.ground_m + wish.altitude_min_m).max(), (scenario.ground_m + wish.altitude_max_m).min()

@@ -16,7 +16,7 @@ DIFFERENCES = ((1.0, 1), (5.0, 2))  # weight and order of squared differences
 
 
 def optimized(task: Task) -> np.ndarray:
-    """Give the flight at the last weight, (num, 3), whatever still stands in its way."""
+    """Return the flight at the last weight, (num, 3), whatever still stands in its way."""
     points = task.line()
     bounds = list(zip(np.tile(task.low, task.num - 2), np.tile(task.high, task.num - 2), strict=True))
     for weight in HINGE_WEIGHTS if bounds else ():
@@ -29,7 +29,7 @@ def optimized(task: Task) -> np.ndarray:
 
 
 def _loss(inner: np.ndarray, task: Task, weight: float) -> tuple[float, np.ndarray]:
-    """Give the loss of the points between both ends, (3 n,), and its gradient."""
+    """Return the loss of the points between both ends, (3 n,), and its gradient."""
     points = np.vstack([task.start, inner.reshape(-1, 3), task.goal])
     loss, slopes = 0.0, np.zeros_like(points)
     for share, order in DIFFERENCES:

@@ -45,7 +45,7 @@ def over_corners(task: Task) -> np.ndarray | None:
 
 
 def _corners(task: Task) -> np.ndarray:
-    """Give the free corners of boxes in the volume that reach up to it, (m, 3), those nearest to the line first."""
+    """Return the free corners of boxes in the volume that reach up to it, (m, 3), those nearest to the line first."""
     rows, beyond_m = task.obstacles.rows, task.clearance_m + BEYOND_M
     keep = rows[:, HIGH_Z] + task.clearance_m > task.low[2]
     keep &= (rows[:, [HIGH_X, HIGH_Y]] >= task.low[:2]).all(axis=1)

@@ -394,7 +394,7 @@ class GlRenderer:
 
 
 def _release(context: Any) -> None:
-    """Give back 0.1 GB, or 0.8 GB if every weather was drawn: most is what the driver compiled, in small pieces."""
+    """Return back 0.1 GB, or 0.8 GB if every weather was drawn: most is what the driver compiled, in small pieces."""
     context.release()
     return_freed_memory()
 

@@ -58,7 +58,7 @@ PERSON_CAPSULE_M = (0.15, 1.62, 0.19)  # low and high end over the feet, radius
 
 
 def placed(body: Body, origin_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give the records of a figure with their places, and their meshes."""
+    """Return the records of a figure with their places, and their meshes."""
     records = body.records.copy()
     records["center"] = body.centers_m - origin_m
     return records, body.mesh
@@ -67,7 +67,7 @@ def placed(body: Body, origin_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def draw_others(
     others: Sequence[PosedOther], origin_m: np.ndarray, view: CameraView
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Give records and meshes of the others whom the camera may see."""
+    """Return records and meshes of the others whom the camera may see."""
     found = []
     for other in others:
         center = other.center_m - origin_m
@@ -80,7 +80,7 @@ def draw_others(
 
 
 def _car(car: PosedCar, instance_id: int, center: np.ndarray, view: CameraView) -> tuple[np.ndarray, np.ndarray]:
-    """A car of the same shape as those that a map has parked."""
+    """Return a car of the same shape as those that a map has parked."""
     builder, turn = PartBuilder(), rotation_matrix(0.0, car.heading_rad, 0.0)
     half, ids = np.array(car.half_extents_m), np.array([instance_id], np.uint16)
     BUILDERS[KINDS["Car"]](

@@ -86,7 +86,8 @@ def lamp_map(lamps: np.ndarray, middle: np.ndarray, half_m: float) -> tuple[np.n
 
 
 def nearest_lamps(lamps: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, int]:
-    """The lamps nearest to the camera, (MOST_NEAR, 4) places and strength, and their number; far ones fade out."""
+    """Return the lamps nearest to the camera, (MOST_NEAR, 4) places and strength, and their number; far ones fade
+    out."""
     away = np.linalg.norm(lamps - eye, axis=1)
     rows = np.argsort(away, kind="stable")[:MOST_NEAR]
     rows = rows[away[rows] < 120.0]

@@ -22,7 +22,7 @@ class UnitMesh:
 
 
 def all_meshes() -> list[UnitMesh]:
-    """Give every mesh, in the order of the numbers above."""
+    """Return every mesh, in the order of the numbers above."""
     return [
         prism(1.0, 1.0),
         blob(2),
@@ -38,7 +38,7 @@ def all_meshes() -> list[UnitMesh]:
 
 
 def prism(top_x: float, top_y: float) -> UnitMesh:
-    """A box whose top face is scaled by top_x and top_y; flat normals, 24 vertices."""
+    """Return a box whose top face is scaled by top_x and top_y; flat normals, 24 vertices."""
     corners = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], dtype=np.float64)
     corners[4:, 0] *= top_x
     corners[4:, 1] *= top_y
@@ -51,7 +51,7 @@ def prism(top_x: float, top_y: float) -> UnitMesh:
 
 
 def revolved(profile: list[tuple[float, float]], num_sides: int) -> UnitMesh:
-    """A profile of (radius, z), from the bottom up, turned about z; sharp between the profile's segments."""
+    """Return a profile of (radius, z), from the bottom up, turned about z; sharp between the profile's segments."""
     angles = np.arange(num_sides + 1) * 2.0 * np.pi / num_sides
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     vertices: list[list[float]] = []
@@ -70,7 +70,7 @@ def revolved(profile: list[tuple[float, float]], num_sides: int) -> UnitMesh:
 
 
 def superquadric(exponent: float, num_sides: int, num_rings: int) -> UnitMesh:
-    """A rounded solid: exponent 1 is the sphere, towards 0 the cube."""
+    """Return a rounded solid: exponent 1 is the sphere, towards 0 the cube."""
 
     def power(values: np.ndarray, e: float) -> np.ndarray:
         return np.sign(values) * np.abs(values) ** e
@@ -93,7 +93,7 @@ def superquadric(exponent: float, num_sides: int, num_rings: int) -> UnitMesh:
 
 
 def blob(num_subdivisions: int) -> UnitMesh:
-    """An icosphere, dented inwards by a fixed smooth pattern: the outline of foliage. Radius at most 1."""
+    """Return an icosphere, dented inwards by a fixed smooth pattern: the outline of foliage. Radius at most 1."""
     golden = (1.0 + 5.0**0.5) / 2.0
     points = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0), (0, -1, golden), (0, 1, golden)]
     points += [(0, -1, -golden), (0, 1, -golden), (golden, 0, -1), (golden, 0, 1), (-golden, 0, -1), (-golden, 0, 1)]

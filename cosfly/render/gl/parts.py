@@ -54,7 +54,7 @@ class Parts:
         return Parts(*(getattr(self, column)[keep] for column in PART_COLUMNS))
 
     def about(self, place: np.ndarray) -> Parts:
-        """The same parts relative to a place, (3,): single precision is best near its zero."""
+        """Return the same parts relative to a place, (3,): single precision is best near its zero."""
         if not place.any():
             return self
         records = self.records.copy()
@@ -86,7 +86,7 @@ class Boxes:
         return replace(self, **{name: getattr(self, name)[keep] for name in columns})
 
     def lengthwise(self) -> Boxes:
-        """The same boxes with x as their longer horizontal axis: turned by 90 degrees where it is not."""
+        """Return the same boxes with x as their longer horizontal axis: turned by 90 degrees where it is not."""
         across = self.half[:, 1] > self.half[:, 0]
         half, turns = self.half.copy(), self.turns.copy()
         half[across] = half[across][:, [1, 0, 2]]
@@ -94,11 +94,11 @@ class Boxes:
         return replace(self, half=half, turns=turns)
 
     def chance(self, number: int) -> np.ndarray:
-        """A further fixed number in [0, 1) per box."""
+        """Return a further fixed number in [0, 1) per box."""
         return chance(self.seeds, number)
 
     def pick(self, palette: np.ndarray) -> np.ndarray:
-        """A colour of a palette, (k, 3), per box; gives (n, 3)."""
+        """Return a colour of a palette, (k, 3), per box; gives (n, 3)."""
         return palette[(self.chance(0) * len(palette)).astype(int)]
 
 

@@ -36,7 +36,7 @@ def open_context() -> Any:
 
 
 def sources(vertex: tuple[str, ...], fragment: tuple[str, ...], define: str = "") -> tuple[str, str]:
-    """Give the texts of a program of these files."""
+    """Return the texts of a program of these files."""
     folder, head = Path(__file__).parent, "#version 330 core\n" + define
     texts = ["\n".join(read_text(folder / name) for name in names) for names in (vertex, fragment)]
     return head + texts[0], head + texts[1]
@@ -75,7 +75,7 @@ def programs_of(context: Any, define: str | None, *, snaps: bool) -> Programs:
 
 
 def packed(value: Any) -> Any:
-    """The bytes of an array as a uniform has them, column by column; other values as they are."""
+    """Return the bytes of an array as a uniform has them, column by column; other values as they are."""
     return np.ascontiguousarray(value.T, dtype=np.float32).tobytes() if isinstance(value, np.ndarray) else value
 
 

@@ -43,7 +43,7 @@ THINNEST_M = 0.01
 
 
 def loose_solids(box_map: BoxMap, solids: Solids, origin_m: np.ndarray, ids: np.ndarray) -> Loose:
-    """Give the triangles of solids, both sides, as a shader draws them. ids: (n,) of the map's boxes."""
+    """Return the triangles of solids, both sides, as a shader draws them. ids: (n,) of the map's boxes."""
     if not len(solids):
         return Loose.all_of({})
     normals, rows, kinds = solids.normals, solids.rows, box_map.kinds[solids.rows]
@@ -114,7 +114,8 @@ def _planes(
 
 
 def _main_yaws(solids: Solids, is_wall: np.ndarray, around: np.ndarray) -> np.ndarray:
-    """The direction that most of each thing's walls face, (n,) in steps of SAME_ANGLE_RAD within a quarter turn."""
+    """Return the direction that most of each thing's walls face, (n,) in steps of SAME_ANGLE_RAD within a quarter
+    turn."""
     quarter = round(np.pi / 2 / SAME_ANGLE_RAD)
     edges = solids.corners_m[:, 1:] - solids.corners_m[:, :1]
     areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) * is_wall

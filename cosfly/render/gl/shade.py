@@ -42,7 +42,7 @@ class Shade:
 def shades_of(
     bones: np.ndarray, capsules: np.ndarray, sun: np.ndarray, view: CameraView, has_headlights: bool = False
 ) -> list[Shade]:
-    """Give the rectangles of a frame; no two of them overlap.
+    """Return the rectangles of a frame; no two of them overlap.
 
     Args:
         bones: (b, 2, 4) capsules of the person, as of others, none without a person; capsules: (c, 2, 4) of others.

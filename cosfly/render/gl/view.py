@@ -30,7 +30,8 @@ class CameraView:
         return rows[np.lexsort((away, -parts.records["bias"][rows]))]
 
     def shown(self, centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
-        """Which spheres may be seen, the nearest first; centers (n, 3), radii (n,) float32, from the scene's origin."""
+        """Return which spheres may be seen, the nearest first; centers (n, 3), radii (n,) float32, from the scene's
+        origin."""
         least_px, most_px = (np.full(len(radii), size, np.float32) for size in (SMALLEST_PX, np.inf))
         rows, away = self._spheres(centers.astype(np.float32), radii, least_px, most_px)
         return rows[np.argsort(away, kind="stable")]
@@ -45,7 +46,7 @@ class CameraView:
         return spheres_in_view(centers, radii, min_px, max_px, eye, turn, tangents, slants, float(self.intrinsic[0, 0]))
 
     def can_show(self, center: np.ndarray, radius: float) -> bool:
-        """Tell whether something within a sphere may be seen; center: (3,) relative to the scene's origin."""
+        """Return whether something within a sphere may be seen; center: (3,) relative to the scene's origin."""
         return len(self.shown(center[None], np.array([radius], np.float32))) > 0
 
     def rectangle_px(self, points: np.ndarray) -> tuple[int, int, int, int] | None:

@@ -85,7 +85,7 @@ def lights_on(params: WeatherParams) -> float:
 
 
 def uniforms(params: WeatherParams) -> dict[str, Any]:
-    """Give the uniforms that hold for a whole flight: name -> number or array."""
+    """Return the uniforms that hold for a whole flight: name -> number or array."""
     altitude, cloud, rain = params.sun_altitude_angle, params.cloudiness / 100.0, params.precipitation / 100.0
     extinction = fog_extinction(params)
     fogged = 1.0 - float(np.exp(-60.0 * extinction))  # of the sun's light and of what one sees of the sky
@@ -139,7 +139,7 @@ def _screen_color(sky_light: np.ndarray, horizon: np.ndarray, exposure: float, l
 
 
 def _step(low: float, high: float, value: float) -> float:
-    """The smooth step of shaders; low may be above high."""
+    """Return the smooth step of shaders; low may be above high."""
     t = float(np.clip((value - low) / (high - low), 0.0, 1.0))
     return t * t * (3.0 - 2.0 * t)
 
@@ -165,8 +165,8 @@ GLOW_WIDTHS_PX = ((5.0, 0.22), (19.0, 0.16))  # of a picture of 1280 px: width, 
 
 
 def defines(params: WeatherParams) -> str:
-    """Say what a weather's programs must know, as preprocessor lines: a CPU runs both sides of every branch, so what is
-    not needed is left out."""
+    """Return what a weather's programs must know, as preprocessor lines: a CPU runs both sides of every branch, so
+    what is not needed is left out."""
     values = uniforms(params)
     casts = float(values["sun_light"].max()) > FAINT
     needs = {
@@ -209,7 +209,7 @@ class WeatherPass:
         return bool(self.values["lights_on"] > 0.0)
 
     def frame_values(self, eye: np.ndarray, camera_pose: np.ndarray, person: PosedPerson | None) -> dict[str, Any]:
-        """Give the uniforms of one frame: the flight's, lamps near the camera, and where drops fall."""
+        """Return the uniforms of one frame: the flight's, lamps near the camera, and where drops fall."""
         lamps, count = street_lamps.nearest_lamps(self._lamps, eye)
         # Drops fall anew in each frame, and in the same places when it is drawn again.
         hip_m = np.zeros(3) if person is None else np.asarray(person.hip_m, dtype=np.float64)
