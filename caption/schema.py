@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from cosfly.formats.captions import KeyframeRecord, LabelFrom, Language, SentenceState, TeacherKind, Verdict, Writing
-from cosfly.formats.places import FlightChoice
+from cosfly.formats.places import TrackChoice
 from cosfly.formats.predictions import PREDICTIONS
 from cosfly.llm.budget import BudgetConfig
 from cosfly.llm.client import EndpointConfig
@@ -253,7 +253,7 @@ class CaptionConfig(Config):
         description="folder with prompts of yours in the place of those that ship; `cosfly caption prompts --export "
         "DIR` writes one to begin with",
     )
-    flights: FlightChoice = Field(FlightChoice(), description="which flights of the tree")
+    flights: TrackChoice = Field(TrackChoice(), description="which flights of the tree")
     window: WindowConfig = Field(WindowConfig(), description="windows")
     image: ImageConfig = Field(ImageConfig(), description="pictures in a request")
     evidence: EvidenceConfig = Field(EvidenceConfig(), description="check of numbers against the flight")

@@ -21,7 +21,7 @@ from pydantic import BaseModel
 
 from cosfly.formats.captions import FIELDS, Language, Prompt, read_captions
 from cosfly.formats.frames import frame_name
-from cosfly.formats.playback import Flight, read_flight
+from cosfly.formats.playback import Track, read_track
 from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.documents import read_object, validated
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError, nearest
@@ -105,7 +105,7 @@ class _Tree:
     def __init__(self, tree: Path, captions: Path, language: Language) -> None:
         self.tree, self.captions, self.language = tree, captions, language
         self.run = tree.absolute().parent.name
-        self._flights: dict[Path, Flight] = {}
+        self._flights: dict[Path, Track] = {}
 
     def places(self, left_out: Counter[str]) -> Iterator[WindowPlace]:
         whole: dict[Path, set[int]] = {}
@@ -129,7 +129,7 @@ class _Tree:
     def read(self, place: WindowPlace) -> ReadWindow:
         folder, prompt, caption, size_px = place.where
         if folder not in self._flights:
-            self._flights[folder] = read_flight(folder, strict=False)
+            self._flights[folder] = read_track(folder, strict=False)
         pictures = [read_view(folder / frame_name(index), "rgb") for index in place.window]
         return ReadWindow(pictures, facts_of(self._flights[folder], place.window), prompt, caption, size_px)
 
@@ -145,7 +145,7 @@ def _frames_in(folder: Path) -> set[int]:
     return {int(f.name[6:]) for f in frames if f.name[6:].isdecimal() and (f / VIEW_FILES["rgb"]).is_file()}
 
 
-def facts_of(flight: Flight, window: Sequence[int]) -> dict[str, np.ndarray]:
+def facts_of(flight: Track, window: Sequence[int]) -> dict[str, np.ndarray]:
     """Return FACTS of some frames of a flight."""
     if max(window) >= len(flight):
         raise InputError("a caption of a frame that is not in its flight", where=flight.folder, got=str(max(window)))

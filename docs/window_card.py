@@ -12,9 +12,9 @@ from pathlib import Path
 import cv2
 
 from cosfly.formats.captions import read_captions
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import read_rgb
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
 
 CROP_PX = (360, 270)  # region round the target that is shown of each frame, at the size it has in a 1280x720 image
 
@@ -26,8 +26,8 @@ STYLE = """body{font:15px/1.45 'DejaVu Sans','Noto Sans CJK SC',sans-serif;margi
 
 def crop(run_tree: Path, caption, index: int) -> str:
     """One observed frame round the target, as a JPEG data URL."""
-    folders = {(f.parent.name, f.name): f for f in find_flights(run_tree)}
-    flight = read_flight(folders[caption.trajectory, caption.variant], strict=False)
+    folders = {(f.parent.name, f.name): f for f in find_tracks(run_tree)}
+    flight = read_track(folders[caption.trajectory, caption.variant], strict=False)
     image = read_rgb(flight.frame_folder(index))
     scale = image.shape[1] / 1280
     width, height = int(CROP_PX[0] * scale), int(CROP_PX[1] * scale)

@@ -32,7 +32,7 @@ from cosfly.formats.frames import (
 )
 from cosfly.formats.motion import ACTION
 from cosfly.formats.places import sample_id
-from cosfly.formats.playback import EVENTS, Flight
+from cosfly.formats.playback import EVENTS, Track
 from cosfly.formats.weather import WeatherMode, WeatherParams
 from cosfly.geometry.axes import BODY_FROM_CAMERA
 from cosfly.runtime.escaping import published_name
@@ -158,7 +158,7 @@ class Column:
 
     name: str
     type: str | tuple[str, ...]
-    of_frame: Callable[[Flight, int], Any] | None = None
+    of_frame: Callable[[Track, int], Any] | None = None
     of_caption: Callable[[Caption], Any] | None = None
     words: tuple[str, ...] | Literal["actions"] = ()
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -168,7 +168,7 @@ class Column:
     counted: bool = False
     shown: bool = False
 
-    def cell(self, flight: Flight, i: int, caption: ReleasedCaption | None, placement: Placement) -> Any:
+    def cell(self, flight: Track, i: int, caption: ReleasedCaption | None, placement: Placement) -> Any:
         value: Any
         if self.of_caption is not None:
             value = None if caption is None else caption[self.name]
@@ -185,14 +185,14 @@ class Column:
         return bool(value) if self.type == "bool" and (value is not None or self.required) else value
 
 
-def _knobs(flight: Flight) -> np.ndarray | None:
+def _knobs(flight: Track) -> np.ndarray | None:
     """Return the six knobs of weather, (6,), None where the file has none."""
     record = flight.weather_record
     return None if record is None else np.array([getattr(record.params, name) for name in WEATHER_PARAMS])
 
 
-def _of_company(k: int, flight: Flight, i: int) -> int | None:
-    value = math.nan if flight.company is None else flight.company[i, k]
+def _of_company(k: int, flight: Track, i: int) -> int | None:
+    value = math.nan if flight.bystanders is None else flight.bystanders[i, k]
     return None if math.isnan(value) else int(value)
 
 
@@ -317,7 +317,7 @@ FRAME = (  # everything of a frame but pictures and depth
     Column("target_legible", "bool", lambda f, i: f.told_legibility(i)["legible"]),
     Column("others_in_view", "int32", partial(_of_company, 0), title="other people in view", shown=True),
     Column(
-        "other_distance_m", "float64", lambda f, i: None if f.company is None else f.company[i, 1],
+        "other_distance_m", "float64", lambda f, i: None if f.bystanders is None else f.bystanders[i, 1],
         ranges={"": (0.0, 1e6)},
     ),
     Column("other_id", "int32", partial(_of_company, 2), ranges={"": (0, PERSON_ID)}),
@@ -398,7 +398,7 @@ def caption_values(caption: Caption) -> ReleasedCaption:
 
 
 def between_of(rows: Collection[Mapping[str, Any]]) -> np.ndarray | None:
-    """Return `Flight.between` of the rows of a flight; None where it was planned at the rate of its frames."""
+    """Return `Track.between` of the rows of a flight; None where it was planned at the rate of its frames."""
     found = [row.get("poses_between") for row in rows]
     most = max((len(one) // len(POSE) for one in found if one), default=0)
     nothing = np.full(most * len(POSE), np.nan)
@@ -434,7 +434,7 @@ def schema(files: Collection[FrameFile]) -> pa.Schema:
     return pa.schema(fields, {b"huggingface": json.dumps({"info": {"features": features}}).encode()})
 
 
-def scalar_row(flight: Flight, i: int, caption: ReleasedCaption | None, placement: Placement) -> dict[str, Any]:
+def scalar_row(flight: Track, i: int, caption: ReleasedCaption | None, placement: Placement) -> dict[str, Any]:
     """Return the row of one frame without its pictures, right-handed axes."""
     return {column.name: column.cell(flight, i, caption, placement) for column in SCALARS}
 

@@ -12,10 +12,10 @@ import numpy as np
 from cosfly.formats.captions import Language
 from cosfly.formats.frames import Camera
 from cosfly.formats.goals import Goal
+from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.people import People
-from cosfly.formats.playback import EVENTS, Flight
+from cosfly.formats.playback import EVENTS, Track
 from cosfly.formats.shown_captions import ShownCaption, ShownFlight
-from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
 from cosfly.geometry.axes import BODY_FROM_CAMERA, CORNER_SIGNS, rotation_matrices
 from cosfly.runtime.documents import parse_document, validated
 from release.columns import BOX, COMPANY_COLUMNS, INTRINSICS, POINT, POSE, between_of, matrices_of
@@ -139,13 +139,13 @@ class FlightRows:
         return self.rows[0].get("track") == "clean"
 
     @cached_property
-    def flight(self) -> Flight:
+    def flight(self) -> Track:
         """The same as a flight of the playback tree, for those who know that."""
         first = self.rows[0]
         matrices = matrices_of(self.intrinsics)
         camera = Camera(int(self.size_px[0, 0]), int(self.size_px[0, 1]), matrices[0])
         has_mask = not np.isnan(self.mask_box).all()
-        return Flight(
+        return Track(
             town=str(first.get("town")), trajectory=str(first.get("trajectory")), variant=str(first.get("variant")),
             camera=camera, time_s=self.time_s, positions_m=self.pose[:, :3], rotations_deg=self.pose[:, 3:],
             targets_m=self.target_m, target_in_view=self.flags("target_in_view"),
@@ -156,7 +156,7 @@ class FlightRows:
             target_mask_bbox=self.mask_box if has_mask else None, is_original=self.is_clean,
             target_legible=None if None in self.column("target_legible") else self.flags("target_legible"),
             intrinsics=matrices if self.zooms else None, between=between_of(self.rows),
-            people=self.people, goal=self.goal, company=None if None in self.column("others_in_view")
+            people=self.people, goal=self.goal, bystanders=None if None in self.column("others_in_view")
             else np.stack([self.numbers(name) for name in COMPANY_COLUMNS], axis=1),
         )  # fmt: skip
 

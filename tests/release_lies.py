@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from release_tampering import depth_of, pixels_of, png, set_depth
 
-from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
+from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.geometry.axes import box_corners, project, world_from_camera
 
 Row = dict[str, Any]

@@ -29,8 +29,8 @@ from cosfly.formats.frames import (
     tree_position,
 )
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.playback import Flight, write_flight
-from cosfly.formats.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
+from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
+from cosfly.formats.playback import Track, write_track
 from cosfly.geometry.axes import DT_S, box_corners, intrinsic_matrix, look_at, project, world_from_camera
 
 PERSON_ID = 0x1234  # two different bytes, so that a swap of the channels shows
@@ -81,7 +81,7 @@ def make_playback_tree(
                 height_px=height_px,
             )
             folder = root / town / flight.trajectory / variant
-            write_flight(folder, flight)
+            write_track(folder, flight)
             if with_images:
                 for i in range(num_points):
                     _write_frame(folder / frame_name(i), flight, scene, i)
@@ -97,7 +97,7 @@ def make_flight(
     variant: str = "ORI",
     width_px: int = 64,
     height_px: int = 36,
-) -> tuple[Flight, Scene]:
+) -> tuple[Track, Scene]:
     """Make a flight behind a walking person (turns, stops, climbs, some occlusion) and the scene round it."""
     rng = np.random.default_rng([seed, 77])
     targets = _walk(num_points, rng)
@@ -118,7 +118,7 @@ def make_flight(
     views = [_annotate(scene, targets[i], positions[i], rotations[i], camera) for i in range(num_points)]
     bbox = np.array([view[0] for view in views])
     visibility = np.array([view[3] for view in views])
-    flight = Flight(
+    flight = Track(
         town=town,
         trajectory=trajectory,
         variant=variant,
@@ -236,7 +236,7 @@ def _slabs(centers: np.ndarray, halves: np.ndarray, origin: np.ndarray, directio
     return np.minimum(one, two).max(axis=2), np.maximum(one, two).min(axis=2)
 
 
-def paint(scene: Scene, flight: Flight, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def paint(scene: Scene, flight: Track, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Give rgb (h, w, 3) uint8, depth (h, w) float32, semantic kinds (h, w) and ids (h, w) of one frame."""
     camera = flight.camera
     h, w = camera.height_px, camera.width_px
@@ -282,7 +282,7 @@ def pack_depth(folder: Path) -> None:
         path.unlink()
 
 
-def _write_frame(folder: Path, flight: Flight, scene: Scene, i: int) -> None:
+def _write_frame(folder: Path, flight: Track, scene: Scene, i: int) -> None:
     rgb, depth, semantic, instance = paint(scene, flight, i)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "rgb.png").write_bytes(rgb_bytes(rgb))
@@ -291,7 +291,7 @@ def _write_frame(folder: Path, flight: Flight, scene: Scene, i: int) -> None:
     (folder / "meta.json").write_bytes(_meta(flight, i, int((instance == PERSON_ID).sum())).to_bytes())
 
 
-def _meta(flight: Flight, i: int, num_pixels: int) -> FrameMeta:
+def _meta(flight: Track, i: int, num_pixels: int) -> FrameMeta:
     nowhere = tree_position(np.zeros(3))
     target = TargetMeta(
         world_location=tree_position(flight.targets_m[i]),

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.formats.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
-from cosfly.formats.flights import find_flights
 from cosfly.formats.places import sample_id
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
 from cosfly.formats.splits import Split
+from cosfly.formats.tracks import find_tracks
 from cosfly.llm.student_chat import FrameLook, Taught, write_taught
 from cosfly.runtime.provenance import fingerprint
 from cosfly.runtime.store import write_json
@@ -95,8 +95,8 @@ def write_set(out: Path, splits: Mapping[Split, Iterable[Sample]], trees: Iterab
 def make_captions(path: Path, tree: Path) -> list[Caption]:
     """Write captions.jsonl for every window of every flight of the tree and give the captions."""
     captions = []
-    for folder in find_flights(tree):
-        flight = read_flight(folder)
+    for folder in find_tracks(tree):
+        flight = read_track(folder)
         names = (flight.town, flight.trajectory, flight.variant)
         captions += [make_caption(*names, frame) for frame in range(WINDOW - 1, len(flight))]
     write_captions(path, captions)

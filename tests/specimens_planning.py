@@ -6,10 +6,10 @@ import numpy as np
 
 from cosfly.formats.boxes import MapHeader, make_box_map
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.walks import Walk
+from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.geometry import kernels
 from cosfly.geometry.axes import DT_S
-from cosfly.planners.contract import PlanConfig, Wish
+from cosfly.planners.contract import PlanConfig, TrackingReference
 from cosfly.planners.stage import make_scenario
 
 
@@ -20,7 +20,7 @@ def walk_along(path_id, corners, speed_mps=1.2, dt_s=DT_S):
     time_s = np.arange(0, along[-1] / speed_mps, dt_s)
     xy = np.stack([np.interp(time_s * speed_mps, along, corners[:, k]) for k in (0, 1)], axis=1)
     positions = np.column_stack([xy, np.zeros(len(xy))])
-    return Walk(path_id, corners, time_s, positions, np.full(len(xy), speed_mps))
+    return PedestrianTrajectory(path_id, corners, time_s, positions, np.full(len(xy), speed_mps))
 
 
 def town_of(*rows):
@@ -53,9 +53,11 @@ def scenario_of(world):
 
 def first_points(scenario, num):
     """The beginning of a scenario."""
-    wish = {f.name: getattr(scenario.wish, f.name) for f in fields(scenario.wish)}
-    wish = Wish(**{name: value if isinstance(value, bool) else value[:num] for name, value in wish.items()})
-    return replace(scenario, targets_m=scenario.targets_m[:num], ground_m=scenario.ground_m[:num], wish=wish)
+    reference = {f.name: getattr(scenario.reference, f.name) for f in fields(scenario.reference)}
+    reference = TrackingReference(
+        **{name: value if isinstance(value, bool) else value[:num] for name, value in reference.items()}
+    )
+    return replace(scenario, targets_m=scenario.targets_m[:num], ground_m=scenario.ground_m[:num], reference=reference)
 
 
 def assert_safe(positions, obstacles, cfg=PlanConfig(), ground_m=0.0):

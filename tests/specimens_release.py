@@ -10,18 +10,18 @@ from unittest import mock
 from specimens_distill import make_caption as caption_of_frame
 
 from cosfly.formats.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
-from cosfly.formats.flights import find_flights
 from cosfly.formats.inspection import (
     RESULTS,
-    FlightFunnel,
-    FlightInspection,
     Funnel,
     Inspection,
+    TrackFunnel,
+    TrackInspection,
     TrajectoryFunnel,
     write_inspection,
 )  # fmt: skip
 from cosfly.formats.issues import Issue
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
 from cosfly.pipeline import run as pipeline
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
@@ -64,13 +64,13 @@ def make_caption(flight, index: int, **change) -> Caption:
 def make_inspection(tree: Path, rejected: dict[str, tuple[str, str]]) -> Inspection:
     """An inspection of a specimen tree; `rejected` maps a folder name to (result, code)."""
     flights = []
-    for folder in find_flights(tree):
+    for folder in find_tracks(tree):
         name = folder.relative_to(tree).as_posix()
         town, trajectory, variant = folder.parts[-3:]
         result, code = rejected.get(name, ("accepted", ""))
         issues = [Issue(severity="error", code=code, where="x", got="y", expected="z")] if code else []
         place = {"town": town, "trajectory": trajectory, "variant": variant, "folder": name, "trace_id": trajectory}
-        flights.append(FlightInspection(**place, result=result, issues=issues, metrics={}))
+        flights.append(TrackInspection(**place, result=result, issues=issues, metrics={}))
     results: dict[tuple[str, str], set[str]] = defaultdict(set)
     for flight in flights:
         results[flight.town, flight.trajectory].add(flight.result)
@@ -78,7 +78,7 @@ def make_inspection(tree: Path, rejected: dict[str, tuple[str, str]]) -> Inspect
     parts = {result: worst[result] for result in RESULTS}
     trajectories = TrajectoryFunnel(planned=n + 3, dropped={"smoothness": 2}, not_rendered=1, rendered=n, **parts)
     counts = {r: sum(f.result == r for f in flights) for r in ("accepted", "review", "rejected")}
-    funnel = FlightFunnel(inspected=len(flights), without_trace=0, reasons={}, **counts)
+    funnel = TrackFunnel(inspected=len(flights), without_trace=0, reasons={}, **counts)
     return Inspection(settings={}, funnel=Funnel(trajectories=trajectories, flights=funnel), flights=flights)
 
 
@@ -86,11 +86,11 @@ def make_inputs(root: Path) -> Path:
     """Write tree/ of six flights (two not accepted), captions.jsonl, inspect.json."""
     tree = make_playback_tree(root / "tree", 3, NUM_POINTS, width_px=96, height_px=54, towns=TOWNS)
     captions = []
-    for flight in map(read_flight, find_flights(tree)):
+    for flight in map(read_track, find_tracks(tree)):
         captions += [make_caption(flight, index) for index in range(4, NUM_POINTS - 1)]
         captions.append(make_caption(flight, 11, status="dropped", drop_reason="hard_conflict", en=None, zh=None))
     write_captions(root / "captions.jsonl", captions)
-    names = [folder.relative_to(tree).as_posix() for folder in find_flights(tree)]
+    names = [folder.relative_to(tree).as_posix() for folder in find_tracks(tree)]
     gone = {names[1]: ("rejected", "missing_file"), names[4]: ("review", "stray_frame")}
     write_inspection(root / "inspect.json", make_inspection(tree, gone))
     return root
@@ -114,7 +114,7 @@ def release_of(root: Path, window: int = 5, **change) -> Path:
     """Release `tree/` with a caption of every window and an inspection that accepts all."""
     captions = [
         make_caption(flight, i, window=list(range(i - window + 1, i + 1)))
-        for flight in map(read_flight, find_flights(root / "tree"))
+        for flight in map(read_track, find_tracks(root / "tree"))
         for i in range(4, len(flight) - 1)
     ]
     write_captions(root / "captions.jsonl", captions)

@@ -17,20 +17,20 @@ from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import way_of
 from cosfly.formats.answer_text import Parsed
 from cosfly.formats.captions import Coc, Prompt
-from cosfly.formats.flights import find_flights
 from cosfly.formats.goals import Goal
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
 from specimens import make_playback_tree
 
 GOAL = Goal(0, "the woman in the red jacket", "穿红色夹克的女子", ("figure", "top"))
-COMPANY = np.array(
+BYSTANDER_COLUMNS = np.array(
     [[0, np.nan, np.nan, np.nan, np.nan], [1, 4.04, 9, 9, 2], [2, 3.5, 9, 8, 1], [3, 2.26, 7, 8, 1], [3, 2.5, 7, 8, 1]]
 )
 
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory):
-    return read_flight(find_flights(make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 12))[0])
+    return read_track(find_tracks(make_playback_tree(tmp_path_factory.mktemp("tree"), 1, 12))[0])
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +43,8 @@ def window_of(flight):
 
 
 def in_company(flight):
-    rows = np.vstack([COMPANY, np.tile(COMPANY[-1], (len(flight) - 5, 1))])
-    return window_of(replace(flight, goal=GOAL, company=rows))
+    rows = np.vstack([BYSTANDER_COLUMNS, np.tile(BYSTANDER_COLUMNS[-1], (len(flight) - 5, 1))])
+    return window_of(replace(flight, goal=GOAL, bystanders=rows))
 
 
 def test_a_prompt_tells_the_goal_and_the_others_in_both_languages(flight, vocabulary):

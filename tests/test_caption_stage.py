@@ -18,8 +18,8 @@ from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig
 from caption.truth.actions import TABLE, measure
 from cosfly.formats.captions import read_captions
-from cosfly.formats.flights import find_flights
-from cosfly.formats.playback import read_flight, write_flight
+from cosfly.formats.playback import read_track, write_track
+from cosfly.formats.tracks import find_tracks
 from cosfly.llm.budget import BudgetConfig
 from cosfly.runtime.errors import NothingKept, ResumeError
 from specimens import make_playback_tree
@@ -38,8 +38,8 @@ def done(tree, tmp_path_factory):
 def test_every_window_is_one_line_sorted_and_labelled_from_geometry(tree, done):
     captions = list(read_captions(done / "captions.jsonl"))
     expected = {}
-    for folder in find_flights(tree):
-        for sample in cut_windows(read_flight(folder), CaptionConfig().window):
+    for folder in find_tracks(tree):
+        for sample in cut_windows(read_track(folder), CaptionConfig().window):
             expected[sample.observed.sample_id] = TABLE.label_of(measure(sample.future))
     assert [caption.sample_id for caption in captions] == sorted(expected)
     assert {caption.sample_id: caption.label for caption in captions} == expected
@@ -76,11 +76,11 @@ def test_who_cannot_be_made_out_changes_what_is_said_to_be_seen_and_no_decision(
     told = {}
     for legible in (True, False):
         dim = shutil.copytree(tree, tmp_path / f"tree_{legible}")
-        for folder in find_flights(dim):
-            flight = read_flight(folder)
+        for folder in find_tracks(dim):
+            flight = read_track(folder)
             for point in flight.raw["points"]:
                 point["target"]["legible"] = legible and point["target"]["visible"]
-            write_flight(folder, flight)
+            write_track(folder, flight)
         told[legible] = list(read_captions(run(CaptionConfig(), dim, tmp_path / f"out_{legible}")))
     assert [one.model_dump() for one in told[True]] == [one.model_dump() for one in before], "nothing is said anew"
     assert any("visible" in one.en.critical_components for one in before)
@@ -101,7 +101,7 @@ def test_a_product_never_loses_captions(tmp_path):
     tree, out = make_playback_tree(tmp_path / "tree", 3, 18), tmp_path / "caption"
     run(CaptionConfig(), tree, out)
     before = (out / "captions.jsonl").read_bytes()
-    shutil.rmtree(find_flights(tree)[0])
+    shutil.rmtree(find_tracks(tree)[0])
     with pytest.raises(ResumeError, match=r"the input data .* has changed; choose another --out"):
         run(CaptionConfig(), tree, out)
     assert (out / "captions.jsonl").read_bytes() == before
@@ -120,7 +120,7 @@ def test_captions_of_another_prompt_are_refused_by_name(tree, tmp_path, monkeypa
 def test_bad_flights_are_counted_and_the_others_captioned(tree, tmp_path):
     root = tmp_path / "tree"
     shutil.copytree(tree, root)
-    folders = find_flights(root)
+    folders = find_tracks(root)
     raw = json.loads((folders[0] / "trajectory.json").read_text())
     raw["points"] = raw["points"][:9]  # one short of a window and its future
     (folders[0] / "trajectory.json").write_text(json.dumps(raw))

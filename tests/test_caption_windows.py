@@ -30,9 +30,9 @@ from caption.truth.actions import TABLE, measure
 from caption.truth.facts import measure_facts
 from cosfly.formats.boxes import MapHeader, make_box_map
 from cosfly.formats.captions import read_captions
-from cosfly.formats.flights import find_flights, read_twin
-from cosfly.formats.playback import Flight, read_flight, write_flight
+from cosfly.formats.playback import Track, read_track, write_track
 from cosfly.formats.segments import Mission
+from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, perturb
 from specimens import make_flight, make_playback_tree
 
@@ -45,7 +45,7 @@ def tree(tmp_path_factory):
 
 
 def flight_in(root):
-    return read_flight(find_flights(root)[0], strict=False)
+    return read_track(find_tracks(root)[0], strict=False)
 
 
 @pytest.mark.parametrize(
@@ -70,8 +70,8 @@ def test_the_observed_type_has_no_future_and_shares_no_memory_with_it(tree):
 
 def spoil_future(root, current: int) -> None:
     """Change every pose, target, flag and picture after a frame."""
-    folder = find_flights(root)[0]
-    flight = read_flight(folder, strict=False)
+    folder = find_tracks(root)[0]
+    flight = read_track(folder, strict=False)
     rng = np.random.default_rng(1)
     later = np.arange(len(flight)) > current
     columns = {}
@@ -91,7 +91,7 @@ def spoil_future(root, current: int) -> None:
         values = getattr(flight, name).copy()
         values[later] = ~values[later]
         columns[name] = values
-    write_flight(folder, dataclasses.replace(flight, **columns))
+    write_track(folder, dataclasses.replace(flight, **columns))
     for i in np.flatnonzero(later):
         frame = flight.frame_folder(int(i))
         h, w = flight.camera.height_px, flight.camera.width_px
@@ -193,7 +193,7 @@ def test_facts_of_a_hand_made_window(tree):
 def test_a_foreign_tree_without_boxes_scores_depth_and_meta(tmp_path):
     """Older public trees: bbox null, no visibility, no meta.json, RGBA pictures, no depth."""
     root = make_playback_tree(tmp_path / "tree", 1, 12, with_augmented=False)
-    folder = find_flights(root)[0]
+    folder = find_tracks(root)[0]
     raw = json.loads((folder / "trajectory.json").read_text())
     del raw["augmentation"], raw["coordinates"]
     for point in raw["points"]:
@@ -251,13 +251,13 @@ def two_tracks(tmp_path_factory):
     )  # fmt: skip
     root = tmp_path_factory.mktemp("two")
     for flight in (clean, perturbed):
-        write_flight(root / flight.town / flight.trajectory / flight.variant, flight)
+        write_track(root / flight.town / flight.trajectory / flight.variant, flight)
     return root
 
 
-def flights_of(root) -> tuple[Flight, Flight]:
+def flights_of(root) -> tuple[Track, Track]:
     """The clean and the perturbed flight of a tree of one trajectory."""
-    clean, perturbed = (read_flight(folder, strict=False) for folder in find_flights(root))
+    clean, perturbed = (read_track(folder, strict=False) for folder in find_tracks(root))
     return clean, perturbed
 
 
@@ -300,7 +300,7 @@ def ordered(tree, tmp_path_factory):
     """The same flight with a mission that ends its pursuit at frame 8."""
     root = tmp_path_factory.mktemp("ordered") / "tree"
     shutil.copytree(tree, root)
-    write_flight(find_flights(root)[0], dataclasses.replace(flight_in(root), mission=MISSION))
+    write_track(find_tracks(root)[0], dataclasses.replace(flight_in(root), mission=MISSION))
     return root
 
 
@@ -377,8 +377,8 @@ def test_a_run_reports_what_it_saved(tmp_path):
     # Read anew from the flights: every window whose label differs from the one before was captioned.
     ids = {caption.sample_id for caption in taken}
     cfg = CaptionConfig.model_validate({"window": window})
-    for folder in find_flights(tree):
-        samples = list(cut_windows(read_flight(folder), cfg.window))
+    for folder in find_tracks(tree):
+        samples = list(cut_windows(read_track(folder), cfg.window))
         labels = [TABLE.label_of(measure(sample.future)) for sample in samples]
         for before, after, sample in zip(labels, labels[1:], samples[1:], strict=False):
             assert before == after or sample.observed.sample_id in ids

@@ -12,10 +12,10 @@ from cosfly.closed_loop.controller import Controller, read_controls
 from cosfly.closed_loop.pilots import PilotAnswer
 from cosfly.closed_loop.settings import CONTROLLER_FILE, Drone
 from cosfly.closed_loop.stage import OpenFlight
-from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight
+from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory
 from cosfly.formats.actions import TOKENS
 from cosfly.planners.contract import PlanConfig
-from cosfly.planners.stage import plan_flight
+from cosfly.planners.stage import plan_trajectory
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.errors import ConfigError
 
@@ -31,10 +31,10 @@ def begin():
     town = town_of()
     airspace = Airspace(RenderConfig(width_px=320, height_px=180, fovs_deg=(90.0,)), town, town)
     walk = walk_along("path_00000", [(0, 0), (60, 0)])
-    plan = plan_flight(walk, airspace.surroundings.obstacles, PlanConfig(), 0)
+    plan = plan_trajectory(walk, airspace.surroundings.obstacles, PlanConfig(), 0)
 
     def start(num_lead=40):
-        flight = ClosedLoopFlight(airspace, plan, num_lead=num_lead)
+        flight = ClosedLoopTrajectory(airspace, plan, num_lead=num_lead)
         moment = flight.reset()[-1]
         return flight, Controller(CONTROLS, Drone(), moment), moment
 

@@ -12,9 +12,9 @@ from teacher_server import TeacherServer
 from caption.run.stage import run as caption_tree
 from caption.schema import CaptionConfig
 from cosfly.formats.captions import read_captions
-from cosfly.formats.flights import find_flights
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
 from cosfly.formats.pursuits import PURSUITS, Pursuit, read_pursuit
+from cosfly.formats.tracks import find_tracks
 from cosfly.llm.student_chat import write_taught
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample, open_split
@@ -78,8 +78,8 @@ def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(t
     captions = list(read_captions(tmp_path / "caption/captions.jsonl"))
     assert captions
     decided = {}  # the rule teacher says of the tree what it said while it flew
-    for folder in find_flights(tmp_path / "render"):
-        flight = read_flight(folder)
+    for folder in find_tracks(tmp_path / "render"):
+        flight = read_track(folder)
         assert flight.source["algorithm"].startswith("flown by rules")
         pursuit = flown[flight.source["scenario_id"]]
         assert np.allclose(flight.positions_m, [frame.pose[:3] for frame in pursuit.frames], atol=1e-3)

@@ -9,10 +9,10 @@ from commands import invoke
 from test_closed_loop_fly import TINY, fly, town  # noqa: F401
 
 from cosfly.closed_loop.settings import Drone
-from cosfly.closed_loop.stepper import ClosedLoopFlight
+from cosfly.closed_loop.stepper import ClosedLoopTrajectory
 from cosfly.formats.captions import read_captions
-from cosfly.formats.flights import find_flights
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import NothingKept
 from cosfly.runtime.runner import run_items
 
@@ -33,7 +33,7 @@ def test_where_it_erred_the_planner_goes_on_and_what_is_made_is_captioned(town, 
     assert counts["input"] == looked_at
     assert counts["kept"] + sum(counts["dropped"].values()) + sum(counts["failed"].values()) == looked_at
     assert counts["kept"] >= 1
-    flights = [read_flight(folder) for folder in find_flights(tmp_path / "made/render")]
+    flights = [read_track(folder) for folder in find_tracks(tmp_path / "made/render")]
     assert len(flights) == counts["kept"]
     for flight in flights:
         name, _, number = flight.source["scenario_id"].rpartition("_f")
@@ -66,10 +66,8 @@ def test_redrawn_frames_show_what_the_student_saw(town, tmp_path):  # noqa: F811
     fly(town, tmp_path / "flown", f"--workers 1 --student track_straight --set fly.most_decisions=20 {weather}")
     done = relabel(town, tmp_path / "flown", tmp_path / "made", weather)
     assert done.exit_code == 0, (done.output, done.exception)
-    whole = {
-        flight.source["scenario_id"]: flight for flight in map(read_flight, find_flights(tmp_path / "flown/render"))
-    }
-    flights = [read_flight(folder) for folder in find_flights(tmp_path / "made/render")]
+    whole = {flight.source["scenario_id"]: flight for flight in map(read_track, find_tracks(tmp_path / "flown/render"))}
+    flights = [read_track(folder) for folder in find_tracks(tmp_path / "made/render")]
     assert len(flights) >= 2
     for flight in flights:
         name, _, number = flight.source["scenario_id"].rpartition("_f")
@@ -95,7 +93,7 @@ def test_redrawn_frames_show_what_the_student_saw(town, tmp_path):  # noqa: F811
 def test_why_nothing_can_be_shown_there_is_counted(town, tmp_path, monkeypatch, more, reason):  # noqa: F811
     fly(town, tmp_path / "flown", f"{STUDENT} --set fly.most_decisions=12")
     if reason == "crashes":
-        monkeypatch.setitem(ClosedLoopFlight.__init__.__kwdefaults__, "drone", Drone(radius_m=16.0))
+        monkeypatch.setitem(ClosedLoopTrajectory.__init__.__kwdefaults__, "drone", Drone(radius_m=16.0))
         here = lambda *given, **how: run_items(*given, **how | {"workers": 0})  # noqa: E731  # in this process
         monkeypatch.setattr("cosfly.closed_loop.relabel.run_items", here)
     done = relabel(town, tmp_path / "flown", tmp_path / "made", more)

@@ -5,9 +5,9 @@ import pytest
 from specimens_planning import CANYON, town_of, walk_along
 
 from cosfly.closed_loop.settings import Drone
-from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight
+from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory
 from cosfly.planners.contract import PlanConfig
-from cosfly.planners.stage import plan_flight
+from cosfly.planners.stage import plan_trajectory
 from cosfly.render.settings import RenderConfig
 
 LOOK = {"width_px": 160, "height_px": 90, "fovs_deg": (90.0,)}
@@ -25,10 +25,10 @@ def airspace():
 @pytest.fixture(scope="module")
 def planned(airspace):
     walk = walk_along("path_00000", [(0, 0), (100, 0)])
-    return plan_flight(walk, airspace.surroundings.obstacles, PlanConfig(), 1)
+    return plan_trajectory(walk, airspace.surroundings.obstacles, PlanConfig(), 1)
 
 
-def flown(flight: ClosedLoopFlight, *commands) -> list:
+def flown(flight: ClosedLoopTrajectory, *commands) -> list:
     moments = list(flight.reset())
     for command in commands:
         if flight.ended is None:
@@ -38,10 +38,10 @@ def flown(flight: ClosedLoopFlight, *commands) -> list:
 
 def test_the_same_commands_give_the_same_flight_and_the_same_pictures_whatever_was_flown_beside_it(airspace, planned):
     commands = [(1.2, 0.3, 0.1, 4.0), (2.0, 0, 0, -8.0), (0, 0, 0, 0)]
-    first = flown(ClosedLoopFlight(airspace, planned), *commands)
-    other = ClosedLoopFlight(airspace, planned)
+    first = flown(ClosedLoopTrajectory(airspace, planned), *commands)
+    other = ClosedLoopTrajectory(airspace, planned)
     again = []
-    for moment in flown(ClosedLoopFlight(airspace, planned), *commands):
+    for moment in flown(ClosedLoopTrajectory(airspace, planned), *commands):
         again.append(moment)
         other.reset()
     for one, two in zip(first, again, strict=True):
@@ -53,7 +53,7 @@ def test_the_same_commands_give_the_same_flight_and_the_same_pictures_whatever_w
 
 def test_a_held_command_is_reached_as_fast_as_the_drone_can_and_no_faster(airspace, planned):
     drone = Drone(accel_max_mps2=2.0, yaw_accel_max_degps2=20.0)
-    flight = ClosedLoopFlight(airspace, planned, drone=drone)
+    flight = ClosedLoopTrajectory(airspace, planned, drone=drone)
     moments = flown(flight, *[(0.0, 0.0, 1.0, 20.0)] * 6)[4:]
     velocities = np.array([m.velocity_mps for m in moments])
     assert np.linalg.norm(np.diff(velocities, axis=0), axis=1).max() <= 2.0 * flight.dt_s + 1e-9
@@ -64,7 +64,7 @@ def test_a_held_command_is_reached_as_fast_as_the_drone_can_and_no_faster(airspa
 
 
 def test_velocities_are_in_the_axes_of_the_drone(airspace, planned):
-    flight = ClosedLoopFlight(airspace, planned)
+    flight = ClosedLoopTrajectory(airspace, planned)
     moments = flown(flight, *[(0.0, 1.0, 0.0, 0.0)] * 4)
     yaw = np.radians(moments[-1].rotation_deg[1])
     assert moments[-1].velocity_mps == pytest.approx([-np.sin(yaw), np.cos(yaw), 0.0], abs=1e-6)
@@ -72,7 +72,7 @@ def test_velocities_are_in_the_axes_of_the_drone(airspace, planned):
 
 def test_who_flies_into_the_ground_or_a_house_has_crashed_before_it_and_flies_no_more(airspace, planned):
     for command in ((0, 0, -4.0, 0), (0, 8.0, -2.0, 0)):
-        flight = ClosedLoopFlight(airspace, planned)
+        flight = ClosedLoopTrajectory(airspace, planned)
         last = flown(flight, *[command] * 40)[-1]
         assert flight.ended == "crashed"
         assert last.clearance_m < flight.drone.radius_m
@@ -83,10 +83,10 @@ def test_who_flies_into_the_ground_or_a_house_has_crashed_before_it_and_flies_no
 
 
 def test_who_leaves_the_person_is_lost_and_who_leaves_the_map_has_left(airspace, planned):
-    flight = ClosedLoopFlight(airspace, planned, lost_s=2.0)
+    flight = ClosedLoopTrajectory(airspace, planned, lost_s=2.0)
     flown(flight, *[(0, 0, 0, 60.0)] * 3, *[(0, 0, 0, 0.0)] * 20)
     assert flight.ended == "lost"
-    small = ClosedLoopFlight(airspace, planned)
+    small = ClosedLoopTrajectory(airspace, planned)
     small.airspace.bounds_m, kept = (np.full(3, 0.0), np.full(3, 1.0)), small.airspace.bounds_m
     try:
         flown(small, *[(-10.0, 0, 4.0, 0)] * 40)

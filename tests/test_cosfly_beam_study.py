@@ -6,7 +6,7 @@ import numpy as np
 from specimens_planning import CANYON, town_of, walk_along
 
 from cosfly.formats.boxes import write_boxes
-from cosfly.formats.walks import write_paths
+from cosfly.formats.pedestrian_paths import write_paths
 from cosfly.studies import beam
 from cosfly.studies.beam import FIGURES, PAPER_BEAM, BeamConfig, Flown
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.coverage import AXES, Coverage, azimuths_deg, coverage_of, default_coverage
-from cosfly.formats.flights import find_flights
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
 from cosfly.viz.coverage_page import coverage_html, ranges, shares
 from specimens import make_playback_tree
 
@@ -21,7 +21,7 @@ from specimens import make_playback_tree
 @pytest.fixture(scope="module")
 def flights(tmp_path_factory):
     tree = make_playback_tree(tmp_path_factory.mktemp("tree"), 2, 12, width_px=64, height_px=36)
-    return [read_flight(folder) for folder in find_flights(tree)]
+    return [read_track(folder) for folder in find_tracks(tree)]
 
 
 @given(st.lists(st.floats(0, 99.9), min_size=1, max_size=300), st.floats(0.02, 0.98))

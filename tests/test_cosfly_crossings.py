@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.walks import Walk
+from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.stage import load_map
+from cosfly.pedestrians.bystanders import bystanders_of
 from cosfly.pedestrians.crossings import CROSSING, ROAD, where_walked
-from cosfly.pedestrians.others import company_of
-from cosfly.pedestrians.stage import make_walk
+from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
 from cosfly.pipeline.settings import RunConfig
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import load, shipped
+from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import simplify
 
 CFG = PedestriansConfig(road_cost=20, open_cost=3, min_component_cells=100, min_distance_m=20)
@@ -62,7 +62,9 @@ def test_points_are_counted_by_where_they_are_and_which_way_they_go(way, marked,
     start, goal = np.array(way)
     length = np.abs(goal - start).max()
     places = start + np.linspace(0, 1, int(2 * length) + 1)[:, None] * (goal - start)
-    walk = Walk("p", places, np.arange(len(places)) * 0.5, np.pad(places, ((0, 0), (0, 1))), np.ones(len(places)))
+    walk = PedestrianTrajectory(
+        "p", places, np.arange(len(places)) * 0.5, np.pad(places, ((0, 0), (0, 1))), np.ones(len(places))
+    )
     ground = walkable_ground(street(marked=marked).box_map(), CFG)
     assert where_walked(walk, ground.footing, ground.grid) == counts
 
@@ -75,14 +77,14 @@ def shares(cfg: RunConfig, name: str, num_others: int = 0) -> tuple[float, float
     counts = np.zeros(3)
     for k in range(walking.num_paths):
         rng = rng_for(town.seed, "pedestrians", f"path_{k:05d}")
-        walk = make_walk(f"path_{k:05d}", ground, walking, rng).walk
+        walk = make_pedestrian(f"path_{k:05d}", ground, walking, rng).walk
         everybody = [walk.positions_m]
         if num_others:
-            everybody += [other.positions_m for other in company_of(walk, ground, [], walking, rng).others]
+            everybody += [other.positions_m for other in bystanders_of(walk, ground, [], walking, rng).others]
         for places in everybody:
             moves = np.r_[True, np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1) > 1e-6]
             line = walk.polyline_m if places is walk.positions_m else places[moves, :2]
-            one = Walk("p", line, walk.time_s, places, walk.speeds_mps)
+            one = PedestrianTrajectory("p", line, walk.time_s, places, walk.speeds_mps)
             counts += *where_walked(one, ground.footing, ground.grid), len(places)
     return counts[0] / counts[2], counts[1] / counts[2]
 
@@ -106,7 +108,9 @@ def test_people_walk_under_passages_and_arcades_of_the_simplified_town(name):
     )
     num_under = 0
     for k in range(40):
-        places = make_walk("p", ground, town.pedestrians, rng_for(0, "pedestrians", f"path_{k:05d}")).walk.positions_m
+        places = make_pedestrian(
+            "p", ground, town.pedestrians, rng_for(0, "pedestrians", f"path_{k:05d}")
+        ).walk.positions_m
         is_under = (places[:, None, :2] >= roofs.mins[:, :2]) & (places[:, None, :2] <= roofs.maxs[:, :2])
         num_under += bool(is_under.all(axis=2).any())
     assert num_under >= 4

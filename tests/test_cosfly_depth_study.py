@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import frame_name
+from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.documents import read_json
 from cosfly.studies.depth import (
     BITS,
@@ -63,7 +63,7 @@ def test_float32_against_float64(tmp_path):
 
 def test_a_frame_of_the_tree_is_studied_with_its_picture(tmp_path):
     tree = make_playback_tree(tmp_path / "tree", 1, 3, with_augmented=False)
-    frame = find_flights(tree)[0] / frame_name(1)
+    frame = find_tracks(tree)[0] / frame_name(1)
     answer = CliRunner().invoke(app, ["study", "depth", "--data", str(tree), "--out", str(tmp_path / "any")])
     assert answer.exit_code == 0, answer.output
     assert "32-bit float" in (tmp_path / "any/depth_study.md").read_text()

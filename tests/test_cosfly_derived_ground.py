@@ -15,10 +15,10 @@ from cosfly.maps.boxlist import BoxList
 from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.derived_ground import CREDITS, NEAR_M, PAVEMENT_M, with_derived_ground
 from cosfly.maps.stage import MapsConfig, load_map, run
-from cosfly.pedestrians.stage import make_walk
+from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
 from cosfly.render.draping import drape, is_draped
-from cosfly.runtime.chance import rng_for
+from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import SimplifyConfig, simplify
 
 ROADS, SIDEWALKS, TERRAIN = (KINDS[name] for name in ("Roads", "Sidewalks", "Terrain"))
@@ -107,7 +107,7 @@ def test_people_of_a_foreign_city_of_buildings_alone_walk_on_its_pavements(share
     assert box_map.header.derived_ground < 2.0 * box_map.counts()["Buildings"]
     cfg = PedestriansConfig(road_cost=20, open_cost=3)
     ground = walkable_ground(simplify(box_map, SimplifyConfig()).box_map, cfg)
-    walks = [make_walk("p", ground, cfg, rng_for(0, "pedestrians", str(k))).walk for k in range(20)]
+    walks = [make_pedestrian("p", ground, cfg, rng_for(0, "pedestrians", str(k))).walk for k in range(20)]
     places = np.concatenate([walk.positions_m for walk in walks])
     x, y = ground.grid.cells_at(places).T
     assert np.isin(ground.footing[y, x], [0, 1]).mean() > 0.95

@@ -10,8 +10,8 @@ from specimens_foreign import write_foreign_tree
 
 from caption.run.stage import run as caption_run
 from caption.schema import CaptionConfig
-from cosfly.formats.flights import find_flights
-from cosfly.formats.places import FlightChoice
+from cosfly.formats.places import TrackChoice
+from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import InputError
 from distill.prepare import stage as prepare
 from distill.prepare.sources import RunSource as Prepared
@@ -29,7 +29,7 @@ def tree(tmp_path_factory) -> Path:
 
 
 def names(tree: Path, **choice) -> list[str]:
-    return [folder.relative_to(tree).as_posix() for folder in find_flights(tree, FlightChoice(**choice))]
+    return [folder.relative_to(tree).as_posix() for folder in find_tracks(tree, TrackChoice(**choice))]
 
 
 # --- which flights ----------------------------------------------------------------------------------------------------
@@ -63,7 +63,7 @@ def test_patterns_are_of_folders_and_those_above_them(tree):
 
 def test_a_training_set_takes_some_flights(tree, tmp_path):
     captions = caption_run(CaptionConfig(), tree, tmp_path / "caption")
-    cfg = PrepareConfig(modalities=("rgb",), too_few="fill", flights=FlightChoice(match=("Town01",), tracks=("clean",)))
+    cfg = PrepareConfig(modalities=("rgb",), too_few="fill", flights=TrackChoice(match=("Town01",), tracks=("clean",)))
     prepare.run(cfg, [Prepared.of_files(tree, captions)], tmp_path / "set")
     splits = ("train", "val", "test")
     flights = {(s.town, s.variant) for split in splits for s in open_split(tmp_path / "set", split)}

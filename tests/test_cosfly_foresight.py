@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from specimens_planning import WORLDS, scenario_of, town_of, walk_along
 
-from cosfly.geometry import flight_metrics, kernels
+from cosfly.geometry import kernels, trajectory_metrics
 from cosfly.planners import foresight, smoothing
 from cosfly.planners.contract import PlanConfig, load_planner
 from cosfly.planners.stage import make_scenario, plan_on
-from cosfly.runtime.chance import rng_for
+from cosfly.runtime.seeding import rng_for
 
 CFG = PlanConfig()
 
@@ -35,11 +35,11 @@ def test_the_wished_places_are_in_the_lattice_and_cost_nothing():
     scenario, _ = scenario_of("corner")
     for climbing in (False, True):
         made = foresight.make_lattice(scenario, climbing=climbing)
-        wished = scenario.wish.places_m(scenario.targets_m, scenario.ground_m)[made.frames]
+        requested = scenario.reference.places_m(scenario.targets_m, scenario.ground_m)[made.frames]
         ring = foresight.RINGS.index((0, 0))
-        np.testing.assert_allclose(made.places_m[:, ring, 0], wished, atol=1e-9)
+        np.testing.assert_allclose(made.places_m[:, ring, 0], requested, atol=1e-9)
         assert (made.costs[:, ring, 0] == 0).all()
-        assert (np.delete(made.costs.reshape(len(wished), -1), ring * foresight.NUM_AZIMUTHS, axis=1) > 0).all()
+        assert (np.delete(made.costs.reshape(len(requested), -1), ring * foresight.NUM_AZIMUTHS, axis=1) > 0).all()
         assert (made.frames[0], made.frames[-1]) == (0, len(scenario.targets_m) - 1)
         away_m = np.hypot(*(made.places_m - scenario.targets_m[made.frames, None, None])[..., :2].T)
         assert made.radius_max_m == pytest.approx(away_m.max())
@@ -113,15 +113,15 @@ def test_no_sequence_of_places_is_cheaper(seed):
 def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
     obstacles = random_town(seed)
     scenario = straight_scenario(obstacles, 60.0)
-    raw = foresight.search_flight(scenario, foresight.make_lattice(scenario, climbing=False), obstacles, CFG, 3.0)
-    points, facts = smoothing.smooth_flight(raw, scenario, obstacles, CFG, 3.0)
+    raw = foresight.search_trajectory(scenario, foresight.make_lattice(scenario, climbing=False), obstacles, CFG, 3.0)
+    points, facts = smoothing.smooth_trajectory(raw, scenario, obstacles, CFG, 3.0)
     assert facts["smooth"]
     assert not smoothing.unsafe(points, obstacles, 3.0, CFG.speed_max_mps * scenario.dt_s).any()
     assert (points[:, 2] >= 20.0).all()
     seen, seen_raw = (kernels.visibility(obstacles, flight, scenario.targets_m).mean() for flight in (points, raw))
     assert seen >= seen_raw - 0.01
     assert facts["raw_visibility"] == pytest.approx(seen_raw, abs=1e-4)
-    assert flight_metrics.jerk_rms(points) <= max(0.3 * flight_metrics.jerk_rms(raw), 0.05)
+    assert trajectory_metrics.jerk_rms(points) <= max(0.3 * trajectory_metrics.jerk_rms(raw), 0.05)
 
 
 # --- whole flights ----------------------------------------------------------------------------------------------------
@@ -148,10 +148,10 @@ def test_it_changes_sides_before_a_row_of_trees_hides_the_walker():
     canopies = [((x, -6, 6), (4.5, 2.5, 5.5)) for x in range(40, 101, 8)]
     obstacles = kernels.obstacle_index(town_of(*canopies))
     scenario = make_scenario(walk_along("w", [(0, 0), (90, 0)]), obstacles, CFG)
-    right = replace(scenario.wish, bearing_rad=np.full_like(scenario.wish.bearing_rad, 1.5 * np.pi))
-    scenario = replace(scenario, wish=right)
-    wished = right.places_m(scenario.targets_m, scenario.ground_m)
-    assert kernels.visibility(obstacles, wished, scenario.targets_m).mean() < 0.6
+    right = replace(scenario.reference, bearing_rad=np.full_like(scenario.reference.bearing_rad, 1.5 * np.pi))
+    scenario = replace(scenario, reference=right)
+    requested = right.places_m(scenario.targets_m, scenario.ground_m)
+    assert kernels.visibility(obstacles, requested, scenario.targets_m).mean() < 0.6
     flown = fly("foresight", scenario, obstacles).positions_m
     assert kernels.visibility(obstacles, flown, scenario.targets_m).mean() > 0.99
 
@@ -160,14 +160,16 @@ def test_a_wished_bearing_counts_for_more_than_a_short_way(subtests):
     for bearing_rad in [0.0, np.pi / 2, np.pi]:
         with subtests.test(bearing_rad=bearing_rad):
             scenario, obstacles = scenario_of("empty")
-            wish = replace(
-                scenario.wish, bearing_rad=np.full_like(scenario.wish.bearing_rad, bearing_rad), any_bearing=False
+            reference = replace(
+                scenario.reference,
+                bearing_rad=np.full_like(scenario.reference.bearing_rad, bearing_rad),
+                any_bearing=False,
             )
-            points = fly("foresight", replace(scenario, wish=wish), obstacles).positions_m
+            points = fly("foresight", replace(scenario, reference=reference), obstacles).positions_m
             away = points - scenario.targets_m
-            off = np.arctan2(away[:, 1], away[:, 0]) - (wish.heading_rad + bearing_rad)
+            off = np.arctan2(away[:, 1], away[:, 0]) - (reference.heading_rad + bearing_rad)
             assert np.abs(np.angle(np.exp(1j * off))).mean() < np.radians(8)
-            assert np.abs(np.linalg.norm(away, axis=1) - wish.distance_m).mean() < 3.0
+            assert np.abs(np.linalg.norm(away, axis=1) - reference.distance_m).mean() < 3.0
 
 
 # --- from where a drone is --------------------------------------------------------------------------------------------

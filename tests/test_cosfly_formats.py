@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
+from cosfly.formats.pedestrian_paths import PedestrianTrajectory, read_paths, write_paths
 from cosfly.formats.roi import read_roi
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
-from cosfly.formats.walks import Walk, read_paths, write_paths
 from cosfly.runtime.errors import InputError
 
 
@@ -63,7 +63,9 @@ def test_roi_forms(tmp_path):
 
 def a_path(n=4):
     t = np.arange(n) * 0.5
-    return Walk("path_00000", np.array([[0.0, 0], [3, 4]]), t, np.stack([t, t, 0 * t], axis=1), np.ones(n))
+    return PedestrianTrajectory(
+        "path_00000", np.array([[0.0, 0], [3, 4]]), t, np.stack([t, t, 0 * t], axis=1), np.ones(n)
+    )
 
 
 def a_trace(n=4):

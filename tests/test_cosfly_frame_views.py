@@ -17,8 +17,8 @@ from caption.teachers.images import FrameEncoder, pictures_of
 from caption.teachers.prompts import make_question, prompt_hash, question_messages
 from caption.teachers.teacher import RuleTeacher
 from cosfly.formats.captions import PICTURES_MARK, Language
-from cosfly.formats.flights import find_flights
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import InputError
 from cosfly.viz.frame_views import PEDESTRIAN_RGB, Pictures
 from distill.inference.stage import InferConfig, make_request
@@ -35,7 +35,7 @@ def tree(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def frame(tree):
-    return read_flight(find_flights(tree)[0]).frame_folder(1)
+    return read_track(find_tracks(tree)[0]).frame_folder(1)
 
 
 def test_the_middle_is_cut_out_wherever_the_person_is(tmp_path):
@@ -98,7 +98,7 @@ def sent_pictures(messages: list[dict]) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def window(tree) -> Window:
-    return next(cut_windows(read_flight(find_flights(tree)[0]), WindowConfig()))
+    return next(cut_windows(read_track(find_tracks(tree)[0]), WindowConfig()))
 
 
 def ask(window: Window, cfg: ImageConfig) -> tuple[dict[Language, str], list[np.ndarray]]:
@@ -170,7 +170,7 @@ def large(tmp_path_factory):
     """A window of a flight in pictures of 640 x 360."""
     root = tmp_path_factory.mktemp("large")
     make_playback_tree(root, 1, 10, seed=1, width_px=640, height_px=360, with_augmented=False)
-    return next(cut_windows(read_flight(find_flights(root)[0]), WindowConfig())).observed
+    return next(cut_windows(read_track(find_tracks(root)[0]), WindowConfig())).observed
 
 
 @pytest.mark.parametrize("max_side_px", [640, 500])

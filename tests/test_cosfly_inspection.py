@@ -15,10 +15,9 @@ import pytest
 from hypothesis import strategies as st
 
 from cosfly.formats.boxes import make_box_map, read_boxes, write_boxes
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import (
-    OtherMeta,
-    OthersMeta,
+    BystanderMeta,
+    BystandersMeta,
     depth_file,
     frame_name,
     read_depth,
@@ -28,16 +27,17 @@ from cosfly.formats.frames import (
 from cosfly.formats.inspection import read_inspection
 from cosfly.formats.issues import Report
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.playback import read_flight, write_flight
+from cosfly.formats.playback import read_track, write_track
 from cosfly.formats.traces import DroneTrace, write_traces
+from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import mask_box
 from cosfly.geometry.kernels import obstacle_index, signed_distances
 from cosfly.inspection import frames
 from cosfly.inspection.files import check_recorded
-from cosfly.inspection.flight import check_plan, is_shifted
 from cosfly.inspection.frames import check_others, pedestrian_region
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
+from cosfly.inspection.track import check_plan, is_shifted
 from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import NothingKept
 from cosfly.runtime.files import sha256_file
@@ -50,7 +50,7 @@ NUM_POINTS = 10
 
 def plan_of(folder: Path) -> DroneTrace:
     """The plan that a specimen flight was flown from."""
-    flight = read_flight(folder)
+    flight = read_track(folder)
     n = len(flight)
     return DroneTrace(
         flight.source["scenario_id"], "muco", flight.time_s, flight.positions_m, flight.rotations_deg, flight.targets_m,
@@ -67,7 +67,7 @@ def write_map(workplace: Path, *boxes) -> None:
 
 
 def list_files(tree: Path) -> None:
-    for folder in find_flights(tree):
+    for folder in find_tracks(tree):
         files = [p for p in folder.rglob("*") if p.is_file() and p.name != CHECKSUMS]
         write_checksums(folder, {p.relative_to(folder).as_posix(): sha256_file(p) for p in files})
 
@@ -78,7 +78,7 @@ def specimen(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("specimen")
     tree = make_playback_tree(root / "tree", num_flights=2, num_points=NUM_POINTS, width_px=192, height_px=108)
     list_files(tree)
-    plans = [plan_of(folder) for folder in find_flights(tree) if folder.name == "ORI"]
+    plans = [plan_of(folder) for folder in find_tracks(tree) if folder.name == "ORI"]
     write_traces(root / "drone_trace.json", plans, {})
     write_map(root)
     return root
@@ -102,7 +102,7 @@ def inspect(workplace: Path, cfg: InspectConfig = CFG, out: str = "out", **more)
 
 
 def first_flight(workplace: Path, variant: str = "ORI") -> Path:
-    return next(f for f in find_flights(workplace / "tree") if f.name == variant)
+    return next(f for f in find_tracks(workplace / "tree") if f.name == variant)
 
 
 def codes_of(inspection, folder: Path) -> dict[str, str]:
@@ -119,7 +119,7 @@ def test_clean_flights_are_accepted(workplace):
         "planned": 2, "dropped": {}, "not_rendered": 0, "rendered": 2, "accepted": 2, "review": 0, "rejected": 0,
     }  # fmt: skip
     metrics = found.flights[0].metrics
-    flight = read_flight(first_flight(workplace))
+    flight = read_track(first_flight(workplace))
     assert metrics["rendered_visibility_mean"] == pytest.approx(flight.visibility.mean(), abs=1e-4)
     assert metrics["num_frames_checked"] == NUM_POINTS
     assert 0.5 < metrics["track_quality"] <= 1.0  # the specimen's person fills its box
@@ -128,7 +128,7 @@ def test_clean_flights_are_accepted(workplace):
 def test_what_a_tree_was_never_to_have_is_not_missing(workplace):
     """Colours alone were drawn (`render.modalities`): the checksums list nothing else. Files that they list were
     lost."""
-    lost, never = find_flights(workplace / "tree")[:2]
+    lost, never = find_tracks(workplace / "tree")[:2]
     for folder in (lost, never):
         for path in [*folder.rglob("depth.npy"), *folder.rglob("instance.png")]:
             path.unlink()
@@ -145,10 +145,10 @@ def test_checksums_that_the_tree_lists_cannot_be_taken_away(workplace):
     tree = workplace / "tree"
     names = [f"{flight.relative_to(tree).as_posix()}/{name}" for name in ("trajectory.json", CHECKSUMS)]
     recorded = {name: sha256_file(tree / name) for name in names}
-    check_recorded(read_flight(flight), tree, recorded, report)
+    check_recorded(read_track(flight), tree, recorded, report)
     assert report.issues == []
     (flight / CHECKSUMS).unlink()
-    check_recorded(read_flight(flight), tree, recorded, report)
+    check_recorded(read_track(flight), tree, recorded, report)
     assert [(issue.code, issue.where) for issue in report.issues] == [("missing_file", CHECKSUMS)]
 
 
@@ -199,7 +199,7 @@ def findings(workplace: Path, cfg: InspectConfig = CFG) -> dict[str, dict[str, s
 
 def test_each_track_is_measured_against_the_map_by_its_own_poses(workplace):
     """A post stands in the middle of one perturbed pose, another 2 m beside a clean one."""
-    clean, shaken = (read_flight(first_flight(workplace, variant)) for variant in ("ORI", "aug_001"))
+    clean, shaken = (read_track(first_flight(workplace, variant)) for variant in ("ORI", "aug_001"))
     i = int(np.argmax(np.linalg.norm(shaken.positions_m - clean.positions_m, axis=1)))
     away = shaken.positions_m[i] - clean.positions_m[i]
     assert np.linalg.norm(away) > 0.5
@@ -221,7 +221,7 @@ def test_each_track_is_measured_against_the_map_by_its_own_poses(workplace):
     ("beside_m", "codes"), [(2.6, set()), (2.4, {"clearance"}), (-0.1, {"collision", "clearance"})]
 )
 def test_clearance_has_a_floor(workplace, beside_m, codes):
-    flight = read_flight(first_flight(workplace))
+    flight = read_track(first_flight(workplace))
     top = flight.positions_m[:, 2].max()
     write_map(workplace, ([*flight.positions_m[:, :2].mean(axis=0), top + beside_m + 50.0], [500.0, 500.0, 50.0]))
     found = findings(workplace)["ORI"].keys() & {"clearance", "collision"}
@@ -230,7 +230,7 @@ def test_clearance_has_a_floor(workplace, beside_m, codes):
 
 
 def test_a_post_between_two_poses_is_a_collision(workplace):
-    positions_m = read_flight(first_flight(workplace)).positions_m
+    positions_m = read_track(first_flight(workplace)).positions_m
     i = int(np.argmax(np.linalg.norm(np.diff(positions_m, axis=0), axis=1)))
     write_map(workplace, (0.5 * (positions_m[i] + positions_m[i + 1]), [0.01, 0.01, 0.01]))
     assert findings(workplace, InspectConfig(clearance_min_m=0.0))["ORI"]["collision"] == "error"
@@ -240,9 +240,9 @@ def test_a_post_between_two_poses_is_a_collision(workplace):
 def test_the_way_between_frames_is_the_one_that_was_flown(workplace, up_m, is_hit):
     """Of a flight whose drawn frames leave poses out, which lie 3 m over the straight line from frame to frame."""
     folder = first_flight(workplace)
-    flight = read_flight(folder)
+    flight = read_track(folder)
     middles = 0.5 * (flight.planned[0] + np.roll(flight.planned[0], -1, axis=0)) + [0.0, 0.0, 3.0, 0.0, 0.0, 0.0]
-    write_flight(folder, replace(flight, between=middles[:, None]))
+    write_track(folder, replace(flight, between=middles[:, None]))
     i = int(np.argmax(np.linalg.norm(np.diff(flight.positions_m, axis=0), axis=1)))
     write_map(workplace, (middles[i, :3] + [0.0, 0.0, up_m - 3.0], [0.01, 0.01, 0.01]))
     found = findings(workplace, InspectConfig(clearance_min_m=0.0, check_checksums=False))
@@ -250,7 +250,7 @@ def test_the_way_between_frames_is_the_one_that_was_flown(workplace, up_m, is_hi
 
 
 def test_what_hides_or_holds_the_person_is_found(workplace):
-    flight = read_flight(first_flight(workplace))
+    flight = read_track(first_flight(workplace))
     write_map(workplace, (flight.targets_m[4], [0.1, 0.1, 0.1]))
     assert findings(workplace)["ORI"]["collision"] == "error"
     middle = 0.5 * (flight.positions_m + flight.targets_m).mean(axis=0)
@@ -262,7 +262,7 @@ def test_what_hides_or_holds_the_person_is_found(workplace):
 
 def test_a_shift_that_hides_what_the_clean_flight_shows_goes_to_review(workplace):
     folder = first_flight(workplace, "aug_001")
-    shaken = read_flight(folder)
+    shaken = read_track(folder)
     shifted = np.flatnonzero(is_shifted(shaken))
     still = np.flatnonzero(~is_shifted(shaken))
     for i in (shifted[0], *still[:1]):
@@ -479,7 +479,7 @@ def test_far_is_far(workplace, form):
 def test_a_flight_that_its_tree_does_not_list(workplace):
     """The tree's manifest lists the other flights, and another digest of one."""
     tree, broken, twin = workplace / "tree", first_flight(workplace), first_flight(workplace, "aug_001")
-    files = [folder / "trajectory.json" for folder in find_flights(tree) if folder != broken]
+    files = [folder / "trajectory.json" for folder in find_tracks(tree) if folder != broken]
     outputs = [
         {"path": p.relative_to(tree).as_posix(), "bytes": 1, "sha256": "0" * 64 if p.parent == twin else sha256_file(p)}
         for p in files
@@ -544,8 +544,8 @@ def test_every_check_has_a_planted_defect():
     assert codes == planted | elsewhere
 
 
-def other_at(place_m, kind: str = "Pedestrians", number: int = 7) -> OtherMeta:
-    return OtherMeta(
+def other_at(place_m, kind: str = "Pedestrians", number: int = 7) -> BystanderMeta:
+    return BystanderMeta(
         instance_id=number, semantic_id=KINDS[kind], world_location=tree_position(np.asarray(place_m, float)), yaw=0.0,
         half_extents_m=(0.3, 0.3, 0.9), num_pixels=0,
     )  # fmt: skip
@@ -563,10 +563,10 @@ def other_at(place_m, kind: str = "Pedestrians", number: int = 7) -> OtherMeta:
     ids=["at_the_drone", "below_the_drone", "in_the_person", "beside_the_person", "a_tree"],
 )
 def test_others_keep_clear_of_drone_and_person(workplace, beside, shift_m, codes):
-    flight, report, metrics = read_flight(first_flight(workplace)), Report(), {}
+    flight, report, metrics = read_track(first_flight(workplace)), Report(), {}
     place_m = (flight.positions_m if beside == "drone" else flight.targets_m)[3] + np.array(shift_m)
     other = other_at(place_m, "Vegetation" if beside == "kind" else "Pedestrians")
-    told = OthersMeta(target_hidden_by_others=0.25, target_hidden_by_map=0.0, others=[other])
+    told = BystandersMeta(target_hidden_by_others=0.25, target_hidden_by_map=0.0, others=[other])
     check_others(flight, {3: told, 4: told.model_copy(update={"others": []})}, 2.5, report, metrics)
     assert {issue.code for issue in report.issues} == codes
     assert (metrics["num_others"], metrics["occluded_by_others_share"], metrics["hidden_by_others_max"]) == (
@@ -597,7 +597,7 @@ def test_a_clean_flight_of_other_frames_leaves_the_perturbed_one_to_a_person(wor
 
 
 def test_the_funnel_counts_prefiltered_and_unrendered_plans(workplace):
-    plans = [plan_of(f) for f in find_flights(workplace / "tree") if f.name == "ORI"]
+    plans = [plan_of(f) for f in find_tracks(workplace / "tree") if f.name == "ORI"]
     extra = [
         replace(plans[0], path_id="low", drop_reason="five_ray_visibility"),
         replace(plans[0], path_id="rough", drop_reason="smoothness"),

@@ -10,14 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, write_boxes
+from cosfly.formats.bystanders import Bystander, Bystanders, gaps_m, read_bystanders, write_bystanders
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.others import Company, Other, gaps_m, read_others, write_others
-from cosfly.formats.walks import read_paths
+from cosfly.formats.pedestrian_paths import read_paths
+from cosfly.pedestrians.bystanders import PASS_M, bystanders_of
 from cosfly.pedestrians.lanes import lanes_of
-from cosfly.pedestrians.others import PASS_M, company_of
-from cosfly.pedestrians.stage import PedestriansConfig, make_walk, run, walkable_ground
-from cosfly.runtime.chance import rng_for
+from cosfly.pedestrians.stage import PedestriansConfig, make_pedestrian, run, walkable_ground
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.store import dump_json
 
 PERSON, CAR = "Pedestrians", "Car"
@@ -39,14 +39,14 @@ def crossing_town(*more: tuple[str, tuple, tuple]) -> BoxMap:
     )
 
 
-def standing(kind: str, x: float, y: float, heading_rad: float = 0.0, n: int = 2) -> Other:
-    return Other(kind, np.tile([x, y, 0.0], (n, 1)), np.full(n, heading_rad))
+def standing(kind: str, x: float, y: float, heading_rad: float = 0.0, n: int = 2) -> Bystander:
+    return Bystander(kind, np.tile([x, y, 0.0], (n, 1)), np.full(n, heading_rad))
 
 
-def going(kind: str, start, end, n: int = 2) -> Other:
+def going(kind: str, start, end, n: int = 2) -> Bystander:
     start, end = np.array([*start, 0.0]), np.array([*end, 0.0])
     places = start + np.linspace(0.0, 1.0, n)[:, None] * (end - start)
-    return Other(kind, places, np.full(n, np.arctan2(*(end - start)[1::-1])))
+    return Bystander(kind, places, np.full(n, np.arctan2(*(end - start)[1::-1])))
 
 
 # --- the product ------------------------------------------------------------------------------------------------------
@@ -57,7 +57,7 @@ def going(kind: str, start, end, n: int = 2) -> Other:
 def test_gaps_agree_with_many_small_steps(seed):
     rng = np.random.default_rng(seed)
     one, two = (
-        Other(PERSON, np.column_stack([rng.uniform(-3, 3, (4, 2)), np.zeros(4)]), np.zeros(4)) for _ in range(2)
+        Bystander(PERSON, np.column_stack([rng.uniform(-3, 3, (4, 2)), np.zeros(4)]), np.zeros(4)) for _ in range(2)
     )
     shares = np.linspace(0.0, 1.0, 2001)
     for step, gap in enumerate(gaps_m(one, two)):
@@ -70,15 +70,15 @@ def test_gaps_agree_with_many_small_steps(seed):
 
 def test_others_round_trip_and_bad_files(tmp_path):
     path = tmp_path / "others.json"
-    write_others(
+    write_bystanders(
         path,
         [
-            Company("p", [going(CAR, (0, 0), (4, 3)), replace(standing(PERSON, 1, 1), is_look_alike=True)]),
-            Company("q", []),
+            Bystanders("p", [going(CAR, (0, 0), (4, 3)), replace(standing(PERSON, 1, 1), is_look_alike=True)]),
+            Bystanders("q", []),
         ],
         {"map": "T"},
     )
-    first, second = read_others(path)
+    first, second = read_bystanders(path)
     assert (first.path_id, second.path_id, second.others) == ("p", "q", [])
     assert [other.kind for other in first.others] == [CAR, PERSON]
     assert [other.is_look_alike for other in first.others] == [False, True]
@@ -95,13 +95,13 @@ def test_others_round_trip_and_bad_files(tmp_path):
         assert old in text
         (tmp_path / "bad.json").write_text(text.replace(old, new, 1))
         with pytest.raises(InputError, match=words):
-            read_others(tmp_path / "bad.json")
+            read_bystanders(tmp_path / "bad.json")
     value = json.loads(path.read_text())
     for axis in ("x", "y", "z", "yaw"):
         value["paths"][0]["others"][1][axis].append(1.0)
     path.write_text(json.dumps(value))
     with pytest.raises(InputError, match=r"paths\[0\]\.others.*|different lengths"):
-        read_others(path)
+        read_bystanders(path)
 
 
 # --- lanes ------------------------------------------------------------------------------------------------------------
@@ -140,14 +140,14 @@ def placed():
     ground, lanes = walkable_ground(box_map, CFG), lanes_of(box_map)
     made = []
     for k in range(4):
-        walk = make_walk(f"p{k}", ground, CFG, rng_for(0, "pedestrians", str(k))).walk
-        made.append((walk, company_of(walk, ground, lanes, CFG, rng_for(0, "others", str(k)))))
+        walk = make_pedestrian(f"p{k}", ground, CFG, rng_for(0, "pedestrians", str(k))).walk
+        made.append((walk, bystanders_of(walk, ground, lanes, CFG, rng_for(0, "others", str(k)))))
     return box_map, ground, lanes, made
 
 
 def test_nobody_meets_anybody(placed):
-    for walk, company in placed[3]:
-        everybody = [Other(PERSON, walk.positions_m, np.zeros(len(walk.time_s))), *company.others]
+    for walk, bystanders in placed[3]:
+        everybody = [Bystander(PERSON, walk.positions_m, np.zeros(len(walk.time_s))), *bystanders.others]
         for k, one in enumerate(everybody):
             assert len(one.positions_m) == len(walk.time_s)
             for two in everybody[:k]:
@@ -158,11 +158,11 @@ def test_nobody_meets_anybody(placed):
 
 def test_people_walk_where_people_walk_and_cars_drive_on_the_road(placed):
     _, ground, _, made = placed
-    kinds = [other.kind for _, company in made for other in company.others]
+    kinds = [other.kind for _, bystanders in made for other in bystanders.others]
     assert kinds.count(PERSON) >= 20
     assert kinds.count(CAR) >= 12
-    for walk, company in made:
-        for other in company.others:
+    for walk, bystanders in made:
+        for other in bystanders.others:
             step_mps = np.linalg.norm(np.diff(other.positions_m, axis=0), axis=1) / np.diff(walk.time_s)
             assert step_mps.max() <= (10.0 if other.kind == CAR else 2.0)
             assert step_mps.max() > 0.5, "somebody who moves"
@@ -183,29 +183,31 @@ def test_people_walk_where_people_walk_and_cars_drive_on_the_road(placed):
 
 def test_people_pass_the_walker_and_look_alikes_are_among_them(placed):
     away_m, starts_m = [], []
-    for walk, company in placed[3]:
-        people = [other for other in company.others if other.kind == PERSON]
+    for walk, bystanders in placed[3]:
+        people = [other for other in bystanders.others if other.kind == PERSON]
         away_m += [np.linalg.norm(one.positions_m - walk.positions_m, axis=1).min() for one in people]
         starts_m.append(np.linalg.norm(people[0].positions_m[0] - walk.positions_m[0]))
         assert sum(other.is_look_alike for other in people) <= 2
         assert people[0].is_look_alike
-        assert not any(other.is_look_alike for other in company.others[len(people) :])
+        assert not any(other.is_look_alike for other in bystanders.others[len(people) :])
     assert np.mean(np.array(away_m) < PASS_M[1] + 1.5) >= 0.8
     assert np.median(starts_m) < PASS_M[1] + 1.5
 
 
 def test_the_same_numbers_give_the_same_company_and_more_keep_the_first(placed):
     _, ground, lanes, made = placed
-    walk, company = made[0]
-    again = company_of(walk, ground, lanes, CFG, rng_for(0, "others", "0"))
-    assert dump_json(again.as_json()) == dump_json(company.as_json())
-    other = company_of(walk, ground, lanes, CFG, rng_for(1, "others", "0"))
-    assert dump_json(other.as_json()) != dump_json(company.as_json())
-    fewer = company_of(
+    walk, bystanders = made[0]
+    again = bystanders_of(walk, ground, lanes, CFG, rng_for(0, "others", "0"))
+    assert dump_json(again.as_json()) == dump_json(bystanders.as_json())
+    other = bystanders_of(walk, ground, lanes, CFG, rng_for(1, "others", "0"))
+    assert dump_json(other.as_json()) != dump_json(bystanders.as_json())
+    fewer = bystanders_of(
         walk, ground, lanes, CFG.model_copy(update={"others": 2, "traffic": 0}), rng_for(0, "others", "0")
     )
-    assert [o.as_json() for o in fewer.others] == [o.as_json() for o in company.others[:2]]
-    assert {o.kind for o in company_of(walk, ground, [], CFG, np.random.default_rng(0)).others} == {PERSON}, "no road"
+    assert [o.as_json() for o in fewer.others] == [o.as_json() for o in bystanders.others[:2]]
+    assert {o.kind for o in bystanders_of(walk, ground, [], CFG, np.random.default_rng(0)).others} == {PERSON}, (
+        "no road"
+    )
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
@@ -222,10 +224,12 @@ def test_the_stage_writes_others_only_where_they_are_wanted(tmp_path: Path, capl
         run(cfg, tmp_path / "map.json", tmp_path / folder, workers=workers)
     one, two = ((tmp_path / folder / "others.json").read_bytes() for folder in ("one", "two"))
     assert one == two
-    walks, companies = read_paths(tmp_path / "one/path.json"), read_others(tmp_path / "one/others.json")
-    assert [walk.path_id for walk in walks] == [company.path_id for company in companies]
+    walks, companions = read_paths(tmp_path / "one/path.json"), read_bystanders(tmp_path / "one/others.json")
+    assert [walk.path_id for walk in walks] == [bystanders.path_id for bystanders in companions]
     for before, walk in zip(read_paths(tmp_path / "none/path.json"), walks, strict=True):
         np.testing.assert_array_equal(before.positions_m, walk.positions_m)
     counts = json.loads((tmp_path / "one/pedestrians_report.json").read_text())["others"]
-    placed = [sum(other.kind == kind for company in companies for other in company.others) for kind in (PERSON, CAR)]
+    placed = [
+        sum(other.kind == kind for bystanders in companions for other in bystanders.others) for kind in (PERSON, CAR)
+    ]
     assert counts == {PERSON: {"wanted": 9, "placed": placed[0]}, CAR: {"wanted": 6, "placed": placed[1]}}

@@ -12,11 +12,11 @@ from test_renderers_contract import circling, street, write_inputs
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import read_instance, read_meta, read_rgb
-from cosfly.formats.playback import read_flight
+from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
+from cosfly.formats.playback import read_track
 from cosfly.formats.town import read_instance_ids
-from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
+from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import box_corners, intrinsic_matrix, project, world_from_camera
 from cosfly.render.contract import instance_ids
 from cosfly.render.settings import RenderConfig
@@ -47,13 +47,13 @@ def trees(tmp_path_factory) -> dict[bool, Path]:
 
 
 def frame_of(tree: Path, index: int = 1) -> Path:
-    return read_flight(find_flights(tree)[0]).frame_folder(index)
+    return read_track(find_tracks(tree)[0]).frame_folder(index)
 
 
 @needs_gl
 def test_debug_pictures_are_written_where_they_are_asked_for(trees):
     assert not list(trees[False].rglob("debug.png"))
-    (folder,) = find_flights(trees[True])
+    (folder,) = find_tracks(trees[True])
     named = [name for name in read_checksums(folder) if name.endswith("debug.png")]
     assert len(named) == len(list(folder.rglob("debug.png"))) == 3
     for name in ("rgb.png", "depth_float32.png", "instance.png"):
@@ -63,7 +63,7 @@ def test_debug_pictures_are_written_where_they_are_asked_for(trees):
 @needs_gl
 def test_the_targets_box_stands_where_its_corners_are(trees):
     frame = frame_of(trees[True])
-    flight, meta = read_flight(find_flights(trees[True])[0]), read_meta(frame)
+    flight, meta = read_track(find_tracks(trees[True])[0]), read_meta(frame)
     drawn = np.asarray(Image.open(frame / "debug.png"))
     corners = box_corners(flight.targets_m[1], np.array(PERSON_HALF_EXTENTS_M))
     pose = world_from_camera(flight.positions_m[1], flight.rotations_deg[1])
@@ -110,5 +110,5 @@ def test_without_boxes_there_is_one_clear_error(trees, tmp_path):
 
 @needs_gl
 def test_ids_of_boxes_are_those_of_the_renderer(trees):
-    ids = read_instance_ids(find_flights(trees[True])[0].parents[1])
+    ids = read_instance_ids(find_tracks(trees[True])[0].parents[1])
     assert ids.of_boxes(street()).tolist() == instance_ids(street()).tolist()

@@ -8,21 +8,21 @@ import pytest
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.formats.ground import Ground
 from cosfly.formats.kinds import KINDS
+from cosfly.formats.pedestrian_paths import paces_of, read_paths
 from cosfly.formats.roi import Roi
-from cosfly.formats.walks import paces_of, read_paths
 from cosfly.geometry.axes import DT_S
 from cosfly.geometry.grid import OccupancyGrid
 from cosfly.pedestrians.crossings import costs_of
 from cosfly.pedestrians.stage import (
     PedestriansConfig,
     WalkableGround,
-    make_walk,
+    make_pedestrian,
     run,
     sample_goal,
     sample_start,
     walkable_ground,
 )
-from cosfly.runtime.chance import rng_for
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.store import dump_json
 
 BUILDINGS, ROADS, WATER = KINDS["Buildings"], KINDS["Roads"], KINDS["Water"]
@@ -129,7 +129,7 @@ def test_the_region_of_interest_bounds_every_walk():
     )
     ground = walkable_ground(town(), PedestriansConfig(), roi)
     assert ground.counts["cells_in_roi"] == 280 * 280 - 80 * 80
-    walk = make_walk("path_00000", ground, PedestriansConfig(), np.random.default_rng(0))
+    walk = make_pedestrian("path_00000", ground, PedestriansConfig(), np.random.default_rng(0))
     for xy in walk.walk.polyline_m:
         assert (xy > 10).all()
         assert (xy < 150).all()
@@ -158,7 +158,7 @@ def test_people_walk_where_the_settings_say(ground, columns):
 def test_a_walk_keeps_every_promise(number, dt_s):
     cfg = PedestriansConfig(dt_s=dt_s)
     ground = walkable_ground(town(), cfg)
-    path = make_walk(f"path_{number:05d}", ground, cfg, rng_for(0, "pedestrians", str(number))).walk
+    path = make_pedestrian(f"path_{number:05d}", ground, cfg, rng_for(0, "pedestrians", str(number))).walk
     assert 50 <= np.linalg.norm(path.polyline_m[-1] - path.polyline_m[0]) <= 100
     np.testing.assert_allclose(path.time_s, np.arange(len(path.time_s)) * dt_s)
     np.testing.assert_allclose(path.positions_m[[0, -1], :2], path.polyline_m[[0, -1]], atol=1e-9)
@@ -176,7 +176,7 @@ def test_a_walk_depends_on_its_own_random_numbers_only():
     cfg = PedestriansConfig()
     ground = walkable_ground(town(), cfg)
     texts = [
-        dump_json(make_walk("p", ground, cfg, rng_for(seed, "pedestrians", name)).walk.as_json())
+        dump_json(make_pedestrian("p", ground, cfg, rng_for(seed, "pedestrians", name)).walk.as_json())
         for seed, name in ((0, "a"), (0, "a"), (0, "b"), (1, "a"))
     ]
     assert texts[0] == texts[1]
@@ -195,9 +195,10 @@ def test_a_detour_is_given_up_and_counted():
     # A wall of 90 m with a way round it at one end only: near the other end, 10 m across are 150 m on foot.
     ground = ground_of("\n".join(["1" * 100] * 5 + ["0" * 95 + "1" * 5] + ["1" * 100] * 5))
     cfg = PedestriansConfig(resolution_m=1.0, min_distance_m=4, max_distance_m=11, num_retries=50, max_detour=2.0)
-    walks = [make_walk("p", ground, cfg, np.random.default_rng(k)) for k in range(40)]
+    walks = [make_pedestrian("p", ground, cfg, np.random.default_rng(k)) for k in range(40)]
     free_walks = [
-        make_walk("p", ground, cfg.model_copy(update={"max_detour": 0.0}), np.random.default_rng(k)) for k in range(40)
+        make_pedestrian("p", ground, cfg.model_copy(update={"max_detour": 0.0}), np.random.default_rng(k))
+        for k in range(40)
     ]
 
     def worst(walks):

@@ -8,10 +8,10 @@ import pytest
 from specimens_planning import WORLDS, walk_along
 
 from cosfly.formats.boxes import write_boxes
-from cosfly.formats.walks import write_paths
+from cosfly.formats.pedestrian_paths import write_paths
 from cosfly.planners import benchmark
 from cosfly.planners.benchmark import CRITERIA, PAPER, WEIGHTS, BenchmarkConfig, read_benchmark
-from cosfly.planners.compare import FlightsOfWalk
+from cosfly.planners.compare import TrajectoriesOfPath
 from cosfly.planners.contract import ALL_PLANNERS
 from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.journal import Journal
@@ -100,7 +100,7 @@ def test_what_is_not_flown_is_counted_and_stays_in_every_table(made):
 
 def test_the_tables_are_those_of_the_flights(made):
     found, records = read_benchmark(made / "benchmark.json"), Journal(made / "items.jsonl").read_as(read_item)
-    flown = {record.id: result_of(record, FlightsOfWalk) for record in records}
+    flown = {record.id: result_of(record, TrajectoriesOfPath) for record in records}
     assert [set(one.flights) | set(one.errors) for one in flown.values()] == [set(FEW)] * 2
     traces = [one.traces(walk_id) for walk_id, one in flown.items()]
     for planner in ("track_astar", "muco", "theta_star"):

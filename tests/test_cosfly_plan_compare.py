@@ -7,8 +7,8 @@ import pytest
 from specimens_planning import CANYON, town_of, walk_along
 
 from cosfly.formats.boxes import write_boxes
+from cosfly.formats.pedestrian_paths import write_paths
 from cosfly.formats.traces import read_traces
-from cosfly.formats.walks import write_paths
 from cosfly.planners import compare
 from cosfly.planners.compare import CompareConfig
 from cosfly.runtime.errors import NoPathError
@@ -112,7 +112,7 @@ def test_the_record_is_what_the_flights_are(made):
 
 
 def test_a_walk_that_one_planner_cannot_fly_is_counted(inputs, tmp_path, monkeypatch):
-    real = compare.plan_flight
+    real = compare.plan_trajectory
 
     def lame(walk, obstacles, cfg, *rest):
         if walk.path_id == "b" and cfg.planner == "muco":

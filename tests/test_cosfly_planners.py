@@ -12,12 +12,12 @@ from specimens_planning import CANYON, WORLDS, assert_safe, first_points, scenar
 
 import cosfly.planners.stage as planners
 from cosfly.formats.boxes import write_boxes
+from cosfly.formats.pedestrian_paths import write_paths
 from cosfly.formats.traces import read_traces
-from cosfly.formats.walks import write_paths
-from cosfly.geometry import flight_metrics as metrics
 from cosfly.geometry import kernels
+from cosfly.geometry import trajectory_metrics as metrics
 from cosfly.geometry.axes import DT_S, look_at
-from cosfly.planners.contract import MucoConfig, PlanConfig, Wish
+from cosfly.planners.contract import MucoConfig, PlanConfig, TrackingReference
 from cosfly.planners.muco import loss, muco, step
 from cosfly.planners.muco.nearby import nothing_nearby
 from cosfly.runtime.errors import ResumeError
@@ -86,7 +86,7 @@ def shaken(world, seed=3):
     """A trajectory behind the target, shaken, so that every term is at work."""
     scenario, obstacles = scenario_of(world)
     problem = muco.make_problem(scenario, CFG)
-    points = replace(scenario.wish, ground_distance_m=np.full(len(scenario.targets_m), 18.0)).places_m(
+    points = replace(scenario.reference, ground_distance_m=np.full(len(scenario.targets_m), 18.0)).places_m(
         scenario.targets_m, scenario.ground_m + 1.0
     )
     points += np.random.default_rng(seed).normal(0, 2.5, points.shape)
@@ -112,9 +112,9 @@ def test_the_wish_of_each_waypoint_reaches_the_loss():
     np.testing.assert_array_equal(paper.pitches_rad, np.tile(np.radians([30, 45, 60]), (num, 1)))
     np.testing.assert_array_equal(paper.altitudes, np.tile([20.0, 20.0, 100.0], (num, 1)))
     assert (paper.bearing_weight, paper.altitude_weights[3]) == (1.0, 0.0)
-    np.testing.assert_array_equal(paper.views_rad, scenario.wish.heading_rad)  # the way that the walker goes
-    wished = Wish(
-        heading_rad=scenario.wish.heading_rad,
+    np.testing.assert_array_equal(paper.views_rad, scenario.reference.heading_rad)  # the way that the walker goes
+    requested = TrackingReference(
+        heading_rad=scenario.reference.heading_rad,
         bearing_rad=np.linspace(-3.0, 3.0, num),
         distance_m=np.linspace(12.0, 40.0, num),
         ground_distance_m=np.linspace(9.0, 30.0, num),
@@ -124,10 +124,10 @@ def test_the_wish_of_each_waypoint_reaches_the_loss():
         altitude_max_m=np.full(num, 90.0),
         keeps_sight=np.arange(num) % 2 == 0,
     )
-    problem = muco.make_problem(replace(scenario, wish=wished), CFG)
-    points = wished.places_m(scenario.targets_m, scenario.ground_m)
-    np.testing.assert_allclose(np.hypot(*(points - scenario.targets_m)[:, :2].T), wished.ground_distance_m)
-    np.testing.assert_allclose(points[:, 2], wished.altitude_m)
+    problem = muco.make_problem(replace(scenario, reference=requested), CFG)
+    points = requested.places_m(scenario.targets_m, scenario.ground_m)
+    np.testing.assert_allclose(np.hypot(*(points - scenario.targets_m)[:, :2].T), requested.ground_distance_m)
+    np.testing.assert_allclose(points[:, 2], requested.altitude_m)
     yaw = look_at(points, scenario.targets_m)[1]
     np.testing.assert_allclose(np.angle(np.exp(1j * (yaw - problem.views_rad))), 0, atol=1e-12)
     points += np.random.default_rng(0).normal(0, 2.5, points.shape)

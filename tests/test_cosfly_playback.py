@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import read_instance
-from cosfly.formats.playback import read_flight, write_flight
+from cosfly.formats.playback import read_track, write_track
+from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import project, world_from_camera
 from cosfly.runtime.errors import InputError
 from specimens import PERSON_ID, make_playback_tree
@@ -22,7 +22,7 @@ def tree(tmp_path_factory):
 
 @pytest.fixture
 def clean(tree):
-    return find_flights(tree)[0]
+    return find_tracks(tree)[0]
 
 
 def rewrite(folder, target, change):
@@ -36,7 +36,7 @@ def rewrite(folder, target, change):
 
 
 def test_axes_are_carlas_on_disk_and_right_handed_in_memory(clean):
-    flight = read_flight(clean)
+    flight = read_track(clean)
     raw = json.loads((clean / "trajectory.json").read_text())
     pose = raw["points"][2]["drone_pose"]
     assert_allclose(flight.positions_m[2], [pose["x"], -pose["y"], pose["z"]])
@@ -47,8 +47,8 @@ def test_axes_are_carlas_on_disk_and_right_handed_in_memory(clean):
 def test_poses_and_pictures_agree(tree):
     """Re-projection self-test: pose, intrinsics and target give the stored pixel; the person is there in the mask."""
     seen = 0
-    for folder in find_flights(tree):
-        flight = read_flight(folder)
+    for folder in find_tracks(tree):
+        flight = read_track(folder)
         for i in np.flatnonzero(flight.target_visible):
             uv, z = project(
                 flight.targets_m[i][None],
@@ -78,15 +78,15 @@ def test_round_trip_keeps_unknown_keys_and_numbers(clean, tmp_path):
 
     folder = rewrite(clean, tmp_path / "a", change)
     first = json.loads((folder / "trajectory.json").read_text())
-    flight = read_flight(folder)
+    flight = read_track(folder)
     assert flight.target_bbox[2].tolist() == flight.target_mask_bbox[2].tolist() == [1, 2, 3, 4]
     assert np.isnan(np.delete(flight.target_mask_bbox, 2, axis=0)).all()
-    assert read_flight(clean).target_mask_bbox is None
+    assert read_track(clean).target_mask_bbox is None
     target = tmp_path / "b" / "Town01" / folder.parent.name / folder.name
     target.mkdir(parents=True)
-    write_flight(target, flight)
+    write_track(target, flight)
     assert json.loads((target / "trajectory.json").read_text()) == first
-    again = read_flight(target)
+    again = read_track(target)
     columns = [name for name, value in vars(flight).items() if isinstance(value, np.ndarray)]
     assert len(columns) == 15
     for name in columns:
@@ -106,8 +106,8 @@ def test_strict_raises_and_tolerant_notes(clean, tmp_path):
     ):
         folder = rewrite(clean, tmp_path, change)
         with pytest.raises(InputError, match=words):
-            read_flight(folder, strict=True)
-        assert any(re.search(words, issue) for issue in read_flight(folder, strict=False).issues), words
+            read_track(folder, strict=True)
+        assert any(re.search(words, issue) for issue in read_track(folder, strict=False).issues), words
 
 
 def test_older_names_and_any_even_time_step_are_read(clean, tmp_path):
@@ -118,7 +118,7 @@ def test_older_names_and_any_even_time_step_are_read(clean, tmp_path):
             for name in ("pitch", "roll"):
                 point["drone_pose"].pop(name)
 
-    flight = read_flight(rewrite(clean, tmp_path, change), strict=False)
+    flight = read_track(rewrite(clean, tmp_path, change), strict=False)
     assert len(flight) == 6
     assert (flight.rotations_deg[:, 0] == 0).all()
     assert_allclose(np.diff(flight.time_s), 0.2)
@@ -135,14 +135,14 @@ def test_the_known_answer_of_the_public_release(clean, tmp_path):
             yaw=first["yaw"] - 3.13,
         )
 
-    flight = read_flight(rewrite(clean, tmp_path, change), strict=False)
+    flight = read_track(rewrite(clean, tmp_path, change), strict=False)
     assert_allclose((flight.positions_m[1] - flight.positions_m[0]) / 0.5, [-3.123, 2.072, -1.600])
     assert_allclose(flight.rotations_deg[1, 1] - flight.rotations_deg[0, 1], 3.13)  # a turn to the left
 
 
 def test_an_offset_that_is_not_on_record_is_unknown_and_no_zero(tree, tmp_path):
     """Public files hold booleans where ours hold offsets."""
-    clean, perturbed = find_flights(tree)
+    clean, perturbed = find_tracks(tree)
 
     def change(value):
         for point, group in zip(
@@ -153,13 +153,13 @@ def test_an_offset_that_is_not_on_record_is_unknown_and_no_zero(tree, tmp_path):
         del value["points"][4]["perturbation"]
 
     folder = rewrite(perturbed, tmp_path / "a", change)
-    flight = read_flight(folder)
+    flight = read_track(folder)
     assert np.isnan(flight.drone_offsets_m).any(axis=1).tolist() == [False, True, True, True, False, False]
     assert (flight.drone_offsets_m[[0, 4]] == 0).all()
     assert (flight.drone_offsets_m[5] != 0).all()
-    assert (read_flight(rewrite(clean, tmp_path / "b", change)).drone_offsets_m[:5] == 0).all()
+    assert (read_track(rewrite(clean, tmp_path / "b", change)).drone_offsets_m[:5] == 0).all()
     target = tmp_path / "c" / "Town01" / folder.parent.name / folder.name
     target.mkdir(parents=True)
-    write_flight(target, flight)
+    write_track(target, flight)
     assert json.loads((target / "trajectory.json").read_text())["points"][1]["perturbation"]["drone_position"] is True
-    assert_array_equal(read_flight(target).drone_offsets_m, flight.drone_offsets_m)
+    assert_array_equal(read_track(target).drone_offsets_m, flight.drone_offsets_m)

@@ -14,13 +14,13 @@ from tables import each
 from test_renderers_contract import circling, pose_towards, street, write_inputs
 
 from cosfly.formats.boxes import BoxMap, make_box_map
-from cosfly.formats.flights import find_flights
+from cosfly.formats.bystanders import Bystander
 from cosfly.formats.frames import Camera, Look, frame_name, read_depth, read_instance, read_meta, read_rgb
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.others import Other
+from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.people import draw_appearance
-from cosfly.formats.playback import read_flight
-from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import focal_px, intrinsic_matrix, look_at, world_from_camera
 from cosfly.geometry.kernels import obstacle_index, signed_distances
 from cosfly.render.camera import rendered_visibility, view_target
@@ -31,14 +31,13 @@ from cosfly.render.contract import (
     PERSON_ID,
     SHARED_ID,
     Frame,
+    PosedBystander,
     PosedCar,
-    PosedOther,
     PosedPerson,
     has_own_ids,
     instance_ids,
     other_id,
 )
-from cosfly.render.flight import Writing, render_flight
 from cosfly.render.gl import meshes as unit_meshes
 from cosfly.render.gl.figure import make_body
 from cosfly.render.gl.parts import Boxes, PartBuilder
@@ -46,7 +45,8 @@ from cosfly.render.gl.view import CameraView
 from cosfly.render.person import cast_of, choose_clothes
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, in_frame, perturb
 from cosfly.render.settings import RenderConfig
-from cosfly.render.stage import open_renderer, run, script_flight
+from cosfly.render.stage import make_track_script, open_renderer, run
+from cosfly.render.track import Writing, render_track
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing
 from cosfly.runtime.files import sha256_file
@@ -171,9 +171,11 @@ def test_shadows_of_those_who_move_lie_in_their_rectangles(elevation_deg, monkey
     clothes = choose_clothes(np.random.default_rng(3))
     walker = PosedPerson(np.array([4.0, -3.0, 0.9]), 0.7, 1.2, 1.0, clothes)
     others = [
-        PosedOther(other_id(0), replace(walker, hip_m=np.array([5.2, -2.4, 0.9]))),  # its rectangle meets the walker's
-        PosedOther(other_id(1), PosedCar(np.array([-9.0, 2.0, 0.75]), 0.6, (2.2, 0.9, 0.75), 0.3)),
-        PosedOther(other_id(2), replace(walker, hip_m=np.array([-2.0, -14.8, 0.9]))),  # beside a wall
+        PosedBystander(
+            other_id(0), replace(walker, hip_m=np.array([5.2, -2.4, 0.9]))
+        ),  # its rectangle meets the walker's
+        PosedBystander(other_id(1), PosedCar(np.array([-9.0, 2.0, 0.75]), 0.6, (2.2, 0.9, 0.75), 0.3)),
+        PosedBystander(other_id(2), replace(walker, hip_m=np.array([-2.0, -14.8, 0.9]))),  # beside a wall
     ]
     whole = (0, 0, *LARGER)
     for eye in ((-4.0, -24.0, 15.0), (4.0, -3.0, 30.0), (3.0, -5.0, 2.0)):
@@ -196,8 +198,8 @@ def test_shadows_of_those_who_move_lie_in_their_rectangles(elevation_deg, monkey
 
 def test_look_alikes_differ_from_the_target_in_one_thing_and_nobody_looks_just_like_it():
     target = draw_appearance(np.random.default_rng(1))
-    stands = Other("Pedestrians", np.zeros((2, 3)), np.zeros(2))
-    others = [Other("Car", np.zeros((2, 3)), np.zeros(2)), replace(stands, is_look_alike=True), stands] * 20
+    stands = Bystander("Pedestrians", np.zeros((2, 3)), np.zeros(2))
+    others = [Bystander("Car", np.zeros((2, 3)), np.zeros(2)), replace(stands, is_look_alike=True), stands] * 20
     people = cast_of(others, np.arange(2) * 0.5, target, np.random.default_rng(0)).people(target)
     assert list(people.others) == [other_id(number) for number in range(60) if number % 3]
     different = np.array([len(target.differences(looks)) for looks in people.others.values()])
@@ -420,11 +422,11 @@ def finished(tmp_path_factory):
 @needs_gl
 def test_the_tree_is_complete_and_readable(finished):
     tree, _ = finished
-    folders = find_flights(tree)
+    folders = find_tracks(tree)
     names = [str(f.relative_to(tree)) for f in folders]
     assert names == [f"Town_Street/trajectory_{1776000000 + k}/{v}" for k in (0, 2) for v in ("ORI", "aug_001")]
     for folder in folders:
-        flight = read_flight(folder)  # strict
+        flight = read_track(folder)  # strict
         assert not flight.missing_frames()
         assert flight.is_original == (folder.name == "ORI")
         checksums = read_checksums(folder)
@@ -439,8 +441,8 @@ def test_the_tree_is_complete_and_readable(finished):
 @needs_gl
 def test_frames_hold_what_their_annotation_says(finished):
     tree, _ = finished
-    for folder in find_flights(tree):
-        flight = read_flight(folder)
+    for folder in find_tracks(tree):
+        flight = read_track(folder)
         for i in range(len(flight)):
             frame = flight.frame_folder(i)
             kinds, ids = read_instance(frame)
@@ -491,9 +493,9 @@ def test_a_shift_that_hides_a_seen_target_falls_back(tmp_path):
     trace, around = circling(60), Surroundings(make_box_map([], [], [], []))
     size = {"width_px": CAMERA.width_px, "height_px": CAMERA.height_px, "fovs_deg": (90.0,)}
     cfg = RenderConfig(**size, first_timestamp=1_776_000_000)
-    script = script_flight(trace, 0, "perturbed", "T", around, cfg, 1)
+    script = make_track_script(trace, 0, "perturbed", "T", around, cfg, 1)
     curtain = Curtain(x_m=float(trace.targets_m[30, 0]))
-    flight = render_flight(curtain, script, tmp_path, Writing(("rgb",), 0.1))
+    flight = render_track(curtain, script, tmp_path, Writing(("rgb",), 0.1))
     is_seen = trace.targets_m[:, 0] <= curtain.x_m
     np.testing.assert_array_equal(flight.target_visible | ~is_seen, True)
     states = [point["perturbation"] for point in flight.raw["points"]]
@@ -512,7 +514,7 @@ def test_a_shift_that_hides_a_seen_target_falls_back(tmp_path):
     assert curtain.num_drawn - 60 >= len(fell_back)
     report = json.loads((tmp_path / "perturbation_report.json").read_text())
     assert report["position"]["fallback: target hidden"] == len(fell_back)
-    assert script_flight(trace, 0, "perturbed", "T", around, cfg, 1).perturbed.states == script.perturbed.states
+    assert make_track_script(trace, 0, "perturbed", "T", around, cfg, 1).perturbed.states == script.perturbed.states
 
 
 # --- gallery ----------------------------------------------------------------------------------------------------------

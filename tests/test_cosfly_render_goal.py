@@ -9,19 +9,19 @@ from test_cosfly_render import needs_gl
 from test_renderers_contract import circling, pose_towards, write_inputs
 
 from cosfly.formats.boxes import make_box_map
-from cosfly.formats.flights import find_flights
+from cosfly.formats.bystanders import Bystander, Bystanders, write_bystanders
 from cosfly.formats.frames import PERSON_ID, read_depth, read_instance, read_rgb
 from cosfly.formats.goals import LANDMARKS, SIDES, SeenFrame, meant, target_picture, words_of
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.others import Company, Other, write_others
 from cosfly.formats.people import Appearance, People
-from cosfly.formats.playback import TARGET_FILE, read_flight
+from cosfly.formats.playback import TARGET_FILE, read_track
+from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
-from cosfly.render.contract import Frame, PosedOther, PosedPerson, other_id
-from cosfly.render.flight import are_told_apart, find_goal
+from cosfly.render.contract import Frame, PosedBystander, PosedPerson, other_id
 from cosfly.render.person import choose_clothes
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
+from cosfly.render.track import are_told_apart, find_goal
 from cosfly.runtime.arrays import read_picture
 from cosfly.runtime.config import build
 
@@ -43,7 +43,7 @@ def test_what_a_wall_hides_is_not_said(y_m, says_legs):
     def draw(looks: Appearance) -> Frame:
         dressed = [replace(clothes, looks=one) for one in (looks, people.others[other_id(0)])]
         bodies = [PosedPerson(hip_m, 0.0, 0.5, 1.0, one) for hip_m, one in zip(hips_m, dressed, strict=True)]
-        return renderer.render(pose, intrinsic, bodies[0], [PosedOther(other_id(0), bodies[1])])
+        return renderer.render(pose, intrinsic, bodies[0], [PosedBystander(other_id(0), bodies[1])])
 
     goal = find_goal(people, 3, draw, intrinsic, pose[:3, :3])
     renderer.close()
@@ -74,10 +74,12 @@ def crowded_tree(tmp_path_factory):
     folder, traces = tmp_path_factory.mktemp("crowd"), [circling(3, f"path_{k:03d}") for k in range(2)]
     places_m = [[x, y, -0.9] for x in (-4.0, -1.5, 1.0, 3.5) for y in (-2.0, 2.0)]
     crowd = [
-        Other("Pedestrians", trace.targets_m + place_m, np.zeros(3), k < 4)
+        Bystander("Pedestrians", trace.targets_m + place_m, np.zeros(3), k < 4)
         for trace in traces for k, place_m in enumerate(places_m)
     ]  # fmt: skip
-    write_others(folder / "others.json", [Company(t.path_id, crowd[i * 8 :][:8]) for i, t in enumerate(traces)], {})
+    write_bystanders(
+        folder / "others.json", [Bystanders(t.path_id, crowd[i * 8 :][:8]) for i, t in enumerate(traces)], {}
+    )
     cfg = build(RenderConfig, {"width_px": 320, "height_px": 180, "fovs_deg": [60.0]}, "test")
     return run(cfg, *write_inputs(folder / "in", traces), folder / "out", seed=2, others=folder / "others.json")
 
@@ -85,7 +87,7 @@ def crowded_tree(tmp_path_factory):
 @needs_gl
 def test_of_all_in_a_crowd_a_goal_means_the_target_alone(crowded_tree):
     tree = crowded_tree
-    flights = [read_flight(folder) for folder in find_flights(tree)]
+    flights = [read_track(folder) for folder in find_tracks(tree)]
     assert len(flights) == 4
     for flight in flights:
         goal, people = flight.goal, flight.people

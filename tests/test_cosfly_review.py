@@ -12,10 +12,10 @@ from test_cosfly_inspection import CFG, plan_of, write_map
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.formats.flights import find_flights
 from cosfly.formats.inspection import read_inspection
 from cosfly.formats.review import REVIEW, Choice, add_decisions, read_decisions, read_settled
 from cosfly.formats.traces import write_traces
+from cosfly.formats.tracks import find_tracks
 from cosfly.inspection.stage import run
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import sha256_file
@@ -31,7 +31,7 @@ def inspected(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("queue")
     tree = make_playback_tree(root / "tree", 2, 6, width_px=96, height_px=54)
     write_map(root)
-    write_traces(root / "drone_trace.json", [plan_of(f) for f in find_flights(tree) if f.name == "ORI"], {})
+    write_traces(root / "drone_trace.json", [plan_of(f) for f in find_tracks(tree) if f.name == "ORI"], {})
     return run(QUEUE, root / "map.json", root / "drone_trace.json", tree, root / "inspect")
 
 

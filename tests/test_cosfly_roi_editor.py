@@ -18,8 +18,8 @@ from commands import invoke
 from cosfly.formats.backdrop import WorldFrame, write_backdrop
 from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.formats.kinds import KINDS
+from cosfly.formats.pedestrian_paths import read_paths
 from cosfly.formats.roi import read_roi
-from cosfly.formats.walks import read_paths
 from cosfly.geometry.grid import roi_mask
 from cosfly.pedestrians.roi_editor import Server, open_editor
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from cosfly.runtime.chance import draws_for, rng_for
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import EnvironmentMissing, InputError, StorageError
 from cosfly.runtime.runner import Item, Outcome, run_items
+from cosfly.runtime.seeding import draws_for, rng_for
 from cosfly.runtime.stage_folder import Failed, Kept, StageFolder
 from cosfly.runtime.store import dump_json
 

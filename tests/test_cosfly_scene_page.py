@@ -15,10 +15,10 @@ from commands import invoke
 from test_cosfly_inspection import plan_of
 
 from cosfly.formats.boxes import MapHeader, make_box_map, write_boxes
-from cosfly.formats.flights import find_flights
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
 from cosfly.formats.traces import write_traces
+from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import box_corners
 from cosfly.viz.scene_page import run
 from specimens import make_playback_tree
@@ -37,7 +37,7 @@ def place(tmp_path_factory) -> Path:
     write_boxes(
         root / "map.json", make_box_map(rows, halves, [[0, 0, 0], [10, 40, 5], [0, 0, 0]], kinds, header=header)
     )
-    flights = [read_flight(folder) for folder in find_flights(tree) if folder.name == "ORI"]
+    flights = [read_track(folder) for folder in find_tracks(tree) if folder.name == "ORI"]
     plans = [plan_of(flight.folder) for flight in flights]
     for name in ("muco", EVIL):
         own = [replace(plan, planner=name, metrics={"length_m": 12.5}) for plan in plans]
@@ -71,7 +71,7 @@ def test_what_is_packed_is_what_was_read(place, tmp_path):
     turned = rows[1, 3:].reshape(3, 3)
     assert np.allclose(np.linalg.norm(turned, axis=1), [2, 3, 5], atol=1e-4)
     assert np.allclose(turned @ turned.T, np.diag([4, 9, 25]), atol=1e-3)
-    flight = read_flight(next(folder for folder in find_flights(place / "tree") if folder.name == "ORI"))
+    flight = read_track(next(folder for folder in find_tracks(place / "tree") if folder.name == "ORI"))
     number = next(k for k, track in enumerate(data["tracks"]) if track["kind"] == "clean frames")
     assert np.allclose(floats(data["tracks"][number]["rows"], 10)[:, 1:4], flight.positions_m, atol=1e-3)
     assert len(data["tracks"][number]["pictures"]) == len(flight)

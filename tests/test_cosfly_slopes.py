@@ -12,13 +12,13 @@ from test_renderers_contract import NAMES
 from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.formats.ground import Ground
 from cosfly.formats.kinds import GROUND_KINDS, KINDS
-from cosfly.formats.walks import Walk
+from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.geometry.axes import DT_S, intrinsic_matrix, world_from_camera
 from cosfly.geometry.grid import blocks_walking
 from cosfly.geometry.kernels import index_boxes, obstacle_index, signed_distances
 from cosfly.pedestrians.stage import PedestriansConfig, walkable_ground
 from cosfly.planners.contract import PLANNERS, PlanConfig
-from cosfly.planners.stage import plan_flight
+from cosfly.planners.stage import plan_trajectory
 from cosfly.render.draping import BARE_GROUND, drape, is_draped
 from cosfly.render.stage import open_renderer
 from cosfly.simplify.passes import SimplifyConfig, simplify
@@ -120,13 +120,13 @@ def bare(shape: str) -> BoxMap:
     return on_ground(block, sampled(shape))
 
 
-def walk_over(box_map: BoxMap, start: tuple[float, float], goal: tuple[float, float]) -> Walk:
+def walk_over(box_map: BoxMap, start: tuple[float, float], goal: tuple[float, float]) -> PedestrianTrajectory:
     """A straight walk at 1.2 m/s with its feet on the ground."""
     ends = np.array([start, goal], dtype=np.float64)
     time_s = np.arange(0.0, np.linalg.norm(ends[1] - ends[0]) / 1.2, DT_S)
     xy = ends[0] + (ends[1] - ends[0]) * (1.2 * time_s / np.linalg.norm(ends[1] - ends[0]))[:, None]
     feet = np.column_stack([xy, box_map.ground.height_at(xy)])
-    return Walk("slope", ends, time_s, feet, np.full(len(xy), 1.2))
+    return PedestrianTrajectory("slope", ends, time_s, feet, np.full(len(xy), 1.2))
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
@@ -136,7 +136,7 @@ def test_flights_count_their_altitude_from_the_ground_under_the_walker(shape: st
     walk = walk_over(box_map, (-60.0, 5.0), (60.0, 5.0))
     assert np.ptp(walk.positions_m[:, 2]) > 4.0
     obstacles = obstacle_index(box_map)
-    trace = plan_flight(walk, obstacles, cfg, 0)
+    trace = plan_trajectory(walk, obstacles, cfg, 0)
     over_walker = trace.positions_m[:, 2] - walk.positions_m[:, 2]
     assert over_walker.min() >= cfg.altitude_min_m - 1e-3
     assert over_walker.max() <= cfg.altitude_min_m + 12.0

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosfly.formats.playback import Flight, read_flight, write_flight
+from cosfly.formats.playback import Track, read_track, write_track
 from cosfly.formats.splits import SPLITS, Course, assign_splits, town_family, walks_of
 from cosfly.runtime.errors import InputError
 from specimens import make_flight
@@ -29,7 +29,7 @@ def course(name: str, points, town: str = "Town01", part: slice = slice(None)) -
     return Course(name, town, points[0][part], points[1][part])
 
 
-def course_of(flight: Flight, name: str = "") -> Course:
+def course_of(flight: Track, name: str = "") -> Course:
     return Course(name or flight.trajectory, flight.town, flight.time_s, flight.walked_m)
 
 
@@ -50,8 +50,8 @@ def test_perturbed_twins_are_one_walk_once_they_are_read_again(tmp_path):
     offsets_m = np.random.default_rng(0).uniform(-1.5, 1.5, (40, 3))
     shifted = replace(noisy, targets_m=noisy.targets_m + offsets_m, target_offsets_m=offsets_m)
     for flight in (clean, shifted):
-        write_flight(tmp_path / "Town01" / flight.trajectory / flight.variant, flight)
-    read = [read_flight(tmp_path / "Town01" / clean.trajectory / variant) for variant in ("ORI", "aug_001")]
+        write_track(tmp_path / "Town01" / flight.trajectory / flight.variant, flight)
+    read = [read_track(tmp_path / "Town01" / clean.trajectory / variant) for variant in ("ORI", "aug_001")]
     one, other = (course_of(flight, flight.variant) for flight in read)
     assert groups(one, other) == [{"ORI", "aug_001"}]
     assert groups(one, replace(other, target_m=read[1].targets_m)) == [{"ORI"}, {"aug_001"}]  # the shift was real

@@ -8,7 +8,8 @@ from specimens_planning import WORLDS, first_points, scenario_of, town_of, walk_
 
 import cosfly.planners.stage as planners
 from cosfly.geometry import kernels
-from cosfly.planners import sight, track_astar
+from cosfly.planners import line_of_sight as sight
+from cosfly.planners import track_astar
 from cosfly.planners.contract import PlanConfig, TrackAStarConfig
 
 CFG = PlanConfig(planner="track_astar")
@@ -90,7 +91,7 @@ def test_a_wide_beam_finds_the_cheapest_way(world, monkeypatch):
     cfg = PlanConfig(altitude_max_m=40, relaxed_safety_m=3.0, track_astar=settings)
     scenario = planners.make_scenario(walk_along(world, corners), obstacles, cfg)
     scenario = first_points(scenario, 16)  # layers of three frames
-    raw, facts = track_astar.search_flight(scenario, obstacles, cfg, 3.0)
+    raw, facts = track_astar.search_trajectory(scenario, obstacles, cfg, 3.0)
     layers = np.arange(0, 16, track_astar.frames_per_layer(cfg))
     targets = scenario.targets_m[layers]
     ahead = (targets[1] - targets[0])[:2] / np.linalg.norm(targets[1] - targets[0])
@@ -104,9 +105,9 @@ def test_a_wide_beam_finds_the_cheapest_way(world, monkeypatch):
 
 def test_a_narrow_beam_looks_less_and_costs_no_less():
     scenario, obstacles = scenario_of("corner")
-    wide = track_astar.search_flight(scenario, obstacles, CFG, 3.0)[1]
+    wide = track_astar.search_trajectory(scenario, obstacles, CFG, 3.0)[1]
     narrow_cfg = CFG.model_copy(update={"track_astar": TrackAStarConfig(beam=32)})
-    narrow = track_astar.search_flight(scenario, obstacles, narrow_cfg, 3.0)[1]
+    narrow = track_astar.search_trajectory(scenario, obstacles, narrow_cfg, 3.0)[1]
     assert narrow["states_seen"] < wide["states_seen"] / 4
     assert narrow["cost"] >= wide["cost"]
 

@@ -23,9 +23,9 @@ from specimens_foreign import NOBODY, write_foreign_tree
 from caption.run import stage as caption_stage
 from caption.schema import CaptionConfig
 from cosfly.formats.captions import read_captions
-from cosfly.formats.flights import find_flights, read_twin
 from cosfly.formats.inspection import read_inspection
-from cosfly.formats.playback import read_flight, write_flight
+from cosfly.formats.playback import read_track, write_track
+from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.settings import InspectConfig
 from cosfly.runtime.documents import read_json
@@ -93,7 +93,7 @@ DEMANDS = {
 
 def test_the_public_reader_can_refuse(ours, tmp_path, subtests):
     tree = copied(ours, tmp_path / "tree")
-    path = find_flights(tree)[0] / "trajectory.json"
+    path = find_tracks(tree)[0] / "trajectory.json"
     whole = path.read_text()
     for demand, change in DEMANDS.items():
         with subtests.test(demand):
@@ -187,16 +187,16 @@ def test_a_quirk_is_read_and_survives_writing(foreign, tmp_path, subtests):
 def _check_quirk(folder: Path, name: str, quirk: Quirk) -> None:
     change_file(folder, quirk.change)
     if quirk.is_strict:
-        assert read_flight(folder).issues == ()
+        assert read_track(folder).issues == ()
     else:
         with pytest.raises(InputError):
-            read_flight(folder)
-    flight = read_flight(folder, strict=False)
+            read_track(folder)
+    flight = read_track(folder, strict=False)
     assert len(flight) == 16
     assert np.isfinite(flight.positions_m).all()
     before = copy.deepcopy(flight.raw)
-    write_flight(folder, flight)
-    again = read_flight(folder, strict="left out" not in name)  # nothing says where the targets were
+    write_track(folder, flight)
+    again = read_track(folder, strict="left out" not in name)  # nothing says where the targets were
     for column, value in vars(flight).items():
         if isinstance(value, np.ndarray):
             assert_allclose(getattr(again, column), value, err_msg=column)
@@ -219,7 +219,7 @@ def in_public_form(value: dict) -> dict:
 
 
 def test_nobody_is_no_target(foreign):
-    flight = read_flight(find_flights(foreign)[0])
+    flight = read_track(find_tracks(foreign)[0])
     assert np.isnan(flight.targets_m[NOBODY]).all()
     assert not flight.target_visible[NOBODY]
     assert flight.target_visible.sum() == len(flight) - 1
@@ -230,7 +230,7 @@ def test_the_clean_twin_is_found_by_what_it_says_it_is(foreign, tmp_path):
     for tree, variants in ((foreign, ("ORI", "aug_001")), (tmp_path / "tree", ("original", "shaken"))):
         if tree != foreign:
             write_foreign_tree(tree, variants=variants)
-        clean, shaken = (read_flight(tree / "Town01/trajectory_1777083733" / variant) for variant in variants)
+        clean, shaken = (read_track(tree / "Town01/trajectory_1777083733" / variant) for variant in variants)
         twin = read_twin(shaken)
         assert twin is not None
         assert_array_equal(twin.positions_m, clean.positions_m)
@@ -310,7 +310,7 @@ def test_a_tree_of_pictures_alone_is_released_without_depth(tmp_path):
     source = Source("theirs", tree, captions, inspected)
     package.run(ReleaseConfig(licence="mit", modalities=("rgb",)), [source], tmp_path / "release")
     assert verify(tmp_path / "release").is_ok
-    one = find_flights(tree)[0] / "frames_playback/frame_00003/instance.png"
+    one = find_tracks(tree)[0] / "frames_playback/frame_00003/instance.png"
     one.write_bytes(b"")  # one frame has it now, so the others lack it
     found = read_inspection(inspection.run(InspectConfig(), None, None, tree, tmp_path / "again"))
     assert sorted(flight.result for flight in found.flights) == ["accepted", "rejected"]
@@ -322,7 +322,7 @@ def test_of_a_foreign_tree_what_was_inspected_is_released_and_nothing_else(tmp_p
     captions = caption_stage.run(CaptionConfig(), tree, tmp_path / "caption")
     alone = tmp_path / "alone"  # inspections travel without the records of their stage
     alone.mkdir()
-    cfg, clean = ReleaseConfig(licence="mit", modalities=("rgb",)), find_flights(tree)[0]
+    cfg, clean = ReleaseConfig(licence="mit", modalities=("rgb",)), find_tracks(tree)[0]
 
     def failed(out: str, source: Source) -> list[str]:
         found: list[str] = []

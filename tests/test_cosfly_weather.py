@@ -12,10 +12,10 @@ from test_cosfly_render import needs_gl
 from test_renderers_contract import HIP, circling, opened, pose_towards, street, write_inputs
 
 from cosfly.formats.boxes import MapHeader, make_box_map
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import read_depth, read_instance, read_meta, read_rgb
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
 from cosfly.formats.weather import TIMES, WEATHER_GROUPS, WEATHERS, WeatherParams, resolved, sky_kind
 from cosfly.geometry.axes import intrinsic_matrix
 from cosfly.pipeline.settings import RunConfig
@@ -274,8 +274,8 @@ def trees(tmp_path_factory):
 def test_records_stand_in_every_file_and_labels_are_those_of_fair_weather(trees):
     (off, drawn_tree), _ = trees
     cfg = config(**RANDOM)
-    for folder in find_flights(off):
-        plain, flight = read_flight(folder), read_flight(drawn_tree / folder.relative_to(off))
+    for folder in find_tracks(off):
+        plain, flight = read_track(folder), read_track(drawn_tree / folder.relative_to(off))
         wanted = weather_of(cfg, read_pools(cfg), flight.source["path_index"])
         assert flight.raw["weather"] == wanted.model_dump() == read_json(flight.folder / "trajectory.json")["weather"]
         assert flight.weather_record == wanted

@@ -12,14 +12,14 @@ import pytest
 from test_cosfly_render import needs_gl
 from test_renderers_contract import circling, write_inputs
 
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import level_name, read_meta
 from cosfly.formats.inspection import read_inspection
-from cosfly.formats.playback import read_flight, write_flight
+from cosfly.formats.playback import read_track, write_track
 from cosfly.formats.segments import Segment
 from cosfly.formats.traces import DroneTrace
+from cosfly.formats.tracks import find_tracks
 from cosfly.inspection import stage as inspection
-from cosfly.inspection.flight import InspectConfig
+from cosfly.inspection.track import InspectConfig
 from cosfly.render.lens import ZoomConfig, cameras_of, zoomed_deg
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
@@ -90,8 +90,8 @@ def zooming(num_points: int = 8):
 def test_the_cameras_of_a_flight_survive_the_file(tmp_path):
     flight, folder = zooming(), tmp_path / "Town01/trajectory_1/ORI"
     folder.mkdir(parents=True)
-    write_flight(folder, flight)
-    found = read_flight(folder)
+    write_track(folder, flight)
+    found = read_track(folder)
     np.testing.assert_array_equal(found.intrinsics, flight.intrinsics)
     assert found.camera_at(7).focal_px == pytest.approx(2 * found.camera.focal_px)
     assert found.fovs_deg[0] < found.fovs_deg[1] == pytest.approx(60.0)
@@ -104,11 +104,11 @@ def test_the_cameras_of_a_flight_survive_the_file(tmp_path):
     raw["points"][3]["camera"]["intrinsic"] = [[0, 0, 0]] * 3
     (folder / "trajectory.json").write_text(json.dumps(raw))
     with pytest.raises(InputError, match=r"points\[3\]\.camera\.intrinsic"):
-        read_flight(folder)
-    assert any("points[3].camera" in issue for issue in read_flight(folder, strict=False).issues)
-    write_flight(folder, replace(flight, intrinsics=None))  # one camera is said once
+        read_track(folder)
+    assert any("points[3].camera" in issue for issue in read_track(folder, strict=False).issues)
+    write_track(folder, replace(flight, intrinsics=None))  # one camera is said once
     assert all("camera" not in point for point in json.loads((folder / "trajectory.json").read_text())["points"])
-    assert read_flight(folder).intrinsics is None
+    assert read_track(folder).intrinsics is None
 
 
 # --- a tree that zooms ------------------------------------------------------------------------------------------------
@@ -125,7 +125,7 @@ def zoomed_tree(tmp_path_factory) -> tuple[Path, list[Path]]:
 @needs_gl
 def test_every_frame_tells_the_camera_it_was_drawn_with(zoomed_tree):
     tree, _ = zoomed_tree
-    flights = [read_flight(folder) for folder in find_flights(tree)]
+    flights = [read_track(folder) for folder in find_tracks(tree)]
     clean, shaken = flights
     np.testing.assert_array_equal(clean.intrinsics, shaken.intrinsics)
     assert len(np.unique(clean.intrinsics[:, 0, 0])) > 4
@@ -150,8 +150,8 @@ def test_the_inspection_projects_with_each_frames_camera(zoomed_tree, tmp_path):
         if issue.severity == "error"
     ]
     assert codes == []
-    for folder in find_flights(tree):
-        flight = read_flight(folder)
+    for folder in find_tracks(tree):
+        flight = read_track(folder)
         seen = np.flatnonzero(
             flight.target_in_view & (np.abs(flight.intrinsics[:, 0, 0] / flight.camera.focal_px - 1) > 0.2)
         )

@@ -22,7 +22,7 @@ from specimens_foreign import write_foreign_tree
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.answer_text import parse_answer
 from cosfly.formats.captions import write_captions
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
 from cosfly.formats.splits import SPLITS
 from cosfly.geometry.blind import past_of
 from cosfly.runtime.errors import ResumeError, VerifyError
@@ -174,7 +174,7 @@ def test_a_sample_has_its_past_and_whether_something_was_drawn_after_it(tree, ca
     samples = [sample for split in SPLITS for sample in open_split(prepared(tree, captions, tmp_path / "set"), split)]
     pasts = {}
     for sample in samples:
-        past = past_of(read_flight(tree / sample.folder), sample.window, False)
+        past = past_of(read_track(tree / sample.folder), sample.window, False)
         np.testing.assert_allclose(sample.past, past, atol=1e-4)
         pasts.setdefault((sample.town, sample.trajectory, sample.window), []).append(past[:12])
     assert all(np.ptp(found, axis=0).max() < 1e-3 for found in pasts.values())

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tables import each
 
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
 from cosfly.formats.splits import SPLITS
 from cosfly.runtime.stage_folder import read_failures, read_manifest
 from distill.prepare import dual_track
@@ -57,7 +57,7 @@ def test_a_window_holds_both_tracks_frame_by_frame(tree, dataset):
     assert len(found) == 4 * ((NUM_POINTS - 10) // 3 + 1)
     for sample in found:
         folder = tree / sample.town / sample.trajectory
-        noisy, clean = read_flight(folder / sample.variant), read_flight(folder / "ORI")
+        noisy, clean = read_track(folder / sample.variant), read_track(folder / "ORI")
         assert sample.variant == "aug_001"
         first = sample.window[0]
         assert sample.window == tuple(range(first, first + 5))

@@ -14,7 +14,7 @@ from commands import invoke
 from specimens_distill import make_caption, write_set
 
 from cosfly.formats.actions import TOKENS
-from cosfly.formats.figures import draw_walks
+from cosfly.formats.figures import draw_pedestrians
 from cosfly.formats.predictions import Prediction, read_predictions
 from cosfly.geometry.blind import LEAST_WINDOWS
 from cosfly.runtime.errors import InputError
@@ -85,7 +85,7 @@ def scores_of(samples, predictions=None, **more) -> Scores:
 
 
 def figures(scores: Scores, resamples: int = 200, confidence: float = 0.95):
-    draws = draw_walks(len(set(scores.walk)), resamples, np.random.default_rng(0))
+    draws = draw_pedestrians(len(set(scores.walk)), resamples, np.random.default_rng(0))
     return figures_of(scores, draws, confidence=confidence)
 
 

@@ -9,10 +9,10 @@ import pytest
 from specimens_release import CFG, build, make_caption, make_inspection
 
 from cosfly.formats.captions import write_captions
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import frame_name, read_rgb
 from cosfly.formats.inspection import write_inspection
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
 from distill.windows import FACTS, Windows
 from specimens import make_playback_tree
 
@@ -27,7 +27,7 @@ def place(tmp_path_factory) -> Path:
     dropped = {"status": "dropped", "drop_reason": "hard_conflict"}
     captions = [
         make_caption(flight, i, **(dropped if i == NUM_POINTS - 2 else {}))
-        for flight in map(read_flight, find_flights(root / "tree"))
+        for flight in map(read_track, find_tracks(root / "tree"))
         for i in range(4, NUM_POINTS - 1)
     ]
     write_captions(root / "captions.jsonl", captions)
@@ -61,7 +61,7 @@ def test_a_tree_and_its_release_give_the_same_windows(place, language):
 def test_a_window_is_what_stands_in_the_files(place):
     windows = Windows(place / "tree", place / "captions.jsonl", max_side_px=96)
     window, found = windows[1], windows._places[1]
-    flight = read_flight(place.joinpath("tree", *found.flight[1:]))
+    flight = read_track(place.joinpath("tree", *found.flight[1:]))
     assert window["window"].tolist() == [1, 2, 3, 4, 5]
     assert window["frames"].shape == (5, 3, 54, 96)
     for k, index in enumerate(window["window"]):

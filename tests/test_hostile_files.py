@@ -19,7 +19,7 @@ from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxe
 from cosfly.formats.captions import read_captions
 from cosfly.formats.frames import DEPTH_PNG, read_depth, read_instance, read_meta, read_rgb
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
 from cosfly.formats.roi import read_roi
 from cosfly.maps import boxfile, cityjson, simworld
 from cosfly.runtime.errors import CosflyError
@@ -72,8 +72,8 @@ READERS = {
     "table of boxes": Reader("own.csv", lambda path: boxfile.load(boxfile.BoxesConfig(path=path))),
     "city model": Reader("city.json", lambda path: cityjson.load(cityjson.CityJsonConfig(path=path))),
     "SimWorld": Reader("world.json", lambda path: simworld.load(simworld.SimWorldConfig(world=path))),
-    "flight": Reader(f"{FLIGHT}/trajectory.json", lambda path: read_flight(path.parent)),
-    "flight, tolerant": Reader(f"{FLIGHT}/trajectory.json", lambda path: read_flight(path.parent, strict=False)),
+    "flight": Reader(f"{FLIGHT}/trajectory.json", lambda path: read_track(path.parent)),
+    "flight, tolerant": Reader(f"{FLIGHT}/trajectory.json", lambda path: read_track(path.parent, strict=False)),
     "annotation": Reader(f"{FRAME}/meta.json", lambda path: read_meta(path.parent)),
     "picture": Reader(f"{FRAME}/rgb.png", lambda path: read_rgb(path.parent)),
     "instances": Reader(f"{FRAME}/instance.png", lambda path: read_instance(path.parent)),

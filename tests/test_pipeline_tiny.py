@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.formats.captions import read_captions
-from cosfly.formats.flights import find_flights
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
 from cosfly.pipeline import run as pipeline
 from cosfly.pipeline.estimate import estimate
 from cosfly.pipeline.settings import RunConfig
@@ -121,7 +121,7 @@ def test_a_finished_run_costs_nothing_more_and_a_half_finished_one_the_rest(base
 
 
 def test_two_walks_give_two_flights_on_two_tracks_with_captions(base):
-    flights = [read_flight(folder) for folder in find_flights(base / "render")]
+    flights = [read_track(folder) for folder in find_tracks(base / "render")]
     assert sorted(flight.variant for flight in flights) == ["ORI", "ORI", "aug_001", "aug_001"]
     assert all(flight.missing_frames() == [] for flight in flights)
     captions = list(read_captions(base / "caption/captions.jsonl"))
@@ -232,7 +232,7 @@ def test_a_changed_file_is_refused_by_the_stages_that_read_it(tampered):
 
 def test_no_changed_picture_reaches_a_release(base, tmp_path):
     out = begin(base, tmp_path / "run", "release")
-    flights = find_flights(out / "render")
+    flights = find_tracks(out / "render")
     for flight, name in zip(flights[:3], PICTURES, strict=True):
         frames = flight / "frames_playback"
         shutil.copy(frames / "frame_00001" / name, frames / "frame_00000" / name)

@@ -11,9 +11,9 @@ from cosfly.geometry import kernels
 from cosfly.geometry.axes import look_at
 from cosfly.planners import contract
 from cosfly.planners.contract import ALL_PLANNERS, REFERENCES, Plan, PlanConfig, load_planner
-from cosfly.planners.stage import make_scenario, plan_flight
-from cosfly.runtime.chance import rng_for
+from cosfly.planners.stage import make_scenario, plan_trajectory
 from cosfly.runtime.errors import NoPathError
+from cosfly.runtime.seeding import rng_for
 
 UP_M = 30.0
 ON_A_HILL = {"on_a_hill": (town_of(*CANYON), [(0, 0), (40, 0)])}  # lifted by UP_M, walk and all
@@ -33,9 +33,9 @@ def test_a_flight_is_whole_safe_and_smooth_and_sees_the_target_it_looks_at(name,
     cfg = PlanConfig(planner=name)
     if (name, world) in NOT_REPAIRED:
         with pytest.raises(NoPathError, match=f"{world}: no flight within the limits"):
-            plan_flight(walk, obstacles, cfg, 0)
+            plan_trajectory(walk, obstacles, cfg, 0)
         return
-    trace = plan_flight(walk, obstacles, cfg, 0)
+    trace = plan_trajectory(walk, obstacles, cfg, 0)
     assert trace.positions_m.shape == (len(walk.time_s), 3)
     assert_safe(trace.positions_m, obstacles, cfg, ground_m=up[2])
     json.dumps(trace.solver, allow_nan=False)
@@ -55,8 +55,8 @@ def test_a_flight_is_whole_safe_and_smooth_and_sees_the_target_it_looks_at(name,
     np.testing.assert_allclose(np.linalg.norm(trace.positions_m - trace.targets_m, axis=1), 28, atol=8)
     if name == "foresight":  # it sees at least as well as from where it would best like to be
         scenario = make_scenario(walk, obstacles, cfg)
-        wished = scenario.wish.places_m(scenario.targets_m, scenario.ground_m)
-        seen = kernels.visibility(obstacles, wished, scenario.targets_m).mean()
+        requested = scenario.reference.places_m(scenario.targets_m, scenario.ground_m)
+        seen = kernels.visibility(obstacles, requested, scenario.targets_m).mean()
         assert trace.visibility.mean() >= min(seen, 0.99) - 0.01
     if name == "track_astar" and world in WORLDS:  # it keeps the nominal distance
         assert trace.metrics["clearance_min_m"] >= cfg.safety_distance_m - 1e-3
@@ -74,7 +74,7 @@ def test_the_same_seed_gives_the_same_flight_and_inputs_stay_as_they_are(name):
     plan = load_planner(name)(scenario, obstacles, cfg, rng_for(0, "plan", walk.path_id))
     for part, was in zip((scenario.targets_m, *obstacles), before, strict=True):
         np.testing.assert_array_equal(part, was)
-    trace = plan_flight(walk, obstacles, cfg, 0)
+    trace = plan_trajectory(walk, obstacles, cfg, 0)
     np.testing.assert_array_equal(trace.positions_m, np.round(plan.positions_m, 4))
     assert json.dumps(trace.solver) == json.dumps(plan.solver)
 
@@ -86,7 +86,7 @@ def test_the_time_step_is_the_walks(name, dt_s):
     box_map, corners = WORLDS["canyon"]
     walk = walk_along("w", corners, dt_s=dt_s)
     cfg = PlanConfig(planner=name, speed_max_mps=3.0)
-    trace = plan_flight(walk, kernels.obstacle_index(box_map), cfg, 0)
+    trace = plan_trajectory(walk, kernels.obstacle_index(box_map), cfg, 0)
     steps_m = np.linalg.norm(np.diff(trace.positions_m, axis=0), axis=1)
     assert steps_m.max() <= 3.0 * dt_s + 1e-3
     assert trace.metrics["speed_max_mps"] == pytest.approx(steps_m.max() / dt_s, abs=1e-3)
@@ -112,7 +112,7 @@ def test_a_planner_that_flies_into_a_tower_is_found_out(monkeypatch):
     monkeypatch.setitem(contract.ALL_PLANNERS, "low", f"{__name__}:fly_low_and_straight")
     box_map, corners = WORLDS["tower_behind"]
     with pytest.raises(NoPathError, match="planner low found no flight that is free of collisions"):
-        plan_flight(walk_along("w", corners), kernels.obstacle_index(box_map), PlanConfig(planner="low"), 0)
+        plan_trajectory(walk_along("w", corners), kernels.obstacle_index(box_map), PlanConfig(planner="low"), 0)
 
 
 def test_an_unknown_planner_is_named():

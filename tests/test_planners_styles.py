@@ -16,24 +16,24 @@ from caption.truth.actions import measure
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.boxes import write_boxes
 from cosfly.formats.frames import LEGIBLE_HEIGHT_PX, Camera
+from cosfly.formats.pedestrian_paths import paces_of, walk_id, write_paths
 from cosfly.formats.traces import DroneTrace, read_traces
-from cosfly.formats.walks import paces_of, walk_id, write_paths
 from cosfly.geometry import kernels
 from cosfly.geometry.axes import intrinsic_matrix, look_at, world_from_camera, wrap_deg
 from cosfly.maps.stage import load_map
-from cosfly.pedestrians.stage import make_walk
+from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import walkable_ground
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners.contract import PLANNERS, PlanConfig
-from cosfly.planners.courses import wish_of
+from cosfly.planners.courses import reference_of
 from cosfly.planners.intent import draw_intent, draw_styles
 from cosfly.planners.reacquire import finds_again, screens_of
-from cosfly.planners.stage import draw_styles_of, make_scenario, plan_flight, run, style_rng
+from cosfly.planners.stage import draw_styles_of, make_scenario, plan_trajectory, run, style_rng
 from cosfly.planners.styles import FOLLOW, NAMES, OTHER_SIDE, REACQUIRE, RETURN_HOME, TABLE
 from cosfly.render.camera import view_target
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import load, shipped
 from cosfly.runtime.errors import NoPathError
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.stage_folder import read_manifest
 from cosfly.simplify.passes import simplify
 
@@ -78,7 +78,7 @@ def test_a_style_shows_the_decisions_that_it_is_for(name):
     counts = Counter()
     for seed in range(3):
         walk = HALTING if TABLE[name].suits == "uneven" else STRAIGHT
-        trace = plan_flight(walk, OPEN, styled(name, planner="muco"), seed)
+        trace = plan_trajectory(walk, OPEN, styled(name, planner="muco"), seed)
         assert trace.drop_reason is None
         assert [part.style for part in trace.segments] == [name]
         counts += labels_of(trace)
@@ -90,11 +90,13 @@ def test_a_style_shows_the_decisions_that_it_is_for(name):
 def test_the_wish_of_parts_has_no_jumps_and_keeps_to_the_speed_limit():
     scenario = make_scenario(walk_along("w", [(0, 0), (60, 0), (60, 60), (0, 60)]), OPEN, PlanConfig())
     names = [*TABLE, FOLLOW, *reversed(TABLE)]
-    wish = wish_of(names, scenario, OPEN, PlanConfig(), np.random.default_rng(5))
-    steps_m = np.linalg.norm(np.diff(wish.places_m(scenario.targets_m, scenario.ground_m), axis=0), axis=1)
+    reference = reference_of(names, scenario, OPEN, PlanConfig(), np.random.default_rng(5))
+    steps_m = np.linalg.norm(np.diff(reference.places_m(scenario.targets_m, scenario.ground_m), axis=0), axis=1)
     assert steps_m.max() / scenario.dt_s <= 10.0
-    np.testing.assert_allclose(wish.distance_m**2, wish.ground_distance_m**2 + (wish.altitude_m - 0.9) ** 2, rtol=1e-9)
-    np.testing.assert_allclose(np.tan(wish.pitch_rad), (wish.altitude_m - 0.9) / wish.ground_distance_m)
+    np.testing.assert_allclose(
+        reference.distance_m**2, reference.ground_distance_m**2 + (reference.altitude_m - 0.9) ** 2, rtol=1e-9
+    )
+    np.testing.assert_allclose(np.tan(reference.pitch_rad), (reference.altitude_m - 0.9) / reference.ground_distance_m)
 
 
 # --- flights ----------------------------------------------------------------------------------------------------------
@@ -107,11 +109,11 @@ def test_every_planner_flies_every_style_safely(planner, style):
     box_map, corners = WORLDS["corner"]
     obstacles, walk = kernels.obstacle_index(box_map), walk_along("w", corners)
     cfg = styled(style, planner=planner, altitude_min_m=8.0, track_astar={"beam": 512})
-    trace = plan_flight(walk, obstacles, cfg, 0)
+    trace = plan_trajectory(walk, obstacles, cfg, 0)
     assert_safe(trace.positions_m, obstacles, cfg)
     assert trace.drop_reason in (None, "style_not_held", "no_hiding_place", "not_lost_and_found")
     if planner == "muco":  # what is drawn does not depend on who flies it
-        again = plan_flight(walk, obstacles, cfg, 0)
+        again = plan_trajectory(walk, obstacles, cfg, 0)
         np.testing.assert_array_equal(trace.positions_m, again.positions_m)
         assert trace.segments == again.segments
     assert trace.as_json() == DroneTrace.from_json(trace.as_json(), "w").as_json()
@@ -122,13 +124,13 @@ def test_every_planner_flies_every_style_safely(planner, style):
 def test_the_default_is_the_papers_flight_and_draws_nothing():
     scenario = make_scenario(STRAIGHT, OPEN, PlanConfig())
     intent = draw_intent([FOLLOW], scenario, OPEN, OPEN, PlanConfig(), style_rng(STRAIGHT, 0))
-    assert intent.wish is scenario.wish
+    assert intent.reference is scenario.reference
     assert (intent.segments, intent.mission, intent.impossible) == ((), None, None)
 
 
 def test_parts_draw_their_styles_and_cover_the_flight():
     cfg = PlanConfig(styles={"side": 1, "rise": 1, "hold": 0}, segment_s=15)
-    trace = plan_flight(STRAIGHT, OPEN, cfg, 1)
+    trace = plan_trajectory(STRAIGHT, OPEN, cfg, 1)
     assert {part.style for part in trace.segments} == {"side", "rise"}
     assert trace.segments[0].begin == 0
     assert [a.end for a in trace.segments[:-1]] == [b.begin for b in trace.segments[1:]]
@@ -151,18 +153,18 @@ def test_styles_are_drawn_to_their_shares_whatever_the_seed():
 
 
 def test_a_style_that_the_map_does_not_hold_is_dropped_or_followed_and_says_why():
-    dropped = plan_flight(STRAIGHT, OPEN, styled(REACQUIRE), 0)
+    dropped = plan_trajectory(STRAIGHT, OPEN, styled(REACQUIRE), 0)
     assert dropped.drop_reason == "no_hiding_place"
-    instead = plan_flight(STRAIGHT, OPEN, styled(REACQUIRE, styles_fallback="follow"), 0)
+    instead = plan_trajectory(STRAIGHT, OPEN, styled(REACQUIRE, styles_fallback="follow"), 0)
     assert (instead.drop_reason, instead.instead_of) == (None, "reacquire: no_hiding_place")
-    np.testing.assert_array_equal(instead.positions_m, plan_flight(STRAIGHT, OPEN, PlanConfig(), 0).positions_m)
+    np.testing.assert_array_equal(instead.positions_m, plan_trajectory(STRAIGHT, OPEN, PlanConfig(), 0).positions_m)
     # Towers all along leave an orbit no room; a planner that searches may hold it from above them.
     towers = [((x, side * 13, 40), (12, 8, 40)) for x in range(-40, 140, 25) for side in (-1, 1)]
     walled = kernels.obstacle_index(town_of(*towers))
-    by_muco = plan_flight(STRAIGHT, walled, styled("orbit_left", planner="muco"), 0)
+    by_muco = plan_trajectory(STRAIGHT, walled, styled("orbit_left", planner="muco"), 0)
     assert by_muco.drop_reason in ("style_not_held", "low_visibility")
     fallback = styled("orbit_left", planner="muco", styles_fallback="follow")
-    assert plan_flight(STRAIGHT, walled, fallback, 0).drop_reason is None
+    assert plan_trajectory(STRAIGHT, walled, fallback, 0).drop_reason is None
 
 
 def test_what_was_asked_what_was_flown_and_what_was_in_the_way_is_said(tmp_path, caplog):
@@ -203,13 +205,13 @@ def flights_of(cfg):
         ground, paces = walkable_ground(box_map, town.pedestrians), paces_of(10, town.pedestrians.pace, town.seed)
         chances = {walk_id(k): rng_for(town.seed, "pedestrians", walk_id(k)) for k in range(len(paces))}
         walks = [
-            make_walk(id_, ground, town.pedestrians, rng, pace).walk
+            make_pedestrian(id_, ground, town.pedestrians, rng, pace).walk
             for (id_, rng), pace in zip(chances.items(), paces, strict=True)
         ]
         obstacles, screens = kernels.obstacle_index(box_map), screens_of(box_map)
         for walk, styles in zip(walks, draw_styles_of(walks, town.plan, town.seed), strict=True):
             with suppress(NoPathError):  # a failure that the stage counts
-                yield plan_flight(walk, obstacles, town.plan, town.seed, screens, styles)
+                yield plan_trajectory(walk, obstacles, town.plan, town.seed, screens, styles)
 
 
 def heights_px(trace, cfg):
@@ -252,7 +254,7 @@ def test_diverse_shows_each_decision_and_all_heights_and_distances_whatever_the_
 
 
 def test_reacquire_loses_the_walker_and_finds_again_and_looks_where_it_lost_it():
-    traces = [plan_flight(STRAIGHT, HOUSE, styled(REACQUIRE), seed) for seed in range(6)]
+    traces = [plan_trajectory(STRAIGHT, HOUSE, styled(REACQUIRE), seed) for seed in range(6)]
     trace = max((trace for trace in traces if trace.drop_reason is None), key=lambda t: (t.visibility == 0).sum())
     assert finds_again(trace.visibility, 0.5)
     assert not trace.segments[0].keeps_sight
@@ -268,7 +270,7 @@ def test_reacquire_loses_the_walker_and_finds_again_and_looks_where_it_lost_it()
 
 
 def test_a_mission_ends_the_pursuit_at_home_and_looks_ahead():
-    trace = plan_flight(STRAIGHT, OPEN, styled(RETURN_HOME), 3)
+    trace = plan_trajectory(STRAIGHT, OPEN, styled(RETURN_HOME), 3)
     mission = trace.mission
     assert trace.drop_reason is None
     assert [part.style for part in trace.segments] == [FOLLOW, RETURN_HOME]
@@ -295,7 +297,7 @@ def test_the_way_home_arrives_and_holds_past_what_stands_between(planner):
     """A tower stands between the end of the pursuit and home; the pursuit went round it."""
     tower = kernels.obstacle_index(town_of(((20, 20, 60), (8, 8, 60))))
     walk = walk_along("round", [(0, 0), (50, 0), (50, 50)])
-    trace = plan_flight(walk, tower, styled(RETURN_HOME, planner=planner, track_astar={"beam": 256}), 0)
+    trace = plan_trajectory(walk, tower, styled(RETURN_HOME, planner=planner, track_astar={"beam": 256}), 0)
     assert trace.drop_reason is None
     assert trace.mission.at_frame >= len(trace.time_s) / 3
     speeds = np.linalg.norm(np.diff(trace.positions_m, axis=0), axis=1) / 0.5

@@ -21,10 +21,10 @@ from specimens_release import FREE, all_bytes, make_caption, make_inspection, re
 from caption.run import stage as caption_stage
 from caption.schema import CaptionConfig
 from cosfly.formats.captions import write_captions
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import depth_bytes, read_depth
 from cosfly.formats.inspection import write_inspection
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.errors import InputError, VerifyError
 from release.package.config import ReleaseConfig
@@ -45,7 +45,7 @@ def material(tmp_path_factory) -> Path:
 def make_material(root: Path, num_walks: int, towns: tuple[str, ...] = ("Town01",)) -> Path:
     """Write a tree with a caption of every window and an inspection that accepts all."""
     tree = make_playback_tree(root / "tree", num_walks, POINTS, width_px=48, height_px=27, towns=towns)
-    flights = map(read_flight, find_flights(tree))
+    flights = map(read_track, find_tracks(tree))
     write_captions(root / "captions.jsonl", [make_caption(f, i) for f in flights for i in range(4, POINTS - 1)])
     write_inspection(root / "inspect.json", make_inspection(tree, {}))
     return root
@@ -100,7 +100,7 @@ def test_splits_share_no_walk_and_no_twins(material, tmp_path):
 
 
 def test_neither_twin_goes_without_the_other_unless_asked(copy, tmp_path):
-    names = [folder.relative_to(copy / "tree").as_posix() for folder in find_flights(copy / "tree")]
+    names = [folder.relative_to(copy / "tree").as_posix() for folder in find_tracks(copy / "tree")]
     write_inspection(copy / "inspect.json", make_inspection(copy / "tree", {names[0]: ("rejected", "jerk")}))
     record = record_of(copy, tmp_path / "both")
     assert record.history.flights.left_out == {"its twin is not released": 1, "rejected: jerk": 1}
@@ -115,7 +115,7 @@ def test_neither_twin_goes_without_the_other_unless_asked(copy, tmp_path):
 
 def test_every_released_caption_has_its_whole_window(tmp_path):
     tree = make_playback_tree(tmp_path / "tree", 1, 100, width_px=32, height_px=18)
-    captions = [make_caption(f, i) for f in map(read_flight, find_flights(tree)) for i in range(4, 90)]
+    captions = [make_caption(f, i) for f in map(read_track, find_tracks(tree)) for i in range(4, 90)]
     write_captions(tmp_path / "captions.jsonl", captions)
     write_inspection(tmp_path / "inspect.json", make_inspection(tree, {}))
     folder = run(split_cfg(num_frames=60), [source_of(tmp_path)], tmp_path / "r")
@@ -182,7 +182,7 @@ def test_the_record_says_where_it_comes_from_and_nothing_of_this_machine(copy, t
 def test_depth_is_lossless_in_either_form_of_the_tree(material, tmp_path):
     folder = run(split_cfg(), [source_of(material)], tmp_path / "r")
     row = table_of(folder, ["town", "trajectory", "variant", "frame_index", "depth"])[3]
-    flight = read_flight(material / "tree" / row["town"] / row["trajectory"] / row["variant"])
+    flight = read_track(material / "tree" / row["town"] / row["trajectory"] / row["variant"])
     assert row["depth"] == depth_bytes(read_depth(flight.frame_folder(row["frame_index"])))
     packed = shutil.copytree(material, tmp_path / "packed")
     pack_depth(packed)
@@ -198,7 +198,7 @@ def test_depth_is_lossless_in_either_form_of_the_tree(material, tmp_path):
 
 
 def first_flight(root: Path) -> Path:
-    return find_flights(root / "tree")[0]
+    return find_tracks(root / "tree")[0]
 
 
 def change_json(path: Path, change) -> None:
@@ -337,7 +337,7 @@ def test_after_a_failed_flight_the_finished_shards_are_not_done_again(tmp_path, 
 
     monkeypatch.setattr(config, "MB", 20_000)
     whole = run(split_cfg(), [source_of(copy)], tmp_path / "whole")
-    picture = find_flights(copy / "tree")[0] / "frames_playback/frame_00005/rgb.png"
+    picture = find_tracks(copy / "tree")[0] / "frames_playback/frame_00005/rgb.png"
     data = picture.read_bytes()
     picture.write_bytes(data[:-30])
     with pytest.raises(InputError, match="nothing is released"):

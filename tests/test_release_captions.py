@@ -10,9 +10,9 @@ from commands import invoke
 from specimens_release import CFG, build, make_caption, make_inspection
 
 from cosfly.formats.captions import Coc, read_captions, write_captions
-from cosfly.formats.flights import find_flights
 from cosfly.formats.inspection import write_inspection
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import InputError, StorageError
 from release.export.captions import FORMULA, export
 from specimens import make_playback_tree
@@ -28,7 +28,7 @@ def run(tmp_path_factory) -> Path:
     make_playback_tree(root / "render", 2, NUM_POINTS)
     (root / "tree").symlink_to("render")
     captions = []
-    for number, flight in enumerate(map(read_flight, find_flights(root / "render"))):
+    for number, flight in enumerate(map(read_track, find_tracks(root / "render"))):
         for i in range(4, NUM_POINTS - 1):
             caption = make_caption(flight, i)
             if i == NUM_POINTS - 2:

@@ -26,11 +26,11 @@ from specimens_release import (
 )
 
 from cosfly.formats.captions import write_captions
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import depth_bytes
 from cosfly.formats.inspection import write_inspection
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
 from cosfly.formats.town import read_town_map
+from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.config import build as build_config
 from cosfly.runtime.documents import read_model
@@ -76,7 +76,7 @@ def spread(tmp_path_factory) -> Path:
 
 def assert_same_flight(found: Path, given: Path, frames: list[int] | None = None) -> None:
     """Every number and every picture of a flight, or of some frames of it."""
-    a, b = read_flight(given), read_flight(found, strict=frames is None)
+    a, b = read_track(given), read_track(found, strict=frames is None)
     kept = np.arange(len(a)) if frames is None else np.array(frames)
     for name in type(a).__dataclass_fields__:
         x, y = getattr(a, name), getattr(b, name)
@@ -94,8 +94,8 @@ def assert_same_flight(found: Path, given: Path, frames: list[int] | None = None
 
 def test_tree_to_release_to_tree_loses_nothing(whole, dataset, tmp_path):
     product = export(config("tree"), dataset, tmp_path / "out")
-    given = find_flights(whole / "tree")
-    found = find_flights(product)
+    given = find_tracks(whole / "tree")
+    found = find_tracks(product)
     assert [p.relative_to(product) for p in found] == [p.relative_to(whole / "tree") for p in given]
     for a, b in zip(given, found, strict=True):
         assert_same_flight(b, a)

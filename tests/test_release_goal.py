@@ -10,11 +10,11 @@ import pytest
 from test_cosfly_render import needs_gl
 from test_cosfly_render_goal import crowded_tree  # noqa: F401
 
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import FILE_NAMES, PERSON_ID, frame_path
 from cosfly.formats.goals import SLOTS, words_of
 from cosfly.formats.people import People
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
 from release.columns import SCALARS, Placement
 from release.export.lerobot import task_of
 from release.export.source import ReleasedRows
@@ -30,8 +30,8 @@ pytestmark = [needs_gl]
 @pytest.fixture(scope="module")
 def flights(crowded_tree) -> list[tuple[FlightRows, Path]]:  # noqa: F811
     found = []
-    for folder in find_flights(crowded_tree):
-        flight, placement = read_flight(folder), Placement(walk="w", split="train")
+    for folder in find_tracks(crowded_tree):
+        flight, placement = read_track(folder), Placement(walk="w", split="train")
         rows = [{one.name: one.cell(flight, i, None, placement) for one in SCALARS} for i in range(len(flight))]
         found.append((FlightRows("a/b/c/d", rows), folder))
     return found

@@ -22,7 +22,7 @@ from cosfly.formats.frames import read_depth, read_instance, read_rgb
 from cosfly.formats.inspection import (
     write_inspection,
 )
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
 from cosfly.formats.town import write_town_map
 from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import ConfigError, InputError
@@ -63,7 +63,7 @@ def test_load_dataset_gives_pictures_poses_and_both_languages(loaded, release_in
     assert set(loaded["town"]) == {"Town01", "Town02"}
     for row in (loaded[0], loaded[9], loaded[31]):
         folder = release_inputs / "tree" / row["town"] / row["trajectory"] / row["variant"]
-        flight, i = read_flight(folder), row["frame_index"]
+        flight, i = read_track(folder), row["frame_index"]
         frame = flight.frame_folder(i)
         assert (np.asarray(row["image"]) == read_rgb(frame)).all()
         coded = np.asarray(row["instance"]).astype(np.uint16)

@@ -18,9 +18,9 @@ from specimens_foreign import hub_snapshot
 
 from cosfly.formats.boxes import make_box_map, write_boxes
 from cosfly.formats.captions import write_captions
-from cosfly.formats.flights import find_flights
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.tables import rows_of
 from cosfly.viz.frame_views import read_view
 from release.columns import PLACE, POINT
@@ -57,7 +57,7 @@ def run_folder(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "one"
     tree = make_playback_tree(folder / "render", 2, NUM_POINTS, width_px=96, height_px=54, towns=("Town01", "Town02"))
     captions, read = [], {"sentences": {"en": ["proved", "unread"], "zh": ["proved", "contradicted"]}}
-    for flight in map(read_flight, find_flights(tree)):
+    for flight in map(read_track, find_tracks(tree)):
         for i in range(WINDOW - 1, NUM_POINTS - 1):
             more = {"checks": read if i % 2 else {}} | ODD.get(i, {})
             caption = make_caption(flight.town, flight.trajectory, flight.variant, i, **more)
@@ -171,7 +171,7 @@ def test_pictures_of_a_release_look_like_those_of_its_tree(release_inputs, built
     record = read_record(built / "release.json")
     row = next(rows_of(built / record.shards[0].path))
     place = release_inputs / "tree" / row["town"] / row["trajectory"] / row["variant"]
-    frame = read_flight(place).frame_folder(row["frame_index"])
+    frame = read_track(place).frame_folder(row["frame_index"])
     for file, view in VIEW_OF.items():
         assert (picture(row, file, record) == read_view(frame, view)).all()
 

@@ -16,10 +16,10 @@ from simulators.scene import clothes_of
 from test_renderers_contract import circling, street, write_inputs
 
 from cosfly.formats.boxes import write_boxes
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import read_depth, read_instance, read_meta, read_rgb
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.traces import DroneTrace
+from cosfly.formats.tracks import find_tracks
 from cosfly.formats.weather import WeatherParams
 from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
 from cosfly.render.carla_backend import CarlaRenderConfig
@@ -60,7 +60,7 @@ def files_of(tree: Path) -> dict[str, bytes]:
 def pictures_of(tree: Path) -> list[tuple]:
     return [
         (folder.name, frame.name, read_rgb(frame), read_depth(frame), *read_instance(frame), read_meta(frame))
-        for folder in find_flights(tree)
+        for folder in find_tracks(tree)
         for frame in sorted((folder / "frames_playback").iterdir())
     ]
 
@@ -85,11 +85,11 @@ def test_a_tree_is_the_embedded_renderers_frame_by_frame(tmp_path):
     with serving(street(), tmp_path / "town") as port:
         tree = run(config(port, FRAMES), *inputs, tmp_path / "carla", seed=5, workers=1)
         assert as_client(found_settings, port) == (False, 0, 5.0), "the server is left as it was found"
-    assert [p.relative_to(tree) for p in find_flights(tree)] == [
-        p.relative_to(reference) for p in find_flights(reference)
+    assert [p.relative_to(tree) for p in find_tracks(tree)] == [
+        p.relative_to(reference) for p in find_tracks(reference)
     ]
     assert files_of(tree).keys() == files_of(reference).keys()
-    for folder in find_flights(tree):
+    for folder in find_tracks(tree):
         ours, theirs = (
             json.loads((root / folder.relative_to(tree) / "trajectory.json").read_text()) for root in (tree, reference)
         )
@@ -176,7 +176,7 @@ def test_a_silent_sensor_fails_the_flight_with_its_name_and_keeps_the_finished_o
     assert len(failures) == 2
     for failure in failures:
         assert re.search(rf"CARLA 0\.9\.16 at 127\.0\.0\.1:{port}, street.*camera depth", failure["message"]), failure
-    assert len(find_flights(tree)) == 1
+    assert len(find_tracks(tree)) == 1
 
 
 @pytest.mark.slow
@@ -186,12 +186,12 @@ def test_a_server_that_dies_is_named_and_the_run_goes_on_with_the_next(tmp_path)
         cfg = config(port, timeout_s=5.0)
         with pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port}"):
             run(cfg, *inputs, tmp_path / "tree", workers=1)
-    assert len(find_flights(tmp_path / "tree")) == 1
+    assert len(find_tracks(tmp_path / "tree")) == 1
     kept = files_of(tmp_path / "tree")
     with serving(street(), tmp_path / "town") as port:
         tree = run(config(port), *inputs, tmp_path / "tree", workers=1)
     files = files_of(tree)
-    assert len(find_flights(tree)) == 2
+    assert len(find_tracks(tree)) == 2
     assert {name: files[name] for name in kept} == kept
 
 
@@ -205,7 +205,7 @@ def test_a_server_that_we_start_is_started_again(tmp_path):
     start = f"sh -c 'mkdir {tmp_path}/{{port}} 2>/dev/null && exec {plain} die@6; exec {plain}'"
     cfg = config(port, timeout_s=15.0, server_command=start)
     tree = run(cfg, *inputs, tmp_path / "tree", workers=2)
-    assert len(find_flights(tree)) == 2
+    assert len(find_tracks(tree)) == 2
     assert (tmp_path / str(port)).is_dir()
     assert (tmp_path / str(port + 10)).is_dir(), "ports 10 apart"
     with pytest.raises(EnvironmentMissing, match="no CARLA server"):

@@ -9,9 +9,9 @@ import pytest
 from test_cosfly_render import needs_gl
 from test_renderers_contract import circling, write_inputs
 
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import LEGIBLE_CONTRAST, TargetMeta, frame_name, read_meta
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
+from cosfly.formats.tracks import find_tracks
 from cosfly.render.camera import contrast_of, legibility
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
@@ -58,8 +58,8 @@ def test_legibility_is_of_the_picture_as_written(tmp_path):
     found = {}
     for name, more in (("plain", {}), ("fog", dim)):
         tree = run(build(RenderConfig, size | more, "test"), boxes, simplified, traces, tmp_path / name)
-        (folder,) = find_flights(tree)
-        flight = read_flight(folder)
+        (folder,) = find_tracks(tree)
+        flight = read_track(folder)
         found[name] = flight.told_legibility(1)
         told = read_meta(folder / frame_name(1)).target
         assert found[name] == told.model_dump(include=set(found[name]))

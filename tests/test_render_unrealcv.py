@@ -18,12 +18,12 @@ from typer.testing import CliRunner
 
 from cosfly.cli import app
 from cosfly.formats.boxes import BoxMap, write_boxes
-from cosfly.formats.flights import find_flights
 from cosfly.formats.kinds import KINDS
+from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
 from cosfly.maps import unrealcv_export
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig
-from cosfly.render.contract import PERSON_ID, PosedCar, PosedOther, PosedPerson, other_id
+from cosfly.render.contract import PERSON_ID, PosedBystander, PosedCar, PosedPerson, other_id
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.render.unrealcv_backend import UnrealCvRenderConfig
@@ -87,7 +87,7 @@ def test_a_tree_is_the_embedded_renderers_by_recursive_diff(tmp_path):
         {str(p.relative_to(root)) for p in root.rglob("*") if p.name != "target.png"} for root in (tree, reference)
     ]
     assert every[0] == every[1]
-    for folder in find_flights(tree):
+    for folder in find_tracks(tree):
         ours, theirs = (
             json.loads((root / folder.relative_to(tree) / "trajectory.json").read_text()) for root in (tree, reference)
         )
@@ -122,7 +122,7 @@ def test_people_and_cars_stand_where_they_are_and_the_lens_changes():
     clothes = clothes_of("Base_User_Agent_C")
     pose = world_from_camera(np.array([-1.0, -9.5, 5.5]), np.array([-32.5, 60.0, 0.0]))
     person = PosedPerson(np.array([4.0, -3.0, 0.90625]), 0.0, 0.0, 1.0, clothes)
-    car = PosedOther(other_id(0), PosedCar(np.array([1.0, -4.0, 0.75]), 1.0, (2.25, 0.9, 0.75), 0.3))
+    car = PosedBystander(other_id(0), PosedCar(np.array([1.0, -4.0, 0.75]), 1.0, (2.25, 0.9, 0.75), 0.3))
     frames = []
     with beside(street()) as port:
         ours = opened(port, exported())
@@ -186,11 +186,11 @@ def test_a_server_that_ends_is_named_and_the_run_goes_on_with_the_next(fault, to
         pytest.raises(EnvironmentMissing, match=rf"127\.0\.0\.1:{port} \(UnrealCV.*{told}"),
     ):
         run(config(port, timeout_s=2.0, retries=1), *given, tmp_path / "tree", workers=1)
-    assert len(find_flights(tmp_path / "tree")) == 1
+    assert len(find_tracks(tmp_path / "tree")) == 1
     kept = files_of(tmp_path / "tree")
     with serving(street(), tmp_path / "town", protocol="unrealcv") as port:
         files = files_of(run(config(port), *given, tmp_path / "tree", workers=1))
-    assert len(find_flights(tmp_path / "tree")) == 2
+    assert len(find_tracks(tmp_path / "tree")) == 2
     assert {name: files[name] for name in kept} == kept
 
 
@@ -209,7 +209,7 @@ def test_the_papers_options(tmp_path):
     words[words.index("--path-index") + 1], words[words.index("--out") + 1] = "7", str(tmp_path / "other")
     other = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
-    flights = find_flights(tmp_path / "render")
+    flights = find_tracks(tmp_path / "render")
     assert {json.loads((f / "trajectory.json").read_text())["source"]["path_index"] for f in flights} == {1}
     names = {p.name for p in (tmp_path / "render").rglob("frame_00000/*")}
     assert "rgb.png" in names

@@ -26,13 +26,13 @@ from simulator_serving import serving
 
 from cosfly.formats import playback
 from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, write_boxes
-from cosfly.formats.flights import find_flights
+from cosfly.formats.bystanders import Bystander, Bystanders, write_bystanders
 from cosfly.formats.frames import SKY_DEPTH_M, Camera, Look, read_instance, read_meta
 from cosfly.formats.inspection import read_inspection
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.others import Company, Other, write_others
+from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.traces import DroneTrace, write_traces
-from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
+from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import box_corners, intrinsic_matrix, look_at, project, rotation_matrices, world_from_camera
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run as inspect_tree
@@ -46,8 +46,8 @@ from cosfly.render.contract import (
     NEAR_M,
     NO_INSTANCE,
     PERSON_ID,
+    PosedBystander,
     PosedCar,
-    PosedOther,
     PosedPerson,
     other_id,
     plane_z_m,
@@ -503,8 +503,8 @@ def test_a_whole_flight_has_the_annotations_of_the_default_renderer(renderer_nam
     found = sorted(str(path.relative_to(tree)) for path in (tree / "Town_Street").rglob("*"))
     assert found == sorted(str(path.relative_to(reference)) for path in (reference / "Town_Street").rglob("*"))
     visibilities = []
-    for folder in find_flights(tree):
-        flight = playback.read_flight(folder)
+    for folder in find_tracks(tree):
+        flight = playback.read_track(folder)
         for i in range(len(flight)):
             there = reference / folder.relative_to(tree) / playback.frame_name(i)
             meta, expected = read_meta(flight.frame_folder(i)), read_meta(there)
@@ -551,10 +551,10 @@ def test_a_second_renderer_without_libraries_names_the_packages(monkeypatch):
 
 # --- others -----------------------------------------------------------------------------------------------------------
 
-BESIDE = PosedOther(
+BESIDE = PosedBystander(
     other_id(0), PosedPerson(HIP + np.array([1.2, 0.6, 0.0]), 0.2, 0.4, 1.0, choose_clothes(np.random.default_rng(4)))
 )
-CAR = PosedOther(other_id(1), PosedCar(HIP + np.array([-5.0, -1.0, -0.15]), 0.6, (2.2, 0.9, 0.75), 0.3))
+CAR = PosedBystander(other_id(1), PosedCar(HIP + np.array([-5.0, -1.0, -0.15]), 0.6, (2.2, 0.9, 0.75), 0.3))
 
 
 def test_others_are_drawn_with_ids_of_their_own_inside_their_boxes(renderer):
@@ -584,7 +584,7 @@ def test_who_stands_before_the_target_hides_it_and_is_told_from_the_map(renderer
     pose = pose_towards(HIP + np.array([0.0, -12.0, 0.3]), HIP)
     walker = PosedPerson(HIP, 0.7, 1.2, 1.0, choose_clothes(np.random.default_rng(3)))
     view = view_target(HIP, pose, camera)
-    before = PosedOther(other_id(1), PosedCar(HIP + np.array([0.0, -4.0, -0.15]), 0.0, (2.2, 0.9, 0.75), 0.3))
+    before = PosedBystander(other_id(1), PosedCar(HIP + np.array([0.0, -4.0, -0.15]), 0.0, (2.2, 0.9, 0.75), 0.3))
     ids = np.array([before.instance_id])
     shares = []
     for others in ((), (before,)):
@@ -626,9 +626,9 @@ def with_others(folder: Path, num: int, trace: DroneTrace) -> Path:
     """Others of a flight: one who walks 1 m beside the person, and a car that stands off; of `num` times."""
     folder.mkdir(exist_ok=True)
     feet = trace.targets_m[:num] - [0.0, 0.0, 0.9]
-    beside = Other("Pedestrians", feet + np.array([0.2, -1.0, 0.0]), np.zeros(num))
-    car = Other("Car", np.tile(feet[0] + [1.0, 3.5, 0.0], (num, 1)), np.full(num, 0.3))
-    write_others(folder / "others.json", [Company(trace.path_id, [beside, car])], {})
+    beside = Bystander("Pedestrians", feet + np.array([0.2, -1.0, 0.0]), np.zeros(num))
+    car = Bystander("Car", np.tile(feet[0] + [1.0, 3.5, 0.0], (num, 1)), np.full(num, 0.3))
+    write_bystanders(folder / "others.json", [Bystanders(trace.path_id, [beside, car])], {})
     return folder / "others.json"
 
 
@@ -642,8 +642,8 @@ def test_a_flight_with_others_tells_of_them_in_every_frame(renderer_name, tmp_pa
     inputs, others = write_inputs(tmp_path / "in", [trace]), with_others(tmp_path / "in", 6, trace)
     cfg = build(RenderConfig, {**FEW, "backend": renderer_name}, "test")
     tree = run(cfg, *inputs, tmp_path / "tree", seed=5, others=others)
-    for folder in find_flights(tree):
-        flight = playback.read_flight(folder)
+    for folder in find_tracks(tree):
+        flight = playback.read_track(folder)
         for i in range(len(flight)):
             meta, ids = read_meta(flight.frame_folder(i)), read_instance(flight.frame_folder(i))[1]
             assert [other.instance_id for other in meta.others.others] == [MAX_BOX_ID, MAX_BOX_ID - 1]

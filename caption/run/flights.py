@@ -15,9 +15,9 @@ from pathlib import Path
 from caption.run.windows import current_frames, cut_windows
 from caption.schema import CaptionConfig, Window, WindowConfig
 from cosfly.formats.captions import caption_lines, write_caption_lines
-from cosfly.formats.flights import find_flights, read_twin
-from cosfly.formats.places import ALL_FLIGHTS, FlightChoice, flight_ids, flight_of, place_of
-from cosfly.formats.playback import Flight, read_flight
+from cosfly.formats.places import ALL_FLIGHTS, TrackChoice, flight_ids, flight_of, place_of
+from cosfly.formats.playback import Track, read_track
+from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.runtime.errors import InputError, VerifyError
 
 log = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ class Allotted:
         Raises:
             InputError: it, or the clean flight beside it, cannot be read.
         """
-        flight = replace(read_flight(self.folder, strict=False), given_id=self.name)
+        flight = replace(read_track(self.folder, strict=False), given_id=self.name)
         for number, window in enumerate(_cut(flight, cfg)):
             if number == self.most:
                 return
@@ -64,11 +64,11 @@ class Allotted:
         return count if self.most is None else min(count, self.most)
 
 
-def _cut(flight: Flight, cfg: CaptionConfig) -> Iterator[Window]:
+def _cut(flight: Track, cfg: CaptionConfig) -> Iterator[Window]:
     return cut_windows(flight, cfg.window, _twin_of(flight))
 
 
-def _twin_of(flight: Flight) -> Flight | None:
+def _twin_of(flight: Track) -> Track | None:
     """Read the clean flight beside a perturbed one; one of other frames is left out, and the log says why."""
     try:
         return read_twin(flight)
@@ -77,9 +77,9 @@ def _twin_of(flight: Flight) -> Flight | None:
         return None
 
 
-def named_flights(data: Path, choice: FlightChoice = ALL_FLIGHTS) -> list[tuple[str, Path]]:
+def named_flights(data: Path, choice: TrackChoice = ALL_FLIGHTS) -> list[tuple[str, Path]]:
     """Return (flight id, folder) in the order of the product."""
-    folders = find_flights(data, choice)
+    folders = find_tracks(data, choice)
     ids = flight_ids([place_of(folder) for folder in folders])
     named = [(ids[place_of(folder)], folder) for folder in folders]
     return sorted(named, key=lambda pair: f"{pair[0]}_frame_")  # the order of their sample ids
@@ -94,7 +94,7 @@ def allot(flights: list[tuple[str, Path]], cfg: CaptionConfig) -> tuple[list[All
     allotted: list[Allotted] = []
     for name, folder in flights:
         try:
-            flight = read_flight(folder, strict=False)
+            flight = read_track(folder, strict=False)
             count = sum(1 for _ in _cut(flight, cfg))
         except InputError:
             count = 0  # the work itself records the failure

@@ -25,7 +25,7 @@ from caption.truth.actions import TABLE, measure
 from cosfly.formats.captions import KeyframeRecord, LabelFrom, Language
 from cosfly.formats.frames import files_in
 from cosfly.formats.places import sample_id
-from cosfly.formats.playback import Flight
+from cosfly.formats.playback import Track
 from cosfly.formats.segments import Mission
 
 
@@ -34,7 +34,7 @@ def current_frames(num_points: int, cfg: WindowConfig) -> range:
     return range(cfg.num_frames - 1, num_points - cfg.future_frames, cfg.stride)
 
 
-def cut_windows(flight: Flight, cfg: WindowConfig, twin: Flight | None = None) -> Iterator[Window]:
+def cut_windows(flight: Track, cfg: WindowConfig, twin: Track | None = None) -> Iterator[Window]:
     """Yield a flight's windows in order of time. A flight shorter than a window gives none.
 
     Args:
@@ -85,7 +85,7 @@ def missed_changes(labels: list[str | None], chosen: set[int]) -> list[int]:
     return [i for i in range(1, len(labels)) if labels[i] != labels[i - 1] and i not in chosen]
 
 
-def frames_of(flight: Flight) -> tuple[ObservedFrame, ...]:
+def frames_of(flight: Track) -> tuple[ObservedFrame, ...]:
     """Return what was known at each frame of a flight."""
     return observed_frames(
         flight.time_s,
@@ -98,17 +98,17 @@ def frames_of(flight: Flight) -> tuple[ObservedFrame, ...]:
         flight.target_visible,
         flight.visibility,
         np.ones(len(flight), dtype=bool) if flight.target_legible is None else flight.target_legible,
-        *(np.full((len(flight), 5), np.nan) if flight.company is None else flight.company).T[[0, 1, 4]],
+        *(np.full((len(flight), 5), np.nan) if flight.bystanders is None else flight.bystanders).T[[0, 1, 4]],
     )
 
 
-def goal_of(flight: Flight) -> dict[Language, str] | None:
+def goal_of(flight: Track) -> dict[Language, str] | None:
     """Return the goal in words, of a flight in which there are other people."""
-    return None if flight.goal is None or flight.company is None else {"en": flight.goal.en, "zh": flight.goal.zh}
+    return None if flight.goal is None or flight.bystanders is None else {"en": flight.goal.en, "zh": flight.goal.zh}
 
 
 def _observe(
-    flight: Flight, frames: tuple[ObservedFrame, ...], span: slice, folders: list[Path], files: list[frozenset[str]]
+    flight: Track, frames: tuple[ObservedFrame, ...], span: slice, folders: list[Path], files: list[frozenset[str]]
 ) -> ObservedWindow:
     """Take the observed frames out of a flight: nothing of what follows stays reachable."""
     return ObservedWindow(
@@ -139,7 +139,7 @@ def order_comes_within(mission: Mission | None, current: int, future_frames: int
     return mission is not None and current < mission.at_frame <= current + future_frames
 
 
-def cut_future(flight: Flight, motion: LabelMotion, current: int, future_frames: int) -> FutureMotion:
+def cut_future(flight: Track, motion: LabelMotion, current: int, future_frames: int) -> FutureMotion:
     """Return the motion after frame `current`: as it is without perturbation, or as it was flown where that is not
     known.
 
@@ -187,12 +187,12 @@ class LabelMotion:
         return (~(np.isnan(self.positions_m).any(axis=1) | np.isnan(self.yaw_deg))).tolist()
 
 
-def as_flown(flight: Flight, label_from: LabelFrom) -> LabelMotion:
+def as_flown(flight: Track, label_from: LabelFrom) -> LabelMotion:
     """Return the motion of a flight as it was flown, perturbation and all."""
     return LabelMotion(label_from, flight.positions_m, flight.rotations_deg[:, 1], flight.targets_m)
 
 
-def label_motion(flight: Flight, twin: Flight | None = None) -> LabelMotion:
+def label_motion(flight: Track, twin: Track | None = None) -> LabelMotion:
     """Return a flight's motion without perturbation, in the best way there is.
 
     Args:

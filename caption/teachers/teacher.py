@@ -36,7 +36,7 @@ from cosfly.llm.budget import BYTES_PER_TOKEN, PIXELS_PER_TOKEN, Budget
 from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import Engine, Reply, Request, Troubles
 from cosfly.llm.vllm_engine import VllmEngine
-from cosfly.runtime.chance import draws_for, rng_for
+from cosfly.runtime.seeding import draws_for, rng_for
 from cosfly.viz.frame_views import Pictures
 
 ENCODING_THREADS = 4

@@ -74,7 +74,7 @@ def caption(
         _examine_endpoint(cfg.teacher, cfg)
     if plan_only:
         return _tell_forecast(job, tree, target)
-    job.finish(stage.run(cfg, tree, target, seed=job.cfg.seed, retry_failed=retry_failed, **job.manner), target)
+    job.finish(stage.run(cfg, tree, target, seed=job.cfg.seed, retry_failed=retry_failed, **job.worker_options), target)
 
 
 def _tell_forecast(job: Job, tree: Path, target: Path) -> None:

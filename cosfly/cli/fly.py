@@ -51,24 +51,28 @@ def fly(
         raise typer.BadParameter("either --policy or --student flies")
     cfg = job.cfg
     flown = cfg.fly.model_copy(update={"student": f"policy:{policy}"}) if policy else cfg.fly
-    run = stage.FlightsConfig(fly=flown, plan=cfg.plan, render=cfg.render, caption=cfg.caption, infer=cfg.distill.infer)
+    run = stage.ClosedLoopConfig(
+        fly=flown, plan=cfg.plan, render=cfg.render, caption=cfg.caption, infer=cfg.distill.infer
+    )
     if relabel is not None:
         if map_ is None or paths or env or policy or student:
             raise typer.BadParameter("--relabel takes --map, and who flew where stands in its folder")
         from cosfly.closed_loop.relabel import run as replan
 
-        job.finish(replan(run, relabel, map_, simplified or map_, out, **job.manner), out)
+        job.finish(replan(run, relabel, map_, simplified or map_, out, **job.worker_options), out)
         return
     if env is not None:
         if map_ or paths or simplified or others:
             raise typer.BadParameter("--env has its own maps and walks")
         from cosfly.envs import listed
 
-        job.finish(listed.run(listed.ListConfig(**dict(run), env=env), out, seed=cfg.seed, **job.manner), out)
+        job.finish(listed.run(listed.ListConfig(**dict(run), env=env), out, seed=cfg.seed, **job.worker_options), out)
         return
     if map_ is None or paths is None:
         raise typer.BadParameter("--map and --paths are needed, or --env")
-    job.finish(stage.run(run, map_, simplified or map_, paths, out, seed=cfg.seed, others=others, **job.manner), out)
+    job.finish(
+        stage.run(run, map_, simplified or map_, paths, out, seed=cfg.seed, others=others, **job.worker_options), out
+    )
 
 
 @app.command()

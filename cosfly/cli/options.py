@@ -45,7 +45,7 @@ class Sets:
         return self.words.get(given, given) if isinstance(given, str) else given
 
 
-Track = Literal["clean", "perturbed", "both"]
+TrackOption = Literal["clean", "perturbed", "both"]
 TRACKS = {"clean": ["clean"], "perturbed": ["perturbed"], "both": ["clean", "perturbed"]}
 GLOB_HELP = "Only flights whose folder, or one above it, matches: 'Town01/trajectory_17*/ORI', 'Town0[12]'; repeat it."
 TRACKS_HELP = "Only flights of this track."
@@ -54,7 +54,7 @@ ENGINE_HELP = "Where the workers are: processes of this machine, or on the nodes
 ADDRESS_HELP = "Head node of --engine ray, or auto; none: $RAY_ADDRESS, or a cluster of this machine."
 SHARED: dict[str, tuple[Any, Any, Any]] = {  # name -> type, option and default, in the order of the help
     "flights": (list[str] | None, Option(metavar="GLOB", help=GLOB_HELP), None),
-    "tracks": (Track | None, Option(show_default="both", help=TRACKS_HELP), None),
+    "tracks": (TrackOption | None, Option(show_default="both", help=TRACKS_HELP), None),
     "config": (Path | None, Option("--config", "-c", help="YAML file with the settings of a run."), None),
     "overrides": (
         list[str] | None,
@@ -92,11 +92,11 @@ class Job:
     resume: Resume = "if-same"
 
     @property
-    def manner(self) -> dict[str, Any]:
+    def worker_options(self) -> dict[str, Any]:
         """How a stage works, whatever it makes: arguments that all stages with workers take."""
-        from cosfly.pipeline.settings import manner_of_work
+        from cosfly.pipeline.settings import worker_options
 
-        return manner_of_work(self.cfg) | {"resume": self.resume}
+        return worker_options(self.cfg) | {"resume": self.resume}
 
     def tree(self, data: list[Path] | None) -> Path:
         """Return the playback tree: given, or that of the run folder one stands in; InputError where there is not
@@ -166,10 +166,10 @@ def takes(*names: str, flights: str | None = None) -> Callable[[Callable[..., No
                 return
             chosen = {name: one for name, one in sets.items() if given[name] not in (None, [])}
             extra = {one.path: one.value_of(given[name]) for name, one in chosen.items()}
-            manner = {name: given[name] for name in ("resume",) if name in given}
+            worker_options = {name: given[name] for name in ("resume",) if name in given}
             cfg = resolve(given["config"], given.get("overrides"), extra)
             town = _town_of(cfg, given["town"]) if "town" in shared else cfg
-            job = Job(town, given.get("overrides") or (), **manner)
+            job = Job(town, given.get("overrides") or (), **worker_options)
             function(job, **{name: _opened(job.cfg, given[name]) for name in taken})
 
         parameters = [

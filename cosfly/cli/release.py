@@ -38,7 +38,7 @@ def release_build(
         list[str] | None, Option(metavar="GLOB", help=options.GLOB_HELP), Sets("release.flights")
     ] = None,
     tracks: Annotated[
-        options.Track | None, Option(help=options.TRACKS_HELP), Sets("release.tracks", options.TRACKS)
+        options.TrackOption | None, Option(help=options.TRACKS_HELP), Sets("release.tracks", options.TRACKS)
     ] = None,
     frames: Annotated[
         str | None,
@@ -59,7 +59,7 @@ def release_build(
                 "give --data and --captions, and --inspect or none, one of each for a tree; or run folders"
             )
         sources += [Source.of_files(*files) for files in zip(trees, captions or [], inspections, strict=True)]
-    job.finish(package.run(job.cfg.release, sources, out, **job.manner), out)
+    job.finish(package.run(job.cfg.release, sources, out, **job.worker_options), out)
 
 
 @app.command("verify")
@@ -80,13 +80,13 @@ def release_verify(
 ) -> None:
     """Check that a release is what its records say and can be true, from cheap to dear. Exit 1 if anything is wrong."""
     from caption.run.released import read_released
-    from cosfly.pipeline.settings import manner_of_work
+    from cosfly.pipeline.settings import worker_options
     from cosfly.runtime.store import write_json
     from release.verify.verify import LEVELS, verify
 
     if level not in LEVELS:
         raise typer.BadParameter(f"one of {', '.join(LEVELS)}", param_hint="--level")
-    report = verify(folder, level=level, reader=read_released, **manner_of_work(job.cfg))
+    report = verify(folder, level=level, reader=read_released, **worker_options(job.cfg))
     typer.echo(str(report))
     if json_file is not None:
         write_json(json_file, report.as_json())
@@ -143,7 +143,9 @@ def release_export(
         from release.export.contract import ExportConfig
 
         given = {"format": format} | ({} if shard_mb is None else {"shard_mb": shard_mb})
-        job.finish(export.run(build(ExportConfig, given, "--format, --shard-mb"), source, out, **job.manner), out)
+        job.finish(
+            export.run(build(ExportConfig, given, "--format, --shard-mb"), source, out, **job.worker_options), out
+        )
         return
     from release.columns import LANGUAGES
     from release.export import captions

@@ -77,7 +77,7 @@ def pedestrians(
     """Step 3: walks of 50-100 m on the simplified map, path.json."""
     from cosfly.pedestrians import stage
 
-    product = stage.run(job.cfg.pedestrians, map_, out, seed=job.cfg.seed, roi=job.cfg.roi, **job.manner)
+    product = stage.run(job.cfg.pedestrians, map_, out, seed=job.cfg.seed, roi=job.cfg.roi, **job.worker_options)
     job.finish(product, out)
 
 
@@ -131,7 +131,7 @@ def plan(
     """Step 4: a drone flight for every walk, drone_trace.json."""
     from cosfly.planners import stage
 
-    job.finish(stage.run(job.cfg.plan, map_, paths, out, seed=job.cfg.seed, **job.manner), out)
+    job.finish(stage.run(job.cfg.plan, map_, paths, out, seed=job.cfg.seed, **job.worker_options), out)
 
 
 @plan_app.command("compare")
@@ -154,7 +154,7 @@ def plan_compare(
 
     settings = job.cfg.plan.model_dump() | ({"planners": planner} if planner else {})
     compared = build(compare.CompareConfig, settings, "--planner")
-    product = compare.run(compared, map_, paths, out, seed=job.cfg.seed, **job.manner)
+    product = compare.run(compared, map_, paths, out, seed=job.cfg.seed, **job.worker_options)
     for table in text_tables(product):
         options.tell_table(console, table.columns, table.rows, title=table.title)
     typer.echo(product)
@@ -177,7 +177,7 @@ def plan_benchmark(
 
     settings = job.cfg.plan.model_dump() | {"scenarios": scenarios} | ({"planners": planner} if planner else {})
     cfg = build(benchmark.BenchmarkConfig, settings, "plan benchmark")
-    product = benchmark.run(cfg, map_, paths, out, seed=job.cfg.seed, **job.manner)
+    product = benchmark.run(cfg, map_, paths, out, seed=job.cfg.seed, **job.worker_options)
     table, *_ = benchmark.text_tables(benchmark.read_benchmark(product))
     narrow = [[row[k] for k in (0, 1, 5, 6, 7)] for row in (table.columns, *table.rows)]  # eighty columns hold these
     options.tell_table(console, narrow[0], narrow[1:], title=table.title)
@@ -252,8 +252,8 @@ def render(
     modalities: list[str] = [name for name in job.cfg.render.modalities if wanted.get(name) is not False]
     modalities += [name for name, is_wanted in wanted.items() if is_wanted and name not in modalities]
     cfg = build(RenderConfig, job.cfg.render.model_dump() | {"modalities": modalities}, "render")
-    manner = job.manner | {"seed": job.cfg.seed, "others": others}
-    product = stage.run(cfg, map_, simplified, traces, out, **manner)
+    worker_options = job.worker_options | {"seed": job.cfg.seed, "others": others}
+    product = stage.run(cfg, map_, simplified, traces, out, **worker_options)
     if gif:
         preview_gif(product, inside(out, gif_name), frames_per_s=gif_fps)
     job.finish(product, out)
@@ -276,7 +276,7 @@ def inspect(
     from cosfly.inspection import stage
 
     tree = job.tree(data)
-    job.finish(stage.run(job.cfg.inspect, map_, traces, tree, out, **job.manner), out)
+    job.finish(stage.run(job.cfg.inspect, map_, traces, tree, out, **job.worker_options), out)
 
 
 @inspect_app.command("review")

@@ -86,7 +86,7 @@ def study_zoom(
 
     given = {name: value for name, value in (("num_flights", flights), ("every", every)) if value is not None}
     studied = build(zoom.ZoomStudyConfig, job.cfg.render.model_dump() | given, "--flights, --every")
-    product = zoom.run(studied, map_, simplified, traces, out, seed=job.cfg.seed, **job.manner)
+    product = zoom.run(studied, map_, simplified, traces, out, seed=job.cfg.seed, **job.worker_options)
     table = zoom.text_table(read_object(product, what="zoom study"))
     options.tell_table(console, table.columns, table.rows, title=table.title)
     job.finish(product, out)

@@ -24,13 +24,13 @@ from cosfly.closed_loop.measures import (
 from cosfly.closed_loop.settings import FLOORS
 from cosfly.formats.figures import Figure
 from cosfly.formats.flight_scores import Score, read_score
-from cosfly.formats.flights import find_flights
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
 from cosfly.formats.pursuits import Pursuit, pursuit_file, read_pursuit
-from cosfly.runtime.chance import rng_for
+from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.config import Config
 from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
 from cosfly.runtime.store import sha256_bytes, write_bytes, write_model
 from cosfly.viz.frame_views import thumbnail
@@ -181,7 +181,7 @@ def _strips(one: Standing, own: Pursuits) -> list[dict[str, Any]]:
             continue
         pursuit, folder = own[key]
         tree = folder / "render"
-        drawn = (read_flight(path) for path in find_flights(tree)) if tree.is_dir() else ()
+        drawn = (read_track(path) for path in find_tracks(tree)) if tree.is_dir() else ()
         flight = next((one for one in drawn if one.source.get("scenario_id") == pursuit.walk), None)
         places = np.unique(np.linspace(pursuit.num_lead, len(pursuit.frames) - 1, STRIP_FRAMES).astype(int)).tolist()
         frames = [(pursuit.frames[i], flight and thumbnail(flight.frame_folder(i), STRIP_PX)) for i in places]

@@ -15,12 +15,12 @@ from itertools import groupby, pairwise
 
 import numpy as np
 
-from cosfly.formats.figures import Figure, draw_walks, figure_of_draws
+from cosfly.formats.figures import Figure, draw_pedestrians, figure_of_draws
 from cosfly.formats.flight_scores import FlightScore, Score
 from cosfly.formats.pursuits import Pursuit
-from cosfly.geometry.flight_metrics import RELAXED_SAFETY_M, derivative_rms
-from cosfly.runtime.chance import rng_for
+from cosfly.geometry.trajectory_metrics import RELAXED_SAFETY_M, derivative_rms
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.store import dump_json, sha256_bytes
 
 LOSS_S = 2.0  # unseen for so long the person is lost; for less it is hidden by a tree or a lamp
@@ -184,7 +184,7 @@ def ratios(draws: np.ndarray, sums: np.ndarray) -> np.ndarray:
 
 def draws_of(num_walks: int, rng: np.random.Generator) -> np.ndarray:
     """Draw walks, (1 + RESAMPLES, walks) how often each; the first has each once, as they were flown."""
-    return np.vstack([np.ones(num_walks), draw_walks(num_walks, RESAMPLES, rng)])
+    return np.vstack([np.ones(num_walks), draw_pedestrians(num_walks, RESAMPLES, rng)])
 
 
 def figures_of(drawn: np.ndarray, counts: Sequence[int], num_walks: int) -> dict[str, Figure]:

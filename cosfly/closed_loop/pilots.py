@@ -25,10 +25,10 @@ from caption.teachers.students import as_taught
 from caption.teachers.teacher import first_budget, open_teacher
 from caption.writing.contract import Draft, more_fields
 from cosfly.closed_loop.settings import FLOORS, FlyConfig
-from cosfly.closed_loop.stepper import ClosedLoopFlight, Moment
+from cosfly.closed_loop.stepper import ClosedLoopTrajectory, Moment
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.answer_text import parse_answer
-from cosfly.formats.frames import COMPANY, FILE_NAMES, depth_file, frame_name, instance_bytes, rgb_bytes
+from cosfly.formats.frames import BYSTANDER_COLUMNS, FILE_NAMES, depth_file, frame_name, instance_bytes, rgb_bytes
 from cosfly.formats.motion import in_axes_of
 from cosfly.formats.places import sample_id
 from cosfly.formats.pursuits import MOST_WORDS, Answer
@@ -37,8 +37,8 @@ from cosfly.llm.answers import Answer as BookAnswer
 from cosfly.llm.answers import AnswerBook
 from cosfly.llm.contract import NoAnswer
 from cosfly.llm.student_chat import TAUGHT
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import CosflyError
+from cosfly.runtime.seeding import rng_for
 from distill.inference.stage import InferConfig, Inputs, local_answers
 from distill.schema import Sample
 
@@ -62,7 +62,7 @@ class Outlook:
     """A flight up to now: its last frames, oldest first."""
 
     episode: str
-    flight: ClosedLoopFlight
+    flight: ClosedLoopTrajectory
     moments: Sequence[Moment]
 
 
@@ -118,7 +118,7 @@ class Ceiling:
         return [PilotAnswer("ok", command=self.to_next(one.flight, one.moments[-1])) for one in outlooks]
 
     @staticmethod
-    def to_next(flight: ClosedLoopFlight, now: Moment) -> np.ndarray:
+    def to_next(flight: ClosedLoopTrajectory, now: Moment) -> np.ndarray:
         """Return the command that leads to the plan's next pose, or as near as the drone's bounds allow."""
         planned, i = flight.planned, now.index + 1
         velocity = in_axes_of(now.rotation_deg[1], planned.positions_m[i] - now.position_m) / flight.dt_s
@@ -184,7 +184,7 @@ class AskedPilot:
     def _question(self, outlook: Outlook) -> Question:
         flight, moments = outlook.flight, outlook.moments
         targets = [moment.target for moment in moments]
-        company = [[moment.company.get(COMPANY[k]) for k in (0, 1, 4)] for moment in moments]
+        bystanders = [[moment.bystanders.get(BYSTANDER_COLUMNS[k]) for k in (0, 1, 4)] for moment in moments]
         frames = observed_frames(
             np.array([moment.time_s for moment in moments]),
             np.array([moment.position_m for moment in moments]),
@@ -194,7 +194,7 @@ class AskedPilot:
             np.array([target.mask_bbox_2d or [math.nan] * 4 for target in targets]),
             *(np.array([getattr(target, name) for target in targets]) for name in ("in_view", "visible", "visibility")),
             np.array([bool(target.legible) for target in targets]),
-            *np.array(company, dtype=np.float64).T,
+            *np.array(bystanders, dtype=np.float64).T,
         )
         folders = [self._folder(flight, moment) for moment in moments]
         place, indices = flight.place, tuple(moment.index for moment in moments)
@@ -204,7 +204,7 @@ class AskedPilot:
         window = ObservedWindow(name, *place, indices, width_px, height_px, frames, tuple(folders), files)
         return make_question(window, self.cfg.image, self.cfg.writing, self.vocabulary)
 
-    def _folder(self, flight: ClosedLoopFlight, moment: Moment) -> Path:
+    def _folder(self, flight: ClosedLoopTrajectory, moment: Moment) -> Path:
         """Return the folder of a frame, written for whoever looks at pictures; those that nobody asks for any more
         go."""
         if self._is_rules:  # which look at none

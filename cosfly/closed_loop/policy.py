@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from cosfly.closed_loop.pilots import Outlook, PilotAnswer
-from cosfly.closed_loop.stepper import ClosedLoopFlight, Moment
+from cosfly.closed_loop.stepper import ClosedLoopTrajectory, Moment
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.goals import SLOTS, words_of
 from cosfly.formats.motion import in_axes_of
@@ -41,7 +41,7 @@ STATE_LOW = np.array([-40, -40, -40, -100, -180, -90, 0], dtype=np.float32)
 STATE_HIGH = np.array([40, 40, 40, 1000, 180, 90, 3600], dtype=np.float32)
 
 
-def observe(flight: ClosedLoopFlight, now: Moment, *, depth: bool = False) -> dict[str, Any]:
+def observe(flight: ClosedLoopTrajectory, now: Moment, *, depth: bool = False) -> dict[str, Any]:
     """Return what a policy sees, which is what a real drone has, and no more: rgb (h, w, 3) uint8, state (7,)
     float32 as
     STATE, depth (h, w) float32 m, and goal: all that the person wears, which a look-alike does but for one thing."""

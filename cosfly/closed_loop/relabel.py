@@ -22,15 +22,15 @@ from caption.schema import FutureMotion
 from caption.truth.actions import TABLE, measure
 from cosfly.closed_loop.measures import LOSS_S
 from cosfly.closed_loop.pilots import Ceiling
-from cosfly.closed_loop.stage import PLAN, TRACES, TREE, FlightsConfig, flown_trace
-from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, as_drawn
+from cosfly.closed_loop.stage import PLAN, TRACES, TREE, ClosedLoopConfig, flown_trace
+from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory, as_drawn
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.flight_scores import read_score
 from cosfly.formats.pursuits import Pursuit, PursuitFrame, pursuit_file, read_pursuit
 from cosfly.formats.traces import ARRAYS, DroneTrace, Excerpt, read_traces, write_traces
 from cosfly.geometry.axes import look_at, step_s
-from cosfly.geometry.flight_metrics import CLEARANCE_CAP_M
 from cosfly.geometry.kernels import signed_distances, swept_distances
+from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_on
 from cosfly.render import stage as rendering
@@ -43,7 +43,7 @@ CAPTIONS = "caption"
 
 
 def run(
-    cfg: FlightsConfig,
+    cfg: ClosedLoopConfig,
     flown: Path,
     boxes: Path,
     simplified: Path,
@@ -88,7 +88,7 @@ def run(
     return out
 
 
-def _seed_of(flown: Path, cfg: FlightsConfig) -> int:
+def _seed_of(flown: Path, cfg: ClosedLoopConfig) -> int:
     """Return the seed of a flown folder, by which clothes and weather were drawn; see that the pictures are the
     same."""
     begun, fix = read_stage_record(flown), "give the settings that it was flown with"
@@ -102,7 +102,7 @@ def _seed_of(flown: Path, cfg: FlightsConfig) -> int:
     return begun.seed
 
 
-def make_worker(cfg: FlightsConfig, flown: Path, boxes: Path, simplified: Path, seed: int) -> Work:
+def make_worker(cfg: ClosedLoopConfig, flown: Path, boxes: Path, simplified: Path, seed: int) -> Work:
     """Open a map in this process, and give the function that judges one window of a student's flight."""
     plans = {plan.path_id: (n, plan) for n, plan in enumerate(read_traces(flown / PLAN / TRACES))}
     space = Airspace(cfg.render, read_boxes(boxes), read_boxes(simplified), seed=seed)
@@ -128,7 +128,7 @@ def make_worker(cfg: FlightsConfig, flown: Path, boxes: Path, simplified: Path, 
         cut: Any = {name: getattr(planned, name)[begin:end] for name in (*ARRAYS, "clearances_m")}
         part_of = Excerpt(plan.path_id, number, plan.targets_m[: begin + 1])
         planned = replace(planned, **cut, part_of=part_of)
-        flight = ClosedLoopFlight(space, planned, number=number, num_lead=num.num_frames)
+        flight = ClosedLoopTrajectory(space, planned, number=number, num_lead=num.num_frames)
         moments = [*flight.reset()]
         while flight.ended is None:
             moments.append(flight.step(Ceiling.to_next(flight, moments[-1])))

@@ -22,7 +22,7 @@ from cosfly.closed_loop.controller import Control, Controller, read_controls
 from cosfly.closed_loop.measures import score_pursuits
 from cosfly.closed_loop.pilots import Outlook, PilotAnswer, open_pilot
 from cosfly.closed_loop.settings import FlyConfig
-from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, Moment, as_drawn
+from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory, Moment, as_drawn
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.flight_scores import SCORE, SCORE_FORMAT
@@ -30,8 +30,8 @@ from cosfly.formats.motion import PlannedMotion
 from cosfly.formats.pursuits import Pursuit, PursuitFrame, WalkStyle, pursuit_file, read_pursuit, write_pursuit
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
 from cosfly.geometry.axes import headings_of, step_s
-from cosfly.geometry.flight_metrics import flight_metrics
 from cosfly.geometry.kernels import BoxIndex, obstacle_index, visibility
+from cosfly.geometry.trajectory_metrics import trajectory_metrics
 from cosfly.planners import stage as planning
 from cosfly.planners.contract import PlanConfig
 from cosfly.render import stage as rendering
@@ -50,7 +50,7 @@ PLAN, TRACES, TREE, ANSWERS = "plan", "drone_trace.json", "render", "answers"
 HALF_SEEN = 0.5  # of the five rays
 
 
-class FlightsConfig(Config):
+class ClosedLoopConfig(Config):
     """All that decides what is flown."""
 
     fly: FlyConfig
@@ -65,13 +65,13 @@ class OpenFlight:
     """A flight under way: the moments that its student may look at, and the records of all frames but the last."""
 
     episode: str
-    flight: ClosedLoopFlight
+    flight: ClosedLoopTrajectory
     controller: Controller
     moments: deque[Moment]
     frames: list[PursuitFrame] = field(default_factory=list)
 
     @classmethod
-    def begin(cls, episode: str, flight: ClosedLoopFlight, controls: dict[str, Control], num_frames: int) -> Self:
+    def begin(cls, episode: str, flight: ClosedLoopTrajectory, controls: dict[str, Control], num_frames: int) -> Self:
         """Begin an episode with what nobody is asked about."""
         plan, lead = flight.planned, flight.reset()
         begun = cls(episode, flight, Controller(controls, flight.drone, lead[-1]), deque(lead, num_frames))
@@ -124,7 +124,7 @@ class Fleet:
     """The student of this process, which flies several flights side by side. Made before a renderer is opened."""
 
     def __init__(
-        self, cfg: FlightsConfig, out: Path, seed: int, num_workers: int, list_sha256: str | None = None
+        self, cfg: ClosedLoopConfig, out: Path, seed: int, num_workers: int, list_sha256: str | None = None
     ) -> None:
         os.environ.setdefault("LP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // num_workers)))
         self.out, self.student = out, open_pilot(cfg.fly, cfg.caption, cfg.infer, seed, out / ANSWERS)
@@ -134,7 +134,7 @@ class Fleet:
             "controller_sha256": None if cfg.fly.engine == "planner" else sha256_file(cfg.fly.table),
         }  # fmt: skip
 
-    def fly(self, episodes: Mapping[str, Callable[[], ClosedLoopFlight]], map_sha256: str) -> Outcome:
+    def fly(self, episodes: Mapping[str, Callable[[], ClosedLoopTrajectory]], map_sha256: str) -> Outcome:
         """Fly episodes to their ends, and write the record of each as it ends; those of before a kill stay."""
         waiting = {name: opened for name, opened in episodes.items() if not pursuit_file(self.out, name).exists()}
         how = self.controls, self.student.num_frames
@@ -151,7 +151,7 @@ class Fleet:
 
 
 def run(
-    cfg: FlightsConfig,
+    cfg: ClosedLoopConfig,
     boxes: Path,
     simplified: Path,
     paths: Path,
@@ -190,7 +190,7 @@ def run(
 Inputs = tuple[Path, Path, Path, Path | None]
 
 
-def _fly_all(stage: StageFolder, cfg: FlightsConfig, inputs: Inputs, seed: int, workers: int, watch: Watch) -> None:
+def _fly_all(stage: StageFolder, cfg: ClosedLoopConfig, inputs: Inputs, seed: int, workers: int, watch: Watch) -> None:
     traces, num = read_traces(inputs[2]), 1 if cfg.fly.asks_model else workers
     why_not = [trace.drop_reason or (len(trace.time_s) <= cfg.fly.lead_frames and "too_short") for trace in traces]
     numbers, dropped = [n for n, why in enumerate(why_not) if not why], Counter(why for why in why_not if why)
@@ -239,20 +239,27 @@ def finish_flights(
 
 
 def make_worker(
-    cfg: FlightsConfig, boxes: Path, simplified: Path, plans: Path, others: Path | None, out: Path, seed: int, num: int
+    cfg: ClosedLoopConfig,
+    boxes: Path,
+    simplified: Path,
+    plans: Path,
+    others: Path | None,
+    out: Path,
+    seed: int,
+    num: int,
 ) -> Work:
     """Open a renderer and a student in this process, and give the function that flies some flights side by side."""
     fleet, traces = Fleet(cfg, out, seed, num), read_traces(plans)
-    companies = rendering.companies_of(others, traces)
-    num_others = rendering.num_others_of(companies)
+    companions = rendering.bystanders_by_path(others, traces)
+    num_others = rendering.num_others_of(companions)
     space = Airspace(cfg.render, read_boxes(boxes), read_boxes(simplified), seed=seed, num_others=num_others)
     bounds: dict[str, Any] = {"num_lead": cfg.fly.lead_frames, "lost_s": cfg.fly.lost_s}
     map_sha256 = sha256_file(boxes)
 
-    def opened(n: int) -> ClosedLoopFlight:
-        company = companies.get(traces[n].path_id)
-        around = () if company is None else company.others
-        return ClosedLoopFlight(space, _cut(traces[n], cfg.fly), number=n, **bounds, others=around)
+    def opened(n: int) -> ClosedLoopTrajectory:
+        bystanders = companions.get(traces[n].path_id)
+        around = () if bystanders is None else bystanders.others
+        return ClosedLoopTrajectory(space, _cut(traces[n], cfg.fly), number=n, **bounds, others=around)
 
     return lambda item: fleet.fly({traces[n].path_id: partial(opened, n) for n in item.payload}, map_sha256)
 
@@ -301,7 +308,7 @@ def flown_trace(
 ) -> DroneTrace:
     """Return a flight of n frames as step 4 gives a plan. poses: (n, 6); targets_m: (n, 3); others (n,)."""
     seen = visibility(obstacles, poses[:, :3], targets_m)
-    metrics = flight_metrics(poses[:, :3], targets_m, seen, clearances_m, ground_m, step_s(time_s))
+    metrics = trajectory_metrics(poses[:, :3], targets_m, seen, clearances_m, ground_m, step_s(time_s))
     return DroneTrace(
         path_id, planner, time_s, poses[:, :3], poses[:, 3:], targets_m, seen, clearances_m, metrics, solver, pace=pace
     )

@@ -13,22 +13,22 @@ import numpy as np
 
 from cosfly.closed_loop.settings import Drone
 from cosfly.formats.boxes import BoxMap
+from cosfly.formats.bystanders import Bystander
 from cosfly.formats.frames import TargetMeta
-from cosfly.formats.others import Other
+from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.formats.places import town_folder
 from cosfly.formats.pursuits import Ended
 from cosfly.formats.traces import DroneTrace
-from cosfly.formats.walks import TARGET_HEIGHT_M
 from cosfly.formats.weather import WeatherParams
 from cosfly.geometry.axes import step_s, wrap_deg
-from cosfly.geometry.flight_metrics import CLEARANCE_CAP_M
 from cosfly.geometry.kernels import swept_distances
+from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M
 from cosfly.render.camera import contrast_of, legibility
 from cosfly.render.contract import PERSON_ID, Frame
-from cosfly.render.flight import annotation, draw_frame
 from cosfly.render.perturbation import PerturbedTrack, Poses, Surroundings
 from cosfly.render.settings import RenderConfig
-from cosfly.render.stage import renderer_of, script_flight
+from cosfly.render.stage import make_track_script, renderer_of
+from cosfly.render.track import annotation, draw_frame
 from cosfly.render.weather import read_pools, weather_of
 
 RATE_HZ = 20.0  # of the autopilot, which follows a command
@@ -94,7 +94,7 @@ class Moment:
     velocity_mps: np.ndarray
     target_m: np.ndarray
     target: TargetMeta
-    company: dict[str, float | None]  # of other people, as `OthersMeta.people_of`; empty where nobody else moves
+    bystanders: dict[str, float | None]  # of other people, as `OthersMeta.people_of`; empty where nobody else moves
     frame: Frame
     clearance_m: float
     height_m: float  # over the ground under the target
@@ -105,7 +105,7 @@ class Moment:
         return float(np.hypot(*(self.position_m - self.target_m)[:2]))
 
 
-class ClosedLoopFlight:
+class ClosedLoopTrajectory:
     """One flight after one walk. `reset` gives the frames of the plan with which it begins, `step` flies a command for
     one time step of the walk and gives what is seen then; `ended` tells how it ended, None while it goes on. `script`:
     what is drawn, cameras and clothes among it."""
@@ -119,7 +119,7 @@ class ClosedLoopFlight:
         num_lead: int = 5,
         drone: Drone = Drone(),
         lost_s: float = 0.0,
-        others: Sequence[Other] = (),
+        others: Sequence[Bystander] = (),
     ) -> None:
         """
         Args:
@@ -133,7 +133,7 @@ class ClosedLoopFlight:
         self.num_lead, self.lost_s, self.dt_s = num_lead, lost_s, step_s(planned.time_s)
         weather = weather_of(airspace.cfg, airspace.pools, number)
         plain = replace(planned, segments=(), mission=None)  # parts and orders are the plan's, not this flight's
-        self.script = script_flight(
+        self.script = make_track_script(
             plain, number, "clean", airspace.town, airspace.surroundings, airspace.cfg, airspace.seed, others, weather
         )
         self._begin()
@@ -216,9 +216,9 @@ class ClosedLoopFlight:
         target = target.model_copy(update=legibility(target, contrast_of(frame.rgb, frame.ids == PERSON_ID)))
         position_m, target_m = poses.positions_m[i].copy(), poses.targets_m[i].copy()
         people = script.others.people(script.clothes.looks) if self.airspace.renderer.dresses else None
-        company = {} if seen.others is None else seen.others.people_of(target_m, people)
+        bystanders = {} if seen.others is None else seen.others.people_of(target_m, people)
         height_m = float(position_m[2] - (target_m[2] - TARGET_HEIGHT_M))
         return Moment(
             i, float(script.time_s[i]), position_m, poses.rotations_deg[i].copy(), velocity_mps,
-            target_m, target, company, frame, clearance_m, height_m,
+            target_m, target, bystanders, frame, clearance_m, height_m,
         )  # fmt: skip

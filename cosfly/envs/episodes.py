@@ -12,25 +12,25 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, Moment
+from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory, Moment
 from cosfly.formats.boxes import BoxMap
-from cosfly.formats.others import Other
+from cosfly.formats.bystanders import Bystander
+from cosfly.formats.pedestrian_paths import walk_id
 from cosfly.formats.traces import DroneTrace
-from cosfly.formats.walks import walk_id
 from cosfly.geometry.kernels import BoxIndex, obstacle_index
 from cosfly.maps.synthetic import PRESETS, SyntheticConfig, load
+from cosfly.pedestrians.bystanders import bystanders_of
 from cosfly.pedestrians.lanes import Lane, lanes_of
-from cosfly.pedestrians.others import company_of
-from cosfly.pedestrians.stage import make_walk
+from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, walkable_ground
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.reacquire import first_loss, screens_of
-from cosfly.planners.stage import plan_flight
+from cosfly.planners.stage import plan_trajectory
 from cosfly.planners.styles import REACQUIRE
 from cosfly.render.settings import RenderConfig
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.documents import FileFormat, Record, read_model
 from cosfly.runtime.errors import InputError, NoPathError, nearest
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.store import dump_json, sha256_bytes
 from cosfly.simplify.passes import SimplifyConfig, simplify
 
@@ -142,7 +142,7 @@ class BenchmarkEpisode:
     number: int
     plan: DroneTrace
     num_lead: int
-    others: tuple[Other, ...]
+    others: tuple[Bystander, ...]
 
     @property
     def name(self) -> str:
@@ -152,9 +152,9 @@ class BenchmarkEpisode:
         """Return whether the first frame is as the task has it: the person is in sight, or is to be found again."""
         return now.target.visible != (self.task == REACQUIRES)
 
-    def flight(self, airspace: Airspace) -> ClosedLoopFlight:
+    def flight(self, airspace: Airspace) -> ClosedLoopTrajectory:
         """Open it."""
-        return ClosedLoopFlight(airspace, self.plan, number=self.number, num_lead=self.num_lead, others=self.others)
+        return ClosedLoopTrajectory(airspace, self.plan, number=self.number, num_lead=self.num_lead, others=self.others)
 
 
 def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisode | None:
@@ -162,8 +162,8 @@ def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisod
     cfg, town, name = TASKS[task], world.town, walk_id(number)
     planning = PlanConfig(styles={REACQUIRE: 1.0}) if task == REACQUIRES else PlanConfig()
     try:
-        walk = make_walk(name, world.ground, cfg, rng_for(town.seed, "pedestrians", name)).walk
-        plan = plan_flight(walk, world.obstacles, planning, town.seed, world.screens)
+        walk = make_pedestrian(name, world.ground, cfg, rng_for(town.seed, "pedestrians", name)).walk
+        plan = plan_trajectory(walk, world.obstacles, planning, town.seed, world.screens)
     except NoPathError:
         return None
     num_lead, turned_deg = LEAD_FRAMES, 0.0
@@ -182,9 +182,9 @@ def episode_of(task: str, world: BenchmarkWorld, number: int) -> BenchmarkEpisod
         rotations = plan.rotations_deg.copy()
         rotations[:num_lead, 1] += turned_deg
         plan = replace(plan, rotations_deg=rotations)
-    others = tuple[Other, ...]()
+    others = tuple[Bystander, ...]()
     if cfg.has_others:
         rng = rng_for(town.seed, "pedestrians", f"{name}/others")
-        there = company_of(walk, world.ground, world.lanes, cfg, rng).others
+        there = bystanders_of(walk, world.ground, world.lanes, cfg, rng).others
         others = tuple(replace(o, positions_m=o.positions_m[:end], headings_rad=o.headings_rad[:end]) for o in there)
     return BenchmarkEpisode(task, world, number, plan, num_lead, others)

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from cosfly.closed_loop.controller import Controller, read_controls
 from cosfly.closed_loop.policy import STATE_HIGH, STATE_LOW, observe
 from cosfly.closed_loop.settings import CONTROLLER_FILE, Drone
-from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight, Moment
+from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory, Moment
 from cosfly.envs.episodes import (
     HELD_OUT,
     SIZE_PX,
@@ -86,7 +86,7 @@ class FollowEnv(gymnasium.Env):
         self.observation_space = spaces.Dict(seen)
         self._space: Airspace | None = None
         self._episode: BenchmarkEpisode | None = None
-        self._flight: ClosedLoopFlight | None = None
+        self._flight: ClosedLoopTrajectory | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         """Begin an episode: of the list the one of options["episode"], counted from 0; else one that is drawn."""

@@ -8,8 +8,8 @@ from functools import lru_cache, partial
 from itertools import groupby
 from pathlib import Path
 
-from cosfly.closed_loop.stage import Fleet, FlightsConfig, finish_flights
-from cosfly.closed_loop.stepper import Airspace, ClosedLoopFlight
+from cosfly.closed_loop.stage import ClosedLoopConfig, Fleet, finish_flights
+from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory
 from cosfly.envs.episodes import (
     EPISODES_FILE,
     HELD_OUT,
@@ -25,7 +25,7 @@ from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
 from cosfly.runtime.stage_folder import Resume, StageFolder
 
 
-class ListConfig(FlightsConfig):
+class ListConfig(ClosedLoopConfig):
     """What decides how a list is flown. env: as `read_list` takes it."""
 
     env: str
@@ -63,7 +63,7 @@ def make_worker(cfg: ListConfig, out: Path, seed: int, num: int) -> Work:
         world = world_of(HELD_OUT[town])
         return world, world.airspace(task)
 
-    def opened(town: str, number: int) -> ClosedLoopFlight:
+    def opened(town: str, number: int) -> ClosedLoopTrajectory:
         world, space = place_of(town)
         if (episode := episode_of(task, world, number)) is None:
             raise InputError("an episode that cannot be flown", where=f"{cfg.env}: {episode_id(town, number)}")

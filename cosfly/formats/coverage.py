@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field, field_validator
 
-from cosfly.formats.playback import Flight
-from cosfly.formats.walks import TARGET_HEIGHT_M
+from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
+from cosfly.formats.playback import Track
 from cosfly.formats.weather import preset_token
 from cosfly.runtime.documents import Record, read_json, validated
 
@@ -151,7 +151,7 @@ def axis_values(
     }
 
 
-def coverage_of(flight: Flight) -> Coverage:
+def coverage_of(flight: Track) -> Coverage:
     """Count the frames of a flight."""
     box = flight.target_bbox if flight.target_mask_bbox is None else flight.target_mask_bbox
     offsets_m = flight.positions_m - flight.targets_m

@@ -20,7 +20,7 @@ class Figure(Record):
     count: int
 
 
-def draw_walks(num_walks: int, resamples: int, rng: np.random.Generator) -> np.ndarray:
+def draw_pedestrians(num_walks: int, resamples: int, rng: np.random.Generator) -> np.ndarray:
     """Draw as many walks as there are, with replacement, `resamples` times: (resamples, walks) counts."""
     return rng.multinomial(num_walks, np.full(num_walks, 1.0 / num_walks), size=resamples).astype(float)
 

@@ -21,7 +21,7 @@ from pydantic import Field
 
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.people import People
-from cosfly.formats.places import tree_of_flight
+from cosfly.formats.places import tree_of_track
 from cosfly.formats.png import areas_png, colours_png, floats_of, floats_png
 from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry.axes import mirror_positions, mirror_rotations, world_from_camera
@@ -50,7 +50,7 @@ META_FORMAT = FileFormat("cosfly.frame", "1.0", "frame annotation")
 # A person is legible who is visible, so high in the picture, of so much of the box unhidden, and of so much colour
 # difference (CIE76, where 2.3 is just noticeable) from what is around.
 LEGIBLE_HEIGHT_PX, LEGIBLE_SHARE, LEGIBLE_CONTRAST = 16.0, 0.3, 5.0
-COMPANY = ("in_view", "nearest_m", "nearest_id", "alike_id", "alike_differences")  # of a point's `others`
+BYSTANDER_COLUMNS = ("in_view", "nearest_m", "nearest_id", "alike_id", "alike_differences")  # of a point's `others`
 XYZ, ANGLES = ("x", "y", "z"), ("pitch", "yaw", "roll")
 
 COORDINATES = {
@@ -223,7 +223,7 @@ class PerturbationMeta(Record):
     drone_rotation: TreeAngles
 
 
-class OtherMeta(Record):
+class BystanderMeta(Record):
     """Somebody beside the target: the middle of the box and its yaw in the tree's axes; how much of the picture."""
 
     instance_id: int
@@ -244,12 +244,12 @@ class OtherMeta(Record):
         return float(np.radians(mirror_rotations(np.array([0.0, self.yaw, 0.0]))[1]))
 
 
-class OthersMeta(Record):
+class BystandersMeta(Record):
     """The others of a frame, and the shares of the target's box, 0 to 1, that they hide and that the map hides."""
 
     target_hidden_by_others: float
     target_hidden_by_map: float
-    others: list[OtherMeta]
+    others: list[BystanderMeta]
 
     def people_of(self, target_m: np.ndarray, people: People | None) -> dict[str, float | None]:
         """Tell of other people who have a pixel (COMPANY): how many, who is nearest to the target and how far, m over
@@ -259,7 +259,7 @@ class OthersMeta(Record):
         nearest = min(away_m, key=away_m.__getitem__, default=None)
         how_far_m = None if nearest is None else round(away_m[nearest], 3)
         alike = (None, None) if people is None else people.most_alike(away_m)
-        return dict(zip(COMPANY, (len(seen), how_far_m, nearest, *alike), strict=True))
+        return dict(zip(BYSTANDER_COLUMNS, (len(seen), how_far_m, nearest, *alike), strict=True))
 
 
 class FrameMeta(Record):
@@ -276,7 +276,9 @@ class FrameMeta(Record):
     target: TargetMeta
     perturbation: PerturbationMeta
     look: Look | None = None  # null with weather, and in trees of before it stood here
-    others: OthersMeta | None = Field(None, exclude_if=lambda others: others is None)  # absent in runs without others
+    others: BystandersMeta | None = Field(
+        None, exclude_if=lambda others: others is None
+    )  # absent in runs without others
     weather: WeatherRecord | None = Field(None, exclude_if=lambda weather: weather is None)  # in the place of `look`
 
     def to_bytes(self) -> bytes:
@@ -320,7 +322,7 @@ def files_in(frame: Path) -> frozenset[str]:
 
 def tree_of(frame: Path) -> Path:
     """Return the playback tree that a frame stands in."""
-    return tree_of_flight(frame.absolute().parents[1])
+    return tree_of_track(frame.absolute().parents[1])
 
 
 def read_rgb(frame: Path) -> np.ndarray:

@@ -21,7 +21,7 @@ Result = Literal["accepted", "review", "rejected"]
 RESULTS: tuple[Result, ...] = ("accepted", "review", "rejected")
 
 
-class FlightInspection(Record):
+class TrackInspection(Record):
     """What was found out about one flight. `folder` is relative to the playback tree; metrics are None where unknown.
 
     sha256: of its files (`provenance.digest_of`), so that nobody takes another flight, or other pictures, for the one
@@ -71,7 +71,7 @@ class TrajectoryFunnel(Record):
         assert self.rendered == self.accepted + self.review + self.rejected, self
 
 
-class FlightFunnel(Record):
+class TrackFunnel(Record):
     """inspected = accepted + review + rejected; `reasons` counts the worst finding of those in review or rejected."""
 
     inspected: int
@@ -86,7 +86,7 @@ class Funnel(Record):
     """From planned trajectories to accepted flights (sec:step6); a trajectory is as good as its worst flight."""
 
     trajectories: TrajectoryFunnel
-    flights: FlightFunnel
+    flights: TrackFunnel
 
 
 class Inspection(Record):
@@ -95,10 +95,10 @@ class Inspection(Record):
     settings: dict[str, Any]
     funnel: Funnel
     coverage: Coverage | None = None  # of the accepted flights; None in inspections of before
-    flights: list[FlightInspection]
+    flights: list[TrackInspection]
 
 
-def count_trajectories(flights: list[FlightInspection], *, planned: bool) -> dict[str, int]:
+def count_trajectories(flights: list[TrackInspection], *, planned: bool) -> dict[str, int]:
     """Count rendered trajectories by the result of their worst flight: `rendered`, `accepted`, `review`, `rejected`.
 
     Args:

@@ -25,17 +25,17 @@ from cosfly.runtime.files import is_below, real_path
 TOWN = "Town"  # what the name of a town's folder begins with
 
 
-Track = Literal["clean", "perturbed"]
-TRACKS: tuple[Track, ...] = get_args(Track)
+TrackName = Literal["clean", "perturbed"]
+TRACKS: tuple[TrackName, ...] = get_args(TrackName)
 
 
-class FlightChoice(Config):
+class TrackChoice(Config):
     """Which flights of a tree a stage takes."""
 
     match: tuple[str, ...] = Field(
         (), description="patterns for their folders in the tree, as Town01/trajectory_17*/ORI or Town0[12]; empty: all"
     )
-    tracks: tuple[Track, ...] = Field(TRACKS, min_length=1, description="clean, perturbed, or both")
+    tracks: tuple[TrackName, ...] = Field(TRACKS, min_length=1, description="clean, perturbed, or both")
 
     def names(self, folder: str) -> bool:
         """Return whether a pattern names a flight by its folder in the tree, or by a folder above it."""
@@ -44,7 +44,7 @@ class FlightChoice(Config):
         return not self.match or any(fnmatchcase(head, pattern.strip("/")) for pattern in self.match for head in heads)
 
 
-ALL_FLIGHTS = FlightChoice()
+ALL_FLIGHTS = TrackChoice()
 
 
 @dataclass(frozen=True, order=True)
@@ -74,7 +74,7 @@ def place_of(folder: Path, run: str = "") -> Place:
     return Place(run, town, trajectory, variant)
 
 
-def tree_of_flight(folder: Path) -> Path:
+def tree_of_track(folder: Path) -> Path:
     """Return the tree that a flight's folder stands in by its name: no link in it may lead out of that.
 
     Of a flight that stands elsewhere inside the tree's parent folder, and in the tree by a link, the folder itself: its

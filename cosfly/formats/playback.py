@@ -6,7 +6,7 @@
         frames_playback/frame_00000/{rgb.png, depth_float32.png or depth.npy, instance.png, meta.json}
 
 Axes inside the tree are CARLA's (left-handed); they are converted here and for `meta.json` in frames.py, and everything
-else in the project sees the right-handed frame. Keys that we do not know are kept in `Flight.raw` and survive a
+else in the project sees the right-handed frame. Keys that we do not know are kept in `Track.raw` and survive a
 read-write round trip.
 """
 
@@ -23,7 +23,7 @@ from pydantic import ValidationError
 from cosfly.formats.columns import is_number
 from cosfly.formats.frames import (
     ANGLES,
-    COMPANY,
+    BYSTANDER_COLUMNS,
     COORDINATES,
     FRAME_FILES,
     FRAMES_DIR,
@@ -34,8 +34,9 @@ from cosfly.formats.frames import (
 )
 from cosfly.formats.goals import Goal
 from cosfly.formats.motion import PlannedMotion, without_perturbation
+from cosfly.formats.pedestrian_paths import pace_of
 from cosfly.formats.people import People
-from cosfly.formats.places import place_of, tree_of_flight
+from cosfly.formats.places import place_of, tree_of_track
 from cosfly.formats.segments import FOLLOW, Mission, Segment, flown_as_json, mirrored, read_flown
 from cosfly.formats.trajectory import (
     BBOX,
@@ -49,7 +50,6 @@ from cosfly.formats.trajectory import (
     offsets_of,
     vectors_of,
 )
-from cosfly.formats.walks import pace_of
 from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry.axes import mirror_positions, mirror_rotations
 from cosfly.runtime.documents import read_json, validated
@@ -76,7 +76,7 @@ HEADING_FRAMES, STANDS_M = 2, 0.1
 
 
 @dataclass(frozen=True)
-class Flight:
+class Track:
     """One `trajectory.json`, n points, in right-handed axes.
 
     time_s (n,) strictly increasing; positions_m (n, 3); rotations_deg (n, 3) pitch, yaw, roll of the camera;
@@ -129,7 +129,7 @@ class Flight:
     between: np.ndarray | None = None
     people: People | None = None
     goal: Goal | None = None
-    company: np.ndarray | None = None
+    bystanders: np.ndarray | None = None
     given_id: str | None = None  # where flights of several towns or runs share the plain one (places.py)
 
     def __len__(self) -> int:
@@ -234,7 +234,7 @@ class Flight:
             return None
         if not (path := self.folder / TARGET_FILE).is_file():
             return None
-        data = read_bytes(path, what="target picture", tree=tree_of_flight(self.folder))
+        data = read_bytes(path, what="target picture", tree=tree_of_track(self.folder))
         return {"bytes": data, "path": f"{self.flight_id}_{TARGET_FILE}"}
 
     def frame_folder(self, index: int) -> Path:
@@ -278,17 +278,17 @@ def _was_moved(offsets: tuple[np.ndarray, ...], told: object) -> bool | None:
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
-def read_flight(folder: Path, *, strict: bool = True) -> Flight:
+def read_track(folder: Path, *, strict: bool = True) -> Track:
     """Read one flight folder.
 
     Args:
         strict: every rule of the layout must hold. Tolerant: older names and missing optional fields are accepted, and
-            what was let pass stands in `Flight.issues`; poses and times must be there and finite either way.
+            what was let pass stands in `Track.issues`; poses and times must be there and finite either way.
     Raises:
         InputError: names the file, the point and the field.
     """
     path = folder / "trajectory.json"
-    raw = read_json(path, what="trajectory", tree=tree_of_flight(folder))
+    raw = read_json(path, what="trajectory", tree=tree_of_track(folder))
     if not isinstance(raw, dict):
         raise InputError("not a trajectory", where=path, got=type(raw).__name__, expected="an object")
     reader = FieldReader(path, strict)
@@ -299,7 +299,7 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
     targets, others = ([object_of(p, name) for p in points] for name in ("target", "others"))
     if not all(target or p.get("target", "missing") is None for target, p in zip(targets, points, strict=True)):
         reader.issue("points[].target", "missing", "an object, or null where there is nobody")
-    company = np.column_stack([numbers_of(others, name) for name in COMPANY])
+    bystanders = np.column_stack([numbers_of(others, name) for name in BYSTANDER_COLUMNS])
     segments, mission = reader.told(lambda: read_flown(raw, len(points), f"{path}: ")) or ((), None)
     people = reader.told(lambda: validated(People, raw["people"], f"{path}: people")) if "people" in raw else None
     has_goal = raw.get("goal") is not None and "absent" not in object_of(raw, "goal")
@@ -312,7 +312,7 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
         for name, axes in (("drone_position", XYZ), ("drone_rotation", ANGLES), ("target_position", XYZ))
     )
     camera = reader.camera(raw.get("camera"))
-    return Flight(
+    return Track(
         town=town,
         trajectory=trajectory,
         variant=variant,
@@ -346,14 +346,14 @@ def read_flight(folder: Path, *, strict: bool = True) -> Flight:
         mission=mirrored(mission),
         people=people,
         goal=goal,
-        company=None if np.isnan(company[:, 0]).any() else company,
+        bystanders=None if np.isnan(bystanders[:, 0]).any() else bystanders,
     )
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
-def write_flight(folder: Path, flight: Flight) -> None:
+def write_track(folder: Path, flight: Track) -> None:
     """Write `trajectory.json` into a folder. Unknown keys of `flight.raw` are kept, known ones set from the arrays."""
     raw = copy.deepcopy(flight.raw)
     points = raw.pop("points", None) or raw.pop("waypoints", None) or [{} for _ in range(len(flight))]
@@ -435,7 +435,7 @@ def _focal(camera: Camera) -> dict:
     }
 
 
-def _target(group: dict, flight: Flight, i: int) -> dict:
+def _target(group: dict, flight: Track, i: int) -> dict:
     """Return the target of point i without its vectors; what else the file says of it stays."""
     target = {"enabled": True} | group
     target["visible"] = bool(flight.target_visible[i])

@@ -16,7 +16,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from cosfly.formats.inspection import FlightInspection, Inspection, count_trajectories, read_inspection
+from cosfly.formats.inspection import Inspection, TrackInspection, count_trajectories, read_inspection
 from cosfly.runtime.documents import Record
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import sha256_file
@@ -127,7 +127,7 @@ def add_decisions(inspected: Path, choices: Iterable[Choice], by: str) -> list[D
     return decisions
 
 
-def _chosen(choice: Choice, flights: list[FlightInspection], inspected: Path) -> list[FlightInspection]:
+def _chosen(choice: Choice, flights: list[TrackInspection], inspected: Path) -> list[TrackInspection]:
     """Return the flights that a choice means; those of a trajectory that need nobody stay as they are."""
     name = choice.folder.strip("/")
     named = [flight for flight in flights if flight.folder == name]
@@ -161,7 +161,7 @@ def read_settled(inspected: Path) -> Inspection:
     return inspection.model_copy(update={"flights": flights, "funnel": funnel})
 
 
-def _settled(flight: FlightInspection, decision: Decision | None) -> FlightInspection:
+def _settled(flight: TrackInspection, decision: Decision | None) -> TrackInspection:
     if decision is None:
         return flight
     return flight.model_copy(update={"result": decision.verdict, "decided": decision.verdict})

@@ -8,7 +8,7 @@ from itertools import repeat
 
 import numpy as np
 
-from cosfly.runtime.chance import rng_for
+from cosfly.runtime.seeding import rng_for
 
 PERTURBED = "aug_001"  # the variant of the perturbed track
 

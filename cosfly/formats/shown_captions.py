@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cosfly.formats.captions import Language
-from cosfly.formats.playback import Flight
+from cosfly.formats.playback import Track
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class ShownFlight:
     where it is not released or shows others. settings: of the captions, as recorded; empty: the defaults.
     """
 
-    flight: Flight
+    flight: Track
     frame_indices: np.ndarray
     captions: Sequence[ShownCaption]
-    twin: Flight | None
+    twin: Track | None
     settings: dict[str, Any]
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from cosfly.formats.columns import column, matrix, read_items, rounded, step_field, text_id, write_items
+from cosfly.formats.pedestrian_paths import PLAIN_PACE, pace_field, pace_of
 from cosfly.formats.segments import Mission, Segment, flown_as_json, read_flown
-from cosfly.formats.walks import PLAIN_PACE, pace_field, pace_of
 from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import InputError
 

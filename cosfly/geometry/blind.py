@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from cosfly.formats.motion import in_axes_of
-from cosfly.formats.playback import Flight
+from cosfly.formats.playback import Track
 from cosfly.geometry.axes import wrap_deg
 
 LOOKS_BACK = 3  # frames: of fewer nothing turns, of five it tells no more
@@ -24,7 +24,7 @@ Decider = Callable[[np.ndarray], np.ndarray]  # pasts (n, d) -> numbers of decis
 Rule = int | tuple[int, float, "Rule", "Rule"]
 
 
-def past_of(flight: Flight, window: Sequence[int], is_ordered: bool) -> np.ndarray:
+def past_of(flight: Track, window: Sequence[int], is_ordered: bool) -> np.ndarray:
     """Return what the last LOOKS_BACK frames of a window tell, (d,), wherever and whenever they were: no place, no
     time.
 
@@ -50,7 +50,7 @@ def past_of(flight: Flight, window: Sequence[int], is_ordered: bool) -> np.ndarr
     return np.nan_to_num(np.concatenate([part.ravel() for part in parts]))
 
 
-def is_drawn_ahead(flight: Flight, now: int, last: int, is_ordered: bool) -> bool | None:
+def is_drawn_ahead(flight: Track, now: int, last: int, is_ordered: bool) -> bool | None:
     """Return whether DRAWN_AHEAD holds after frame `now`, within the frames up to `last` of which a label is made.
 
     What is drawn within a part (when a drone that hops does) is on no record and not counted. Where an order stands

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from cosfly.formats.frames import FRAME_FILES, FRAMES_DIR, FrameMeta, frame_name, frame_path, public_name, read_meta
 from cosfly.formats.issues import Report
-from cosfly.formats.places import tree_of_flight
-from cosfly.formats.playback import Flight
+from cosfly.formats.places import tree_of_track
+from cosfly.formats.playback import Track
 from cosfly.runtime.arrays import array_header, picture_size
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import sha256_file
@@ -19,7 +19,7 @@ from cosfly.runtime.runner import advance
 from cosfly.runtime.store import CHECKSUMS, read_checksums, sha256_bytes
 
 
-def check_files(flight: Flight, report: Report) -> dict[int, FrameMeta | None]:
+def check_files(flight: Track, report: Report) -> dict[int, FrameMeta | None]:
     """Check that every frame has its files, of the right size and type by their headers, and no frame stands alone.
 
     A flight may lack a kind of file altogether that its checksums do not list, as one of somebody else does:
@@ -30,7 +30,7 @@ def check_files(flight: Flight, report: Report) -> dict[int, FrameMeta | None]:
         of each frame that is complete so far its annotation, None in a tree without.
     """
     assert flight.folder is not None
-    tree = tree_of_flight(flight.folder)
+    tree = tree_of_track(flight.folder)
     size = (flight.camera.width_px, flight.camera.height_px)
     complete: dict[int, FrameMeta | None] = {}
     absent = [name for name in FRAME_FILES[1:] if not _has_any(flight, name)]
@@ -60,7 +60,7 @@ def check_files(flight: Flight, report: Report) -> dict[int, FrameMeta | None]:
     return complete
 
 
-def _lists(flight: Flight, names: Collection[str]) -> bool:
+def _lists(flight: Track, names: Collection[str]) -> bool:
     """Return whether the checksums of a flight list a file of these names; where they cannot be read, they may."""
     assert flight.folder is not None
     if not (flight.folder / CHECKSUMS).is_file():
@@ -71,7 +71,7 @@ def _lists(flight: Flight, names: Collection[str]) -> bool:
         return True
 
 
-def _has_any(flight: Flight, name: str) -> bool:
+def _has_any(flight: Track, name: str) -> bool:
     return any(frame_path(flight.frame_folder(i), name).exists() for i in range(len(flight)))
 
 
@@ -90,7 +90,7 @@ def _check_header(path: Path, size: tuple[int, int], tree: Path, where: str, rep
         report.error("wrong_format", where, found, expected)
 
 
-def _check_meta(flight: Flight, i: int, report: Report) -> FrameMeta | None:
+def _check_meta(flight: Track, i: int, report: Report) -> FrameMeta | None:
     where = f"{frame_name(i)}/meta.json"
     try:
         meta = read_meta(flight.frame_folder(i))
@@ -105,7 +105,7 @@ def _check_meta(flight: Flight, i: int, report: Report) -> FrameMeta | None:
 class Checksums:
     """The digests that `checksums.sha256` lists, each compared once: with a file that is read anyway, or at the end."""
 
-    def __init__(self, flight: Flight, report: Report, *, is_wanted: bool) -> None:
+    def __init__(self, flight: Track, report: Report, *, is_wanted: bool) -> None:
         self._flight, self._report = flight, report
         self._open = _listed(flight, report) if is_wanted else {}
 
@@ -130,7 +130,7 @@ class Checksums:
         self._report.error("checksum", name, "other bytes", f"the digest in {CHECKSUMS}")
 
 
-def _listed(flight: Flight, report: Report) -> dict[str, str]:
+def _listed(flight: Track, report: Report) -> dict[str, str]:
     assert flight.folder is not None
     if not (flight.folder / CHECKSUMS).is_file():
         report.add("note", "no_checksums", CHECKSUMS, "no such file", "digests of the flight's files")
@@ -142,7 +142,7 @@ def _listed(flight: Flight, report: Report) -> dict[str, str]:
         return {}
 
 
-def check_recorded(flight: Flight, root: Path, recorded: Mapping[str, str], report: Report) -> None:
+def check_recorded(flight: Track, root: Path, recorded: Mapping[str, str], report: Report) -> None:
     """Compare a flight's own records with its tree's manifest, `recorded`: path in the tree -> sha256."""
     assert flight.folder is not None
     for name in ("trajectory.json", CHECKSUMS) if recorded else ():

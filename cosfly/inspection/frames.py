@@ -13,26 +13,26 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from cosfly.formats.bystanders import BUILDS, Bystander, distances_to_boxes_m
 from cosfly.formats.frames import (
     DEPTH_NPY,
     FILE_NAMES,
     INVALID_DEPTH_M,
     SKY_DEPTH_M,
+    BystanderMeta,
+    BystandersMeta,
     FrameMeta,
-    OtherMeta,
-    OthersMeta,
     frame_name,
     frame_path,
 )
 from cosfly.formats.issues import Report
 from cosfly.formats.kinds import KIND_NAMES, KINDS
-from cosfly.formats.others import BUILDS, Other, distances_to_boxes_m
-from cosfly.formats.places import tree_of_flight
-from cosfly.formats.playback import Flight
-from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
+from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
+from cosfly.formats.places import tree_of_track
+from cosfly.formats.playback import Track
 from cosfly.geometry.axes import box_corners, box_iou, mask_box, project, world_from_camera
-from cosfly.geometry.flight_metrics import CLEARANCE_TOLERANCE_M
 from cosfly.geometry.reprojection import LEAST_SEEN, Agreement, View, compare_views
+from cosfly.geometry.trajectory_metrics import CLEARANCE_TOLERANCE_M
 from cosfly.inspection.files import Checksums
 from cosfly.inspection.pixels import NUM_IDS, Picture, PixelFigures, look_at, unpack
 from cosfly.inspection.settings import (
@@ -62,7 +62,7 @@ USUAL_AGREE, ROUGH_ERROR = 0.8, 1e-3  # of the points; of planes, as a share of 
 class Jumps:
     """Compares depth and ids of successive frames through their poses; colours change with light, rain and zoom."""
 
-    flight: Flight
+    flight: Track
     _before: tuple[int, View] | None = None
     _frames: list[int] = field(default_factory=list)
     _found: list[Agreement] = field(default_factory=list)
@@ -103,7 +103,7 @@ class Jumps:
 # Checks on who else moves in a flight: do they keep clear of drone and person, and what do they hide of the person?
 
 
-def others_told(flight: Flight, metas: Mapping[int, FrameMeta | None]) -> dict[int, OthersMeta]:
+def others_told(flight: Track, metas: Mapping[int, FrameMeta | None]) -> dict[int, BystandersMeta]:
     """Return what the annotations of frames tell of others, by frame; empty for foreign flights."""
     if not flight.is_ours:
         return {}
@@ -111,7 +111,7 @@ def others_told(flight: Flight, metas: Mapping[int, FrameMeta | None]) -> dict[i
 
 
 def check_others(
-    flight: Flight, told: dict[int, OthersMeta], clearance_min_m: float, report: Report, metrics: dict
+    flight: Track, told: dict[int, BystandersMeta], clearance_min_m: float, report: Report, metrics: dict
 ) -> None:
     """Measure how near others come to drone and person, and add what they hide of the person."""
     nearest_m = np.inf
@@ -143,13 +143,13 @@ def check_others(
         )
 
 
-def _other(line: OtherMeta) -> Other | None:
+def _other(line: BystanderMeta) -> Bystander | None:
     """Return the other of an annotation in right-handed axes; None of an unknown kind."""
     kind = KIND_NAMES.get(line.semantic_id, "")
     if kind not in BUILDS:
         return None
     feet_m = line.center_m - np.array([0.0, 0.0, BUILDS[kind].half_extents_m[2]])
-    return Other(kind, feet_m[None], np.array([line.heading_rad]))
+    return Bystander(kind, feet_m[None], np.array([line.heading_rad]))
 
 
 SMALL_PX, SMALL_ROWS = (128, 72), 5  # frames are shrunk to this, of every fifth row, before they are compared
@@ -179,9 +179,9 @@ def choose_frames(indices: list[int], setting: str, num_sample: int) -> list[int
 
 
 def check_frames(
-    flight: Flight,
+    flight: Track,
     indices: list[int],
-    told: Mapping[int, OthersMeta],
+    told: Mapping[int, BystandersMeta],
     checksums: Checksums,
     cfg: InspectConfig,
     report: Report,
@@ -194,7 +194,7 @@ def check_frames(
         told: what annotations tell of others, by frame.
     """
     assert flight.folder is not None
-    numbers, jumps, tree = FrameNumbers(), Jumps(flight), tree_of_flight(flight.folder)
+    numbers, jumps, tree = FrameNumbers(), Jumps(flight), tree_of_track(flight.folder)
     previous: tuple[int, np.ndarray] | None = None
     for i in indices:
         advance()
@@ -223,7 +223,7 @@ def check_frames(
     return numbers
 
 
-def _read(flight: Flight, i: int, tree: Path, checksums: Checksums) -> dict[str, bytes]:
+def _read(flight: Track, i: int, tree: Path, checksums: Checksums) -> dict[str, bytes]:
     """Read the pictures of a frame that are there; `check_files` said which are not."""
     folder, files = flight.frame_folder(i), dict[str, bytes]()
     for name in FILE_NAMES.values():
@@ -233,7 +233,7 @@ def _read(flight: Flight, i: int, tree: Path, checksums: Checksums) -> dict[str,
     return files
 
 
-def _ids_of(told: OthersMeta | None) -> np.ndarray:
+def _ids_of(told: BystandersMeta | None) -> np.ndarray:
     """Ids of people who are not the target, (65536,) bool."""
     ids = np.zeros(NUM_IDS, dtype=np.bool_)
     if told is not None:
@@ -256,14 +256,14 @@ def _check_surfaces(look: PixelFigures, where: str, cfg: InspectConfig, report: 
         report.warn("z_fighting", f"{where}/instance.png", got, f"at most {Z_FIGHTING_MAX:.3%}")
 
 
-def _moved(flight: Flight, i: int, k: int) -> bool:
+def _moved(flight: Track, i: int, k: int) -> bool:
     """Return whether the camera changed so much between two frames that equal pictures are an error."""
     shift_m = np.linalg.norm(flight.positions_m[k] - flight.positions_m[i])
     turn_deg = np.abs(flight.rotations_deg[k] - flight.rotations_deg[i]).max()
     return bool(shift_m > 0.5 or turn_deg > 2.0)
 
 
-def _depth_place(flight: Flight, i: int) -> str:
+def _depth_place(flight: Track, i: int) -> str:
     """Name the file that a finding on the depth of frame i is about."""
     return f"{frame_name(i)}/{frame_path(flight.frame_folder(i), DEPTH_NPY).name}"
 
@@ -285,7 +285,7 @@ def _check_depth(depth: np.ndarray, place: str, numbers: FrameNumbers, report: R
 
 
 def _check_mask(
-    flight: Flight,
+    flight: Track,
     i: int,
     picture: Picture,
     look: PixelFigures,
@@ -342,7 +342,7 @@ def _kinds_without(instance: np.ndarray, left_out: np.ndarray) -> np.ndarray:
     return np.where(left_out[ids], KINDS["NONE"], instance[..., 0])
 
 
-def target_box(flight: Flight, i: int) -> np.ndarray:
+def target_box(flight: Track, i: int) -> np.ndarray:
     """Project the target's 3D box: xmin, ymin, xmax, ymax px, cut to the image; NaN where it is not in view."""
     camera = flight.camera_at(i)
     corners_m = box_corners(flight.targets_m[i], np.array(PERSON_HALF_EXTENTS_M))

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.formats.inspection import RESULTS, FlightInspection, Inspection
+from cosfly.formats.inspection import RESULTS, Inspection, TrackInspection
 from cosfly.formats.playback import STATES
-from cosfly.inspection.view import PLOTS, FlightView, in_question
+from cosfly.inspection.view import PLOTS, TrackView, in_question
 from cosfly.runtime.files import read_text
 from cosfly.viz.coverage_page import coverage_html
 from cosfly.viz.page import fragment, page
@@ -36,7 +36,7 @@ PLOT_WIDTH, PLOT_HEIGHT = 250.0, 62.0
 OPENING_PICTURES = 4
 
 
-def report_html(name: str, inspection: Inspection, views: Mapping[str, FlightView], page_mb: float) -> str:
+def report_html(name: str, inspection: Inspection, views: Mapping[str, TrackView], page_mb: float) -> str:
     """Return the page. Flights that need a look come first, and are the last to lose their pictures.
 
     Args:
@@ -70,7 +70,7 @@ def report_html(name: str, inspection: Inspection, views: Mapping[str, FlightVie
     )
 
 
-def cards(flights: list[FlightInspection], views: Mapping[str, FlightView], page_mb: float) -> dict[str, Any]:
+def cards(flights: list[TrackInspection], views: Mapping[str, TrackView], page_mb: float) -> dict[str, Any]:
     """Return what the page shows of flights: a row for each that opens, and how many lack pictures for its size."""
     parts, size, left_out = list[str](), 0, 0
     for flight in flights:
@@ -82,7 +82,7 @@ def cards(flights: list[FlightInspection], views: Mapping[str, FlightView], page
     return {"style": STYLE, "columns": COLUMNS, "cards": parts, "left_out": left_out, "page_mb": page_mb}
 
 
-def _card(flight: FlightInspection, view: FlightView | None) -> str:
+def _card(flight: TrackInspection, view: TrackView | None) -> str:
     issues = [issue for issue in flight.issues if issue.severity != "note"]
     plots = [] if view is None else [plot for name in PLOTS if (plot := _plot(name, view)) is not None]
     return fragment(
@@ -91,7 +91,7 @@ def _card(flight: FlightInspection, view: FlightView | None) -> str:
     )  # fmt: skip
 
 
-def _plot(name: str, view: FlightView) -> dict[str, Any] | None:
+def _plot(name: str, view: TrackView) -> dict[str, Any] | None:
     """Return a curve over time and its range; a gap where a value is unknown. None where all are."""
     title, unit, span = PLOTS[name]
     values, time_s = view.curves.get(name, []), view.time_s

@@ -6,8 +6,13 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from cosfly.formats.places import FlightChoice
-from cosfly.geometry.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3, RELAXED_SAFETY_M
+from cosfly.formats.places import TrackChoice
+from cosfly.geometry.trajectory_metrics import (
+    ACCEL_RMS_MAX_MPS2,
+    FIVE_RAY_MEAN_MIN,
+    JERK_RMS_MAX_MPS3,
+    RELAXED_SAFETY_M,
+)
 from cosfly.runtime.config import Config
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -44,7 +49,7 @@ PAGE_MB = 25.0
 class InspectConfig(Config):
     """Thresholds of the inspection. An error rejects a flight, a warning routes it to manual review."""
 
-    flights: FlightChoice = Field(FlightChoice(), description="which flights of the tree")
+    flights: TrackChoice = Field(TrackChoice(), description="which flights of the tree")
     accel_rms_max_mps2: float = Field(
         ACCEL_RMS_MAX_MPS2, gt=0, description="planned RMS acceleration above this rejects, m/s^2"
     )

@@ -13,25 +13,25 @@ from pathlib import Path
 
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.coverage import Coverage
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import FRAMES_DIR
 from cosfly.formats.inspection import (
-    FlightFunnel,
-    FlightInspection,
     Funnel,
     Inspection,
+    TrackFunnel,
+    TrackInspection,
     TrajectoryFunnel,
     count_trajectories,
     write_inspection,
 )
 from cosfly.formats.issues import Report
-from cosfly.formats.playback import read_flight
+from cosfly.formats.playback import read_track
 from cosfly.formats.review import how_to_decide
 from cosfly.formats.traces import DroneTrace, read_traces
-from cosfly.inspection.flight import InspectedFlight, inspect_flight, trace_id
+from cosfly.formats.tracks import find_tracks
 from cosfly.inspection.report import report_html
 from cosfly.inspection.settings import PAGE_MB, InspectConfig
-from cosfly.inspection.view import FlightView
+from cosfly.inspection.track import InspectedTrack, inspect_track, trace_id
+from cosfly.inspection.view import TrackView
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.provenance import recorded_digests
 from cosfly.runtime.runner import Item, ItemOutcomes, Outcome, Watch, Work, run_items
@@ -52,7 +52,7 @@ def make_worker(cfg: InspectConfig, simplified: Path | None, traces: Path | None
     recorded = recorded_digests(data)
 
     def work(item: Item) -> Outcome:
-        inspected = inspect_flight(data / item.payload, data, by_id, box_map, obstacles, cfg, recorded)
+        inspected = inspect_track(data / item.payload, data, by_id, box_map, obstacles, cfg, recorded)
         record = inspected.record
         return Outcome(
             inspected.model_dump(mode="json"), drop_reason=record.reason if record.result == "rejected" else None
@@ -89,7 +89,7 @@ def run(
     if stage.is_complete:
         return product
     planned = None if traces is None else read_traces(traces)
-    names = [folder.relative_to(data).as_posix() for folder in find_flights(data, cfg.flights)]
+    names = [folder.relative_to(data).as_posix() for folder in find_tracks(data, cfg.flights)]
     every = cfg.check_pixels == "all"  # then a frame is a step
     items = [Item(name, name, num_steps=_num_frames(data / name) if every else None) for name in names]
     arguments, label = (cfg, simplified, traces, data), "inspect: frames" if every else "inspect: flights"
@@ -102,7 +102,7 @@ def run(
     return product
 
 
-def _tell_review(flights: FlightFunnel, out: Path) -> None:
+def _tell_review(flights: TrackFunnel, out: Path) -> None:
     """Return which flights wait for a person: loudly where no other is left, so that a release would be empty."""
     if flights.review:
         level = logging.INFO if flights.accepted else logging.WARNING
@@ -124,16 +124,16 @@ def _num_frames(folder: Path) -> int:
 
 def assemble(
     finished: ItemOutcomes, planned: list[DroneTrace] | None, cfg: InspectConfig, data: Path
-) -> tuple[Inspection, dict[str, FlightView]]:
+) -> tuple[Inspection, dict[str, TrackView]]:
     """Put the outcomes of all flights together: the inspection, and the report's material by flight folder."""
-    flights: list[FlightInspection] = []
-    views: dict[str, FlightView] = {}
+    flights: list[TrackInspection] = []
+    views: dict[str, TrackView] = {}
     covered: list[Coverage] = []
     for outcome in finished.records:
         if isinstance(outcome, Failed):
             flights.append(_unreadable(outcome, planned or [], data))
         else:
-            inspected = result_of(outcome, InspectedFlight)
+            inspected = result_of(outcome, InspectedTrack)
             flights.append(inspected.record)
             views[outcome.id] = inspected.view
             if inspected.record.result == "accepted":
@@ -145,12 +145,12 @@ def assemble(
     return Inspection(settings=settings, funnel=funnel, coverage=coverage, flights=flights), views
 
 
-def _unreadable(outcome: Failed, planned: list[DroneTrace], data: Path) -> FlightInspection:
+def _unreadable(outcome: Failed, planned: list[DroneTrace], data: Path) -> TrackInspection:
     """Return the record of a flight whose inspection failed: rejected, for the reason that the error names."""
     town, trajectory, variant = ("", "", *outcome.id.split("/"))[-3:]
     report = Report()
     report.error("unreadable", outcome.id, outcome.message.replace(f"{data}/", ""), "a flight that can be read")
-    return FlightInspection(
+    return TrackInspection(
         town=town, trajectory=trajectory, variant=variant, folder=outcome.id,
         trace_id=_planned_id(data / outcome.id, planned), result="rejected", issues=report.issues, metrics={},
     )  # fmt: skip
@@ -159,13 +159,13 @@ def _unreadable(outcome: Failed, planned: list[DroneTrace], data: Path) -> Fligh
 def _planned_id(folder: Path, planned: list[DroneTrace]) -> str | None:
     """Name the plan of a flight whose inspection failed; None where it cannot be read."""
     try:
-        found = trace_id(read_flight(folder, strict=False))
+        found = trace_id(read_track(folder, strict=False))
     except InputError:
         return None
     return found if any(trace.path_id == found for trace in planned) else None
 
 
-def _with_twins_trace(flights: list[FlightInspection]) -> list[FlightInspection]:
+def _with_twins_trace(flights: list[TrackInspection]) -> list[TrackInspection]:
     """Return an unreadable flight the trace of its twin, so that the funnel counts it there."""
     known = {Path(flight.folder).parent: flight.trace_id for flight in flights if flight.trace_id is not None}
     return [
@@ -174,7 +174,7 @@ def _with_twins_trace(flights: list[FlightInspection]) -> list[FlightInspection]
     ]
 
 
-def _trajectory_funnel(flights: list[FlightInspection], planned: list[DroneTrace] | None) -> TrajectoryFunnel:
+def _trajectory_funnel(flights: list[TrackInspection], planned: list[DroneTrace] | None) -> TrajectoryFunnel:
     """Count planned trajectories on their way; of an original and its perturbed twin the worse one decides.
 
     Without plans those that are there count as planned.
@@ -193,10 +193,10 @@ def _trajectory_funnel(flights: list[FlightInspection], planned: list[DroneTrace
     )
 
 
-def _flight_funnel(flights: list[FlightInspection]) -> FlightFunnel:
+def _flight_funnel(flights: list[TrackInspection]) -> TrackFunnel:
     results = Counter(flight.result for flight in flights)
     reasons = Counter(flight.reason for flight in flights if flight.reason is not None)
-    return FlightFunnel(
+    return TrackFunnel(
         inspected=len(flights),
         accepted=results["accepted"],
         review=results["review"],

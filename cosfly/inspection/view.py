@@ -10,10 +10,10 @@ import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, model_validator
 
 from cosfly.formats.boxes import BoxMap
-from cosfly.formats.flights import read_tracks_beside
 from cosfly.formats.issues import Issue, sort_key
-from cosfly.formats.playback import Flight
-from cosfly.geometry.flight_metrics import CLEARANCE_CAP_M
+from cosfly.formats.playback import Track
+from cosfly.formats.tracks import read_tracks_beside
+from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M
 from cosfly.viz.frame_views import small_jpeg, thumbnail
 from cosfly.viz.topview import INK, PAPER, TopView, draw_dot, draw_line, draw_map, draw_text
 
@@ -33,7 +33,7 @@ DRONE, PERSON, BESIDE = (35, 100, 220), (235, 120, 20), (150, 80, 190)  # RGB
 JPEG = Annotated[str, Field(pattern=r"^[A-Za-z0-9+/=]*$")]
 
 
-class FlightView(BaseModel):
+class TrackView(BaseModel):
     """Curves with gaps by their names in PLOTS, three frames (those in question before the first, the middle and the
     last), and the map, as JPEGs in base64; None of what there is not. frames: which those are; absent in inspections of
     before."""
@@ -45,20 +45,20 @@ class FlightView(BaseModel):
     frames: list[int] = []
 
     @model_validator(mode="after")
-    def _curves_have_their_times(self) -> FlightView:
+    def _curves_have_their_times(self) -> TrackView:
         if wrong := [name for name, values in self.curves.items() if len(values) != len(self.time_s)]:
             raise ValueError(f"{wrong[0]} has {len(self.curves[wrong[0]])} values at {len(self.time_s)} times")
         return self
 
 
-def draw_flight(
-    flight: Flight,
+def draw_track(
+    flight: Track,
     heights_m: np.ndarray,
     clearance_m: np.ndarray | None,
     box_map: BoxMap | None,
     width_px: int,
     issues: Sequence[Issue] = (),
-) -> FlightView:
+) -> TrackView:
     """Return what a page shows of a flight.
 
     Args:
@@ -77,7 +77,7 @@ def draw_flight(
     }
     usual = [0, len(flight) // 2, len(flight) - 1]
     chosen = sorted((in_question(issues, len(flight)) + usual)[: len(usual)])
-    return FlightView(
+    return TrackView(
         time_s=[round(float(at_s), 2) for at_s in flight.time_s[rows]],
         curves={name: _numbers(values[rows]) for name, values in curves.items() if values is not None},
         pictures=[thumbnail(flight.frame_folder(i), width_px) for i in chosen],
@@ -100,7 +100,7 @@ def _numbers(values: np.ndarray) -> list[float | None]:
     return [round(float(value), 3) if np.isfinite(value) else None for value in values]
 
 
-def draw_plan(flight: Flight, box_map: BoxMap | None, beside: Sequence[Flight] = ()) -> str:
+def draw_plan(flight: Track, box_map: BoxMap | None, beside: Sequence[Track] = ()) -> str:
     """Draw the ways of drone and person on the map from above, or on paper where there is none; a JPEG in base64.
 
     Args:

@@ -36,9 +36,9 @@ from cosfly.maps.town_blocks import (
     ring,
     tree,
 )
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import nearest
+from cosfly.runtime.seeding import rng_for
 
 GENERATOR_VERSION = "1"
 

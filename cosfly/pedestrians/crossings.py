@@ -17,7 +17,7 @@ import numpy as np
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.kinds import GROUND_KINDS, KINDS
-from cosfly.formats.walks import Walk
+from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.geometry.grid import OccupancyGrid, surface, surface_kinds
 from cosfly.runtime.compiled import njit
 
@@ -96,7 +96,7 @@ def costs_of(open_cost: int, road_cost: int) -> np.ndarray:
     return costs
 
 
-def where_walked(walk: Walk, footing: np.ndarray, grid: OccupancyGrid) -> tuple[int, int]:
+def where_walked(walk: PedestrianTrajectory, footing: np.ndarray, grid: OccupancyGrid) -> tuple[int, int]:
     """Count a walk's points on carriageway away from crossings, and on crossings."""
     steps = np.diff(walk.polyline_m, axis=0)
     middles = walk.polyline_m[:-1] + steps / 2

@@ -27,14 +27,14 @@ import numpy as np
 from pydantic import BaseModel
 
 from cosfly.formats.boxes import read_boxes
+from cosfly.formats.bystanders import OTHERS_FILE, Bystanders, write_bystanders
 from cosfly.formats.ground import Ground
-from cosfly.formats.others import OTHERS_FILE, Company, write_others
+from cosfly.formats.pedestrian_paths import PedestrianTrajectory, pace_field, paces_of, walk_id, write_paths
 from cosfly.formats.roi import read_roi
-from cosfly.formats.walks import Walk, pace_field, paces_of, walk_id, write_paths
 from cosfly.pedestrians.astar import route_cost
+from cosfly.pedestrians.bystanders import bystanders_of
 from cosfly.pedestrians.crossings import CROSSING, ROAD, where_walked
 from cosfly.pedestrians.lanes import Lane, lanes_of
-from cosfly.pedestrians.others import company_of
 from cosfly.pedestrians.walkable import (
     Clock,
     PedestriansConfig,
@@ -44,10 +44,10 @@ from cosfly.pedestrians.walkable import (
     walkable_ground,
 )  # fmt: skip
 from cosfly.pedestrians.walking import PACES, arrival_times, resample, speeds_at, take_pace
-from cosfly.runtime.chance import draw_by_share, rng_for
 from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.seeding import draw_by_share, rng_for
 from cosfly.runtime.stage_folder import Resume, StageFolder, result_of
 from cosfly.runtime.store import write_bytes, write_json
 from cosfly.viz.topview import INK, TopView, draw_dot, draw_line, draw_text, png_bytes
@@ -68,7 +68,7 @@ LEGEND = (("obstacle", OBSTACLE), ("safety margin", MARGIN), ("free, not used", 
           ("carriageway", ON_ROAD), ("crossing", ON_CROSSING))  # fmt: skip
 
 
-def draw_overview(ground: WalkableGround, paths: list[Walk]) -> bytes:
+def draw_overview(ground: WalkableGround, paths: list[PedestrianTrajectory]) -> bytes:
     """Draw the ground and the walks; a ring is a start, a dot a goal, and north is up; PNG bytes."""
     picture, view = _ground_picture(ground)
     thickness = max(1, round(LONGER_SIDE_PX / 600))
@@ -144,17 +144,17 @@ RETRY_REASONS = ("no_goal", "detour")
 
 
 @dataclass(frozen=True)
-class WalkResult:
+class PedestrianResult:
     """A walk and what it took: pairs of ends given up by reason, and the seconds of the steps."""
 
-    walk: Walk
+    walk: PedestrianTrajectory
     retries: dict[str, int]
     seconds: dict[str, float]
 
 
-def make_walk(
+def make_pedestrian(
     path_id: str, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator, pace: str | None = None
-) -> WalkResult:
+) -> PedestrianResult:
     """Make one walk: draw its ends, find the route, take it at a pace, sample it.
 
     Args:
@@ -167,7 +167,7 @@ def make_walk(
     route_m, retries = _draw_route(path_id, ground, cfg, rng, clock)
     with clock("report"):
         walk = walk_along(path_id, route_m, ground.heights, cfg, rng, pace_rng, pace)
-    return WalkResult(walk, retries, clock.seconds)
+    return PedestrianResult(walk, retries, clock.seconds)
 
 
 def walk_along(
@@ -178,7 +178,7 @@ def walk_along(
     rng: np.random.Generator,
     pace_rng: np.random.Generator,
     pace: str | None = None,
-) -> Walk:
+) -> PedestrianTrajectory:
     """Walk a route, (k, 2) m, at a pace, or one that is drawn, and sample it."""
     name = pace or draw_by_share(cfg.pace, pace_rng)
     way = take_pace(route_m, PACES[name], pace_rng)
@@ -186,7 +186,7 @@ def walk_along(
     times_s = arrival_times(way.polyline_m, waypoint_mps)
     time_s, positions_m, speeds_mps = resample(way.polyline_m, waypoint_mps, times_s, cfg.dt_s, way.stops_s)
     on_ground = np.column_stack([positions_m, heights.height_at(positions_m)])
-    return Walk(path_id, way.polyline_m, time_s, on_ground, speeds_mps, name)
+    return PedestrianTrajectory(path_id, way.polyline_m, time_s, on_ground, speeds_mps, name)
 
 
 def _draw_route(
@@ -217,24 +217,24 @@ def _draw_route(
     )
 
 
-class _WalkRecord(BaseModel):
+class _PedestrianRecord(BaseModel):
     """What the journal holds of a walk."""
 
     path: dict[str, Any]
     retries: dict[str, int]
     seconds: dict[str, float]
-    company: dict[str, Any] = {}  # where others are wanted
+    bystanders: dict[str, Any] = {}  # where others are wanted
 
 
 def make_worker(cfg: PedestriansConfig, seed: int, ground: WalkableGround, lanes: list[Lane]) -> Work:
     """Worker factory: gives the function that makes one walk, and its company where the settings ask for one."""
 
     def work(item: Item) -> Outcome:
-        made = make_walk(item.item_id, ground, cfg, rng_for(seed, STAGE, item.item_id), item.payload)
+        made = make_pedestrian(item.item_id, ground, cfg, rng_for(seed, STAGE, item.item_id), item.payload)
         result = {"path": made.walk.as_json(), "retries": made.retries, "seconds": made.seconds}
         if cfg.has_others:
             rng = rng_for(seed, STAGE, f"{item.item_id}/others")
-            result["company"] = company_of(made.walk, ground, lanes, cfg, rng).as_json()
+            result["company"] = bystanders_of(made.walk, ground, lanes, cfg, rng).as_json()
         return Outcome(result)
 
     return work
@@ -243,7 +243,9 @@ def make_worker(cfg: PedestriansConfig, seed: int, ground: WalkableGround, lanes
 # --- the stage --------------------------------------------------------------------------------------------------------
 
 
-def report(ground: WalkableGround, paths: list[Walk], retries: list[dict[str, int]], failed: dict[str, int]) -> dict:
+def report(
+    ground: WalkableGround, paths: list[PedestrianTrajectory], retries: list[dict[str, int]], failed: dict[str, int]
+) -> dict:
     """Sum up the stage for `pedestrians_report.json`: equal inputs give equal bytes, so times are in the manifest."""
     lines: list[dict[str, Any]] = []
     for path, given_up in zip(paths, retries, strict=True):
@@ -287,14 +289,14 @@ def report(ground: WalkableGround, paths: list[Walk], retries: list[dict[str, in
 
 def _write_companies(path: Path, lines: list[dict], header: dict, cfg: PedestriansConfig) -> dict[str, dict[str, int]]:
     """Write `others.json`; count who was wanted and who found a place, by kind, and warn if some are missing."""
-    companies = [Company.from_json(line, f"{path.parent}: items.jsonl") for line in lines]
-    write_others(path, companies, header)
+    companions = [Bystanders.from_json(line, f"{path.parent}: items.jsonl") for line in lines]
+    write_bystanders(path, companions, header)
     counts = {}
     for kind, wanted in (("Pedestrians", cfg.others), ("Car", cfg.traffic)):
-        placed = sum(other.kind == kind for company in companies for other in company.others)
-        counts[kind] = {"wanted": wanted * len(companies), "placed": placed}
-        if placed < wanted * len(companies):
-            log.warning("pedestrians: %d of %d others of kind %s found a place", placed, wanted * len(companies), kind)
+        placed = sum(other.kind == kind for bystanders in companions for other in bystanders.others)
+        counts[kind] = {"wanted": wanted * len(companions), "placed": placed}
+        if placed < wanted * len(companions):
+            log.warning("pedestrians: %d of %d others of kind %s found a place", placed, wanted * len(companions), kind)
     return counts
 
 
@@ -339,8 +341,8 @@ def run(
     )
     if not finished.tally.kept:
         raise stage.nothing_kept(finished.tally)
-    results = [result_of(record, _WalkRecord) for record in finished.kept]
-    paths = [Walk.from_json(result.path, f"{out}: items.jsonl") for result in results]
+    results = [result_of(record, _PedestrianRecord) for record in finished.kept]
+    paths = [PedestrianTrajectory.from_json(result.path, f"{out}: items.jsonl") for result in results]
     for result in results:
         for step, taken_s in result.seconds.items():
             clock.add(step, taken_s)
@@ -352,7 +354,7 @@ def run(
         if cfg.has_others:
             header = {"map": box_map.name, "seed": seed, "dt_s": cfg.dt_s}
             outputs.append(out / OTHERS_FILE)
-            summary["others"] = _write_companies(outputs[-1], [result.company for result in results], header, cfg)
+            summary["others"] = _write_companies(outputs[-1], [result.bystanders for result in results], header, cfg)
         write_json(out / "pedestrians_report.json", summary)
         share = summary["total"]["on_carriageway_share"]
         log.info("%.1f %% of the walked points are on carriageway away from crossings", 100 * share)

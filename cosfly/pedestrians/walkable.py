@@ -22,8 +22,8 @@ from pydantic import Field, field_validator, model_validator
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.ground import Ground
 from cosfly.formats.kinds import GROUND_KINDS, PAVED_KINDS
+from cosfly.formats.pedestrian_paths import PLAIN_PACE
 from cosfly.formats.roi import MOST_VERTICES, Roi
-from cosfly.formats.walks import PLAIN_PACE
 from cosfly.geometry.axes import DT_S
 from cosfly.geometry.grid import (
     SURFACE_REACH_M,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cosfly.formats.walks import PLAIN_PACE
+from cosfly.formats.pedestrian_paths import PLAIN_PACE
 
 if TYPE_CHECKING:
     from cosfly.pedestrians.walkable import PedestriansConfig

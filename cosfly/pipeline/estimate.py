@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 
 from caption.run.progress import duration
+from cosfly.formats.pedestrian_paths import read_paths, walk_id
 from cosfly.formats.traces import read_traces
-from cosfly.formats.walks import read_paths, walk_id
 from cosfly.maps.stage import load_map
 from cosfly.pipeline.runs import STAGES
 from cosfly.pipeline.settings import RunConfig

@@ -18,18 +18,18 @@ from cosfly.formats.traces import DroneTrace
 from cosfly.geometry.axes import intrinsic_matrix, look_at, world_from_camera
 from cosfly.maps.stage import SOURCES, MapsConfig
 from cosfly.maps.stage import load_map as load_source
-from cosfly.pedestrians.stage import make_walk, walk_along
+from cosfly.pedestrians.stage import make_pedestrian, walk_along
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
 from cosfly.planners.contract import PlanConfig
-from cosfly.planners.stage import plan_flight
+from cosfly.planners.stage import plan_trajectory
 from cosfly.render.contract import Frame
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import renderer_of
 from cosfly.render.weather import WeatherConfig, drawn_seed, read_pools, weather_of
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import SimplifyConfig, simplify
 
 __all__ = ["BoxMap", "DroneTrace", "Frame", "load_map", "plan", "read_captions", "render_frames"]
@@ -100,11 +100,11 @@ def plan(
         box_map = simplify(box_map, SimplifyConfig()).box_map
     rng = rng_for(seed, "pedestrians", "path_00000")
     if way_m is None:
-        person = make_walk("path_00000", walkable_ground(box_map, walking), walking, rng).walk
+        person = make_pedestrian("path_00000", walkable_ground(box_map, walking), walking, rng).walk
     else:
         route_m = _way(way_m)
         person = walk_along("path_00000", route_m, box_map.ground, walking, rng, rng.spawn(1)[0])
-    return plan_flight(person, obstacle_index(box_map), cfg, seed, screens_of(box_map))
+    return plan_trajectory(person, obstacle_index(box_map), cfg, seed, screens_of(box_map))
 
 
 def _way(way_m: Any) -> np.ndarray:

@@ -26,7 +26,7 @@ from cosfly.formats.captions import FIELDS, read_captions
 from cosfly.formats.segments import FOLLOW
 from cosfly.pipeline import bench as benchmark
 from cosfly.pipeline.runs import look
-from cosfly.pipeline.settings import RunConfig, manner_of_work
+from cosfly.pipeline.settings import RunConfig, worker_options
 from cosfly.planners import compare
 from cosfly.runtime.arrays import read_picture
 from cosfly.runtime.config import build, read_yaml
@@ -116,7 +116,7 @@ def run(cfg: RunConfig, folder: Path, out: Path, *, walks: int = 20, resume: Res
             "the run has not come to its flights", where=folder, got=f"no {', no '.join(missing)}", fix=fix
         )
     printed = read_paper()
-    made = measure(cfg, folder, out, walks, done, {**manner_of_work(cfg), "resume": resume})
+    made = measure(cfg, folder, out, walks, done, {**worker_options(cfg), "resume": resume})
     places = Places([folder, out], made)
     made |= work(cfg, folder, places, done)
     parts, left_out = [settings(cfg, printed)], dict(printed.left_out)
@@ -284,7 +284,7 @@ def settings(cfg: RunConfig, printed: Paper) -> Part:
 
 
 def measure(
-    cfg: RunConfig, run: Path, out: Path, num_walks: int, done: Sequence[str], manner: dict[str, Any]
+    cfg: RunConfig, run: Path, out: Path, num_walks: int, done: Sequence[str], worker_options: dict[str, Any]
 ) -> dict[str, Any]:
     """Do what the run has not recorded, in folders of their own below `out`; give what of it stands in no file.
 
@@ -292,7 +292,7 @@ def measure(
     own are the first of them.
     """
     boxes, simplified = run / "maps/boxes_3d.json", run / "simplify/step2_simplified.json"
-    traces, tree, how = run / "plan/drone_trace.json", run / "render", {"seed": cfg.seed, **manner}
+    traces, tree, how = run / "plan/drone_trace.json", run / "render", {"seed": cfg.seed, **worker_options}
     walking = cfg.pedestrians.model_copy(update={"num_paths": num_walks, "others": 0, "traffic": 0, "look_alikes": 0})
     paths = cosfly.pedestrians.stage.run(walking, simplified, out / "walks", roi=cfg.roi, **how)
     plan = cfg.plan.model_copy(update={"styles": {FOLLOW: 1.0}})

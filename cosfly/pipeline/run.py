@@ -24,8 +24,8 @@ import cosfly.planners.stage
 import cosfly.render.stage
 import cosfly.simplify.stage
 import release.package.stage
-from cosfly.formats.others import OTHERS_FILE
-from cosfly.pipeline.settings import RunConfig, manner_of_work
+from cosfly.formats.bystanders import OTHERS_FILE
+from cosfly.pipeline.settings import RunConfig, worker_options
 from cosfly.runtime.documents import read_object
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError, ResumeError
 from cosfly.runtime.folder_lock import hold_folder
@@ -59,7 +59,7 @@ class StageResult:
 
 def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path | None = None) -> list[Stage]:
     """Return the stages of a run in order; each works in the folder of its name, of the run or of `into`."""
-    seed, working = cfg.seed, manner_of_work(cfg)
+    seed, working = cfg.seed, worker_options(cfg)
     boxes, simplified = out / "maps/boxes_3d.json", out / "simplify/step2_simplified.json"
     walks, traces, tree = out / "pedestrians/path.json", out / "plan/drone_trace.json", out / "render"
     others = walks.with_name(OTHERS_FILE) if cfg.pedestrians.has_others else None
@@ -87,7 +87,7 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path 
 def joint_release(cfg: RunConfig, sources: list[Source], out: Path, resume: Resume) -> Stage:
     """Return the stage that releases runs together."""
     work = partial(
-        release.package.stage.run, cfg.release, sources, out / "release", resume=resume, **manner_of_work(cfg)
+        release.package.stage.run, cfg.release, sources, out / "release", resume=resume, **worker_options(cfg)
     )
     return Stage("release", out / "release/dataset", work)
 

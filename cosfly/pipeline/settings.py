@@ -16,11 +16,11 @@ from cosfly.maps.stage import MapsConfig
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners.contract import PlanConfig
 from cosfly.render.settings import RenderConfig
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import Config, build
 from cosfly.runtime.errors import ConfigError
 from cosfly.runtime.files import LinkedPath
 from cosfly.runtime.ray_engine import ALL_ROOM, RayConfig
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.worker_pool import Watch
 from cosfly.simplify.passes import SimplifyConfig
 from cosfly.worldgen.settings import WorldConfig
@@ -161,7 +161,7 @@ def merged(group: Config, settings: dict[str, Any], changes: dict[str, Any]) -> 
     return result
 
 
-def manner_of_work(cfg: RunConfig) -> dict[str, Any]:
+def worker_options(cfg: RunConfig) -> dict[str, Any]:
     """Return the arguments that all stages with items take: how many workers, where, and when one counts as stalled."""
     cluster = cfg.ray if cfg.engine == "ray" else None
     workers = cfg.workers or (len(os.sched_getaffinity(0)) if cluster is None else ALL_ROOM)

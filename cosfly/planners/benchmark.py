@@ -21,15 +21,15 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from cosfly.formats.boxes import BoxMap, read_boxes
-from cosfly.formats.walks import read_paths
+from cosfly.formats.pedestrian_paths import read_paths
 from cosfly.planners import compare
 from cosfly.planners.compare import AXES, FIGURES, INTERVAL_PERCENT, NUM_RESAMPLES, CompareConfig
 from cosfly.planners.contract import ALL_PLANNERS, title_of
 from cosfly.planners.stage import check_ids, draw_styles_of
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.documents import FileFormat, read_model
 from cosfly.runtime.errors import EnvironmentMissing, InputError
 from cosfly.runtime.runner import Item, Watch, run_items
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.stage_folder import Resume, StageFolder, result_of
 from cosfly.runtime.store import write_bytes, write_model
 from cosfly.viz.tables import TextTable
@@ -83,7 +83,7 @@ PAPER_SHORTEST_M = 85.73  # to which the paper normalises path efficiency
 PAPER_GROUPS = dict(zip(list(GROUPS)[1:], (0.9364, 0.6205, 0.6083, 0.6075), strict=True))  # visibility
 
 
-Flown = dict[str, compare.FlightsOfWalk]  # by the id of the walk
+Flown = dict[str, compare.TrajectoriesOfPath]  # by the id of the walk
 
 
 class BenchmarkConfig(CompareConfig):
@@ -129,7 +129,7 @@ def run(
     done = run_items(stage, items, compare.make_worker, (cfg, simplified_map, seed, True), workers=workers, watch=watch)
     if not done.tally.kept:
         raise stage.nothing_kept(done.tally, expected="a walk that a planner flies")
-    flown = {record.id: result_of(record, compare.FlightsOfWalk) for record in done.kept}
+    flown = {record.id: result_of(record, compare.TrajectoriesOfPath) for record in done.kept}
     header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.all_values()}
     summary = summarize(flown, cfg.planners, rng_for(seed, "plan_benchmark", "intervals"))
     found = Benchmark(**header, **summary)
@@ -220,7 +220,7 @@ def read_benchmark(path: Path) -> Benchmark:
 def summarize(flown: Flown, planners: tuple[str, ...], rng: np.random.Generator) -> dict[str, Any]:
     """Make the tables of `benchmark.json` from the flights. rng: draws scenarios."""
     traces = [found.traces(name) for name, found in flown.items()]
-    figures = {p: [compare.flight_figures(t[p]) if p in t else None for t in traces] for p in planners}
+    figures = {p: [compare.trajectory_figures(t[p]) if p in t else None for t in traces] for p in planners}
     tables = {p: np.array([_row(flight) for flight in rows]) for p, rows in figures.items()}
     means = _means(tables, np.arange(len(flown)))
     drawn = [_means(tables, draw) for draw in rng.integers(len(flown), size=(NUM_RESAMPLES, len(flown)))]

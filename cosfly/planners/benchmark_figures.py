@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from cosfly.formats.boxes import BoxMap
-from cosfly.formats.walks import TARGET_HEIGHT_M
+from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.geometry.axes import rotation_matrices
 from cosfly.geometry.kernels import NO_OBSTACLE_KINDS
 from cosfly.planners.benchmark import PAPER, Benchmark, Flown

@@ -18,15 +18,15 @@ import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
 from cosfly.formats.boxes import BoxMap, read_boxes
+from cosfly.formats.pedestrian_paths import PedestrianTrajectory, read_paths
 from cosfly.formats.traces import DroneTrace, write_traces
-from cosfly.formats.walks import Walk, read_paths
 from cosfly.planners.contract import ALL_PLANNERS, PLANNERS, PlanConfig, known_planner, title_of
-from cosfly.planners.overview import draw_walks
-from cosfly.planners.stage import check_ids, draw_styles_of, plan_flight, warm_up
-from cosfly.runtime.chance import rng_for
+from cosfly.planners.overview import draw_pedestrians
+from cosfly.planners.stage import check_ids, draw_styles_of, plan_trajectory, warm_up
 from cosfly.runtime.documents import FileFormat, read_object
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.stage_folder import Dropped, Failed, ItemRecord, Resume, StageFolder, read_manifest, result_of
 from cosfly.runtime.store import write_bytes, write_json
 from cosfly.viz.tables import TextTable
@@ -56,7 +56,7 @@ NUM_RESAMPLES, INTERVAL_PERCENT = 1000, (2.5, 97.5)  # of walks, for the interva
 # --- figures ----------------------------------------------------------------------------------------------------------
 
 
-def flight_figures(trace: DroneTrace) -> dict[str, float]:
+def trajectory_figures(trace: DroneTrace) -> dict[str, float]:
     """Return the figures of FIGURES of one flight."""
     figures = {name: float(trace.metrics[name]) for name, _, _ in FIGURES if name in trace.metrics}
     figures["blocked_fraction"] = round(1.0 - figures["five_ray_mean"], 4)
@@ -152,7 +152,7 @@ def summarize(flights: dict[str, list[DroneTrace]], rng: np.random.Generator) ->
         less its own, the first's wins.
     """
     first, *others = flights
-    figures = {planner: [flight_figures(trace) for trace in traces] for planner, traces in flights.items()}
+    figures = {planner: [trajectory_figures(trace) for trace in traces] for planner, traces in flights.items()}
     means = {planner: mean_figures(rows) for planner, rows in figures.items()}
     ids = [trace.path_id for trace in flights[first]]
     return {
@@ -207,7 +207,7 @@ def make_worker(cfg: CompareConfig, simplified_map: Path, seed: int, keeps_all: 
         for name, planner in settings.items():
             begin_s = time.perf_counter()
             try:
-                flights[name] = plan_flight(walk, obstacles, planner, seed, screens, styles).as_json()
+                flights[name] = plan_trajectory(walk, obstacles, planner, seed, screens, styles).as_json()
             except NoPathError as error:
                 errors[name] = error
             times_ms[name] = round(1000.0 * (time.perf_counter() - begin_s), 2)
@@ -252,7 +252,7 @@ def run(
     finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers, watch=watch)
     if not finished.tally.kept:
         raise stage.nothing_kept(finished.tally, expected="a walk that all planners fly")
-    shared = {record.id: result_of(record, FlightsOfWalk) for record in finished.kept}
+    shared = {record.id: result_of(record, TrajectoriesOfPath) for record in finished.kept}
     traces = [found.traces(walk_id) for walk_id, found in shared.items()]
     flights = {name: [flown[name] for flown in traces] for name in cfg.planners}
     header = {"map": box_map.name, "num_boxes": len(box_map), "seed": seed, "settings": cfg.all_values()}
@@ -268,14 +268,14 @@ def run(
         outputs.append(out / f"drone_trace_{name}.json")
         write_traces(outputs[-1], own, {**header, "planner": name})
     by_id = {walk.path_id: walk for walk in walks}
-    flown: list[Walk] = [by_id[walk_id] for walk_id in shared]
+    flown: list[PedestrianTrajectory] = [by_id[walk_id] for walk_id in shared]
     outputs.append(out / "compare_overlay.png")
     write_bytes(outputs[-1], draw_overlay(box_map, flown, flights))
     stage.finish(outputs, finished.tally, timings=timings(shared.values(), cfg.planners))
     return product
 
 
-class FlightsOfWalk(BaseModel):
+class TrajectoriesOfPath(BaseModel):
     """What the journal holds of a walk, by planner."""
 
     flights: dict[str, dict[str, Any]]
@@ -296,12 +296,12 @@ def _left_out(records: Iterable[ItemRecord]) -> list[dict[str, str]]:
         elif isinstance(record, Dropped):
             rows += [
                 {"id": record.id, "planner": k, "message": v}
-                for k, v in result_of(record, FlightsOfWalk).errors.items()
+                for k, v in result_of(record, TrajectoriesOfPath).errors.items()
             ]
     return rows
 
 
-def timings(shared: Collection[FlightsOfWalk], planners: Sequence[str]) -> dict[str, dict[str, float]]:
+def timings(shared: Collection[TrajectoriesOfPath], planners: Sequence[str]) -> dict[str, dict[str, float]]:
     """Return planning times over the compared walks: they differ from run to run, so they stand in the manifest
     alone."""
     table = {}
@@ -338,9 +338,9 @@ def _legend(picture: np.ndarray, planners: Collection[str], y: float) -> None:
 # --- from above -------------------------------------------------------------------------------------------------------
 
 
-def draw_overlay(box_map: BoxMap, walks: list[Walk], flights: dict[str, list[DroneTrace]]) -> bytes:
+def draw_overlay(box_map: BoxMap, walks: list[PedestrianTrajectory], flights: dict[str, list[DroneTrace]]) -> bytes:
     """Draw walks (dark) and the flights of each planner over the map; PNG bytes."""
-    picture, view = draw_walks(box_map, walks, [trace for traces in flights.values() for trace in traces])
+    picture, view = draw_pedestrians(box_map, walks, [trace for traces in flights.values() for trace in traces])
     for planner, traces in flights.items():
         for trace in traces:
             line = view.pixels(trace.positions_m)

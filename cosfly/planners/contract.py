@@ -21,7 +21,7 @@ from pydantic import Field, field_validator, model_validator
 
 from cosfly.formats.segments import FOLLOW
 from cosfly.geometry.axes import DT_S
-from cosfly.geometry.flight_metrics import (
+from cosfly.geometry.trajectory_metrics import (
     ACCEL_RMS_MAX_MPS2,
     FIVE_RAY_MEAN_MIN,
     JERK_RMS_MAX_MPS3,
@@ -269,7 +269,7 @@ class PlanConfig(Config):
 
 
 @dataclass(frozen=True)
-class Wish:
+class TrackingReference:
     """What a flight should be at each of n waypoints, all (n,); a planner comes as near as boxes, speed and sight
     allow.
 
@@ -317,7 +317,7 @@ class Scenario:
     path_id: str
     targets_m: np.ndarray
     ground_m: np.ndarray
-    wish: Wish
+    reference: TrackingReference
     dt_s: float = DT_S
     flown_m: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
     turns_round: bool = False
@@ -343,9 +343,9 @@ class Scenario:
         frames = np.unique(np.append(np.arange(self.start, len(self.targets_m), stride), len(self.targets_m) - 1))
         least, preferred = (
             maximum_filter1d(self.ground_m + altitudes_m, 2 * stride + 1, mode="nearest")[frames]
-            for altitudes_m in (self.wish.altitude_min_m, self.wish.altitude_m)
+            for altitudes_m in (self.reference.altitude_min_m, self.reference.altitude_m)
         )
-        highest_m = self.ground_m + self.wish.altitude_max_m
+        highest_m = self.ground_m + self.reference.altitude_max_m
         return frames, least, preferred, minimum_filter1d(highest_m, 2 * stride + 1, mode="nearest")[frames]
 
     def between(self, frames: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -355,7 +355,7 @@ class Scenario:
 
     def no_way(self, what: str, floor_m: float) -> NoPathError:
         """Return the error of a planner that finds nothing. floor_m: distance to boxes that it keeps at least."""
-        low_m, high_m = self.wish.altitude_min_m.min(), self.wish.altitude_max_m.max()
+        low_m, high_m = self.reference.altitude_min_m.min(), self.reference.altitude_max_m.max()
         expected = f"places from {low_m:g} to {high_m:g} m up, {floor_m:g} m from all boxes"
         fix = "is the walk roofed over? raise plan.altitude_max_m or leave the path out"
         return NoPathError(what, where=self.path_id, expected=expected, fix=fix)

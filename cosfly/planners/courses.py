@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from cosfly.formats.segments import FOLLOW
 from cosfly.geometry.axes import DT_S
-from cosfly.planners.contract import PlanConfig, Scenario, Wish
+from cosfly.planners.contract import PlanConfig, Scenario, TrackingReference
 from cosfly.planners.styles import Range, Style
 
 if TYPE_CHECKING:
@@ -33,11 +33,11 @@ DRAWS, GOOD = 32, 0.99
 WAY_ROUND = 0.2  # of that is the price of half the way round the walker from the part before
 
 
-def wish_of(
+def reference_of(
     names: list[str], scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator
-) -> Wish:
+) -> TrackingReference:
     """Return the wish of a flight of equally long parts in these styles; the wish of `follow` is the scenario's own."""
-    num, paper = len(scenario.targets_m), scenario.wish
+    num, paper = len(scenario.targets_m), scenario.reference
     course, paces_mps = np.empty((num, 3)), np.full(num, APART_MPS)
     cuts = np.linspace(0, num, len(names) + 1).round().astype(int).tolist()
     for name, begin, end in zip(names, cuts[:-1], cuts[1:], strict=True):
@@ -54,9 +54,9 @@ def wish_of(
 
 def without_jumps(
     course: np.ndarray, scenario: Scenario, cfg: PlanConfig, paces_mps: np.ndarray | float = APART_MPS
-) -> Wish:
+) -> TrackingReference:
     """Make a wish of a course, (n, 3): steps become ways at the speeds above and paces_mps, corners are rounded."""
-    num, dt_s, paper = len(course), scenario.dt_s, scenario.wish
+    num, dt_s, paper = len(course), scenario.dt_s, scenario.reference
 
     def followed(values: np.ndarray, speeds_mps: np.ndarray | float) -> np.ndarray:
         slewed = _slew(values, np.broadcast_to(np.asarray(speeds_mps) * dt_s, num))
@@ -83,10 +83,10 @@ def places_of(course: np.ndarray, targets_m: np.ndarray, ground_m: np.ndarray) -
     return np.column_stack([targets_m[:, :2] + away, ground_m + course[:, 2]])
 
 
-def going_on(scenario: Scenario, cfg: PlanConfig) -> Wish:
+def going_on(scenario: Scenario, cfg: PlanConfig) -> TrackingReference:
     """Return the wish of a flight that is to come from where the drone is (`flown_m`) to where the scenario wishes it,
     as from one style to the next; altitudes that it comes from are no breach."""
-    paper, num_flown = scenario.wish, len(scenario.flown_m)
+    paper, num_flown = scenario.reference, len(scenario.flown_m)
     away = scenario.flown_m[-1] - scenario.targets_m[num_flown - 1]
     altitude_m = scenario.flown_m[-1, 2] - scenario.ground_m[num_flown - 1]
     course = np.column_stack([paper.heading_rad + paper.bearing_rad, paper.ground_distance_m, paper.altitude_m])
@@ -128,7 +128,7 @@ def _course(
     style: Style, scenario: Scenario, part: slice, before: float | None, rng: np.random.Generator
 ) -> np.ndarray:
     """Draw the course of one part, (k, 3). before: azimuth where the part before ended."""
-    targets_m, heading_rad, dt_s = scenario.targets_m[part], scenario.wish.heading_rad[part], scenario.dt_s
+    targets_m, heading_rad, dt_s = scenario.targets_m[part], scenario.reference.heading_rad[part], scenario.dt_s
     seconds = np.arange(len(targets_m)) * dt_s
     apart_m = _even(style.ground_distance_m, style.ground_distance_end_m, EVEN_APART_MPS, seconds, rng)
     altitude_m = _even(style.altitude_m, style.altitude_end_m, EVEN_CLIMB_MPS, seconds, rng)
@@ -183,14 +183,14 @@ def _slew(values: np.ndarray, steps_max: np.ndarray) -> np.ndarray:
 # What a flight is wished to be: the paper's, behind the walker; and the heading that wishes are counted from.
 
 
-def follow(targets_m: np.ndarray, cfg: PlanConfig, dt_s: float = DT_S) -> Wish:
+def follow(targets_m: np.ndarray, cfg: PlanConfig, dt_s: float = DT_S) -> TrackingReference:
     """Return the paper's wish: behind the walker, the settings' height, distance and pitch throughout.
 
     Args:
         targets_m: (n, 3), n >= 2. dt_s: between points.
     """
     num, muco = len(targets_m), cfg.muco
-    return Wish(
+    return TrackingReference(
         heading_rad=smoothed_headings(targets_m, cfg.heading_smoothing_s, dt_s),
         bearing_rad=np.full(num, np.pi),
         distance_m=np.full(num, muco.track_distance_m),

@@ -26,8 +26,8 @@ from cosfly.geometry.kernels import (
     visibility,
 )
 from cosfly.planners.contract import Plan, PlanConfig, Scenario
-from cosfly.planners.sight import FOOT_LOW_M, look, make_horizon
-from cosfly.planners.smoothing import smooth_flight, unsafe
+from cosfly.planners.line_of_sight import FOOT_LOW_M, look, make_horizon
+from cosfly.planners.smoothing import smooth_trajectory, unsafe
 from cosfly.runtime.compiled import njit
 
 # --- the places that the search may choose from: rings round the walker, counted from the wished place ----------------
@@ -78,23 +78,23 @@ def make_lattice(scenario: Scenario, *, climbing: bool) -> Lattice:
     Args:
         climbing: with places far above the wished ones, at fewer key frames.
     """
-    wish, targets = scenario.wish, scenario.targets_m
+    reference, targets = scenario.reference, scenario.targets_m
     stride = max(1, round((BETWEEN_KEYS_CLIMBING_S if climbing else BETWEEN_KEYS_S) / scenario.dt_s))
     frames, least_z, _, greatest_z = scenario.key_frames(stride)
     least_z, greatest_z = least_z[:, None], greatest_z[:, None]
     rings = np.array(RINGS + CLIMBS if climbing else RINGS, dtype=np.float64)
-    distances_m, grounds_m = wish.distance_m[frames, None], wish.ground_distance_m[frames, None]
+    distances_m, grounds_m = reference.distance_m[frames, None], reference.ground_distance_m[frames, None]
     steps_m = np.minimum(STEP_OUT_SHARE * distances_m, STEP_OUT_MAX_M)
     radii_m = np.maximum(grounds_m + rings[:, 0] * steps_m, grounds_m / 2.0)
-    z = np.maximum((scenario.ground_m + wish.altitude_m)[frames, None] + STEP_UP_M * rings[:, 1], least_z)
+    z = np.maximum((scenario.ground_m + reference.altitude_m)[frames, None] + STEP_UP_M * rings[:, 1], least_z)
     z = np.minimum(z, np.maximum(greatest_z, least_z))
     turns = np.arange(NUM_AZIMUTHS) * (2.0 * np.pi / NUM_AZIMUTHS)
-    angles = wish.view_rad[frames, None, None] + np.pi + turns
+    angles = reference.view_rad[frames, None, None] + np.pi + turns
     x = targets[frames, 0, None, None] + radii_m[:, :, None] * np.cos(angles)
     y = targets[frames, 1, None, None] + radii_m[:, :, None] * np.sin(angles)
     places_m = np.stack([x, y, np.broadcast_to(z[:, :, None], x.shape)], axis=-1)
     off = (radii_m - grounds_m) / distances_m
-    turned, high = (ANY_BEARING_COST, ANY_BEARING_HIGH_COST) if wish.any_bearing else (BEARING_COST, HIGH_COST)
+    turned, high = (ANY_BEARING_COST, ANY_BEARING_HIGH_COST) if reference.any_bearing else (BEARING_COST, HIGH_COST)
     aside = np.where(off > 0, FAR_COST, NEAR_COST) * off**2 + high * (STEP_UP_M * rings[:, 1] / distances_m) ** 2
     costs = aside[:, :, None] + turned * np.minimum(turns, 2.0 * np.pi - turns) ** 2
     if len(scenario.flown_m):  # all places of the first key frame are the one where the drone is
@@ -129,7 +129,7 @@ SPEED_SHARE = 0.9  # of the limit: smoothing must be able to catch up
 REACH_M = 12.0  # a box farther away than this is not asked after: two places this free have nothing between them
 
 
-def search_flight(
+def search_trajectory(
     scenario: Scenario, lattice: Lattice, obstacles: BoxIndex, cfg: PlanConfig, clearance_m: float
 ) -> np.ndarray | None:
     """Search the raw flight of one walk.
@@ -148,7 +148,7 @@ def search_flight(
     before, after = np.roll(hidden, 1, axis=0), np.roll(hidden, -1, axis=0)
     before[0], after[-1] = hidden[0], hidden[-1]
     own = (1.0 - 2.0 * NEIGHBOUR_SHARE) * hidden + NEIGHBOUR_SHARE * (before + after)
-    own[~scenario.wish.keeps_sight[frames]] = 0.0
+    own[~scenario.reference.keeps_sight[frames]] = 0.0
     own += lattice.costs.reshape(own.shape)
     longest_m = SPEED_SHARE * cfg.speed_max_mps * scenario.dt_s * np.diff(frames, prepend=frames[0])
     chosen = _cheapest(
@@ -257,25 +257,25 @@ def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.rando
     Raises:
         NoPathError: no places lead along this walk.
     """
-    raw, start, clearance_m = raw_flight(scenario, obstacles, cfg)
-    points, facts = smooth_flight(raw, scenario, obstacles, cfg, clearance_m)
+    raw, start, clearance_m = raw_trajectory(scenario, obstacles, cfg)
+    points, facts = smooth_trajectory(raw, scenario, obstacles, cfg, clearance_m)
     return Plan(points, {"start": start, "clearance_m": clearance_m, **facts})
 
 
-def raw_flight(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> tuple[np.ndarray, str, float]:
+def raw_trajectory(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig) -> tuple[np.ndarray, str, float]:
     """Return the flight to be smoothed, its kind (`wished`, `search` or `climbing search`), and the clearance that it
     keeps, m.
 
     Where the wished places are free and see all that they are to see, nothing is searched.
     """
-    wished = scenario.as_flown(scenario.wish.places_m(scenario.targets_m, scenario.ground_m))
+    requested = scenario.as_flown(scenario.reference.places_m(scenario.targets_m, scenario.ground_m))
     ahead, step_m = slice(scenario.start, None), cfg.speed_max_mps * scenario.dt_s
     safety_m, relaxed_m = cfg.safety_distance_m, cfg.relaxed_safety_m
-    seen = ~scenario.wish.keeps_sight | (visibility(obstacles, wished, scenario.targets_m) == 1.0)
-    if seen[ahead].all() and not unsafe(wished[ahead], obstacles, safety_m, SPEED_SHARE * step_m).any():
-        return wished, "wished", safety_m
+    seen = ~scenario.reference.keeps_sight | (visibility(obstacles, requested, scenario.targets_m) == 1.0)
+    if seen[ahead].all() and not unsafe(requested[ahead], obstacles, safety_m, SPEED_SHARE * step_m).any():
+        return requested, "wished", safety_m
     for climbing, clearance_m in ((False, safety_m), (True, safety_m), (True, relaxed_m)):
-        found = search_flight(scenario, make_lattice(scenario, climbing=climbing), obstacles, cfg, clearance_m)
+        found = search_trajectory(scenario, make_lattice(scenario, climbing=climbing), obstacles, cfg, clearance_m)
         if found is not None:
             return found, "climbing search" if climbing else "search", clearance_m
     raise scenario.no_way("no free places lead along this walk", relaxed_m)

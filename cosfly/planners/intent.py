@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.formats.segments import FOLLOW, MISSION_KINDS, Mission, Segment
-from cosfly.formats.walks import Walk
 from cosfly.geometry.axes import look_at
-from cosfly.planners.contract import PlanConfig, Scenario, Wish
-from cosfly.planners.courses import ROUNDING_S, wish_of
-from cosfly.planners.reacquire import finds_again, wish_of_reacquire
+from cosfly.planners.contract import PlanConfig, Scenario, TrackingReference
+from cosfly.planners.courses import ROUNDING_S, reference_of
+from cosfly.planners.reacquire import finds_again, reference_of_reacquire
 from cosfly.planners.styles import OTHER_SIDE, REACQUIRE, RETURN_HOME, ROWS, WHOLE, suits
-from cosfly.runtime.chance import draw_to_quota
+from cosfly.runtime.seeding import draw_to_quota
 
 if TYPE_CHECKING:
     from cosfly.geometry.kernels import BoxIndex
@@ -41,7 +41,7 @@ class Intent:
     the paper's then.
     """
 
-    wish: Wish
+    reference: TrackingReference
     segments: tuple[Segment, ...] = ()
     mission: Mission | None = None
     order: str | None = None
@@ -56,7 +56,7 @@ class Intent:
         return any(part.style == REACQUIRE for part in self.segments)
 
 
-def draw_styles(walks: Sequence[Walk], cfg: PlanConfig, rng: np.random.Generator) -> list[list[str]]:
+def draw_styles(walks: Sequence[PedestrianTrajectory], cfg: PlanConfig, rng: np.random.Generator) -> list[list[str]]:
     """Draw the styles of the parts of each flight of a run to the quota of the settings' shares.
 
     Flights draw among themselves which takes a style that is of a whole flight, parts which styles they have. Styles
@@ -96,11 +96,11 @@ def draw_styles(walks: Sequence[Walk], cfg: PlanConfig, rng: np.random.Generator
     return [names + ([last] if last else []) for names, last in zip(drawn, lasts, strict=True)]
 
 
-def _unevenness_mps(walk: Walk, points: np.ndarray) -> float:
+def _unevenness_mps(walk: PedestrianTrajectory, points: np.ndarray) -> float:
     return float(np.std(walk.speeds_mps[points]))
 
 
-def _straightness(walk: Walk, points: np.ndarray) -> float:
+def _straightness(walk: PedestrianTrajectory, points: np.ndarray) -> float:
     steps_m = np.diff(walk.positions_m[points, :2], axis=0)
     return float(np.hypot(*steps_m.sum(axis=0)) / max(float(np.hypot(*steps_m.T).sum()), 1e-9))
 
@@ -123,21 +123,21 @@ def draw_intent(
     """Draw how a flight of these styles is flown. screens: the obstacles that hide a person for certain."""
     num = len(scenario.targets_m)
     if names[-1] == REACQUIRE:
-        wish = wish_of_reacquire(scenario, obstacles, screens, cfg, rng)
+        reference = reference_of_reacquire(scenario, obstacles, screens, cfg, rng)
         segment = Segment(REACQUIRE, 0, num, keeps_sight=False)
-        if wish is None:
-            return Intent(scenario.wish, (segment,), impossible=NO_HIDING_PLACE)
-        return Intent(wish, (segment,))
+        if reference is None:
+            return Intent(scenario.reference, (segment,), impossible=NO_HIDING_PLACE)
+        return Intent(reference, (segment,))
     names, goes_home = [name for name in names if name != RETURN_HOME], names[-1] == RETURN_HOME
     cuts = np.linspace(0, num, len(names) + 1).round().astype(int).tolist()
     plain = [name.removeprefix(OTHER_SIDE) for name in names]
     segments = tuple(Segment(*part) for part in zip(plain, cuts[:-1], cuts[1:], strict=True))
     is_paper = not goes_home and set(names) == {FOLLOW}
-    wish = scenario.wish if is_paper else wish_of(names, scenario, obstacles, cfg, rng)
+    reference = scenario.reference if is_paper else reference_of(names, scenario, obstacles, cfg, rng)
     if not goes_home:
-        return Intent(wish, () if is_paper else segments)
+        return Intent(reference, () if is_paper else segments)
     order = MISSION_KINDS[int(rng.integers(len(MISSION_KINDS)))]
-    return Intent(wish, (*segments, Segment(RETURN_HOME, num, num, keeps_sight=False)), order=order)
+    return Intent(reference, (*segments, Segment(RETURN_HOME, num, num, keeps_sight=False)), order=order)
 
 
 def why_not_held(intent: Intent, scenario: Scenario, positions_m: np.ndarray, seen: np.ndarray) -> str | None:
@@ -151,15 +151,15 @@ def why_not_held(intent: Intent, scenario: Scenario, positions_m: np.ndarray, se
     if intent.searches:
         return None if finds_again(seen, scenario.dt_s) else NOT_FOUND_AGAIN
     pursued = None if intent.mission is None else intent.mission.at_frame
-    return None if _is_held(intent.wish, scenario, positions_m)[:pursued].mean() >= HELD_SHARE else NOT_HELD
+    return None if _is_held(intent.reference, scenario, positions_m)[:pursued].mean() >= HELD_SHARE else NOT_HELD
 
 
-def _is_held(wish: Wish, scenario: Scenario, positions_m: np.ndarray) -> np.ndarray:
+def _is_held(reference: TrackingReference, scenario: Scenario, positions_m: np.ndarray) -> np.ndarray:
     """Tell at which frames a flight is about where it is wished, (n,) bool."""
-    wished = wish.places_m(scenario.targets_m, scenario.ground_m) - scenario.targets_m
+    requested = reference.places_m(scenario.targets_m, scenario.ground_m) - scenario.targets_m
     flown = positions_m - scenario.targets_m
-    wished_m, flown_m = np.linalg.norm(wished, axis=1), np.linalg.norm(flown, axis=1)
-    cosine = (wished * flown).sum(axis=1) / np.maximum(wished_m * flown_m, 1e-9)
+    wished_m, flown_m = np.linalg.norm(requested, axis=1), np.linalg.norm(flown, axis=1)
+    cosine = (requested * flown).sum(axis=1) / np.maximum(wished_m * flown_m, 1e-9)
     ratio = np.maximum(flown_m, 1e-9) / np.maximum(wished_m, 1e-9)
     return (cosine >= np.cos(np.radians(HELD_DEG))) & (ratio <= HELD_RATIO) & (ratio >= 1.0 / HELD_RATIO)
 
@@ -170,16 +170,20 @@ def tell_not_held(
     """Say of the part that is held least what was asked, what was flown, and what was in the way."""
     from cosfly.geometry.kernels import signed_distances, visibility
 
-    is_held, targets, wish = _is_held(intent.wish, scenario, positions_m), scenario.targets_m, intent.wish
+    is_held, targets, reference = (
+        _is_held(intent.reference, scenario, positions_m),
+        scenario.targets_m,
+        intent.reference,
+    )
     part = min(
         (part for part in intent.segments if part.keeps_sight), key=lambda part: is_held[part.begin : part.end].mean()
     )
-    span, places = slice(part.begin, part.end), wish.places_m(targets, scenario.ground_m)
+    span, places = slice(part.begin, part.end), reference.places_m(targets, scenario.ground_m)
     lost = ~is_held[span]
 
     def told(flown: np.ndarray) -> str:
         away = flown[span] - targets[span]
-        bearing = np.degrees(_wrapped(np.arctan2(away[:, 1], away[:, 0]) - wish.heading_rad[span]))
+        bearing = np.degrees(_wrapped(np.arctan2(away[:, 1], away[:, 0]) - reference.heading_rad[span]))
         up_m = np.median((flown[:, 2] - scenario.ground_m)[span][lost])
         apart_m = np.median(np.hypot(away[:, 0], away[:, 1])[lost])
         return f"{up_m:.0f} m up, {apart_m:.0f} m away, at {np.median(bearing[lost]):.0f} deg"
@@ -231,8 +235,8 @@ def ended_by_order(
     mission = Mission(intent.order, at, at + len(legs[0]), (float(home_m[0]), float(home_m[1]), float(home_m[2])))
     before = tuple(Segment(p.style, p.begin, min(p.end, at)) for p in intent.segments if p.begin < at)
     segments = (*before, Segment(RETURN_HOME, at, num, keeps_sight=False))
-    wish = replace(intent.wish, keeps_sight=intent.wish.keeps_sight & (np.arange(num) < at))
-    return replace(intent, wish=wish, segments=segments, mission=mission), within_limits(
+    reference = replace(intent.reference, keeps_sight=intent.reference.keeps_sight & (np.arange(num) < at))
+    return replace(intent, reference=reference, segments=segments, mission=mission), within_limits(
         flown, scenario, obstacles, cfg
     )
 

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from cosfly.formats.boxes import BoxMap
+from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.formats.traces import DroneTrace
-from cosfly.formats.walks import Walk
 from cosfly.viz.topview import HALO, TopView, add_caption, draw_dot, draw_line, draw_map, draw_text, png_bytes
 
 MARGIN_M, SIZE_PX = 27.0, 1400
@@ -16,7 +16,9 @@ SEEN_COLOR, HIDDEN_COLOR = np.array([20.0, 110.0, 230.0]), np.array([225.0, 30.0
 FRAMES_BETWEEN_SIGHTS = 20  # a line of sight every 10 s
 
 
-def draw_walks(box_map: BoxMap, walks: list[Walk], traces: list[DroneTrace]) -> tuple[np.ndarray, TopView]:
+def draw_pedestrians(
+    box_map: BoxMap, walks: list[PedestrianTrajectory], traces: list[DroneTrace]
+) -> tuple[np.ndarray, TopView]:
     """Draw the surroundings of walks and flights, pale, and the walks on them; gives the picture and where it lies."""
     places_m = [walk.positions_m for walk in walks] + [trace.positions_m for trace in traces]
     view = TopView.around(np.vstack(places_m), SIZE_PX, MARGIN_M)
@@ -26,26 +28,26 @@ def draw_walks(box_map: BoxMap, walks: list[Walk], traces: list[DroneTrace]) -> 
     return picture, view
 
 
-def draw_flights(box_map: BoxMap, walks: list[Walk], traces: list[DroneTrace]) -> bytes:
+def draw_trajectories(box_map: BoxMap, walks: list[PedestrianTrajectory], traces: list[DroneTrace]) -> bytes:
     """Draw obstacles, walks (dark) and flights (blue where the target is seen, red where hidden).
 
     Returns:
         PNG bytes. Dropped flights are thin; a walk without a flight ends in a cross.
     """
-    picture, view = draw_walks(box_map, walks, traces)
+    picture, view = draw_pedestrians(box_map, walks, traces)
     flown = {trace.path_id for trace in traces}
     for walk in walks:
         if walk.path_id not in flown:
             end = view.pixels(walk.positions_m[-1:])[0].astype(int).tolist()
             cv2.drawMarker(picture, end, HIDDEN_COLOR.tolist(), cv2.MARKER_TILTED_CROSS, 16, 3, cv2.LINE_AA)
     for trace in traces:
-        _draw_flight(picture, trace, view.pixels(trace.positions_m), view.pixels(trace.targets_m))
+        _draw_trajectory(picture, trace, view.pixels(trace.positions_m), view.pixels(trace.targets_m))
     num_dropped = sum(trace.drop_reason is not None for trace in traces)
     flights = f"{len(traces)} flights (blue: sees, red: hidden), {num_dropped} dropped"
     return png_bytes(add_caption(picture, f"{box_map.name}: {len(walks)} walks (dark), {flights}"))
 
 
-def _draw_flight(picture: np.ndarray, trace: DroneTrace, drone: np.ndarray, target: np.ndarray) -> None:
+def _draw_trajectory(picture: np.ndarray, trace: DroneTrace, drone: np.ndarray, target: np.ndarray) -> None:
     """Draw one flight with a line of sight every few seconds and its id where it begins."""
     for i in range(0, len(drone), FRAMES_BETWEEN_SIGHTS):
         draw_line(picture, np.stack([drone[i], target[i]]), SIGHT_COLOR)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cosfly.formats.kinds import KINDS
-from cosfly.planners.contract import PlanConfig, Scenario, Wish
+from cosfly.planners.contract import PlanConfig, Scenario, TrackingReference
 from cosfly.planners.courses import places_of, without_jumps
 from cosfly.planners.styles import REACQUIRE, Style
 
@@ -41,9 +41,9 @@ def screens_of(box_map: BoxMap) -> BoxIndex:
     return obstacle_index(replace(box_map, half_extents=half_extents))
 
 
-def wish_of_reacquire(
+def reference_of_reacquire(
     scenario: Scenario, obstacles: BoxIndex, screens: BoxIndex, cfg: PlanConfig, rng: np.random.Generator
-) -> Wish | None:
+) -> TrackingReference | None:
     """Look for a flight that loses the walker and finds again; None where the map hides nobody on this walk."""
     from cosfly.geometry.kernels import signed_distances, visibility
 
@@ -57,20 +57,20 @@ def wish_of_reacquire(
         if lost is None:
             continue
         searching = np.arange(len(course)) >= lost + round(WAITS_S / dt_s)
-        course[searching, 0] = scenario.wish.heading_rad[searching] + np.pi
+        course[searching, 0] = scenario.reference.heading_rad[searching] + np.pi
         course[searching, 1:] = near_m, course[lost, 2] + climb_m
-        wish = without_jumps(course, scenario, cfg)
-        places = wish.places_m(targets, ground)
+        reference = without_jumps(course, scenario, cfg)
+        places = reference.places_m(targets, ground)
         gaps_m, _ = signed_distances(obstacles, places, cfg.safety_distance_m)
         is_free = gaps_m >= cfg.safety_distance_m
         if is_free.mean() >= FREE_SHARE and finds_again(visibility(screens, places, targets), dt_s):
-            return replace(wish, keeps_sight=np.zeros(len(course), dtype=bool))
+            return replace(reference, keeps_sight=np.zeros(len(course), dtype=bool))
     return None
 
 
 def _watching(style: Style, scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
     """Draw a course, (n, 3), before the loss: at a bearing of the walker, or late along the walker's own way."""
-    targets, heading_rad = scenario.targets_m, scenario.wish.heading_rad
+    targets, heading_rad = scenario.targets_m, scenario.reference.heading_rad
     apart_m, altitude_m = rng.uniform(*style.ground_distance_m), rng.uniform(*style.altitude_m)
     bearing, is_late = rng.uniform(-np.pi, np.pi), rng.random() < LATE_SHARE
     azimuth, aparts_m = heading_rad + bearing, np.full(len(targets), apart_m)

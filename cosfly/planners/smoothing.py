@@ -14,8 +14,8 @@ import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
 
-from cosfly.geometry.flight_metrics import CLEARANCE_TOLERANCE_M
 from cosfly.geometry.kernels import BoxIndex, normals, swept_distances, visibility
+from cosfly.geometry.trajectory_metrics import CLEARANCE_TOLERANCE_M
 from cosfly.planners.contract import PlanConfig, Scenario
 
 # Weights of the squared distance to the raw flight: where any bearing will do; where the wished one counts, and there
@@ -37,7 +37,7 @@ AWAY_M = 0.05  # beyond what is asked for, so that rounds end
 ROUNDING_M = 1e-9
 
 
-def smooth_flight(
+def smooth_trajectory(
     raw: np.ndarray, scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, clearance_m: float
 ) -> tuple[np.ndarray, dict]:
     """Smooth a raw flight that keeps all bounds; give it back as it is if no smooth one does.
@@ -47,17 +47,17 @@ def smooth_flight(
     Returns:
         (n, 3), and facts: visibility of the raw flight, rounds, whether a smooth flight was found.
     """
-    wish, dt_s = scenario.wish, scenario.dt_s
+    reference, dt_s = scenario.reference, scenario.dt_s
     ahead, settled = slice(scenario.start, None), 0
     if scenario.turns_round:  # and is on its way: before it can neither follow the raw flight nor see as much
         change_m = np.linalg.norm(np.diff(raw[scenario.start - 1 : scenario.start + 2], n=2, axis=0))
         settled = scenario.start + SETTLES * int(np.ceil(change_m / (cfg.accel_max_mps2 * dt_s**2)))
-    seen_raw, astray_m = visibility(obstacles, raw, scenario.targets_m), ASTRAY_SHARE * wish.distance_m
+    seen_raw, astray_m = visibility(obstacles, raw, scenario.targets_m), ASTRAY_SHARE * reference.distance_m
     band, pulls = smoothness_band(len(raw), dt_s), first_pulls(raw, scenario)
     for tried in range(1, ROUNDS_MAX + 1):
         points, blocked = _drawn_to(raw, pulls, band, scenario), np.zeros(len(raw), dtype=bool)
         blocked[ahead] = unsafe(points[ahead], obstacles, clearance_m, cfg.speed_max_mps * dt_s)
-        lost = np.maximum(seen_raw - visibility(obstacles, points, scenario.targets_m), 0.0) * wish.keeps_sight
+        lost = np.maximum(seen_raw - visibility(obstacles, points, scenario.targets_m), 0.0) * reference.keeps_sight
         lost = np.maximum(lost, np.linalg.norm(points - raw, axis=1) > astray_m)
         lost[(lost < SIGHT_LOSS) | (pulls >= PULL_FOR_SIGHT_MAX)] = 0.0
         lost[:settled] = 0.0
@@ -97,7 +97,9 @@ def _drawn_to(goal: np.ndarray, pulls: np.ndarray, band: np.ndarray, scenario: S
     """Return the smooth flight, (n, 3), that is drawn to a goal, (n, 3), with pulls (n,), within the wished
     altitudes."""
     system, goal = band.copy(), scenario.as_flown(goal)
-    low, high = (scenario.ground_m + bound for bound in (scenario.wish.altitude_min_m, scenario.wish.altitude_max_m))
+    low, high = (
+        scenario.ground_m + bound for bound in (scenario.reference.altitude_min_m, scenario.reference.altitude_max_m)
+    )
     pulls = np.where(np.arange(len(pulls)) < len(scenario.flown_m), PULL_FLOWN, pulls)
     system[0] += pulls
     points = solveh_banded(system, pulls[:, None] * goal, lower=True)
@@ -119,9 +121,9 @@ def hurries(points: np.ndarray, cfg: PlanConfig, dt_s: float, num_flown: int = 0
 
 def first_pulls(raw: np.ndarray, scenario: Scenario) -> np.ndarray:
     """Return the pull of each waypoint of a raw flight (n, 3) before anything is lost, (n,)."""
-    if scenario.wish.any_bearing:
+    if scenario.reference.any_bearing:
         return np.full(len(raw), PULL_ANY_BEARING)
-    off_m = np.linalg.norm(raw - scenario.wish.places_m(scenario.targets_m, scenario.ground_m), axis=1)
+    off_m = np.linalg.norm(raw - scenario.reference.places_m(scenario.targets_m, scenario.ground_m), axis=1)
     return np.where(off_m <= AS_WISHED_M, PULL_AS_WISHED, PULL)
 
 

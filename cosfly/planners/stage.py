@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cosfly.formats.boxes import BoxMap, read_boxes
+from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M, PedestrianTrajectory, read_paths
 from cosfly.formats.segments import FOLLOW
 from cosfly.formats.traces import DroneTrace, write_traces
-from cosfly.formats.walks import TARGET_HEIGHT_M, Walk, read_paths
 from cosfly.geometry.axes import DT_S, step_s
-from cosfly.geometry.flight_metrics import CLEARANCE_CAP_M, CLEARANCE_TOLERANCE_M, flight_metrics
+from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M, CLEARANCE_TOLERANCE_M, trajectory_metrics
 from cosfly.planners.contract import PlanConfig, Scenario, load_planner
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import InputError, NoPathError
 from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.stage_folder import Failed, Resume, StageFolder
 from cosfly.runtime.store import write_bytes
 
@@ -41,7 +41,7 @@ COORDINATE_MAX_M = 1e6  # beyond, float32 depth and four decimals of a metre in 
 # --- one walk ---------------------------------------------------------------------------------------------------------
 
 
-def make_scenario(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig) -> Scenario:
+def make_scenario(walk: PedestrianTrajectory, obstacles: BoxIndex, cfg: PlanConfig) -> Scenario:
     """Check a walk and give the scenario of it, with the paper's wish."""
     from cosfly.geometry.kernels import segments_hit
     from cosfly.planners.courses import follow
@@ -72,7 +72,7 @@ def make_scenario(walk: Walk, obstacles: BoxIndex, cfg: PlanConfig) -> Scenario:
     return Scenario(walk.path_id, targets, np.array(walk.positions_m[:, 2]), follow(targets, cfg, dt_s), dt_s)
 
 
-def draw_styles_of(walks: Sequence[Walk], cfg: PlanConfig, seed: int) -> list[list[str]]:
+def draw_styles_of(walks: Sequence[PedestrianTrajectory], cfg: PlanConfig, seed: int) -> list[list[str]]:
     """Draw the styles of the flights of a run, for each walk in order; by the first one's begin too: walks of other
     maps have the same ids.
     """
@@ -81,8 +81,8 @@ def draw_styles_of(walks: Sequence[Walk], cfg: PlanConfig, seed: int) -> list[li
     return draw_styles(walks, cfg, style_rng(walks[0], seed))
 
 
-def plan_flight(
-    walk: Walk, obstacles: BoxIndex, cfg: PlanConfig, seed: int, screens: BoxIndex | None = None,
+def plan_trajectory(
+    walk: PedestrianTrajectory, obstacles: BoxIndex, cfg: PlanConfig, seed: int, screens: BoxIndex | None = None,
     styles: Sequence[str] = (),
 ) -> DroneTrace:  # fmt: skip
     """Plan, measure and check one flight in styles drawn for it; in that of the paper instead where it fails and the
@@ -115,7 +115,7 @@ def plan_flight(
     if isinstance(flown, NoPathError) and is_last:
         raise flown
     reason, not_held = ("no_path", None) if isinstance(flown, NoPathError) else (flown.drop_reason, flown.not_held)
-    follows = _fly(walk, scenario, Intent(scenario.wish), obstacles, screens, cfg, seed)
+    follows = _fly(walk, scenario, Intent(scenario.reference), obstacles, screens, cfg, seed)
     return replace(follows, instead_of=f"{intent.styles}: {reason}", not_held=not_held)
 
 
@@ -134,7 +134,7 @@ def plan_on(
 
     ground_m = targets_m[:, 2] - TARGET_HEIGHT_M
     scenario = Scenario(path_id, targets_m, ground_m, follow(targets_m, cfg, dt_s), dt_s, flown_m)
-    scenario = replace(scenario, wish=going_on(scenario, cfg))
+    scenario = replace(scenario, reference=going_on(scenario, cfg))
     try:
         return plan(scenario, obstacles, cfg, rng_for(0, "plan", path_id)).positions_m
     except NoPathError:
@@ -142,19 +142,25 @@ def plan_on(
         return plan(turning, obstacles, cfg, rng_for(0, "plan", path_id)).positions_m
 
 
-def style_rng(walk: Walk, seed: int, attempt: int = 0) -> np.random.Generator:
+def style_rng(walk: PedestrianTrajectory, seed: int, attempt: int = 0) -> np.random.Generator:
     """Return the generator of how a flight's styles are flown, by the walk's begin too."""
     x_m, y_m = np.round(walk.positions_m[0, :2], 2) + 0.0
     return rng_for(seed, "style", f"{walk.path_id}/{x_m:.2f}/{y_m:.2f}" + (f"/{attempt}" if attempt else ""))
 
 
 def _fly(
-    walk: Walk, scenario: Scenario, intent: Intent, obstacles: BoxIndex, screens: BoxIndex, cfg: PlanConfig, seed: int
+    walk: PedestrianTrajectory,
+    scenario: Scenario,
+    intent: Intent,
+    obstacles: BoxIndex,
+    screens: BoxIndex,
+    cfg: PlanConfig,
+    seed: int,
 ) -> DroneTrace:
     from cosfly.geometry.kernels import swept_distances, visibility
     from cosfly.planners.intent import NOT_HELD, ended_by_order, tell_not_held, view_of, why_not_held
 
-    scenario = replace(scenario, wish=intent.wish)
+    scenario = replace(scenario, reference=intent.reference)
     made = load_planner(cfg.planner)(scenario, obstacles, cfg, rng_for(seed, "plan", walk.path_id))
     positions = made.positions_m
     if intent.order is not None:
@@ -168,12 +174,12 @@ def _fly(
             got=f"a least clearance of {clearances.min():.2f} m",
             expected=f"{cfg.relaxed_safety_m:g} m all the way",
         )  # fmt: skip
-    seen, judged = visibility(obstacles, positions, targets), intent.wish.keeps_sight
+    seen, judged = visibility(obstacles, positions, targets), intent.reference.keeps_sight
     seen_past_screens = visibility(screens, positions, targets) if intent.searches else seen
     pitch, yaw = view_of(intent, positions, targets, seen_past_screens, scenario.dt_s)
     rotations = np.degrees(np.stack([pitch, yaw, np.zeros_like(yaw)], axis=1))
     counted = seen[judged] if judged.any() else seen
-    metrics = flight_metrics(positions, targets, counted, clearances, scenario.ground_m, scenario.dt_s)
+    metrics = trajectory_metrics(positions, targets, counted, clearances, scenario.ground_m, scenario.dt_s)
     reason = drop_reason(metrics, cfg, made.is_converged, is_judged_by_sight=bool(judged.any()))
     reason = reason or why_not_held(intent, scenario, positions, seen_past_screens)
     return DroneTrace(
@@ -224,7 +230,7 @@ def make_worker(cfg: PlanConfig, simplified_map: Path, seed: int) -> Work:
 
     def work(item: Item) -> Outcome:
         walk, styles = item.payload
-        trace = plan_flight(walk, obstacles, cfg, seed, screens, styles)
+        trace = plan_trajectory(walk, obstacles, cfg, seed, screens, styles)
         return Outcome(trace.as_json(), trace.drop_reason)
 
     return work
@@ -239,7 +245,9 @@ def warm_up(cfg: PlanConfig) -> None:
     # One box that hides the walk from behind: the search for a start runs too.
     obstacles = index_boxes(np.array([[-10.0, 0.0, 15.0]]), np.array([[1.0, 3.0, 15.0]]), np.eye(3)[None])
     cfg = cfg.model_copy(update={"styles": {FOLLOW: 1.0}})
-    plan_flight(Walk("warm-up", positions[:, :2], DT_S * walk, positions, np.ones(8)), obstacles, cfg, 0)
+    plan_trajectory(
+        PedestrianTrajectory("warm-up", positions[:, :2], DT_S * walk, positions, np.ones(8)), obstacles, cfg, 0
+    )
 
 
 def run(
@@ -261,7 +269,7 @@ def run(
         InputError: a file is not what it must be.
         NothingKept: not one walk has a flight, or the prefilter dropped them all.
     """
-    from cosfly.planners.overview import draw_flights
+    from cosfly.planners.overview import draw_trajectories
 
     inputs = {"map": simplified_map, "paths": paths}
     stage = StageFolder.open(out, "plan", config=cfg, inputs=inputs, seed=seed, resume=resume)
@@ -286,7 +294,7 @@ def run(
         if trace.not_held:
             log.warning("%s: style_not_held: %s", trace.path_id, trace.not_held)
     write_traces(product, traces, header)
-    write_bytes(picture, draw_flights(box_map, walks, traces))
+    write_bytes(picture, draw_trajectories(box_map, walks, traces))
     stage.finish([product, picture], finished.tally, **_facts(box_map, traces, seconds))
     return product
 
@@ -319,7 +327,7 @@ def _styles_flown(traces: list[DroneTrace]) -> dict:
     }
 
 
-def check_ids(walks: list[Walk], paths: Path) -> None:
+def check_ids(walks: list[PedestrianTrajectory], paths: Path) -> None:
     """Raise InputError where there is no walk, or two of one id."""
     if not walks:
         raise InputError("there are no paths", where=f"{paths}: paths", fix="run the pedestrians stage again")

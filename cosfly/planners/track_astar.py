@@ -28,8 +28,8 @@ import numpy as np
 from cosfly.geometry.axes import DT_S
 from cosfly.geometry.kernels import BoxIndex, collect_hits, nearest_box
 from cosfly.planners.contract import Plan, PlanConfig, Scenario
-from cosfly.planners.sight import look, make_horizon
-from cosfly.planners.smoothing import smooth_flight
+from cosfly.planners.line_of_sight import look, make_horizon
+from cosfly.planners.smoothing import smooth_trajectory
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import NoPathError
 
@@ -72,7 +72,7 @@ class Costs(NamedTuple):
 
     weights: np.ndarray
     ring_m: np.ndarray
-    wished: np.ndarray
+    requested: np.ndarray
     sight: np.ndarray
     least_z: np.ndarray
     preferred_z: np.ndarray
@@ -197,7 +197,7 @@ def _choose(touched, best, target, layer, voxels, costs, index, beam):
         x, y, z = _place(cell, voxels)
         away = np.sqrt((x - target[0]) ** 2 + (y - target[1]) ** 2)
         reach_m, aside = max(reach_m, away), away - costs.ring_m[layer]
-        wished_x, wished_y = costs.wished[layer, 0], costs.wished[layer, 1]
+        wished_x, wished_y = costs.requested[layer, 0], costs.requested[layer, 1]
         if not np.isnan(wished_x):
             aside = np.sqrt((x - wished_x) ** 2 + (y - wished_y) ** 2)
         climb, gap = z - costs.preferred_z[layer], voxels.clearances[cell]  # known: the way here has asked for it
@@ -285,15 +285,15 @@ def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.rando
         NoPathError: the grid is too large, or no voxels lead along this walk.
     """
     for safety_m in (cfg.safety_distance_m, cfg.relaxed_safety_m):
-        found = search_flight(scenario, obstacles, cfg, safety_m)
+        found = search_trajectory(scenario, obstacles, cfg, safety_m)
         if found is not None:
             raw, facts = found
-            points, smoothing = smooth_flight(raw, scenario, obstacles, cfg, safety_m)
+            points, smoothing = smooth_trajectory(raw, scenario, obstacles, cfg, safety_m)
             return Plan(points, {"safety_m": safety_m, **facts, **smoothing})
     raise scenario.no_way("no free voxels lead along this walk", cfg.relaxed_safety_m)
 
 
-def search_flight(
+def search_trajectory(
     scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, safety_m: float
 ) -> tuple[np.ndarray, dict] | None:
     """Search the raw flight of one walk.
@@ -303,15 +303,15 @@ def search_flight(
     Returns:
         (n, 3) one position per target, and facts of the search; None if there is no way.
     """
-    settings, targets, wish = cfg.track_astar, scenario.targets_m, scenario.wish
+    settings, targets, reference = cfg.track_astar, scenario.targets_m, scenario.reference
     voxels = make_voxels(scenario, cfg)
     stride = frames_per_layer(cfg, scenario.dt_s)
     frames, least_z, preferred_z, greatest_z = scenario.key_frames(stride)
-    places = wish.places_m(targets, scenario.ground_m)[frames, :2]
+    places = reference.places_m(targets, scenario.ground_m)[frames, :2]
     costs = Costs(
         weights=np.array([getattr(settings, f"weight_{name}") for name in WEIGHTS]),
-        ring_m=wish.ground_distance_m[frames], wished=np.full_like(places, np.nan) if wish.any_bearing else places,
-        sight=settings.weight_visibility * wish.keeps_sight[frames],
+        ring_m=reference.ground_distance_m[frames], requested=np.full_like(places, np.nan) if reference.any_bearing
+        else places, sight=settings.weight_visibility * reference.keeps_sight[frames],
         least_z=least_z, preferred_z=preferred_z, greatest_z=greatest_z,
         influence_m=settings.influence_m, safety_m=safety_m, start=np.array([*places[0], preferred_z[0]]),
     )  # fmt: skip
@@ -335,10 +335,10 @@ def frames_per_layer(cfg: PlanConfig, dt_s: float = DT_S) -> int:
 
 def make_voxels(scenario: Scenario, cfg: PlanConfig) -> Voxels:
     """Lay the grid round a walk: the corridor in the plane, the altitude bounds above it."""
-    settings, flat, wish = cfg.track_astar, scenario.targets_m[:, :2], scenario.wish
+    settings, flat, reference = cfg.track_astar, scenario.targets_m[:, :2], scenario.reference
     low_xy = flat.min(axis=0) - settings.corridor_m
     num_xy = np.floor((np.ptp(flat, axis=0) + 2.0 * settings.corridor_m) / settings.voxel_m) + 1
-    least_z, greatest_z = (scenario.ground_m + bound for bound in (wish.altitude_min_m, wish.altitude_max_m))
+    least_z, greatest_z = (scenario.ground_m + bound for bound in (reference.altitude_min_m, reference.altitude_max_m))
     num_z = np.floor((greatest_z.max() - least_z.min()) / settings.voxel_height_m + 1e-9) + 1
     if num_xy.prod() * num_z > MAX_CELLS:
         raise NoPathError(

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from cosfly.formats.frames import LEGIBLE_CONTRAST, LEGIBLE_HEIGHT_PX, LEGIBLE_SHARE, Camera, TargetMeta
-from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
+from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.geometry.axes import box_corners, mask_box, project
 from cosfly.render.contract import NEAR_M, PERSON_ID, Frame
 

@@ -30,8 +30,8 @@ from cosfly.render.contract import (
     NO_INSTANCE,
     PERSON_ID,
     Frame,
+    PosedBystander,
     PosedCar,
-    PosedOther,
     PosedPerson,
     check_pose,
     far_as_sky,
@@ -182,7 +182,7 @@ class CarlaRenderer:
         camera_pose: np.ndarray,
         intrinsic: np.ndarray,
         person: PosedPerson | None,
-        others: Sequence[PosedOther] = (),
+        others: Sequence[PosedBystander] = (),
     ) -> Frame:
         """Draw one frame, as the contract says."""
         check_pose(camera_pose, intrinsic)

@@ -103,7 +103,7 @@ class PosedCar:
 
 
 @dataclass(frozen=True)
-class PosedOther:
+class PosedBystander:
     """Somebody beside the target in one moment, and the id of `instance.png`."""
 
     instance_id: int
@@ -143,7 +143,7 @@ class Renderer(Protocol):
         camera_pose: np.ndarray,
         intrinsic: np.ndarray,
         person: PosedPerson | None,
-        others: Sequence[PosedOther] = (),
+        others: Sequence[PosedBystander] = (),
     ) -> Frame:
         """Draw one frame from world_from_camera (4, 4), OpenCV axes, through K (3, 3) px.
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cosfly.formats.walks import TARGET_HEIGHT_M
+from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.geometry.axes import rotation_matrices, rotation_matrix
 from cosfly.render.contract import Clothes, PosedPerson
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosfly.formats.frames import OtherMeta, OthersMeta, tree_position, tree_yaw
-from cosfly.formats.others import Other, distances_to_boxes_m
+from cosfly.formats.bystanders import Bystander, distances_to_boxes_m
+from cosfly.formats.frames import BystanderMeta, BystandersMeta, tree_position, tree_yaw
 from cosfly.formats.people import Appearance, People, draw_appearance, look_alike
 from cosfly.geometry.axes import headings_of
-from cosfly.render.contract import Clothes, Frame, PosedCar, PosedOther, PosedPerson, other_id
+from cosfly.render.contract import Clothes, Frame, PosedBystander, PosedCar, PosedPerson, other_id
 
 STRIDE_M = 1.35  # two steps
 SLOW_MPS = 0.7  # below this speed the swing shrinks, down to standing
@@ -68,7 +68,7 @@ SHARE_DIGITS = 6
 class Cast:
     """Everybody beside the target in one flight; gaits and clothes of those who walk, a seed for the paint of each."""
 
-    others: list[Other]
+    others: list[Bystander]
     gaits: list[Gait]
     clothes: list[Clothes]
     seeds: np.ndarray
@@ -81,9 +81,9 @@ class Cast:
         walking = (number for number, other in enumerate(self.others) if other.kind == "Pedestrians")
         return People(target, {other_id(number): self.clothes[number].looks for number in walking})
 
-    def posed(self, i: int) -> list[PosedOther]:
+    def posed(self, i: int) -> list[PosedBystander]:
         """All of them in frame i."""
-        return [PosedOther(other_id(number), self._body(number, i)) for number in range(len(self))]
+        return [PosedBystander(other_id(number), self._body(number, i)) for number in range(len(self))]
 
     def _body(self, number: int, i: int) -> PosedPerson | PosedCar:
         other = self.others[number]
@@ -92,11 +92,11 @@ class Cast:
             return self.gaits[number].posed(i, center_m, self.clothes[number])
         return PosedCar(center_m, float(other.headings_rad[i]), other.build.half_extents_m, float(self.seeds[number]))
 
-    def meta(self, i: int, frame: Frame, hidden_by_others: float, hidden_by_map: float) -> OthersMeta:
+    def meta(self, i: int, frame: Frame, hidden_by_others: float, hidden_by_map: float) -> BystandersMeta:
         """What the annotation of frame i says of them."""
         pixels = np.bincount(frame.ids.ravel(), minlength=other_id(0) + 1)
         lines = [
-            OtherMeta(
+            BystanderMeta(
                 instance_id=other_id(number),
                 semantic_id=other.kind_number,
                 world_location=tree_position(other.centers_m[i]),
@@ -106,7 +106,7 @@ class Cast:
             )
             for number, other in enumerate(self.others)
         ]
-        return OthersMeta(
+        return BystandersMeta(
             target_hidden_by_others=round(hidden_by_others, SHARE_DIGITS),
             target_hidden_by_map=round(hidden_by_map, SHARE_DIGITS),
             others=lines,
@@ -124,7 +124,7 @@ class Cast:
 NOBODY = Cast([], [], [], np.empty(0))
 
 
-def cast_of(others: list[Other], time_s: np.ndarray, target: Appearance, rng: np.random.Generator) -> Cast:
+def cast_of(others: list[Bystander], time_s: np.ndarray, target: Appearance, rng: np.random.Generator) -> Cast:
     """Dress the others of a flight at times (n,): look-alikes as the target but for one thing, nobody just as it."""
     gaits, clothes = [gait_of(other.positions_m, time_s) for other in others], []
     for other in others:

@@ -19,11 +19,11 @@ from pydantic import Field
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import Camera
 from cosfly.formats.kinds import GROUND_KINDS
+from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.formats.shift_draws import ShiftDraw, shift_draws
-from cosfly.formats.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.geometry.axes import look_at, project, rotation_matrices, world_from_camera, wrap_deg
-from cosfly.geometry.flight_metrics import CLEARANCE_CAP_M, SAFETY_DISTANCE_M
 from cosfly.geometry.kernels import obstacle_index, signed_distances
+from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M, SAFETY_DISTANCE_M
 from cosfly.render.contract import plane_z_m
 from cosfly.render.person import NOBODY, Cast
 from cosfly.runtime.config import Config

@@ -23,7 +23,7 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.weather import WeatherParams
 from cosfly.geometry.axes import rotation_matrices, rotation_matrix
 from cosfly.render import contract
-from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, PosedCar, PosedOther, PosedPerson
+from cosfly.render.contract import FAR_M, NEAR_M, NO_INSTANCE, Frame, PosedBystander, PosedCar, PosedPerson
 from cosfly.render.draping import drape, is_draped, layers_of
 from cosfly.render.figure import figure_of
 from cosfly.render.solids import are_solids, solids_of
@@ -103,7 +103,7 @@ class PyrenderRenderer:
         camera_pose: np.ndarray,
         intrinsic: np.ndarray,
         person: PosedPerson | None,
-        others: Sequence[PosedOther] = (),
+        others: Sequence[PosedBystander] = (),
     ) -> Frame:
         """Draw one frame, as the contract says."""
         contract.check_pose(camera_pose, intrinsic)

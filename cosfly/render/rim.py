@@ -18,8 +18,8 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.traces import DroneTrace
 from cosfly.geometry.axes import axis_aligned_half_extents
 from cosfly.render.contract import FAR_M, ground_plane
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import RenderError
+from cosfly.runtime.seeding import rng_for
 
 # Distances from the map's bounds, m.
 REACH_M = FAR_M + 60.0

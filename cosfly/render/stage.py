@@ -16,28 +16,28 @@ import numpy as np
 from pydantic import BaseModel
 
 from cosfly.formats.boxes import BoxMap, check_ground, read_boxes
+from cosfly.formats.bystanders import Bystander, Bystanders, read_bystanders
 from cosfly.formats.frames import Look
-from cosfly.formats.others import Company, Other, read_others
+from cosfly.formats.pedestrian_paths import pace_field
 from cosfly.formats.places import place_of, town_folder
 from cosfly.formats.shift_draws import PERTURBED, rng_of_shifts
 from cosfly.formats.town import IDS_FILE, IDS_FORMAT, write_town_map
 from cosfly.formats.traces import DroneTrace, read_traces
-from cosfly.formats.walks import pace_field
 from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry.axes import step_s
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids, other_id
-from cosfly.render.flight import FlightScript, Writing, check_flight, render_flight
 from cosfly.render.lens import cameras_of
 from cosfly.render.person import cast_of, choose_clothes, gait_of
 from cosfly.render.perturbation import PerturbedTrack, Poses, Surroundings, perturb
 from cosfly.render.rim import check_outside_rim, rim_of
 from cosfly.render.settings import RenderConfig
+from cosfly.render.track import TrackScript, Writing, check_track, render_track
 from cosfly.render.weather import coverage_of, drawn_seed, fog_hides, read_pools, told_coverage, weather_of
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.provenance import checked_inputs, fingerprint
 from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.stage_folder import Kept, Resume, StageFolder, Tally, result_of
 from cosfly.runtime.store import CHECKSUMS, atomic_folder, dump_json, inside, sha256_bytes, write_json
 from cosfly.viz.overlay import Overlay
@@ -89,7 +89,7 @@ def renderer_of(cfg: RenderConfig, box_map: BoxMap, seed: int, num_others: int =
 # --- from traces to scripts -------------------------------------------------------------------------------------------
 
 
-def script_flight(
+def make_track_script(
     planned: DroneTrace,
     number: int,
     track: str,
@@ -97,9 +97,9 @@ def script_flight(
     surroundings: Surroundings,
     cfg: RenderConfig,
     seed: int,
-    others: Sequence[Other] = (),
+    others: Sequence[Bystander] = (),
     weather: WeatherRecord | None = None,
-) -> FlightScript:
+) -> TrackScript:
     """Decide everything about one flight. Both tracks of a trace share field of view, people and weather.
 
     Args:
@@ -126,7 +126,7 @@ def script_flight(
         perturbed = perturb(poses, cameras, surroundings, cfg.perturbation, rng, cast)
     else:
         perturbed = PerturbedTrack.nothing(poses)
-    return FlightScript(
+    return TrackScript(
         town=town,
         trajectory=f"{TRAJECTORY}{cfg.first_timestamp + number}",
         variant=VARIANTS[track],
@@ -193,7 +193,7 @@ def run(
     all_traces = read_traces(traces)
     _check_ids(all_traces, traces)
     passed = _passed(stage, all_traces, cfg.path_index)
-    ids_record = _ids_record(box_map, num_others_of(companies_of(others, all_traces)))
+    ids_record = _ids_record(box_map, num_others_of(bystanders_by_path(others, all_traces)))
     if num_shared := ids_record["num_shared"]:
         log.warning("render: %d boxes share the instance id %d: ids have 16 bits", num_shared, SHARED_ID)
     town, first_timestamp = _names(stage, cfg, box_map.name, traces, others, seed)
@@ -209,7 +209,7 @@ def run(
     ids_file = out / town / IDS_FILE
     write_json(ids_file, ids_record, indent=None)
     map_file = write_town_map(out / town, box_map.header)
-    made = [result_of(record, _RenderedFlight) for record in finished.kept]
+    made = [result_of(record, _RenderedTrack) for record in finished.kept]
     outputs = [inside(out, one.folder) / name for one in made for name in ("trajectory.json", CHECKSUMS)]
     stage.finish(
         [*outputs, ids_file, map_file],
@@ -239,7 +239,7 @@ def _passed(stage: StageFolder, traces: list[DroneTrace], chosen: int | None) ->
     return passed
 
 
-def _weather_drawn(cfg: RenderConfig, made: list[_RenderedFlight]) -> dict:
+def _weather_drawn(cfg: RenderConfig, made: list[_RenderedTrack]) -> dict:
     """What the manifest says of the weather of the trajectories, nothing in runs without."""
     if cfg.weather_mode == "off":
         return {}
@@ -254,7 +254,7 @@ def _weather_told(weather: WeatherRecord, seed: int) -> dict:
     return {"weather": weather.weather_name, "time_of_day": weather.tod_name, "weather_seed": seed}
 
 
-class _RenderedFlight(BaseModel):
+class _RenderedTrack(BaseModel):
     """Of what the journal holds of a flight, what is read again."""
 
     folder: str
@@ -265,16 +265,16 @@ class _RenderedFlight(BaseModel):
     weather_seed: int | None = None
 
 
-def companies_of(others: Path | None, traces: list[DroneTrace]) -> dict[str, Company]:
+def bystanders_by_path(others: Path | None, traces: list[DroneTrace]) -> dict[str, Bystanders]:
     """Read the others of every flight, by the walk's id; nobody without a file."""
     if others is None:
         return {}
-    found = {company.path_id: company for company in read_others(others)}
+    found = {bystanders.path_id: bystanders for bystanders in read_bystanders(others)}
     for trace in traces:
-        company = found.get(trace.path_id)
-        if company is None:
+        bystanders = found.get(trace.path_id)
+        if bystanders is None:
             raise InputError("no others for a walk", where=f"{others}: paths", expected=trace.path_id, fix=FROM_ONE_RUN)
-        for other in company.others:
+        for other in bystanders.others:
             if len(other.positions_m) != len(trace.time_s):
                 got, expected = (
                     f"{len(other.positions_m)} places",
@@ -290,9 +290,9 @@ def companies_of(others: Path | None, traces: list[DroneTrace]) -> dict[str, Com
     return found
 
 
-def num_others_of(companies: dict[str, Company]) -> int:
+def num_others_of(companions: dict[str, Bystanders]) -> int:
     """How many ids the others of a tree need: as many as the largest company has."""
-    return max((len(company.others) for company in companies.values()), default=0)
+    return max((len(bystanders.others) for bystanders in companions.values()), default=0)
 
 
 def _names(
@@ -303,7 +303,7 @@ def _names(
     for record in stage.items():
         number = numbers.get(record.id.rpartition("/")[0])
         if isinstance(record, Kept) and number is not None:
-            place = place_of(Path(result_of(record, _RenderedFlight).folder))
+            place = place_of(Path(result_of(record, _RenderedTrack).folder))
             return place.town, int(place.trajectory.removeprefix(TRAJECTORY)) - number
     town = town_folder(cfg.town or map_name)
     of_others = [] if others is None else [fingerprint(others)]
@@ -318,7 +318,7 @@ def _weather_seed(stage: StageFolder, cfg: RenderConfig) -> int:
     """Return the seed of the weather; a drawn one stays what it was when the tree was begun."""
     if cfg.weather_seed >= 0:
         return cfg.weather_seed
-    begun = (result_of(record, _RenderedFlight).weather_seed for record in stage.items() if isinstance(record, Kept))
+    begun = (result_of(record, _RenderedTrack).weather_seed for record in stage.items() if isinstance(record, Kept))
     return next((seed for seed in begun if seed is not None), None) or drawn_seed()
 
 
@@ -357,8 +357,8 @@ def make_worker(
         # Several processes share the cores already: one rasteriser thread each. Only read when the driver loads.
         os.environ.setdefault("LP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // num_processes)))
     surroundings, all_traces = Surroundings(read_boxes(simplified)), read_traces(traces)
-    companies = companies_of(others, all_traces)
-    num_others = num_others_of(companies)
+    companions = bystanders_by_path(others, all_traces)
+    num_others = num_others_of(companions)
     drawn = read_boxes(boxes)
     renderer = renderer_of(cfg, drawn, seed, num_others)
     pools = read_pools(cfg)
@@ -368,16 +368,16 @@ def make_worker(
     def work(item: Item) -> Outcome:
         number, track = item.payload
         trace = all_traces[number]
-        check_flight(trace, surroundings)
+        check_track(trace, surroundings)
         if cfg.rim:
             check_outside_rim(trace, drawn)
-        company = companies.get(trace.path_id)
-        others = () if company is None else company.others
+        bystanders = companions.get(trace.path_id)
+        others = () if bystanders is None else bystanders.others
         weather = weather_of(cfg, pools, trace.drawn_as(number).number)
-        script = script_flight(trace, number, track, town, surroundings, cfg, seed, others, weather)
+        script = make_track_script(trace, number, track, town, surroundings, cfg, seed, others, weather)
         folder = out / town / script.trajectory / script.variant
         with atomic_folder(folder) as unfinished:
-            flight = render_flight(renderer, script, unfinished, writing, ENCODER_THREADS)
+            flight = render_track(renderer, script, unfinished, writing, ENCODER_THREADS)
         return Outcome(
             {
                 "folder": str(folder.relative_to(out)),

@@ -29,9 +29,9 @@ from cosfly.formats.weather import (
     resolved,
     sky_kind,
 )  # fmt: skip
-from cosfly.runtime.chance import draw_to_quota, rng_for
 from cosfly.runtime.config import Config, MayDiffer, build, read_yaml
 from cosfly.runtime.errors import ConfigError, nearest
+from cosfly.runtime.seeding import draw_to_quota, rng_for
 
 # Extinction per m at 100 percent; dense fog (80) leaves 5 % of what stands 60 m away.
 FOG_AT_FULL, FOG_POWER = 0.10, 2.4

@@ -27,7 +27,7 @@ from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.files import sha256_file
 from cosfly.runtime.items import Item
 from cosfly.runtime.stage_events import Vitals
-from cosfly.runtime.worker import Manner, Message, Start
+from cosfly.runtime.worker import Message, Start, WorkerOptions
 
 log = logging.getLogger(__name__)
 
@@ -87,19 +87,21 @@ class Cluster:
     def _alive(self) -> list[dict[str, Any]]:
         return [node for node in self._ray.nodes() if node["Alive"]]
 
-    def start_post(self, manner: Manner) -> RayPost:
+    def start_transport(self, worker_options: WorkerOptions) -> RayTransport:
         """Ask for a worker somewhere."""
         takes = {"num_cpus": self._cfg.worker_cpus, "num_gpus": self._cfg.worker_gpus, "max_restarts": 0}
-        host = self._actor.options(**takes).remote(manner.heartbeat_s, manner.log_level, manner.place)
+        host = self._actor.options(**takes).remote(
+            worker_options.heartbeat_s, worker_options.log_level, worker_options.place
+        )
         begun = host.begin.remote(str(self._folder), self._record, os.getcwd(), sys.path, cosfly.__version__)
-        return RayPost(self._ray, host, begun, manner.place, self.needs)
+        return RayTransport(self._ray, host, begun, worker_options.place, self.needs)
 
     @cached_property
     def _actor(self) -> Any:
         return self._ray.remote(_host())
 
 
-class RayPost:
+class RayTransport:
     """The way to a worker process on a node."""
 
     def __init__(self, ray: Any, host: Any, begun: Any, place: int, needs: str) -> None:
@@ -194,8 +196,8 @@ def _host() -> type:
                 got = f"{cosfly.__version__} ({python})"
                 return node, None, {"what": "another cosfly", "got": got, "expected": version, "fix": fix}
             from cosfly.runtime.files import sha256_file
-            from cosfly.runtime.worker import Manner
-            from cosfly.runtime.worker_pool import LocalPost
+            from cosfly.runtime.worker import WorkerOptions
+            from cosfly.runtime.worker_pool import LocalTransport
 
             try:
                 os.chdir(cwd)
@@ -210,7 +212,7 @@ def _host() -> type:
                 os.environ.setdefault("GLCONTEXT_DEVICE_INDEX", str(devices[0]))  # of EGL, which counts NVIDIA's first
             sys.path.extend(place for place in path if place not in sys.path)  # a spawned process takes it over
             vars(sys.modules["__main__"]).pop("__file__", None)  # Ray's own, which a spawned process would run again
-            self.post = LocalPost(Manner(os.getpid(), self.heartbeat_s, self.log_level, self.place))
+            self.post = LocalTransport(WorkerOptions(os.getpid(), self.heartbeat_s, self.log_level, self.place))
             threading.Thread(target=self._send, daemon=True).start()
             return node, self.post.pid, None
 

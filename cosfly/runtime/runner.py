@@ -23,7 +23,7 @@ from cosfly.runtime.ray_engine import ALL_ROOM, Cluster
 from cosfly.runtime.stage_events import EventLog
 from cosfly.runtime.stage_folder import Dropped, Failed, ItemRecord, Kept, StageFolder, Tally, read_item, write_failures
 from cosfly.runtime.store import remove_partials
-from cosfly.runtime.worker_pool import LocalPost, StartPost, Watch, WorkerPool
+from cosfly.runtime.worker_pool import LocalTransport, StartTransport, Watch, WorkerPool
 
 __all__ = ["Item", "ItemOutcomes", "Outcome", "Watch", "Work", "advance", "run_items"]
 
@@ -154,12 +154,12 @@ def _in_this_process(
 def _in_processes(
     stage: StageFolder, items: Sequence[Item], start: _Start, workers: int, watch: Watch, progress: _Progress
 ) -> Generator[tuple[int, ItemRecord], None, None]:
-    start_post: StartPost = LocalPost
+    start_transport: StartTransport = LocalTransport
     if watch.ray is not None:
         cluster = Cluster(watch.ray, stage.path)
-        start_post, workers = cluster.start_post, cluster.room if workers == ALL_ROOM else workers
+        start_transport, workers = cluster.start_transport, cluster.room if workers == ALL_ROOM else workers
     events = EventLog(stage.path)
-    pool = WorkerPool(*start, min(workers, len(items)), watch, events, progress.move, start_post)
+    pool = WorkerPool(*start, min(workers, len(items)), watch, events, progress.move, start_transport)
     try:
         yield from pool.outcomes(items)
     except CosflyError:

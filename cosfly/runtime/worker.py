@@ -51,7 +51,7 @@ Message = Sign | Abort | logging.LogRecord | ItemRecord
 
 
 @dataclass(frozen=True)
-class Manner:
+class WorkerOptions:
     """How a worker works, whatever it makes. Little: a process that starts its worker waits until this is read."""
 
     parent_pid: int
@@ -110,18 +110,18 @@ def return_freed_memory() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def work_through(connection: Connection, manner: Manner) -> None:
+def work_through(connection: Connection, worker_options: WorkerOptions) -> None:
     """Take a Start, then do items until None comes. Everything that is to be said goes back through the pipe."""
-    end_with_parent(manner.parent_pid)
+    end_with_parent(worker_options.parent_pid)
     for number in LEFT_TO_THE_PARENT:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, LEFT_TO_THE_PARENT)
     voice = _Voice(connection)
     logging.getLogger().handlers = [voice]
-    set_levels(manner.log_level)
-    take_place(manner.place)
+    set_levels(worker_options.log_level)
+    take_place(worker_options.place)
     keep_freed_memory()
-    threading.Thread(target=voice.tell_life, args=(manner.heartbeat_s,), daemon=True).start()
+    threading.Thread(target=voice.tell_life, args=(worker_options.heartbeat_s,), daemon=True).start()
     try:
         start: Start | None = _received(connection)
         work = start.make_worker(*start.worker_args) if start else None

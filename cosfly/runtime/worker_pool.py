@@ -1,8 +1,8 @@
 """Worker processes that are watched: one that dies, stalls or takes for ever is replaced, and its item tried again.
 
 All that can block on a worker (sending it an item, reading from it) happens in a thread of its own, so that nothing a
-worker does or leaves undone holds up the stage. Where a process runs and how it is reached is its `Post`: here one of
-this machine, at the other end of a pipe (`worker`); in `ray_engine` one on a node of a cluster.
+worker does or leaves undone holds up the stage. Where a process runs and how it is reached is its `Transport`:
+here one of this machine, at the other end of a pipe (`worker`); in `ray_engine` one on a node of a cluster.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from cosfly.runtime.errors import CosflyError, EnvironmentMissing
 from cosfly.runtime.items import Item, Work
 from cosfly.runtime.stage_events import LOSSES, EventLog, Loss, Vitals
 from cosfly.runtime.stage_folder import Failed, ItemRecord
-from cosfly.runtime.worker import Abort, Manner, Message, Sign, Start, signals_held_back, work_through
+from cosfly.runtime.worker import Abort, Message, Sign, Start, WorkerOptions, signals_held_back, work_through
 
 if TYPE_CHECKING:
     from cosfly.runtime.ray_engine import RayConfig
@@ -77,7 +77,7 @@ def limit_s(watch: Watch, seconds: Collection[float], attempt: int, has_begun: b
     return max(LEAST_LIMIT_S, TYPICAL_ITEMS * typical_s, watch.item_limit_s or 0.0) * 2**attempt
 
 
-class Post(Protocol):
+class Transport(Protocol):
     """A worker's process, wherever it is: `work_through` at the other end.
 
     pid: None until it has started. node: its machine's name, of a cluster's.
@@ -99,18 +99,18 @@ class Post(Protocol):
         """End it: by itself, if it has been given None and can within the time. It is gone, or out of reach, then."""
 
 
-StartPost = Callable[[Manner], Post]
+StartTransport = Callable[[WorkerOptions], Transport]
 
 
-class LocalPost:
+class LocalTransport:
     """A process of this machine, which it starts."""
 
     node: str | None = None
 
-    def __init__(self, manner: Manner) -> None:
+    def __init__(self, worker_options: WorkerOptions) -> None:
         context = multiprocessing.get_context("spawn")  # fork would copy GL and thread-pool state
         self.connection, there = context.Pipe()
-        self._process = context.Process(target=work_through, args=(there, manner), daemon=True)
+        self._process = context.Process(target=work_through, args=(there, worker_options), daemon=True)
         resource_tracker.ensure_running()  # the first worker would start this, and with it end the holding back
         with signals_held_back():
             self._process.start()
@@ -148,7 +148,7 @@ class _Worker:
     """One process, and what is known of it."""
 
     place: int
-    post: Post
+    post: Transport
     inbox: queue.SimpleQueue[Item | None] = field(default_factory=queue.SimpleQueue)
     is_known: bool = False  # to the log of events
     attempt: _Attempt | None = None
@@ -176,7 +176,7 @@ class WorkerPool:
     watch: Watch
     events: EventLog
     on_steps: Callable[[Item, int], None]
-    start_post: StartPost = LocalPost
+    start_transport: StartTransport = LocalTransport
     num_lost: int = 0
     _num_done: int = 0
     _seconds: deque[float] = field(default_factory=lambda: deque(maxlen=ITEMS_REMEMBERED))
@@ -254,8 +254,8 @@ class WorkerPool:
         return None
 
     def _start(self, place: int) -> _Worker:
-        manner = Manner(os.getpid(), self.watch.heartbeat_s, logging.getLogger().level, place)
-        worker = self._workers[place] = _Worker(place, self.start_post(manner))
+        worker_options = WorkerOptions(os.getpid(), self.watch.heartbeat_s, logging.getLogger().level, place)
+        worker = self._workers[place] = _Worker(place, self.start_transport(worker_options))
         start = Start(self.make_worker, self.worker_args)
         threading.Thread(target=_attend, args=(worker, start, self._messages), daemon=True).start()
         return worker

@@ -14,14 +14,14 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from cosfly.formats.boxes import read_boxes
-from cosfly.formats.walks import read_paths
+from cosfly.formats.pedestrian_paths import read_paths
 from cosfly.planners.compare import INTERVAL_PERCENT, NUM_RESAMPLES
 from cosfly.planners.contract import PlanConfig
-from cosfly.planners.stage import check_ids, draw_styles_of, make_scenario, plan_flight, warm_up
-from cosfly.runtime.chance import rng_for
+from cosfly.planners.stage import check_ids, draw_styles_of, make_scenario, plan_trajectory, warm_up
 from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.stage_folder import Resume, StageFolder, result_of
 from cosfly.runtime.store import write_json
 
@@ -60,8 +60,8 @@ def make_worker(cfg: BeamConfig, simplified_map: Path, seed: int) -> Work:
     """Load and index the map once; return the function that plans one walk at each beam."""
     from cosfly.geometry.kernels import obstacle_index
     from cosfly.planners.reacquire import screens_of
-    from cosfly.planners.smoothing import smooth_flight
-    from cosfly.planners.track_astar import search_flight
+    from cosfly.planners.smoothing import smooth_trajectory
+    from cosfly.planners.track_astar import search_trajectory
 
     box_map = read_boxes(simplified_map)
     obstacles, screens = obstacle_index(box_map), screens_of(box_map)
@@ -69,14 +69,14 @@ def make_worker(cfg: BeamConfig, simplified_map: Path, seed: int) -> Work:
 
     def fly(walk: Any, styles: list[str], own: PlanConfig) -> Flown:
         try:
-            trace = plan_flight(walk, obstacles, own, seed, screens, styles)
+            trace = plan_trajectory(walk, obstacles, own, seed, screens, styles)
         except NoPathError:
             return Flown(reason="no_path")
         scenario, begin_s = make_scenario(walk, obstacles, own), time.perf_counter()
-        found = search_flight(scenario, obstacles, own, own.safety_distance_m)
+        found = search_trajectory(scenario, obstacles, own, own.safety_distance_m)
         times_ms, begin_s = {"search": _since(begin_s)}, time.perf_counter()
         if found is not None:
-            smooth_flight(found[0], scenario, obstacles, own, own.safety_distance_m)
+            smooth_trajectory(found[0], scenario, obstacles, own, own.safety_distance_m)
             times_ms["smooth"] = _since(begin_s)
         figures = {name: float(trace.metrics[name]) for name in FIGURES}
         return Flown(figures=figures, reason=trace.drop_reason, times_ms=times_ms)

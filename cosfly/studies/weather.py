@@ -14,12 +14,12 @@ from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.weather import TIMES, WEATHERS, resolved
 from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
 from cosfly.render.contract import PosedPerson, Renderer
-from cosfly.render.flight import MARGIN_M
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import renderer_of
-from cosfly.runtime.chance import rng_for
+from cosfly.render.track import MARGIN_M
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.store import write_bytes
 from cosfly.viz.frame_views import encode_picture
 from cosfly.viz.topview import PAPER, draw_text

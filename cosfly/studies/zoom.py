@@ -22,10 +22,10 @@ from cosfly.formats.frames import Camera, level_name, rgb_bytes
 from cosfly.formats.traces import read_traces
 from cosfly.geometry.axes import box_iou, intrinsic_matrix
 from cosfly.render.contract import Renderer
-from cosfly.render.flight import MARGIN_M, FlightScript, check_flight, draw_frame
 from cosfly.render.perturbation import Surroundings
 from cosfly.render.settings import RenderConfig
-from cosfly.render.stage import renderer_of, script_flight
+from cosfly.render.stage import make_track_script, renderer_of
+from cosfly.render.track import MARGIN_M, TrackScript, check_track, draw_frame
 from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.runner import Item, Outcome, Watch, Work, advance, run_items
 from cosfly.runtime.stage_folder import Resume, StageFolder, result_of
@@ -78,7 +78,7 @@ def camera_of(cfg: RenderConfig, fov_deg: float) -> Camera:
     return Camera(cfg.width_px, cfg.height_px, intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg))
 
 
-def at_level(script: FlightScript, camera: Camera) -> FlightScript:
+def at_level(script: TrackScript, camera: Camera) -> TrackScript:
     """Return the same flight through another lens."""
     return replace(script, cameras=(camera,) * len(script.cameras))
 
@@ -110,8 +110,8 @@ def make_worker(cfg: ZoomStudyConfig, boxes: Path, simplified: Path, traces: Pat
 
     def work(item: Item) -> Outcome:
         trace = all_traces[item.payload]
-        check_flight(trace, surroundings)
-        script = script_flight(trace, item.payload, "clean", "study", surroundings, cfg, seed)
+        check_track(trace, surroundings)
+        script = make_track_script(trace, item.payload, "clean", "study", surroundings, cfg, seed)
         ready(renderer, script)
         levels, best_frame = {}, 0
         for fov in reversed(cfg.levels_deg):
@@ -121,13 +121,13 @@ def make_worker(cfg: ZoomStudyConfig, boxes: Path, simplified: Path, traces: Pat
     return work
 
 
-def ready(renderer: Renderer, script: FlightScript) -> None:
+def ready(renderer: Renderer, script: TrackScript) -> None:
     """Prepare a renderer for a flight, as drawing it does."""
     places = np.concatenate([script.perturbed.poses.positions_m, script.perturbed.poses.targets_m])
     renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M)
 
 
-def _level(renderer: Renderer, script: FlightScript, cfg: ZoomStudyConfig) -> tuple[Level, int]:
+def _level(renderer: Renderer, script: TrackScript, cfg: ZoomStudyConfig) -> tuple[Level, int]:
     """Measure a flight at one level; and the frame that shows most of the target."""
     rows, visibility = [], np.zeros(len(script.time_s))
     frames = range(0, len(script.time_s), cfg.every)
@@ -186,7 +186,7 @@ def run(
     surroundings = Surroundings(read_boxes(simplified))
     renderer = renderer_of(cfg, box_map, seed)
     shown = [
-        (script_flight(trace, k, "clean", "study", surroundings, cfg, seed), studied[trace.path_id].best_frame)
+        (make_track_script(trace, k, "clean", "study", surroundings, cfg, seed), studied[trace.path_id].best_frame)
         for k, trace in passed
         if trace.path_id in studied
     ]
@@ -246,7 +246,7 @@ def _cell(found: dict[str, float | None], digits: int) -> str:
 # --- pictures: flights by levels (fig:zoom_demo), optical and digital zoom (fig:zoom_fidelity) ------------------------
 
 
-def draw_levels(renderer: Renderer, shown: Sequence[tuple[FlightScript, int]], cfg: ZoomStudyConfig) -> bytes:
+def draw_levels(renderer: Renderer, shown: Sequence[tuple[TrackScript, int]], cfg: ZoomStudyConfig) -> bytes:
     """Draw one frame of up to four flights, a row each, at every level, widest first; a PNG.
 
     Args:
@@ -270,7 +270,7 @@ def draw_levels(renderer: Renderer, shown: Sequence[tuple[FlightScript, int]], c
     return rgb_bytes(np.vstack(rows))
 
 
-def draw_fidelity(renderer: Renderer, script: FlightScript, i: int, cfg: ZoomStudyConfig) -> bytes:
+def draw_fidelity(renderer: Renderer, script: TrackScript, i: int, cfg: ZoomStudyConfig) -> bytes:
     """Draw the widest picture, digital enlargements of its middle, and what a longer lens shows; a PNG."""
     ready(renderer, script)
     wide = camera_of(cfg, cfg.levels_deg[0])

@@ -10,11 +10,11 @@ import numpy as np
 from PIL import Image
 
 from cosfly.formats.boxes import BoxMap
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import DEBUG_FILE, FRAME_FILES, frame_path, read_instance, read_meta, read_rgb, rgb_bytes
-from cosfly.formats.places import ALL_FLIGHTS, FlightChoice
-from cosfly.formats.playback import Flight, read_flight
+from cosfly.formats.places import ALL_FLIGHTS, TrackChoice
+from cosfly.formats.playback import Track, read_track
 from cosfly.formats.town import read_instance_ids
+from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.arrays import read_picture
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.store import inside, write_bytes
@@ -30,20 +30,20 @@ GIF_WIDTH_PX, GIF_FRAME_MS = 480, 250  # at the paper's 0.5 s a frame twice as f
 BOX_COLOR = (255, 214, 10)
 
 
-def contact_sheet(tree: Path, out_png: Path, choice: FlightChoice = ALL_FLIGHTS) -> None:
+def contact_sheet(tree: Path, out_png: Path, choice: TrackChoice = ALL_FLIGHTS) -> None:
     """Reads a playback tree, writes one PNG below 2 MB: for each flight a few RGB frames, a depth image and a mask."""
-    folders = find_flights(tree, choice)
-    rows = [_row(read_flight(folder, strict=False)) for folder in folders[:MOST_ROWS]]
+    folders = find_tracks(tree, choice)
+    rows = [_row(read_track(folder, strict=False)) for folder in folders[:MOST_ROWS]]
     sheet = np.vstack([_heading(len(folders), rows[0].shape[1]), *rows])
     write_bytes(out_png, _png_below(sheet, SHEET_BYTES))
 
 
 def preview_gif(
-    tree: Path, out_gif: Path, choice: FlightChoice = ALL_FLIGHTS, frames_per_s: float = 1000 / GIF_FRAME_MS
+    tree: Path, out_gif: Path, choice: TrackChoice = ALL_FLIGHTS, frames_per_s: float = 1000 / GIF_FRAME_MS
 ) -> None:
     """Reads a playback tree, writes its first clean flight as an animation below 4 MB, the target's box drawn in."""
-    folders = find_flights(tree, choice)
-    flight = read_flight(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
+    folders = find_tracks(tree, choice)
+    flight = read_track(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
     frames = _frames_with(flight, "rgb.png")
     width, num = GIF_WIDTH_PX, 60
     while True:
@@ -101,8 +101,8 @@ def frame_in(tree: Path, frame: str | Path) -> Path:
 
 def best_frame(tree: Path, *names: str) -> Path:
     """Return the frame folder of a tree's first clean flight that shows most of the target and has these files."""
-    folders = find_flights(tree)
-    flight = read_flight(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
+    folders = find_tracks(tree)
+    flight = read_track(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
     frames = _frames_with(flight, *names)
     return flight.frame_folder(max(frames, key=lambda i: (np.nan_to_num(flight.visibility[i]), i)))
 
@@ -114,14 +114,14 @@ def _spread(n: int, num: int) -> list[int]:
     return sorted({int(i) for i in np.linspace(0, n - 1, min(n, num)).round()})
 
 
-def _frames_with(flight: Flight, *names: str) -> list[int]:
+def _frames_with(flight: Track, *names: str) -> list[int]:
     frames = sorted(set(range(len(flight))) - set(flight.missing_frames(names)))
     if not frames:
         raise InputError("the flight has no frames to show", where=flight.folder, expected=", ".join(names))
     return frames
 
 
-def _row(flight: Flight) -> np.ndarray:
+def _row(flight: Track) -> np.ndarray:
     frames = _frames_with(flight, "rgb.png")
     tiles = []
     for i in (frames[k] for k in _spread(len(frames), NUM_RGB_TILES)):
@@ -155,7 +155,7 @@ def _tile(picture: np.ndarray, text: str) -> np.ndarray:
     return tile
 
 
-def _boxed(picture: np.ndarray, flight: Flight, i: int) -> np.ndarray:
+def _boxed(picture: np.ndarray, flight: Track, i: int) -> np.ndarray:
     """Draw the target's box if the frame has one."""
     picture = np.ascontiguousarray(picture)
     if not np.isnan(flight.target_bbox[i]).any():
@@ -164,7 +164,7 @@ def _boxed(picture: np.ndarray, flight: Flight, i: int) -> np.ndarray:
     return picture
 
 
-def _preview(flight: Flight, i: int, width_px: int) -> Image.Image:
+def _preview(flight: Track, i: int, width_px: int) -> Image.Image:
     picture = _boxed(read_rgb(flight.frame_folder(i)), flight, i)
     height_px = round(width_px * picture.shape[0] / picture.shape[1])
     return Image.fromarray(cv2.resize(picture, (width_px, height_px), interpolation=cv2.INTER_AREA))

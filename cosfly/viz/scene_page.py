@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 
 from cosfly.formats.boxes import BoxMap, read_boxes
-from cosfly.formats.flights import find_flights
 from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES, KINDS, LAYERS
+from cosfly.formats.pedestrian_paths import read_paths
 from cosfly.formats.places import town_folder
-from cosfly.formats.playback import Flight, read_flight
+from cosfly.formats.playback import Track, read_track
 from cosfly.formats.traces import DroneTrace, read_traces
-from cosfly.formats.walks import read_paths
+from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import rotation_matrices
 from cosfly.geometry.grid import occupancy
 from cosfly.runtime.errors import InputError
@@ -39,7 +39,7 @@ JPEG_QUALITY = 70
 
 
 @dataclass
-class Track:
+class PageTrack:
     """One flight: of a planner, or of a tree. path: which walk it follows; kind: whose it is, as its legend says.
 
     rows: (n, 10) s, drone x, y, z, m, pitch, yaw, degrees, target x, y, z, m (NaN: nobody knows), visibility.
@@ -49,7 +49,7 @@ class Track:
     kind: str
     rows: np.ndarray
     figures: dict[str, float] = field(default_factory=dict)
-    flight: Flight | None = None
+    flight: Track | None = None
     pictures: dict[int, str] = field(default_factory=dict)
 
 
@@ -75,7 +75,7 @@ def run(
     box_map, notes = read_boxes(map_), list[str]()
     walks = [] if paths is None else read_paths(paths)
     tracks = [_of_trace(trace) for path in traces for trace in read_traces(path)]
-    flights = [] if data is None else [read_flight(place, strict=False) for place in find_flights(data)]
+    flights = [] if data is None else [read_track(place, strict=False) for place in find_tracks(data)]
     own = [flight for flight in flights if town_folder(flight.town) == town_folder(box_map.name)] or flights
     if len(own) < len(flights):
         notes.append(f"{len(flights) - len(own):,} flights are of other towns")
@@ -120,20 +120,20 @@ def page_html(name: str, notes: Sequence[str], content: dict[str, Any]) -> str:
     return page(template, title=name, style=style, script=script, notes=notes, data=content)
 
 
-def _of_trace(trace: DroneTrace) -> Track:
+def _of_trace(trace: DroneTrace) -> PageTrack:
     rows = np.column_stack(
         [trace.time_s, trace.positions_m, trace.rotations_deg[:, :2], trace.targets_m, trace.visibility]
     )
     figures = {name: value for name, value in trace.metrics.items() if isinstance(value, int | float)}
-    return Track(trace.path_id, trace.planner, rows, figures)
+    return PageTrack(trace.path_id, trace.planner, rows, figures)
 
 
-def _of_flight(flight: Flight) -> Track:
+def _of_flight(flight: Track) -> PageTrack:
     rows = np.column_stack(
         [flight.time_s, flight.positions_m, flight.rotations_deg[:, :2], flight.targets_m, flight.visibility]
     )
     kind = "clean frames" if flight.is_original else "perturbed frames"
-    return Track(str(flight.source.get("scenario_id") or flight.trajectory), kind, rows, {}, flight)
+    return PageTrack(str(flight.source.get("scenario_id") or flight.trajectory), kind, rows, {}, flight)
 
 
 def _packed(values: np.ndarray) -> str:
@@ -178,7 +178,7 @@ def _matrix(box_map: BoxMap) -> dict[str, Any] | None:
     return {"png": base64.b64encode(png.tobytes()).decode(), "bounds": [grid.x_min_m, grid.y_min_m, east, north]}
 
 
-def _add_pictures(tracks: Sequence[Track], left: float, picture_px: int) -> list[str]:
+def _add_pictures(tracks: Sequence[PageTrack], left: float, picture_px: int) -> list[str]:
     """Add frames to tracks of a tree, every so many of each flight as there is room for; says what is left out."""
     flights = [(track, track.flight) for track in tracks if track.flight is not None]
     num_frames = sum(len(flight) for _, flight in flights)
@@ -195,5 +195,5 @@ def _add_pictures(tracks: Sequence[Track], left: float, picture_px: int) -> list
     return [] if num_shown == num_frames else [f"{num_shown:,} of {num_frames:,} frames have their picture here"]
 
 
-def _picture(flight: Flight, index: int, width_px: int) -> str | None:
+def _picture(flight: Track, index: int, width_px: int) -> str | None:
     return thumbnail(flight.frame_folder(index), width_px, JPEG_QUALITY)

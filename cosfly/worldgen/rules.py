@@ -10,9 +10,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import read_yaml
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.seeding import rng_for
 from cosfly.worldgen.objects import OBJECTS
 from cosfly.worldgen.plan import NamedObject, WorldPlan
 

@@ -23,7 +23,7 @@ from cosfly.maps.boxlist import BoxList
 from cosfly.maps.stage import MapsConfig, load_map
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.town_blocks import LAWN_TOP_M, PAVED_TOP_M, SLAB_M
-from cosfly.runtime.chance import rng_for
+from cosfly.runtime.seeding import rng_for
 from cosfly.worldgen.objects import Object, asset_for, assets
 from cosfly.worldgen.plan import SPACE_M, WorldPlan, objects_of, town_settings, unknown_objects
 

@@ -12,11 +12,11 @@ from typing import Any
 
 from pydantic import Field
 
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import Config
 from cosfly.runtime.documents import FileFormat, Record
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import for_markdown
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
 from cosfly.runtime.store import write_bytes, write_model
 from cosfly.viz.page import page

@@ -12,16 +12,16 @@ from pydantic import BaseModel
 
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.captions import FIELDS, Coc, Language, SentenceState, read_captions
-from cosfly.formats.figures import Figure, draw_walks
+from cosfly.formats.figures import Figure, draw_pedestrians
 from cosfly.formats.predictions import FAILED, Prediction
 from cosfly.formats.splits import Split
 from cosfly.geometry.blind import DRAWN_AHEAD, FITTED_ON, LEAST_WINDOWS, LOOKS_BACK
 from cosfly.llm.answers import read_answers
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.documents import FileFormat, Record, read_model, read_object, validated
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.journal import Journal
 from cosfly.runtime.provenance import MANIFEST_FORMAT
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.stage_folder import read_manifest
 from distill.evaluation.bertscore import Metric, score_beside_floors
 from distill.evaluation.floors import WITH_TEXT, Floors, coc_of
@@ -218,7 +218,7 @@ def measure(
     """Measure everyone on the same samples and the same draws."""
     student = scores[STUDENT]
     found = {}
-    draws = draw_walks(len(set(student.walk)), resamples, rng_for(seed, STAGE, "draws"))
+    draws = draw_pedestrians(len(set(student.walk)), resamples, rng_for(seed, STAGE, "draws"))
     for name, own in scores.items():
         figures, decisions = figures_of(own, draws, confidence=confidence)
         found[name] = FigureSet(figures=figures, by_decision=decisions, confusion=_confusion(own))

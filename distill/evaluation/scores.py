@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 from cosfly.formats.actions import TOKENS, not_in_set
 from cosfly.formats.captions import Coc, SentenceState, Verdict, verdict_on
-from cosfly.formats.figures import Figure, draw_walks, figure_of_draws, interval_of
+from cosfly.formats.figures import Figure, draw_pedestrians, figure_of_draws, interval_of
 from cosfly.formats.predictions import FAILED, Prediction
 from cosfly.runtime.documents import Record
 from cosfly.runtime.errors import InputError
@@ -333,7 +333,7 @@ def _values(sums: _Sums, draws: np.ndarray) -> dict[str, np.ndarray]:
 
 def figures_of(scores: Scores, draws: np.ndarray, *, confidence: float) -> tuple[dict[str, Figure], dict[str, Figure]]:
     """Return all figures, and the accuracy of each decision that references have; draws: of the walks
-    (`draw_walks`)."""
+    (`draw_pedestrians`)."""
     names, walk = np.unique(scores.walk.astype(str), return_inverse=True)
     sums = _sums(scores, walk, len(names))
     whole = _values(sums, np.ones((1, len(names))))
@@ -373,7 +373,7 @@ def differences_of(
     names, walk = np.unique(one.walk.astype(str), return_inverse=True)
     sums = [_sums(scores, walk, len(names)) for scores in (one, other)]
     whole = [_values(each, np.ones((1, len(names)))) for each in sums]
-    draws = draw_walks(len(names), resamples, rng)
+    draws = draw_pedestrians(len(names), resamples, rng)
     drawn = [_values(each, draws) for each in sums]
     return len(here), {
         name: _difference(

@@ -15,10 +15,10 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from cosfly.formats.flights import find_flights, read_twin
 from cosfly.formats.places import Place, flight_ids, place_of, sample_id
-from cosfly.formats.playback import ORIGINAL, Flight, read_flight
+from cosfly.formats.playback import ORIGINAL, Track, read_track
 from cosfly.formats.splits import SPLITS, Course, Split, walks_of
+from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.geometry.axes import step_s
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.documents import FileFormat, Record, read_model, validated
@@ -166,7 +166,7 @@ def _survey(
     stage: StageFolder, cfg: DualTrackConfig, runs: Mapping[str, Path]
 ) -> tuple[list[_PairedFlight], list[Course], Tally]:
     """Find the perturbed flights that give windows, the walks' courses, and what becomes of the others."""
-    folders = [(folder, place_of(folder, run)) for run, tree in runs.items() for folder in find_flights(tree)]
+    folders = [(folder, place_of(folder, run)) for run, tree in runs.items() for folder in find_tracks(tree)]
     ids = flight_ids([place for _, place in folders])
     paired: list[_PairedFlight] = []
     courses: list[Course] = []
@@ -194,9 +194,9 @@ def _survey(
     return paired, courses, tally
 
 
-def _read_pair(folder: Path, cfg: DualTrackConfig) -> tuple[Flight, Flight] | str | None:
+def _read_pair(folder: Path, cfg: DualTrackConfig) -> tuple[Track, Track] | str | None:
     """Read a perturbed flight and its clean one; None for a clean flight, a word for why there are no windows."""
-    flight = read_flight(folder, strict=False)
+    flight = read_track(folder, strict=False)
     if flight.is_original:
         return None
     try:
@@ -250,7 +250,7 @@ def _write(
 
 
 def samples_of(
-    found: _PairedFlight, flight: Flight, twin: Flight, walk: str, cfg: DualTrackConfig
+    found: _PairedFlight, flight: Track, twin: Track, walk: str, cfg: DualTrackConfig
 ) -> Iterator[TrackSample | None]:
     """Cut a pair of flights into windows; None for one whose frames are not evenly apart in time."""
     step, place = step_s(flight.time_s), found.place

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Literal
 
 from cosfly.formats.captions import Caption
-from cosfly.formats.flights import find_flights, track_of
 from cosfly.formats.frames import frame_name, frame_path
-from cosfly.formats.places import TRACKS, FlightChoice, Place, flight_ids, folder_name, sample_id
-from cosfly.formats.playback import read_flight
+from cosfly.formats.places import TRACKS, Place, TrackChoice, flight_ids, folder_name, sample_id
+from cosfly.formats.playback import read_track
 from cosfly.formats.splits import Course, walks_of
+from cosfly.formats.tracks import find_tracks, track_of
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.files import check_stays_below
 from cosfly.runtime.provenance import was_made_of
@@ -104,7 +104,7 @@ class CaptionedFlight:
     def folder(self) -> Path:
         return self.source.data / self.town / self.trajectory / self.variant
 
-    def is_chosen(self, choice: FlightChoice) -> bool:
+    def is_chosen(self, choice: TrackChoice) -> bool:
         return choice.names(f"{self.town}/{self.trajectory}/{self.variant}") and (
             len(choice.tracks) == len(TRACKS) or track_of(self.folder) in choice.tracks
         )
@@ -145,7 +145,7 @@ class Flights:
         town, trajectory, variant = folder.parts[-3:]  # the tree may have been converted since
         flight_id, size_px, num_frames = None, None, 0
         if (folder / "trajectory.json").exists():
-            flight = read_flight(folder, strict=False)
+            flight = read_track(folder, strict=False)
             name = f"{source.run}/{town}/{trajectory}"
             self._courses.append(Course(name, town, flight.time_s, flight.walked_m).at_seconds())
             size_px, num_frames = (flight.camera.width_px, flight.camera.height_px), len(flight)
@@ -163,6 +163,6 @@ def _ids_of(sources: Sequence[RunSource]) -> dict[Place, str]:
     places = [
         Place(source.run, *folder.relative_to(source.data).parts[-3:])
         for source in sources
-        for folder in find_flights(source.data)
+        for folder in find_tracks(source.data)
     ]
     return flight_ids(places)

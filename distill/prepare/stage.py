@@ -24,8 +24,8 @@ from pydantic import Field, model_validator
 from cosfly.formats.actions import TOKENS, not_in_set
 from cosfly.formats.answer_text import parse_answer
 from cosfly.formats.captions import PICTURES_MARK, Caption, Language, Verdict, read_captions
-from cosfly.formats.places import FlightChoice
-from cosfly.formats.playback import read_flight
+from cosfly.formats.places import TrackChoice
+from cosfly.formats.playback import read_track
 from cosfly.formats.splits import SPLITS, Split
 from cosfly.geometry.blind import is_drawn_ahead, past_of
 from cosfly.runtime.console import progress_bar
@@ -164,7 +164,7 @@ DIGITS = 4  # of a past: a tenth of a millimetre, as trees have it
 class PrepareConfig(SplitConfig):
     """Settings of `distill prepare`."""
 
-    flights: FlightChoice = Field(FlightChoice(), description="which flights of the trees")
+    flights: TrackChoice = Field(TrackChoice(), description="which flights of the trees")
     languages: tuple[Language, ...] = Field(("en", "zh"), min_length=1, description="answers to learn, each as samples")
     modalities: tuple[View, ...] = Field(
         ("rgb",),
@@ -281,7 +281,7 @@ class _Windows:
         self._cfg, self._sources = cfg, sources
         self.flights = Flights(sources)
         self._frames_of = lru_cache(maxsize=16)(lambda flight: flight.whole_frames(cfg.modalities))
-        self._read = lru_cache(maxsize=16)(lambda flight: read_flight(flight.folder, strict=False))
+        self._read = lru_cache(maxsize=16)(lambda flight: read_track(flight.folder, strict=False))
         self._is_chosen = lru_cache(maxsize=16)(lambda flight: flight.is_chosen(cfg.flights))
         self.walks: Mapping[str, str] = {}
         self.count = 0

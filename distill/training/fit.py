@@ -21,9 +21,9 @@ from pydantic import BaseModel
 
 from cosfly.formats.answer_text import parse_answer
 from cosfly.formats.captions import verdict_on
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.store import dump_json, storage_errors
 from distill.schema import Sample, Samples
 from distill.student.checkpoint import (

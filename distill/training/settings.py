@@ -12,8 +12,8 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.config import Config, MayDiffer
+from cosfly.runtime.seeding import rng_for
 from distill.student.model import Device, Dtype
 from distill.student.random_student import RandomStudent
 

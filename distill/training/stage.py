@@ -13,8 +13,8 @@ from typing import Any
 
 from cosfly.formats.captions import Language, Prompt
 from cosfly.llm.student_chat import FrameLook, Taught, write_taught
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
 from cosfly.runtime.store import atomic_folder, write_json
 from distill.schema import Sample, open_split, resolve_trees, tree_inputs

@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 
 from cosfly.formats.boxes import UNKNOWN_LICENCE
-from cosfly.formats.frames import COMPANY, COORDINATES, FILE_NAMES, frame_name
+from cosfly.formats.frames import BYSTANDER_COLUMNS, COORDINATES, FILE_NAMES, frame_name
 from cosfly.formats.goals import Goal
+from cosfly.formats.pedestrian_paths import pace_field
 from cosfly.formats.places import TOWN
-from cosfly.formats.playback import LEGIBILITY, TARGET_FILE, Flight, write_flight
+from cosfly.formats.playback import LEGIBILITY, TARGET_FILE, Track, write_track
 from cosfly.formats.segments import FOLLOW, Segment
 from cosfly.formats.town import TOWN_FILE, TOWN_FORMAT, TownMap
-from cosfly.formats.walks import pace_field
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import sha256_file
 from cosfly.runtime.runner import advance
@@ -83,7 +83,7 @@ def write(release: Release, unit: ExportUnit, folder: Path, cfg: ExportConfig) -
         scalars.append({column: row[column] for column in SCALAR_NAMES})
         advance()
     (folder / place).mkdir(parents=True, exist_ok=True)
-    write_flight(folder / place, flight_of_rows(scalars, rows, number))
+    write_track(folder / place, flight_of_rows(scalars, rows, number))
     digests["trajectory.json"] = sha256_file(folder / place / "trajectory.json")
     files.put(f"{place}/{CHECKSUMS}", checksum_lines(digests).encode())
     has_gaps = bool((np.diff(rows.frame_index) != 1).any() or rows.frame_index[0] != 0)
@@ -118,7 +118,7 @@ def finish(
         },
         coordinates=COORDINATES,
         notes=list(_notes(units, written)),
-        how_to_open="from cosfly.formats.flights import find_flights\n"
+        how_to_open="from cosfly.formats.tracks import find_flights\n"
         "from cosfly.formats.playback import read_flight\n"
         "flights = [read_flight(folder, strict=False) for folder in find_flights(Path('.'))]",
         files=files,
@@ -146,7 +146,7 @@ def _notes(units: Sequence[ExportUnit], written: Sequence[UnitFiles]) -> Iterato
 # --- trajectory.json --------------------------------------------------------------------------------------------------
 
 
-def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Flight:
+def flight_of_rows(rows: list[Row], placed: ReleasedRows, number: int) -> Track:
     """Return the flight that released rows are of; `number` is its trajectory's among those of the release."""
     sizes = {(r["width_px"], r["height_px"]) for r in rows}
     if len(sizes) != 1:
@@ -182,7 +182,7 @@ def _point(row: Row) -> dict[str, Any]:
     if row["is_perturbed"] and row["drone_offset"] is None:
         told |= {"drone_position": True, "drone_rotation": True}
     target = {name: value for name in LEGIBILITY if (value := row[f"target_{name}"]) is not None}
-    others = dict(zip(COMPANY, (row[name] for name in COMPANY_COLUMNS), strict=True))
+    others = dict(zip(BYSTANDER_COLUMNS, (row[name] for name in COMPANY_COLUMNS), strict=True))
     point = {"perturbation": told, "target": target, "others": others if others["in_view"] is not None else {}}
     return {name: one for name, one in point.items() if one}
 

@@ -6,7 +6,7 @@ from pydantic import Field, field_validator, model_validator
 
 from cosfly.formats.boxes import LicenceId
 from cosfly.formats.frames import FILE_NAMES, FrameFile
-from cosfly.formats.places import Track
+from cosfly.formats.places import TrackName
 from cosfly.runtime.config import Config
 from release.columns import SplitName
 from release.record import Pairs, SplitBy
@@ -35,7 +35,9 @@ class ReleaseConfig(Config):
         (),
         description="patterns for the folders of flights in their trees, as Town01/trajectory_17*/ORI; empty: all",
     )
-    tracks: tuple[Track, ...] = Field(("clean", "perturbed"), min_length=1, description="which flights of a trajectory")
+    tracks: tuple[TrackName, ...] = Field(
+        ("clean", "perturbed"), min_length=1, description="which flights of a trajectory"
+    )
     pairs: Pairs = Field(
         "both",
         description="both: of two wanted tracks neither without the other; any: also flights whose twin is left out",

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cosfly.formats.frames import DEPTH_PNG, FILE_NAMES, frame_name, frame_path
-from cosfly.formats.places import FlightChoice
+from cosfly.formats.places import TrackChoice
 from cosfly.formats.review import how_to_decide
 from cosfly.runtime.errors import CosflyError, InputError, NothingKept, VerifyError
 from cosfly.runtime.stage_folder import Failed, StageFolder, Tally, write_failures
@@ -143,7 +143,7 @@ class ReleasePlan:
 def make_plan(cfg: ReleaseConfig, sources: list[Source], stage: StageFolder) -> ReleasePlan:
     """Look at all of the material, and decide what goes where."""
     faults = Faults(stage)
-    choice, accepts = FlightChoice(match=cfg.flights), cfg.unbound == "accept"
+    choice, accepts = TrackChoice(match=cfg.flights), cfg.unbound == "accept"
     material = gather(sources, include_review=cfg.include_review, accept_unbound=accepts, choice=choice)
     flights, walks, left_out = survey(material.candidates, cfg.tracks, faults.tell)
     flights, without_twin = keep_pairs(flights, cfg.pairs, cfg.tracks, faults.tell)

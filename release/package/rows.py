@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from cosfly.formats.frames import FILE_NAMES, FrameFile, depth_bytes, depth_values, frame_path, is_packed
 from cosfly.formats.places import sample_id
-from cosfly.formats.playback import Flight
+from cosfly.formats.playback import Track
 from release import columns
 from release.columns import PICTURES
 
@@ -39,7 +39,7 @@ class Rows:
         self._paths: list[str] = []
         self._num_bytes = 0
 
-    def add(self, scalars: dict[str, Any], pictures: dict[FrameFile, bytes], flight: Flight, i: int) -> None:
+    def add(self, scalars: dict[str, Any], pictures: dict[FrameFile, bytes], flight: Track, i: int) -> None:
         """Add a frame."""
         for file, data in pictures.items():
             if file == "depth" and is_packed(data):

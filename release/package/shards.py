@@ -25,7 +25,7 @@ from cosfly.formats.frames import (
     frame_path,
     tree_of,
 )
-from cosfly.formats.playback import TARGET_FILE, Flight
+from cosfly.formats.playback import TARGET_FILE, Track
 from cosfly.formats.png import parse_png
 from cosfly.runtime.arrays import PNG_HEADER_BYTES, png_size
 from cosfly.runtime.errors import CosflyError, InputError, VerifyError
@@ -246,7 +246,7 @@ def _check_digest(folder: Path, name: str, data: bytes | None, digests: Mapping[
         raise VerifyError(what, where=folder / name, got=got, expected=expected, fix=ANEW)
 
 
-def _read_picture(flight: Flight, path: Path, file: FrameFile, tree: Path, *, is_known: bool) -> bytes:
+def _read_picture(flight: Track, path: Path, file: FrameFile, tree: Path, *, is_known: bool) -> bytes:
     """Read a picture, and see that it is what it must be.
 
     Args:

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from cosfly.formats.boxes import UNKNOWN_LICENCE
 from cosfly.formats.captions import OWN_PROMPTS, QUESTIONS
-from cosfly.formats.flights import find_flights
-from cosfly.formats.inspection import FlightInspection, Inspection, TrajectoryFunnel
-from cosfly.formats.places import ALL_FLIGHTS, FlightChoice, Place, flight_ids, folder_name
+from cosfly.formats.inspection import Inspection, TrackInspection, TrajectoryFunnel
+from cosfly.formats.places import ALL_FLIGHTS, Place, TrackChoice, flight_ids, folder_name
 from cosfly.formats.review import REVIEW, read_settled
 from cosfly.formats.town import read_town_map
+from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.files import check_stays_below, read_text
 from cosfly.runtime.provenance import is_bound
@@ -134,7 +134,7 @@ class Material:
 
 
 def gather(
-    sources: list[Source], *, include_review: bool, accept_unbound: bool, choice: FlightChoice = ALL_FLIGHTS
+    sources: list[Source], *, include_review: bool, accept_unbound: bool, choice: TrackChoice = ALL_FLIGHTS
 ) -> Material:
     """Read the inspections of the runs, and list their flights; of a tree without one all. Those that are not chosen
     are left out.
@@ -158,7 +158,7 @@ def gather(
                 "if you know that they are of this tree, --set release.unbound=accept",
             )  # fmt: skip
         if source.inspect is None:
-            for folder in find_flights(source.data):
+            for folder in find_tracks(source.data):
                 inner = folder.relative_to(source.data)
                 found.append((number, _place(source, inner), folder, _not_chosen(choice, inner.as_posix()), None, None))
             continue
@@ -180,7 +180,7 @@ def gather(
     return Material(candidates, num_inspected, _sum_of(inspections) if inspections else None)
 
 
-def _not_chosen(choice: FlightChoice, folder: str) -> str | None:
+def _not_chosen(choice: TrackChoice, folder: str) -> str | None:
     return None if choice.names(folder) else NOT_CHOSEN
 
 
@@ -191,7 +191,7 @@ def maps_of(candidates: list[Candidate]) -> list[ReleasedMap]:
     return sorted(shown, key=lambda one: (one.town, one.name, one.licence, one.credits))
 
 
-def _inspected_place(source: Source, flight: FlightInspection) -> Place:
+def _inspected_place(source: Source, flight: TrackInspection) -> Place:
     """Tell a flight's place; raises InputError where the record of one flight has the folder of another."""
     parts = Path(flight.folder).parts[-2:]
     if parts != (flight.trajectory, flight.variant)[2 - len(parts) :]:

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cosfly.formats.frames import FRAMES_DIR, frame_name, read_meta
-from cosfly.formats.places import Track
-from cosfly.formats.playback import Flight, read_flight
+from cosfly.formats.places import TrackName
+from cosfly.formats.playback import Track, read_track
 from cosfly.formats.splits import Course, town_family, walks_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
@@ -29,7 +29,7 @@ class Surveyed:
     `trajectory.json`."""
 
     candidate: Candidate
-    track: Track
+    track: TrackName
     num_frames: int
     size_px: tuple[int, int]
     version: str
@@ -43,7 +43,7 @@ Tell = Callable[[str, InputError], None]
 
 
 def survey(
-    candidates: list[Candidate], tracks: tuple[Track, ...], tell: Tell
+    candidates: list[Candidate], tracks: tuple[TrackName, ...], tell: Tell
 ) -> tuple[list[Surveyed], dict[str, str], Counter[str]]:
     """Read the flights that no inspection leaves out.
 
@@ -66,7 +66,7 @@ def survey(
                 except InputError as error:
                     tell(candidate.name, error)
                     continue
-                track: Track = "clean" if flight.is_original else "perturbed"
+                track: TrackName = "clean" if flight.is_original else "perturbed"
                 if track not in tracks:
                     left_out[f"track {track} not wanted"] += 1
                     continue
@@ -84,7 +84,7 @@ def survey(
     return found, walks, left_out
 
 
-def open_flight(candidate: Candidate) -> Flight:
+def open_flight(candidate: Candidate) -> Track:
     """Read a candidate under the name that it has in the release.
 
     Trees of ours are held to all of it, those of others to what the public layout demands of every reader.
@@ -92,13 +92,13 @@ def open_flight(candidate: Candidate) -> Flight:
     Raises:
         InputError: it cannot be read.
     """
-    flight = read_flight(candidate.folder, strict=False)
+    flight = read_track(candidate.folder, strict=False)
     if flight.is_ours and flight.issues:
-        flight = read_flight(candidate.folder)  # says what is wrong
+        flight = read_track(candidate.folder)  # says what is wrong
     return replace(flight, run=candidate.place.run, given_id=candidate.flight_id)
 
 
-def look_of(flight: Flight, i: int) -> np.ndarray | None:
+def look_of(flight: Track, i: int) -> np.ndarray | None:
     """Return sun and air of a frame, (4,), None where there is no annotation or it does not say."""
     folder = flight.frame_folder(i)
     if not (folder / "meta.json").is_file():
@@ -109,7 +109,7 @@ def look_of(flight: Flight, i: int) -> np.ndarray | None:
     return None if meta.look is None else np.array(list(meta.look.model_dump().values()))
 
 
-def _check_frames(flight: Flight) -> None:
+def _check_frames(flight: Track) -> None:
     """See that a flight has a picture folder for each point, and for none beside them."""
     assert flight.folder is not None
     folder = flight.folder / FRAMES_DIR
@@ -124,7 +124,7 @@ def _check_frames(flight: Flight) -> None:
 
 
 def keep_pairs(
-    flights: list[Surveyed], pairs: Pairs, tracks: tuple[Track, ...], tell: Tell
+    flights: list[Surveyed], pairs: Pairs, tracks: tuple[TrackName, ...], tell: Tell
 ) -> tuple[list[Surveyed], Counter[str]]:
     """Leave out flights whose twin is not released, where both tracks are wanted and the flight's run has both.
 
@@ -146,7 +146,7 @@ def keep_pairs(
             tell(next(iter(group.values())).name, InputError("twins of different lengths", got=f"{got} frames"))
     if pairs == "any" or len(tracks) < 2:
         return flights, Counter()
-    tracks_of: dict[int, set[Track]] = defaultdict(set)
+    tracks_of: dict[int, set[TrackName]] = defaultdict(set)
     for flight in flights:
         tracks_of[flight.candidate.source].add(flight.track)
     kept = [
@@ -184,7 +184,7 @@ def place_flights(
     }
     splits = split_groups(group_of.values(), fractions, seed, f"{by}s")
     by_track = {(f.candidate.trajectory, f.track): f.name for f in flights}
-    other: dict[Track, Track] = {"clean": "perturbed", "perturbed": "clean"}
+    other: dict[TrackName, TrackName] = {"clean": "perturbed", "perturbed": "clean"}
     return {
         f.name: Placement(
             walk=walks[f.candidate.trajectory],

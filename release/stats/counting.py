@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from cosfly.formats.captions import FIELDS
-from cosfly.formats.walks import TARGET_HEIGHT_M
+from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.geometry.axes import box_iou
 from release.card.numbers import Place3, Sum, bounded, clean_place
 from release.columns import BOX, LANGUAGES, PLACE, POINT, POSE

@@ -14,7 +14,12 @@ from cosfly.formats.answer_text import MIN_CHARACTERS, MIN_CHARACTERS_ZH
 from cosfly.formats.captions import FIELDS
 from cosfly.formats.frames import LEVEL_NAMES
 from cosfly.formats.weather import TIMES, WEATHERS, preset_token
-from cosfly.geometry.flight_metrics import ACCEL_RMS_MAX_MPS2, FIVE_RAY_MEAN_MIN, JERK_RMS_MAX_MPS3, smoothness_score
+from cosfly.geometry.trajectory_metrics import (
+    ACCEL_RMS_MAX_MPS2,
+    FIVE_RAY_MEAN_MIN,
+    JERK_RMS_MAX_MPS3,
+    smoothness_score,
+)
 from cosfly.runtime.documents import Record
 from release.card.numbers import Sum, bounded, spread_of
 from release.columns import LANGUAGE_NAMES, LANGUAGES

@@ -12,10 +12,10 @@ from typing import Any
 
 import pyarrow as pa
 
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import FILE_NAMES, FrameFile, frame_path
 from cosfly.formats.places import Place, flight_ids
-from cosfly.formats.playback import Flight, read_flight
+from cosfly.formats.playback import Track, read_track
+from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.files import read_bytes
 from cosfly.runtime.tables import open_table, read_row_group, row_batches
@@ -132,7 +132,7 @@ class TreeFlights:
         Raises:
             InputError: it is none.
         """
-        folders = find_flights(folder)
+        folders = find_tracks(folder)
         frames = [frame for flight in folders for frame in sorted(flight.glob("frames_playback/*"))[:1]]
         files = (file for file, name in FILE_NAMES.items() if any(frame_path(frame, name).exists() for frame in frames))
         tree = cls(folder, tuple(files))
@@ -162,8 +162,8 @@ class TreeFlights:
                 for file, path in paths.items()
             }
 
-    def _flight(self, entry: Entry) -> Flight:
-        return read_flight(self.folder / entry.parts[0], strict=False)
+    def _flight(self, entry: Entry) -> Track:
+        return read_track(self.folder / entry.parts[0], strict=False)
 
 
 FlightSource = Shards | TreeFlights

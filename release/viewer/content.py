@@ -251,7 +251,7 @@ class PagePictures:
 
 PATH_POINTS = 240
 MOST_BOXES, MARGIN_M = 2_500, 30.0  # of one map
-Flight = TypeVar("Flight")
+Track = TypeVar("Track")
 
 
 def spread(count: int, most: int) -> list[int]:
@@ -259,11 +259,11 @@ def spread(count: int, most: int) -> list[int]:
     return sorted({int(i) for i in np.linspace(0, count - 1, min(count, most)).round()})
 
 
-def choose_flights(flights: Sequence[Flight], groups: Sequence[Hashable], most: int) -> list[Flight]:
+def choose_flights(flights: Sequence[Track], groups: Sequence[Hashable], most: int) -> list[Track]:
     """Choose whole groups (the tracks of a trajectory), spread evenly, as many as give no more than `most` flights, and
     one at least.
     """
-    by_group: dict[Hashable, list[Flight]] = defaultdict(list)
+    by_group: dict[Hashable, list[Track]] = defaultdict(list)
     for flight, group in zip(flights, groups, strict=True):
         by_group[group].append(flight)
     named = list(by_group.values())

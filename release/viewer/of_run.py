@@ -12,11 +12,11 @@ import numpy as np
 
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.captions import Caption, read_captions
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import frame_path
 from cosfly.formats.places import folder_name, place_of, town_folder
-from cosfly.formats.playback import Flight, read_flight
+from cosfly.formats.playback import Track, read_track
 from cosfly.formats.review import read_settled
+from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
 from cosfly.viz.frame_views import VIEW_FILES, View, read_view
@@ -73,7 +73,7 @@ def _of_run(folder: Path, captions: Path | None) -> Tree:
 def show_run(folder: Path, cfg: ViewerConfig, captions: Path | None = None) -> ViewerPage:
     """Reads a run folder or a playback tree, gives what the page shows of it."""
     trees = find_trees(folder, captions)
-    found = [(tree, place) for tree in trees for place in find_flights(tree.data)]
+    found = [(tree, place) for tree in trees for place in find_tracks(tree.data)]
     groups = [(tree.run, place_of(place).town, place_of(place).trajectory) for tree, place in found]
     chosen = choose_flights(found, groups, cfg.flights)
     notes = [] if len(chosen) == len(found) else [f"{len(chosen):,} of {len(found):,} flights are shown"]
@@ -82,7 +82,7 @@ def show_run(folder: Path, cfg: ViewerConfig, captions: Path | None = None) -> V
     frames: dict[tuple[Tree, Path], list[int]] = {}  # the flights themselves are read again, one at a time
     for tree, place in chosen:
         try:
-            num_frames = len(read_flight(place, strict=False))
+            num_frames = len(read_track(place, strict=False))
         except InputError as error:
             notes.append(f"not shown: {place.parent.name}/{place.name}: {error.what}")
             continue
@@ -93,7 +93,7 @@ def show_run(folder: Path, cfg: ViewerConfig, captions: Path | None = None) -> V
     shown = list[PageFlight]()
     with progress_bar("viewer: frames", pictures.num_frames) as advance:
         for (tree, place), indices in frames.items():
-            flight, key = read_flight(place, strict=False), (tree.run, _key(place))
+            flight, key = read_track(place, strict=False), (tree.run, _key(place))
             one = _flight(tree, flight, results.get(key), len(kinds.get(key, {})))
             for index in indices:
                 one.frames.append(_frame(flight, index, texts.get((*key, index)), pictures))
@@ -148,7 +148,7 @@ def _results(trees: list[Tree]) -> dict[tuple[str, Key], str]:
     }
 
 
-def _flight(tree: Tree, flight: Flight, result: str | None, num_captions: int) -> PageFlight:
+def _flight(tree: Tree, flight: Track, result: str | None, num_captions: int) -> PageFlight:
     names = [name for name in (tree.run, flight.town, flight.trajectory) if name]
     return PageFlight(
         name="/".join([*names, flight.variant]),
@@ -167,7 +167,7 @@ def _flight(tree: Tree, flight: Flight, result: str | None, num_captions: int) -
     )
 
 
-def _frame(flight: Flight, index: int, caption: Caption | None, pictures: PagePictures) -> PageFrame:
+def _frame(flight: Track, index: int, caption: Caption | None, pictures: PagePictures) -> PageFrame:
     folder = flight.frame_folder(index)
     views: Mapping[View, Callable[[], np.ndarray]] = {
         view: partial(read_view, folder, view) for view in VIEWS if frame_path(folder, VIEW_FILES[view]).exists()

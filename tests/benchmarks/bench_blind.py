@@ -25,20 +25,20 @@ from caption.run.windows import current_frames, cut_future, label_motion, order_
 from caption.schema import WindowConfig
 from caption.truth.actions import TABLE, measure
 from cosfly.formats.actions import TOKENS
-from cosfly.formats.playback import Flight
+from cosfly.formats.pedestrian_paths import walk_id
+from cosfly.formats.playback import Track
 from cosfly.formats.traces import DroneTrace
-from cosfly.formats.walks import walk_id
 from cosfly.geometry.axes import look_at, wrap_deg
 from cosfly.geometry.blind import FITTED_ON, fit_deciders, is_drawn_ahead, past_of
 from cosfly.geometry.kernels import obstacle_index
 from cosfly.maps.stage import load_map
-from cosfly.pedestrians.stage import make_walk
+from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import walkable_ground
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners.reacquire import screens_of
-from cosfly.planners.stage import draw_styles_of, plan_flight
-from cosfly.runtime.chance import rng_for
+from cosfly.planners.stage import draw_styles_of, plan_trajectory
 from cosfly.runtime.config import load, shipped
+from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import simplify
 from specimens import make_flight
 
@@ -52,15 +52,15 @@ def flights_of(cfg: RunConfig, name: str) -> Iterator[DroneTrace]:
     town = cfg.of_town(name)
     box_map = simplify(load_map(town.maps, seed=town.seed), town.simplify).box_map
     ground, ids = walkable_ground(box_map, town.pedestrians), map(walk_id, range(town.pedestrians.num_paths))
-    walks = [make_walk(id_, ground, town.pedestrians, rng_for(town.seed, "pedestrians", id_)).walk for id_ in ids]
+    walks = [make_pedestrian(id_, ground, town.pedestrians, rng_for(town.seed, "pedestrians", id_)).walk for id_ in ids]
     obstacles, screens = obstacle_index(box_map), screens_of(box_map)
     for walk, styles in zip(walks, draw_styles_of(walks, town.plan, town.seed), strict=True):
-        trace = plan_flight(walk, obstacles, town.plan, town.seed, screens, styles)
+        trace = plan_trajectory(walk, obstacles, town.plan, town.seed, screens, styles)
         if trace.drop_reason is None:
             yield trace
 
 
-def flight_of(trace: DroneTrace) -> Flight:
+def flight_of(trace: DroneTrace) -> Track:
     """A plan as a flight of a playback tree."""
     pitch, yaw = np.degrees(look_at(trace.positions_m, trace.targets_m))
     aside = np.abs(wrap_deg(yaw - trace.rotations_deg[:, 1])), np.abs(pitch - trace.rotations_deg[:, 0])

@@ -80,7 +80,7 @@ def main() -> None:
         paths = pedestrians.run(walks, root / "step2_simplified.json", root / "walks", **how)
         fly = FlyConfig(most_decisions=asked.decisions, lost_s=0, tree=False)
         render = RenderConfig(width_px=640, height_px=360, fovs_deg=(60.0, 90.0))
-        cfg = stage.FlightsConfig(
+        cfg = stage.ClosedLoopConfig(
             fly=fly, plan=PlanConfig(), render=render, caption=CaptionConfig(), infer=InferConfig()
         )
         for number in range(asked.rounds):

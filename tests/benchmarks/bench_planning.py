@@ -20,16 +20,16 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from cosfly.formats.boxes import BoxMap, write_boxes
 from cosfly.formats.kinds import KINDS
-from cosfly.geometry import flight_metrics as metrics
+from cosfly.geometry import trajectory_metrics as metrics
 from cosfly.geometry.kernels import BoxIndex, obstacle_index, segments_hit, signed_distances, visibility
 from cosfly.pedestrians.astar import find_route, route_cost
-from cosfly.pedestrians.stage import PedestriansConfig, make_walk, run, walkable_ground
+from cosfly.pedestrians.stage import PedestriansConfig, make_pedestrian, run, walkable_ground
 from cosfly.planners.contract import PLANNERS, PlanConfig, Scenario, load_planner
 from cosfly.planners.muco import muco
 from cosfly.planners.muco.loss import evaluate, make_state
 from cosfly.planners.stage import make_scenario
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.errors import NoPathError
+from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import SimplifyConfig, clusters, simplify
 
 SHORT_POINTS = 121  # the paper's SimWorld flight
@@ -87,7 +87,7 @@ def stage_a(box_map: BoxMap) -> tuple:
     """Grid to A* without files and pictures: the ground and the walks."""
     ground = walkable_ground(box_map, WALKS)
     names = [f"path_{k:05d}" for k in range(WALKS.num_paths)]
-    return ground, [make_walk(name, ground, WALKS, rng_for(scenes.SEED, "pedestrians", name)) for name in names]
+    return ground, [make_pedestrian(name, ground, WALKS, rng_for(scenes.SEED, "pedestrians", name)) for name in names]
 
 
 def walking(maps: dict[str, BoxMap]) -> None:

@@ -32,9 +32,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from specimens_distill import make_captions
 
-from cosfly.formats.flights import find_flights
 from cosfly.formats.frames import FILE_NAMES, FrameFile, depth_bytes, frame_name, instance_bytes, rgb_bytes
-from cosfly.formats.playback import Flight, write_flight
+from cosfly.formats.playback import Track, write_track
+from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.store import CHECKSUMS, checksum_lines, sha256_bytes
 from release.package.config import ReleaseConfig
 from release.package.sources import Source
@@ -70,7 +70,7 @@ def make_tree(root: Path, num_released: int, size_px: tuple[int, int]) -> Path:
                 positions_m=flight.positions_m + away_m, targets_m=flight.targets_m + away_m,
             )  # fmt: skip
             folder = root / "tree/Town01" / trajectory / variant
-            write_flight(folder, own)
+            write_track(folder, own)
             listed = {"trajectory.json": sha256_bytes((folder / "trajectory.json").read_bytes())}
             for i in range(NUM_POINTS):
                 (folder / frame_name(i)).mkdir(parents=True)
@@ -82,7 +82,7 @@ def make_tree(root: Path, num_released: int, size_px: tuple[int, int]) -> Path:
     return root / "tree"
 
 
-def _paint_files(folder: Path, flight: Flight, scene: Scene, i: int) -> Path:
+def _paint_files(folder: Path, flight: Track, scene: Scene, i: int) -> Path:
     folder.mkdir(parents=True)
     rgb, depth, kinds, ids = paint(scene, flight, i)
     noise = np.random.default_rng(i).integers(-3, 4, rgb.shape)  # texture: without it a PNG packs to nothing
@@ -133,7 +133,7 @@ def copy_flight(folder: Path, target: Path, num_digests: int) -> int:
 def copy(tree: Path, out: Path, workers: int, num_digests: int) -> tuple[float, int]:
     """Copy the pictures; gives seconds and bytes."""
     out.mkdir()
-    flights = find_flights(tree)
+    flights = find_tracks(tree)
     start_s = time.perf_counter()
     with ProcessPoolExecutor(workers, mp_context=get_context("fork")) as pool:
         sizes = list(
@@ -172,7 +172,7 @@ def measure_speed(num_frames: int, folder: Path, rounds: int) -> None:
             told = ", ".join(f"{100 * share[column]:.0f} %" for share in own)
             print(f"stored as they are: {told} of a {name} {what}")
     few = min(num_frames, 2 * FRAMES_RELEASED)
-    for path in find_flights(tree)[few // FRAMES_RELEASED :]:
+    for path in find_tracks(tree)[few // FRAMES_RELEASED :]:
         shutil.rmtree(path.parent, ignore_errors=True)
     make_captions(folder / "captions.jsonl", tree)
     before_s = cpu_seconds()

@@ -37,15 +37,15 @@ from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
 from cosfly.geometry.kernels import obstacle_index
 from cosfly.pipeline.bench import row_of
 from cosfly.planners.contract import PlanConfig
-from cosfly.planners.stage import plan_flight
-from cosfly.render import flight
+from cosfly.planners.stage import plan_trajectory
 from cosfly.render import stage as render_stage
+from cosfly.render import track as flight
 from cosfly.render.contract import Renderer
-from cosfly.render.flight import MARGIN_M, Writing, render_flight
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.perturbation import Surroundings
 from cosfly.render.settings import RenderConfig
-from cosfly.render.stage import open_renderer, script_flight
+from cosfly.render.stage import make_track_script, open_renderer
+from cosfly.render.track import MARGIN_M, Writing, render_track
 from cosfly.runtime.stage_events import read_events
 from cosfly.runtime.stage_folder import read_manifest
 
@@ -61,7 +61,7 @@ from dataclasses import replace
 from pathlib import Path
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.traces import read_traces
-from cosfly.render.flight import Writing, render_flight
+from cosfly.render.track import Writing, render_flight
 from cosfly.render.stage import RenderConfig, open_renderer, script_flight  # where older checkouts have them all
 boxes, traces, out, number = *map(Path, sys.argv[1:4]), int(sys.argv[4])
 cfg = RenderConfig(fovs_deg=(90.0,), first_timestamp=1776000000)
@@ -88,7 +88,7 @@ def make_inputs(root: Path, num_flights: int) -> dict[str, Path]:
         simple, cfg = scenes.simplified(raw), PlanConfig()
         walks = scenes.walks_on(simple, num_paths=num_flights)
         obstacles = obstacle_index(simple)
-        traces = [plan_flight(walk, obstacles, cfg, scenes.SEED) for walk in walks]
+        traces = [plan_trajectory(walk, obstacles, cfg, scenes.SEED) for walk in walks]
         folders[name] = root / name
         folders[name].mkdir()
         write_boxes(folders[name] / FILES[0], raw)
@@ -244,7 +244,7 @@ def tiles(num_frames: int) -> list[list[Any]]:
         return []
     simple, cfg = scenes.simplified(city), PlanConfig()
     (walk,) = scenes.walks_on(simple, num_paths=1)
-    trace = plan_flight(walk, obstacle_index(simple), cfg, scenes.SEED)
+    trace = plan_trajectory(walk, obstacle_index(simple), cfg, scenes.SEED)
     maps: dict[str, BoxMap] = {"one city": city, "12 x 12": scenes.tiled(city, 12, 12)}
     renderers, opened_s = {}, {}
     for name, box_map in maps.items():
@@ -270,15 +270,15 @@ def memory(num_frames: int) -> list[list[Any]]:
     box_map = scenes.town()
     simple, cfg = scenes.simplified(box_map), PlanConfig()
     (walk,) = scenes.walks_on(simple, num_paths=1)
-    trace = plan_flight(walk, obstacle_index(simple), cfg, scenes.SEED)
+    trace = plan_trajectory(walk, obstacle_index(simple), cfg, scenes.SEED)
     small = RenderConfig(width_px=160, height_px=90, fovs_deg=(90.0,), first_timestamp=1776000000)
     renderer = open_renderer("gl", box_map, small.width_px, small.height_px)
     writing = Writing(tuple(small.modalities), small.visible_threshold)
     rows, done = [], 0
     while done < num_frames:
-        script = script_flight(trace, 0, "clean", "Town", Surroundings(simple), small, 0)
+        script = make_track_script(trace, 0, "clean", "Town", Surroundings(simple), small, 0)
         with tempfile.TemporaryDirectory() as scratch:
-            done += len(render_flight(renderer, script, Path(scratch), writing))
+            done += len(render_track(renderer, script, Path(scratch), writing))
         if not rows or done - rows[-1][0] >= num_frames // 10:
             rows.append([done, resident_mib()])
     return [[count, mib, 100.0 * (mib / rows[1][1] - 1.0)] for count, mib in rows]

@@ -14,7 +14,7 @@ import numpy as np
 
 from cosfly.formats.boxes import OUR_LICENCE, BoxMap, MapHeader, MapSource
 from cosfly.maps.boxlist import BoxList
-from cosfly.runtime.chance import rng_for
+from cosfly.runtime.seeding import rng_for
 
 # tab:box_categories: boxes of each kind before simplification, 65,614 together.
 CENSUS = {

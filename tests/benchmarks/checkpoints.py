@@ -26,8 +26,8 @@ from cosfly.formats.pursuits import PURSUITS, read_pursuit
 from cosfly.formats.traces import read_traces
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners import stage as planning
-from cosfly.runtime.chance import rng_for
 from cosfly.runtime.runner import Item
+from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.store import write_model
 
 TURNS = ("yaw_left_to_follow", "yaw_right_to_follow")
@@ -62,7 +62,7 @@ def main() -> None:
     parser.add_argument("--walks", type=int, default=6)
     given = parser.parse_args()
     run = RunConfig.model_validate({"render": {"width_px": 320, "height_px": 180}})
-    whole = stage.FlightsConfig(
+    whole = stage.ClosedLoopConfig(
         fly=run.fly, plan=run.plan, render=run.render, caption=run.caption, infer=run.distill.infer
     )
     plans = planning.run(run.plan, given.simplified, given.paths, given.out / "plan", workers=1)

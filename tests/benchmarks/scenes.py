@@ -14,11 +14,11 @@ from census_town import census_town
 from threadpoolctl import threadpool_limits
 
 from cosfly.formats.boxes import BoxMap
-from cosfly.formats.walks import Walk
+from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.maps.stage import MapsConfig, load_map
-from cosfly.pedestrians.stage import PedestriansConfig, make_walk, walkable_ground
-from cosfly.runtime.chance import rng_for
+from cosfly.pedestrians.stage import PedestriansConfig, make_pedestrian, walkable_ground
 from cosfly.runtime.config import build
+from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import SimplifyConfig, simplify
 
 SHARED_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -66,19 +66,19 @@ def simplified(raw: BoxMap) -> BoxMap:
     return simplify(raw, SimplifyConfig()).box_map
 
 
-def walks_on(box_map: BoxMap, **settings: Any) -> list[Walk]:
+def walks_on(box_map: BoxMap, **settings: Any) -> list[PedestrianTrajectory]:
     """20 walks (`num_paths`) of 75 to 100 m as the crow flies: about 186 points, the length of the paper's pilot."""
     cfg = PedestriansConfig(**{"num_paths": NUM_WALKS, "min_distance_m": 75.0, **settings})
     ground = walkable_ground(box_map, cfg)
     names = [f"path_{k:05d}" for k in range(cfg.num_paths)]
-    return [make_walk(name, ground, cfg, rng_for(SEED, "pedestrians", name)).walk for name in names]
+    return [make_pedestrian(name, ground, cfg, rng_for(SEED, "pedestrians", name)).walk for name in names]
 
 
-def moved(walk: Walk, shift_m: np.ndarray) -> Walk:
+def moved(walk: PedestrianTrajectory, shift_m: np.ndarray) -> PedestrianTrajectory:
     return replace(walk, polyline_m=walk.polyline_m + shift_m[:2], positions_m=walk.positions_m + shift_m)
 
 
-def first_points(walk: Walk, count: int) -> Walk:
+def first_points(walk: PedestrianTrajectory, count: int) -> PedestrianTrajectory:
     return replace(
         walk, time_s=walk.time_s[:count], positions_m=walk.positions_m[:count], speeds_mps=walk.speeds_mps[:count]
     )

@@ -14,7 +14,7 @@ import msgpack
 import numpy as np
 
 from cosfly.formats.boxes import BoxMap
-from cosfly.formats.others import BUILDS
+from cosfly.formats.bystanders import BUILDS
 from cosfly.formats.weather import WeatherParams
 from cosfly.simulators.conventions import CARLA_VERSION, DEPTH_RANGE_M, DEPTH_STEPS, SIMULATED_STEP_S, unreal_pose
 from simulators.scene import Mover, Server, listen, send

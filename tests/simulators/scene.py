@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from cosfly.formats.boxes import BoxMap
-from cosfly.formats.others import BUILDS
+from cosfly.formats.bystanders import BUILDS
 from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
-from cosfly.render.contract import PERSON_ID, Frame, PosedCar, PosedOther, PosedPerson, instance_ids, other_id
+from cosfly.render.contract import PERSON_ID, Frame, PosedBystander, PosedCar, PosedPerson, instance_ids, other_id
 from cosfly.render.person import SLOW_MPS, choose_clothes
 from cosfly.render.stage import open_renderer
-from cosfly.runtime.chance import rng_for
+from cosfly.runtime.seeding import rng_for
 from cosfly.simulators.conventions import SIMULATED_STEP_S, world_pose
 
 MOST_MOVERS = 64
@@ -111,7 +111,7 @@ class Server:
         if self._prepared_for != self.weather:
             self._renderer.prepare(*self.town.bounds(), self.weather)
             self._prepared_for = self.weather
-        others = [PosedOther(other_id(k), mover.body()) for k, mover in enumerate(self.bodies().values())]
+        others = [PosedBystander(other_id(k), mover.body()) for k, mover in enumerate(self.bodies().values())]
         ids = [*instance_ids(self.town, MOST_MOVERS), *(one.instance_id for one in others)]
         owners = np.full(PERSON_ID + 1, -1)
         owners[ids] = np.arange(len(ids))

@@ -56,9 +56,9 @@ def search_start(
         (n, 3), straight between key frames, every point and segment `clearance_m` from all boxes; None if there is
         none.
     """
-    targets_m, wish = problem.targets, scenario.wish
+    targets_m, reference = problem.targets, scenario.reference
     keys, _, preferred_m, greatest_m = scenario.key_frames(max(1, round(BETWEEN_KEYS_S / problem.dt_s)))
-    rings = _rings(wish.ground_distance_m[keys], preferred_m, greatest_m, climbing)
+    rings = _rings(reference.ground_distance_m[keys], preferred_m, greatest_m, climbing)
     azimuths = np.arange(NUM_AZIMUTHS) * (2.0 * np.pi / NUM_AZIMUTHS)
     angles = problem.views_rad[keys, None, None] + np.pi + azimuths[None, None, :]
     offsets = rings[:, :, 0, None]
@@ -68,9 +68,9 @@ def search_start(
     places = np.stack([x, y, z], axis=-1).reshape(len(keys), -1, 3)
     turns = np.minimum(azimuths, 2.0 * np.pi - azimuths) / np.pi
     climbs = np.maximum(rings[0, :, 1] - preferred_m[0], 0.0)[:, None] / 20.0
-    turn_cost = TURN_COST if wish.any_bearing else TURN_COST_OF_STYLES
+    turn_cost = TURN_COST if reference.any_bearing else TURN_COST_OF_STYLES
     extra = turn_cost * turns[None] ** 2 + CLIMB_COST * climbs + STEEP_COST * (np.arange(rings.shape[1]) > 0)[:, None]
-    sight = wish.keeps_sight[keys]
+    sight = reference.keeps_sight[keys]
     chosen = _search(places, targets_m[keys], keys * problem.dt_s, extra, sight, index, clearance_m, cfg.speed_max_mps)
     if chosen[0] < 0:
         return None
@@ -167,23 +167,23 @@ def plan(scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.rando
 
 def make_problem(scenario: Scenario, cfg: PlanConfig) -> Problem:
     """Bring settings and scenario into the form of the compiled loss."""
-    muco, wish = cfg.muco, scenario.wish
+    muco, reference = cfg.muco, scenario.reference
     weights = np.array([getattr(muco, f"weight_{name}") for name in TERM_NAMES[:7]])
     # The band stands round the settings' pitch; it goes where the wish goes.
-    shift = wish.pitch_rad - np.radians(muco.pitch_deg)
+    shift = reference.pitch_rad - np.radians(muco.pitch_deg)
     low, high = (edge + shift for edge in np.radians(muco.pitch_band_deg))
-    bounds = (wish.altitude_min_m, wish.altitude_m, wish.altitude_max_m)
-    beneath = 0.0 if wish.any_bearing else muco.weight_beneath
+    bounds = (reference.altitude_min_m, reference.altitude_m, reference.altitude_max_m)
+    beneath = 0.0 if reference.any_bearing else muco.weight_beneath
     return Problem(
         targets=np.ascontiguousarray(scenario.targets_m),
-        views_rad=wish.view_rad,
-        distances=wish.distance_m,
+        views_rad=reference.view_rad,
+        distances=reference.distance_m,
         weights=weights,
         altitudes=scenario.ground_m[:, None] + np.stack(bounds, axis=1),
-        keeps_sight=wish.keeps_sight,
-        bearing_weight=muco.weight_view_angle if wish.any_bearing else muco.weight_bearing,
+        keeps_sight=reference.keeps_sight,
+        bearing_weight=muco.weight_view_angle if reference.any_bearing else muco.weight_bearing,
         altitude_weights=np.array([muco.weight_below, muco.weight_above, muco.weight_oscillation, beneath]),
-        pitches_rad=np.stack([low, wish.pitch_rad, high], axis=1),
+        pitches_rad=np.stack([low, reference.pitch_rad, high], axis=1),
         influence_m=muco.influence_m,
         difference_m=muco.difference_m,
         pitch_weight=muco.weight_pitch,
@@ -205,7 +205,7 @@ def start_trajectory(
     blocked or blind.
     """
     targets = problem.targets
-    plain = scenario.wish.places_m(targets, scenario.ground_m)
+    plain = scenario.reference.places_m(targets, scenario.ground_m)
     plain_is_free = bool(project(plain, problem, obstacles, 0, len(plain), nothing_nearby(len(plain))))
     seen = np.where(problem.keeps_sight, visibility(obstacles, plain, targets), 1.0)
     if plain_is_free and seen.mean() >= cfg.muco.start_visibility:

@@ -65,13 +65,16 @@ def make_task(
     scenario: Scenario, obstacles: BoxIndex, cfg: PlanConfig, rng: np.random.Generator, clearance_m: float
 ) -> Task | None:
     """Return the task of a scenario; None where no free place is near its first or last wished one."""
-    wish, targets = scenario.wish, scenario.targets_m
+    reference, targets = scenario.reference, scenario.targets_m
     margin_m = cfg.track_astar.corridor_m
-    low_z, high_z = (scenario.ground_m + wish.altitude_min_m).max(), (scenario.ground_m + wish.altitude_max_m).min()
+    low_z, high_z = (
+        (scenario.ground_m + reference.altitude_min_m).max(),
+        (scenario.ground_m + reference.altitude_max_m).min(),
+    )
     low = np.array([*(targets[:, :2].min(axis=0) - margin_m), low_z])
     high = np.array([*(targets[:, :2].max(axis=0) + margin_m), high_z])
-    wished = wish.places_m(targets, scenario.ground_m)[[0, -1]]
-    ends = [_free_place(place, low, high, obstacles, clearance_m) for place in wished]
+    requested = reference.places_m(targets, scenario.ground_m)[[0, -1]]
+    ends = [_free_place(place, low, high, obstacles, clearance_m) for place in requested]
     if ends[0] is None or ends[1] is None:
         return None
     return Task(ends[0], ends[1], low, high, obstacles, clearance_m, len(targets), scenario.dt_s, rng)

@@ -17,10 +17,10 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import SKY_DEPTH_M, Look
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.weather import WeatherParams
-from cosfly.render.contract import FAR_M, NEAR_M, Frame, PosedOther, PosedPerson, check_pose, far_as_sky
+from cosfly.render.contract import FAR_M, NEAR_M, Frame, PosedBystander, PosedPerson, check_pose, far_as_sky
 from cosfly.render.gl import meshes
 from cosfly.render.gl import parts as part_tables
-from cosfly.render.gl.figure import MOST_CAPSULES, Body, capsules_of, draw_others, make_body, placed
+from cosfly.render.gl.figure import MOST_CAPSULES, Body, capsules_of, draw_bystanders, make_body, placed
 from cosfly.render.gl.loose import LooseTriangles, attributes
 from cosfly.render.gl.parts import PART
 from cosfly.render.gl.programs import Programs, open_context, packed, programs_of, set_uniform, sources
@@ -245,7 +245,7 @@ class GlRenderer:
         camera_pose: np.ndarray,
         intrinsic: np.ndarray,
         person: PosedPerson | None,
-        others: Sequence[PosedOther] = (),
+        others: Sequence[PosedBystander] = (),
     ) -> Frame:
         """Draw one frame, as the contract says."""
         check_pose(camera_pose, intrinsic)
@@ -254,7 +254,7 @@ class GlRenderer:
             camera_pose[:3, :3], camera_pose[:3, 3] - self.origin_m, intrinsic, self.width_px, self.height_px
         )
         moving = [] if body is None else [placed(body, self.origin_m)]
-        moving += draw_others(others, self.origin_m, view)
+        moving += draw_bystanders(others, self.origin_m, view)
         bones = self._bones(body)
         capsules = capsules_of(others, self.origin_m, view)
         has_headlights = self._weather is not None and self._weather.has_lights

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.walks import TARGET_HEIGHT_M
+from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.geometry.axes import rotation_matrix
-from cosfly.render.contract import LAYER_STEP, PERSON_ID, STANDING_LAYER, PosedCar, PosedOther, PosedPerson
+from cosfly.render.contract import LAYER_STEP, PERSON_ID, STANDING_LAYER, PosedBystander, PosedCar, PosedPerson
 from cosfly.render.figure import figure_of
 from cosfly.render.gl import meshes
 from cosfly.render.gl.parts import CLOTH, PART, Boxes, PartBuilder, tags
@@ -64,8 +64,8 @@ def placed(body: Body, origin_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return records, body.mesh
 
 
-def draw_others(
-    others: Sequence[PosedOther], origin_m: np.ndarray, view: CameraView
+def draw_bystanders(
+    others: Sequence[PosedBystander], origin_m: np.ndarray, view: CameraView
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return records and meshes of the others whom the camera may see."""
     found = []
@@ -91,7 +91,7 @@ def _car(car: PosedCar, instance_id: int, center: np.ndarray, view: CameraView) 
     return parts.records[rows], parts.mesh[rows]
 
 
-def capsules_of(others: Sequence[PosedOther], origin_m: np.ndarray, view: CameraView) -> np.ndarray:
+def capsules_of(others: Sequence[PosedBystander], origin_m: np.ndarray, view: CameraView) -> np.ndarray:
     """Capsules of the others whose shadows the camera may see, relative to the origin, (k, 2, 4): from and radius, to
     and instance id.
 

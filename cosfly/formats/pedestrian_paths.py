@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.formats.columns import column, matrix, read_items, rounded, step_field, text_id, write_items
-from cosfly.runtime.chance import draw_to_quota, rng_for
 from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.seeding import draw_to_quota, rng_for
 
 # The tracked person: an axis-aligned box round the hip point, which is the target's position everywhere.
 PERSON_HALF_EXTENTS_M = (0.3, 0.3, 0.9)
@@ -24,7 +24,7 @@ PATHS_FORMAT = FileFormat("cosfly.path", "1.0", "pedestrian paths")
 
 
 @dataclass(frozen=True)
-class Walk:
+class PedestrianTrajectory:
     """One walk, the product of stage 3.
 
     polyline_m: (k, 2) the way: the A* route, or what a pace makes of it. time_s: (n,), even steps from 0.
@@ -52,7 +52,7 @@ class Walk:
         }
 
     @classmethod
-    def from_json(cls, record: dict, where: str) -> Walk:
+    def from_json(cls, record: dict, where: str) -> PedestrianTrajectory:
         columns = {name: column(record, name, where) for name in ("t", "x", "y", "z", "speed")}
         lengths = {name: len(column) for name, column in columns.items()}
         if len(set(lengths.values())) != 1:
@@ -86,11 +86,11 @@ def pace_of(record: dict, where: str) -> str:
     return pace
 
 
-def write_paths(path: Path, paths: list[Walk], header: dict) -> None:
+def write_paths(path: Path, paths: list[PedestrianTrajectory], header: dict) -> None:
     """Write `path.json`; `header` holds the map's name, seed and whatever the stage wants on record."""
     write_items(path, PATHS_FORMAT, "paths", paths, header | step_field(paths))
 
 
-def read_paths(path: Path) -> list[Walk]:
+def read_paths(path: Path) -> list[PedestrianTrajectory]:
     """Read `path.json`; raises as `read_items`."""
-    return read_items(path, PATHS_FORMAT, "paths", Walk.from_json)
+    return read_items(path, PATHS_FORMAT, "paths", PedestrianTrajectory.from_json)

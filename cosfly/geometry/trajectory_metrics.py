@@ -56,7 +56,7 @@ def speed_max_mps(positions_m: np.ndarray, dt_s: float = DT_S) -> float:
     return float(_steps_m(positions_m).max(initial=0.0)) / dt_s
 
 
-def flight_metrics(
+def trajectory_metrics(
     positions_m: np.ndarray,
     targets_m: np.ndarray,
     visibility: np.ndarray,

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.formats.places import ALL_FLIGHTS, TRACKS, FlightChoice, Track
-from cosfly.formats.playback import ORIGINAL, Flight, read_flight
+from cosfly.formats.places import ALL_FLIGHTS, TRACKS, TrackChoice, TrackName
+from cosfly.formats.playback import ORIGINAL, Track, read_track
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.files import files_named
 
 TWIN_TOLERANCE_S = 1e-3
 
 
-def find_flights(root: Path, choice: FlightChoice = ALL_FLIGHTS) -> list[Path]:
+def find_tracks(root: Path, choice: TrackChoice = ALL_FLIGHTS) -> list[Path]:
     """Find the folders that hold a `trajectory.json`, sorted; of them those that are chosen."""
     if not root.is_dir():
         raise InputError("there is no such folder", where=root, expected="a playback tree", fix="check the path")
@@ -31,10 +31,10 @@ def find_flights(root: Path, choice: FlightChoice = ALL_FLIGHTS) -> list[Path]:
             expected="Town*/trajectory_*/ORI/trajectory.json",
             fix="check --data",
         )
-    return chosen_flights(folders, root, choice)
+    return chosen_tracks(folders, root, choice)
 
 
-def chosen_flights(folders: Sequence[Path], root: Path, choice: FlightChoice) -> list[Path]:
+def chosen_tracks(folders: Sequence[Path], root: Path, choice: TrackChoice) -> list[Path]:
     """Return the flights of a tree that are chosen."""
     chosen = [folder for folder in folders if choice.names(folder.relative_to(root).as_posix())]
     if folders and not chosen:
@@ -49,19 +49,19 @@ def chosen_flights(folders: Sequence[Path], root: Path, choice: FlightChoice) ->
     return chosen
 
 
-def track_of(folder: Path) -> Track:
+def track_of(folder: Path) -> TrackName:
     """Tell a flight's track: by its folder's name, else by its file; one that cannot be read is perturbed."""
     if folder.name == ORIGINAL:
         return "clean"
     if re.fullmatch(r"aug_\d+", folder.name):
         return "perturbed"
     try:
-        return "clean" if read_flight(folder, strict=False).is_original else "perturbed"
+        return "clean" if read_track(folder, strict=False).is_original else "perturbed"
     except InputError:
         return "perturbed"
 
 
-def read_twin(flight: Flight) -> Flight | None:
+def read_twin(flight: Track) -> Track | None:
     """Read the clean flight beside a perturbed one, the same walk frame by frame; None where there is none.
 
     Raises:
@@ -73,7 +73,7 @@ def read_twin(flight: Flight) -> Flight | None:
     named = own.parent / ORIGINAL
     has_named = named != own and (named / "trajectory.json").exists()
     for folder in [named] if has_named else sorted(p.parent for p in own.parent.glob("[!.]*/trajectory.json")):
-        twin = read_flight(folder, strict=False) if folder != own else flight
+        twin = read_track(folder, strict=False) if folder != own else flight
         if twin.is_original:
             break
         if has_named:
@@ -85,17 +85,17 @@ def read_twin(flight: Flight) -> Flight | None:
     return twin
 
 
-def read_tracks_beside(flight: Flight) -> list[Flight]:
+def read_tracks_beside(flight: Track) -> list[Track]:
     """Read the other flights of a trajectory, of the same walk; those that cannot be read are left out."""
-    found = list[Flight]()
+    found = list[Track]()
     if flight.folder is not None:
         for path in sorted(flight.folder.parent.glob("[!.]*/trajectory.json")):
             with contextlib.suppress(InputError):
-                found += [read_flight(path.parent, strict=False)] if path.parent != flight.folder else []
+                found += [read_track(path.parent, strict=False)] if path.parent != flight.folder else []
     return found
 
 
-def _no_twin(flight: Flight, other: Flight) -> VerifyError:
+def _no_twin(flight: Track, other: Track) -> VerifyError:
     got, expected = (f"{len(f)} points from {f.time_s[0]:.3f} to {f.time_s[-1]:.3f} s" for f in (other, flight))
     got = f"{got}, is_original {other.is_original}"
     return VerifyError("not the clean twin of the flight beside it", where=other.folder, got=got, expected=expected)

@@ -10,7 +10,7 @@ import numpy as np
 
 from cosfly.formats.columns import column, read_items, records, rounded, text_id, write_items
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.walks import PERSON_HALF_EXTENTS_M
+from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import InputError
 
@@ -37,7 +37,7 @@ BUILDS = {
 
 
 @dataclass(frozen=True)
-class Other:
+class Bystander:
     """One who moves beside the target: kind of BUILDS; positions_m (n, 3) on the ground below its middle; headings_rad
     (n,). A look-alike wears what the target does but for one thing."""
 
@@ -70,11 +70,11 @@ class Other:
         apart = np.linalg.norm(self.discs_m[0] - person_m[:2], axis=1).min()
         return float(apart) - self.build.disc_radius_m - BUILDS["Pedestrians"].disc_radius_m
 
-    def at(self, i: int) -> Other:
+    def at(self, i: int) -> Bystander:
         """Return the same at one time alone."""
         return replace(self, positions_m=self.positions_m[i : i + 1], headings_rad=self.headings_rad[i : i + 1])
 
-    def every(self, stride: int) -> Other:
+    def every(self, stride: int) -> Bystander:
         """Return the same at every so many times."""
         return replace(self, positions_m=self.positions_m[::stride], headings_rad=self.headings_rad[::stride])
 
@@ -84,7 +84,7 @@ class Other:
         return {"kind": self.kind, **told, **columns, "yaw": rounded(np.degrees(self.headings_rad), 3)}
 
     @classmethod
-    def from_json(cls, record: dict, where: str) -> Other:
+    def from_json(cls, record: dict, where: str) -> Bystander:
         kind = record.get("kind")
         if not isinstance(kind, str) or kind not in BUILDS:
             raise InputError("no such kind", where=f"{where}.kind", got=repr(kind)[:60], expected=" or ".join(BUILDS))
@@ -94,25 +94,25 @@ class Other:
 
 
 @dataclass(frozen=True)
-class Company:
+class Bystanders:
     """The others of one walk, at its times. Their number in the list is who they are."""
 
     path_id: str
-    others: list[Other]
+    others: list[Bystander]
 
     def as_json(self) -> dict:
         return {"id": self.path_id, "others": [other.as_json() for other in self.others]}
 
     @classmethod
-    def from_json(cls, record: dict, where: str) -> Company:
+    def from_json(cls, record: dict, where: str) -> Bystanders:
         lines = records(record, "others", where)
-        others = [Other.from_json(line, f"{where}.others[{i}]") for i, line in enumerate(lines)]
+        others = [Bystander.from_json(line, f"{where}.others[{i}]") for i, line in enumerate(lines)]
         if len({len(other.positions_m) for other in others}) > 1:
             raise InputError("columns of different lengths", where=f"{where}.others")
         return cls(text_id(record, where), others)
 
 
-def gaps_m(one: Other, two: Other) -> np.ndarray:
+def gaps_m(one: Bystander, two: Bystander) -> np.ndarray:
     """How far the discs of two are apart in each step of time, (n - 1,) m, negative where they overlap.
 
     Between two times both go straight on, so the nearest place within a step is that of the origin to a segment.
@@ -125,7 +125,7 @@ def gaps_m(one: Other, two: Other) -> np.ndarray:
     return nearest.min(axis=(1, 2)) - one.build.disc_radius_m - two.build.disc_radius_m
 
 
-def distances_to_boxes_m(points_m: np.ndarray, other: Other) -> np.ndarray:
+def distances_to_boxes_m(points_m: np.ndarray, other: Bystander) -> np.ndarray:
     """How far a point is from the box of an other at each time, (n,) m, 0 inside; points_m: (n, 3)."""
     offset = points_m - other.centers_m
     cos, sin = np.cos(other.headings_rad), np.sin(other.headings_rad)
@@ -133,11 +133,11 @@ def distances_to_boxes_m(points_m: np.ndarray, other: Other) -> np.ndarray:
     return np.linalg.norm(np.maximum(np.abs(local) - np.array(other.build.half_extents_m)[:, None], 0.0), axis=0)
 
 
-def write_others(path: Path, companies: list[Company], header: dict) -> None:
+def write_bystanders(path: Path, companions: list[Bystanders], header: dict) -> None:
     """Write `others.json`; `header` holds the map's name, the seed and the time step."""
-    write_items(path, OTHERS_FORMAT, "paths", companies, header)
+    write_items(path, OTHERS_FORMAT, "paths", companions, header)
 
 
-def read_others(path: Path) -> list[Company]:
+def read_bystanders(path: Path) -> list[Bystanders]:
     """Read `others.json`; raises as `read_items`."""
-    return read_items(path, OTHERS_FORMAT, "paths", Company.from_json)
+    return read_items(path, OTHERS_FORMAT, "paths", Bystanders.from_json)

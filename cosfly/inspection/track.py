@@ -14,16 +14,16 @@ import numpy as np
 from pydantic import BaseModel
 
 from cosfly.formats.coverage import Coverage, coverage_of
-from cosfly.formats.flights import read_twin
 from cosfly.formats.frames import LEGIBLE_HEIGHT_PX
-from cosfly.formats.inspection import FlightInspection
 from cosfly.formats.inspection import Result as FlightResult
+from cosfly.formats.inspection import TrackInspection
 from cosfly.formats.issues import Report
-from cosfly.formats.playback import STATES, Flight, read_flight
+from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
+from cosfly.formats.playback import STATES, Track, read_track
 from cosfly.formats.traces import DroneTrace
-from cosfly.formats.walks import TARGET_HEIGHT_M
+from cosfly.formats.tracks import read_twin
 from cosfly.geometry.axes import project, step_s, world_from_camera, wrap_deg
-from cosfly.geometry.flight_metrics import (
+from cosfly.geometry.trajectory_metrics import (
     CLEARANCE_CAP_M,
     CLEARANCE_TOLERANCE_M,
     accel_rms,
@@ -44,7 +44,7 @@ from cosfly.inspection.settings import (
     TRACK_QUALITY_MIN,
     InspectConfig,
 )
-from cosfly.inspection.view import FlightView, draw_flight
+from cosfly.inspection.view import TrackView, draw_track
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.provenance import digest_of, folder_digests
 
@@ -55,15 +55,15 @@ if TYPE_CHECKING:
 TIME_TOLERANCE_S = 1e-3
 
 
-class InspectedFlight(BaseModel):
+class InspectedTrack(BaseModel):
     """A flight's record, and what the report draws of it; so it stands in `items.jsonl`."""
 
-    record: FlightInspection
-    view: FlightView
+    record: TrackInspection
+    view: TrackView
     coverage: Coverage
 
 
-def inspect_flight(
+def inspect_track(
     folder: Path,
     root: Path,
     traces: dict[str, DroneTrace] | None,
@@ -71,7 +71,7 @@ def inspect_flight(
     obstacles: BoxIndex | None,
     cfg: InspectConfig,
     recorded: Mapping[str, str],
-) -> InspectedFlight:
+) -> InspectedTrack:
     """Check one flight folder.
 
     Args:
@@ -101,7 +101,7 @@ def inspect_flight(
     _rendered_metrics(flight, frames, cfg, report, metrics)
     issues = report.merged()
     result: FlightResult = "rejected" if report.num("error") else "review" if report.num("warning") else "accepted"
-    record = FlightInspection(
+    record = TrackInspection(
         town=flight.town,
         trajectory=flight.trajectory,
         variant=flight.variant,
@@ -113,8 +113,8 @@ def inspect_flight(
         issues=issues,
         metrics={name: None if value is None else round(value, 4) for name, value in metrics.items()},
     )
-    view = draw_flight(flight, _heights_m(flight), clearance_m, box_map, THUMBNAIL_PX, report.issues)
-    return InspectedFlight(record=record, view=view, coverage=coverage_of(flight))
+    view = draw_track(flight, _heights_m(flight), clearance_m, box_map, THUMBNAIL_PX, report.issues)
+    return InspectedTrack(record=record, view=view, coverage=coverage_of(flight))
 
 
 def _digest(folder: Path) -> str | None:
@@ -126,17 +126,17 @@ def _digest(folder: Path) -> str | None:
         return None
 
 
-def trace_id(flight: Flight) -> str:
+def trace_id(flight: Track) -> str:
     """Return the id of the plan that a flight says it was rendered from."""
     return str(flight.source.get("scenario_id", ""))
 
 
-def _read(folder: Path, report: Report) -> Flight:
+def _read(folder: Path, report: Report) -> Track:
     """Read a flight strictly; if only the layout is broken, read on and report what is."""
     try:
-        return read_flight(folder)
+        return read_track(folder)
     except InputError as error:
-        flight = read_flight(folder, strict=False)  # raises when poses or times are unusable
+        flight = read_track(folder, strict=False)  # raises when poses or times are unusable
         where = str(error.where).replace(f"{folder}/", "")
         report.error("layout", where, error.got or error.what, error.expected or "the strict layout")
         return flight
@@ -160,7 +160,7 @@ def check_plan(trace: DroneTrace, cfg: InspectConfig, report: Report, metrics: d
 
 
 def check_surroundings(
-    flight: Flight, obstacles: BoxIndex, cfg: InspectConfig, report: Report, metrics: dict[str, float | int | None]
+    flight: Track, obstacles: BoxIndex, cfg: InspectConfig, report: Report, metrics: dict[str, float | int | None]
 ) -> np.ndarray:
     """Measure the poses of a flight against the map: clearance of the drone, five-ray visibility, a person in an
     obstacle; gives the first, (n,) m: of the way to the next pose, of the poses alone where shifts moved them.
@@ -197,7 +197,7 @@ def check_surroundings(
     return gaps_m
 
 
-def check_shifts(flight: Flight, report: Report, metrics: dict[str, float | int | None]) -> None:
+def check_shifts(flight: Track, report: Report, metrics: dict[str, float | int | None]) -> None:
     """Find the frames of a perturbed flight whose shift hides a target which the clean flight beside it shows."""
     try:
         twin = read_twin(flight)
@@ -214,12 +214,12 @@ def check_shifts(flight: Flight, report: Report, metrics: dict[str, float | int 
         report.warn("hidden_by_shift", where, "false, and true in the clean flight", "a shift that falls back")
 
 
-def is_shifted(flight: Flight) -> np.ndarray:
+def is_shifted(flight: Track) -> np.ndarray:
     """Return where drone or person were moved from their plan, (n,) bool; an offset that no file tells counts."""
     return (flight.drone_offsets_m != 0).any(axis=1) | (flight.target_offsets_m != 0).any(axis=1)
 
 
-def check_poses(flight: Flight, trace: DroneTrace, cfg: InspectConfig, report: Report) -> None:
+def check_poses(flight: Track, trace: DroneTrace, cfg: InspectConfig, report: Report) -> None:
     """Check that a flight, its recorded perturbation taken off, is the plan.
 
     Where a perturbation shifted drone or person, the camera was aimed anew, so only the positions can be compared
@@ -252,7 +252,7 @@ def check_poses(flight: Flight, trace: DroneTrace, cfg: InspectConfig, report: R
             report.error("pose_differs", where, f"{distance[i]:.4f} {unit} beside the plan", expected)
 
 
-def check_motion(flight: Flight, cfg: InspectConfig, report: Report) -> None:
+def check_motion(flight: Track, cfg: InspectConfig, report: Report) -> None:
     """Find teleports: steps between frames that nothing flies or walks. Recorded perturbations are taken off."""
     drone_offsets_m, target_offsets_m = np.nan_to_num(flight.drone_offsets_m), np.nan_to_num(flight.target_offsets_m)
     limits = (
@@ -266,7 +266,7 @@ def check_motion(flight: Flight, cfg: InspectConfig, report: Report) -> None:
             report.error("teleport", where, f"{speeds[i]:.1f} m/s", f"at most {limit_mps:g} m/s")
 
 
-def check_projection(flight: Flight, cfg: InspectConfig, report: Report) -> None:
+def check_projection(flight: Track, cfg: InspectConfig, report: Report) -> None:
     """Check the recorded pixel, box and depth of the target against pose, intrinsics and target position."""
     for i in range(len(flight)):
         point = f"trajectory.json: points[{i}].target"
@@ -295,7 +295,7 @@ def check_projection(flight: Flight, cfg: InspectConfig, report: Report) -> None
 
 
 def _check_frames(
-    flight: Flight, cfg: InspectConfig, report: Report, metrics: dict[str, float | int | None]
+    flight: Track, cfg: InspectConfig, report: Report, metrics: dict[str, float | int | None]
 ) -> FrameNumbers:
     metas = check_files(flight, report)
     told = others_told(flight, metas)
@@ -308,7 +308,7 @@ def _check_frames(
 
 
 def _rendered_metrics(
-    flight: Flight, frames: FrameNumbers, cfg: InspectConfig, report: Report, metrics: dict[str, float | int | None]
+    flight: Track, frames: FrameNumbers, cfg: InspectConfig, report: Report, metrics: dict[str, float | int | None]
 ) -> None:
     """Add what the rendered frames say; rendered visibility describes, it never rejects (sec:dataset_stats)."""
     known = flight.visibility[~np.isnan(flight.visibility)]
@@ -341,6 +341,6 @@ def _rendered_metrics(
         report.warn("invalid_depth", "depth.npy", f"{invalid:.3f} of a frame", expected)
 
 
-def _heights_m(flight: Flight) -> np.ndarray:
+def _heights_m(flight: Track) -> np.ndarray:
     """Height of the drone over the person's feet, (n,) m."""
     return flight.positions_m[:, 2] - (flight.targets_m[:, 2] - TARGET_HEIGHT_M)

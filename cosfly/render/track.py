@@ -16,14 +16,23 @@ import cv2
 import numpy as np
 
 from cosfly.formats import frames
-from cosfly.formats.frames import Camera, DepthFormat, FrameFile, FrameMeta, Look, OthersMeta, TargetMeta, frame_name
+from cosfly.formats.frames import (
+    BystandersMeta,
+    Camera,
+    DepthFormat,
+    FrameFile,
+    FrameMeta,
+    Look,
+    TargetMeta,
+    frame_name,
+)
 from cosfly.formats.goals import Goal, SeenFrame, find_says, otherwise, target_picture, words_of
 from cosfly.formats.kinds import KINDS
+from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.formats.people import Appearance, People
-from cosfly.formats.playback import LEGIBILITY, TARGET_FILE, Flight, write_flight
+from cosfly.formats.playback import LEGIBILITY, TARGET_FILE, Track, write_track
 from cosfly.formats.segments import Mission, Segment
 from cosfly.formats.traces import DroneTrace
-from cosfly.formats.walks import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
 from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry.axes import mask_box, world_from_camera
 from cosfly.geometry.kernels import signed_distances
@@ -88,7 +97,7 @@ def are_told_apart(frame: Frame, other: Frame) -> bool:
 TOUCH_M = 0.01  # so deep in a box a camera still counts as touching it
 
 
-def check_flight(trace: DroneTrace, surroundings: Surroundings) -> None:
+def check_track(trace: DroneTrace, surroundings: Surroundings) -> None:
     """Check that the camera is outside every obstacle and the person on or over the ground, in all frames of a plan."""
     depths_m, _ = signed_distances(surroundings.obstacles, trace.positions_m, 0.0)
     inside = np.flatnonzero(depths_m < -TOUCH_M)
@@ -116,7 +125,7 @@ FRAMES_IN_FLIGHT = 6  # drawn but not written yet: bounds the memory (about 10 M
 
 
 @dataclass(frozen=True)
-class FlightScript:
+class TrackScript:
     """All that is drawn in one flight, n frames. cameras: of each frame. source: who planned it."""
 
     town: str
@@ -146,7 +155,7 @@ class TargetSight:
     visibility: float
     num_pixels: int
     is_visible: bool
-    others: OthersMeta | None
+    others: BystandersMeta | None
 
 
 @dataclass(frozen=True)
@@ -159,9 +168,9 @@ class Writing:
     overlay: Overlay | None = None
 
 
-def render_flight(
-    renderer: Renderer, script: FlightScript, folder: Path, writing: Writing, num_threads: int = 2
-) -> Flight:
+def render_track(
+    renderer: Renderer, script: TrackScript, folder: Path, writing: Writing, num_threads: int = 2
+) -> Track:
     """Draw a flight into an (unfinished) folder: frames, `trajectory.json`, `perturbation_report.json`,
     `checksums.sha256`.
 
@@ -177,7 +186,7 @@ def render_flight(
     renderer.prepare(places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M, knobs)
     targets: list[TargetMeta] = []
     visibility: list[float] = []
-    company: list[dict] = []
+    bystanders: list[dict] = []
     people = script.others.people(script.clothes.looks) if renderer.dresses else None
     pending: list[Future] = []
     digests: dict[str, str] = {}
@@ -198,16 +207,16 @@ def render_flight(
                     frame, seen = without
             visibility.append(seen.visibility)
             told = {} if seen.others is None else {"others": seen.others.people_of(poses.targets_m[i], people)}
-            company.append(told)
+            bystanders.append(told)
             pending.append(pool.submit(_write_frame, folder, frame, annotation(script, i, seen), writing, script))
             advance()
             while len(pending) >= FRAMES_IN_FLIGHT:
                 take(pending.pop(0))
         for written in pending:
             take(written)
-    flight = _flight(script, targets, np.array(visibility), company)
+    flight = _flight(script, targets, np.array(visibility), bystanders)
     flight = _with_goal(flight, renderer, script, writing.visible_threshold)
-    write_flight(folder, flight)
+    write_track(folder, flight)
     write_json(folder / "perturbation_report.json", _report(script.perturbed))
     made = ["trajectory.json", "perturbation_report.json"]
     if flight.goal is not None and "rgb" in writing.files:
@@ -222,7 +231,7 @@ def render_flight(
 
 
 def draw_frame(
-    renderer: Renderer, script: FlightScript, i: int, poses: Poses, threshold: float
+    renderer: Renderer, script: TrackScript, i: int, poses: Poses, threshold: float
 ) -> tuple[Frame, TargetSight]:
     """Draw frame i from the given poses and see what shows of the target."""
     pose, target = world_from_camera(poses.positions_m[i], poses.rotations_deg[i]), poses.targets_m[i]
@@ -241,7 +250,7 @@ def draw_frame(
     return frame, TargetSight(view, mask_box(frame.ids == PERSON_ID), score, num_px, is_visible, told)
 
 
-def _with_goal(flight: Flight, renderer: Renderer, script: FlightScript, threshold: float) -> Flight:
+def _with_goal(flight: Track, renderer: Renderer, script: TrackScript, threshold: float) -> Track:
     """Add the goal, of the first frame in which the target can be made out and told apart, or why there is none."""
     if not renderer.dresses:
         return replace(flight, people=None, raw=flight.raw | {"goal": {"absent": "clothes_unknown"}})
@@ -264,7 +273,7 @@ def _with_goal(flight: Flight, renderer: Renderer, script: FlightScript, thresho
 
 
 def _write_frame(
-    folder: Path, frame: Frame, meta: FrameMeta, writing: Writing, script: FlightScript
+    folder: Path, frame: Frame, meta: FrameMeta, writing: Writing, script: TrackScript
 ) -> tuple[TargetMeta, dict[str, str]]:
     """Encode and write one frame beside the drawing; gives the target's annotation, and file
     name -> sha256."""
@@ -293,7 +302,7 @@ def _write_frame(
 # --- annotations ------------------------------------------------------------------------------------------------------
 
 
-def annotation(script: FlightScript, i: int, seen: TargetSight) -> FrameMeta:
+def annotation(script: TrackScript, i: int, seen: TargetSight) -> FrameMeta:
     perturbed, view = script.perturbed, seen.view
     return FrameMeta(
         index=i,
@@ -345,10 +354,10 @@ def _report(perturbed: PerturbedTrack) -> dict:
     }
 
 
-def _flight(script: FlightScript, targets: list[TargetMeta], visibility: np.ndarray, company: list[dict]) -> Flight:
+def _flight(script: TrackScript, targets: list[TargetMeta], visibility: np.ndarray, bystanders: list[dict]) -> Track:
     perturbed = script.perturbed
     zooms = any(camera is not script.cameras[0] for camera in script.cameras)
-    return Flight(
+    return Track(
         town=script.town,
         trajectory=script.trajectory,
         variant=script.variant,
@@ -379,7 +388,7 @@ def _flight(script: FlightScript, targets: list[TargetMeta], visibility: np.ndar
             **({} if script.weather is None else {"weather": script.weather.model_dump()}),
             "points": [
                 {"perturbation": dict(state), "target": target.model_dump(include=set(LEGIBILITY)), **others}
-                for state, target, others in zip(perturbed.states, targets, company, strict=True)
+                for state, target, others in zip(perturbed.states, targets, bystanders, strict=True)
             ],
         },
     )

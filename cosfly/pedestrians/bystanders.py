@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cosfly.formats.bystanders import Bystander, Bystanders, gaps_m
 from cosfly.formats.ground import Ground
-from cosfly.formats.others import Company, Other, gaps_m
-from cosfly.formats.walks import Walk
+from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.geometry.axes import headings_of
 from cosfly.pedestrians.lanes import Lane
 from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, sample_goal
@@ -29,7 +29,7 @@ from cosfly.pedestrians.walking import (
     speeds_at,
     take_pace,
 )
-from cosfly.runtime.chance import draw_by_share
+from cosfly.runtime.seeding import draw_by_share
 
 MOST_WAITS, WAIT_S = 10, 3.0  # who meets somebody again after so many waits is drawn anew
 KEEP_BACK_M = {"Pedestrians": 1.5, "Car": 7.0}  # way from where one waits to where one would have met
@@ -54,7 +54,7 @@ class Trip:
     limits_mps: np.ndarray
     head_start_s: float = 0.0
 
-    def moved(self, time_s: np.ndarray, heights: Ground) -> Other:
+    def moved(self, time_s: np.ndarray, heights: Ground) -> Bystander:
         """Where the course leads at each time."""
         positions_m = self._at(self.along_m(time_s))
         if self.kind == "Car":
@@ -62,7 +62,7 @@ class Trip:
             headings_rad = np.arctan2(*(ahead - behind).T[::-1])
         else:
             headings_rad = headings_of(positions_m, time_s)
-        return Other(self.kind, np.column_stack([positions_m, heights.height_at(positions_m)]), headings_rad)
+        return Bystander(self.kind, np.column_stack([positions_m, heights.height_at(positions_m)]), headings_rad)
 
     def along_m(self, time_s: np.ndarray) -> np.ndarray:
         """How far along the way one is at each time, (n,) m."""
@@ -101,11 +101,15 @@ def braked(limits_mps: np.ndarray, along_m: np.ndarray) -> np.ndarray:
 # --- one company ------------------------------------------------------------------------------------------------------
 
 
-def company_of(
-    walk: Walk, ground: WalkableGround, lanes: list[Lane], cfg: PedestriansConfig, rng: np.random.Generator
-) -> Company:
+def bystanders_of(
+    walk: PedestrianTrajectory,
+    ground: WalkableGround,
+    lanes: list[Lane],
+    cfg: PedestriansConfig,
+    rng: np.random.Generator,
+) -> Bystanders:
     """Place the others of one walk."""
-    there = [Other("Pedestrians", walk.positions_m, headings_of(walk.positions_m, walk.time_s))]
+    there = [Bystander("Pedestrians", walk.positions_m, headings_of(walk.positions_m, walk.time_s))]
     for kind, wanted in (("Pedestrians", cfg.others), ("Car", cfg.traffic)):
         for number in range(wanted):
             for _ in range(cfg.num_retries + 1):
@@ -115,10 +119,10 @@ def company_of(
                 if other is not None:
                     there.append(replace(other, is_look_alike=not is_car and number < cfg.look_alikes))
                     break
-    return Company(walk.path_id, there[1:])
+    return Bystanders(walk.path_id, there[1:])
 
 
-def without_meeting(course: Trip, time_s: np.ndarray, there: list[Other], heights: Ground) -> Other | None:
+def without_meeting(course: Trip, time_s: np.ndarray, there: list[Bystander], heights: Ground) -> Bystander | None:
     """Move along a course and wait for those who are there already; None where that does not help."""
     for _ in range(MOST_WAITS + 1):
         other = course.moved(time_s, heights)
@@ -133,7 +137,7 @@ def without_meeting(course: Trip, time_s: np.ndarray, there: list[Other], height
 
 
 def draw_stroll(
-    walk: Walk, number: int, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator
+    walk: PedestrianTrajectory, number: int, ground: WalkableGround, cfg: PedestriansConfig, rng: np.random.Generator
 ) -> Trip | None:
     """Draw a person's route that passes the walker, there and back for as long as the walk lasts; None without one."""
     moment_s = number * GOLDEN % 1.0 * float(walk.time_s[-1])
@@ -172,7 +176,9 @@ def and_back(course: Trip) -> Trip:
     return replace(course, way=back, limits_mps=np.concatenate([course.limits_mps, course.limits_mps[-2::-1]]))
 
 
-def draw_drive(walk: Walk, lanes: list[Lane], cfg: PedestriansConfig, rng: np.random.Generator) -> Trip | None:
+def draw_drive(
+    walk: PedestrianTrajectory, lanes: list[Lane], cfg: PedestriansConfig, rng: np.random.Generator
+) -> Trip | None:
     """Draw a drive that begins near a walk and lasts as long, or up to a dead end; None where no lane is near."""
     place_m = walk.polyline_m[rng.integers(len(walk.polyline_m))]
     near = [k for k, lane in enumerate(lanes) if lane.distance_m(place_m) < cfg.others_reach_m]
