@@ -19,10 +19,10 @@ import pyarrow.parquet as pq
 from cosfly.formats.captions import Language, Prompt
 from cosfly.formats.frames import frame_name
 from cosfly.formats.splits import SPLITS, Split
-from cosfly.runtime.documents import FileFormat, Record, read_model, validated
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.provenance import fingerprint
-from cosfly.runtime.store import atomic_file, write_bytes, write_model
+from cosfly.runtime.io import atomic_file, write_bytes
+from cosfly.runtime.json_io import FileFormat, Record, read_model, validated, write_model
+from cosfly.runtime.run_dir import fingerprint
 from cosfly.runtime.tables import TableRows
 from cosfly.viz.frame_views import VIEW_FILES, Pictures, View
 
@@ -94,7 +94,7 @@ class Sample(SplitMember):
 
 
 class SourceTree(Record):
-    """A playback tree that samples name frames of: its run and its fingerprint (cosfly/runtime/provenance.py)."""
+    """A playback tree that samples name frames of: its run and its fingerprint (cosfly/runtime/run_dir.py)."""
 
     run: str
     sha256: str

@@ -23,10 +23,9 @@ from cosfly.formats.captions import FIELDS, Language, Prompt, read_captions
 from cosfly.formats.frames import frame_name
 from cosfly.formats.playback import Track, read_track
 from cosfly.runtime.arrays import parse_picture
-from cosfly.runtime.documents import read_object, validated
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError, nearest
-from cosfly.runtime.files import check_stays_below
-from cosfly.runtime.store import inside
+from cosfly.runtime.io import check_stays_below, inside
+from cosfly.runtime.json_io import read_object, validated
 from cosfly.runtime.tables import TableRows, open_table, rows_of
 from cosfly.viz.frame_views import VIEW_FILES, Pictures, read_view, scaled_size
 

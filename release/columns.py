@@ -36,7 +36,7 @@ from cosfly.formats.playback import EVENTS, Track
 from cosfly.formats.weather import WeatherMode, WeatherParams
 from cosfly.geometry.axes import BODY_FROM_CAMERA
 from cosfly.runtime.escaping import published_name
-from cosfly.runtime.store import dump_json
+from cosfly.runtime.json_io import dump_json
 
 POSE = ("x_m", "y_m", "z_m", "pitch_deg", "yaw_deg", "roll_deg")
 POINT = ("x_m", "y_m", "z_m")

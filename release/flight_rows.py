@@ -17,7 +17,7 @@ from cosfly.formats.people import People
 from cosfly.formats.playback import EVENTS, Track
 from cosfly.formats.shown_captions import ShownCaption, ShownFlight
 from cosfly.geometry.axes import BODY_FROM_CAMERA, CORNER_SIGNS, rotation_matrices
-from cosfly.runtime.documents import parse_document, validated
+from cosfly.runtime.json_io import parse_document, validated
 from release.columns import BOX, COMPANY_COLUMNS, INTRINSICS, POINT, POSE, between_of, matrices_of
 
 Row = dict[str, Any]

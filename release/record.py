@@ -13,9 +13,9 @@ from cosfly.formats.coverage import Coverage
 from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile
 from cosfly.formats.inspection import TrajectoryFunnel
 from cosfly.formats.town import TownMap
-from cosfly.runtime.documents import FileFormat, read_model
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.store import sha256_bytes, write_model
+from cosfly.runtime.io import sha256_bytes
+from cosfly.runtime.json_io import FileFormat, read_model, write_model
 from release.columns import COUNTED, SPLIT_NAMES, SplitName
 
 RELEASE_FORMAT = FileFormat("cosfly.release", "3.0", "release record")

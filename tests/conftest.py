@@ -53,7 +53,7 @@ def clean_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 HOLDER = """
 import sys, time
 from pathlib import Path
-from cosfly.runtime.folder_lock import hold_folder
+from cosfly.runtime.run_dir import hold_folder
 lock = hold_folder(Path(sys.argv[1]))
 print("held", flush=True)
 time.sleep(600)

@@ -28,10 +28,10 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
-from cosfly.runtime import worker_pool
+from cosfly.runtime import pool
 from cosfly.runtime.errors import CosflyError
-from cosfly.runtime.provenance import checked_inputs, recorded_digests
-from cosfly.runtime.stage_events import EVENTS
+from cosfly.runtime.events import EVENTS
+from cosfly.runtime.run_dir import checked_inputs, recorded_digests
 from release.verify.verify import verify
 
 PACKAGES = tuple(f"/{name}/" for name in ("cosfly", "caption", "distill", "release"))
@@ -191,7 +191,7 @@ def _be_child(work: Callable[[], object], watch: _Watch, voice: int) -> None:
         os.dup2(voice, 1)
         os.dup2(voice, 2)
         sys.stdout = sys.stderr = os.fdopen(voice, "w", buffering=1, closefd=False)
-        worker_pool.multiprocessing = _Forking()  # type: ignore[assignment]
+        pool.multiprocessing = _Forking()  # type: ignore[assignment]
         watch.begin()
         work()
         code = 0

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 
 from caption.run.released import read_released
 from cosfly.formats.frames import depth_bytes
-from cosfly.runtime.files import sha256_file
+from cosfly.runtime.io import sha256_file
 from release import columns
 from release.card.numbers import compute_numbers
 from release.package.records import write_records

@@ -12,8 +12,8 @@ from cosfly.formats.playback import read_track
 from cosfly.formats.splits import Split
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.student_chat import FrameLook, Taught, write_taught
-from cosfly.runtime.provenance import fingerprint
-from cosfly.runtime.store import write_json
+from cosfly.runtime.json_io import write_json
+from cosfly.runtime.run_dir import fingerprint
 from distill.prepare import stage as prepare
 from distill.prepare.sources import RunSource
 from distill.prepare.stage import PrepareConfig

@@ -93,7 +93,7 @@ def ours(name: str) -> set[str]:
 
 
 def test_the_sources_were_found():
-    assert {"cosfly.cli", "cosfly.runtime.store", "caption", "distill", "release"} <= SOURCES.keys()
+    assert {"cosfly.cli", "cosfly.runtime.io", "caption", "distill", "release"} <= SOURCES.keys()
     assert {room(name) for name in SOURCES} == set(ROOMS)
     assert {path.name for path in (ROOT / "cosfly").glob("*.py")} == {"__init__.py", "__main__.py"}
 
@@ -154,13 +154,13 @@ READING = {
     *("open", "read_bytes", "read_text", "load", "loads", "safe_load", "full_load", "fromfile", "memmap", "imread"),
     *("imdecode", "decompress", "ParquetFile", "read_table", "read_metadata", "load_file", "genfromtxt", "loadtxt"),
 }
-GATE = tuple(
-    f"cosfly.runtime.{name}"
-    for name in ("files", "documents", "arrays", "tables", "objects", "settings_text", "geojson", "meshes")
+GATE = (
+    *(f"cosfly.runtime.{name}" for name in ("io", "json_io", "arrays", "tables", "model_json", "config")),
+    *("cosfly.formats.geojson", "cosfly.formats.meshes"),
 )
 ALLOWED_TO_READ = {
     ("cosfly.runtime.ray_engine", "loads"),  # what a worker says, as `multiprocessing` reads it from a pipe
-    ("cosfly.runtime.stage_events", "read_bytes"),  # /proc, whose files have no size
+    ("cosfly.runtime.events", "read_bytes"),  # /proc, whose files have no size
     ("cosfly.formats.png", "decompress"),  # of a picture, up to the size that its header gives
     ("cosfly.llm.protocol", "loads"),  # the reply, of a bounded size
     ("cosfly.closed_loop.policy", "loads"),  # the answer of a process that it started, of a bounded size
@@ -202,10 +202,10 @@ def test_the_rules_can_fail(monkeypatch, tmp_path):
     def put(text):  # a path of its own: what a file says is read once
         bad = tmp_path / f"bad_{len(list(tmp_path.iterdir()))}.py"
         bad.write_text(text)
-        monkeypatch.setitem(SOURCES, "cosfly.runtime.store", bad)
+        monkeypatch.setitem(SOURCES, "cosfly.runtime.journal", bad)
 
     put("import torch\nimport release.package.stage\n")
-    with pytest.raises(AssertionError, match=r"cosfly\.runtime\.store"):
+    with pytest.raises(AssertionError, match=r"cosfly\.runtime\.journal"):
         test_imports_point_one_way()
     with pytest.raises(AssertionError):
         test_heavy_packages_are_imported_where_they_are_used()

@@ -20,7 +20,7 @@ from cosfly.formats.predictions import Prediction
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.settings import InspectConfig
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.stage_folder import Failed
+from cosfly.runtime.run_dir import Failed
 from distill.inference import stage as infer
 from distill.inference.outcome import SampleOutcome, make_prediction, prediction_of
 from distill.prepare.stage import PrepareConfig, make_sample

@@ -8,7 +8,7 @@ from test_closed_loop_measures import flight
 from cosfly.closed_loop.measures import score_pursuits
 from cosfly.formats.flight_scores import SCORE, SCORE_FORMAT
 from cosfly.formats.pursuits import pursuit_file, write_pursuit
-from cosfly.runtime.store import write_model
+from cosfly.runtime.json_io import write_model
 
 GOOD, BAD = "1111111111", "1111100000"
 

@@ -6,7 +6,7 @@ from test_formats_pursuits import frame, pursuit
 
 from cosfly.closed_loop.measures import MEASURES, measure, score_pursuits
 from cosfly.formats.flight_scores import SCORE, SCORE_FORMAT, read_score
-from cosfly.runtime.store import write_model
+from cosfly.runtime.json_io import write_model
 
 
 def flight(seen="", *, walk="path_0", ended="finished", num_walk_frames=None, **columns):

@@ -14,7 +14,7 @@ from cosfly.formats.captions import read_captions
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import NothingKept
-from cosfly.runtime.runner import run_items
+from cosfly.runtime.pool import run_items
 
 STUDENT, FRAMES = "--workers 1 --student track_straight --set fly.tree=false", 5
 

@@ -17,7 +17,7 @@ from cosfly.formats.captions import Coc
 from cosfly.llm.contract import Reply
 from cosfly.llm.protocol import error_words, read_body, read_completion, read_models
 from cosfly.llm.wire import Response
-from cosfly.runtime.objects import find_object
+from cosfly.runtime.model_json import find_object
 
 GOOD = {
     "critical_components": "A pedestrian walks ahead on the pavement.",

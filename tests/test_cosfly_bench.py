@@ -8,10 +8,10 @@ from cosfly.cli import app
 from cosfly.pipeline.bench import Bench, row_of, run, stage_rows, tables
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.errors import ConfigError, ResumeError
-from cosfly.runtime.runner import Item, run_items
-from cosfly.runtime.stage_events import Event, read_events
-from cosfly.runtime.stage_folder import Manifest, Tally, read_manifest
-from cosfly.runtime.worker_pool import Watch
+from cosfly.runtime.events import Event, read_events
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Manifest, Tally, read_manifest
+from cosfly.runtime.worker import Item
 
 
 def event(at_s: float, kind: str, **fields) -> Event:

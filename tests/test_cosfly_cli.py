@@ -16,8 +16,8 @@ from cosfly.llm.client import ChatClient, EndpointConfig
 from cosfly.llm.wire import base_url
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.errors import InputError, TeacherError
-from cosfly.runtime.stage_folder import StageFolder, Tally
-from cosfly.runtime.store import write_json
+from cosfly.runtime.json_io import write_json
+from cosfly.runtime.run_dir import StageFolder, Tally
 
 
 @pytest.fixture(autouse=True)

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from cosfly.cli import app
 from cosfly.formats.frames import frame_name
 from cosfly.formats.tracks import find_tracks
-from cosfly.runtime.documents import read_json
+from cosfly.runtime.json_io import read_json
 from cosfly.studies.depth import (
     BITS,
     Study,

@@ -26,9 +26,9 @@ from cosfly.inspection.report import report_html
 from cosfly.inspection.stage import run as inspect
 from cosfly.llm.budget import BudgetConfig
 from cosfly.runtime import console as shared
-from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import LONGEST, for_markdown, for_terminal
+from cosfly.runtime.json_io import read_json
 from release.card.render import render_card
 from release.record import ReleaseRecord
 from specimens import make_playback_tree

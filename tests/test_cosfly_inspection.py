@@ -38,10 +38,9 @@ from cosfly.inspection.frames import check_others, pedestrian_region
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
 from cosfly.inspection.track import check_plan, is_shifted
-from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import NothingKept
-from cosfly.runtime.files import sha256_file
-from cosfly.runtime.store import CHECKSUMS, write_checksums, write_json
+from cosfly.runtime.io import CHECKSUMS, sha256_file, write_checksums
+from cosfly.runtime.json_io import read_json, write_json
 from release.verify.verify import verify
 from specimens import make_playback_tree
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.formats.frames import Look
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.meshes import MESHES_FILE, Meshes, MeshRef, write_meshes
+from cosfly.formats.meshes import MESHES_FILE, Mesh, Meshes, MeshRef, read_meshes, write_meshes
 from cosfly.geometry.axes import intrinsic_matrix, look_at, world_from_camera
 from cosfly.maps import cityjson
 from cosfly.maps.cityjson import CityJsonConfig, solid_mesh, top_within, triangles_of
@@ -36,7 +36,6 @@ from cosfly.render.solids import solids_of
 from cosfly.render.stage import RENDERERS, open_renderer
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.meshes import Mesh, read_meshes
 from cosfly.simplify.passes import SimplifyConfig, simplify
 
 SIZE = (320, 180)
@@ -195,10 +194,10 @@ def test_missing_linked_and_large_files_are_clear_errors(tmp_path: Path) -> None
 
 def test_a_file_may_have_so_many_triangles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trimesh.creation.icosphere(subdivisions=3).export(tmp_path / "fine.glb")
-    monkeypatch.setattr("cosfly.runtime.meshes.MOST_TRIANGLES", 500)
+    monkeypatch.setattr("cosfly.formats.meshes.MOST_TRIANGLES", 500)
     with pytest.raises(InputError, match="over the limit"):
         read_meshes(tmp_path / "fine.glb", tree=tmp_path)
-    monkeypatch.setattr("cosfly.runtime.meshes.FILE_MB", 1e-3)
+    monkeypatch.setattr("cosfly.formats.meshes.FILE_MB", 1e-3)
     with pytest.raises(InputError, match="over the limit"):
         read_meshes(tmp_path / "fine.glb", tree=tmp_path)
 

@@ -17,8 +17,8 @@ from cosfly.pedestrians.bystanders import PASS_M, bystanders_of
 from cosfly.pedestrians.lanes import lanes_of
 from cosfly.pedestrians.stage import PedestriansConfig, make_pedestrian, run, walkable_ground
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.store import dump_json
 
 PERSON, CAR = "Pedestrians", "Car"
 

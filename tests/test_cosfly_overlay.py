@@ -22,7 +22,7 @@ from cosfly.render.contract import instance_ids
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.store import read_checksums
+from cosfly.runtime.io import read_checksums
 from cosfly.viz.gallery import four_panels
 from cosfly.viz.overlay import TARGET_COLOR, Overlay, _lines
 

@@ -22,8 +22,8 @@ from cosfly.pedestrians.stage import (
     sample_start,
     walkable_ground,
 )
+from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.store import dump_json
 
 BUILDINGS, ROADS, WATER = KINDS["Buildings"], KINDS["Roads"], KINDS["Water"]
 

@@ -15,7 +15,7 @@ from cosfly.planners.compare import TrajectoriesOfPath
 from cosfly.planners.contract import ALL_PLANNERS
 from cosfly.runtime.errors import EnvironmentMissing
 from cosfly.runtime.journal import Journal
-from cosfly.runtime.stage_folder import read_item, result_of
+from cosfly.runtime.run_dir import read_item, result_of
 
 FEW = ("foresight", "track_astar", "muco", "minimum_jerk", "theta_star")
 

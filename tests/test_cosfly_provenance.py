@@ -6,13 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from cosfly.runtime import provenance
+from cosfly.runtime import run_dir
 from cosfly.runtime.config import Config
-from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import InputError, VerifyError
-from cosfly.runtime.files import sha256_file
-from cosfly.runtime.stage_folder import StageFolder, Tally
-from cosfly.runtime.store import dump_json, sha256_bytes, write_bytes, write_checksums, write_json
+from cosfly.runtime.io import sha256_bytes, sha256_file, write_bytes, write_checksums
+from cosfly.runtime.json_io import dump_json, read_json, write_json
+from cosfly.runtime.run_dir import StageFolder, Tally
 
 
 def begin(out: Path, name: str, **inputs: Path) -> StageFolder:
@@ -59,7 +58,7 @@ def inputs_of(run: Path) -> dict[str, Path]:
 
 
 def test_what_belongs_together_is_taken(run):
-    found = provenance.checked_inputs(inputs_of(run))
+    found = run_dir.checked_inputs(inputs_of(run))
     assert found["simplified"].sha256 == sha256_bytes(b"boxes")
     listed = read_json(run / "render/manifest.json")["outputs"]
     assert found["data"].sha256 == sha256_bytes(dump_json(listed).encode()), "as in the records of earlier runs"
@@ -68,13 +67,13 @@ def test_what_belongs_together_is_taken(run):
 def test_captions_of_another_tree_are_refused(run):
     other = make_tree(run / "other", "of another seed")
     with pytest.raises(VerifyError, match=r"captions\.jsonl: it was made of another input 'data'.*given: .*other"):
-        provenance.checked_inputs(inputs_of(run) | {"data": other})
+        run_dir.checked_inputs(inputs_of(run) | {"data": other})
     captions = make(run / "c2", "caption", {"captions.jsonl": "c"}, data=other) / "captions.jsonl"
     two = {"0.data": run / "render", "0.captions": run / "caption/captions.jsonl"}
     two |= {"1.data": other, "1.captions": captions}
-    provenance.checked_inputs(two)
+    run_dir.checked_inputs(two)
     with pytest.raises(VerifyError, match="another input 'data'"):
-        provenance.checked_inputs(two | {"0.captions": captions})
+        run_dir.checked_inputs(two | {"0.captions": captions})
 
 
 def test_what_was_made_of_several_trees_goes_with_each_of_them(run):
@@ -83,26 +82,26 @@ def test_what_was_made_of_several_trees_goes_with_each_of_them(run):
     trees = {"1.data": run / "render", "2.data": south}
     answers = make(run / "infer", "distill.infer", {"predictions.jsonl": "p"}, **trees) / "predictions.jsonl"
     for tree in trees.values():
-        provenance.checked_inputs({"predictions": answers, "data": tree})
+        run_dir.checked_inputs({"predictions": answers, "data": tree})
     with pytest.raises(VerifyError, match=r"another input '1\.data'.*given: .*third"):
-        provenance.checked_inputs({"predictions": answers, "data": third})
+        run_dir.checked_inputs({"predictions": answers, "data": third})
 
 
 def test_a_map_that_the_plan_was_not_made_on_is_refused(run):
     other = make(run / "s2", "simplify", {"map.json": "other boxes"}) / "map.json"
     with pytest.raises(VerifyError, match=r"traces\.json: it was made of another input 'map'"):
-        provenance.checked_inputs({"simplified": other, "traces": run / "plan/traces.json"})
+        run_dir.checked_inputs({"simplified": other, "traces": run / "plan/traces.json"})
 
 
 @pytest.mark.parametrize("name", ["manifest.json", "stage.json"])
 def test_a_stage_without_its_records_is_not_finished(run, name):
     (run / "caption" / name).unlink()
     with pytest.raises(VerifyError, match=f"not finished, or its records are gone; got no {name}"):
-        provenance.checked_inputs(inputs_of(run))
+        run_dir.checked_inputs(inputs_of(run))
     alone = run / "alone/captions.jsonl"
     alone.parent.mkdir()
     shutil.copy(run / "caption/captions.jsonl", alone)
-    provenance.checked_inputs(inputs_of(run) | {"captions": alone})
+    run_dir.checked_inputs(inputs_of(run) | {"captions": alone})
 
 
 def test_a_name_that_no_record_can_hold(tmp_path):
@@ -116,23 +115,23 @@ def test_a_name_that_no_record_can_hold(tmp_path):
 def test_records_of_others_are_not_ours(tmp_path):
     write_json(tmp_path / "manifest.json", {"name": "an app"})
     write_json(tmp_path / "map.json", [])
-    provenance.checked_inputs({"map": tmp_path / "map.json"})
+    run_dir.checked_inputs({"map": tmp_path / "map.json"})
 
 
 def test_a_tree_of_others_with_a_manifest_of_theirs_is_known_by_its_flights(tmp_path):
     write_json(tmp_path / "manifest.json", {"name": "a data set"})
     write_json(tmp_path / "flight/trajectory.json", 1)
-    before = provenance.fingerprint(tmp_path)
+    before = run_dir.fingerprint(tmp_path)
     write_json(tmp_path / "flight/trajectory.json", 2)
-    assert provenance.fingerprint(tmp_path) != before
+    assert run_dir.fingerprint(tmp_path) != before
 
 
 def test_a_folder_without_checksums_is_as_good_as_one_with_them(run):
     folder = run / "render/Town1/trajectory_1/ORI"
-    whole = provenance.folder_digests(folder)
+    whole = run_dir.folder_digests(folder)
     lines = (folder / "checksums.sha256").read_text().splitlines(keepends=True)
-    assert provenance.digest_of(whole) == sha256_file(folder / "checksums.sha256")
+    assert run_dir.digest_of(whole) == sha256_file(folder / "checksums.sha256")
     (folder / "checksums.sha256").write_text(lines[0])
-    assert provenance.folder_digests(folder) == whole, "what it leaves out is read"
+    assert run_dir.folder_digests(folder) == whole, "what it leaves out is read"
     (folder / "checksums.sha256").unlink()
-    assert provenance.folder_digests(folder) == whole
+    assert run_dir.folder_digests(folder) == whole

@@ -20,9 +20,10 @@ from cosfly.pipeline import run as pipeline
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
 from cosfly.runtime.errors import EnvironmentMissing
+from cosfly.runtime.events import LOSSES, read_events
+from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.ray_engine import ALL_ROOM, ENVIRONMENT, STORE_BYTES, RayConfig
-from cosfly.runtime.runner import Item, Watch, run_items
-from cosfly.runtime.stage_events import LOSSES, read_events
+from cosfly.runtime.worker import Item
 
 ray = pytest.importorskip("ray")
 os.environ |= ENVIRONMENT

@@ -24,13 +24,13 @@ from cosfly.formats.boxes import read_boxes
 from cosfly.formats.frames import depth_bytes, read_depth, rgb_bytes
 from cosfly.maps import cityjson
 from cosfly.maps.footprints import check_outline, num_crossings
-from cosfly.runtime import arrays, documents, files, tables
+from cosfly.runtime import arrays, json_io, tables
+from cosfly.runtime import io as files
 from cosfly.runtime.config import Config, apply_overrides, build, read_yaml
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError
-from cosfly.runtime.files import LinkedPath, read_text
+from cosfly.runtime.io import LinkedPath, inside, read_text
 from cosfly.runtime.journal import Journal
-from cosfly.runtime.stage_folder import StageFolder, read_failures
-from cosfly.runtime.store import inside
+from cosfly.runtime.run_dir import StageFolder, read_failures
 from release.record import RELEASE_FORMAT, read_record
 from specimens import make_playback_tree
 
@@ -83,15 +83,15 @@ def test_what_is_no_regular_file_is_refused_and_never_waited_for(tmp_path, monke
 )  # fmt: skip
 def test_honest_json_passes(tmp_path, text, value):
     (tmp_path / "x.json").write_bytes(text)
-    found = documents.read_json(tmp_path / "x.json")
+    found = json_io.read_json(tmp_path / "x.json")
     assert value is None or list(found.values()) == value
 
 
 def test_a_key_that_is_given_twice_in_a_file_of_ours(tmp_path):
     (tmp_path / "x.json").write_text('{"result": "rejected", "result": "accepted"}')
-    assert documents.read_json(tmp_path / "x.json") == {"result": "accepted"}
+    assert json_io.read_json(tmp_path / "x.json") == {"result": "accepted"}
     with pytest.raises(InputError, match="'result' is given twice"):
-        documents.read_json(tmp_path / "x.json", each_key_once=True)
+        json_io.read_json(tmp_path / "x.json", each_key_once=True)
 
 
 @pytest.mark.parametrize("field", ["shards", "flights", "maps"])
@@ -110,7 +110,7 @@ def test_a_list_of_empty_objects_is_refused_at_the_first(tmp_path, field):
 
 def test_more_brackets_than_a_text_of_its_size_has_are_refused_before_they_are_lists():
     with pytest.raises(ValueError, match="20,000,000 lists and objects"):
-        documents.parse_json(b"[" + b"{},[]," * 9_999_999 + b"{}]")
+        json_io.parse_json(b"[" + b"{},[]," * 9_999_999 + b"{}]")
 
 
 # --- records of stages ------------------------------------------------------------------------------------------------

@@ -49,8 +49,7 @@ from cosfly.render.stage import make_track_script, open_renderer, run
 from cosfly.render.track import Writing, render_track
 from cosfly.runtime.config import build
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing
-from cosfly.runtime.files import sha256_file
-from cosfly.runtime.store import read_checksums
+from cosfly.runtime.io import read_checksums, sha256_file
 
 LARGER = (640, 360)
 CAMERA = Camera(320, 180, intrinsic_matrix(320, 180, 90.0))

@@ -5,7 +5,7 @@ import pytest
 from cosfly.pipeline.reproduce import OF_RELEASE, MissingFile, Paper, Places, read_paper
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.journal import Journal
-from cosfly.runtime.store import write_json
+from cosfly.runtime.json_io import write_json
 from release.stats.tables import SHAPES
 
 # All labels of tables and figures in the paper.

@@ -18,7 +18,7 @@ from cosfly.formats.traces import write_traces
 from cosfly.formats.tracks import find_tracks
 from cosfly.inspection.stage import run
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import sha256_file
+from cosfly.runtime.io import sha256_file
 from release.package.sources import Source, gather
 from specimens import make_playback_tree
 

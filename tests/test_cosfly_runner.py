@@ -8,10 +8,11 @@ import pytest
 
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import EnvironmentMissing, InputError, StorageError
-from cosfly.runtime.runner import Item, Outcome, run_items
+from cosfly.runtime.json_io import dump_json
+from cosfly.runtime.pool import run_items
+from cosfly.runtime.run_dir import Failed, Kept, StageFolder
 from cosfly.runtime.seeding import draws_for, rng_for
-from cosfly.runtime.stage_folder import Failed, Kept, StageFolder
-from cosfly.runtime.store import dump_json
+from cosfly.runtime.worker import Item, Outcome
 
 
 def make_worker(log: Path):

@@ -9,13 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field
 
-from cosfly.runtime import store
+from cosfly.runtime import io as store
 from cosfly.runtime.config import Config, MayDiffer
-from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import InputError, NothingKept, ResumeError, StorageError, VerifyError
+from cosfly.runtime.io import inside, write_bytes
 from cosfly.runtime.journal import Journal
-from cosfly.runtime.stage_folder import Failed, StageFolder, Tally, read_manifest, write_failures
-from cosfly.runtime.store import inside, write_bytes, write_json
+from cosfly.runtime.json_io import read_json, write_json
+from cosfly.runtime.run_dir import Failed, StageFolder, Tally, read_manifest, write_failures
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):

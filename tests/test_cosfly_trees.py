@@ -28,10 +28,9 @@ from cosfly.formats.playback import read_track, write_track
 from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.settings import InspectConfig
-from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import InputError, VerifyError
-from cosfly.runtime.stage_folder import read_failures
-from cosfly.runtime.store import write_json
+from cosfly.runtime.json_io import read_json, write_json
+from cosfly.runtime.run_dir import read_failures
 from distill.prepare import stage as prepare
 from distill.prepare.sources import RunSource as Prepared
 from distill.prepare.stage import PrepareConfig

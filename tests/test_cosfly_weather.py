@@ -26,8 +26,8 @@ from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.render.weather import path_seed, read_pools, weather_of
 from cosfly.runtime.config import build, load, shipped
-from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import ConfigError
+from cosfly.runtime.json_io import read_json
 
 SIZE = (320, 180)
 RANDOM = {"weather_mode": "random_per_path"}

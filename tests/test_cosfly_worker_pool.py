@@ -13,12 +13,10 @@ from processes import is_running, wait_until
 from toy_workers import make_worker, stage_in
 
 from cosfly.runtime.errors import EnvironmentMissing
-from cosfly.runtime.runner import Item, Watch, run_items
-from cosfly.runtime.stage_events import (
-    LOSSES,
-    read_events,
-)
-from cosfly.runtime.stage_folder import Failed
+from cosfly.runtime.events import LOSSES, read_events
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Failed
+from cosfly.runtime.worker import Item
 
 # Stands still after 2 s, and a while before its item has taken too long, or chance would say which of them it was.
 QUICK = Watch(item_limit_s=3.2, heartbeat_s=0.1, check_s=0.4, probe_s=0.3, failed_checks=5)
@@ -73,7 +71,8 @@ import sys; sys.path.insert(0, {tests!r})
 from pathlib import Path
 from toy_workers import make_idle_worker, stage_in
 from cosfly import cli
-from cosfly.runtime.runner import Item, run_items
+from cosfly.runtime.worker import Item
+from cosfly.runtime.pool import run_items
 
 if __name__ == "__main__":
     @cli.app.command()

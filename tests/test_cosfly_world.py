@@ -12,9 +12,9 @@ from teacher_server import TeacherServer
 
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.stage import MapsConfig, load_map
-from cosfly.runtime.documents import read_json, read_model
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.stage_folder import read_manifest
+from cosfly.runtime.json_io import read_json, read_model
+from cosfly.runtime.run_dir import read_manifest
 from cosfly.worldgen.objects import OBJECTS, assets
 from cosfly.worldgen.plan import PLAN_FORMAT, NamedObject, WorldPlan
 from cosfly.worldgen.rules import plan_by_rules

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from cosfly.cli import app
 from cosfly.formats.frames import Camera
 from cosfly.geometry.axes import intrinsic_matrix
-from cosfly.runtime.stage_folder import read_manifest
+from cosfly.runtime.run_dir import read_manifest
 from cosfly.studies.zoom import enlarged_camera
 
 LEVELS = [110.0, 60.0, 30.0]

@@ -11,8 +11,9 @@ from toy_workers import stage_in
 from typer.main import get_command
 
 from cosfly.cli import app
-from cosfly.runtime.stage_folder import Tally
-from cosfly.runtime.store import atomic_folder, write_bytes, write_json
+from cosfly.runtime.io import atomic_folder, write_bytes
+from cosfly.runtime.json_io import write_json
+from cosfly.runtime.run_dir import Tally
 
 SWEEP = Path(__file__).with_name("crash_sweep.py")
 # Of the commands that need a finished run, those that are swept here.

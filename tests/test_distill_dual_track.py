@@ -12,7 +12,7 @@ from tables import each
 
 from cosfly.formats.playback import read_track
 from cosfly.formats.splits import SPLITS
-from cosfly.runtime.stage_folder import read_failures, read_manifest
+from cosfly.runtime.run_dir import read_failures, read_manifest
 from distill.prepare import dual_track
 from distill.prepare.dual_track import DualTrackConfig, TrackSample, read_track_samples, read_track_set, windows_of
 from specimens import make_playback_tree

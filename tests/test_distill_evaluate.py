@@ -18,7 +18,7 @@ from cosfly.formats.figures import draw_pedestrians
 from cosfly.formats.predictions import Prediction, read_predictions
 from cosfly.geometry.blind import LEAST_WINDOWS
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.store import dump_json
+from cosfly.runtime.json_io import dump_json
 from distill.evaluation import compare
 from distill.evaluation.bertscore import BertScoreConfig, Scorer
 from distill.evaluation.floors import Floors, coc_of, majority

@@ -19,7 +19,7 @@ from specimens_students import inputs_of, samples_of, trees_of  # noqa: E402
 
 from cosfly.llm.student_chat import TAUGHT, read_taught  # noqa: E402
 from cosfly.runtime.errors import InputError  # noqa: E402
-from cosfly.runtime.store import write_json  # noqa: E402
+from cosfly.runtime.json_io import write_json  # noqa: E402
 from distill.inference import merge  # noqa: E402
 from distill.inference.merge import MergeConfig  # noqa: E402
 from distill.student.model import Student, load_student  # noqa: E402

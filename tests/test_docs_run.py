@@ -35,10 +35,11 @@ from cosfly.formats.captions import read_captions
 from cosfly.formats.kinds import KIND_NAMES
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
-from cosfly.runtime import runner
+from cosfly.runtime import pool
 from cosfly.runtime.config import shipped
-from cosfly.runtime.runner import Item, Watch
-from cosfly.runtime.stage_folder import StageFolder
+from cosfly.runtime.pool import Watch
+from cosfly.runtime.run_dir import StageFolder
+from cosfly.runtime.worker import Item
 from distill.student.random_student import make_tiny_student
 
 # Pages in the order in which what one makes is there for the next; the last one draws the tree of all others anew.
@@ -273,14 +274,14 @@ def test_what_cannot_run_here_is_in_the_documents():
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Items are worked on in this process, since each worker takes seconds to begin; `bench` measures workers, and
     keeps them."""
-    in_processes = runner._in_processes
+    in_processes = pool._in_processes
 
     def work(stage: StageFolder, items: Sequence[Item], start: Any, workers: int, watch: Watch, progress: Any) -> Any:
         if "bench" in stage.path.parts:
             return in_processes(stage, items, start, workers, watch, progress)
-        return runner._in_this_process(items, start, progress.move)
+        return pool._in_this_process(items, start, progress.move)
 
-    monkeypatch.setattr(runner, "_in_processes", work)
+    monkeypatch.setattr(pool, "_in_processes", work)
 
 
 @pytest.fixture

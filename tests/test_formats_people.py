@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from cosfly.formats.people import COLORS, HAIR, Appearance, People, draw_appearance, look_alike
-from cosfly.runtime.documents import validated
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.json_io import validated
 
 
 def test_a_drawn_person_is_read_back_as_written():

@@ -23,8 +23,9 @@ from cosfly.formats.playback import read_track
 from cosfly.formats.roi import read_roi
 from cosfly.maps import boxfile, cityjson, simworld
 from cosfly.runtime.errors import CosflyError
-from cosfly.runtime.stage_folder import read_manifest
-from cosfly.runtime.store import CHECKSUMS, read_checksums, write_json
+from cosfly.runtime.io import CHECKSUMS, read_checksums
+from cosfly.runtime.json_io import write_json
+from cosfly.runtime.run_dir import read_manifest
 from cosfly.runtime.tables import rows_of
 from release.record import read_record
 from specimens import pack_depth

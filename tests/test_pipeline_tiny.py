@@ -18,10 +18,9 @@ from cosfly.pipeline import run as pipeline
 from cosfly.pipeline.estimate import estimate
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
-from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import ConfigError, ResumeError, VerifyError
-from cosfly.runtime.stage_folder import read_failures
-from cosfly.runtime.store import write_json
+from cosfly.runtime.json_io import read_json, write_json
+from cosfly.runtime.run_dir import read_failures
 from release.verify.verify import verify
 
 TINY = [

@@ -33,8 +33,8 @@ from cosfly.planners.styles import FOLLOW, NAMES, OTHER_SIDE, REACQUIRE, RETURN_
 from cosfly.render.camera import view_target
 from cosfly.runtime.config import load, shipped
 from cosfly.runtime.errors import NoPathError
+from cosfly.runtime.run_dir import read_manifest
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.stage_folder import read_manifest
 from cosfly.simplify.passes import simplify
 
 OPEN = kernels.obstacle_index(town_of())

@@ -33,10 +33,9 @@ from cosfly.formats.town import read_town_map
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.config import build as build_config
-from cosfly.runtime.documents import read_model
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import sha256_file
-from cosfly.runtime.store import CHECKSUMS, read_checksums
+from cosfly.runtime.io import CHECKSUMS, read_checksums, sha256_file
+from cosfly.runtime.json_io import read_model
 from release.columns import POSE
 from release.export.contract import FORMATS, ExportConfig, ExportUnit, Files, FormatFacts
 from release.export.lerobot import merged, runs_of, states, summarize, tiff_of_depth

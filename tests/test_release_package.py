@@ -24,8 +24,8 @@ from cosfly.formats.inspection import (
 )
 from cosfly.formats.playback import read_track
 from cosfly.formats.town import write_town_map
-from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.json_io import read_json
 from release.card.render import render_card
 from release.package.plan import plan_shards
 from release.package.sources import Source

@@ -20,7 +20,7 @@ from cosfly.formats.inspection import read_inspection, write_inspection
 from cosfly.formats.kinds import KINDS
 from cosfly.geometry.axes import box_iou
 from cosfly.geometry.trajectory_metrics import accel_rms, jerk_rms, length_m
-from cosfly.runtime.documents import read_json
+from cosfly.runtime.json_io import read_json
 from release.columns import POINT, POSE
 from release.record import read_record
 from release.stats.counting import Counts

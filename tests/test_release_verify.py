@@ -24,9 +24,9 @@ from specimens_release import run_here
 
 from caption.run.released import read_released
 from cosfly.formats.frames import instance_bytes
-from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.store import write_bytes
+from cosfly.runtime.io import write_bytes
+from cosfly.runtime.json_io import read_json
 from release.columns import INTRINSICS
 from release.export.contract import ExportConfig
 from release.export.stage import run as export

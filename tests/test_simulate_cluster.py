@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosfly.runtime.stage_events import EventLog
+from cosfly.runtime.events import EventLog
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 import simulate_cluster as simulation

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import RenderError
-from cosfly.runtime.runner import Item, Outcome, advance
-from cosfly.runtime.stage_folder import StageFolder
-from cosfly.runtime.store import atomic_folder
+from cosfly.runtime.io import atomic_folder
+from cosfly.runtime.run_dir import StageFolder
+from cosfly.runtime.worker import Item, Outcome, advance
 
 
 def stage_in(path: Path) -> StageFolder:

@@ -31,7 +31,7 @@ from cosfly.llm.budget import BudgetSpent
 from cosfly.llm.contract import NoAnswer, Troubles
 from cosfly.runtime.console import SECONDS_BETWEEN_LINES
 from cosfly.runtime.errors import CosflyError, InputError, TeacherError
-from cosfly.runtime.stage_folder import Failed, StageFolder, Tally, read_failures, write_failures
+from cosfly.runtime.run_dir import Failed, StageFolder, Tally, read_failures, write_failures
 
 log = logging.getLogger(__name__)
 

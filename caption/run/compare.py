@@ -29,7 +29,8 @@ from cosfly.llm.answers import AnswerBook
 from cosfly.llm.contract import NoAnswer
 from cosfly.llm.interrupts import run_until_interrupted
 from cosfly.runtime.errors import ConfigError, InputError
-from cosfly.runtime.store import refuse_links, write_json
+from cosfly.runtime.io import refuse_links
+from cosfly.runtime.json_io import write_json
 
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 RESULT = "compare_strategies.json"

@@ -24,7 +24,7 @@ from cosfly.formats.places import flight_of
 from cosfly.llm.answers import AnswerBook
 from cosfly.llm.interrupts import run_until_interrupted
 from cosfly.runtime.errors import ConfigError, InputError, TeacherError
-from cosfly.runtime.stage_folder import Resume
+from cosfly.runtime.run_dir import Resume
 
 TRIAL_WINDOWS = 6
 

@@ -11,8 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.captions import Caption, TeacherRecord, Usage
-from cosfly.runtime.stage_folder import Tally
-from cosfly.runtime.store import sha256_bytes
+from cosfly.runtime.io import sha256_bytes
+from cosfly.runtime.run_dir import Tally
 
 NUM_CARDS = 24
 # Fields of the report that count captions by a word.

@@ -14,8 +14,7 @@ from cosfly.formats.frames import frame_name
 from cosfly.formats.places import flight_of
 from cosfly.formats.sentences import sentences_of
 from cosfly.llm.budget import BudgetConfig
-from cosfly.runtime.files import read_text
-from cosfly.runtime.store import write_bytes
+from cosfly.runtime.io import read_text, write_bytes
 from cosfly.viz.frame_views import thumbnail
 from cosfly.viz.page import page, run_name
 

@@ -31,9 +31,10 @@ from cosfly.formats.places import flight_of
 from cosfly.llm.interrupts import run_until_interrupted
 from cosfly.llm.student_chat import student_files
 from cosfly.runtime.errors import ConfigError, ResumeError, TeacherError
-from cosfly.runtime.runner import Item, Outcome, Watch, Work, advance, run_items
-from cosfly.runtime.stage_folder import Resume, StageFolder, Tally, read_manifest
-from cosfly.runtime.store import write_json
+from cosfly.runtime.json_io import write_json
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Resume, StageFolder, Tally, read_manifest
+from cosfly.runtime.worker import Item, Outcome, Work, advance
 
 log = logging.getLogger(__name__)
 

@@ -36,8 +36,8 @@ from cosfly.formats.captions import (
 )
 from cosfly.llm.contract import NoAnswer, Reply
 from cosfly.runtime.errors import InputError, RenderError
-from cosfly.runtime.objects import CONTEXT_FULL
-from cosfly.runtime.store import dump_json
+from cosfly.runtime.json_io import dump_json
+from cosfly.runtime.model_json import CONTEXT_FULL
 
 MAX_COMPLAINTS = 8  # named at once
 

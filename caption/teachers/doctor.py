@@ -32,8 +32,8 @@ from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import Reply
 from cosfly.llm.protocol import read_body, request_body, response_format, thoughts_of
 from cosfly.llm.refusals import MEANINGS, Refusal
-from cosfly.runtime.documents import parse_json
 from cosfly.runtime.errors import TeacherError
+from cosfly.runtime.json_io import parse_json
 from cosfly.viz.frame_views import VIEW_FILES
 
 State = Literal["ok", "warning", "unusable"]

@@ -16,9 +16,8 @@ from caption.writing.contract import Draft
 from cosfly.formats.captions import Coc, Language, TeacherRecord, TeacherSettings, Writing
 from cosfly.formats.predictions import FAILED, Prediction, read_predictions
 from cosfly.llm.contract import NoAnswer, Reply
-from cosfly.runtime.documents import Record, model_lines
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.store import dump_json
+from cosfly.runtime.json_io import Record, dump_json, model_lines
 
 NOT_IN_FILE = "not_in_file"
 

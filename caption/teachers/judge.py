@@ -25,11 +25,10 @@ from cosfly.llm.answers import AnswerBook, KeptAnswers
 from cosfly.llm.budget import Budget
 from cosfly.llm.client import ChatClient, EndpointConfig
 from cosfly.llm.contract import NoAnswer, Request, Troubles, started
-from cosfly.runtime.documents import Record, parse_document, validated
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import read_unpacked
-from cosfly.runtime.objects import find_object
-from cosfly.runtime.store import dump_json
+from cosfly.runtime.io import read_unpacked
+from cosfly.runtime.json_io import Record, dump_json, parse_document, validated
+from cosfly.runtime.model_json import find_object
 
 GOLD = Path(__file__).with_name("gold.jsonl.gz")
 

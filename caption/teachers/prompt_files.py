@@ -16,8 +16,7 @@ from caption.schema import CaptionConfig
 from caption.truth.vocabulary import Vocabulary
 from cosfly.formats.captions import OWN_PROMPTS
 from cosfly.runtime.errors import ConfigError, InputError, nearest
-from cosfly.runtime.files import read_text
-from cosfly.runtime.store import refuse_links, storage_errors, write_bytes
+from cosfly.runtime.io import read_text, refuse_links, storage_errors, write_bytes
 
 log = logging.getLogger(__name__)
 

@@ -19,7 +19,8 @@ from caption.writing.contract import Draft, WayOfWriting, way_of
 from cosfly.formats.actions import ACTIONS, TOKENS
 from cosfly.formats.captions import GOAL_WORDS, PICTURES_MARK, Language, Prompt, Writing
 from cosfly.formats.segments import MISSION_KINDS
-from cosfly.runtime.store import dump_json, sha256_bytes
+from cosfly.runtime.io import sha256_bytes
+from cosfly.runtime.json_io import dump_json
 from cosfly.viz.frame_views import Pictures, frame_label
 
 MAX_RETURNED_CHARACTERS = 6000  # of a refused answer, when it is shown to who wrote it

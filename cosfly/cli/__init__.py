@@ -99,7 +99,7 @@ def main() -> None:
             _fail(f"{ENDED[code]}; finished work is kept: run the same command again to continue", code)
         _end(code)
     except OSError as error:
-        from cosfly.runtime.store import DISK_FULL
+        from cosfly.runtime.io import DISK_FULL
 
         if error.filename is not None or error.errno not in DISK_FULL:
             raise

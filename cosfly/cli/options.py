@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
     from cosfly.pipeline.settings import RunConfig
-    from cosfly.runtime.stage_folder import Resume, Tally
+    from cosfly.runtime.run_dir import Resume, Tally
 
 log = logging.getLogger(__name__)
 
@@ -120,7 +120,7 @@ class Job:
 
     def finish(self, product: Path, out: Path) -> None:
         """Name a stage's product. Too much that failed is an error: whoever calls the next stage must know."""
-        from cosfly.runtime.stage_folder import read_manifest
+        from cosfly.runtime.run_dir import read_manifest
 
         typer.echo(product)
         self.check_failures({out.name: read_manifest(out).counts}, out / "failures.jsonl")
@@ -213,7 +213,7 @@ def resolve(config: Path | None, overrides: list[str] | None, given: Mapping[str
     """Resolve the settings: defaults, file, --set, then `given`: what options say of single settings."""
     from cosfly.pipeline.settings import RunConfig
     from cosfly.runtime.config import config_file, load
-    from cosfly.runtime.store import dump_json
+    from cosfly.runtime.json_io import dump_json
 
     # As YAML, which JSON is: a colon in a text is only a colon.
     extra = [f"{name}={dump_json(str(value) if isinstance(value, Path) else value)}" for name, value in given.items()]

@@ -81,7 +81,7 @@ def release_verify(
     """Check that a release is what its records say and can be true, from cheap to dear. Exit 1 if anything is wrong."""
     from caption.run.released import read_released
     from cosfly.pipeline.settings import worker_options
-    from cosfly.runtime.store import write_json
+    from cosfly.runtime.json_io import write_json
     from release.verify.verify import LEVELS, verify
 
     if level not in LEVELS:

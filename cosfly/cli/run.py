@@ -96,7 +96,7 @@ def show(run: Annotated[Path, Argument(metavar="RUN", help="A run folder.")]) ->
     from cosfly.pipeline.estimate import in_words as size
     from cosfly.pipeline.runs import look
     from cosfly.runtime.console import answer_console
-    from cosfly.runtime.store import dump_json
+    from cosfly.runtime.json_io import dump_json
 
     seen = look(run)
     at_work = ", at work now" if seen.is_at_work else ""

@@ -245,7 +245,7 @@ def render(
     from cosfly.render import stage
     from cosfly.render.settings import RenderConfig
     from cosfly.runtime.config import build
-    from cosfly.runtime.store import inside
+    from cosfly.runtime.io import inside
     from cosfly.viz.gallery import preview_gif
 
     wanted = {"rgb": require_rgb, "depth": require_depth}

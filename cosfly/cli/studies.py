@@ -81,7 +81,7 @@ def study_zoom(
     """The same flights at every level of zoom: target size, visibility, track quality; optical against digital zoom."""
     from cosfly.runtime.config import build
     from cosfly.runtime.console import console
-    from cosfly.runtime.documents import read_object
+    from cosfly.runtime.json_io import read_object
     from cosfly.studies import zoom
 
     given = {name: value for name, value in (("num_flights", flights), ("every", every)) if value is not None}

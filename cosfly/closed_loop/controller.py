@@ -19,8 +19,8 @@ from cosfly.formats.motion import in_axes_of
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.geometry.axes import look_at, wrap_deg
 from cosfly.runtime.config import Config, build, read_yaml
-from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import ConfigError
+from cosfly.runtime.json_io import FileFormat
 
 CONTROLLER_FORMAT = FileFormat("cosfly.controller", "1.0", "controller")
 AIM_MOST_M = 100.0  # a camera that looks at the horizon has no place ahead

@@ -28,11 +28,11 @@ from cosfly.formats.playback import read_track
 from cosfly.formats.pursuits import Pursuit, pursuit_file, read_pursuit
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.config import Config
-from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.io import sha256_bytes, write_bytes
+from cosfly.runtime.json_io import FileFormat, write_model
+from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
-from cosfly.runtime.store import sha256_bytes, write_bytes, write_model
 from cosfly.viz.frame_views import thumbnail
 from cosfly.viz.page import page
 from distill.evaluation.pages import COLORS, STYLE, bars, shown_as

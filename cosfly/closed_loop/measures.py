@@ -20,8 +20,9 @@ from cosfly.formats.flight_scores import FlightScore, Score
 from cosfly.formats.pursuits import Pursuit
 from cosfly.geometry.trajectory_metrics import RELAXED_SAFETY_M, derivative_rms
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.io import sha256_bytes
+from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.store import dump_json, sha256_bytes
 
 LOSS_S = 2.0  # unseen for so long the person is lost; for less it is hidden by a tree or a lamp
 BAND_M = (5.0, 40.0)  # over ground: a quarter and twice of what plans keep (plan.behind_distance_m)

@@ -35,9 +35,9 @@ from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_on
 from cosfly.render import stage as rendering
 from cosfly.runtime.errors import ConfigError, InputError, NoPathError
-from cosfly.runtime.provenance import read_stage_record
-from cosfly.runtime.runner import Item, Outcome, Watch, Work, advance, run_items
-from cosfly.runtime.stage_folder import Resume, StageFolder, flattened
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Resume, StageFolder, flattened, read_stage_record
+from cosfly.runtime.worker import Item, Outcome, Work, advance
 
 CAPTIONS = "caption"
 

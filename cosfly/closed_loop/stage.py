@@ -38,10 +38,11 @@ from cosfly.render import stage as rendering
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError
-from cosfly.runtime.files import sha256_file
-from cosfly.runtime.runner import Item, Outcome, Watch, Work, advance, run_items
-from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
-from cosfly.runtime.store import write_model
+from cosfly.runtime.io import sha256_file
+from cosfly.runtime.json_io import write_model
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Resume, StageFolder, Tally
+from cosfly.runtime.worker import Item, Outcome, Work, advance
 from distill.inference.stage import InferConfig
 
 log = logging.getLogger(__name__)

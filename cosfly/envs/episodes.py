@@ -28,10 +28,10 @@ from cosfly.planners.reacquire import first_loss, screens_of
 from cosfly.planners.stage import plan_trajectory
 from cosfly.planners.styles import REACQUIRE
 from cosfly.render.settings import RenderConfig
-from cosfly.runtime.documents import FileFormat, Record, read_model
 from cosfly.runtime.errors import InputError, NoPathError, nearest
+from cosfly.runtime.io import sha256_bytes
+from cosfly.runtime.json_io import FileFormat, Record, dump_json, read_model
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.store import dump_json, sha256_bytes
 from cosfly.simplify.passes import SimplifyConfig, simplify
 
 EPISODES_FILE = Path(__file__).with_name("episodes.json")

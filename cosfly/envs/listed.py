@@ -21,8 +21,9 @@ from cosfly.envs.episodes import (
     world_of,
 )
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.runtime.stage_folder import Resume, StageFolder
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Resume, StageFolder
+from cosfly.runtime.worker import Item, Outcome, Work
 
 
 class ListConfig(ClosedLoopConfig):

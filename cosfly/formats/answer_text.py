@@ -10,7 +10,7 @@ from typing import Any
 
 from cosfly.formats.actions import BY_LETTERS, TOKENS
 from cosfly.formats.captions import FIELDS, Coc, Language
-from cosfly.runtime.objects import find_object
+from cosfly.runtime.model_json import find_object
 
 _DECISION = re.compile(
     r"""[\s"'`*_<\[({“”‘’「『【《]*(?:[0-9]{1,2}[.)]\s*)?"""
@@ -90,7 +90,7 @@ def parse_answer(
     """Check the structure of a raw answer (phase 3 of sec:appendix_e).
 
     What stands round the answer's object, and what differs from JSON in punctuation alone, is taken off and named in
-    `recovered` (cosfly/runtime/objects.py), as are raw control characters inside strings. Anything else is a failure
+    `recovered` (cosfly/runtime/model_json.py), as are raw control characters inside strings. Anything else is a failure
     with a reason word.
 
     Args:

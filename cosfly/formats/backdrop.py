@@ -11,8 +11,8 @@ from pydantic import Field
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.columns import LARGEST
 from cosfly.runtime.arrays import read_picture
-from cosfly.runtime.documents import FileFormat, Record, read_model
-from cosfly.runtime.store import write_bytes, write_model
+from cosfly.runtime.io import write_bytes
+from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 
 FORMAT = FileFormat("cosfly.backdrop", "1.0", "world frame of a picture")
 

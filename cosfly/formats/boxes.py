@@ -17,9 +17,9 @@ from cosfly.formats.ground import Ground, GroundGrid
 from cosfly.formats.kinds import GROUND_KINDS, KIND_COLORS, KIND_NAMES, KINDS
 from cosfly.formats.meshes import Meshes, MeshRef
 from cosfly.geometry.axes import axis_aligned_half_extents
-from cosfly.runtime.documents import MISSING, FileFormat, check_schema, read_json, validated
 from cosfly.runtime.errors import InputError, nearest
-from cosfly.runtime.store import dump_json, write_bytes
+from cosfly.runtime.io import write_bytes
+from cosfly.runtime.json_io import MISSING, FileFormat, check_schema, dump_json, read_json, validated
 
 BOXES_FORMAT = FileFormat("cosfly.boxes_3d", "1.0", "map")
 MAP_MB = 4_096  # 15 million boxes; ten million took 2.7 GB as they are written

@@ -11,8 +11,8 @@ import numpy as np
 from cosfly.formats.columns import column, read_items, records, rounded, text_id, write_items
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
-from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.json_io import FileFormat
 
 OTHERS_FILE = "others.json"
 OTHERS_FORMAT = FileFormat("cosfly.others", "1.0", "others")

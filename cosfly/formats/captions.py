@@ -14,8 +14,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from cosfly.runtime.documents import Record, model_lines
-from cosfly.runtime.store import atomic_file
+from cosfly.runtime.io import atomic_file
+from cosfly.runtime.json_io import Record, model_lines
 
 FIELDS = ("critical_components", "reasoning_trace", "flight_decision")
 Language = Literal["en", "zh"]

@@ -9,9 +9,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from cosfly.geometry.axes import step_s
-from cosfly.runtime.documents import MISSING, FileFormat, check_schema, read_json
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.store import write_json
+from cosfly.runtime.json_io import MISSING, FileFormat, check_schema, read_json, write_json
 
 Item = TypeVar("Item")
 

@@ -18,7 +18,7 @@ from pydantic import Field, field_validator
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.formats.playback import Track
 from cosfly.formats.weather import preset_token
-from cosfly.runtime.documents import Record, read_json, validated
+from cosfly.runtime.json_io import Record, read_json, validated
 
 DEFAULT = Path(__file__).with_name("default_coverage.json")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosfly.runtime.documents import Record
+from cosfly.runtime.json_io import Record
 
 
 class Figure(Record):

@@ -14,7 +14,7 @@ from pydantic import Field, FiniteFloat, NonNegativeInt, model_validator
 
 from cosfly.formats.figures import Figure
 from cosfly.formats.pursuits import Answer, Ended
-from cosfly.runtime.documents import FileFormat, Record, read_model
+from cosfly.runtime.json_io import FileFormat, Record, read_model
 
 SCORE, SCORE_FORMAT = "score.json", FileFormat("cosfly.score", "1.0", "score")
 

@@ -27,10 +27,9 @@ from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry.axes import mirror_positions, mirror_rotations, world_from_camera
 from cosfly.runtime.arrays import PNG_SIGNATURE, parse_array_header, read_array, read_picture
 from cosfly.runtime.config import Config
-from cosfly.runtime.documents import FileFormat, Record, read_model
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import read_bytes
-from cosfly.runtime.store import dump_json
+from cosfly.runtime.io import read_bytes
+from cosfly.runtime.json_io import FileFormat, Record, dump_json, read_model
 
 FRAMES_DIR = "frames_playback"
 FrameFile = Literal["rgb", "depth", "instance"]

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from cosfly.formats.columns import LARGEST
-from cosfly.runtime.documents import Record
+from cosfly.runtime.json_io import Record
 
 Height = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 

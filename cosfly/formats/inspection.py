@@ -11,9 +11,8 @@ from pydantic import Field, FiniteFloat
 from cosfly.formats.coverage import Coverage
 from cosfly.formats.issues import Issue
 from cosfly.formats.playback import ORIGINAL
-from cosfly.runtime.documents import FileFormat, Record, read_model
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.store import write_model
+from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 
 INSPECT_FORMAT = FileFormat("cosfly.inspect", "1.0", "inspection")
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from cosfly.runtime.documents import Record
 from cosfly.runtime.escaping import cut, for_terminal
+from cosfly.runtime.json_io import Record
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")

@@ -1,31 +1,216 @@
-"""`meshes.glb` beside a map, and which of its boxes are drawn as meshes; planners and visibility know boxes alone."""
+"""Meshes: glTF 2.0 (.glb, .gltf) and Wavefront OBJ (.obj) read through trimesh, and `meshes.glb` next to a map.
+
+Triangles and plain colours, no textures. +y is up in glTF and becomes +z; an OBJ is read as it is, z up. trimesh is given
+bytes only: files that a mesh names are read here, from below its folder, and counts are bounded before they are loaded.
+Planners and visibility use boxes only.
+"""
 
 from __future__ import annotations
 
+import base64
+import functools
+import io
 import json
+import re
 import struct
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Literal
+from typing import Any, Literal
+from urllib.parse import unquote
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.meshes import (
-    BINARY_CHUNK,
-    GLB_MAGIC,
-    JSON_CHUNK,
-    MOST_TRIANGLES,
-    SUFFIXES,
-    TRIANGLES,
-    Z_UP,
-    Mesh,
-    joined,
-    read_meshes,
-    too_many,
-)
-from cosfly.runtime.store import write_bytes
+from cosfly.runtime.io import MB, decoded, over_limit, read_bytes, write_bytes
+from cosfly.runtime.json_io import parse_document
+
+MOST_TRIANGLES = 2_000_000  # of a file, and of all that a map draws
+FILE_MB = MOST_TRIANGLES * 256 / MB  # an OBJ takes some 100 bytes for a triangle
+MOST_NUMBERS = 12 * MOST_TRIANGLES  # of vertices, colours and indices; three of each are usual for a triangle
+SUFFIXES = (".glb", ".gltf", ".obj")
+Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # from glTF's axes
+GLB_MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
+TRIANGLES, STRIP = 4, 5  # modes; points and lines have no surface
+DISPLAY_GAMMA = 2.2  # an OBJ's colours are those of a screen
+LARGEST_M = 1e7
+# What trimesh raises on a file that contradicts itself.
+NOT_READ = (ValueError, LookupError, TypeError, AttributeError, AssertionError, ArithmeticError, NotImplementedError)
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles, k of them: corners_m (k, 3, 3) float64, z up, counter-clockwise from outside; colors (k, 3) linear
+    RGB, NaN where the file has none.
+    """
+
+    corners_m: np.ndarray
+    colors: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.corners_m)
+
+
+def joined(meshes: list[Mesh]) -> Mesh:
+    """Return all of some meshes, at least one, as one."""
+    return Mesh(np.concatenate([m.corners_m for m in meshes]), np.concatenate([m.colors for m in meshes]))
+
+
+def too_many(where: object, num_triangles: int) -> InputError:
+    """Return the error of a mesh or a map with too many triangles."""
+    return over_limit(where, f"{num_triangles:,} triangles", f"{MOST_TRIANGLES:,}", "simplify the meshes")
+
+
+@dataclass(frozen=True)
+class _Folder:
+    """The folder of a mesh. As trimesh's resolver, it gives materials without pictures."""
+
+    path: Path
+    tree: Path
+
+    def read(self, name: str) -> bytes:
+        inner = PurePosixPath(unquote(name))
+        if inner.is_absolute() or ".." in inner.parts or "\\" in name or ":" in name or "\0" in name or not inner.parts:
+            what = "the mesh names a file outside of its folder"
+            raise InputError(what, where=self.path, got=name[:80], expected="a name below it")
+        where = self.path.parent / inner
+        return read_bytes(where, what=f"file that {self.path.name} names", tree=self.tree, most_mb=FILE_MB)
+
+    def __getitem__(self, name: str) -> bytes:
+        return re.sub(rb"(?im)^\s*map_kd\b", b"pictured", self.read(name))
+
+
+def read_meshes(path: Path, *, tree: Path) -> dict[str, Mesh]:
+    """Read a file of meshes, node by node; an OBJ is one node.
+
+    Args:
+        tree: the folder that neither the file nor what it names may lie outside of.
+    """
+    data = read_bytes(path, what="mesh", tree=tree, most_mb=FILE_MB)
+    readers = {".glb": _read_glb, ".gltf": _read_gltf, ".obj": _read_obj}
+    if path.suffix.lower() not in readers:
+        raise InputError("unknown kind of mesh", where=path, got=path.suffix, expected=", ".join(SUFFIXES))
+    try:
+        found = readers[path.suffix.lower()](data, _Folder(path, tree))
+    except NOT_READ as error:
+        raise InputError("the mesh is malformed", where=path, got=f"{type(error).__name__}: {error}"[:120]) from None
+    if not any(map(len, found.values())):
+        raise InputError("the mesh has no triangles", where=path)
+    if not all((np.abs(mesh.corners_m) <= LARGEST_M).all() for mesh in found.values()):  # NaN is not
+        raise InputError("a vertex is not finite or too far off", where=path, expected=f"within {LARGEST_M:g} m")
+    return found
+
+
+def _read_glb(data: bytes, folder: _Folder) -> dict[str, Mesh]:
+    if struct.unpack_from("<II", data.ljust(20)) != (GLB_MAGIC, 2):
+        raise InputError("not a binary glTF 2.0", where=folder.path)
+    chunks, at = dict[int, bytes](), 12
+    while at + 8 <= len(data):
+        size, kind = struct.unpack_from("<II", data, at)
+        chunks.setdefault(kind, data[at + 8 : at + 8 + size])
+        at += 8 + size
+    if at > len(data):
+        raise InputError("the mesh is cut short", where=folder.path, got=f"{len(data)} bytes", expected=f"{at}")
+    return _read_gltf(chunks[JSON_CHUNK], folder, chunks.get(BINARY_CHUNK, b""))
+
+
+def _read_gltf(data: bytes, folder: _Folder, binary: bytes = b"") -> dict[str, Mesh]:
+    """Let trimesh place the primitives, each a mesh of its own, of a document without what is not drawn."""
+    document = parse_document(data, folder.path, what="mesh")
+    accessors, views = document.get("accessors", []), document.get("bufferViews", [])
+    if document.get("extensionsRequired") or any("sparse" in a or "bufferView" not in a for a in accessors):
+        raise InputError("the mesh needs an extension or sparse numbers", where=folder.path, expected="plain glTF 2.0")
+    nodes, owners = [dict(node) for node in document.get("nodes", ())], list[tuple[int, dict]]()
+    inner = [child for node in nodes for child in node.get("children", ())]
+    every = sorted(set(range(len(nodes))) - set(inner))
+    roots = document["scenes"][document.get("scene", 0)].get("nodes", []) if "scenes" in document else every
+    if len({*inner, *roots}) < len(inner) + len(roots):  # also a cycle
+        raise InputError("a node of the mesh has two parents", where=folder.path)
+    for k, node in enumerate(list(nodes)):
+        pieces = document["meshes"][node.pop("mesh")]["primitives"] if "mesh" in node else ()
+        for piece in (one for one in pieces if one.get("mode", TRIANGLES) >= TRIANGLES):
+            node["children"] = [*node.get("children", ()), len(nodes)]
+            nodes.append({"mesh": len(owners)})
+            owners.append((k, piece))
+    drawn = [{key: piece[key] for key in ("mode", "indices") if key in piece} for _, piece in owners]
+    for flat, (_, piece) in zip(drawn, owners, strict=True):
+        kept = {name: k for name, k in piece["attributes"].items() if name in ("POSITION", "COLOR_0")}
+        flat["attributes"] = kept
+        if flat.get("mode", TRIANGLES) > STRIP:
+            raise InputError("a fan of triangles", where=folder.path, expected="triangles, or strips of them")
+    used = [k for flat in drawn for k in (*flat["attributes"].values(), flat.get("indices")) if k is not None]
+    counts = [*(accessors[k]["count"] for k in used), *(view["byteLength"] for view in views)]
+    if min(counts, default=0) < 0 or sum(counts) > MOST_NUMBERS + FILE_MB * MB:
+        raise InputError("the mesh counts more numbers than it may", where=folder.path, got=f"{sum(counts):,}")
+    read = functools.cache(lambda uri: _buffer(uri, binary, folder))  # each once, however many name it
+    buffers = {str(k): read(b.get("uri")) for k, b in enumerate(document.get("buffers", ()))}
+    flat_document = {
+        "asset": {"version": "2.0"}, "scenes": [{"nodes": roots}], "accessors": accessors, "bufferViews": views,
+        "nodes": [{key: v for key, v in n.items() if key != "name"} | {"name": str(k)} for k, n in enumerate(nodes)],
+        "meshes": [{"name": str(k), "primitives": [flat]} for k, flat in enumerate(drawn)],
+        "buffers": [{"uri": name} for name in buffers],
+    }  # fmt: skip
+    scene = _scene(json.dumps(flat_document).encode(), "gltf", buffers, folder, skip_materials=True)
+    found: dict[str, list[Mesh]] = {}
+    placed = [scene.graph[name] for name in scene.graph.nodes_geometry]
+    for number, world in sorted((int(str(key)), world) for world, key in placed):
+        k, piece = owners[number]
+        mesh = _placed(scene.geometry[str(number)], world, _color(piece, document))
+        found.setdefault(str(document["nodes"][k].get("name", f"node_{k}")), []).append(mesh)
+    return {name: joined(meshes) for name, meshes in found.items()}
+
+
+def _buffer(uri: str | None, binary: bytes, folder: _Folder) -> bytes:
+    if uri is None:
+        return binary
+    return base64.b64decode(uri.partition(",")[2]) if uri.startswith("data:") else folder.read(uri)
+
+
+def _scene(data: bytes, file_type: str, resolver: Any, folder: _Folder, **options: Any) -> Any:
+    import trimesh
+
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=file_type, resolver=resolver, **options)
+    num_triangles = sum(len(getattr(shape, "faces", ())) for shape in scene.geometry.values())
+    if num_triangles > MOST_TRIANGLES:
+        raise too_many(folder.path, num_triangles)
+    return scene
+
+
+def _color(piece: dict, document: dict) -> np.ndarray:
+    """Return the plain colour of a primitive, linear RGB; NaN where it has none or a picture has it."""
+    material = document["materials"][piece["material"]] if "material" in piece else {}
+    surface = material.get("pbrMetallicRoughness", {})
+    is_plain = "baseColorFactor" in surface and "baseColorTexture" not in surface
+    return np.array(surface["baseColorFactor"] if is_plain else [np.nan] * 4, np.float64).reshape(4)[:3]
+
+
+def _placed(shape: Any, world: np.ndarray, color: np.ndarray) -> Mesh:
+    """Return a mesh of trimesh's at the place of its node."""
+    corners = (shape.vertices[shape.faces] @ world[:3, :3].T + world[:3, 3]) @ Z_UP.T
+    colors = np.tile(color, (len(corners), 1))
+    if shape.visual.kind == "vertex":
+        painted = np.asarray(shape.visual.vertex_colors)[shape.faces][..., :3].mean(axis=1) / 255
+        colors = np.where(np.isnan(colors), 1.0, colors) * painted
+    mirrored = np.linalg.det(world[:3, :3]) < 0
+    return Mesh(corners[:, ::-1] if mirrored else corners, np.clip(colors, 0.0, 1.0))
+
+
+def _read_obj(data: bytes, folder: _Folder) -> dict[str, Mesh]:
+    """Read an OBJ; of its materials the diffuse colours (`Kd`) of those without a picture."""
+    if re.search(r"(?m)^[ \t]*f[ \t].*-", text := decoded(data, folder.path)):
+        what, expected = "the mesh counts vertices from the end", "indices from 1"
+        raise InputError(what, where=folder.path, expected=expected)
+    for name in re.findall(r"(?m)^[ \t]*mtllib[ \t]+(.*)$", text):
+        folder.read(name.strip())  # trimesh would pass over what cannot be read
+    scene, found = _scene(text.encode(), "obj", folder, folder, process=False), list[Mesh]()
+    for shape in scene.geometry.values():
+        told = getattr(getattr(shape.visual, "material", None), "kwargs", {})
+        is_plain = "kd" in told and "pictured" not in told
+        color = np.clip(told["kd"], 0.0, 1.0) ** DISPLAY_GAMMA if is_plain else np.full(3, np.nan)
+        corners = shape.vertices[getattr(shape, "faces", np.zeros((0, 3), int))]
+        found.append(Mesh(corners, np.tile(np.reshape(color, 3), (len(corners), 1))))
+    return {"mesh": joined(found)} if found else {}
+
 
 MESHES_FILE = "meshes.glb"
 FLOAT, ARRAY_BUFFER = 5126, 34962

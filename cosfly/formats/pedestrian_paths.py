@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from cosfly.formats.columns import column, matrix, read_items, rounded, step_field, text_id, write_items
-from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.json_io import FileFormat
 from cosfly.runtime.seeding import draw_to_quota, rng_for
 
 # The tracked person: an axis-aligned box round the hip point, which is the target's position everywhere.

@@ -20,7 +20,7 @@ from pydantic import Field
 
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import is_below, real_path
+from cosfly.runtime.io import is_below, real_path
 
 TOWN = "Town"  # what the name of a town's folder begins with
 

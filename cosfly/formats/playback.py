@@ -52,10 +52,9 @@ from cosfly.formats.trajectory import (
 )
 from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry.axes import mirror_positions, mirror_rotations
-from cosfly.runtime.documents import read_json, validated
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import read_bytes
-from cosfly.runtime.store import write_json
+from cosfly.runtime.io import read_bytes
+from cosfly.runtime.json_io import read_json, validated, write_json
 
 ORIGINAL = "ORI"  # the folder of a clean flight
 TARGET_FILE = "target.png"  # of a flight: the person of its goal, cut out of the frame that this is true of

@@ -7,8 +7,8 @@ from typing import Literal
 
 from cosfly.formats.captions import Coc, Language
 from cosfly.formats.splits import Split
-from cosfly.runtime.documents import Record, model_lines
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.json_io import Record, model_lines
 
 PREDICTIONS = "predictions.jsonl"
 FAILED = "failed_"  # what the reason of a prediction begins with that could not be made

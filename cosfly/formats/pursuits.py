@@ -13,8 +13,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, FiniteFloat, NonNegativeInt, model_validator
 
 from cosfly.formats.motion import ACTION
-from cosfly.runtime.documents import FileFormat, Record, read_model
-from cosfly.runtime.store import write_model
+from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 
 PURSUITS = "pursuits"  # the folder of them in what `cosfly fly` writes
 PURSUIT_FORMAT = FileFormat("cosfly.pursuit", "1.0", "pursuit")

@@ -17,10 +17,10 @@ from typing import Literal
 from pydantic import Field
 
 from cosfly.formats.inspection import Inspection, TrackInspection, count_trajectories, read_inspection
-from cosfly.runtime.documents import Record
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import sha256_file
+from cosfly.runtime.io import sha256_file
 from cosfly.runtime.journal import Journal
+from cosfly.runtime.json_io import Record
 
 log = logging.getLogger(__name__)
 

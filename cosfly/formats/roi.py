@@ -13,11 +13,10 @@ from shapely.geometry.base import BaseGeometry
 
 from cosfly.formats.boxes import AXES, BoxMap
 from cosfly.formats.columns import numbers
-from cosfly.runtime.documents import parse_document, validated
+from cosfly.formats.geojson import Feature, features_of, is_geojson
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import over_limit, read_bytes
-from cosfly.runtime.geojson import Feature, features_of, is_geojson
-from cosfly.runtime.store import write_json
+from cosfly.runtime.io import over_limit, read_bytes
+from cosfly.runtime.json_io import parse_document, validated, write_json
 
 WHAT = "region of interest"
 MOST_VERTICES = 100_000  # of a region; to see that a spiky ring does not cross itself takes 8 s then

@@ -11,8 +11,8 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from cosfly.formats.columns import is_number
-from cosfly.runtime.documents import validated
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.json_io import validated
 
 FOLLOW = "follow"  # the style where nothing else is said
 MISSION_KINDS = ("geofence", "battery", "time_over")

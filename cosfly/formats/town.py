@@ -11,8 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader
-from cosfly.runtime.documents import FileFormat, Record, read_model
-from cosfly.runtime.store import write_model
+from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 
 IDS_FILE, IDS_FORMAT = "instance_ids.json", FileFormat("cosfly.instance_ids", "1.0", "record of ids")
 TOWN_FILE, TOWN_FORMAT = "map.json", FileFormat("cosfly.town_map", "1.0", "town's map")

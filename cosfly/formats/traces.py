@@ -11,8 +11,8 @@ import numpy as np
 from cosfly.formats.columns import column, matrix, read_items, rounded, step_field, text_id, write_items
 from cosfly.formats.pedestrian_paths import PLAIN_PACE, pace_field, pace_of
 from cosfly.formats.segments import Mission, Segment, flown_as_json, read_flown
-from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.json_io import FileFormat
 
 TRACE_FORMAT = FileFormat("cosfly.drone_trace", "1.0", "drone traces")
 ARRAYS = ("time_s", "positions_m", "rotations_deg", "targets_m", "visibility")

@@ -13,7 +13,7 @@ import numpy as np
 from cosfly.formats.places import ALL_FLIGHTS, TRACKS, TrackChoice, TrackName
 from cosfly.formats.playback import ORIGINAL, Track, read_track
 from cosfly.runtime.errors import InputError, VerifyError
-from cosfly.runtime.files import files_named
+from cosfly.runtime.io import files_named
 
 TWIN_TOLERANCE_S = 1e-3
 

@@ -13,8 +13,8 @@ from cosfly.formats.columns import is_number, numbers
 from cosfly.formats.frames import ANGLES, XYZ, Camera
 from cosfly.geometry.axes import step_s
 from cosfly.runtime.arrays import check_pixels
-from cosfly.runtime.documents import MISSING
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.json_io import MISSING
 
 Told = TypeVar("Told")
 

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from cosfly.runtime.config import Config
-from cosfly.runtime.documents import Record
+from cosfly.runtime.json_io import Record
 
 WeatherMode = Literal["fixed", "random_per_path", "by_weight"]
 SkyKind = Literal[

@@ -14,9 +14,8 @@ from cosfly.formats.places import tree_of_track
 from cosfly.formats.playback import Track
 from cosfly.runtime.arrays import array_header, picture_size
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import sha256_file
-from cosfly.runtime.runner import advance
-from cosfly.runtime.store import CHECKSUMS, read_checksums, sha256_bytes
+from cosfly.runtime.io import CHECKSUMS, read_checksums, sha256_bytes, sha256_file
+from cosfly.runtime.worker import advance
 
 
 def check_files(flight: Track, report: Report) -> dict[int, FrameMeta | None]:

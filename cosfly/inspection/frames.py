@@ -45,8 +45,8 @@ from cosfly.inspection.settings import (
     InspectConfig,
 )
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import read_bytes
-from cosfly.runtime.runner import advance
+from cosfly.runtime.io import read_bytes
+from cosfly.runtime.worker import advance
 
 # --- jumps ------------------------------------------------------------------------------------------------------------
 # Do the frames of a flight show one world? What stands still is carried from each frame into the next

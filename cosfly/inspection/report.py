@@ -11,7 +11,7 @@ import numpy as np
 from cosfly.formats.inspection import RESULTS, Inspection, TrackInspection
 from cosfly.formats.playback import STATES
 from cosfly.inspection.view import PLOTS, TrackView, in_question
-from cosfly.runtime.files import read_text
+from cosfly.runtime.io import read_text
 from cosfly.viz.coverage_page import coverage_html
 from cosfly.viz.page import fragment, page
 

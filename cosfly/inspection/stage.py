@@ -33,10 +33,10 @@ from cosfly.inspection.settings import PAGE_MB, InspectConfig
 from cosfly.inspection.track import InspectedTrack, inspect_track, trace_id
 from cosfly.inspection.view import TrackView
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.provenance import recorded_digests
-from cosfly.runtime.runner import Item, ItemOutcomes, Outcome, Watch, Work, run_items
-from cosfly.runtime.stage_folder import Failed, Resume, StageFolder, result_of
-from cosfly.runtime.store import write_bytes
+from cosfly.runtime.io import write_bytes
+from cosfly.runtime.pool import ItemOutcomes, Watch, run_items
+from cosfly.runtime.run_dir import Failed, Resume, StageFolder, recorded_digests, result_of
+from cosfly.runtime.worker import Item, Outcome, Work
 from cosfly.viz.page import run_name
 
 log = logging.getLogger(__name__)

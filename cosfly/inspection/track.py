@@ -46,7 +46,7 @@ from cosfly.inspection.settings import (
 )
 from cosfly.inspection.view import TrackView, draw_track
 from cosfly.runtime.errors import InputError, VerifyError
-from cosfly.runtime.provenance import digest_of, folder_digests
+from cosfly.runtime.run_dir import digest_of, folder_digests
 
 if TYPE_CHECKING:
     from cosfly.formats.boxes import BoxMap

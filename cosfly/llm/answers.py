@@ -25,9 +25,10 @@ from cosfly.formats.captions import Usage
 from cosfly.llm.budget import Budget
 from cosfly.llm.contract import MOST_TOKENS, CountName, Engine, NoAnswer, Reply, Request
 from cosfly.runtime.errors import CosflyError
+from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.journal import Journal
-from cosfly.runtime.objects import CONTEXT_FULL
-from cosfly.runtime.store import dump_json, sha256_bytes
+from cosfly.runtime.json_io import dump_json
+from cosfly.runtime.model_json import CONTEXT_FULL
 
 log = logging.getLogger(__name__)
 

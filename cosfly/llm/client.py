@@ -34,7 +34,7 @@ from cosfly.llm.throttle import Throttle
 from cosfly.llm.wire import KEY_VARIABLE, Connections, Response, base_url, check_url
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.errors import TeacherError
-from cosfly.runtime.objects import CONTEXT_FULL
+from cosfly.runtime.model_json import CONTEXT_FULL
 
 log = logging.getLogger(__name__)
 

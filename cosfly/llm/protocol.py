@@ -10,7 +10,7 @@ from typing import Any
 from cosfly.formats.captions import Usage
 from cosfly.llm.contract import MOST_TOKENS, Reply, Request
 from cosfly.llm.wire import Response
-from cosfly.runtime.store import dump_json
+from cosfly.runtime.json_io import dump_json
 
 _IMAGE_MARK = re.compile(rb'"\\u0000(\d+)"')
 THOUGHT_FIELDS = ("reasoning_content", "reasoning", "thinking", "reasoning_details")  # of a message, beside its content

@@ -20,9 +20,9 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 from cosfly.formats.captions import Language, Prompt
 from cosfly.llm.client import EndpointConfig
 from cosfly.llm.contract import Request
-from cosfly.runtime.documents import FileFormat, read_model
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.store import sha256_bytes, write_model
+from cosfly.runtime.io import sha256_bytes
+from cosfly.runtime.json_io import FileFormat, read_model, write_model
 from cosfly.viz.frame_views import View, encode_picture, frame_label
 
 IMAGE_ENCODING: Literal["png"] = "png"

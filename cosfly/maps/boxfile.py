@@ -24,14 +24,14 @@ from shapely.geometry import Polygon
 
 from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource, read_boxes
 from cosfly.formats.columns import LARGEST
+from cosfly.formats.geojson import read_features
 from cosfly.formats.kinds import GROUND_KINDS, KINDS, SURFACE_KINDS
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.derived_ground import with_derived_ground
 from cosfly.maps.footprints import CUT_SHARES, cover
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError, InputError, nearest
-from cosfly.runtime.files import read_text
-from cosfly.runtime.geojson import read_features
+from cosfly.runtime.io import read_text
 
 log = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ from pydantic import Field
 from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_box_map
 from cosfly.formats.kinds import KINDS
 from cosfly.runtime.errors import EnvironmentMissing, InputError
-from cosfly.runtime.store import sha256_bytes
+from cosfly.runtime.io import sha256_bytes
 from cosfly.simulators.carla_client import CarlaConfig, connect
 from cosfly.simulators.conventions import world_pose
 

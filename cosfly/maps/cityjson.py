@@ -23,14 +23,13 @@ from shapely.geometry import Polygon
 
 from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource
 from cosfly.formats.ground import Ground, GroundGrid
-from cosfly.formats.meshes import MESHES_FILE, Meshes, MeshRef
+from cosfly.formats.meshes import MESHES_FILE, Mesh, Meshes, MeshRef
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.cityjson_file import CityObject, read_model
 from cosfly.maps.derived_ground import with_derived_ground
 from cosfly.maps.footprints import CUT_SHARES, Rectangle, check_outline, cover, polygons_of, rectangle_polygon, united
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.errors import ConfigError, InputError
-from cosfly.runtime.meshes import Mesh
 
 FOOT_M = 0.01  # vertices this near to the lowest one are the solid's foot
 EDGE_M = 0.05  # what only touches a rectangle is not over it

@@ -17,9 +17,9 @@ from typing import Any, Literal, NamedTuple, TypeGuard
 import numpy as np
 
 from cosfly.formats.columns import numbers
-from cosfly.runtime.documents import MISSING, parse_document, parse_json
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import over_limit, read_unpacked
+from cosfly.runtime.io import over_limit, read_unpacked
+from cosfly.runtime.json_io import MISSING, parse_document, parse_json
 
 log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ import shapely
 from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from cosfly.runtime.files import over_limit
+from cosfly.runtime.io import over_limit
 
 MIN_AREA_M2 = 0.02  # smaller pieces are what rounding leaves of a cut
 PAIRS_AT_ONCE = 1_000_000  # of edges that are compared before the count is looked at

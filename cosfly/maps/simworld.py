@@ -25,8 +25,8 @@ from cosfly.formats.kinds import KIND_NAMES
 from cosfly.geometry.axes import box_corners
 from cosfly.maps.boxlist import BoxList
 from cosfly.runtime.config import Config
-from cosfly.runtime.documents import read_json, validated
 from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.json_io import read_json, validated
 from cosfly.simulators.assets import Asset, asset_of, kind_of
 
 log = logging.getLogger(__name__)

@@ -21,9 +21,8 @@ from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.unrealcv_export import UnrealCvMapConfig
 from cosfly.runtime.config import Config
-from cosfly.runtime.files import LinkedPath
-from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
-from cosfly.runtime.store import write_bytes
+from cosfly.runtime.io import LinkedPath, write_bytes
+from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.viz.topview import TopView, draw_map, png_bytes
 
 log = logging.getLogger(__name__)

@@ -22,7 +22,7 @@ from cosfly.formats.boxes import BoxMap, LicenceId, MapHeader, MapSource, make_b
 from cosfly.formats.kinds import KIND_NAMES, KINDS
 from cosfly.maps.simworld import read_sizes
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.store import write_json
+from cosfly.runtime.json_io import write_json
 from cosfly.simulators.assets import asset_of, id_of, is_nothing, kind_of
 from cosfly.simulators.conventions import CM_PER_M, world_pose
 from cosfly.simulators.unrealcv_client import UnrealCvConfig, UnrealCvConnection, connect

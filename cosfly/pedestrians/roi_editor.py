@@ -35,8 +35,7 @@ from cosfly.pedestrians.walkable import (
     walkable_ground,
 )
 from cosfly.runtime.errors import CosflyError, EnvironmentMissing, InputError, StorageError
-from cosfly.runtime.files import read_bytes, read_text
-from cosfly.runtime.store import sha256_bytes
+from cosfly.runtime.io import read_bytes, read_text, sha256_bytes
 from cosfly.viz.page import page, scripts
 from cosfly.viz.topview import TopView, draw_map, png_bytes
 

@@ -44,12 +44,13 @@ from cosfly.pedestrians.walkable import (
     walkable_ground,
 )  # fmt: skip
 from cosfly.pedestrians.walking import PACES, arrival_times, resample, speeds_at, take_pace
-from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import NoPathError
-from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.io import write_bytes
+from cosfly.runtime.json_io import FileFormat, write_json
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Resume, StageFolder, result_of
 from cosfly.runtime.seeding import draw_by_share, rng_for
-from cosfly.runtime.stage_folder import Resume, StageFolder, result_of
-from cosfly.runtime.store import write_bytes, write_json
+from cosfly.runtime.worker import Item, Outcome, Work
 from cosfly.viz.topview import INK, TopView, draw_dot, draw_line, draw_text, png_bytes
 
 # --- overview ---------------------------------------------------------------------------------------------------------

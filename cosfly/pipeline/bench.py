@@ -14,11 +14,10 @@ import numpy as np
 from pydantic import BaseModel
 
 from caption.teachers.teacher import EMBEDDED
-from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import ConfigError, ResumeError
-from cosfly.runtime.stage_events import EVENTS, LOSSES, Event, read_events
-from cosfly.runtime.stage_folder import Manifest, read_manifest
-from cosfly.runtime.store import write_model
+from cosfly.runtime.events import EVENTS, LOSSES, Event, read_events
+from cosfly.runtime.json_io import FileFormat, write_model
+from cosfly.runtime.run_dir import Manifest, read_manifest
 
 if TYPE_CHECKING:
     from cosfly.pipeline.settings import RunConfig

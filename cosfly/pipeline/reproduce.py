@@ -30,13 +30,12 @@ from cosfly.pipeline.settings import RunConfig, worker_options
 from cosfly.planners import compare
 from cosfly.runtime.arrays import read_picture
 from cosfly.runtime.config import build, read_yaml
-from cosfly.runtime.documents import FileFormat, read_object
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import read_bytes
+from cosfly.runtime.events import read_events
+from cosfly.runtime.io import read_bytes, write_bytes
 from cosfly.runtime.journal import Journal
-from cosfly.runtime.stage_events import read_events
-from cosfly.runtime.stage_folder import Resume, read_manifest
-from cosfly.runtime.store import write_bytes, write_json
+from cosfly.runtime.json_io import FileFormat, read_object, write_json
+from cosfly.runtime.run_dir import Resume, read_manifest
 from cosfly.studies import beam, depth, weather, zoom
 from cosfly.viz.frame_views import small_jpeg
 from cosfly.viz.gallery import four_panels

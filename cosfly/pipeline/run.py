@@ -26,11 +26,10 @@ import cosfly.simplify.stage
 import release.package.stage
 from cosfly.formats.bystanders import OTHERS_FILE
 from cosfly.pipeline.settings import RunConfig, worker_options
-from cosfly.runtime.documents import read_object
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError, ResumeError
-from cosfly.runtime.folder_lock import hold_folder
-from cosfly.runtime.stage_folder import Manifest, Resume, read_manifest
-from cosfly.runtime.store import refuse_link, write_bytes, write_json
+from cosfly.runtime.io import refuse_link, write_bytes
+from cosfly.runtime.json_io import read_object, write_json
+from cosfly.runtime.run_dir import Manifest, Resume, hold_folder, read_manifest
 from cosfly.viz.gallery import contact_sheet, preview_gif
 from release.package.sources import Source, choose_licence
 

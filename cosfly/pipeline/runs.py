@@ -13,8 +13,7 @@ from cosfly.pipeline.settings import RunConfig
 from cosfly.pipeline.settings_guide import Setting, changed
 from cosfly.runtime.config import load
 from cosfly.runtime.errors import CosflyError, InputError
-from cosfly.runtime.folder_lock import is_held
-from cosfly.runtime.stage_folder import Failed, StageFolder, Tally, read_manifest
+from cosfly.runtime.run_dir import Failed, StageFolder, Tally, is_held, read_manifest
 
 STAGES = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")  # of a run, in order
 TO_LOOK_AT = (

@@ -18,10 +18,10 @@ from cosfly.planners.contract import PlanConfig
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.config import Config, build
 from cosfly.runtime.errors import ConfigError
-from cosfly.runtime.files import LinkedPath
+from cosfly.runtime.io import LinkedPath
+from cosfly.runtime.pool import Watch
 from cosfly.runtime.ray_engine import ALL_ROOM, RayConfig
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.worker_pool import Watch
 from cosfly.simplify.passes import SimplifyConfig
 from cosfly.worldgen.settings import WorldConfig
 from distill.evaluation.compare import ReportConfig

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from cosfly.runtime.errors import ConfigError, nearest
-from cosfly.runtime.store import dump_json
+from cosfly.runtime.json_io import dump_json
 
 
 @dataclass(frozen=True)

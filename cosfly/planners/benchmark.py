@@ -26,12 +26,13 @@ from cosfly.planners import compare
 from cosfly.planners.compare import AXES, FIGURES, INTERVAL_PERCENT, NUM_RESAMPLES, CompareConfig
 from cosfly.planners.contract import ALL_PLANNERS, title_of
 from cosfly.planners.stage import check_ids, draw_styles_of
-from cosfly.runtime.documents import FileFormat, read_model
 from cosfly.runtime.errors import EnvironmentMissing, InputError
-from cosfly.runtime.runner import Item, Watch, run_items
+from cosfly.runtime.io import write_bytes
+from cosfly.runtime.json_io import FileFormat, read_model, write_model
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Resume, StageFolder, result_of
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.stage_folder import Resume, StageFolder, result_of
-from cosfly.runtime.store import write_bytes, write_model
+from cosfly.runtime.worker import Item
 from cosfly.viz.tables import TextTable
 
 log = logging.getLogger(__name__)

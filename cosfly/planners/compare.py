@@ -23,12 +23,13 @@ from cosfly.formats.traces import DroneTrace, write_traces
 from cosfly.planners.contract import ALL_PLANNERS, PLANNERS, PlanConfig, known_planner, title_of
 from cosfly.planners.overview import draw_pedestrians
 from cosfly.planners.stage import check_ids, draw_styles_of, plan_trajectory, warm_up
-from cosfly.runtime.documents import FileFormat, read_object
 from cosfly.runtime.errors import NoPathError
-from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.io import write_bytes
+from cosfly.runtime.json_io import FileFormat, read_object, write_json
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Dropped, Failed, ItemRecord, Resume, StageFolder, read_manifest, result_of
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.stage_folder import Dropped, Failed, ItemRecord, Resume, StageFolder, read_manifest, result_of
-from cosfly.runtime.store import write_bytes, write_json
+from cosfly.runtime.worker import Item, Outcome, Work
 from cosfly.viz.tables import TextTable
 from cosfly.viz.topview import add_caption, draw_dot, draw_line, draw_text, png_bytes
 

@@ -23,10 +23,11 @@ from cosfly.geometry.axes import DT_S, step_s
 from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M, CLEARANCE_TOLERANCE_M, trajectory_metrics
 from cosfly.planners.contract import PlanConfig, Scenario, load_planner
 from cosfly.runtime.errors import InputError, NoPathError
-from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.io import write_bytes
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Failed, Resume, StageFolder
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.stage_folder import Failed, Resume, StageFolder
-from cosfly.runtime.store import write_bytes
+from cosfly.runtime.worker import Item, Outcome, Work
 
 if TYPE_CHECKING:
     from cosfly.geometry.kernels import BoxIndex

@@ -40,8 +40,9 @@ from cosfly.render.contract import (
 from cosfly.render.engines import WALK_MPS, NoPictureError, fov_of, keep_asking
 from cosfly.runtime.config import MayDiffer
 from cosfly.runtime.errors import InputError, RenderError
-from cosfly.runtime.items import worker_place
-from cosfly.runtime.store import dump_json, sha256_bytes
+from cosfly.runtime.io import sha256_bytes
+from cosfly.runtime.json_io import dump_json
+from cosfly.runtime.worker import worker_place
 from cosfly.simulators.carla_client import CarlaConfig, CarlaConnection, connect
 from cosfly.simulators.conventions import (
     ACTOR_BITS,

@@ -35,11 +35,12 @@ from cosfly.render.track import TrackScript, Writing, check_track, render_track
 from cosfly.render.weather import coverage_of, drawn_seed, fog_hides, read_pools, told_coverage, weather_of
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import ConfigError, InputError
-from cosfly.runtime.provenance import checked_inputs, fingerprint
-from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.io import CHECKSUMS, atomic_folder, inside, sha256_bytes
+from cosfly.runtime.json_io import dump_json, write_json
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Kept, Resume, StageFolder, Tally, checked_inputs, fingerprint, result_of
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.stage_folder import Kept, Resume, StageFolder, Tally, result_of
-from cosfly.runtime.store import CHECKSUMS, atomic_folder, dump_json, inside, sha256_bytes, write_json
+from cosfly.runtime.worker import Item, Outcome, Work
 from cosfly.viz.overlay import Overlay
 
 log = logging.getLogger(__name__)

@@ -47,11 +47,10 @@ from cosfly.render.camera import (
 from cosfly.render.contract import FAR_M, NEAR_M, PERSON_ID, Clothes, Frame, Renderer
 from cosfly.render.person import Cast, Gait
 from cosfly.render.perturbation import HIDDEN, STEP_UP_M, PerturbedTrack, Poses, Surroundings
-from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import RenderError
-from cosfly.runtime.files import sha256_file
-from cosfly.runtime.runner import advance
-from cosfly.runtime.store import sha256_bytes, storage_errors, write_checksums, write_json
+from cosfly.runtime.io import sha256_bytes, sha256_file, storage_errors, write_checksums
+from cosfly.runtime.json_io import FileFormat, write_json
+from cosfly.runtime.worker import advance
 from cosfly.viz.overlay import Overlay
 
 MOST_TRIED = 8  # frames of a flight, the first in which the target is legible

@@ -42,7 +42,7 @@ from cosfly.render.engines import WALK_MPS, NoPictureError, fov_of, keep_asking
 from cosfly.runtime.arrays import parse_array, parse_picture
 from cosfly.runtime.config import MayDiffer
 from cosfly.runtime.errors import ConfigError, InputError, RenderError
-from cosfly.runtime.items import worker_place
+from cosfly.runtime.worker import worker_place
 from cosfly.simulators.assets import id_of, kind_of
 from cosfly.simulators.conventions import FAR_CM, camera_rotation_deg, unreal_pose, world_pose
 from cosfly.simulators.guard import EngineGuard

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import disk_errors, open_file, over_limit, read_bytes
+from cosfly.runtime.io import disk_errors, open_file, over_limit, read_bytes
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_HEADER_BYTES = 24  # signature, length and name of the first chunk, width, height

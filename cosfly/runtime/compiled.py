@@ -27,7 +27,7 @@ import numba
 from numba import boolean, int64
 from numba.core import caching, event
 
-from cosfly.runtime.files import read_bytes
+from cosfly.runtime.io import read_bytes
 
 __all__ = ["boolean", "int64", "njit"]
 

@@ -9,12 +9,55 @@ from inspect import get_annotations
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
+import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import to_jsonable_python
 
 from cosfly.runtime.errors import ConfigError, InputError, nearest, plain
-from cosfly.runtime.files import read_text
-from cosfly.runtime.settings_text import parse_yaml
+from cosfly.runtime.io import read_text
+
+MOST_BYTES = 1_000_000  # a run's settings are some 10 kB; the longest word list that ships has 100
+
+
+class _Loader(yaml.SafeLoader):
+    """The safe loader, with keys that are given once."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict:
+        seen = set[str]()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise yaml.constructor.ConstructorError(None, None, "a key that is no word", key.start_mark)
+            if key.value in seen and key.value != "<<":
+                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} is given twice", key.start_mark)
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+# Only what JSON has: without the resolver a date stays text, which is what its users mean.
+_KINDS = {f"tag:yaml.org,2002:{kind}" for kind in ("null", "bool", "int", "float", "str", "seq", "map", "merge")}
+_Loader.yaml_constructors = {
+    tag: constructor for tag, constructor in yaml.SafeLoader.yaml_constructors.items() if tag is None or tag in _KINDS
+}
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag in _KINDS]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+
+
+def parse_yaml(text: str, where: str | Path, *, what: str = "configuration") -> Any:
+    """Read YAML text.
+
+    Raises:
+        ConfigError: it is not valid, or too long.
+    """
+    if len(text) > MOST_BYTES:
+        expected = f"at most {MOST_BYTES / 1e6:g} MB"
+        raise ConfigError(f"the {what} is too long", where=where, got=f"{len(text) / 1e6:.1f} MB", expected=expected)
+    try:
+        return yaml.load(text, _Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ConfigError(f"the {what} is not valid YAML", where=where, got=str(error)) from None
+
 
 MOST_LISTED = 15  # names of settings in a message
 MOST_ELSEWHERE = 3  # places of an unknown name, as in "did you mean plan.x or render.x"

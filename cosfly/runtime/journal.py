@@ -12,10 +12,9 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from cosfly.runtime.documents import parse_json
 from cosfly.runtime.errors import InputError, plain
-from cosfly.runtime.files import disk_errors, open_file, read_lines
-from cosfly.runtime.store import dump_json, sha256_bytes, storage_errors
+from cosfly.runtime.io import disk_errors, open_file, read_lines, sha256_bytes, storage_errors
+from cosfly.runtime.json_io import dump_json, parse_json
 
 T = TypeVar("T")
 

@@ -24,10 +24,9 @@ from pydantic import Field
 import cosfly
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import EnvironmentMissing
-from cosfly.runtime.files import sha256_file
-from cosfly.runtime.items import Item
-from cosfly.runtime.stage_events import Vitals
-from cosfly.runtime.worker import Message, Start, WorkerOptions
+from cosfly.runtime.events import Vitals
+from cosfly.runtime.io import sha256_file
+from cosfly.runtime.worker import Item, Message, Start, WorkerOptions
 
 log = logging.getLogger(__name__)
 
@@ -195,9 +194,9 @@ def _host() -> type:
                 fix = "install the same on every node, then start Ray there again"
                 got = f"{cosfly.__version__} ({python})"
                 return node, None, {"what": "another cosfly", "got": got, "expected": version, "fix": fix}
-            from cosfly.runtime.files import sha256_file
+            from cosfly.runtime.io import sha256_file
+            from cosfly.runtime.pool import LocalTransport
             from cosfly.runtime.worker import WorkerOptions
-            from cosfly.runtime.worker_pool import LocalTransport
 
             try:
                 os.chdir(cwd)

@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import FILE_MB, MB, SMALL_UNPACKED_MB, UNPACK_FACTOR, open_file, over_limit
+from cosfly.runtime.io import FILE_MB, MB, SMALL_UNPACKED_MB, UNPACK_FACTOR, open_file, over_limit
 
 MOST_FOOTER_BYTES = 100 * MB  # what the footer's strings and lists may take; ours have some 10 kB
 

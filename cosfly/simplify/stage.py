@@ -10,10 +10,10 @@ import numpy as np
 from cosfly.formats.boxes import BoxMap, read_boxes, write_boxes
 from cosfly.formats.kinds import KINDS, SURFACE_KINDS
 from cosfly.geometry.grid import blocks_walking, compare, connected_parts, empty_grid, inflate, occupancy
-from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
-from cosfly.runtime.store import write_bytes, write_json
+from cosfly.runtime.io import write_bytes
+from cosfly.runtime.json_io import FileFormat, write_json
+from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.simplify.passes import Simplification, SimplifyConfig, simplify
 from cosfly.viz.topview import TopView, add_caption, draw_map, png_bytes
 

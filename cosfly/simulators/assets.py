@@ -7,7 +7,7 @@ from fnmatch import fnmatchcase
 from typing import NamedTuple
 
 from cosfly.formats.kinds import KINDS
-from cosfly.runtime.store import sha256_bytes
+from cosfly.runtime.io import sha256_bytes
 
 
 class Asset(NamedTuple):

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from cosfly.runtime.errors import EnvironmentMissing
-from cosfly.runtime.stage_events import process_stat
+from cosfly.runtime.events import process_stat
 from cosfly.runtime.worker import LEFT_TO_THE_PARENT, adopt_orphans, end_with_parent, signals_held_back
 
 PATIENCE_S = 20.0  # for a server that is to be left in order

@@ -18,12 +18,12 @@ from cosfly.formats.pedestrian_paths import read_paths
 from cosfly.planners.compare import INTERVAL_PERCENT, NUM_RESAMPLES
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import check_ids, draw_styles_of, make_scenario, plan_trajectory, warm_up
-from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import NoPathError
-from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
+from cosfly.runtime.json_io import FileFormat, write_json
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Resume, StageFolder, result_of
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.stage_folder import Resume, StageFolder, result_of
-from cosfly.runtime.store import write_json
+from cosfly.runtime.worker import Item, Outcome, Work
 
 FORMAT = FileFormat("cosfly.beam_study", "1.0")
 PAPER_BEAM = 2048

@@ -15,10 +15,9 @@ from pydantic import BaseModel
 
 from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M, depth_values, frame_path, is_packed, read_rgb
 from cosfly.runtime.arrays import parse_array, parse_array_header
-from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import read_bytes
-from cosfly.runtime.store import write_bytes, write_model
+from cosfly.runtime.io import read_bytes, write_bytes
+from cosfly.runtime.json_io import FileFormat, write_model
 from cosfly.viz.frame_views import depth_colors
 from cosfly.viz.tables import TextTable
 from cosfly.viz.topview import PAPER, Color, draw_line, draw_text, png_bytes

@@ -19,8 +19,8 @@ from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import renderer_of
 from cosfly.render.track import MARGIN_M
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.io import write_bytes
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.store import write_bytes
 from cosfly.viz.frame_views import encode_picture
 from cosfly.viz.topview import PAPER, draw_text
 

@@ -26,10 +26,11 @@ from cosfly.render.perturbation import Surroundings
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import make_track_script, renderer_of
 from cosfly.render.track import MARGIN_M, TrackScript, check_track, draw_frame
-from cosfly.runtime.documents import FileFormat
-from cosfly.runtime.runner import Item, Outcome, Watch, Work, advance, run_items
-from cosfly.runtime.stage_folder import Resume, StageFolder, result_of
-from cosfly.runtime.store import write_bytes, write_json
+from cosfly.runtime.io import write_bytes
+from cosfly.runtime.json_io import FileFormat, write_json
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Resume, StageFolder, result_of
+from cosfly.runtime.worker import Item, Outcome, Work, advance
 from cosfly.viz.tables import TextTable
 from cosfly.viz.topview import add_caption
 

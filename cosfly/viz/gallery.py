@@ -17,7 +17,7 @@ from cosfly.formats.town import read_instance_ids
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.arrays import read_picture
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.store import inside, write_bytes
+from cosfly.runtime.io import inside, write_bytes
 from cosfly.viz.frame_views import DEPTH_RANGE_M, VIEW_FILES, read_view
 from cosfly.viz.overlay import Overlay
 from cosfly.viz.topview import add_caption, draw_text

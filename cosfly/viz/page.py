@@ -18,8 +18,8 @@ from markupsafe import Markup
 
 import cosfly
 from cosfly.runtime.escaping import for_markdown, for_terminal, markdown_code
-from cosfly.runtime.files import read_text
-from cosfly.runtime.store import dump_json
+from cosfly.runtime.io import read_text
+from cosfly.runtime.json_io import dump_json
 
 ROOT = Path(cosfly.__file__).parents[1]  # cosfly, caption, distill and release stand side by side
 

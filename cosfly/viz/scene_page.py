@@ -25,7 +25,7 @@ from cosfly.geometry.axes import rotation_matrices
 from cosfly.geometry.grid import occupancy
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import for_terminal
-from cosfly.runtime.store import write_bytes
+from cosfly.runtime.io import write_bytes
 from cosfly.viz.frame_views import thumbnail
 from cosfly.viz.page import page, scripts
 from cosfly.viz.topview import COLORS, OTHER_COLOR

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from cosfly.runtime.config import read_yaml
-from cosfly.runtime.documents import Record
+from cosfly.runtime.json_io import Record
 from cosfly.simulators.assets import ASSETS
 
 Where = Literal["open", "quay", "water", "layout"]

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cosfly.maps.synthetic import MIN_BLOCK_M, SyntheticConfig
 from cosfly.maps.town_blocks import LotsConfig
-from cosfly.runtime.documents import FileFormat, Record
+from cosfly.runtime.json_io import FileFormat, Record
 from cosfly.worldgen.objects import OBJECTS, Object, assets
 
 PLAN_FORMAT = FileFormat("cosfly.world_plan", "1", "plan of a world")

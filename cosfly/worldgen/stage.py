@@ -25,12 +25,11 @@ from cosfly.llm.client import ChatClient, EndpointConfig
 from cosfly.llm.contract import NoAnswer, Reply, started
 from cosfly.maps.simworld import PLACEHOLDER_CM
 from cosfly.runtime.config import read_yaml, shipped
-from cosfly.runtime.documents import FileFormat, validated
 from cosfly.runtime.errors import TeacherError
-from cosfly.runtime.folder_lock import hold_folder
-from cosfly.runtime.objects import find_object
-from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
-from cosfly.runtime.store import sha256_bytes, write_bytes, write_json, write_model
+from cosfly.runtime.io import sha256_bytes, write_bytes
+from cosfly.runtime.json_io import FileFormat, validated, write_json, write_model
+from cosfly.runtime.model_json import find_object
+from cosfly.runtime.run_dir import Resume, StageFolder, Tally, hold_folder
 from cosfly.viz.topview import TopView, draw_map, png_bytes
 from cosfly.worldgen.objects import OBJECTS, assets
 from cosfly.worldgen.plan import PLAN_FORMAT, WorldPlan

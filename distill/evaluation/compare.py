@@ -13,12 +13,12 @@ from typing import Any
 from pydantic import Field
 
 from cosfly.runtime.config import Config
-from cosfly.runtime.documents import FileFormat, Record
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import for_markdown
+from cosfly.runtime.io import write_bytes
+from cosfly.runtime.json_io import FileFormat, Record, write_model
+from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
-from cosfly.runtime.store import write_bytes, write_model
 from cosfly.viz.page import page
 from distill.evaluation.measure import STUDENT, Evaluation, FigureSet, read_report
 from distill.evaluation.pages import (

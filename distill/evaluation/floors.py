@@ -20,7 +20,7 @@ import numpy as np
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.captions import Coc, Language
 from cosfly.geometry.blind import FITTED_ON, Decider, fit_deciders
-from cosfly.runtime.documents import parse_document, validated
+from cosfly.runtime.json_io import parse_document, validated
 from cosfly.runtime.seeding import rng_for
 from distill.evaluation.scores import ScoredAnswer, number_of
 from distill.schema import Sample

@@ -17,12 +17,11 @@ from cosfly.formats.predictions import FAILED, Prediction
 from cosfly.formats.splits import Split
 from cosfly.geometry.blind import DRAWN_AHEAD, FITTED_ON, LEAST_WINDOWS, LOOKS_BACK
 from cosfly.llm.answers import read_answers
-from cosfly.runtime.documents import FileFormat, Record, read_model, read_object, validated
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.journal import Journal
-from cosfly.runtime.provenance import MANIFEST_FORMAT
+from cosfly.runtime.json_io import FileFormat, Record, read_model, read_object, validated
+from cosfly.runtime.run_dir import MANIFEST_FORMAT, read_manifest
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.stage_folder import read_manifest
 from distill.evaluation.bertscore import Metric, score_beside_floors
 from distill.evaluation.floors import WITH_TEXT, Floors, coc_of
 from distill.evaluation.scores import UNPARSED, ScoredAnswer, Scores, figures_of, score_answers

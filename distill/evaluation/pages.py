@@ -10,7 +10,7 @@ from cosfly.formats.actions import TOKENS
 from cosfly.formats.captions import FIELDS
 from cosfly.formats.figures import Figure
 from cosfly.runtime.escaping import for_markdown
-from cosfly.runtime.files import read_text
+from cosfly.runtime.io import read_text
 from cosfly.viz.page import page
 from distill.evaluation.measure import STUDENT, UNPARSED_NAME, Evaluation, FigureSet, Measurement
 from distill.evaluation.scores import FIGURES

@@ -22,9 +22,9 @@ from cosfly.formats.actions import TOKENS, not_in_set
 from cosfly.formats.captions import Coc, SentenceState, Verdict, verdict_on
 from cosfly.formats.figures import Figure, draw_pedestrians, figure_of_draws, interval_of
 from cosfly.formats.predictions import FAILED, Prediction
-from cosfly.runtime.documents import Record
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.store import atomic_file, dump_json, sha256_bytes
+from cosfly.runtime.io import atomic_file, sha256_bytes
+from cosfly.runtime.json_io import Record, dump_json
 from cosfly.runtime.tables import arrow_errors, row_groups
 from distill.schema import Sample
 

@@ -17,8 +17,9 @@ from cosfly.formats.captions import Language
 from cosfly.formats.predictions import Prediction, read_predictions
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
-from cosfly.runtime.store import inside, write_bytes, write_model
+from cosfly.runtime.io import inside, write_bytes
+from cosfly.runtime.json_io import write_model
+from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.viz.frame_views import thumbnail
 from distill.evaluation.bertscore import BertScoreConfig, Metric, Scorer, check_encoder, deciding_files
 from distill.evaluation.floors import Floors, coc_of

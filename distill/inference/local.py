@@ -24,7 +24,8 @@ from cosfly.formats.places import flight_of
 from cosfly.llm.answers import Answer, AnswerBook
 from cosfly.runtime.console import Advance
 from cosfly.runtime.errors import ConfigError, InputError
-from cosfly.runtime.store import dump_json, sha256_bytes
+from cosfly.runtime.io import sha256_bytes
+from cosfly.runtime.json_io import dump_json
 from distill.inference.outcome import OpenFlights, SampleOutcome, failed
 from distill.schema import Sample
 from distill.student.decoding import Completion, Constraint, decode

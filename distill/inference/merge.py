@@ -16,10 +16,10 @@ from pydantic import BaseModel, Field
 from cosfly.llm.student_chat import TAUGHT
 from cosfly.runtime.config import Config
 from cosfly.runtime.console import progress_bar
-from cosfly.runtime.documents import read_json, read_object, validated
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
-from cosfly.runtime.store import atomic_folder, storage_errors, write_json
+from cosfly.runtime.io import atomic_folder, storage_errors
+from cosfly.runtime.json_io import read_json, read_object, validated, write_json
+from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from distill.student.checkpoint import read_adapter_facts, save_tensors
 from distill.student.model import require, student_folder, weight_files
 

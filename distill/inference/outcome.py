@@ -13,9 +13,10 @@ from cosfly.formats.answer_text import parse_answer
 from cosfly.formats.places import flight_of
 from cosfly.formats.predictions import FAILED, PREDICTIONS, Prediction, Split
 from cosfly.llm.answers import Answer, AnswerBook
-from cosfly.runtime.objects import CONTEXT_FULL
-from cosfly.runtime.stage_folder import Failed, Tally, write_failures
-from cosfly.runtime.store import atomic_file, dump_json
+from cosfly.runtime.io import atomic_file
+from cosfly.runtime.json_io import dump_json
+from cosfly.runtime.model_json import CONTEXT_FULL
+from cosfly.runtime.run_dir import Failed, Tally, write_failures
 from distill.schema import Sample
 
 ANSWERS = "answers"  # the folder of journals

@@ -23,8 +23,8 @@ from cosfly.llm.vllm_engine import VllmConfig, VllmEngine
 from cosfly.runtime.config import Config, MayDiffer
 from cosfly.runtime.console import Advance, progress_bar
 from cosfly.runtime.errors import ConfigError, InputError, TeacherError
-from cosfly.runtime.stage_folder import Resume, StageFolder, read_manifest
-from cosfly.runtime.store import sha256_bytes
+from cosfly.runtime.io import sha256_bytes
+from cosfly.runtime.run_dir import Resume, StageFolder, read_manifest
 from distill.inference.local import AnswerSchemas, LocalAnswers
 from distill.inference.outcome import ANSWERS, OpenFlights, Results, SampleOutcome, failed, writing_results
 from distill.schema import Sample, open_split, resolve_trees, tree_inputs

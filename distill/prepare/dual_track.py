@@ -21,11 +21,10 @@ from cosfly.formats.splits import SPLITS, Course, Split, walks_of
 from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.geometry.axes import step_s
 from cosfly.runtime.console import progress_bar
-from cosfly.runtime.documents import FileFormat, Record, read_model, validated
 from cosfly.runtime.errors import InputError, VerifyError
-from cosfly.runtime.provenance import fingerprint
-from cosfly.runtime.stage_folder import Failed, Resume, StageFolder, Tally, write_failures
-from cosfly.runtime.store import write_bytes, write_model
+from cosfly.runtime.io import write_bytes
+from cosfly.runtime.json_io import FileFormat, Record, read_model, validated, write_model
+from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, fingerprint, write_failures
 from cosfly.runtime.tables import rows_of
 from distill.prepare.sources import check_names, run_of
 from distill.prepare.splitting import SplitConfig, check_no_leak

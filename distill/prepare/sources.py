@@ -15,9 +15,8 @@ from cosfly.formats.playback import read_track
 from cosfly.formats.splits import Course, walks_of
 from cosfly.formats.tracks import find_tracks, track_of
 from cosfly.runtime.errors import InputError, VerifyError
-from cosfly.runtime.files import check_stays_below
-from cosfly.runtime.provenance import was_made_of
-from cosfly.runtime.store import inside
+from cosfly.runtime.io import check_stays_below, inside
+from cosfly.runtime.run_dir import was_made_of
 from cosfly.viz.frame_views import VIEW_FILES, View
 
 log = logging.getLogger(__name__)

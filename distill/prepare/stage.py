@@ -30,9 +30,8 @@ from cosfly.formats.splits import SPLITS, Split
 from cosfly.geometry.blind import is_drawn_ahead, past_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.provenance import fingerprint
-from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
-from cosfly.runtime.store import dump_json
+from cosfly.runtime.json_io import dump_json
+from cosfly.runtime.run_dir import Resume, StageFolder, Tally, fingerprint
 from cosfly.viz.frame_views import DEPTH_RANGE_M, Pictures, View, scaled_size
 from distill.prepare.sources import CaptionedFlight, Flights, RunSource, check_sources, inputs_of
 from distill.prepare.splitting import SplitConfig, check_no_leak

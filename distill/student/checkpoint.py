@@ -17,10 +17,18 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from cosfly.runtime.documents import FileFormat, parse_json, read_json, read_model, read_object, validated
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import read_lines, sha256_file
-from cosfly.runtime.store import atomic_folder, read_checksums, write_bytes, write_checksums, write_json, write_model
+from cosfly.runtime.io import atomic_folder, read_checksums, read_lines, sha256_file, write_bytes, write_checksums
+from cosfly.runtime.json_io import (
+    FileFormat,
+    parse_json,
+    read_json,
+    read_model,
+    read_object,
+    validated,
+    write_json,
+    write_model,
+)
 from distill.student.model import Student, weight_files
 
 log = logging.getLogger(__name__)

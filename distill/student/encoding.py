@@ -19,7 +19,7 @@ from cosfly.formats.frames import tree_of
 from cosfly.llm.student_chat import IMAGE_PART, chat_messages
 from cosfly.runtime.arrays import array_header, picture_size
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.store import inside
+from cosfly.runtime.io import inside
 from distill.schema import Sample
 from distill.student.model import END_OF_TURN, IMAGE_TOKEN, Processor, Student
 

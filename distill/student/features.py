@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cosfly.runtime.store import inside
+from cosfly.runtime.io import inside
 from cosfly.viz.frame_views import VIEW_FILES, Pictures, View
 from distill.schema import Sample
 from distill.student.encoding import patches_of, picture_grid

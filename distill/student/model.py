@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cosfly.llm.student_chat import TAUGHT
-from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError
+from cosfly.runtime.json_io import read_json
 from distill.student.kernels import fuse_norms, look_at_equal_sizes_at_once, use_kernels_for
 
 INSTALL = 'pip install "cosfly[distill]"'

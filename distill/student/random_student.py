@@ -17,8 +17,8 @@ from cosfly.formats.actions import TOKENS
 from cosfly.formats.captions import FIELDS
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.io import atomic_folder
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.store import atomic_folder
 from distill.student.checkpoint import disk_errors
 from distill.student.model import END_OF_TURN, IMAGE_TOKEN, quiet_transformers, require
 

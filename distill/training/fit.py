@@ -23,8 +23,9 @@ from cosfly.formats.answer_text import parse_answer
 from cosfly.formats.captions import verdict_on
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.io import storage_errors
+from cosfly.runtime.json_io import dump_json
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.store import dump_json, storage_errors
 from distill.schema import Sample, Samples
 from distill.student.checkpoint import (
     Progress,

@@ -19,7 +19,7 @@ from cosfly.formats.frames import frame_path
 from cosfly.formats.places import flight_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import CosflyError, EnvironmentMissing, InputError
-from cosfly.runtime.store import inside
+from cosfly.runtime.io import inside
 from cosfly.runtime.worker import end_with_parent
 from cosfly.viz.frame_views import VIEW_FILES
 from distill.schema import Sample

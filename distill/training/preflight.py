@@ -16,7 +16,7 @@ import numpy as np
 
 from cosfly.formats.actions import TOKENS
 from cosfly.runtime.errors import ConfigError, InputError
-from cosfly.runtime.store import write_json
+from cosfly.runtime.json_io import write_json
 from distill.schema import Sample, Samples
 from distill.student.encoding import END_OF_ANSWER, EncodedSample, chat_text, prompt_text
 from distill.student.features import VisionFeatures

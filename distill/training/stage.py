@@ -14,9 +14,10 @@ from typing import Any
 from cosfly.formats.captions import Language, Prompt
 from cosfly.llm.student_chat import FrameLook, Taught, write_taught
 from cosfly.runtime.errors import ConfigError, InputError
+from cosfly.runtime.io import atomic_folder
+from cosfly.runtime.json_io import write_json
+from cosfly.runtime.run_dir import Resume, StageFolder, Tally
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.stage_folder import Resume, StageFolder, Tally
-from cosfly.runtime.store import atomic_folder, write_json
 from distill.schema import Sample, open_split, resolve_trees, tree_inputs
 from distill.student.checkpoint import ADAPTER_FACTS, Progress, adapter_facts, write_adapter_folder, write_model_folder
 from distill.student.features import PictureReader, VisionFeatures

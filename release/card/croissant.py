@@ -12,7 +12,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from cosfly.runtime.store import dump_json
+from cosfly.runtime.json_io import dump_json
 from release.columns import CONTRACT, PICTURES, schema
 from release.record import ReleaseRecord, shard_pattern
 

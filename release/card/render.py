@@ -21,7 +21,7 @@ from cosfly.formats.coverage import NAMED
 from cosfly.formats.frames import FrameFile
 from cosfly.geometry.blind import DRAWN_AHEAD, LEAST_WINDOWS, LOOKS_BACK
 from cosfly.runtime.escaping import for_terminal
-from cosfly.runtime.files import read_text
+from cosfly.runtime.io import read_text
 from cosfly.viz.coverage_page import ranges, shares
 from cosfly.viz.page import markdown
 from release.columns import CAPTION, PICTURES, SCALARS, SPLIT_NAMES, schema

@@ -20,8 +20,8 @@ from cosfly.formats.captions import FIELDS, Language, Prompt, read_captions
 from cosfly.formats.frames import FILE_NAMES, frame_name
 from cosfly.formats.places import Place
 from cosfly.runtime.errors import InputError, NothingKept, StorageError
-from cosfly.runtime.files import check_stays_below
-from cosfly.runtime.store import atomic_file, dump_json, inside
+from cosfly.runtime.io import atomic_file, check_stays_below, inside
+from cosfly.runtime.json_io import dump_json
 from cosfly.viz.frame_views import Pictures, frame_label
 from release.columns import LANGUAGES, SplitName, caption_values
 from release.export.source import open_release, rows_of_flight, scan

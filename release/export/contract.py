@@ -19,8 +19,7 @@ from typing import Any, Literal, Protocol, cast
 from pydantic import BaseModel, Field
 
 from cosfly.runtime.config import Config
-from cosfly.runtime.files import sha256_file
-from cosfly.runtime.store import atomic_file, sha256_bytes
+from cosfly.runtime.io import atomic_file, sha256_bytes, sha256_file
 from release.export.source import Release, ReleasedRows, Span
 
 FormatName = Literal["tree", "webdataset", "lerobot"]

@@ -29,8 +29,9 @@ from cosfly.formats.motion import ACTION, PlannedMotion
 from cosfly.geometry.axes import step_s
 from cosfly.runtime.arrays import parse_array, parse_picture
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.runner import advance
-from cosfly.runtime.store import atomic_file, dump_json
+from cosfly.runtime.io import atomic_file
+from cosfly.runtime.json_io import dump_json
+from cosfly.runtime.worker import advance
 from release.columns import BOX, CAPTION_FIELDS, PICTURES, POINT, POSE, SPLIT_NAMES
 from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
 from release.export.source import (

@@ -14,20 +14,13 @@ import yaml
 from pydantic import Field
 
 import cosfly
-from cosfly.runtime.documents import FileFormat
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.escaping import for_markdown
-from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.runtime.stage_folder import Resume, StageFolder, result_of
-from cosfly.runtime.store import (
-    CHECKSUMS,
-    dump_json,
-    inside,
-    sha256_bytes,
-    storage_errors,
-    write_bytes,
-    write_checksums,
-)
+from cosfly.runtime.io import CHECKSUMS, inside, sha256_bytes, storage_errors, write_bytes, write_checksums
+from cosfly.runtime.json_io import FileFormat, dump_json
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Resume, StageFolder, result_of
+from cosfly.runtime.worker import Item, Outcome, Work
 from release.export.contract import ExportConfig, ExportUnit, FormatFacts, UnitFiles, format_of
 from release.export.source import Release, open_release, scan
 from release.record import ReleasedMap, Strict

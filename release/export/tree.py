@@ -29,9 +29,9 @@ from cosfly.formats.playback import LEGIBILITY, TARGET_FILE, Track, write_track
 from cosfly.formats.segments import FOLLOW, Segment
 from cosfly.formats.town import TOWN_FILE, TOWN_FORMAT, TownMap
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import sha256_file
-from cosfly.runtime.runner import advance
-from cosfly.runtime.store import CHECKSUMS, checksum_lines, write_model
+from cosfly.runtime.io import CHECKSUMS, checksum_lines, sha256_file
+from cosfly.runtime.json_io import write_model
+from cosfly.runtime.worker import advance
 from release.columns import COMPANY_COLUMNS, PICTURES, SCALAR_NAMES, TARGET_PICTURE, matrices_of
 from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
 from release.export.source import DEPTH_CODING, Release, ReleasedRows, picture, read_span

@@ -16,8 +16,9 @@ from typing import Any
 
 from cosfly.formats.frames import FrameFile
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.runner import advance
-from cosfly.runtime.store import atomic_file, dump_json
+from cosfly.runtime.io import atomic_file
+from cosfly.runtime.json_io import dump_json
+from cosfly.runtime.worker import advance
 from release.columns import PICTURES, SPLIT_NAMES, TARGET_PICTURE
 from release.export.contract import ExportConfig, ExportUnit, Files, FormatFacts, UnitFiles
 from release.export.source import DEPTH_CODING, PART, Release, ReleasedRows, Span, picture, read_span

@@ -11,11 +11,10 @@ from pathlib import Path
 from cosfly.formats.actions import ACTIONS, not_in_set
 from cosfly.formats.captions import Caption, caption_lines
 from cosfly.formats.places import sample_id
-from cosfly.runtime.documents import parse_document, parse_json, validated
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import published_name
-from cosfly.runtime.files import read_span
-from cosfly.runtime.store import dump_json
+from cosfly.runtime.io import read_span
+from cosfly.runtime.json_io import dump_json, parse_document, parse_json, validated
 from release.columns import LANGUAGES
 
 FlightKey = tuple[str, str, str]  # town's folder, trajectory, variant

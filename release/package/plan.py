@@ -14,7 +14,7 @@ from cosfly.formats.frames import DEPTH_PNG, FILE_NAMES, frame_name, frame_path
 from cosfly.formats.places import TrackChoice
 from cosfly.formats.review import how_to_decide
 from cosfly.runtime.errors import CosflyError, InputError, NothingKept, VerifyError
-from cosfly.runtime.stage_folder import Failed, StageFolder, Tally, write_failures
+from cosfly.runtime.run_dir import Failed, StageFolder, Tally, write_failures
 from release.columns import SPLIT_NAMES, Placement, SplitName
 from release.package.captions import CaptionAccount, FlightCaptions, FlightKey, index_captions
 from release.package.config import ReleaseConfig

@@ -16,9 +16,8 @@ import pyarrow as pa
 import cosfly
 from cosfly.runtime.errors import VerifyError
 from cosfly.runtime.escaping import published
-from cosfly.runtime.files import sha256_file
-from cosfly.runtime.provenance import StageInput, stages_behind
-from cosfly.runtime.store import write_bytes, write_checksums
+from cosfly.runtime.io import sha256_file, write_bytes, write_checksums
+from cosfly.runtime.run_dir import StageInput, stages_behind
 from release import columns
 from release.card.croissant import CROISSANT, render_croissant
 from release.card.render import render_card

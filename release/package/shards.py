@@ -29,10 +29,9 @@ from cosfly.formats.playback import TARGET_FILE, Track
 from cosfly.formats.png import parse_png
 from cosfly.runtime.arrays import PNG_HEADER_BYTES, png_size
 from cosfly.runtime.errors import CosflyError, InputError, VerifyError
-from cosfly.runtime.files import check_stays_below, read_bytes, sha256_file
-from cosfly.runtime.items import advance
-from cosfly.runtime.provenance import FLIGHT, digest_of, folder_digests
-from cosfly.runtime.store import CHECKSUMS, atomic_file, read_checksums
+from cosfly.runtime.io import CHECKSUMS, atomic_file, check_stays_below, read_bytes, read_checksums, sha256_file
+from cosfly.runtime.run_dir import FLIGHT, digest_of, folder_digests
+from cosfly.runtime.worker import advance
 from release import columns
 from release.columns import Placement, ReleasedCaption, caption_values
 from release.package.captions import FlightCaptions

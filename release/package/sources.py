@@ -14,9 +14,8 @@ from cosfly.formats.review import REVIEW, read_settled
 from cosfly.formats.town import read_town_map
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import ConfigError, InputError
-from cosfly.runtime.files import check_stays_below, read_text
-from cosfly.runtime.provenance import is_bound
-from cosfly.runtime.store import inside
+from cosfly.runtime.io import check_stays_below, inside, read_text
+from cosfly.runtime.run_dir import is_bound
 from release.package.captions import FlightKey
 from release.record import ReleasedMap
 

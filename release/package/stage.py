@@ -11,10 +11,10 @@ import shutil
 from pathlib import Path
 
 from cosfly.runtime.errors import VerifyError
-from cosfly.runtime.provenance import read_stage_record
-from cosfly.runtime.runner import Item, Outcome, Watch, Work, run_items
-from cosfly.runtime.stage_folder import Failed, Resume, StageFolder, Tally, result_of
-from cosfly.runtime.store import CHECKSUMS, atomic_folder
+from cosfly.runtime.io import CHECKSUMS, atomic_folder
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Failed, Resume, StageFolder, Tally, read_stage_record, result_of
+from cosfly.runtime.worker import Item, Outcome, Work
 from release.card.ceilings import ceilings_of
 from release.card.numbers import compute_numbers
 from release.package.config import ReleaseConfig

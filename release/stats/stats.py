@@ -9,7 +9,8 @@ from typing import Any
 from cosfly.formats.coverage import Coverage
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.escaping import for_markdown
-from cosfly.runtime.store import write_bytes, write_json
+from cosfly.runtime.io import write_bytes
+from cosfly.runtime.json_io import write_json
 from cosfly.viz.coverage_page import coverage_html
 from cosfly.viz.page import page
 from release.card.numbers import RowCounts, check_rows, row_lists

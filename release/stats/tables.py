@@ -20,7 +20,7 @@ from cosfly.geometry.trajectory_metrics import (
     JERK_RMS_MAX_MPS3,
     smoothness_score,
 )
-from cosfly.runtime.documents import Record
+from cosfly.runtime.json_io import Record
 from release.card.numbers import Sum, bounded, spread_of
 from release.columns import LANGUAGE_NAMES, LANGUAGES
 from release.record import ReleaseRecord, Spread

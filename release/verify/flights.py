@@ -14,7 +14,7 @@ from cosfly.formats.frames import LEGIBLE_CONTRAST, LEGIBLE_HEIGHT_PX, LEGIBLE_S
 from cosfly.formats.shown_captions import CaptionReader
 from cosfly.geometry.axes import BODY_FROM_CAMERA
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.items import Item, Outcome
+from cosfly.runtime.worker import Item, Outcome
 from release.columns import CAPTION, CAPTION_NAMES, LANGUAGES, REQUIRED, SCALARS, TARGET_PICTURE, WINDOW
 from release.flight_rows import FlightRows, Row
 from release.record import ReleaseRecord

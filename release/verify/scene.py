@@ -28,7 +28,7 @@ from cosfly.geometry.reprojection import (
 )
 from cosfly.runtime.compiled import njit
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.items import advance
+from cosfly.runtime.worker import advance
 from release.columns import PICTURES, TARGET_PICTURE, matrices_of
 from release.flight_rows import FlightRows
 from release.verify.findings import Findings

@@ -17,7 +17,7 @@ from cosfly.formats.places import Place, flight_ids
 from cosfly.formats.playback import Track, read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import read_bytes
+from cosfly.runtime.io import read_bytes
 from cosfly.runtime.tables import open_table, read_row_group, row_batches
 from release.columns import PICTURES, PLACE, SCALAR_NAMES, SCALARS, Placement, flight_name, flight_spans
 from release.flight_rows import FlightRows, Row

@@ -22,12 +22,11 @@ from cosfly.formats.shown_captions import CaptionReader
 from cosfly.formats.splits import town_family
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.files import open_file, read_bytes, sha256_file
-from cosfly.runtime.items import Item
-from cosfly.runtime.runner import Watch, run_items
-from cosfly.runtime.stage_folder import Failed, Kept, StageFolder, flattened
-from cosfly.runtime.store import CHECKSUMS, read_checksums
+from cosfly.runtime.io import CHECKSUMS, open_file, read_bytes, read_checksums, sha256_file
+from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.run_dir import Failed, Kept, StageFolder, flattened
 from cosfly.runtime.tables import open_table
+from cosfly.runtime.worker import Item
 from release import columns
 from release.card.ceilings import ceilings_of
 from release.card.croissant import CROISSANT, render_croissant

@@ -19,8 +19,7 @@ from cosfly.formats.frames import FrameFile, depth_values
 from cosfly.runtime.arrays import parse_picture
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.escaping import for_terminal
-from cosfly.runtime.files import read_text
-from cosfly.runtime.store import write_bytes
+from cosfly.runtime.io import read_text, write_bytes
 from cosfly.runtime.tables import arrow_errors, row_groups
 from cosfly.viz.frame_views import View, depth_colors, segmentation_colors
 from cosfly.viz.page import page, scripts

@@ -27,7 +27,7 @@ from cosfly.pedestrians import stage as pedestrians
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners.contract import PlanConfig
 from cosfly.render.settings import RenderConfig
-from cosfly.runtime.stage_folder import read_manifest
+from cosfly.runtime.run_dir import read_manifest
 from cosfly.simplify.passes import SimplifyConfig, simplify
 from distill.inference.stage import InferConfig
 

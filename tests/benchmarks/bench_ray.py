@@ -33,10 +33,11 @@ from toy_workers import make_talking_worker, stage_in
 from cosfly.pipeline import run as pipeline
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.config import load
+from cosfly.runtime.events import LOSSES, Event, read_events, rss_mib
+from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.ray_engine import RayConfig, connected
-from cosfly.runtime.runner import Item, Watch, run_items
-from cosfly.runtime.stage_events import LOSSES, Event, read_events, rss_mib
-from cosfly.runtime.stage_folder import read_manifest
+from cosfly.runtime.run_dir import read_manifest
+from cosfly.runtime.worker import Item
 
 WORKERS = 2
 TOWN = ("pedestrians.num_paths=7", "render.width_px=320", "render.height_px=180", "release.licence=cc-by-4.0")

@@ -35,7 +35,7 @@ from specimens_distill import make_captions
 from cosfly.formats.frames import FILE_NAMES, FrameFile, depth_bytes, frame_name, instance_bytes, rgb_bytes
 from cosfly.formats.playback import Track, write_track
 from cosfly.formats.tracks import find_tracks
-from cosfly.runtime.store import CHECKSUMS, checksum_lines, sha256_bytes
+from cosfly.runtime.io import CHECKSUMS, checksum_lines, sha256_bytes
 from release.package.config import ReleaseConfig
 from release.package.sources import Source
 from release.package.stage import run

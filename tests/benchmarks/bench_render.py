@@ -46,8 +46,8 @@ from cosfly.render.perturbation import Surroundings
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import make_track_script, open_renderer
 from cosfly.render.track import MARGIN_M, Writing, render_track
-from cosfly.runtime.stage_events import read_events
-from cosfly.runtime.stage_folder import read_manifest
+from cosfly.runtime.events import read_events
+from cosfly.runtime.run_dir import read_manifest
 
 SIZE = (1280, 720)
 PAPER = {1: (1.07, 46.3, 7.5), 2: (1.43, 58.6, 10.6), 4: (2.55, 86.8, 24.3), 6: (2.68, 91.6, 34.0)}  # frames/s, %, GiB

@@ -26,9 +26,9 @@ from cosfly.formats.pursuits import PURSUITS, read_pursuit
 from cosfly.formats.traces import read_traces
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners import stage as planning
-from cosfly.runtime.runner import Item
+from cosfly.runtime.json_io import write_model
 from cosfly.runtime.seeding import rng_for
-from cosfly.runtime.store import write_model
+from cosfly.runtime.worker import Item
 
 TURNS = ("yaw_left_to_follow", "yaw_right_to_follow")
 NOISE = (0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)

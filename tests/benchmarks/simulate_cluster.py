@@ -24,12 +24,12 @@ import numpy as np
 import scenes
 
 from cosfly.runtime.config import Config
+from cosfly.runtime.events import read_events
 from cosfly.runtime.journal import Journal
+from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.ray_engine import RayConfig
-from cosfly.runtime.runner import Item, Outcome, Work, run_items
-from cosfly.runtime.stage_events import read_events
-from cosfly.runtime.stage_folder import StageFolder
-from cosfly.runtime.worker_pool import Watch
+from cosfly.runtime.run_dir import StageFolder
+from cosfly.runtime.worker import Item, Outcome, Work
 
 STAGES = ("plan", "render", "inspect", "caption", "release")
 OPS = {"render": 5.1, "inspect": 9.5, "caption": 2.2, "release": 3.2}  # opens and mkdirs of a frame, counted by strace

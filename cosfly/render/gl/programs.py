@@ -11,7 +11,7 @@ import numpy as np
 from cosfly.render.contract import DEBIAN_PACKAGES
 from cosfly.render.gl.parts import NUM_MATERIALS
 from cosfly.runtime.errors import EnvironmentMissing
-from cosfly.runtime.files import read_text
+from cosfly.runtime.io import read_text
 
 # Files of shaders that follow light.glsl.
 FAIR, WEATHER_SKY, WEATHER_SCENE = ("look.glsl",), ("weather.glsl",), ("weather.glsl", "weather_scene.glsl")

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import SchemaValidator
 
 from cosfly.runtime.errors import InputError, plain
-from cosfly.runtime.files import CHECK_PATH, FILE_MB, decoded, not_utf8, read_bytes, read_lines
+from cosfly.runtime.io import CHECK_PATH, FILE_MB, decoded, not_utf8, read_bytes, read_lines, write_bytes
 
 Model = TypeVar("Model", bound=BaseModel)
 Kind = TypeVar("Kind")
@@ -267,3 +267,25 @@ def model_of(value: Any, model: type[Model], form: FileFormat, where: Path | str
 def read_model(path: Path, model: type[Model], form: FileFormat, *, tree: Path | None = None) -> Model:
     """Read a JSON file of the wanted schema and major version; raises as `read_json` and `model_of`."""
     return model_of(read_json(path, what=form.what, tree=tree, each_key_once=True), model, form, path)
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+_COMPACT = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+
+
+def dump_json(value: Any, *, indent: int | None = None) -> str:
+    """Return JSON text; NaN and infinity are an error, never a value."""
+    encoder = _COMPACT if indent is None else json.JSONEncoder(ensure_ascii=False, allow_nan=False, indent=indent)
+    return encoder.encode(value)
+
+
+def write_json(path: Path, value: Any, *, indent: int | None = 1) -> None:
+    """Write JSON as `write_bytes` writes; indent None: on one line."""
+    write_bytes(path, (dump_json(value, indent=indent) + "\n").encode())
+
+
+def write_model(path: Path, content: BaseModel, form: FileFormat) -> None:
+    """Write what `read_model` reads."""
+    write_json(path, {**form.header, **content.model_dump(mode="json")})

@@ -12,7 +12,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
-from cosfly.runtime.documents import is_deep
+from cosfly.runtime.json_io import is_deep
 
 MAX_DIGITS = 18  # of an integer; what has more is read as a float
 MAX_CHARACTERS = 100_000  # more than any reasoning and answer take; what is longer is not read

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cosfly.runtime.documents import read_json
 from cosfly.runtime.errors import InputError
+from cosfly.runtime.json_io import read_json
 
 GEOMETRIES = ("Point", "Polygon", "MultiPolygon")
 LARGEST = 1e9  # of a coordinate
