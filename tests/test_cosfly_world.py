@@ -190,5 +190,5 @@ def test_worlds_go_on_to_releases_with_the_settings_that_are_told(tmp_path):
         assert read_json(run_folder / "roi_polygon.json", what="region")["points_world"]
         assert read_manifest(run_folder / "render").counts.kept == 2
         assert (run_folder / "release/dataset/README.md").is_file()
-        assert (run_folder / "preview.gif").is_file()
+        assert (run_folder / "viewer.html").is_file()
         assert f"seed: {5 + number}\n" in (run_folder / "run.yaml").read_text()

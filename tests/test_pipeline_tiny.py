@@ -80,7 +80,7 @@ def test_every_stage_is_complete_and_adds_up(base):
         )
         assert products(base / stage), stage
     assert read_json(base / "summary.json")["peak_memory_mb"] > 10
-    for picture in ("contact_sheet.png", "preview.gif"):
+    for picture in ("contact_sheet.png", "viewer.html"):
         assert (base / picture).stat().st_size > 10_000
 
 
@@ -164,7 +164,7 @@ UNBOUND = {
     "run.yaml",
     "summary.json",
     "contact_sheet.png",
-    "preview.gif",
+    "viewer.html",
     "stage.json",
     "manifest.json",
     "items.jsonl",

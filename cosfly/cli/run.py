@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from cosfly.pipeline.settings import RunConfig
 
 app = typer.Typer()
-CONFIG = "YAML file, one that ships (quickstart, diverse, learning, simworld, delft), or a run folder, to continue."
+CONFIG = "YAML file, quickstart, showcase, diverse, learning, simworld or delft, or a run directory to continue."
 Until = Literal["maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release"]
 PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)}
 
@@ -84,9 +84,9 @@ def _closing_table(results: list[StageResult], out: Path) -> None:
     options.tell_table(console, head, rows, title=f"What was made in {out}", left=("dropped", "failed"))
     made = (os.path.relpath(result.stage.product, out) for result in results)
     console.print(f"  made     {', '.join(made)}", soft_wrap=True)  # a path that a table folds cannot be copied
-    for name in ("contact_sheet.png", "preview.gif", "inspect/report.html", "release/dataset/README.md"):
-        if (out / name).exists():  # of several towns only the release is here
-            console.print(f"  look at  {os.path.relpath(out / name)}", soft_wrap=True)
+    pages = [out / name for name in ("viewer.html", "contact_sheet.png", "inspect/report.html")]
+    if is_there := [os.path.relpath(page) for page in pages if page.exists()]:  # several towns have their own
+        console.print(f"  open     {', '.join(is_there)}", soft_wrap=True)
 
 
 @app.command()

@@ -162,5 +162,5 @@ def coverage_of(flight: Track) -> Coverage:
 
 @cache
 def default_coverage() -> Coverage:
-    """Return what the plain run that ships covers (`configs/quickstart.yaml`)."""
+    """Return what the plain run that ships covers (`configs/showcase.yaml`)."""
     return validated(Coverage, read_json(DEFAULT), DEFAULT)

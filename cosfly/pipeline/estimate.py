@@ -1,4 +1,4 @@
-"""What a run will take: time and disk by stage, from its settings and the figures of the quickstart."""
+"""What a run will take: time and disk by stage, from its settings and the figures of `cosfly run showcase`."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ UNITS = {
     "caption": "windows", "release": "frames",
 }  # fmt: skip
 BY_PIXELS = ("render", "inspect", "release")  # what costs as much as its pictures have pixels
-BASIS = "the quickstart on a 2-core machine (docs/first-runs.md)"
-# Seconds and MB of a unit of each stage; of BY_PIXELS of a million pixels. Of `cosfly run quickstart`: seconds of
+BASIS = "`cosfly run showcase` on a 2-core machine (docs/first-runs.md)"
+# Seconds and MB of a unit of each stage; of BY_PIXELS of a million pixels. Of `cosfly run showcase`: seconds of
 # docs/first-runs.md (2 cores, AMD EPYC, idle): 3 walks, 858 frames of 0.9216 Mpx, 804 windows of teacher `rules`.
 RATES = {
     "maps": (0.2, 1.1), "simplify": (5.6, 1.2), "pedestrians": (4.6 / 3, 0.3 / 3), "plan": (2.3 / 3, 0.4 / 3),

@@ -30,8 +30,10 @@ from cosfly.runtime.errors import ConfigError, CosflyError, InputError, ResumeEr
 from cosfly.runtime.io import refuse_link, write_bytes
 from cosfly.runtime.json_io import read_object, write_json
 from cosfly.runtime.run_dir import Manifest, Resume, hold_folder, read_manifest
-from cosfly.viz.gallery import contact_sheet, preview_gif
+from cosfly.viz.gallery import contact_sheet
 from release.package.sources import Source, choose_licence
+from release.viewer.content import ViewerConfig
+from release.viewer.page import run as write_viewer
 
 log = logging.getLogger(__name__)
 
@@ -99,7 +101,7 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "
         until: the last stage that is done.
 
     Every stage is complete or resumable at any moment; running again continues. Ends with `contact_sheet.png`,
-    `preview.gif` and `summary.json` in the run folder, in that of each town where there are several.
+    `viewer.html` and `summary.json` in the run directory, or in that of each town if there are several.
     """
     out = cfg.opened(out)
     check_out(out)
@@ -200,9 +202,9 @@ def _run_town(cfg: RunConfig, out: Path, todo: list[Stage]) -> list[StageResult]
         results = [_do(stage, out, f"{number}/{len(todo)}") for number, stage in enumerate(todo, 1)]
         tree = out / "render"
         has_frames = (tree / "manifest.json").exists()
-        if has_frames and not (_is_summed_up(results, out) and (out / "preview.gif").exists()):
+        if has_frames and not (_is_summed_up(results, out) and (out / "viewer.html").exists()):
             contact_sheet(tree, out / "contact_sheet.png")
-            preview_gif(tree, out / "preview.gif")
+            write_viewer(out, out / "viewer.html", ViewerConfig())
         _save_summary(results, out)
     return results
 

@@ -18,7 +18,7 @@ from cosfly.runtime.run_dir import Failed, StageFolder, Tally, is_held, read_man
 STAGES = ("maps", "simplify", "pedestrians", "plan", "render", "inspect", "caption", "release")  # of a run, in order
 TO_LOOK_AT = (
     "contact_sheet.png",
-    "preview.gif",
+    "viewer.html",
     "inspect/report.html",
     "caption/report.html",
     "release/dataset/README.md",
