@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -143,11 +143,9 @@ class WindowConfig(Config):
     future_frames: int = Field(5, ge=1, le=32, description="frames after the current one that give the label")
     stride: int = Field(1, ge=1, description="frames between the current frames of two windows; 1 takes every frame")
     keyframes: bool = Field(
-        False, description="take only the windows at which the label changes, and each keyframe_stride-th after one"
+        False, description="take only the windows at which the label changes, and each tenth after one"
     )
-    keyframe_stride: int = Field(
-        10, ge=1, description="longest way, in windows, from one keyframe to the next within a label"
-    )
+    keyframe_stride: ClassVar[int] = 10  # windows from one keyframe to the next within a label, at most
     require_images: bool = Field(True, description="drop a window that lacks the rgb.png of an observed frame")
 
 
@@ -164,7 +162,7 @@ class ImageConfig(Config):
         description="longest side of one view's picture; pixels in facts, prompt and answer are this picture's",
     )
     depth_range_m: float = Field(DEPTH_RANGE_M, gt=0, description="depth at the dark end of the pseudo-colour")
-    encoding: Literal["jpeg", "png"] = Field("jpeg", description="encoding of the pictures in a request")
+    encoding: ClassVar[Literal["jpeg", "png"]] = "jpeg"  # of the pictures in a request; a student's are PNG
 
 
 class EvidenceConfig(Config):
@@ -263,17 +261,13 @@ class CaptionConfig(Config):
     budget: MayDiffer[BudgetConfig] = Field(BudgetConfig(), description="prices and limits of tokens and money")
     repair: RepairConfig = Field(RepairConfig(), description="re-generation of rejected samples")
     judge: JudgeConfig = Field(JudgeConfig(), description="an optional judge of conflicts")
-    structure_asks: int = Field(3, ge=1, le=10, description="asks until an answer has the right structure")
-    correction_asks: int = Field(
-        1,
-        ge=0,
-        le=5,
-        description="asks that name what was wrong with an answer of the right structure, before its window is dropped",
-    )
+    # Requests for one text, at most; of a student, which answers the same again, 1, 0 and 1.
+    structure_asks: ClassVar[int] = 3  # until an answer has the right structure
+    correction_asks: ClassVar[int] = 1  # that name what was wrong with an answer of the right structure
+    mirror_asks: ClassVar[int] = 2  # for the Chinese mirror, until the pair is consistent
     stop_after_dropped: MayDiffer[int] = Field(
         50, ge=0, description="end the run when none of the first so many answered windows is accepted; 0: never"
     )
-    mirror_asks: int = Field(2, ge=1, le=10, description="asks for the Chinese mirror until the pair is consistent")
     limit: MayDiffer[int | None] = Field(None, ge=1, description="caption at most this many windows; empty takes all")
 
     @model_validator(mode="after")

@@ -364,7 +364,7 @@ def test_no_change_is_missed_and_every_window_is_taken_or_counted(labels, stride
 
 def test_a_run_reports_what_it_saved(tmp_path):
     tree = make_playback_tree(tmp_path / "tree", 2, 40, with_images=False)
-    window = {"require_images": False, "keyframe_stride": 5}
+    window = {"require_images": False}
     plain = run(CaptionConfig.model_validate({"window": window}), tree, tmp_path / "plain")
     few = run(CaptionConfig.model_validate({"window": window | {"keyframes": True}}), tree, tmp_path / "few")
     every = {caption.sample_id: caption for caption in read_captions(plain)}

@@ -112,7 +112,9 @@ def ask(window: Window, cfg: ImageConfig) -> tuple[dict[Language, str], list[np.
 def test_a_teacher_is_told_what_it_is_shown(window):
     middle = [(("middle",), "separate", 640), (("rgb", "middle", "depth"), "tiled", 40)]
     for views, layout, max_side_px in [*SHAPES, *middle]:
-        cfg = ImageConfig(modalities=views, layout=layout, max_side_px=max_side_px, encoding="png")
+        cfg = ImageConfig(modalities=views, layout=layout, max_side_px=max_side_px).model_copy(
+            update={"encoding": "png"}
+        )
         told, pictures = ask(window, cfg)
         for language, text in told.items():
             assert told_views(text, language) == views
@@ -126,8 +128,9 @@ def test_a_teacher_is_told_what_it_is_shown(window):
 @pytest.mark.parametrize(("views", "layout", "max_side_px"), SHAPES)
 def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, window, views, layout, max_side_px):
     """The teacher gets all three; the student any of them, in any order."""
-    image = {"layout": layout, "max_side_px": max_side_px, "depth_range_m": 40.0, "encoding": "png"}
+    image = {"layout": layout, "max_side_px": max_side_px, "depth_range_m": 40.0}
     cfg = CaptionConfig.model_validate({"image": image, "window": {"require_images": True}})
+    cfg = cfg.model_copy(update={"image": cfg.image.model_copy(update={"encoding": "png"})})
     caption = asyncio.run(caption_window(window, RuleTeacher(0), cfg, VOCABULARY))
     _, shown = ask(window, cfg.image)
     if layout == "tiled":

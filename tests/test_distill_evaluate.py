@@ -362,7 +362,7 @@ def test_scores_are_those_of_the_library(encoder):
     texts = [text for frame in FRAMES for text in (text_of(coc_of(sample_of(frame))), sample_of(frame, "zh").answer)]
     texts += ["short one", "a " * 700, texts[0]]
     candidates = [*texts[1:], texts[0]]
-    cfg = BertScoreConfig.model_validate({"en": {"layer": 2}, "device": "cpu"})
+    cfg = BertScoreConfig.model_validate({"en": {"layer": 2}})
     own = Scorer(cfg, "en", encoder, texts)
     plain = bert_score.BERTScorer(model_type=str(encoder), num_layers=2, device="cpu", nthreads=1)
     plain._tokenizer.model_max_length = 512

@@ -91,7 +91,7 @@ def test_a_merged_student_sees_pictures_as_it_was_taught(place, tmp_path):
     adapter = Path(shutil.copytree(place / "trained" / "adapter", tmp_path / "few" / "adapter"))
     for name in (TAUGHT, ADAPTER_FACTS):
         (adapter / name).write_text(json.dumps(json.loads((adapter / name).read_text()) | {"max_pixels": 32 * 32}))
-    merged = merge.run(merge.MergeConfig(), place / "student", adapter, tmp_path / "merged")
+    merged = merge.run(place / "student", adapter, tmp_path / "merged")
     given = (settings(max_samples=3), place / "set", [place / "tree"])
     infer.run(*given, place / "student", tmp_path / "beside", adapter=adapter)
     infer.run(*given, merged, tmp_path / "alone")

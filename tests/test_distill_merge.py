@@ -21,7 +21,6 @@ from cosfly.llm.student_chat import TAUGHT, read_taught  # noqa: E402
 from cosfly.runtime.errors import InputError  # noqa: E402
 from cosfly.runtime.json_io import write_json  # noqa: E402
 from distill.inference import merge  # noqa: E402
-from distill.inference.merge import MergeConfig  # noqa: E402
 from distill.student.model import Student, load_student  # noqa: E402
 from distill.student.random_student import make_tiny_student  # noqa: E402
 
@@ -65,7 +64,7 @@ def logits(student: Student, inputs: dict) -> torch.Tensor:
 
 
 def test_merged_weights_give_the_logits_of_base_and_adapter(base, adapter, inputs, tmp_path):
-    model = merge.run(MergeConfig(), base, adapter, tmp_path / "out")
+    model = merge.run(base, adapter, tmp_path / "out")
     alone = logits(load_student(base, device="cpu", max_pixels=PIXELS), inputs)
     beside = logits(load_student(base, device="cpu", max_pixels=PIXELS, adapter=adapter), inputs)
     merged = logits(load_student(model, device="cpu", max_pixels=PIXELS), inputs)
@@ -80,7 +79,7 @@ def test_merged_weights_give_the_logits_of_base_and_adapter(base, adapter, input
 def test_merged_as_peft_merges(base, tmp_path, changes):
     folder = make_adapter(base, tmp_path / "adapter", **changes)
     expected = load_student(base, device="cpu", max_pixels=PIXELS, adapter=folder).model.merge_and_unload().state_dict()
-    found = load_file(merge.run(MergeConfig(), base, folder, tmp_path / "out") / "model.safetensors")
+    found = load_file(merge.run(base, folder, tmp_path / "out") / "model.safetensors")
     before = load_file(base / "model.safetensors")
     changed = {name for name in found if not torch.equal(found[name], before[name])}
     assert changed
@@ -90,7 +89,7 @@ def test_merged_as_peft_merges(base, tmp_path, changes):
 
 
 def test_a_model_folder_is_whole(base, adapter, tmp_path):
-    model = merge.run(MergeConfig(), base, adapter, tmp_path / "out")
+    model = merge.run(base, adapter, tmp_path / "out")
     assert {path.name for path in model.iterdir()} == {path.name for path in base.iterdir()} | {TAUGHT}
     for name in {path.name for path in base.iterdir()} - {"model.safetensors"}:
         assert (model / name).read_bytes() == (base / name).read_bytes()
@@ -112,7 +111,7 @@ def test_another_kind_of_adapter_is_refused(base, adapter, tmp_path, changes, wo
     path = tmp_path / "adapter" / "adapter_config.json"
     write_json(path, json.loads(path.read_text()) | changes)
     with pytest.raises(InputError, match=words):
-        merge.run(MergeConfig(), base, tmp_path / "adapter", tmp_path / "out")
+        merge.run(base, tmp_path / "adapter", tmp_path / "out")
     assert not (tmp_path / "out" / "model").exists()
 
 
@@ -132,5 +131,5 @@ def test_damaged_adapters_are_refused(base, adapter, tmp_path):
         shutil.copytree(adapter, folder)
         save_file(changed, folder / "adapter_model.safetensors")
         with pytest.raises(InputError, match=words):
-            merge.run(MergeConfig(), base, folder, tmp_path / f"out_{number}")
+            merge.run(base, folder, tmp_path / f"out_{number}")
         assert [path.name for path in (tmp_path / f"out_{number}").iterdir() if path.is_dir()] == []

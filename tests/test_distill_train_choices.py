@@ -82,20 +82,15 @@ def test_validation_is_drawn_over_all_decisions_and_flights(place):
     assert choose_over_all([], 5, np.random.default_rng(0)) == []
 
 
-@pytest.mark.parametrize("best_by", ["decision", "verdict"])
-def test_the_best_is_who_decides_best_and_patience_ends(best_by):
-    progress, cfg, found = Progress(), TrainConfig(best_by=best_by, patience=2), []
+def test_the_best_is_who_decides_best_and_patience_ends():
+    progress, cfg, found = Progress(), TrainConfig(patience=2), []
     for step, (share, loss) in enumerate([(0.2, 3.0), (0.5, 2.0), (0.5, 1.0), (0.4, 0.5), (0.5, 1.5)], 1):
-        other = 0.1 * step  # what is not followed only grows
-        accuracy, consistent = (share, other) if best_by == "decision" else (other, share)
-        validation = Validation(samples=4, loss=loss, accuracy=accuracy, consistent=consistent)
+        validation = Validation(samples=4, loss=loss, accuracy=share, consistent=0.1 * step)  # the latter only grows
         progress = judged(progress.model_copy(update={"step": step}), validation, cfg)
         found.append((progress.best_step, progress.stale, progress.has_ended))
     assert found == [(1, 0, False), (2, 0, False), (3, 0, False), (3, 1, False), (3, 2, True)]
     patient = TrainConfig(patience=0)
     assert not judged(Progress(step=9, best_score=(1.0, 0.0)), Validation(samples=1, loss=1.0), patient).has_ended
-    with pytest.raises(ValueError, match="verdict needs validation_answers"):
-        TrainConfig(best_by="verdict", validation_answers=False)
 
 
 def test_an_answer_is_judged_by_the_teacher_and_by_the_future(place):

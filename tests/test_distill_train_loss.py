@@ -16,6 +16,7 @@ from specimens_students import FAST, features_of, inputs_of, load, losses_of, ru
 
 from distill.student.encoding import EncodedSample, encode_text, padded  # noqa: E402
 from distill.student.model import Student  # noqa: E402
+from distill.training import fit  # noqa: E402
 from distill.training import stage as train  # noqa: E402
 from distill.training.loss import answer_loss, chunked_loss  # noqa: E402
 from distill.training.settings import TrainConfig  # noqa: E402
@@ -96,15 +97,18 @@ def test_a_sample_in_a_batch_has_its_loss_alone(place):
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("changes", "feature_memory_gb", "logit_chunk"),
     [
-        {"feature_memory_gb": 0, "batch_size": 3},
-        {"feature_memory_gb": 2e-5, "logit_chunk": 9, "gradient_checkpointing": True},  # three pictures have room
-        pytest.param({"data_workers": 2}, marks=pytest.mark.slow),
+        ({"batch_size": 3}, 0.0, 512),
+        ({"gradient_checkpointing": True}, 2e-5, 9),  # three pictures have room
+        pytest.param({"data_workers": 2}, 16.0, 512, marks=pytest.mark.slow),
     ],
-    ids=lambda changes: "_".join(changes),
 )
-def test_what_changes_how_and_not_what_gives_the_same_losses(place, plain, tmp_path, changes):
+def test_what_changes_how_and_not_what_gives_the_same_losses(
+    place, plain, tmp_path, monkeypatch, changes, feature_memory_gb, logit_chunk
+):
+    monkeypatch.setattr(train, "FEATURE_MEMORY_GB", feature_memory_gb)
+    monkeypatch.setattr(fit, "LOGIT_CHUNK", logit_chunk)
     run(place, tmp_path / "out", **{**FOUR, **changes})
     assert losses_of(tmp_path / "out") == pytest.approx(plain, rel=1e-5)
 

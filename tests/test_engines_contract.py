@@ -168,7 +168,7 @@ def test_an_engine_is_closed_whatever_came_of_its_start():
 def test_the_engine_of_the_recipe_captions_a_flight(tree, tmp_path: Path, monkeypatch):
     engine = PlainEngine()
     monkeypatch.setattr(teacher, "make_engine", lambda cfg, troubles: engine)
-    cfg = settings("http://plain", mirror_asks=1)
+    cfg = settings("http://plain").model_copy(update={"mirror_asks": 1})
     captions = list(read_captions(run(cfg, tree, tmp_path / "out")))
     assert len(captions) == 5
     for caption in captions:

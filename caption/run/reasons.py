@@ -13,7 +13,7 @@ REASONS = {
     "unreadable_frame": "a picture of the window cannot be read",
     "refused_": "the server refused the request, as the word behind says; see `checks.refusal`",
     "engine": "the vLLM engine refused the request",
-    "structure_": "no answer had the fields that were asked for, in structure_asks asks; the word behind says what was "
+    "structure_": "no answer had the fields that were asked for, in 3 asks; the word behind says what was "
     "wrong with the last",
     "regeneration_context_full": "prompt and answer fill the server's context: raise it, or send smaller pictures",
     "structure_context_full": "prompt and answer fill the server's context: raise it, or send smaller pictures",

@@ -112,7 +112,7 @@ def distill_merge(
     """Put an adapter into the weights of its base: a model folder for transformers, vLLM and servers."""
     from distill.inference import merge
 
-    typer.echo(merge.run(job.cfg.distill.merge, model, adapter, out, resume=job.resume))
+    typer.echo(merge.run(model, adapter, out, resume=job.resume))
 
 
 @app.command("evaluate")

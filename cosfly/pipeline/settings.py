@@ -26,7 +26,6 @@ from cosfly.simplify.passes import SimplifyConfig
 from cosfly.worldgen.settings import WorldConfig
 from distill.evaluation.compare import ReportConfig
 from distill.evaluation.stage import EvaluateConfig
-from distill.inference.merge import MergeConfig
 from distill.inference.stage import InferConfig
 from distill.prepare.dual_track import DualTrackConfig
 from distill.prepare.stage import PrepareConfig
@@ -43,7 +42,6 @@ class DistillConfig(Config):
     dual_track: DualTrackConfig = Field(default_factory=DualTrackConfig, description="windows over both tracks")
     train: TrainConfig = Field(default_factory=TrainConfig, description="LoRA training")
     infer: InferConfig = Field(default_factory=InferConfig, description="answers of the student")
-    merge: MergeConfig = Field(default_factory=MergeConfig, description="an adapter into its base's weights")
     evaluate: EvaluateConfig = Field(default_factory=EvaluateConfig, description="scores")
     report: ReportConfig = Field(default_factory=ReportConfig, description="students side by side")
 

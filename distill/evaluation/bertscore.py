@@ -16,10 +16,10 @@ from pydantic import Field
 from cosfly.formats.captions import Language
 from cosfly.runtime.config import Config
 from cosfly.runtime.console import progress_bar
+from cosfly.runtime.json_io import Record, read_json, read_object
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.io import sha256_file
-from cosfly.runtime.json_io import Record, read_json, read_object
-from distill.student.model import Device, pick_device, quiet_transformers, require
+from distill.student.model import pick_device, quiet_transformers, require
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,6 @@ class LanguageMetric(Config):
     """BERTScore of one language; the model's folder is an argument of the command."""
 
     layer: int = Field(17, ge=1, description="layer of the embeddings")
-    baseline: Path | None = Field(None, description="baseline file (.tsv) of the model to rescale with")
 
 
 class BertScoreConfig(Config):
@@ -39,7 +38,6 @@ class BertScoreConfig(Config):
 
     en: LanguageMetric = Field(LanguageMetric(), description="English: layer 17 of roberta-large, as in the paper")
     zh: LanguageMetric = Field(LanguageMetric(layer=8), description="Chinese: layer 8 of bert-base-chinese")
-    device: Device = Field("auto", description="auto, cpu or cuda")
 
 
 class Metric(Record):
@@ -50,7 +48,6 @@ class Metric(Record):
 
     model: str
     layer: int
-    baseline_sha256: str | None
     max_tokens: int
     cut: int
     sha256: dict[str, str]
@@ -81,9 +78,7 @@ class Scorer:
         try:
             self._library = bert_score.BERTScorer(
                 model_type=str(folder), num_layers=own.layer, batch_size=BATCH_SIZE, nthreads=1,
-                device=pick_device(cfg.device), rescale_with_baseline=own.baseline is not None,
-                baseline_path=str(own.baseline) if own.baseline else None,
-                lang="en" if own.baseline else None,  # asked for by the library, unused with a baseline file
+                device=pick_device("auto"), rescale_with_baseline=False,
             )  # fmt: skip
         except (OSError, ValueError, RuntimeError) as error:
             raise InputError("the BERTScore model does not load", where=folder, got=str(error)[:300]) from error
@@ -97,7 +92,6 @@ class Scorer:
         self.metric = Metric(
             model=folder.name,
             layer=own.layer,
-            baseline_sha256=sha256_file(own.baseline) if own.baseline else None,
             max_tokens=limit,
             cut=sum(length > limit for length in lengths),
             sha256={path.name: sha256_file(path) for path in deciding_files(folder)},
@@ -164,5 +158,3 @@ def check_encoder(own: LanguageMetric, folder: Path, language: Language) -> None
     if "t5" in str(folder) or str(folder).startswith("scibert"):  # bert-score reads the model's family off its path
         words, fix = "bert-score would take this path for another kind of model", "name it without 't5' or 'scibert'"
         raise InputError(words, where=folder, fix=fix)
-    if own.baseline is not None and not own.baseline.is_file():
-        raise ConfigError("no such baseline file", where=f"{where}.baseline", got=str(own.baseline))

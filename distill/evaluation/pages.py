@@ -54,8 +54,7 @@ def metric_lines(report: Evaluation) -> list[str]:
             lines.append(f"BERTScore of {language}: not computed, no model folder")
             continue
         weights = [d[:12] for name, d in metric.sha256.items() if name.endswith((".safetensors", ".bin"))]
-        words = [metric.model, f"layer {metric.layer}"]
-        words += ["rescaled" if metric.baseline_sha256 else "not rescaled", f"weights {', '.join(weights)}"]
+        words = [metric.model, f"layer {metric.layer}", "not rescaled", f"weights {', '.join(weights)}"]
         words += [f"{name} {number}" for name, number in metric.versions.items()]
         cut = f"; {metric.cut} references longer than {metric.max_tokens} tokens" if metric.cut else ""
         lines.append(f"BERTScore of {language}: {', '.join(words)}{cut}")

@@ -29,12 +29,6 @@ PREFIX = "base_model.model."  # of the names that peft gives
 COPIED = ("*.json", "*.jinja", "*.txt", "*.model", "LICENSE*")
 
 
-class MergeConfig(Config):
-    """Settings of `distill merge`."""
-
-    dtype: Literal["base", "float32"] = Field("base", description="of what the adapter changes; sums are in float32")
-
-
 class LoraSettings(BaseModel):
     """Of `adapter_config.json`, what decides how an update is computed."""
 
@@ -57,7 +51,7 @@ class LoraSettings(BaseModel):
         return self.lora_alpha / (math.sqrt(self.r) if self.use_rslora else self.r)
 
 
-def run(cfg: MergeConfig, model: Path, adapter: Path, out: Path, *, resume: Resume = "if-same") -> Path:
+def run(model: Path, adapter: Path, out: Path, *, resume: Resume = "if-same") -> Path:
     """Read a base model's folder and an adapter that was trained on it; write `model/`.
 
     Returns:
@@ -70,7 +64,7 @@ def run(cfg: MergeConfig, model: Path, adapter: Path, out: Path, *, resume: Resu
     model = student_folder(str(model))
     inputs = {**weight_files(model), **adapter_files(adapter)}
     read_adapter_facts(adapter, model)
-    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=0, resume=resume)
+    stage = StageFolder.open(out, STAGE, config=Config(), inputs=inputs, seed=0, resume=resume)
     merged = out / "model"
     if stage.is_complete:
         return merged
@@ -80,7 +74,7 @@ def run(cfg: MergeConfig, model: Path, adapter: Path, out: Path, *, resume: Resu
         shards, num_bytes = sorted(model.glob("*.safetensors")), 0
         with progress_bar(STAGE, total=len(shards)) as advance:
             for shard in shards:
-                num_bytes += _merge_shard(shard, partial / shard.name, updates, cfg.dtype)
+                num_bytes += _merge_shard(shard, partial / shard.name, updates)
                 advance(1)
         _mend_index(partial, num_bytes)
         if left := updates.unused():
@@ -88,7 +82,7 @@ def run(cfg: MergeConfig, model: Path, adapter: Path, out: Path, *, resume: Resu
             raise InputError("the base has no layer that the adapter changes", where=adapter, got=left[0], fix=fix)
     outputs = [path for path in merged.iterdir() if path.is_file()]
     tally = Tally(input=len(updates.names), kept=len(updates.names))
-    stage.finish(outputs, tally, dtype=cfg.dtype)
+    stage.finish(outputs, tally)
     return merged
 
 
@@ -159,7 +153,7 @@ def _read_tensors(path: Path) -> tuple[dict[str, str] | None, dict[str, Any]]:
         raise InputError("a damaged file of weights", where=path, got=str(error)[:200]) from error
 
 
-def _merge_shard(shard: Path, out: Path, updates: Updates, dtype: str) -> int:
+def _merge_shard(shard: Path, out: Path, updates: Updates) -> int:
     """Write one file of weights with the updates in it; gives the bytes of its tensors."""
     import torch
 
@@ -167,7 +161,7 @@ def _merge_shard(shard: Path, out: Path, updates: Updates, dtype: str) -> int:
     for name in tensors:
         if name in updates:
             merged = updates.add_to(name, tensors[name])
-            tensors[name] = merged.to(tensors[name].dtype if dtype == "base" else torch.float32)
+            tensors[name] = merged.to(tensors[name].dtype)
             if not torch.isfinite(tensors[name]).all():
                 raise InputError("a merged weight is not finite", where=shard, got=name, fix="see the training's loss")
     with storage_errors(out):

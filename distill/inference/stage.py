@@ -120,6 +120,7 @@ class EngineAnswers:
 
 
 STAGE = "distill.infer"
+FEATURE_MEMORY_GB = 16.0  # for features of pictures; what has no room is computed each time
 
 
 class InferConfig(Config):
@@ -137,7 +138,6 @@ class InferConfig(Config):
     batch_size: int = Field(8, ge=1, description="samples that transformers answers together; rounding may follow it")
     max_pixels: int = Field(0, ge=0, description="most pixels of a picture; 0: as in training, where it is known")
     device: Device = Field("auto", description="auto, cpu or cuda for transformers; bfloat16 on cuda, float32 on a CPU")
-    feature_memory_gb: MayDiffer[float] = Field(16.0, ge=0, description="memory for features of pictures, GB")
     endpoint: StudentEndpointConfig = Field(
         StudentEndpointConfig(), description="how endpoint and vllm are asked; max_new_tokens and constrained go before"
     )
@@ -204,7 +204,7 @@ def local_answers(cfg: InferConfig, inputs: Inputs, book: AnswerBook) -> LocalAn
         batch_size=cfg.batch_size,
         max_tokens=cfg.max_new_tokens,
         constrain=AnswerSchemas(student) if cfg.constrained else None,
-        feature_bytes=int(cfg.feature_memory_gb * 1e9),
+        feature_bytes=int(FEATURE_MEMORY_GB * 1e9),
     )
 
 

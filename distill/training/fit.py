@@ -44,7 +44,15 @@ from distill.training.loading import Census, ReadyStep, Row, Supply
 from distill.training.loss import answer_loss
 from distill.training.preflight import used_gb
 from distill.training.ranks import Ranks
-from distill.training.settings import MAX_GRADIENT_NORM, STAGE, Steps, TrainConfig, learning_rate_at, share_of
+from distill.training.settings import (
+    LOGIT_CHUNK,
+    MAX_GRADIENT_NORM,
+    STAGE,
+    Steps,
+    TrainConfig,
+    learning_rate_at,
+    share_of,
+)
 
 log = logging.getLogger(__name__)
 
@@ -65,9 +73,9 @@ class Validation(BaseModel):
     consistent: float | None = None
     parsed: float | None = None
 
-    def score(self, best_by: str) -> tuple[float, float]:
+    def score(self) -> tuple[float, float]:
         """Return what the best checkpoint has most of: decisions or verdicts first, then likelihood."""
-        return ((self.accuracy if best_by == "decision" else self.consistent) or 0.0, -self.loss)
+        return (self.accuracy or 0.0, -self.loss)
 
     def __str__(self) -> str:
         shares = {"decisions right": self.accuracy, "consistent": self.consistent, "parsed": self.parsed}
@@ -103,7 +111,7 @@ def validate(
 def _validate_batch(student: Student, rows: Sequence[Row], supply: Supply, cfg: TrainConfig) -> Any:
     features = supply.features.of([picture for row in rows for picture in row.pictures])
     encoded = [row.encoded for row in rows]
-    nats, _ = answer_loss(student, encoded, features, cfg.logit_chunk)
+    nats, _ = answer_loss(student, encoded, features, LOGIT_CHUNK)
     weight = sum(len(row.answer_ids) * row.weight for row in encoded)
     counts = np.zeros(4)
     if cfg.validation_answers:
@@ -196,7 +204,7 @@ def train_step(lesson: Lesson, optimizer: Any, ready: ReadyStep, rate: float) ->
     for start in range(0, len(rows), cfg.batch_size):
         batch = rows[start : start + cfg.batch_size]
         features = lesson.supply.features.of([picture for row in batch for picture in row.pictures])
-        nats, _ = answer_loss(student, [row.encoded for row in batch], features, cfg.logit_chunk)
+        nats, _ = answer_loss(student, [row.encoded for row in batch], features, LOGIT_CHUNK)
         nats.backward()
         own_nats += float(nats.detach())
     answers = [(len(row.encoded.answer_ids), row.encoded.weight, len(row.encoded)) for row in rows]
@@ -286,7 +294,7 @@ def _run_steps(
 
 def judged(progress: Progress, found: Validation, cfg: TrainConfig) -> Progress:
     """Take a validation into account: is it the best, and has there been none better for too long."""
-    score, stale = found.score(cfg.best_by), progress.stale + 1
+    score, stale = found.score(), progress.stale + 1
     if progress.best_score is None or score > progress.best_score:
         return progress.model_copy(update={"best_step": progress.step, "best_score": score, "stale": 0})
     has_ended = bool(cfg.patience) and stale >= cfg.patience

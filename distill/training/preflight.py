@@ -23,7 +23,7 @@ from distill.student.features import VisionFeatures
 from distill.student.model import Processor, Student
 from distill.training.loading import Census
 from distill.training.loss import answer_loss
-from distill.training.settings import Steps, TrainConfig
+from distill.training.settings import LOGIT_CHUNK, Steps, TrainConfig
 
 log = logging.getLogger(__name__)
 
@@ -79,7 +79,7 @@ def saved_bytes_per_token(student: Student, cfg: TrainConfig) -> float:
         half = np.full(length // 2, student.end_token_id, np.int64)
         row = EncodedSample("probe", half, half, np.zeros((0, 3), np.int64), 1.0)
         with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
-            answer_loss(student, [row], torch.zeros((0, 1)), cfg.logit_chunk)
+            answer_loss(student, [row], torch.zeros((0, 1)), LOGIT_CHUNK)
         found.append(sum(storage.nbytes() for storage in storages.values()))
     return (found[1] - found[0]) / (PROBES[1] - PROBES[0])
 
@@ -100,7 +100,7 @@ def estimate(student: Student, cfg: TrainConfig, longest: int, picture_bytes: fl
         optimizer=ADAM_COPIES * learning,
         # While a layer goes backward, the gradients of what it kept stand beside what all layers kept.
         activations=saved_bytes_per_token(student, cfg) * longest * rows * (1 + 1 / config.num_hidden_layers),
-        logits=float(TABLES * cfg.logit_chunk * config.vocab_size * 4),
+        logits=float(TABLES * LOGIT_CHUNK * config.vocab_size * 4),
         pictures=rows * picture_bytes,
         program=max(0.0, used_gb(student.device) * GB - weights),
         available=available_bytes(student.device),

@@ -27,7 +27,7 @@ from distill.training.fit import LOG, Lesson, fit, seeded
 from distill.training.loading import Census, Supply, choose_over_all, num_workers, reader_errors, take_census
 from distill.training.preflight import GB, findings, memory_errors, tell
 from distill.training.ranks import Ranks, joined
-from distill.training.settings import STAGE, TrainConfig
+from distill.training.settings import FEATURE_MEMORY_GB, STAGE, TrainConfig
 
 
 def taught_by(samples: Iterable[Sample], max_pixels: int) -> Taught:
@@ -180,7 +180,7 @@ def _lesson(
     asked = take_census(validation, chosen, processor, trees, **counting, label=f"{STAGE}: counting tokens of val")
     if not len(census):
         raise _nothing_to_learn(out, census)
-    memory_bytes = int(cfg.feature_memory_gb * GB)
+    memory_bytes = int(FEATURE_MEMORY_GB * GB)
     features = VisionFeatures(student, memory_bytes=memory_bytes, is_frozen=not cfg.train_vision)
     reader = PictureReader(processor, trees, student.dtype)
     lesson = Lesson(student, samples, census, validation, asked, Supply(features, reader, workers), cfg, ranks, seed)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from pydantic import Field, field_validator, model_validator
 
 from cosfly.formats.boxes import LicenceId
@@ -51,7 +53,7 @@ class ReleaseConfig(Config):
     split_by: SplitBy = Field("walk", description="what two splits may not share: a walk, or a town in all its builds")
     validation_fraction: float = Field(0.1, ge=0, lt=1, description="share of walks (towns) for validation; 0: none")
     test_fraction: float = Field(0.1, ge=0, lt=1, description="share of walks (towns) for the test; 0: none")
-    split_seed: int = Field(0, ge=0, description="seed of the division into splits")
+    split_seed: ClassVar[int] = 0  # of the division into splits
     modalities: tuple[FrameFile, ...] = Field(
         tuple(FILE_NAMES), min_length=1, description="pictures to include: rgb, depth, instance"
     )

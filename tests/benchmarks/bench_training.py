@@ -130,7 +130,7 @@ def plain_loss(student: Student, rows: list[EncodedSample], patches: Any) -> Any
     return student.model(**inputs, pixel_values=patches.to(student.device), use_cache=False).loss * count
 
 
-def backward(student: Student, way: str, rows: list, features: VisionFeatures, cfg: TrainConfig) -> float:
+def backward(student: Student, way: str, rows: list, features: VisionFeatures, chunk: int) -> float:
     """Compute loss and gradients of a micro-batch."""
     encoded, pictures = [row for row, _ in rows], [picture for _, found in rows for picture in found]
     if way == "plain":
@@ -139,7 +139,7 @@ def backward(student: Student, way: str, rows: list, features: VisionFeatures, c
     else:
         plan = features.plan()
         features.take([noise_of(picture, student.dtype) for picture in features.wanted(plan, pictures)])
-        loss, _ = answer_loss(student, encoded, features.of(pictures), cfg.logit_chunk)
+        loss, _ = answer_loss(student, encoded, features.of(pictures), chunk)
     loss.backward()
     features.end_step()
     return float(loss.detach())
@@ -148,7 +148,7 @@ def backward(student: Student, way: str, rows: list, features: VisionFeatures, c
 def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
     shape, dtype = arguments.shape, compute_dtype(arguments.dtype, ranks.device)
     cfg = TrainConfig(
-        batch_size=arguments.micro or arguments.batch, samples_per_step=arguments.batch, logit_chunk=arguments.chunk,
+        batch_size=arguments.micro or arguments.batch, samples_per_step=arguments.batch,
         gradient_checkpointing=arguments.checkpointing,
     )  # fmt: skip
     student = add_adapter(make_student(shape, ranks.device, dtype), cfg, 0)
@@ -167,7 +167,7 @@ def measure(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
         ranks.total([0.0])  # all begin a step together
         begun_s = time.perf_counter()
         for start in range(0, len(rows), cfg.batch_size):
-            backward(student, arguments.way, rows[start : start + cfg.batch_size], features, cfg)
+            backward(student, arguments.way, rows[start : start + cfg.batch_size], features, arguments.chunk)
         ranks.add_gradients(parameters)
         torch.nn.utils.clip_grad_norm_(parameters, 1.0)
         optimizer.step()
@@ -193,7 +193,7 @@ def check(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
     Both in float32, of one process; in bfloat16 against what a float32 run left in `--kept`, since a process has either
     PyTorch's functions or the fast kernels.
     """
-    cfg, dtype = TrainConfig(logit_chunk=arguments.chunk), compute_dtype(arguments.dtype, ranks.device)
+    cfg, dtype = TrainConfig(), compute_dtype(arguments.dtype, ranks.device)
     if arguments.dtype == "auto":
         dtype = torch.float32
     student = add_adapter(make_student(arguments.shape, ranks.device, dtype), cfg, 0)
@@ -201,7 +201,7 @@ def check(arguments: argparse.Namespace, ranks: Ranks) -> dict[str, Any]:
     rows = make_rows(arguments.shape, 2, 0)
 
     def gradients_of(way: str) -> dict[str, torch.Tensor]:
-        loss = backward(student, way, rows, VisionFeatures(student), cfg)
+        loss = backward(student, way, rows, VisionFeatures(student), arguments.chunk)
         gradients = {name: parameter.grad.float().cpu() for name, parameter in learned.items()}
         student.model.zero_grad(set_to_none=True)
         return {"loss": torch.tensor(loss)} | gradients
