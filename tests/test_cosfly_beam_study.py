@@ -8,22 +8,22 @@ from specimens_planning import CANYON, town_of, walk_along
 from cosfly.formats.boxes import write_boxes
 from cosfly.formats.pedestrian_paths import write_paths
 from cosfly.studies import beam
-from cosfly.studies.beam import FIGURES, PAPER_BEAM, BeamConfig, Flown
+from cosfly.studies.beam import FIGURES, PAPER_BEAM, BeamConfig, Planned
 
 
-def flown(value, reason=None):
-    return Flown(figures=None if value is None else dict.fromkeys(FIGURES, value), reason=reason)
+def planned(value, reason=None):
+    return Planned(figures=None if value is None else dict.fromkeys(FIGURES, value), reason=reason)
 
 
 def test_differences_are_those_of_the_walks_that_both_fly():
     many = {
-        PAPER_BEAM: [flown(1.0), flown(5.0), flown(None, "no_path")],
-        64: [flown(3.0), flown(None, "no_path"), flown(9.0)],
+        PAPER_BEAM: [planned(1.0), planned(5.0), planned(None, "no_path")],
+        64: [planned(3.0), planned(None, "no_path"), planned(9.0)],
     }
     rows = beam.summarize(many, np.random.default_rng(0))
     assert rows[64]["figures"]["length_m"] == {"mean": 3.0, "difference": 2.0, "low": 2.0, "high": 2.0}
     assert rows[64]["kept"] == 2
-    nobody = beam.summarize({PAPER_BEAM: [flown(None, "no_path")]}, np.random.default_rng(0))
+    nobody = beam.summarize({PAPER_BEAM: [planned(None, "no_path")]}, np.random.default_rng(0))
     assert nobody[PAPER_BEAM] == {"walks": 1, "kept": 0, "figures": {}}
 
 

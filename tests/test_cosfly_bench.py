@@ -63,10 +63,10 @@ def test_tables_are_those_of_the_paper():
     head, *rows = tables(bench)["render on 2 cores"]
     assert [dict(zip(head, row, strict=True))["speed-up"] for row in rows] == ["1.00x", "2.00x"]
     assert rows[1][:6] == ("2", "10.0", "200", "200", "20.00", "2.00x")
-    assert "its NVIDIA devices" not in tables(bench)
+    assert "NVIDIA GPUs" not in tables(bench)
     seen = bench.rows[1].model_copy(update={"gpu_percent": 58.6, "gpu_gib": 10.6})
     bench.rows[1] = seen
-    assert tables(bench)["its NVIDIA devices"][2] == ("2", "58.6", "10.6")
+    assert tables(bench)["NVIDIA GPUs"][2] == ("2", "58.6", "10.6")
 
 
 def test_what_lost_workers_had_done_is_counted_and_left_out(tmp_path):

@@ -13,10 +13,8 @@ from test_renderers_contract import circling, write_inputs
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.formats.frames import Camera
-from cosfly.geometry.axes import intrinsic_matrix
 from cosfly.runtime.run_dir import read_manifest
-from cosfly.studies.zoom import enlarged_camera
+from cosfly.studies.zoom import enlarged_fov_deg, tree_of
 
 LEVELS = [110.0, 60.0, 30.0]
 
@@ -25,11 +23,8 @@ LEVELS = [110.0, 60.0, 30.0]
 
 
 def test_a_longer_lens_shows_the_middle_as_large():
-    camera = Camera(1280, 720, intrinsic_matrix(1280, 720, 110.0))
-    longer = enlarged_camera(camera, 5.0)
-    assert longer.focal_px == pytest.approx(5 * camera.focal_px)
-    assert longer.intrinsic[:2, 2].tolist() == [640.0, 360.0]
-    assert np.tan(np.radians(longer.fov_deg / 2)) == pytest.approx(np.tan(np.radians(55)) / 5)
+    longer_deg = enlarged_fov_deg(110.0, 5.0)
+    assert np.tan(np.radians(longer_deg / 2)) == pytest.approx(np.tan(np.radians(55)) / 5)
 
 
 # --- the study --------------------------------------------------------------------------------------------------------
@@ -61,6 +56,6 @@ def test_the_target_grows_as_the_lens_does(studied):
         assert long[name]["mean"] / wide[name]["mean"] == pytest.approx(factor, rel=0.05)
     assert long["visibility"]["mean"] == pytest.approx(wide["visibility"]["mean"], abs=0.05)
     assert 0.2 < long["track_quality"]["mean"] < 1.0
-    assert set(found["by_flight"]) == {"path_000", "path_002"}
-    counts = read_manifest(out).counts  # a bad flight is counted and stops no other
+    assert set(wide["by_flight"]) == {"path_000", "path_002"}
+    counts = read_manifest(tree_of(out, LEVELS[0])).counts  # a bad flight is counted and stops no other
     assert (counts.input, counts.kept, dict(counts.failed)) == (3, 2, {"render": 1})

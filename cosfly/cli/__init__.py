@@ -1,6 +1,6 @@
-"""The command line: one command per stage. The only place with log handlers, tables on the terminal and exit codes.
+"""The command line: one command per stage, log handlers, tables on the terminal and exit codes.
 
-Nothing heavy is imported before a command runs, so that `cosfly --help` is instant.
+Nothing heavy is imported before a command runs, so `cosfly --help` is instant.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from cosfly.cli.view import app as view_app
 from cosfly.cli.world import app as world_app
 from cosfly.runtime.errors import CosflyError, plain
 
-# The exit codes of Ctrl-C, which Typer makes of a KeyboardInterrupt without a word, and of SIGTERM.
+# Exit codes of Ctrl-C, which Typer catches silently, and of SIGTERM.
 ENDED = {130: "interrupted", 143: "terminated"}
 
 log = logging.getLogger(__name__)
 
 
 class _Root(typer.core.TyperGroup):
-    """The command of commands. Of a value that an option does not take it says what is wrong, in words for people."""
+    """The root command: explains an invalid value of an option in plain words."""
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -50,13 +50,13 @@ class _Root(typer.core.TyperGroup):
 
 app = typer.Typer(
     cls=_Root,
-    help="From a 3D map to a data set that teaches a vision-language model to follow a person from the air.",
+    help="Make data sets from 3D maps that teach a vision-language model to follow a person from the air.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 for group in (run_app, stages_app, view_app, world_app, fly_app):
-    app.add_typer(group)  # without a name: its commands stand at the top
+    app.add_typer(group)  # without a name: its commands are at the top level
 for name, named_group in (
     ("caption", caption_app),
     ("distill", distill_app),
@@ -70,11 +70,9 @@ for name, named_group in (
 def _root(
     context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Tell what is done, item by item.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Tell warnings and errors only.")] = False,
-    log_file: Annotated[
-        Path | None, typer.Option("--log-file", help="Also append all that -v tells to this file, with times.")
-    ] = None,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log every item.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Log warnings and errors only.")] = False,
+    log_file: Annotated[Path | None, typer.Option("--log-file", help="Append a verbose log to this file.")] = None,
 ) -> None:
     if version:
         typer.echo(f"cosfly {__version__}")
@@ -86,26 +84,26 @@ def _root(
 
 
 def main() -> None:
-    """Entry point: a CosflyError is one line and exit 1; a bug keeps its traceback."""
-    # As Ctrl-C: workers end, locks are let go.
+    """Run the command line: a CosflyError is one line and exit 1; a bug keeps its traceback."""
+    # As Ctrl-C: workers end, locks are released.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
         app()
     except CosflyError as error:
         _fail(str(error), 1)
     except (SystemExit, KeyboardInterrupt) as end:
-        code = end.code if isinstance(end, SystemExit) else 130  # before Typer, which catches it, has begun
+        code = end.code if isinstance(end, SystemExit) else 130  # before Typer, which catches it, has started
         if code in ENDED:
-            _fail(f"{ENDED[code]}; finished work is kept: run the same command again to continue", code)
+            _fail(f"{ENDED[code]}; finished work is kept; run the same command again to resume", code)
         _end(code)
     except OSError as error:
         from cosfly.runtime.io import DISK_FULL
 
         if error.filename is not None or error.errno not in DISK_FULL:
             raise
-        # What stands in no file's name is the output of the command itself, as in `cosfly config show > FILE`.
-        sys.stdout = None  # type: ignore[assignment]  # what is left in it cannot be written at the end either
-        _fail(f"cannot write the output; got {error.strerror}; free some space, then run the same command again", 1)
+        # An error without a file name is of the command's own output, as in `cosfly config show > FILE`.
+        sys.stdout = None  # type: ignore[assignment]  # the rest of the buffer cannot be written at the end either
+        _fail(f"cannot write the output; got {error.strerror}; free some space and run the same command again", 1)
 
 
 def _fail(message: str, status: int) -> None:
@@ -114,11 +112,13 @@ def _fail(message: str, status: int) -> None:
 
 
 def _end(status: int | str | None) -> None:
-    """End the process. One of several, as a launcher starts them, ends at once: threads of their libraries abort the
-    interpreter's own end now and then (2 of some 200), which a launcher takes for a failure of the whole training.
+    """End the process; at once if a launcher started several.
+
+    Threads of libraries abort the interpreter's shutdown now and then (2 in about 200), which a launcher would take
+    for a failure of the whole training.
     """
     for stream in (sys.stdout, sys.stderr):
-        if stream is not None:  # a process may be started with either closed
+        if stream is not None:  # a process may be started with a stream closed
             stream.flush()
     if os.environ.get("WORLD_SIZE", "1") != "1" and (status is None or isinstance(status, int)):
         logging.shutdown()

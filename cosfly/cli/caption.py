@@ -9,157 +9,128 @@ import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import STAGE, Job, Sets, takes
+from cosfly.cli.options import STAGE, Job, Short, takes
 
 if TYPE_CHECKING:
     from caption.schema import CaptionConfig
 
-app = options.stage_group("Step 7: Chain-of-Cause captions in English and Chinese.")
+app = options.stage_group("Write Chain-of-Cause captions in English and Chinese (step 7).")
 
-TEACHER = "rules, an OpenAI-compatible endpoint's URL, vllm:MODEL_DIR, file:PATH, or student:PATH of `distill infer`."
-STUDENT = "Folder of `distill train` or `merge`: the teacher is that student behind a server, asked as it was taught."
-Teacher = Annotated[str | None, Option(show_default="rules", help=TEACHER), Sets("caption.teacher")]
-Model = Annotated[
-    str | None, Option(help="Model name at the endpoint; by default its only one."), Sets("caption.endpoint.model")
-]
-MaxCost = Annotated[
-    float | None,
-    Option(help="Stop before this cost is passed; prices: caption.budget.price_*."),
-    Sets("caption.budget.max_cost"),
-]
-MaxTokens = Annotated[
-    int | None, Option(help="Stop before this many tokens are passed, all runs."), Sets("caption.budget.max_tokens")
-]
+TEACHERS = "rules, URL of an OpenAI-compatible server, vllm:MODEL_DIR, file:PATH, or student:PATH of `distill infer`."
+TEACHER = Short("caption.teacher", TEACHERS, default="rules")
+MODEL = Short("caption.endpoint.model", "Model name at the server; by default its only model.")
+STUDENT = "Folder of `distill train` or `merge`: ask the teacher's model as that student was trained."
 
 
-@app.callback()
-@takes(*STAGE, flights="caption.flights")
+@app.callback(epilog="cosfly caption --data render --teacher http://localhost:8000")
+@takes(
+    "caption",
+    STAGE,
+    **options.choice_of("caption"),
+    teacher=TEACHER,
+    as_student=Short("caption.student.folder", STUDENT, Path),
+    model=MODEL,
+    judge=Short("caption.judge.url", "URL of a server that judges conflicts."),
+    keyframes=Short("caption.window.keyframes", "Only windows at which the label changes, and every tenth.", bool),
+    limit=Short("caption.limit", "Caption at most this many windows; a later run resumes.", int),
+    max_cost=Short("caption.budget.max_cost", "Stop before this cost; prices: caption.budget.price_*.", float),
+    max_tokens=Short("caption.budget.max_tokens", "Stop before this many tokens, over all runs.", int),
+)
 def caption(
     job: Job,
-    teacher: Teacher = None,
-    as_student: Annotated[Path | None, Option(help=STUDENT), Sets("caption.student.folder")] = None,
-    model: Model = None,
-    judge: Annotated[
-        str | None, Option(help="URL of an endpoint that judges conflicts."), Sets("caption.judge.url")
-    ] = None,
-    keyframes: Annotated[
-        bool | None,
-        Option("--keyframes", help="Only windows at which the label changes, plus a stride."),
-        Sets("caption.window.keyframes"),
-    ] = None,
     data: options.Trees = None,
-    out: Annotated[
-        Path | None, Option(show_default="`caption` beside the playback tree", help="Output folder.")
-    ] = None,
-    limit: Annotated[
-        int | None, Option(help="Caption at most this many windows; a later run goes on."), Sets("caption.limit")
-    ] = None,
-    max_cost: MaxCost = None,
-    max_tokens: MaxTokens = None,
+    out: Annotated[Path | None, Option(show_default="`caption` next to the tree", help="Output directory.")] = None,
     plan_only: Annotated[
         bool, Option("--plan", help="Ask about a few windows, print calls, tokens, time and cost, and stop.")
     ] = False,
-    retry_failed: Annotated[
-        bool, Option("--retry-failed", help="Ask only about the windows in quarantine.jsonl.")
-    ] = False,
-    check: Annotated[bool, Option(help="Before the first request of a folder, try what the endpoint can do.")] = True,
+    retry_failed: Annotated[bool, Option("--retry-failed", help="Only the windows in quarantine.jsonl.")] = False,
+    check: Annotated[bool, Option(help="Test the server before the first request of a directory.")] = True,
 ) -> None:
-    """Step 7: ask a teacher for the reason of every manoeuvre, prove it against the geometry, repair, translate."""
+    """Ask a teacher for the reason of every manoeuvre, verify it against geometry, regenerate, translate (step 7)."""
     from caption.run import stage
 
     cfg, tree = job.cfg.caption, job.tree(data)
     target = out or tree.resolve().parent / "caption"
-    is_student = cfg.student.folder is not None  # it knows one question, and no other is tried
+    is_student = cfg.student.folder is not None  # it answers one kind of question only
     if check and cfg.teacher_kind == "endpoint" and not is_student and not (target / "answers").exists():
         _examine_endpoint(cfg.teacher, cfg)
     if plan_only:
-        return _tell_forecast(job, tree, target)
+        return _print_forecast(job, tree, target)
     job.finish(stage.run(cfg, tree, target, seed=job.cfg.seed, retry_failed=retry_failed, **job.worker_options), target)
 
 
-def _tell_forecast(job: Job, tree: Path, target: Path) -> None:
+def _print_forecast(job: Job, tree: Path, target: Path) -> None:
     from caption.run.forecast import make_forecast
     from cosfly.runtime.console import console
 
     forecast = make_forecast(job.cfg.caption, tree, target, seed=job.cfg.seed, resume=job.resume)
-    options.tell_table(console, (), forecast, title="What this run will take")
+    options.print_table(console, (), forecast, title="What this run will take")
 
 
-@app.command("doctor")
-@takes()
-def caption_doctor(
-    job: Job,
-    url: Annotated[str, Argument(help="URL of an OpenAI-compatible endpoint.")],
-    model: Model = None,
-) -> None:
-    """Try what an endpoint can do: text, images, schema, thinking, context. Exit 1 if it cannot caption."""
+@app.command("doctor", epilog="cosfly caption doctor http://localhost:8000")
+@takes("caption", model=MODEL)
+def caption_doctor(job: Job, url: Annotated[str, Argument(help="URL of an OpenAI-compatible server.")]) -> None:
+    """Test what a server can do: text, images, schema, thinking, context. Exit with 1 if it cannot caption."""
     _examine_endpoint(url, job.cfg.caption)
 
 
 def _examine_endpoint(url: str, cfg: CaptionConfig) -> None:
-    """Print a table of what works; exit 1 when the endpoint is unusable."""
     from caption.teachers.doctor import examine_endpoint
     from caption.teachers.prompt_files import vocabulary_of
     from cosfly.runtime.console import console
 
-    findings = examine_endpoint(url, cfg, vocabulary_of(cfg))
-    options.tell_checks(findings, console, "What the endpoint can do")
+    options.print_checks(examine_endpoint(url, cfg, vocabulary_of(cfg)), console, "What the server can do")
 
 
-@app.command("prompts")
-@takes()
+@app.command("prompts", epilog="cosfly caption prompts --export my-prompts")
+@takes("caption")
 def caption_prompts(
     job: Job,
-    export: Annotated[Path | None, Option(help="Folder to write the prompts in use to, to begin with.")] = None,
-    check: Annotated[Path | None, Option(help="Folder with prompts of yours: say what is missing or unknown.")] = None,
+    export: Annotated[Path | None, Option(help="Folder to write the current prompts to.")] = None,
+    check: Annotated[Path | None, Option(help="Folder with your own prompts, to be checked.")] = None,
 ) -> None:
-    """Write the prompts into a folder, or check a folder of yours; --set caption.prompts=DIR asks with it."""
+    """Export the prompts to a folder, or check a folder of your own, for --set caption.prompts=DIR."""
     from caption.teachers.prompt_files import export_prompts, own_prompts, vocabulary_of
 
-    if (export is None) == (check is None):
-        raise typer.BadParameter("give --export DIR or --check DIR")
-    if check is not None:
-        typer.echo(f"{check}: {len(own_prompts(check))} prompts, nothing wrong")
-    elif export is not None:
-        found = export_prompts(export, vocabulary_of(job.cfg.caption).prompts)
-        typer.echo(f"{export}: {len(found)} prompts")
+    if check is not None and export is None:
+        typer.echo(f"{check}: {len(own_prompts(check))} prompts, no problem found")
+    elif export is not None and check is None:
+        typer.echo(f"{export}: {len(export_prompts(export, vocabulary_of(job.cfg.caption).prompts))} prompts")
+    else:
+        raise typer.BadParameter("give either --export DIR or --check DIR")
 
 
-@app.command("judge-check")
-@takes()
-def caption_judge_check(
-    job: Job,
-    url: Annotated[str, Argument(help="OpenAI-compatible endpoint of the judge."), Sets("caption.judge.url")],
-    model: Annotated[
-        str | None, Option(help="Model name at the endpoint; by default its only one."), Sets("caption.judge.model")
-    ] = None,
-) -> None:
+@app.command("judge-check", epilog="cosfly caption judge-check http://localhost:8000")
+@takes("caption", model=Short("caption.judge.model", "Model name at the server; by default its only model."))
+def caption_judge_check(job: Job, url: Annotated[str, Argument(help="URL of the judge's server.")]) -> None:
     """Measure a judge on a small gold set: agreement, position bias, unparsable answers."""
     import asyncio
 
     from caption.teachers.judge import check_judge, gold_conflicts, judge_check_table
     from caption.teachers.prompt_files import vocabulary_of
+    from cosfly.runtime.config import build
     from cosfly.runtime.console import console
 
-    cfg, seed = job.cfg.caption, job.cfg.seed
-    found = asyncio.run(check_judge(cfg.judge, vocabulary_of(cfg), gold_conflicts(), seed))
+    cfg = job.cfg.caption
+    judge = build(type(cfg.judge), cfg.judge.model_dump() | {"url": url}, "caption.judge")
+    found = asyncio.run(check_judge(judge, vocabulary_of(cfg), gold_conflicts(), job.cfg.seed))
     console.print(judge_check_table(found))
 
 
-@app.command("compare-strategies")
-@takes("seed", flights="caption.flights")
+@app.command(
+    "compare-strategies",
+    epilog="cosfly caption compare-strategies --teacher URL --out compared",
+)
+@takes("caption", "seed", **options.choice_of("caption"), teacher=TEACHER, model=MODEL)
 def caption_compare_strategies(
     job: Job,
     out: Annotated[Path, Option(help="Folder for compare_strategies.json and the answers.")],
     data: options.Trees = None,
-    teacher: Teacher = None,
-    model: Model = None,
-    conflicts: Annotated[int, Option(min=1, help="Stop looking for conflicts after so many.")] = 50,
+    conflicts: Annotated[int, Option(min=1, help="Stop after so many conflicts.")] = 50,
 ) -> None:
-    """Compare hint, multi_sample, anchored and cascade on the same conflicts: consistency, text, asks, tokens."""
+    """Compare hint, multi_sample, anchored and cascade on the same conflicts: consistency, text, requests, tokens."""
     from caption.run import compare
     from cosfly.runtime.console import console
 
-    tree = job.tree(data)
-    comparisons = compare.run(job.cfg.caption, tree, out, seed=job.cfg.seed, conflicts=conflicts)
-    console.print(compare.comparison_table(comparisons))
+    found = compare.run(job.cfg.caption, job.tree(data), out, seed=job.cfg.seed, conflicts=conflicts)
+    console.print(compare.comparison_table(found))

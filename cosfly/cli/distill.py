@@ -3,40 +3,36 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import Job, Sets, takes
+from cosfly.cli.options import Job, Short, takes
 
-app = typer.Typer(no_args_is_help=True, help="Teach a small model: training set, LoRA, inference, evaluation.")
+app = typer.Typer(no_args_is_help=True, help="Train a small student: training set, LoRA, inference, evaluation.")
 
-Dataset = Annotated[Path, Option(help="Training set, the output of `distill prepare`.")]
-Runs = Annotated[list[Path] | None, Argument(help="Run folders, as `cosfly run` makes them; all are taken together.")]
-STUDENTS = (
-    "A model folder, a repository as Qwen/Qwen3.5-2B, or of random weights: tiny, tiny:small, tiny:medium, random."
+Dataset = Annotated[Path, Option(help="Training set: the output of `distill prepare`.")]
+STUDENTS = "Model folder, repository such as Qwen/Qwen3.5-2B, or random weights: tiny, tiny:small, tiny:medium, random."
+JUDGED = "captions.jsonl of `caption --teacher student:PATH`, one per tree; repeat it."
+
+
+@app.command("prepare", epilog="cosfly distill prepare runs/diverse --out dataset")
+@takes(
+    "distill",
+    "seed resume",
+    **options.choice_of("distill.prepare"),
+    limit=Short("distill.prepare.limit", "Windows in all splits, shared by the decisions; 0 for all.", int),
 )
-ENGINES = "transformers, endpoint (a server) or vllm."
-JUDGED = "captions.jsonl of `caption --teacher student:`, one per tree; repeat it."
-
-
-@app.command("prepare")
-@takes("seed", "resume", flights="distill.prepare.flights")
 def distill_prepare(
     job: Job,
     out: options.Out,
-    runs: Runs = None,
+    runs: options.Runs = None,
     captions: Annotated[list[Path] | None, Option(help="captions.jsonl of a tree; repeat both for several.")] = None,
     data: options.Trees = None,
-    limit: Annotated[
-        int | None,
-        Option(help="Windows in all splits together, of each decision its share; 0: all."),
-        Sets("distill.prepare.limit"),
-    ] = None,
 ) -> None:
-    """Captions of one run or several to a training set with splits that share no walk."""
+    """Make a training set from the captions of one or more runs, with splits that share no pedestrian."""
     from distill.prepare import stage as prepare
     from distill.prepare.sources import RunSource
 
@@ -44,15 +40,15 @@ def distill_prepare(
     if captions or data or not sources:
         trees = job.trees(data)
         if len(trees) != len(captions or []):
-            raise typer.BadParameter("give --data and --captions, one of each for a tree, or run folders")
+            raise typer.BadParameter("give one --captions for each --data, or run directories")
         sources += [RunSource.of_files(*files) for files in zip(trees, captions or [], strict=True)]
     typer.echo(prepare.run(job.cfg.distill.prepare, sources, out, seed=job.cfg.seed, resume=job.resume))
 
 
-@app.command("dual-track")
-@takes("seed", "resume")
-def distill_dual_track(job: Job, out: options.Out, runs: Runs = None, data: options.Trees = None) -> None:
-    """Windows over clean and perturbed flights, to learn denoising and prediction from, by split."""
+@app.command("dual-track", epilog="cosfly distill dual-track runs/diverse --out windows")
+@takes("distill", "seed resume")
+def distill_dual_track(job: Job, out: options.Out, runs: options.Runs = None, data: options.Trees = None) -> None:
+    """Make windows over clean and perturbed tracks, by split, to learn denoising and prediction from."""
     from distill.prepare import dual_track
 
     trees = [folder / "render" for folder in runs or []]
@@ -61,8 +57,8 @@ def distill_dual_track(job: Job, out: options.Out, runs: Runs = None, data: opti
     job.finish(dual_track.run(job.cfg.distill.dual_track, trees, out, seed=job.cfg.seed, resume=job.resume), out)
 
 
-@app.command("train")
-@takes("seed", "resume")
+@app.command("train", epilog="cosfly distill train --dataset dataset --student Qwen/Qwen3.5-2B --out student")
+@takes("distill", "seed resume")
 def distill_train(
     job: Job,
     dataset: Dataset,
@@ -70,7 +66,7 @@ def distill_train(
     out: options.Out,
     data: options.Trees = None,
 ) -> None:
-    """Train a student, LoRA or in full, in one process or many (torchrun); continues from its last checkpoint."""
+    """Train a student, by LoRA or in full, in one process or many (torchrun); resume from its last checkpoint."""
     from distill.training import stage as train
     from distill.training.ranks import is_first_process
 
@@ -80,20 +76,23 @@ def distill_train(
         typer.echo(product)
 
 
-@app.command("infer")
-@takes("resume")
+ENGINE = Short("distill.infer.engine", "transformers, endpoint (a server) or vllm.", default="transformers")
+
+
+@app.command(
+    "infer",
+    epilog="cosfly distill infer --dataset dataset --model Qwen/Qwen3.5-2B --out predictions",
+)
+@takes("distill", "resume", engine=ENGINE)
 def distill_infer(
     job: Job,
     dataset: Dataset,
-    model: Annotated[str, Option(help="Base model: a folder, or a repository's name; with --engine endpoint a URL.")],
+    model: Annotated[str, Option(help="Base model: folder or repository; with --engine endpoint a URL.")],
     out: options.Out,
-    engine: Annotated[
-        str | None, Option(show_default="transformers", help=ENGINES), Sets("distill.infer.engine")
-    ] = None,
-    adapter: Annotated[Path | None, Option(help="Adapter folder; none: the base model as it is.")] = None,
+    adapter: Annotated[Path | None, Option(help="Adapter folder; none: the base model alone.")] = None,
     data: options.Trees = None,
 ) -> None:
-    """Let the student answer a split; continues where it stopped."""
+    """Let the student answer the samples of a split; resume where it stopped."""
     from distill.inference import stage as infer
 
     trees = job.trees(data)
@@ -101,58 +100,58 @@ def distill_infer(
     job.finish(product, out)
 
 
-@app.command("merge")
-@takes("resume")
+@app.command("merge", epilog="cosfly distill merge --model models/Qwen3.5-2B --adapter student/adapter --out merged")
+@takes("", "resume")
 def distill_merge(
     job: Job,
     model: Annotated[Path, Option(help="Folder of the student's base model.")],
     adapter: Annotated[Path, Option(help="Adapter folder, the output of `distill train`.")],
     out: options.Out,
 ) -> None:
-    """Put an adapter into the weights of its base: a model folder for transformers, vLLM and servers."""
+    """Merge an adapter into its base: a model folder for transformers, vLLM and servers."""
     from distill.inference import merge
 
     typer.echo(merge.run(model, adapter, out, resume=job.resume))
 
 
-@app.command("evaluate")
-@takes("seed", "resume")
+@app.command("evaluate", epilog="cosfly distill evaluate --dataset dataset --predictions predictions --out evaluation")
+@takes("distill", "seed resume")
 def distill_evaluate(
     job: Job,
     dataset: Dataset,
-    predictions: Annotated[Path, Option(help="Predictions, the output of `distill infer`.")],
+    predictions: Annotated[Path, Option(help="Predictions: the output of `distill infer`.")],
     out: options.Out,
-    data: Annotated[
-        list[Path] | None,
-        Option(help="Playback tree, for the pictures of the page; repeat it where there are several."),
-    ] = None,
-    bertscore_en: Annotated[
-        Path | None, Option(help="Model folder for BERTScore of English (roberta-large); none: not computed.")
-    ] = None,
-    bertscore_zh: Annotated[
-        Path | None, Option(help="Model folder for BERTScore of Chinese (bert-base-chinese); none: not computed.")
-    ] = None,
+    data: Annotated[list[Path] | None, Option(help="Playback tree, for the page's pictures; repeat it.")] = None,
+    bertscore_en: Annotated[Path | None, Option(help="roberta-large, for BERTScore of English.")] = None,
+    bertscore_zh: Annotated[Path | None, Option(help="bert-base-chinese, for BERTScore of Chinese.")] = None,
     judged: Annotated[list[Path] | None, Option(help=JUDGED)] = None,
 ) -> None:
-    """Parse rate, decisions, verdicts, BERTScore and evidence, each beside its floors and with its interval."""
+    """Score predictions: parse rate, decisions, verdicts, BERTScore and evidence, with baselines and intervals."""
     from distill.evaluation import stage as evaluate
 
-    given: Any = {"en": bertscore_en, "zh": bertscore_zh}
-    more: Any = {"bertscore_models": {language: folder for language, folder in given.items() if folder is not None}}
-    more |= {"data": data or [], "judged": judged or [], "seed": job.cfg.seed, "resume": job.resume}
-    typer.echo(evaluate.run(job.cfg.distill.evaluate, predictions, dataset, out, **more))
+    models = {"en": bertscore_en, "zh": bertscore_zh}
+    product = evaluate.run(
+        job.cfg.distill.evaluate,
+        predictions,
+        dataset,
+        out,
+        bertscore_models={language: folder for language, folder in models.items() if folder is not None},  # type: ignore[misc]
+        data=data or [],
+        judged=judged or [],
+        seed=job.cfg.seed,
+        resume=job.resume,
+    )
+    typer.echo(product)
 
 
-@app.command("report")
-@takes("seed", "resume")
+@app.command("report", epilog="cosfly distill report evaluation-2B evaluation-4B --out report")
+@takes("distill", "seed resume")
 def distill_report(
     job: Job,
-    evaluations: Annotated[
-        list[Path], Argument(help="Folders of `distill evaluate`, one a student; their names name the rows.")
-    ],
+    evaluations: Annotated[list[Path], Argument(help="Output directories of `distill evaluate`, one per student.")],
     out: options.Out,
 ) -> None:
-    """Students side by side: the trade-off table, and differences by paired bootstrap over walks."""
+    """Compare students: the trade-off table, and differences by paired bootstrap over pedestrians."""
     from distill.evaluation import compare
 
     typer.echo(compare.run(job.cfg.distill.report, evaluations, out, seed=job.cfg.seed, resume=job.resume))

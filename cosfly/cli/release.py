@@ -1,4 +1,4 @@
-"""The commands `cosfly release ...` and `cosfly export ...`."""
+"""The commands `cosfly release ...`."""
 
 from __future__ import annotations
 
@@ -9,83 +9,63 @@ import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import WORKERS, Job, Sets, takes
+from cosfly.cli.options import WORKERS, Job, Short, takes
 
 app = typer.Typer(no_args_is_help=True, help="Package captions and frames as a data set that opens with one line.")
-ReleaseFolder = Annotated[Path, Argument(help="Release folder, or a run with one.")]
 
 
-@app.command("build")
-@takes(*WORKERS, "resume")
+@app.command("build", epilog="cosfly release build runs/diverse --out release")
+@takes(
+    "release",
+    f"{WORKERS} resume",
+    flights=Short("release.flights", options.GLOB_HELP, list[str], metavar="GLOB"),
+    tracks=options.choice_of("release")["tracks"]._replace(setting="release.tracks"),
+    frames=Short("release.num_frames", "Frames per track, or all.", words={"all": None}, metavar="N|all"),
+)
 def release_build(
     job: Job,
-    out: Annotated[Path, Option(help="Release folder.")],
-    runs: Annotated[
-        list[Path] | None, Argument(help="Run folders, as `cosfly run` makes them; all go into one release.")
-    ] = None,
-    captions: Annotated[
-        list[Path] | None, Option(help="captions.jsonl of a tree; repeat with --data for several.")
-    ] = None,
+    out: Annotated[Path, Option(help="Release directory.")],
+    runs: options.Runs = None,
+    captions: Annotated[list[Path] | None, Option(help="captions.jsonl of a tree; repeat with --data.")] = None,
     inspected: Annotated[
         list[Path] | None,
-        Option("--inspect", help="inspect.json of a tree, one for each or none: then all flights are released."),
+        Option("--inspect", help="inspect.json of a tree, one for each, or none: then all tracks are released."),
     ] = None,
-    data: Annotated[
-        list[Path] | None,
-        Option(help="Playback tree, also of others; by default that of the run folder one stands in."),
-    ] = None,
-    flights: Annotated[
-        list[str] | None, Option(metavar="GLOB", help=options.GLOB_HELP), Sets("release.flights")
-    ] = None,
-    tracks: Annotated[
-        options.TrackOption | None, Option(help=options.TRACKS_HELP), Sets("release.tracks", options.TRACKS)
-    ] = None,
-    frames: Annotated[
-        str | None,
-        Option(metavar="N|all", help="Frames of each flight, in evenly spread runs; or all of them."),
-        Sets("release.num_frames", {"all": None}),
-    ] = None,
+    data: options.Trees = None,
 ) -> None:
-    """Select frames of one run or several, join captions, write parquet, data-set card and checksums."""
+    """Select frames of one or more runs, join captions, write parquet, data-set card and checksums."""
     from release.package import stage as package
     from release.package.sources import Source
 
     sources = [Source.of_run(folder) for folder in runs or []]
     if captions or inspected or data or not sources:
-        trees = data or [job.tree(None)]
+        trees = job.trees(data)
         inspections: list[Path | None] = list(inspected) if inspected else [None for _ in trees]
         if not len(trees) == len(captions or []) == len(inspections):
             raise typer.BadParameter(
-                "give --data and --captions, and --inspect or none, one of each for a tree; or run folders"
+                "give one --captions and at most one --inspect for each --data, or run directories"
             )
         sources += [Source.of_files(*files) for files in zip(trees, captions or [], inspections, strict=True)]
     job.finish(package.run(job.cfg.release, sources, out, **job.worker_options), out)
 
 
-@app.command("verify")
-@takes(*WORKERS)
+@app.command("verify", epilog="cosfly release verify release")
+@takes("", WORKERS)
 def release_verify(
     job: Job,
-    folder: Annotated[
-        Path,
-        Argument(help="Release folder, a run with one, playback tree, or export of a release; the hub's cache too."),
-    ],
+    folder: Annotated[Path, Argument(help="Release, run directory, playback tree, export, or the hub's cache.")],
     level: Annotated[
-        str,
-        Option(
-            help="structure: names, sizes, records, card. rows: every row too. pixels: checksums and every picture too."
-        ),
+        Literal["structure", "rows", "pixels"],
+        Option(help="structure: names, sizes, records, card. rows: also every row. pixels: also all files."),
     ] = "pixels",
-    json_file: Annotated[Path | None, Option("--json", help="Write the findings for machines here.")] = None,
+    json_file: Annotated[Path | None, Option("--json", help="File for the findings, as JSON.")] = None,
 ) -> None:
-    """Check that a release is what its records say and can be true, from cheap to dear. Exit 1 if anything is wrong."""
+    """Check that a release agrees with its records and with geometry. Exit with 1 if anything is wrong."""
     from caption.run.released import read_released
-    from cosfly.pipeline.settings import worker_options
+    from cosfly.pipeline.command_settings import worker_options
     from cosfly.runtime.json_io import write_json
-    from release.verify.verify import LEVELS, verify
+    from release.verify.verify import verify
 
-    if level not in LEVELS:
-        raise typer.BadParameter(f"one of {', '.join(LEVELS)}", param_hint="--level")
     report = verify(folder, level=level, reader=read_released, **worker_options(job.cfg))
     typer.echo(str(report))
     if json_file is not None:
@@ -94,28 +74,25 @@ def release_verify(
         raise typer.Exit(1)
 
 
-@app.command("stats")
+@app.command("stats", epilog="cosfly release stats release --out stats")
 @takes()
 def release_stats(
     job: Job,
-    folder: ReleaseFolder,
+    folder: Annotated[Path, Argument(help="Release directory, or a run directory.")],
     out: Annotated[Path, Option(help="Folder for stats.html, stats.md and stats.json.")],
-    pixels: Annotated[
-        int,
-        Option(min=0, help="Frames whose depth and instance pictures are decoded, spread evenly; 0 for none."),
-    ] = 200,
+    pixels: Annotated[int, Option(min=0, help="Frames whose depth and instance pictures are read; 0 for none.")] = 200,
 ) -> None:
-    """Compute the tables of the paper that a release can tell again from the rows, and draw what is covered."""
+    """Compute the paper's tables from the rows of a release, and draw what it covers."""
     from release.stats import stats
 
     typer.echo(stats.run(folder, out, pixels=pixels))
 
 
-@app.command("export")
-@takes(*WORKERS, "resume")
+@app.command("export", epilog="cosfly release export release --format webdataset --out shards")
+@takes("", f"{WORKERS} resume")
 def release_export(
     job: Job,
-    source: Annotated[Path, Argument(help="Release; for captions alone also a run directory or captions.jsonl.")],
+    source: Annotated[Path, Argument(help="Release; for captions also a run directory or captions.jsonl.")],
     out: Annotated[Path, Option(help="Output directory; of captions the file.")],
     format: Annotated[
         Literal["tree", "webdataset", "lerobot", "csv", "jsonl", "sharegpt", "llava"],
@@ -143,10 +120,8 @@ def release_export(
         from release.export.contract import ExportConfig
 
         given = {"format": format} | ({} if shard_mb is None else {"shard_mb": shard_mb})
-        job.finish(
-            export.run(build(ExportConfig, given, "--format, --shard-mb"), source, out, **job.worker_options), out
-        )
-        return
+        cfg = build(ExportConfig, given, "--format, --shard-mb")
+        return job.finish(export.run(cfg, source, out, **job.worker_options), out)
     from release.columns import LANGUAGES
     from release.export import captions
 

@@ -1,4 +1,4 @@
-"""The commands of steps 1 to 6: `cosfly maps`, `simplify`, `pedestrians`, `plan`, `render`, `gallery`, `inspect`."""
+"""The commands of steps 1 to 6: `cosfly maps`, `simplify`, `pedestrians`, `roi`, `plan`, `render` and `inspect`."""
 
 from __future__ import annotations
 
@@ -9,97 +9,84 @@ import typer
 from typer import Argument, Option
 
 from cosfly.cli import options
-from cosfly.cli.options import STAGE, WORKERS, Job, Sets, takes
+from cosfly.cli.options import STAGE, WORKERS, Job, Short, takes
 
 app = typer.Typer()
 
-Simplification = Annotated[Path, Option(help="Simplification map: step2_simplified.json.")]
-Traces = Annotated[Path, Option(help="Flights: drone_trace.json.")]
+Paths = Annotated[Path, Option(help="Pedestrian trajectories: path.json.")]
+PathsArgument = Annotated[Path, Argument(metavar="PATHS", help="Pedestrian trajectories: path.json.")]
+Planners = Annotated[list[str] | None, Option("--planner", show_default="all", help="Planner to compare; repeat it.")]
+SOURCE = Short("maps.source", "synthetic, simworld, cityjson, boxes, carla or unrealcv.")
+BACKEND = Short("render.backend", "Renderer: gl, pyrender, carla or unrealcv.")
 
-
-maps_app = options.stage_group("Step 1: a map of boxes.")
+maps_app = options.stage_group("Make a map of boxes (step 1).")
 app.add_typer(maps_app, name="maps")
 
 
-@maps_app.callback()
-@takes("town", "seed", "resume")
-def maps(
-    job: Job,
-    out: options.Out,
-    source: Annotated[
-        str | None, Option(help="synthetic, simworld, cityjson, boxes, carla or unrealcv."), Sets("maps.source")
-    ] = None,
-) -> None:
-    """Step 1: make boxes_3d.json from a map source."""
+@maps_app.callback(epilog="cosfly maps --source synthetic --out maps")
+@takes(
+    "maps", "town seed resume", source=Short("maps.source", "synthetic, simworld, cityjson, boxes, carla or unrealcv.")
+)
+def maps(job: Job, out: options.Out) -> None:
+    """Make boxes_3d.json from a map source (step 1)."""
     from cosfly.maps import stage
 
     cfg = job.cfg
     job.finish(stage.run(cfg.maps, out, seed=cfg.seed, resume=job.resume, follow_links=cfg.follow_links), out)
 
 
-@maps_app.command("roi-backdrop")
-@takes("seed")
+@maps_app.command("roi-backdrop", epilog="cosfly maps roi-backdrop --map maps/boxes_3d.json --out above.png")
+@takes("render", "seed", backend=BACKEND)
 def maps_roi_backdrop(
     job: Job,
     map_: options.Map,
-    out: Annotated[Path, Option(help="PNG to write, and beside it a JSON that tells where it lies.")],
-    backend: Annotated[str | None, Option(help="gl, pyrender or carla."), Sets("render.backend")] = None,
+    out: Annotated[Path, Option(help="PNG to write, with its world frame in a JSON file next to it.")],
     bounds: Annotated[
         tuple[float, float, float, float] | None,
-        Option(metavar="W S E N", show_default="the whole map", help="What to show, world m."),
+        Option(metavar="W S E N", show_default="the whole map", help="Area to draw, world metres."),
     ] = None,
     pixels_per_m: Annotated[float, Option(min=0.01, max=100, help="Scale.")] = 4.0,
 ) -> None:
-    """The map from above as a renderer draws it, for `roi edit --backdrop`."""
+    """Draw the map from above with a renderer, for `roi edit --backdrop`."""
     from cosfly.render import backdrop
 
     cfg = job.cfg
     typer.echo(backdrop.run(cfg.render, map_, out, bounds_m=bounds, pixels_per_m=pixels_per_m, seed=cfg.seed))
 
 
-@app.command()
-@takes("town", "resume")
+@app.command(epilog="cosfly simplify --map maps/boxes_3d.json --out simplify")
+@takes("simplify", "town resume")
 def simplify(job: Job, map_: options.Map, out: options.Out) -> None:
-    """Step 2: merge, crop and prune boxes_3d.json into step2_simplified.json."""
+    """Merge, crop and prune boxes_3d.json into step2_simplified.json (step 2)."""
     from cosfly.simplify import stage
 
     job.finish(stage.run(job.cfg.simplify, map_, out, resume=job.resume), out)
 
 
-@app.command()
-@takes(*STAGE)
-def pedestrians(
-    job: Job,
-    map_: options.Map,
-    out: options.Out,
-    roi: Annotated[Path | None, Option(help="Region of interest: roi_polygon.json."), Sets("roi")] = None,
-) -> None:
-    """Step 3: walks of 50-100 m on the simplified map, path.json."""
+@app.command(epilog="cosfly pedestrians --map simplify/step2_simplified.json --out pedestrians")
+@takes("pedestrians", STAGE, roi=Short("roi", "Region of interest: roi_polygon.json.", Path))
+def pedestrians(job: Job, map_: options.Map, out: options.Out) -> None:
+    """Plan pedestrian trajectories of 50 to 100 m on the simplified map, path.json (step 3)."""
     from cosfly.pedestrians import stage
 
     product = stage.run(job.cfg.pedestrians, map_, out, seed=job.cfg.seed, roi=job.cfg.roi, **job.worker_options)
     job.finish(product, out)
 
 
-roi_app = typer.Typer(help="Region of interest: where people may walk.", no_args_is_help=True)
+roi_app = typer.Typer(help="Draw the region of interest for pedestrians.", no_args_is_help=True)
 app.add_typer(roi_app, name="roi")
-MapArgument = Annotated[Path, Argument(metavar="MAP", help="Boxes: step2_simplified.json.")]
 
 
-@roi_app.command("edit")
-@takes("town")
+@roi_app.command("edit", epilog="cosfly roi edit simplify/step2_simplified.json --roi roi_polygon.json")
+@takes("pedestrians", "town")
 def roi_edit(
     job: Job,
-    map_: MapArgument,
-    roi: Annotated[Path, Option(help="The region: opened where it is there, written when the page saves.")] = Path(
-        "roi_polygon.json"
-    ),
-    backdrop: Annotated[
-        Path | None, Option(help="Picture from above, PNG, with its world frame beside it as JSON.")
-    ] = None,
+    map_: options.MapArgument,
+    roi: Annotated[Path, Option(help="Region to edit, if it exists, and to save.")] = Path("roi_polygon.json"),
+    backdrop: Annotated[Path | None, Option(help="PNG of `maps roi-backdrop`.")] = None,
     port: Annotated[int, Option(min=0, max=65535, help="Port on this machine; 0 takes a free one.")] = 0,
 ) -> None:
-    """Draw the region of interest on a local page, over the planning grid; Ctrl-C ends it."""
+    """Edit the region of interest on a local page, over the planning grid; end with Ctrl-C."""
     from cosfly.pedestrians.roi_editor import open_editor
 
     server = open_editor(map_, job.cfg.pedestrians, roi, port, backdrop)
@@ -107,70 +94,64 @@ def roi_edit(
     server.serve()
 
 
-@roi_app.command("propose")
-@takes("town")
+@roi_app.command("propose", epilog="cosfly roi propose simplify/step2_simplified.json --out roi_polygon.json")
+@takes("pedestrians", "town")
 def roi_propose(
-    job: Job, map_: MapArgument, out: Annotated[Path, Option(help="The region: roi_polygon.json.")]
+    job: Job, map_: options.MapArgument, out: Annotated[Path, Option(help="Region to write: roi_polygon.json.")]
 ) -> None:
-    """Write a first region: the outline of the walkable ground, to go on with in `cosfly roi edit`."""
+    """Write the outline of the walkable ground as a first region, to edit with `cosfly roi edit`."""
     from cosfly.pedestrians.roi_editor import run_propose
 
     typer.echo(run_propose(map_, job.cfg.pedestrians, out))
     typer.echo(out)
 
 
-plan_app = options.stage_group("Step 4: drone flights.")
+plan_app = options.stage_group("Plan drone trajectories (step 4).")
 app.add_typer(plan_app, name="plan")
 
 
-@plan_app.callback()
-@takes(*STAGE)
-def plan(
-    job: Job, map_: options.Map, paths: Annotated[Path, Option(help="Walks: path.json.")], out: options.Out
-) -> None:
-    """Step 4: a drone flight for every walk, drone_trace.json."""
+@plan_app.callback(epilog="cosfly plan --map simplify/step2_simplified.json --paths pedestrians/path.json --out plan")
+@takes("plan", STAGE)
+def plan(job: Job, map_: options.Map, paths: Paths, out: options.Out) -> None:
+    """Plan a drone trajectory for each pedestrian, drone_trace.json (step 4)."""
     from cosfly.planners import stage
 
     job.finish(stage.run(job.cfg.plan, map_, paths, out, seed=job.cfg.seed, **job.worker_options), out)
 
 
-@plan_app.command("compare")
-@takes(*STAGE)
+@plan_app.command("compare", epilog="cosfly plan compare step2_simplified.json path.json --out compare")
+@takes("plan", STAGE)
 def plan_compare(
-    job: Job,
-    map_: MapArgument,
-    paths: Annotated[Path, Argument(metavar="PATHS", help="Walks: path.json.")],
-    out: options.Out,
-    planner: Annotated[
-        list[str] | None,
-        Option(show_default="all", help="A planner; repeat it. The others are held against the first."),
-    ] = None,
+    job: Job, map_: options.MapArgument, paths: PathsArgument, out: options.Out, planner: Planners = None
 ) -> None:
-    """Planners on the same walks: tables, compare.json, the flights, and pictures."""
+    """Compare planners on the same pedestrians, against the first: tables, compare.json, trajectories, pictures.
+
+    TA*+Smooth is the paper's search with our smoothing, MuCO the paper's objective with our step."""
     from cosfly.planners import compare
-    from cosfly.planners.compare import text_tables
     from cosfly.runtime.config import build
     from cosfly.runtime.console import console
 
     settings = job.cfg.plan.model_dump() | ({"planners": planner} if planner else {})
-    compared = build(compare.CompareConfig, settings, "--planner")
-    product = compare.run(compared, map_, paths, out, seed=job.cfg.seed, **job.worker_options)
-    for table in text_tables(product):
-        options.tell_table(console, table.columns, table.rows, title=table.title)
+    cfg = build(compare.CompareConfig, settings, "--planner")
+    product = compare.run(cfg, map_, paths, out, seed=job.cfg.seed, **job.worker_options)
+    for table in compare.text_tables(product):
+        options.print_table(console, table.columns, table.rows, title=table.title)
     typer.echo(product)
 
 
-@plan_app.command("benchmark")
-@takes(*STAGE)
+@plan_app.command("benchmark", epilog="cosfly plan benchmark step2_simplified.json path.json --out benchmark")
+@takes("plan", STAGE)
 def plan_benchmark(
     job: Job,
-    map_: Annotated[Path, Argument(metavar="MAP", help="Boxes: step2_simplified.json.")],
-    paths: Annotated[Path, Argument(metavar="PATHS", help="Walks: path.json.")],
+    map_: options.MapArgument,
+    paths: PathsArgument,
     out: options.Out,
-    scenarios: Annotated[int, Option(help="Walks, from the first one on.")] = 20,
-    planner: Annotated[list[str] | None, Option(show_default="all", help="A planner; repeat it.")] = None,
+    scenarios: Annotated[int, Option(help="Number of pedestrians, the first of the file.")] = 20,
+    planner: Planners = None,
 ) -> None:
-    """The paper's comparison of 14 planners and ours: tables with intervals, benchmark.json, figures."""
+    """Compare the paper's 14 planners and ours: tables with intervals, benchmark.json, figures.
+
+    TA*+Smooth is the paper's search with our smoothing, MuCO the paper's objective with our step."""
     from cosfly.planners import benchmark
     from cosfly.runtime.config import build
     from cosfly.runtime.console import console
@@ -179,69 +160,50 @@ def plan_benchmark(
     cfg = build(benchmark.BenchmarkConfig, settings, "plan benchmark")
     product = benchmark.run(cfg, map_, paths, out, seed=job.cfg.seed, **job.worker_options)
     table, *_ = benchmark.text_tables(benchmark.read_benchmark(product))
-    narrow = [[row[k] for k in (0, 1, 5, 6, 7)] for row in (table.columns, *table.rows)]  # eighty columns hold these
-    options.tell_table(console, narrow[0], narrow[1:], title=table.title)
+    narrow = [[row[k] for k in (0, 1, 5, 6, 7)] for row in (table.columns, *table.rows)]  # fits eighty columns
+    options.print_table(console, narrow[0], narrow[1:], title=table.title)
     console.print(f"all tables: {out / 'benchmark.md'}")
     typer.echo(product)
 
 
-render_app = options.stage_group("Step 5: frames of flights.")
-app.add_typer(render_app, name="render")
-
-
-@render_app.callback()
-@takes(*STAGE)
+@app.command(
+    epilog="cosfly render --map boxes_3d.json --simplified step2_simplified.json --traces drone_trace.json --out render"
+)
+@takes(
+    "render",
+    STAGE,
+    backend=BACKEND,
+    weather_mode=Short("render.weather_mode", "How weather is chosen."),
+    weather_name=Short("render.weather_name", "Weather of mode fixed, such as heavy_rain."),
+    tod_name=Short("render.tod_name", "Time of day of mode fixed, such as night."),
+    weather_pool=Short("render.weather_pool", "YAML file with your own weather presets.", Path),
+    tod_pool=Short("render.tod_pool", "YAML file with your own times of day.", Path),
+    weather_seed=Short("render.weather_seed", "Seed of the weather; a negative one is replaced by a new seed.", int),
+    path_index=Short("render.path_index", "Index of one trajectory of the traces, or all.", words={"all": None}),
+    cvip=Short("render.unrealcv.host", "UnrealCV: host."),
+    cvport=Short("render.unrealcv.port", "UnrealCV: port.", int),
+    settle_delay=Short("render.unrealcv.settle_delay_s", "UnrealCV: seconds from a pose to its pictures.", float),
+    coord_scale=Short("render.unrealcv.coord_scale", "UnrealCV: its units per metre.", float),
+    coord_z_offset=Short("render.unrealcv.coord_z_offset", "UnrealCV: metres added to heights.", float),
+)
 def render(
     job: Job,
     map_: options.Map,
-    simplified: Simplification,
-    traces: Traces,
+    simplified: options.Simplified,
+    traces: options.Traces,
     out: options.Out,
-    backend: Annotated[str | None, Option(help="gl, pyrender, carla or unrealcv."), Sets("render.backend")] = None,
-    others: Annotated[Path | None, Option(help="Who else moves: others.json, beside path.json.")] = None,
-    weather_mode: Annotated[str | None, Option(help="How skies are drawn."), Sets("render.weather_mode")] = None,
-    weather_name: Annotated[
-        str | None, Option(help="Weather of mode fixed, as heavy_rain."), Sets("render.weather_name")
-    ] = None,
-    tod_name: Annotated[
-        str | None, Option(help="Time of day of mode fixed, as night."), Sets("render.tod_name")
-    ] = None,
-    weather_pool: Annotated[
-        Path | None, Option(help="YAML file with weather presets of yours."), Sets("render.weather_pool")
-    ] = None,
-    tod_pool: Annotated[
-        Path | None, Option(help="YAML file with times of day of yours."), Sets("render.tod_pool")
-    ] = None,
-    weather_seed: Annotated[
-        int | None, Option(help="Seed; a negative one draws one."), Sets("render.weather_seed")
-    ] = None,
-    cvip: Annotated[str | None, Option(help="Where UnrealCV is."), Sets("render.unrealcv.host")] = None,
-    cvport: Annotated[int | None, Option(help="Its port."), Sets("render.unrealcv.port")] = None,
-    path_index: Annotated[
-        str | None, Option(help="One flight of the traces, or all."), Sets("render.path_index", {"all": None})
-    ] = None,
+    others: options.Bystanders = None,
     require_rgb: Annotated[
-        bool | None, Option("--require-rgb/--no-require-rgb", help="Write colours.", show_default="as in settings")
+        bool | None, Option("--require-rgb/--no-require-rgb", help="Write RGB.", show_default="as in settings")
     ] = None,
     require_depth: Annotated[
         bool | None, Option("--require-depth/--no-require-depth", help="Write depth.", show_default="as in settings")
     ] = None,
-    settle_delay: Annotated[
-        float | None,
-        Option(help="UnrealCV: seconds from a pose to its pictures."),
-        Sets("render.unrealcv.settle_delay_s"),
-    ] = None,
-    coord_scale: Annotated[
-        float | None, Option(help="UnrealCV: its units in 1 m."), Sets("render.unrealcv.coord_scale")
-    ] = None,
-    coord_z_offset: Annotated[
-        float | None, Option(help="UnrealCV: added to heights, m."), Sets("render.unrealcv.coord_z_offset")
-    ] = None,
-    gif: Annotated[bool, Option("--gif", help="Also make an animation of the first flight.")] = False,
-    gif_fps: Annotated[float, Option(min=0.1, max=50, help="Its frames a second.")] = 4.0,
-    gif_name: Annotated[str, Option(help="Its name, in the folder.")] = "preview.gif",
+    gif: Annotated[bool, Option("--gif", help="Also write an animation of the first trajectory.")] = False,
+    gif_fps: Annotated[float, Option(min=0.1, max=50, help="Frames per second of the animation.")] = 4.0,
+    gif_name: Annotated[str, Option(help="File name of the animation, in the output directory.")] = "preview.gif",
 ) -> None:
-    """Step 5: RGB, depth and instance frames of the clean and the perturbed flight."""
+    """Render RGB, depth and instance frames of the clean and the perturbed track (step 5)."""
     from cosfly.render import stage
     from cosfly.render.settings import RenderConfig
     from cosfly.runtime.config import build
@@ -252,57 +214,56 @@ def render(
     modalities: list[str] = [name for name in job.cfg.render.modalities if wanted.get(name) is not False]
     modalities += [name for name, is_wanted in wanted.items() if is_wanted and name not in modalities]
     cfg = build(RenderConfig, job.cfg.render.model_dump() | {"modalities": modalities}, "render")
-    worker_options = job.worker_options | {"seed": job.cfg.seed, "others": others}
-    product = stage.run(cfg, map_, simplified, traces, out, **worker_options)
+    product = stage.run(cfg, map_, simplified, traces, out, seed=job.cfg.seed, others=others, **job.worker_options)
     if gif:
         preview_gif(product, inside(out, gif_name), frames_per_s=gif_fps)
     job.finish(product, out)
 
 
-inspect_app = options.stage_group("Step 6: accept, route to review or reject every flight.")
+inspect_app = options.stage_group("Accept, review or reject every track (step 6).")
 app.add_typer(inspect_app, name="inspect")
 
 
-@inspect_app.callback()
-@takes("town", *WORKERS, "resume", flights="inspect.flights")
+@inspect_app.callback(epilog="cosfly inspect --map step2_simplified.json --traces drone_trace.json --out inspect")
+@takes("inspect", f"town {WORKERS} resume", **options.choice_of("inspect"))
 def inspect(
     job: Job,
     out: options.Out,
-    map_: Annotated[Path | None, Option("--map", help="step2_simplified.json; none for somebody else's tree.")] = None,
-    traces: Annotated[Path | None, Option(help="drone_trace.json; none for somebody else's tree.")] = None,
+    map_: Annotated[Path | None, Option("--map", help="step2_simplified.json; not for a foreign tree.")] = None,
+    traces: Annotated[Path | None, Option(help="drone_trace.json; not for a foreign tree.")] = None,
     data: options.Trees = None,
 ) -> None:
-    """Step 6: accept, route to review or reject every flight; inspect.json and an HTML report."""
+    """Accept, route to review or reject every track; write inspect.json and an HTML report (step 6)."""
     from cosfly.inspection import stage
 
-    tree = job.tree(data)
-    job.finish(stage.run(job.cfg.inspect, map_, traces, tree, out, **job.worker_options), out)
+    job.finish(stage.run(job.cfg.inspect, map_, traces, job.tree(data), out, **job.worker_options), out)
 
 
-@inspect_app.command("review")
+TRACK_HELP = "a track, or all tracks of a trajectory; repeat it."
+
+
+@inspect_app.command(
+    "review",
+    epilog="cosfly inspect review --inspect inspect --accept trajectory_1 --by me --reason clear",
+)
 def inspect_review(
-    folder: Annotated[Path, Option("--inspect", help="Folder of the inspection, or its inspect.json.")],
-    accept: Annotated[
-        list[str] | None, Option(metavar="FLIGHT", help="Accept a flight, or those of a trajectory; repeat it.")
-    ] = None,
-    reject: Annotated[
-        list[str] | None, Option(metavar="FLIGHT", help="Reject a flight, or those of a trajectory; repeat it.")
-    ] = None,
-    by: Annotated[str | None, Option(help="Who decides.")] = None,
-    reason: Annotated[str | None, Option(help="Why.")] = None,
+    folder: Annotated[Path, Option("--inspect", help="Output directory of the inspection, or its inspect.json.")],
+    accept: Annotated[list[str] | None, Option(metavar="TRACK", help=f"Accept {TRACK_HELP}")] = None,
+    reject: Annotated[list[str] | None, Option(metavar="TRACK", help=f"Reject {TRACK_HELP}")] = None,
+    by: Annotated[str | None, Option(help="Name of the reviewer.")] = None,
+    reason: Annotated[str | None, Option(help="Reason of the decision.")] = None,
 ) -> None:
-    """Decide flights that were left to a person, into review.jsonl; without a decision, list those that are open."""
+    """Decide tracks that wait for review, into review.jsonl; without a decision, list them."""
     from cosfly.formats.review import Choice, add_decisions, summary
 
     product = folder / "inspect.json" if folder.is_dir() else folder
-    given = {"accepted": accept or [], "rejected": reject or []}
     if accept or reject:
         if not (by and reason):
-            raise typer.BadParameter("who decides and why must be given", param_hint="'--by', '--reason'")
+            raise typer.BadParameter("give the reviewer and the reason", param_hint="'--by', '--reason'")
         choices = [
             Choice.model_validate({"folder": name, "verdict": verdict, "reason": reason})
-            for verdict, names in given.items()
-            for name in names
+            for verdict, names in (("accepted", accept), ("rejected", reject))
+            for name in names or []
         ]
         add_decisions(product, choices, by)
     typer.echo(summary(product))

@@ -1,22 +1,21 @@
-"""The commands `cosfly study ...`: depth formats, levels of zoom, weathers, each on the same frames and flights."""
+"""The commands `cosfly study ...`: depth formats, weathers and levels of zoom, on the same frames and trajectories."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from typer import Option
 
 from cosfly.cli import options
 from cosfly.cli.options import STAGE, Job, takes
-from cosfly.cli.stages import Simplification, Traces
 
-ABOUT = "Compare depth formats, levels of zoom and weathers on the same frames and flights."
+ABOUT = "Compare depth formats, weathers and levels of zoom on the same frames and trajectories."
 app = typer.Typer(no_args_is_help=True, help=ABOUT)
 
 
-@app.command("depth")
+@app.command("depth", epilog="cosfly study depth --data render --out depth")
 @takes()
 def study_depth(
     job: Job,
@@ -24,13 +23,10 @@ def study_depth(
     data: options.Trees = None,
     frame: Annotated[
         Path | None,
-        Option(
-            show_default="one that shows the target whole",
-            help="Folder of a frame, in the tree or a path; or a .npy, in metres.",
-        ),
+        Option(show_default="one that shows the target", help="Frame folder in the tree, or a .npy in metres."),
     ] = None,
 ) -> None:
-    """The ways to store depth on one frame: errors, entropy, edges and size, with a figure."""
+    """Compare ways to store the depth of one frame: errors, entropy, edges and size."""
     from cosfly.studies import depth
     from cosfly.viz.gallery import best_frame, frame_in
 
@@ -42,51 +38,51 @@ def study_depth(
     typer.echo(out / "depth_study.md")
 
 
-@app.command("weather")
-@takes("seed")
+@app.command("weather", epilog="cosfly study weather --map boxes_3d.json --traces drone_trace.json --out weather")
+@takes("render", "seed")
 def study_weather(
     job: Job,
     map_: options.Map,
-    traces: Traces,
+    traces: options.Traces,
     out: Annotated[Path, Option(help="Folder for weather_gallery.jpg and weather_sheet.jpg.")],
-    trajectory: Annotated[int, Option(help="Which flight of the traces, counted from 0.")] = 0,
-    frame: Annotated[
-        int | None, Option(show_default="the one that looks down least", help="Which of its frames.")
-    ] = None,
+    trajectory: Annotated[int, Option(help="Index of the trajectory in the traces.")] = 0,
+    frame: Annotated[int | None, Option(show_default="looks down least", help="Index of its frame.")] = None,
     fov: Annotated[float, Option(min=1.0, max=169.0, help="Horizontal field of view, degrees.")] = 67.38,
 ) -> None:
-    """One view under every weather and time of day: nine pictures, and a sheet of all."""
+    """Draw one view under every weather and time of day: nine pictures, and a sheet of all."""
     from cosfly.formats.weather import TIMES, WEATHERS
     from cosfly.runtime.console import progress_bar
     from cosfly.studies import weather
 
     with progress_bar("study weather: pictures", len(WEATHERS) * len(TIMES)) as advance:
-        chosen: Any = {"trajectory": trajectory, "frame": frame, "fov_deg": fov, "seed": job.cfg.seed}
-        product = weather.run(job.cfg.render, map_, traces, out, **chosen, advance=lambda: advance(1))
+        product = weather.run(
+            job.cfg.render, map_, traces, out, trajectory=trajectory, frame=frame, fov_deg=fov, seed=job.cfg.seed,
+            advance=lambda: advance(1),
+        )  # fmt: skip
     for path in product:
         typer.echo(path)
 
 
-@app.command("zoom")
-@takes(*STAGE)
+@app.command(
+    "zoom",
+    epilog="cosfly study zoom --map boxes.json --simplified simplified.json --traces traces.json --out zoom",
+)
+@takes("render", STAGE)
 def study_zoom(
     job: Job,
     map_: options.Map,
-    simplified: Simplification,
-    traces: Traces,
+    simplified: options.Simplified,
+    traces: options.Traces,
     out: options.Out,
-    flights: Annotated[int | None, Option(show_default="50", help="Flights at most.")] = None,
-    every: Annotated[int | None, Option(show_default="2", help="Every how many frames of a flight are drawn.")] = None,
+    every: Annotated[int, Option(min=1, max=100, help="Draw one of this many frames.")] = 2,
 ) -> None:
-    """The same flights at every level of zoom: target size, visibility, track quality; optical against digital zoom."""
-    from cosfly.runtime.config import build
+    """Compare levels of zoom on the same trajectories: target size, visibility, track quality; optical and digital."""
     from cosfly.runtime.console import console
     from cosfly.runtime.json_io import read_object
     from cosfly.studies import zoom
 
-    given = {name: value for name, value in (("num_flights", flights), ("every", every)) if value is not None}
-    studied = build(zoom.ZoomStudyConfig, job.cfg.render.model_dump() | given, "--flights, --every")
-    product = zoom.run(studied, map_, simplified, traces, out, seed=job.cfg.seed, **job.worker_options)
+    cfg = job.cfg.render
+    product = zoom.run(cfg, map_, simplified, traces, out, every=every, seed=job.cfg.seed, **job.worker_options)
     table = zoom.text_table(read_object(product, what="zoom study"))
-    options.tell_table(console, table.columns, table.rows, title=table.title)
-    job.finish(product, out)
+    options.print_table(console, table.columns, table.rows, title=table.title)
+    job.finish(product, zoom.tree_of(out, max(cfg.fovs_deg)))

@@ -8,13 +8,13 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from cosfly.cli.options import Job, takes
+from cosfly.cli.options import Job, choice_of, takes
 
 app = typer.Typer()
 
 
-@app.command("view")
-@takes(flights="inspect.flights")
+@app.command("view", epilog="cosfly view release --out release.html")
+@takes("inspect", **choice_of("inspect"))
 def view(
     job: Job,
     source: Annotated[Path, Argument(help="Map (a file), playback tree, run directory or release.")],

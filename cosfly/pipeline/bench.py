@@ -1,4 +1,4 @@
-"""`cosfly bench`: a stage of a finished run again, with several counts of workers; figures come from its events."""
+"""`cosfly bench`: measure a stage of a finished run with several numbers of workers, from its events."""
 
 from __future__ import annotations
 
@@ -25,13 +25,14 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 FORMAT = FileFormat("cosfly.bench", "1.2")
-STAGES = ("pedestrians", "plan", "render", "inspect", "caption", "release")  # those that do items
+STAGES = ("pedestrians", "plan", "render", "inspect", "caption", "release")  # those that process items
 
 
 class BenchRun(BaseModel):
     """Figures of one run of the stage.
 
-    attempted: frames of render, or items of another stage, that were done, and those that were lost with a worker.
+    attempted: frames of render, or items of another stage, that were done or lost with a worker. gpu_percent, gpu_gib:
+    mean load and peak memory of the probes; None without a GPU.
     """
 
     workers: int
@@ -40,7 +41,7 @@ class BenchRun(BaseModel):
     successful: int
     cores_used: float
     peak_memory_mib: float
-    gpu_percent: float | None = None  # the mean of the probes, and the most memory; None on a machine without
+    gpu_percent: float | None = None
     gpu_gib: float | None = None
     restarts: int
     failed: int
@@ -51,7 +52,7 @@ class BenchRun(BaseModel):
 
 
 class StageRow(BaseModel):
-    """What the watchdog saw of a stage of the run. launches: worker processes; modes: how workers were lost."""
+    """The watchdog's figures of a stage. launches: worker processes; modes: how workers were lost."""
 
     stage: str
     launches: int
@@ -61,7 +62,7 @@ class StageRow(BaseModel):
 
 
 class Bench(BaseModel):
-    """`bench.json`: one row for each count of workers."""
+    """`bench.json`: one row for each number of workers."""
 
     stage: str
     cores: int
@@ -69,35 +70,30 @@ class Bench(BaseModel):
 
 
 def run(cfg: RunConfig, run_folder: Path, out: Path, stage: str, workers: Iterable[int]) -> Bench:
-    """Reads a run up to `stage`; writes `bench.json` and the events of each run; products go again.
+    """Read a run up to `stage`; write `bench.json` and the events of each measurement.
 
     Raises:
-        ConfigError: the stage has no items, or a server does them. ResumeError: `out` holds something.
+        ConfigError: The stage has no items, or a server processes them. ResumeError: `out` is not empty.
     """
     if stage not in STAGES:
-        raise ConfigError("not a stage that can be measured", where="--stage", got=stage, expected=", ".join(STAGES))
+        raise ConfigError("this stage cannot be measured", where="--stage", got=stage, expected=", ".join(STAGES))
     if out.exists() and any(out.iterdir()):
-        raise ResumeError("the folder is not empty", where=out, fix="choose another --out")
-    asked = cfg.caption.teacher_kind not in EMBEDDED or cfg.caption.judge.url
-    if stage == "caption" and asked:
+        raise ResumeError("the output directory is not empty", where=out, fix="choose another --out")
+    if stage == "caption" and (cfg.caption.teacher_kind not in EMBEDDED or cfg.caption.judge.url):
         raise ConfigError(
-            "captions that a server writes are no work of workers",
+            "captions that a server writes do not depend on the number of workers",
             where="caption.teacher",
             got=cfg.caption.teacher,
-            expected="an embedded teacher, no judge and no reader",
+            expected="an embedded teacher and no judge",
             fix="--set caption.teacher=rules",
         )
-    bench = Bench(
-        stage=stage,
-        cores=len(os.sched_getaffinity(0)),
-        rows=[_measured(cfg, run_folder, out / f"workers_{count}", stage, count) for count in sorted(set(workers))],
-    )
+    rows = [_measure(cfg, run_folder, out / f"workers_{count}", stage, count) for count in sorted(set(workers))]
+    bench = Bench(stage=stage, cores=len(os.sched_getaffinity(0)), rows=rows)
     write_model(out / "bench.json", bench, FORMAT)
     return bench
 
 
-def _measured(cfg: RunConfig, run_folder: Path, folder: Path, stage: str, workers: int) -> BenchRun:
-    """Run the stage once; gives its figures."""
+def _measure(cfg: RunConfig, run_folder: Path, folder: Path, stage: str, workers: int) -> BenchRun:
     from cosfly.pipeline.run import stages
 
     log.info("bench: %s with %d worker%s", stage, workers, "s" if workers > 1 else "")
@@ -110,7 +106,7 @@ def _measured(cfg: RunConfig, run_folder: Path, folder: Path, stage: str, worker
 
 
 def row_of(events: list[Event], manifest: Manifest, workers: int, *, counts_frames: bool) -> BenchRun:
-    """Return the figures of one run from what its events and its manifest say."""
+    """Return the figures of one run from its events and its manifest."""
     done = [event for event in events if event.event == "item_done"]
     lost = [event for event in events if event.event in LOSSES]
     probes = [event for event in events if event.event == "probe"]
@@ -131,34 +127,46 @@ def row_of(events: list[Event], manifest: Manifest, workers: int, *, counts_fram
 
 
 def stage_rows(run_folder: Path, names: Iterable[str]) -> list[StageRow]:
-    """Return what the events of the finished stages of a run say."""
+    """Return the watchdog's figures of the finished stages of a run."""
     rows = []
     for name in names:
         folder = run_folder / name
         if (folder / "manifest.json").is_file():
-            events = read_events(folder)
-            counts = Counter(event.event for event in events)
-            restarts, seconds = counts["restarted"], read_manifest(folder).seconds
-            counted = {"launches": counts["worker_started"] + restarts, "restarts": restarts, "seconds": seconds}
-            rows.append(StageRow(stage=name, modes={k: n for k, n in counts.items() if k in LOSSES}, **counted))
+            counts = Counter(event.event for event in read_events(folder))
+            restarts, modes = counts["restarted"], {mode: n for mode, n in counts.items() if mode in LOSSES}
+            launches, seconds = counts["worker_started"] + restarts, read_manifest(folder).seconds
+            rows.append(StageRow(stage=name, launches=launches, restarts=restarts, seconds=seconds, modes=modes))
     return rows
 
 
 def tables(bench: Bench) -> dict[str, list[tuple[str, ...]]]:
-    """Return how the stage scales (tab:render_scaling), and what that takes of a GPU where there is one.
+    """Return title -> table: how the stage scales (tab:render_scaling), and its GPU where there is one.
 
-    A table's first row is its head, the first column is a name.
+    The first row of a table is its head, the first column is a name.
     """
     unit, first = "frames" if bench.stage == "render" else "items", bench.rows[0].per_s
-    scaling: list[tuple[str, ...]] = [
-        ("workers", "wall s", "attempted", "successful", f"{unit}/s", "speed-up", "cores", "MiB", "restarts", "failed")
-    ]
-    for row in bench.rows:
-        rates = f"{row.per_s:.2f}", f"{row.per_s / first:.2f}x", f"{row.cores_used:.2f}", f"{row.peak_memory_mib:.0f}"
-        counts = str(row.attempted), str(row.successful)
-        scaling.append((str(row.workers), f"{row.seconds:.1f}", *counts, *rates, str(row.restarts), str(row.failed)))
-    found = {f"{bench.stage} on {bench.cores} cores": scaling}
+    head = (
+        "workers",
+        "wall s",
+        "attempted",
+        "successful",
+        f"{unit}/s",
+        "speed-up",
+        "cores",
+        "MiB",
+        "restarts",
+        "failed",
+    )
+    rows = [
+        (
+            str(row.workers), f"{row.seconds:.1f}", str(row.attempted), str(row.successful), f"{row.per_s:.2f}",
+            f"{row.per_s / first:.2f}x", f"{row.cores_used:.2f}", f"{row.peak_memory_mib:.0f}", str(row.restarts),
+            str(row.failed),
+        )
+        for row in bench.rows
+    ]  # fmt: skip
+    found: dict[str, list[tuple[str, ...]]] = {f"{bench.stage} on {bench.cores} cores": [head, *rows]}
     if any(row.gpu_percent is not None for row in bench.rows):
         used = [(str(row.workers), str(row.gpu_percent), str(row.gpu_gib)) for row in bench.rows]
-        found["its NVIDIA devices"] = [("workers", "GPU %", "GPU GiB"), *used]
+        found["NVIDIA GPUs"] = [("workers", "GPU %", "GPU GiB"), *used]
     return found

@@ -1,4 +1,4 @@
-"""`cosfly doctor`: what works on this machine, and what to do about what does not."""
+"""`cosfly doctor`: check what works on this machine, and how to fix what does not."""
 
 from __future__ import annotations
 
@@ -14,9 +14,7 @@ from typing import Literal
 
 from cosfly.runtime.errors import EnvironmentMissing
 
-State = Literal["ok", "missing", "optional"]
-
-OPTIONAL_PACKAGES = {  # what it is for, and what brings it
+OPTIONAL_PACKAGES = {  # name -> what needs it, and what to install
     "torch": ("students", "cosfly[distill]"),
     "transformers": ("students", "cosfly[distill]"),
     "peft": ("students", "cosfly[distill]"),
@@ -32,15 +30,15 @@ OPTIONAL_PACKAGES = {  # what it is for, and what brings it
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the table; `optional` means: not there, and the main job does not need it."""
+    """One line of the table. state: `missing` stops the main job; `optional` does not."""
 
     name: str
-    state: State
+    state: Literal["ok", "missing", "optional"]
     detail: str
 
 
 def examine(folder: Path) -> list[Check]:
-    """Look at everything. `missing` in any check means that the main job cannot run here."""
+    """Return the checks of this machine; runs will be written to `folder`."""
     memory_gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     return [
         Check("python", "ok", f"{platform.python_version()} on {platform.platform()}"),
@@ -78,19 +76,19 @@ def _gl() -> Check:
 def _gpu() -> Check:
     program = shutil.which("nvidia-smi")
     if program is None:
-        return Check("GPU", "optional", "no nvidia-smi: frames are rendered on the CPU, students train on the CPU")
+        return Check("GPU", "optional", "no nvidia-smi: frames are rendered and students trained on the CPU")
+    query = [program, "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
     try:
-        query = [program, "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
-        found = subprocess.run(query, capture_output=True, text=True, timeout=20, check=False)
+        done = subprocess.run(query, capture_output=True, text=True, timeout=20, check=False)
     except subprocess.TimeoutExpired:
         return Check("GPU", "optional", "nvidia-smi does not answer")
-    if found.returncode != 0:
-        return Check("GPU", "optional", f"nvidia-smi failed: {found.stdout.strip() or found.stderr.strip()}"[:120])
-    return Check("GPU", "ok", "; ".join(found.stdout.strip().splitlines()))
+    if done.returncode != 0:
+        return Check("GPU", "optional", f"nvidia-smi failed: {done.stdout.strip() or done.stderr.strip()}"[:120])
+    return Check("GPU", "ok", "; ".join(done.stdout.strip().splitlines()))
 
 
 def _package(name: str) -> Check:
     if importlib.util.find_spec(name) is None:
-        purpose, brings = OPTIONAL_PACKAGES[name]
-        return Check(name, "optional", f'not installed; for {purpose}: pip install "{brings}"')
+        purpose, install = OPTIONAL_PACKAGES[name]
+        return Check(name, "optional", f'not installed; for {purpose}: pip install "{install}"')
     return Check(name, "ok", importlib.metadata.version(name.replace("_", "-")))

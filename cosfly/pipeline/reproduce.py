@@ -25,9 +25,11 @@ from cosfly.formats.boxes import read_boxes
 from cosfly.formats.captions import FIELDS, read_captions
 from cosfly.formats.segments import FOLLOW
 from cosfly.pipeline import bench as benchmark
-from cosfly.pipeline.runs import look
-from cosfly.pipeline.settings import RunConfig, worker_options
+from cosfly.pipeline.command_settings import worker_options
+from cosfly.pipeline.runs import summarize
+from cosfly.pipeline.settings import RunConfig
 from cosfly.planners import compare
+from cosfly.render.settings import RenderConfig
 from cosfly.runtime.arrays import read_picture
 from cosfly.runtime.config import build, read_yaml
 from cosfly.runtime.errors import InputError
@@ -51,7 +53,7 @@ FORMAT = FileFormat("cosfly.reproduction", "1.0")
 STAGES = ("maps", "simplify", "pedestrians", "plan")  # of a run without which nothing can be told
 PLANNERS = ("track_astar", "muco", "foresight")  # the first is held against the others, as in the paper
 LENSES_DEG = (120, 110, 90, 70, 60, 45, 30)  # tab:zoom_conversion
-ZOOM = {"fovs_deg": (110, 90, 60, 30), "every": 12, "modalities": ("rgb", "depth", "instance")}
+ZOOM_DEG, ZOOM_EVERY = (110.0, 90.0, 60.0, 30.0), 12
 WIDTH_PX = 1500  # of pictures on the page
 STYLE = """
 .pair { display: flex; flex-wrap: wrap; gap: 12px 34px; align-items: flex-start; }
@@ -108,7 +110,7 @@ def run(cfg: RunConfig, folder: Path, out: Path, *, walks: int = 20, resume: Res
     Raises:
         InputError: it is no run folder, one of several towns, or one that has no flights yet.
     """
-    done = [stage.name for stage in look(folder).stages if stage.state == "complete"]
+    done = [stage.name for stage in summarize(folder).stages if stage.state == "complete"]
     if missing := [name for name in STAGES if name not in done]:
         fix = f"one town at a time: {folder}/{next(iter(cfg.towns))}" if cfg.towns else f"cosfly run {folder}"
         raise InputError(
@@ -307,8 +309,8 @@ def measure(
     frame = four_panels(tree, out / "sample.png", box_map=read_boxes(boxes))
     depth.run(tree / frame, out / "depth")
     weather.run(cfg.render, boxes, traces, out / "weather", seed=cfg.seed)
-    lenses = build(zoom.ZoomStudyConfig, cfg.render.model_dump() | ZOOM, "zoom")
-    zoom.run(lenses, boxes, simplified, traces, out / "zoom", **how)
+    lenses = cfg.render.model_copy(update={"fovs_deg": ZOOM_DEG})
+    zoom.run(lenses, boxes, simplified, traces, out / "zoom", every=ZOOM_EVERY, **how)
     return {"sample": frame}
 
 
@@ -316,7 +318,7 @@ def work(cfg: RunConfig, run: Path, places: Places, done: Sequence[str]) -> dict
     """Return `work`: what is put together of several files, or of none."""
     manifests = {name: read_manifest(run / name) for name in benchmark.STAGES if name in done}
     watched = benchmark.stage_rows(run, benchmark.STAGES)
-    lens = build(zoom.ZoomStudyConfig, {"width_px": 1280, "height_px": 720}, "lenses")
+    lens = RenderConfig(width_px=1280, height_px=720)
     lenses = {str(fov): zoom.camera_of(lens, fov) for fov in LENSES_DEG}
     points = places.figures("plan/drone_trace.json:traces.*.metrics.num_points")[0]
     found: dict[str, Any] = {

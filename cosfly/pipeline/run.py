@@ -25,7 +25,8 @@ import cosfly.render.stage
 import cosfly.simplify.stage
 import release.package.stage
 from cosfly.formats.bystanders import OTHERS_FILE
-from cosfly.pipeline.settings import RunConfig, worker_options
+from cosfly.pipeline.command_settings import worker_options
+from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError, ResumeError
 from cosfly.runtime.io import refuse_link, write_bytes
 from cosfly.runtime.json_io import read_object, write_json
@@ -156,6 +157,15 @@ def check(cfg: RunConfig) -> dict[str, RunConfig]:
             fix = f"draw them, or --set 'release.modalities=[{', '.join(one.render.modalities)}]'"
             raise ConfigError(what, where="render.modalities", got=got, fix=fix)
     return towns
+
+
+def begun_run(config: Path, cfg: RunConfig) -> Path | None:
+    """Return the run directory that a configuration belongs to: a run, or the run.yaml of one that has begun."""
+    if (config / "run.yaml").is_file():
+        return config
+    places = [config.parent, *(config.parent / town for town in cfg.towns)]
+    has_begun = config.name == "run.yaml" and any(any(place.glob("*/stage.json")) for place in places)
+    return config.parent if has_begun else None
 
 
 def check_out(out: Path) -> None:

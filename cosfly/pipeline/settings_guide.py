@@ -11,16 +11,19 @@ from pydantic import BaseModel
 from cosfly.runtime.errors import ConfigError, nearest
 from cosfly.runtime.json_io import dump_json
 
+KINDS = {"integer": "whole number", "number": "number", "string": "text", "boolean": "true or false", "null": "null"}
+BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
+
 
 @dataclass(frozen=True)
 class Setting:
-    """One setting.
+    """One setting, or a group of settings.
 
     Attributes:
-        name: with its sections: `plan.altitude_max_m`.
-        value: JSON-able; None also of a group.
-        kind: what it may be, in words; empty of a group of settings.
-        meaning: its description.
+        name: With its sections: `plan.altitude_max_m`.
+        value: JSON-able; None for a group.
+        kind: What it may be, in words; empty for a group.
+        meaning: Its description.
     """
 
     name: str
@@ -34,7 +37,7 @@ class Setting:
 
 
 def explain(cfg: BaseModel, section: str | None = None) -> list[Setting]:
-    """Explain all settings in order, a group before what stands in it; or one section, or one setting."""
+    """Return all settings in order, a group before its members; or those of one section, or one setting."""
     schema = type(cfg).model_json_schema()
     settings = list(_explain(schema, schema["$defs"], cfg.model_dump(mode="json"), ""))
     if section is None:
@@ -44,13 +47,13 @@ def explain(cfg: BaseModel, section: str | None = None) -> list[Setting]:
         raise ConfigError(
             f"no such section or setting{nearest(section, [setting.name for setting in settings])}",
             got=section,
-            expected="for instance plan or plan.muco; a file, or a configuration that ships, comes before it",
+            expected="for instance plan or plan.muco, after the name of a file or of a shipped configuration",
         )
     return found
 
 
 def changed(cfg: BaseModel, section: str | None = None) -> list[Setting]:
-    """Explain those settings that are not the defaults; raises as `explain`."""
+    """Return the settings that are not the defaults; raises as `explain`."""
     defaults = {setting.name: setting.value for setting in explain(type(cfg)())}
     return [one for one in explain(cfg, section) if not one.is_group and one.value != defaults.get(one.name)]
 
@@ -59,30 +62,19 @@ def _explain(
     group: Mapping[str, Any], models: Mapping[str, Any], values: Mapping[str, Any], above: str
 ) -> Iterator[Setting]:
     for name, field in group["properties"].items():
-        model = _model_of(field, models)
-        meaning = field.get("description", "")
-        if model is None:
-            yield Setting(above + name, values[name], _kind_of(field, models), meaning)
-        else:
+        meaning, model = field.get("description", ""), models.get(field.get("$ref", "").rpartition("/")[2], {})
+        if "properties" in model:
             yield Setting(above + name, None, "", meaning)
             yield from _explain(model, models, values[name], f"{above}{name}.")
-
-
-def _model_of(field: Mapping[str, Any], models: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """Return the schema of a group of settings, None of a single one."""
-    model = models.get(field.get("$ref", "").rpartition("/")[2])
-    return model if model is not None and "properties" in model else None
-
-
-_KINDS = {"integer": "whole number", "number": "number", "string": "text", "boolean": "true or false", "null": "null"}
-_BOUNDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
+        else:
+            yield Setting(above + name, values[name], _kind_of(field, models), meaning)
 
 
 def _kind_of(field: Mapping[str, Any], models: Mapping[str, Any]) -> str:
     """Return what a setting may be: `number > 0`, `one of a, b`, `list of texts`, `text, as a, b`."""
     if "examples" in field:
-        names = {name: value for name, value in field.items() if name != "examples"}
-        return f"{_kind_of(names, models)}, as {', '.join(map(str, field['examples']))}"
+        rest = {name: value for name, value in field.items() if name != "examples"}
+        return f"{_kind_of(rest, models)}, as {', '.join(map(str, field['examples']))}"
     if "$ref" in field:
         return _kind_of(models[field["$ref"].rpartition("/")[2]], models)
     if "anyOf" in field:
@@ -93,21 +85,19 @@ def _kind_of(field: Mapping[str, Any], models: Mapping[str, Any]) -> str:
         return str(field["const"])
     kind = field.get("type")
     if kind == "array":
-        parts = field.get("prefixItems")
-        return "list of: " + (
-            ", ".join(_kind_of(p, models) for p in parts) if parts else _kind_of(field.get("items", {}), models)
-        )
+        parts = field.get("prefixItems") or [field.get("items", {})]
+        return f"list of: {', '.join(_kind_of(part, models) for part in parts)}"
     if kind == "object":
         rule = field.get("additionalProperties")
         return "mapping of names to: " + (_kind_of(rule, models) if isinstance(rule, dict) and rule else "values")
     if kind == "string" and field.get("format") == "path":
         return "path"
-    if kind not in _KINDS:
+    if kind not in KINDS:
         return "value"
-    bounds = [f"{sign} {field[bound]}" for bound, sign in _BOUNDS.items() if bound in field]
+    bounds = [f"{sign} {field[bound]}" for bound, sign in BOUNDS.items() if bound in field]
     if "multipleOf" in field:
         bounds.append(f"a multiple of {field['multipleOf']}")
-    return " ".join([_KINDS[kind], " and ".join(bounds)]).strip()
+    return " ".join([KINDS[kind], " and ".join(bounds)]).strip()
 
 
 def nested(settings: list[Setting]) -> dict[str, Any]:
@@ -123,7 +113,7 @@ def nested(settings: list[Setting]) -> dict[str, Any]:
 
 
 def as_lines(settings: list[Setting]) -> Iterator[str]:
-    """Write settings for a terminal: `name = value`, then what it means and what it may be."""
+    """Yield lines for a terminal: `name = value`, then what it means and what it may be."""
     for setting in settings:
         if setting.is_group:
             yield f"\n{setting.name}: {setting.meaning}"

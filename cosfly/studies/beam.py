@@ -1,7 +1,7 @@
-"""The sweep over the beam of TA*+Smooth (subsec:appendix_planner_tastar): the same walks at each beam.
+"""The sweep over the beam of TA*+Smooth (subsec:appendix_planner_tastar): the same pedestrians at each beam.
 
-Differences are those of the walks that a beam and the paper's both fly, so that no walk that fails makes a beam look
-better.
+Differences are taken over the pedestrians that both a beam and the paper's beam can follow, so that a failure does not
+make a beam look better.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import check_ids, draw_styles_of, make_scenario, plan_trajectory, warm_up
 from cosfly.runtime.errors import NoPathError
 from cosfly.runtime.json_io import FileFormat, write_json
-from cosfly.runtime.pool import Watch, run_items
+from cosfly.runtime.pool import run_items
 from cosfly.runtime.run_dir import Resume, StageFolder, result_of
 from cosfly.runtime.seeding import rng_for
 from cosfly.runtime.worker import Item, Outcome, Work
@@ -31,18 +31,18 @@ FIGURES = ("five_ray_mean", "length_m", "jerk_rms_mps3", "clearance_min_m")
 
 
 class BeamConfig(PlanConfig):
-    """Settings of the study: those of step 4, whose planner and beam count for nothing here, and the beams."""
+    """Settings of the study: those of step 4 but for planner and beam, and the beams."""
 
     beams: tuple[int, ...] = Field((64, 256, 512, 1024, PAPER_BEAM, 4096), description="beams of TA*'s search")
 
-    def of(self, beam: int) -> PlanConfig:
-        """Return the settings at a beam."""
+    def at_beam(self, beam: int) -> PlanConfig:
+        """Return the settings of the planner at a beam."""
         track_astar = self.track_astar.model_copy(update={"beam": beam})
         return self.model_copy(update={"planner": "track_astar", "track_astar": track_astar})
 
 
-class Flown(BaseModel):
-    """One walk at one beam. figures: None where no flight was found; reason: why it is not kept, None if it is.
+class Planned(BaseModel):
+    """One pedestrian at one beam. figures: None where no trajectory was found; reason: why it was dropped.
 
     times_ms: `search` and `smooth`, each measured once more by itself.
     """
@@ -52,12 +52,12 @@ class Flown(BaseModel):
     times_ms: dict[str, float] = {}
 
 
-class _Walk(BaseModel):
-    flown: dict[str, Flown]
+class _Result(BaseModel):
+    flown: dict[str, Planned]
 
 
 def make_worker(cfg: BeamConfig, simplified_map: Path, seed: int) -> Work:
-    """Load and index the map once; return the function that plans one walk at each beam."""
+    """Load and index the map once; return the function that plans one pedestrian at each beam."""
     from cosfly.geometry.kernels import obstacle_index
     from cosfly.planners.reacquire import screens_of
     from cosfly.planners.smoothing import smooth_trajectory
@@ -65,88 +65,84 @@ def make_worker(cfg: BeamConfig, simplified_map: Path, seed: int) -> Work:
 
     box_map = read_boxes(simplified_map)
     obstacles, screens = obstacle_index(box_map), screens_of(box_map)
-    warm_up(cfg.of(PAPER_BEAM))
+    warm_up(cfg.at_beam(PAPER_BEAM))
 
-    def fly(walk: Any, styles: list[str], own: PlanConfig) -> Flown:
+    def plan(pedestrian: Any, styles: list[str], own: PlanConfig) -> Planned:
         try:
-            trace = plan_trajectory(walk, obstacles, own, seed, screens, styles)
+            trace = plan_trajectory(pedestrian, obstacles, own, seed, screens, styles)
         except NoPathError:
-            return Flown(reason="no_path")
-        scenario, begin_s = make_scenario(walk, obstacles, own), time.perf_counter()
+            return Planned(reason="no_path")
+        scenario = make_scenario(pedestrian, obstacles, own)
+        times_s = [time.perf_counter()]
         found = search_trajectory(scenario, obstacles, own, own.safety_distance_m)
-        times_ms, begin_s = {"search": _since(begin_s)}, time.perf_counter()
+        times_s.append(time.perf_counter())
         if found is not None:
             smooth_trajectory(found[0], scenario, obstacles, own, own.safety_distance_m)
-            times_ms["smooth"] = _since(begin_s)
+            times_s.append(time.perf_counter())
+        times_ms = dict(zip(("search", "smooth"), np.round(1000.0 * np.diff(times_s), 2).tolist(), strict=False))
         figures = {name: float(trace.metrics[name]) for name in FIGURES}
-        return Flown(figures=figures, reason=trace.drop_reason, times_ms=times_ms)
+        return Planned(figures=figures, reason=trace.drop_reason, times_ms=times_ms)
 
     def work(item: Item) -> Outcome:
-        walk, styles = item.payload
-        return Outcome({"flown": {str(beam): fly(walk, styles, cfg.of(beam)).model_dump() for beam in cfg.beams}})
+        return Outcome(
+            {"flown": {str(beam): plan(*item.payload, cfg.at_beam(beam)).model_dump() for beam in cfg.beams}}
+        )
 
     return work
 
 
-def _since(begin_s: float) -> float:
-    return round(1000.0 * (time.perf_counter() - begin_s), 2)
-
-
 def run(
-    cfg: BeamConfig,
-    simplified_map: Path,
-    paths: Path,
-    out: Path,
-    *,
-    seed: int = 0,
-    workers: int = 0,
-    watch: Watch = Watch(),
-    resume: Resume = "if-same",
-) -> Path:
-    """Reads a simplified map and `path.json`, writes `beam_study.json`; returns its path.
+    cfg: BeamConfig, simplified_map: Path, paths: Path, out: Path, *, seed: int = 0, resume: Resume = "if-same",
+    **pool: Any,
+) -> Path:  # fmt: skip
+    """Read a simplified map and `path.json`; write `beam_study.json` and return its path.
 
-    Times, which differ from run to run, are in the journal alone.
+    Times differ from run to run and are in the journal only.
 
+    Args:
+        pool: `workers` and `watch` of `run_items`.
     Raises:
-        InputError: a file is not what it must be. NothingKept: there is no walk.
+        InputError: An input is malformed. NothingKept: There is no pedestrian trajectory.
     """
     inputs = {"map": simplified_map, "paths": paths}
     stage = StageFolder.open(out, "beam_study", config=cfg, inputs=inputs, seed=seed, resume=resume)
     product = out / "beam_study.json"
     if stage.is_complete:
         return product
-    walks = read_paths(paths)
-    check_ids(walks, paths)
-    items = [Item(w.path_id, (w, styles)) for w, styles in zip(walks, draw_styles_of(walks, cfg, seed), strict=True)]
-    finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), workers=workers, watch=watch)
+    pedestrians = read_paths(paths)
+    check_ids(pedestrians, paths)
+    styles = draw_styles_of(pedestrians, cfg, seed)
+    items = [Item(one.path_id, (one, own)) for one, own in zip(pedestrians, styles, strict=True)]
+    finished = run_items(stage, items, make_worker, (cfg, simplified_map, seed), **pool)
     if not finished.tally.kept:
         raise stage.nothing_kept(finished.tally)
-    studied = [result_of(record, _Walk).flown for record in finished.kept]
-    flown = {beam: [walk[str(beam)] for walk in studied] for beam in cfg.beams}
-    rows = summarize(flown, rng_for(seed, "beam_study", "intervals"))
+    results = [result_of(record, _Result).flown for record in finished.kept]
+    planned = {beam: [result[str(beam)] for result in results] for beam in cfg.beams}
+    rows = summarize(planned, rng_for(seed, "beam_study", "intervals"))
     write_json(product, {**FORMAT.header, "seed": seed, "settings": cfg.all_values(), "beams": rows})
     stage.finish([product], finished.tally)
     return product
 
 
-def summarize(flown: dict[int, list[Flown]], rng: np.random.Generator) -> dict[int, dict[str, Any]]:
-    """Return of each beam how many walks it flies and keeps, and its figures against those of the paper's beam.
+def summarize(planned: dict[int, list[Planned]], rng: np.random.Generator) -> dict[int, dict[str, Any]]:
+    """Return how many pedestrians each beam can follow, and its figures against those of the paper's beam.
 
     Args:
-        flown: beam -> walks, the same in the same order; PAPER_BEAM is one of them.
+        planned: beam -> the same pedestrians in the same order; PAPER_BEAM is one of the beams.
+
     Returns:
         beam -> `walks`, `kept`, and by figure `mean` and `difference` with `low` and `high` of its 95 % interval, over
-        walks drawn with replacement (Efron 1979).
+        pedestrians drawn with replacement (Efron 1979).
     """
     rows = {}
-    for beam, many in flown.items():
-        pairs = [
-            (a.figures, b.figures) for a, b in zip(many, flown[PAPER_BEAM], strict=True) if a.figures and b.figures
+    for beam, many in planned.items():
+        both = [
+            (a.figures, b.figures) for a, b in zip(many, planned[PAPER_BEAM], strict=True) if a.figures and b.figures
         ]
-        draws = rng.integers(max(len(pairs), 1), size=(NUM_RESAMPLES, len(pairs)))
+        draws = rng.integers(max(len(both), 1), size=(NUM_RESAMPLES, len(both)))
         figures = {}
-        for figure in FIGURES if pairs else ():
-            own, base = (np.array([pair[k][figure] for pair in pairs]) for k in (0, 1))
+        for figure in FIGURES if both else ():
+            own, base = (np.array([pair[k][figure] for pair in both]) for k in (0, 1))
             low, high = np.percentile((own - base)[draws].mean(axis=1), INTERVAL_PERCENT)
             found = {"mean": own.mean(), "difference": (own - base).mean(), "low": low, "high": high}
             figures[figure] = {part: round(float(value), 4) for part, value in found.items()}

@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 
 from cosfly.formats.boxes import check_ground, read_boxes
-from cosfly.formats.traces import DroneTrace, read_traces
+from cosfly.formats.traces import read_traces
 from cosfly.formats.weather import TIMES, WEATHERS, resolved
 from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
-from cosfly.render.contract import PosedPerson, Renderer
 from cosfly.render.person import choose_clothes, gait_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import renderer_of
@@ -36,43 +35,44 @@ FOV_DEG = 67.38  # 90 degrees at a zoom of 1.5
 
 
 def run(
-    cfg: RenderConfig,
-    boxes: Path,
-    traces: Path,
-    out: Path,
-    *,
-    trajectory: int = 0,
-    frame: int | None = None,
-    fov_deg: float = FOV_DEG,
-    seed: int = 0,
-    advance: Callable[[], object] = lambda: None,
-) -> tuple[Path, Path]:
-    """Reads `boxes_3d.json`, `drone_trace.json`; writes the figure and the sheet; gives their paths.
+    cfg: RenderConfig, boxes: Path, traces: Path, out: Path, *, trajectory: int = 0, frame: int | None = None,
+    fov_deg: float = FOV_DEG, seed: int = 0, advance: Callable[[], object] = lambda: None,
+) -> tuple[Path, Path]:  # fmt: skip
+    """Read `boxes_3d.json` and `drone_trace.json`; write the figure and the sheet and return their paths.
 
     Args:
-        trajectory: index of a flight of the traces; frame: of its clean track, None for the one that looks down least.
-        advance: called for each picture that is drawn.
+        trajectory: Index of a trajectory of the traces.
+        frame: Index of a frame of its clean track; None takes the frame that looks down least.
+        advance: Called for each picture that is drawn.
+
     Raises:
-        InputError: no such flight or frame, or an input is malformed. EnvironmentMissing: no renderer.
+        InputError: There is no such trajectory or frame, or an input is malformed.
     """
-    flights = read_traces(traces)
-    if not 0 <= trajectory < len(flights):
-        raise InputError("there is no such flight", where=traces, got=trajectory, expected=f"0 to {len(flights) - 1}")
-    trace = flights[trajectory]
+    all_traces = read_traces(traces)
+    if not 0 <= trajectory < len(all_traces):
+        expected = f"0 to {len(all_traces) - 1}"
+        raise InputError("there is no such trajectory", where=traces, got=trajectory, expected=expected)
+    trace = all_traces[trajectory]
     index = int(np.argmax(trace.rotations_deg[:, 0])) if frame is None else frame
     if not 0 <= index < len(trace.time_s):
-        raise InputError(
-            "the flight has no such frame",
-            where=f"{traces}: {trace.path_id}",
-            got=index,
-            expected=f"0 to {len(trace.time_s) - 1}",
-        )
+        where, expected = f"{traces}: {trace.path_id}", f"0 to {len(trace.time_s) - 1}"
+        raise InputError("the trajectory has no such frame", where=where, got=index, expected=expected)
     box_map = read_boxes(boxes)
     check_ground(box_map, boxes)
+    pose = world_from_camera(trace.positions_m[index], trace.rotations_deg[index])
+    clothes = choose_clothes(rng_for(seed, "weather_gallery", trace.path_id))
+    person = gait_of(trace.targets_m, trace.time_s).posed(index, trace.targets_m[index], clothes)
+    places = np.concatenate([trace.positions_m, trace.targets_m])
+    corners = places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M
+    intrinsic = intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg)
+    pictures = {}
     renderer = renderer_of(cfg, box_map, seed)
     try:
-        intrinsic = intrinsic_matrix(cfg.width_px, cfg.height_px, fov_deg)
-        pictures = _drawn(renderer, trace, index, intrinsic, seed, advance)
+        for weather, time_of_day in product(WEATHERS, TIMES):
+            renderer.prepare(*corners, resolved(WEATHERS[weather], TIMES[time_of_day]))
+            rgb = renderer.render(pose, intrinsic, person).rgb
+            pictures[weather, time_of_day] = cv2.resize(rgb, FIGURE_TILE_PX, interpolation=cv2.INTER_AREA)
+            advance()
     finally:
         renderer.close()
     figure = _grid([_tile(pictures[pair], pair, FIGURE_TILE_PX) for pair in FIGURE], FIGURE_COLUMNS)
@@ -82,34 +82,8 @@ def run(
     return out / FIGURE_NAME, out / SHEET_NAME
 
 
-def _drawn(
-    renderer: Renderer,
-    trace: DroneTrace,
-    index: int,
-    intrinsic: np.ndarray,
-    seed: int,
-    advance: Callable[[], object],
-) -> dict[tuple[str, str], np.ndarray]:
-    """Draw one frame of a flight under each pair of presets, in their order; pictures are kept at the figure's size."""
-    pose, person = world_from_camera(trace.positions_m[index], trace.rotations_deg[index]), _walker(trace, index, seed)
-    places = np.concatenate([trace.positions_m, trace.targets_m])
-    corners = places.min(axis=0) - MARGIN_M, places.max(axis=0) + MARGIN_M
-    pictures = {}
-    for pair in product(WEATHERS, TIMES):
-        renderer.prepare(*corners, resolved(WEATHERS[pair[0]], TIMES[pair[1]]))
-        rgb = renderer.render(pose, intrinsic, person).rgb
-        pictures[pair] = cv2.resize(rgb, FIGURE_TILE_PX, interpolation=cv2.INTER_AREA)
-        advance()
-    return pictures
-
-
-def _walker(trace: DroneTrace, index: int, seed: int) -> PosedPerson:
-    clothes = choose_clothes(rng_for(seed, "weather_gallery", trace.path_id))
-    return gait_of(trace.targets_m, trace.time_s).posed(index, trace.targets_m[index], clothes)
-
-
 def _tile(picture: np.ndarray, pair: tuple[str, str], size_px: tuple[int, int]) -> np.ndarray:
-    """Return a picture of the grid with its presets under it."""
+    """Return a picture of the grid with the names of its presets below it."""
     strip = np.full((STRIP_PX, size_px[0], 3), PAPER, np.uint8)
     draw_text(strip, ", ".join(pair).replace("_", " "), size_px[0] / 2.0, 18, 0.5, align=0.5)
     return np.vstack([cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA), strip])

@@ -16,9 +16,9 @@ from pydantic import Field
 from cosfly.formats.captions import Language
 from cosfly.runtime.config import Config
 from cosfly.runtime.console import progress_bar
-from cosfly.runtime.json_io import Record, read_json, read_object
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.io import sha256_file
+from cosfly.runtime.json_io import Record, read_json, read_object
 from distill.student.model import pick_device, quiet_transformers, require
 
 log = logging.getLogger(__name__)
