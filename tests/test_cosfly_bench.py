@@ -96,7 +96,7 @@ def test_frames_of_a_trajectory_that_fails_are_counted_and_left_out(tmp_path):
 
 
 def test_what_cannot_be_measured(tmp_path):
-    with pytest.raises(ConfigError, match=r"not a stage that can be measured.*simplify.*render"):
+    with pytest.raises(ConfigError, match=r"this stage cannot be measured.*simplify.*render"):
         run(RunConfig(), tmp_path, tmp_path / "out", "simplify", [1])
     asked = RunConfig.model_validate({"caption": {"teacher": "http://127.0.0.1:9"}})
     with pytest.raises(ConfigError, match="no work of workers"):

@@ -64,7 +64,7 @@ def test_a_way_of_ones_own_is_flown(town):
     own = cosfly.plan(town, walk[::6], planner="muco", altitude_max_m=25)
     assert_allclose(own.targets_m[0, :2], walk[0], atol=1e-3)
     assert own.positions_m[:, 2].max() < 26
-    with pytest.raises(InputError, match=r"way_m: not a way; got an array of shape \(3,\)"):
+    with pytest.raises(InputError, match=r"way_m: the route is invalid; got an array of shape \(3,\)"):
         cosfly.plan(town, [1, 2, 3])
 
 
@@ -92,16 +92,20 @@ def test_what_is_wrong_is_said_as_on_the_command_line(town):
         (lambda: cosfly.load_map(source="carla", port=1), EnvironmentMissing, r"127\.0\.0\.1:1 .*no CARLA server"),
         (lambda: cosfly.load_map("a.json", source="synthetic"), ConfigError, "reads no file"),
         (lambda: cosfly.load_map("nowhere.json"), InputError, r"nowhere\.json"),
-        (lambda: cosfly.load_map(**TOWN | {"seed": "x"}), ConfigError, "not a seed; got 'x'"),
-        (lambda: cosfly.plan(town, "abc"), InputError, "way_m: not a way"),
-        (lambda: cosfly.plan(town, [[0, 0, 0]]), InputError, "way_m: not a way"),
-        (lambda: cosfly.plan(town, [[0, "a"], [1, 2]]), InputError, "way_m: not a way"),
-        (lambda: cosfly.plan(town, [[0, 0], [9, 9], [9, 9]]), InputError, "way_m: not a way"),
+        (lambda: cosfly.load_map(**TOWN | {"seed": "x"}), ConfigError, "the seed is invalid; got 'x'"),
+        (lambda: cosfly.plan(town, "abc"), InputError, "way_m: the route is invalid"),
+        (lambda: cosfly.plan(town, [[0, 0, 0]]), InputError, "way_m: the route is invalid"),
+        (lambda: cosfly.plan(town, [[0, "a"], [1, 2]]), InputError, "way_m: the route is invalid"),
+        (lambda: cosfly.plan(town, [[0, 0], [9, 9], [9, 9]]), InputError, "way_m: the route is invalid"),
         (lambda: cosfly.plan(town, planer="muco"), ConfigError, "plan: planer: unknown setting"),
-        (lambda: cosfly.render_frames(town, [0, 0, 9]), InputError, "nobody says where to look"),
-        (lambda: cosfly.render_frames(town, [0, 9], [0, 0, 0]), InputError, "position_m: not places"),
-        (lambda: cosfly.load_map("a", source="simworld", world="b"), ConfigError, "load_map: world: changes nothing"),
-        (lambda: cosfly.plan(town, track_astar={"beam": 9}), ConfigError, "plan: track_astar: changes nothing"),
+        (lambda: cosfly.render_frames(town, [0, 0, 9]), InputError, "the camera has no direction"),
+        (
+            lambda: cosfly.render_frames(town, [0, 9], [0, 0, 0]),
+            InputError,
+            "position_m: the array has the wrong shape",
+        ),
+        (lambda: cosfly.load_map("a", source="simworld", world="b"), ConfigError, "load_map: world: has no effect"),
+        (lambda: cosfly.plan(town, track_astar={"beam": 9}), ConfigError, "plan: track_astar: has no effect"),
     ):
         with pytest.raises(error, match=words):
             call()

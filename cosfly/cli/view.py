@@ -14,7 +14,7 @@ app = typer.Typer()
 
 
 @app.command("view", epilog="cosfly view release --out release.html")
-@takes("inspect", **choice_of("inspect"))
+@takes("inspect", "", **choice_of("inspect"))
 def view(
     job: Job,
     source: Annotated[Path, Argument(help="Map (a file), playback tree, run directory or release.")],

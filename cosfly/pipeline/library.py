@@ -1,7 +1,6 @@
-"""cosfly as a library: stages as functions over values in memory, with the settings and results of commands.
+"""cosfly as a library: stages as functions over values in memory, with the settings and results of the commands.
 
-`import cosfly` loads nothing until a name is used. Positions are world metres, x east, y north, z up; angles are
-degrees.
+`import cosfly` loads nothing until a name is used. Positions are world metres, x east, y north, z up; angles degrees.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from cosfly.simplify.passes import SimplifyConfig, simplify
 
 __all__ = ["BoxMap", "DroneTrace", "Frame", "load_map", "plan", "read_captions", "render_frames"]
 
-# Settings that a function makes something of; it refuses the others of the section.
+# Settings that a function uses; it refuses the others of the section.
 OF_WALK = PedestriansConfig.model_fields.keys() - {*("num_paths", "others", "look_alikes", "traffic", "roi_vertices")}
 OF_PACE = {
     "cruise_speed_mps", "curvature_gain_m", "speed_jitter", "min_speed_mps", "pace", "hurry_speed_mps",
@@ -46,17 +45,17 @@ FILE_SETTING = {"simworld": "world", "cityjson": "path", "boxes": "path"}  # of 
 
 
 def load_map(path: str | Path | None = None, *, source: str | None = None, seed: int = 0, **settings: Any) -> BoxMap:
-    """Load or invent a map.
+    """Load or generate a map.
 
     Args:
-        path: `boxes_3d.json`, `step2_simplified.json`, a table or GeoJSON of boxes, or a source's file; None invents a
-            town.
-        source: `synthetic`, `simworld`, `cityjson`, `boxes` or `carla`; None goes by the file. A running CARLA is asked
-            by a process of its own: a script that asks it needs `if __name__ == "__main__":`.
-        settings: of the source, as in `maps.<source>` of a configuration: `load_map(size_m=400)`.
+        path: `boxes_3d.json`, `step2_simplified.json`, a table or GeoJSON of boxes, or a source's file; None generates
+            a town.
+        source: `synthetic`, `simworld`, `cityjson`, `boxes` or `carla`; None chooses by the file. CARLA is queried in
+            another process, so a script that uses it needs `if __name__ == "__main__":`.
+        settings: Of the source, as in `maps.<source>` of a configuration: `load_map(size_m=400)`.
     """
     if not isinstance(seed, int):
-        raise ConfigError("not a seed", where="load_map", got=repr(seed)[:40], expected="a whole number")
+        raise ConfigError("the seed is invalid", where="load_map", got=repr(seed)[:40], expected="a whole number")
     path = Path(path) if isinstance(path, str) else path
     if source is None and path is not None and path.suffix == ".json" and not settings:
         return read_boxes(path)
@@ -64,12 +63,8 @@ def load_map(path: str | Path | None = None, *, source: str | None = None, seed:
     if source not in SOURCES:
         raise ConfigError("there is no such source of maps", got=source, expected=", ".join(SOURCES))
     if path is not None and source not in FILE_SETTING:
-        raise ConfigError(
-            "this source reads no file",
-            where="load_map",
-            got=str(path),
-            fix=f"leave the path out, or give another source than {source}",
-        )
+        fix = f"omit the path, or choose another source than {source}"
+        raise ConfigError("this source reads no file", where="load_map", got=str(path), fix=fix)
     given = settings
     if path is not None:
         _check_taken(settings, settings.keys() - {FILE_SETTING[source]}, "load_map")
@@ -80,14 +75,15 @@ def load_map(path: str | Path | None = None, *, source: str | None = None, seed:
 def plan(
     box_map: BoxMap, way_m: Any = None, *, seed: int = 0, walk: dict[str, Any] | None = None, **settings: Any
 ) -> DroneTrace:
-    """Plan one flight behind one walk. A map that was not simplified yet is simplified first.
+    """Plan one drone trajectory behind one pedestrian. A map that is not simplified yet is simplified first.
 
     Args:
-        way_m: (k, 2) the way that the person walks, over free ground; None draws one, another for each seed.
-        walk: settings of the walk, as in `pedestrians` of a configuration.
-        settings: as in `plan` of a configuration: `plan(box_map, planner="muco", altitude_max_m=30)`.
+        way_m: (k, 2) route of the pedestrian over free ground; None draws one for the seed.
+        walk: Settings of the pedestrian, as in `pedestrians` of a configuration.
+        settings: As in `plan` of a configuration: `plan(box_map, planner="muco", altitude_max_m=30)`.
+
     Raises:
-        NoPathError: there is no way, or no flight.
+        NoPathError: There is no route, or no drone trajectory.
     """
     from cosfly.geometry.kernels import obstacle_index
     from cosfly.planners.reacquire import screens_of
@@ -102,20 +98,21 @@ def plan(
     if way_m is None:
         person = make_pedestrian("path_00000", walkable_ground(box_map, walking), walking, rng).walk
     else:
-        route_m = _way(way_m)
+        route_m = _route(way_m)
         person = walk_along("path_00000", route_m, box_map.ground, walking, rng, rng.spawn(1)[0])
     return plan_trajectory(person, obstacle_index(box_map), cfg, seed, screens_of(box_map))
 
 
-def _way(way_m: Any) -> np.ndarray:
-    expected = "(k, 2) finite places in m, two or more, no two alike one after the other"
+def _route(way_m: Any) -> np.ndarray:
+    """Return a route, (k, 2) m, checked."""
+    what, expected = "the route is invalid", "(k, 2) finite positions in m, at least two, successive ones different"
     try:
         route_m = np.asarray(way_m, dtype=np.float64)
     except (TypeError, ValueError):
-        raise InputError("not a way", where="way_m", got=repr(way_m)[:60], expected=expected) from None
+        raise InputError(what, where="way_m", got=repr(way_m)[:60], expected=expected) from None
     is_way = route_m.ndim == 2 and route_m.shape[1] == 2 and len(route_m) >= 2 and np.isfinite(route_m).all()
     if not is_way or not np.diff(route_m, axis=0).any(axis=1).all():
-        raise InputError("not a way", where="way_m", got=f"an array of shape {route_m.shape}", expected=expected)
+        raise InputError(what, where="way_m", got=f"an array of shape {route_m.shape}", expected=expected)
     return route_m
 
 
@@ -130,13 +127,16 @@ def render_frames(
     seed: int = 0,
     **settings: Any,
 ) -> list[Frame]:
-    """Draw what a camera sees from one or more places.
+    """Render the view of a camera from one or more positions.
 
     Args:
-        position_m: (3,) or (n, 3). rotation_deg: pitch, yaw, roll of the same shape; None looks at the target.
-        target_m: hip of the person, the same shape; None: nobody is there.
-        fov_deg: horizontal. size_px: width and height.
-        settings: as in `render` of a configuration: `look`, `backend`, those of weather.
+        position_m: (3,) or (n, 3).
+        rotation_deg: Pitch, yaw, roll, of the same shape; None looks at the target.
+        target_m: Hip of the target, of the same shape; None for no person.
+        fov_deg: Horizontal field of view.
+        size_px: Width and height.
+        settings: As in `render` of a configuration: `look`, `backend` and those of weather.
+
     Returns:
         n frames: rgb (h, w, 3) uint8, depth (h, w) float32 z-depth in m, kinds and instance ids (h, w).
     """
@@ -148,9 +148,8 @@ def render_frames(
         pitch, yaw = look_at(positions, targets)
         rotations = np.degrees(np.column_stack([pitch, yaw, np.zeros(len(positions))]))
     else:
-        raise InputError(
-            "nobody says where to look", where="render_frames", expected="rotation_deg, or target_m to look at"
-        )
+        expected = "rotation_deg, or target_m to look at"
+        raise InputError("the camera has no direction", where="render_frames", expected=expected)
     camera = {"width_px": size_px[0], "height_px": size_px[1], "fovs_deg": [fov_deg]}
     cfg = build(RenderConfig, settings | camera, "render_frames")
     _check_taken(settings, OF_PICTURE, "render_frames")
@@ -164,20 +163,19 @@ def render_frames(
     try:
         knobs = None if weather is None else weather.params
         renderer.prepare(positions.min(axis=0), positions.max(axis=0), knobs)
-        people = [
-            None if gait is None or targets is None else gait.posed(i, targets[i], clothes)
-            for i in range(len(positions))
-        ]
-        poses = [world_from_camera(*pose) for pose in zip(positions, rotations, strict=True)]
-        return [renderer.render(pose, intrinsic, person) for pose, person in zip(poses, people, strict=True)]
+        frames = []
+        for i, pose in enumerate(zip(positions, rotations, strict=True)):
+            person = None if gait is None or targets is None else gait.posed(i, targets[i], clothes)
+            frames.append(renderer.render(world_from_camera(*pose), intrinsic, person))
+        return frames
     finally:
         renderer.close()
 
 
 def _check_taken(settings: dict[str, Any], taken: Collection[str], where: str) -> None:
     if ignored := sorted(settings.keys() - taken):
-        expected = f"settings that do: {', '.join(sorted(taken)) or 'none'}; the function's own arguments"
-        raise ConfigError(f"{', '.join(ignored)}: changes nothing here", where=where, expected=expected)
+        expected = f"one of {', '.join(sorted(taken)) or 'none'}, or an argument of the function"
+        raise ConfigError(f"{', '.join(ignored)}: has no effect here", where=where, expected=expected)
 
 
 def _places(values: Any, name: str, count: int | None = None) -> np.ndarray:
@@ -185,5 +183,6 @@ def _places(values: Any, name: str, count: int | None = None) -> np.ndarray:
     places = np.atleast_2d(np.asarray(values, dtype=np.float64))
     if places.ndim != 2 or places.shape[1] != 3 or len(places) == 0 or count not in (None, len(places)):
         expected = "(3,) or (n, 3)" if count is None else f"({count}, 3), as position_m"
-        raise InputError("not places or turns", where=name, got=f"an array of shape {places.shape}", expected=expected)
+        got = f"an array of shape {places.shape}"
+        raise InputError("the array has the wrong shape", where=name, got=got, expected=expected)
     return places

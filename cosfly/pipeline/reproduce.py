@@ -1,8 +1,8 @@
-"""`cosfly reproduce`: the paper's tables and figures from one run, each beside the paper's own, on one page.
+"""`cosfly reproduce`: the paper's tables and figures from one run, next to the paper's own, on one page.
 
-What the run recorded is read from its stages. What it has not is measured anew in folders of their own below `out`:
-planners, TA*'s beam and zoom are stages that go on after a kill; depth, weather and single pictures are
-done again. `paper.yaml` says where each figure stands, what the paper's is, why they differ, and what is left out.
+What the run recorded is read from its stages. The rest is measured again in folders below `out`: planners, TA*'s beam
+and zoom are stages that resume after a kill; depth, weather and single pictures are made again. `paper.yaml` lists
+where each figure is found, the paper's value, why they differ, and what is not reproduced.
 """
 
 from __future__ import annotations
@@ -50,29 +50,30 @@ from release.stats.tables import Cell, Rows, Table
 log = logging.getLogger(__name__)
 
 FORMAT = FileFormat("cosfly.reproduction", "1.0")
-STAGES = ("maps", "simplify", "pedestrians", "plan")  # of a run without which nothing can be told
-PLANNERS = ("track_astar", "muco", "foresight")  # the first is held against the others, as in the paper
+STAGES = ("maps", "simplify", "pedestrians", "plan")  # of a run that can be compared
+PLANNERS = ("track_astar", "muco", "foresight")  # the first is compared with the others, as in the paper
 LENSES_DEG = (120, 110, 90, 70, 60, 45, 30)  # tab:zoom_conversion
 ZOOM_DEG, ZOOM_EVERY = (110.0, 90.0, 60.0, 30.0), 12
+UNEXPECTED = "the file is not as a stage writes it"
 WIDTH_PX = 1500  # of pictures on the page
 STYLE = """
 .pair { display: flex; flex-wrap: wrap; gap: 12px 34px; align-items: flex-start; }
 .pair img { flex: 1 1 420px; min-width: 0; max-width: min(100%, 860px); border-radius: 4px; }
 .panel h2 { margin-top: 2px; } [id="muco_visibility"] img { flex-basis: 100%; max-width: 100%; }
 """
-# Of `cosfly release stats` the tables that name one of the paper; the others are told of plans here.
+# Tables of `cosfly release stats` that are the paper's; the others come from plans here.
 OF_RELEASE = ("release", "decisions", "confusion", "repairs", "text_lengths", "fovs", "weather")
 
 
 class Part(Table):
-    """A table of the paper as this run gives it; `paper`: its labels. picture: JPEG in base64, on the page alone."""
+    """A table of the paper with this run's figures. picture: JPEG in base64, on the page only."""
 
-    source: Literal["recorded", "measured anew"] = "recorded"
+    source: Literal["recorded", "measured again"] = "recorded"
     picture: str | None = Field(None, exclude=True)
 
 
 class Printed(BaseModel):
-    """A table of `paper.yaml`. here: row -> place of its figures, or what `from` wants; "*": all rows of a place."""
+    """A table of `paper.yaml`. here: row -> place of its figures, or the argument of `from`; "*": all rows of it."""
 
     title: str
     head: str
@@ -93,29 +94,29 @@ class Paper(BaseModel):
 
 
 class MissingFile(Exception):
-    """A file that a table is made of is not there."""
+    """A file that a table needs does not exist."""
 
 
 def read_paper() -> Paper:
-    """Read what the paper prints, and where ours stands."""
+    """Read the paper's figures, and the places of ours."""
     path = Path(__file__).with_name("paper.yaml")
     return build(Paper, read_yaml(path), path)
 
 
 def run(cfg: RunConfig, folder: Path, out: Path, *, walks: int = 20, resume: Resume) -> Path:
-    """Reads a run folder, writes `reproduction.html` and `reproduction.json`, and what it measures; gives the page.
+    """Read a run directory; write `reproduction.html` and `reproduction.json`, and return the page.
 
     Args:
-        walks: how many planners are measured on.
+        walks: Number of pedestrians that planners are measured on.
+
     Raises:
-        InputError: it is no run folder, one of several towns, or one that has no flights yet.
+        InputError: It is not a run directory, has several towns, or no drone trajectories yet.
     """
     done = [stage.name for stage in summarize(folder).stages if stage.state == "complete"]
     if missing := [name for name in STAGES if name not in done]:
         fix = f"one town at a time: {folder}/{next(iter(cfg.towns))}" if cfg.towns else f"cosfly run {folder}"
-        raise InputError(
-            "the run has not come to its flights", where=folder, got=f"no {', no '.join(missing)}", fix=fix
-        )
+        what, got = "the run has no drone trajectories yet", f"no {', no '.join(missing)}"
+        raise InputError(what, where=folder, got=got, fix=fix)
     printed = read_paper()
     made = measure(cfg, folder, out, walks, done, {**worker_options(cfg), "resume": resume})
     places = Places([folder, out], made)
@@ -125,20 +126,20 @@ def run(cfg: RunConfig, folder: Path, out: Path, *, walks: int = 20, resume: Res
         try:
             parts.append(part(label, table, places, folder))
         except MissingFile as absent:
-            left_out[f"{label}, {table.also}".strip(", ")] = f"needs {absent}, to which this run has not come"
+            left_out[f"{label}, {table.also}".strip(", ")] = f"needs {absent}, which this run has not made"
     if "release" in done:
         tables = read_object(out / "release/stats.json", what="statistics")["tables"]
         parts += [Part(**one) for one in tables if one["key"] in OF_RELEASE]
     name, machine = run_name(folder / "plan"), f"cosfly {cosfly.__version__}, {len(os.sched_getaffinity(0))} cores"
-    told = {"run": name, "made_by": machine, "walks": walks, "left_out": left_out}
+    facts = {"run": name, "made_by": machine, "walks": walks, "left_out": left_out}
     listed = [one.model_dump(mode="json") for one in parts]
-    write_json(out / "reproduction.json", {**FORMAT.header, **told, "parts": listed})
-    text = page("cosfly/pipeline/reproduce.html", title=name, style=STYLE, told=told, parts=parts, look=TABLE_LOOK)
+    write_json(out / "reproduction.json", {**FORMAT.header, **facts, "parts": listed})
+    text = page("cosfly/pipeline/reproduce.html", title=name, style=STYLE, facts=facts, parts=parts, look=TABLE_LOOK)
     write_bytes(out / "reproduction.html", text.encode())
     return out / "reproduction.html"
 
 
-# --- where figures stand ----------------------------------------------------------------------------------------------
+# --- places of figures ----------------------------------------------------------------------------------------------
 
 FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     "mean": lambda values: float(np.mean(values)), "std": lambda values: float(np.std(values)), "min": min, "max": max,
@@ -151,7 +152,7 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
 
 @dataclass
 class Places:
-    """Reads figures by their places. roots: folders in which files are looked for, in order; made: `work`."""
+    """Reader of figures by their places. roots: folders that are searched for files, in order; made: `work`."""
 
     roots: Sequence[Path]
     made: dict[str, Any]
@@ -164,7 +165,7 @@ class Places:
         return found
 
     def figures(self, place: str) -> list[Any]:
-        """Return the figures of a place of `paper.yaml`; None where a part of one is not there."""
+        """Return the figures of a place of `paper.yaml`; None where one does not exist."""
         found = list[Any]()
         for one in place.split(" + "):
             path, _, functions = one.partition("|")
@@ -172,13 +173,11 @@ class Places:
             *way, last = keys.split(".")
             try:
                 values = [_at(self._document(name), [*way, key]) for key in last.split(",")]
-                found += (
-                    [FUNCTIONS[f](v) if v else None for v in values for f in functions.split(",")]
-                    if functions
-                    else values
-                )
+                if functions:
+                    values = [FUNCTIONS[f](v) if v else None for v in values for f in functions.split(",")]
+                found += values
             except (TypeError, ValueError, AttributeError, ArithmeticError) as error:
-                raise InputError("not what a stage writes", where=f"{name}: {keys}", got=str(error)) from None
+                raise InputError(UNEXPECTED, where=f"{name}: {keys}", got=str(error)) from None
         return found
 
     def _document(self, name: str) -> Any:
@@ -208,19 +207,17 @@ def _at(value: Any, way: list[str]) -> Any:
 
 
 def part(label: str, printed: Printed, places: Places, run: Path) -> Part:
-    """Make a table of the paper: our figures, the paper's beside or below them."""
+    """Make a table of the paper: our figures, with the paper's next to or below them."""
     files, ours = set[str](), dict[str, list[Any]]()
     for name, row in printed.here.items():
         place = row if ":" in row else printed.place.format(row)
         files |= {one.partition(":")[0] for one in place.split(" + ")} - {"work"}
         found = places.figures(place)
         if name == "*" and not isinstance(found[0] or {}, dict):
-            raise InputError(
-                "not what a stage writes", where=place, got=str(found[0])[:80], expected="names with figures"
-            )
+            raise InputError(UNEXPECTED, where=place, got=str(found[0])[:80], expected="names with figures")
         ours |= {key: _values(row) for key, row in (found[0] or {}).items()} if name == "*" else {name: found}
     names, rows, theirs = printed.head.split("|"), Rows(), {name: _values(row) for name, row in printed.paper.items()}
-    is_beside = names[1] == "here"  # ours is one column, the paper's stand beside it; else the paper's rows stand below
+    is_beside = names[1] == "here"  # ours is one column, next to the paper's; else the paper's rows follow ours
     for name in dict.fromkeys([*ours, *theirs]):
         here, paper = ([*map(_cell, found.get(name, [])), *[None] * len(names)] for found in (ours, theirs))
         if is_beside:
@@ -234,13 +231,14 @@ def part(label: str, printed: Printed, places: Places, run: Path) -> Part:
     if printed.picture:
         files.add(printed.picture)
     is_recorded = all((run / file).is_file() for file in files)
-    said = printed.why if theirs else printed.why[:1].upper() + printed.why[1:]
-    why = f"{'Differs: ' * bool(theirs)}{said}. " if said else ""
+    why = f"Differs: {printed.why}. " if theirs and printed.why else ""
+    if printed.why and not theirs:
+        why = f"{printed.why[:1].upper()}{printed.why[1:]}. "
     labels = ", ".join(name for name in (label, printed.also) if ":" in name)
     return Part(
         key=label, title=printed.title, head=names, rows=rows, paper=labels,
         note=why + (f"From {', '.join(sorted(files))}." if files else ""),
-        source="recorded" if is_recorded else "measured anew",
+        source="recorded" if is_recorded else "measured again",
         picture=_jpeg(places.file(printed.picture)) if printed.picture else None,
     )  # fmt: skip
 
@@ -250,7 +248,7 @@ def _values(row: Any) -> list[Any]:
 
 
 def _cell(value: Any) -> Cell:
-    """Return what a cell shows: numbers and words as they are, counts by a word and lists as words."""
+    """Return the content of a cell: numbers and words as they are, counts by name and lists as words."""
     if isinstance(value, dict):
         return ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in value.items()) or "none"
     if isinstance(value, list | tuple):
@@ -268,29 +266,27 @@ def _jpeg(path: Path) -> str:
 
 
 def settings(cfg: RunConfig, printed: Paper) -> Part:
-    """Set the settings of the run beside what the paper prints."""
+    """Compare the settings of the run with the paper's."""
     data, rows = cfg.all_values(), Rows()
     for label, wanted in printed.settings.items():
         for name, theirs in wanted.items():
             own = _at(data, name.split("."))
             rows.append([name, str(_cell(own)), str(_cell(theirs)), "" if own == theirs else "other", label])
-    note = (
-        "What the paper prints for its own planner, its trunks and its SimWorld runs are settings here, not defaults."
-    )
+    note = "The paper's planner, trunks and SimWorld runs are settings here, not defaults."
     head, labels = ["setting", "here", "paper", "", "label"], ", ".join(printed.settings)
     return Part(key="settings", title="Settings", head=head, rows=rows, paper=labels, note=note)
 
 
-# --- what is measured anew --------------------------------------------------------------------------------------------
+# --- what is measured again -------------------------------------------------------------------------------------------
 
 
 def measure(
     cfg: RunConfig, run: Path, out: Path, num_walks: int, done: Sequence[str], worker_options: dict[str, Any]
 ) -> dict[str, Any]:
-    """Do what the run has not recorded, in folders of their own below `out`; give what of it stands in no file.
+    """Measure what the run has not recorded, in folders below `out`; return the facts that are in no file.
 
-    Planners fly the paper's wish, whatever styles the run has, on walks that are drawn on its map by its settings: its
-    own are the first of them.
+    Planners track the paper's reference trajectory, whatever styles the run has, after pedestrians that are drawn on
+    its map with its settings; its own pedestrians are the first of them.
     """
     boxes, simplified = run / "maps/boxes_3d.json", run / "simplify/step2_simplified.json"
     traces, tree, how = run / "plan/drone_trace.json", run / "render", {"seed": cfg.seed, **worker_options}
@@ -315,7 +311,7 @@ def measure(
 
 
 def work(cfg: RunConfig, run: Path, places: Places, done: Sequence[str]) -> dict[str, Any]:
-    """Return `work`: what is put together of several files, or of none."""
+    """Return `work`: the figures that come from several files, or from none."""
     manifests = {name: read_manifest(run / name) for name in benchmark.STAGES if name in done}
     watched = benchmark.stage_rows(run, benchmark.STAGES)
     lens = RenderConfig(width_px=1280, height_px=720)

@@ -1,4 +1,4 @@
-"""The stages in order, inside one run folder: `cosfly run`. Resumes where it stopped."""
+"""`cosfly run`: the stages in order, in one run directory. Resumes where it stopped."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ SUMMARY = "summary.json"
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a run: `work` makes `product` in the stage's folder and is safe to call again."""
+    """One stage of a run: `work` makes `product` in the stage's folder and may be called again."""
 
     name: str
     product: Path
@@ -60,49 +60,44 @@ class StageResult:
 
 
 def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path | None = None) -> list[Stage]:
-    """Return the stages of a run in order; each works in the folder of its name, of the run or of `into`."""
-    seed, working = cfg.seed, worker_options(cfg)
+    """Return the stages of a run in order; each works in the folder of its name in the run directory or in `into`."""
+    seed, pool = cfg.seed, worker_options(cfg)
     boxes, simplified = out / "maps/boxes_3d.json", out / "simplify/step2_simplified.json"
-    walks, traces, tree = out / "pedestrians/path.json", out / "plan/drone_trace.json", out / "render"
-    others = walks.with_name(OTHERS_FILE) if cfg.pedestrians.has_others else None
+    paths, traces, tree = out / "pedestrians/path.json", out / "plan/drone_trace.json", out / "render"
+    others = paths.with_name(OTHERS_FILE) if cfg.pedestrians.has_others else None
     inspected, captions = out / "inspect/inspect.json", out / "caption/captions.jsonl"
 
-    whole = [Source.of_files(tree, captions, inspected)]
-
     def stage(name: str, product: Path, run: Callable[..., Path], *inputs: Any, **options: Any) -> Stage:
-        return Stage(
-            name, product, partial(run, getattr(cfg, name), *inputs, (into or out) / name, resume=resume, **options)
-        )
+        work = partial(run, getattr(cfg, name), *inputs, (into or out) / name, resume=resume, **options)
+        return Stage(name, product, work)
 
     return [
         stage("maps", boxes, cosfly.maps.stage.run, seed=seed, follow_links=cfg.follow_links),
         stage("simplify", simplified, cosfly.simplify.stage.run, boxes),
-        stage("pedestrians", walks, cosfly.pedestrians.stage.run, simplified, roi=cfg.roi, seed=seed, **working),
-        stage("plan", traces, cosfly.planners.stage.run, simplified, walks, seed=seed, **working),
-        stage("render", tree, cosfly.render.stage.run, boxes, simplified, traces, others=others, seed=seed, **working),
-        stage("inspect", inspected, cosfly.inspection.stage.run, simplified, traces, tree, **working),
-        stage("caption", captions, caption.run.stage.run, tree, seed=seed, **working),
-        joint_release(cfg, whole, into or out, resume),
+        stage("pedestrians", paths, cosfly.pedestrians.stage.run, simplified, roi=cfg.roi, seed=seed, **pool),
+        stage("plan", traces, cosfly.planners.stage.run, simplified, paths, seed=seed, **pool),
+        stage("render", tree, cosfly.render.stage.run, boxes, simplified, traces, others=others, seed=seed, **pool),
+        stage("inspect", inspected, cosfly.inspection.stage.run, simplified, traces, tree, **pool),
+        stage("caption", captions, caption.run.stage.run, tree, seed=seed, **pool),
+        joint_release(cfg, [Source.of_files(tree, captions, inspected)], into or out, resume),
     ]
 
 
 def joint_release(cfg: RunConfig, sources: list[Source], out: Path, resume: Resume) -> Stage:
-    """Return the stage that releases runs together."""
-    work = partial(
-        release.package.stage.run, cfg.release, sources, out / "release", resume=resume, **worker_options(cfg)
-    )
+    """Return the stage that releases one or more runs together."""
+    options: dict[str, Any] = {"resume": resume, **worker_options(cfg)}
+    work = partial(release.package.stage.run, cfg.release, sources, out / "release", **options)
     return Stage("release", out / "release/dataset", work)
 
 
 def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "release") -> list[StageResult]:
-    """Make a data set: reads what the configuration names, writes one folder per stage below `out`; of several towns
-    one run folder for each, and `release`.
+    """Make a data set: read what the configuration names, write one folder per stage below `out`.
+
+    Of several towns each is a run directory of its own, and `release` is made of all. Every stage is complete or
+    resumable at any moment. The run ends with `contact_sheet.png`, `viewer.html` and `summary.json`.
 
     Args:
-        until: the last stage that is done.
-
-    Every stage is complete or resumable at any moment; running again continues. Ends with `contact_sheet.png`,
-    `viewer.html` and `summary.json` in the run directory, or in that of each town if there are several.
+        until: The last stage to run.
     """
     out = cfg.opened(out)
     check_out(out)
@@ -111,7 +106,7 @@ def run(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", until: str = "
         return _run_town(cfg, out, _up_to(until, stages(cfg, out, resume=resume)))
     for name in (*towns, "release"):
         refuse_link(out / name)
-    with _run_folder(cfg, out):
+    with _run_directory(cfg, out):
         results = []
         for number, (name, town) in enumerate(towns.items(), 1):
             log.info("town %d of %d: %s", number, len(towns), name)
@@ -130,9 +125,9 @@ def _up_to(name: str, todo: list[Stage]) -> list[Stage]:
 
 
 @contextlib.contextmanager
-def _run_folder(cfg: RunConfig, out: Path) -> Iterator[None]:
-    """Hold a run folder with its `run.yaml`, which other settings replace when every stage has taken them, or at once
-    where no map is finished yet."""
+def _run_directory(cfg: RunConfig, out: Path) -> Iterator[None]:
+    """Lock a run directory and write its `run.yaml`: at once where no map is finished yet, else when all stages have
+    accepted the settings."""
     with hold_folder(out):
         is_new = not any(any(out.glob(maps)) for maps in ("maps/manifest.json", "*/maps/manifest.json"))
         if is_new or not (out / "run.yaml").exists():
@@ -143,24 +138,24 @@ def _run_folder(cfg: RunConfig, out: Path) -> Iterator[None]:
 
 
 def check(cfg: RunConfig) -> dict[str, RunConfig]:
-    """Check what the last stage would ask for, before the first; gives the settings of each town, if there are any.
+    """Check before the first stage what the last one requires; return the settings of each town.
 
     Raises:
-        ConfigError: nobody says under which licence the release goes out, or it asks for pictures that are not drawn.
+        ConfigError: The licence of the release is not known, or it needs pictures that are not rendered.
     """
     towns = {name: cfg.of_town(name) for name in cfg.towns}
     maps = [(name, town.maps.licence) for name, town in towns.items()] or [(cfg.maps.source, cfg.maps.licence)]
     choose_licence(cfg.release.licence, maps)
     for one in towns.values() or [cfg]:
         if missing := sorted(set(cfg.release.modalities) - set(one.render.modalities)):
-            what, got = "the release asks for pictures that nobody draws", f"no {', no '.join(missing)}"
-            fix = f"draw them, or --set 'release.modalities=[{', '.join(one.render.modalities)}]'"
+            what, got = "the release needs pictures that are not rendered", f"no {', no '.join(missing)}"
+            fix = f"render them, or --set 'release.modalities=[{', '.join(one.render.modalities)}]'"
             raise ConfigError(what, where="render.modalities", got=got, fix=fix)
     return towns
 
 
 def begun_run(config: Path, cfg: RunConfig) -> Path | None:
-    """Return the run directory that a configuration belongs to: a run, or the run.yaml of one that has begun."""
+    """Return the run directory that a configuration belongs to: the run, or the run.yaml of one that has begun."""
     if (config / "run.yaml").is_file():
         return config
     places = [config.parent, *(config.parent / town for town in cfg.towns)]
@@ -171,15 +166,15 @@ def begun_run(config: Path, cfg: RunConfig) -> Path | None:
 def check_out(out: Path) -> None:
     """Refuse to make a run in the folder of a stage: its tree would hold a second one."""
     if (out / "stage.json").exists() and not (out / "run.yaml").exists():
-        fix = "choose another --out; a run goes on with its own folder, in which those of its stages stand"
-        raise ResumeError("the folder of a stage, not of a run", where=out, got="stage.json in it", fix=fix)
+        what, fix = "the folder of a stage, not of a run", "choose another --out, or the run directory above it"
+        raise ResumeError(what, where=out, got="stage.json in it", fix=fix)
 
 
 def check_with_files(cfg: RunConfig) -> None:
-    """Check what the last stage would ask for, and that the files of all maps are there.
+    """Check what the last stage requires, and that the files of all maps exist.
 
     Raises:
-        CosflyError: of several the text names each.
+        CosflyError: The text names each of several problems.
     """
     problems = list[CosflyError]()
     try:
@@ -193,11 +188,8 @@ def check_with_files(cfg: RunConfig) -> None:
         except CosflyError as error:
             problems.append(error)
             continue
-        problems += [
-            InputError("there is no such file", where=f"{where}: {name}", got=str(path))
-            for name, path in files.items()
-            if not path.exists()
-        ]
+        missing = [(f"{where}: {name}", path) for name, path in files.items() if not path.exists()]
+        problems += [InputError("there is no such file", where=place, got=str(path)) for place, path in missing]
     if len(problems) > 1:
         raise ConfigError.of_all([str(problem) for problem in problems], where=cfg.name)
     if problems:
@@ -205,22 +197,22 @@ def check_with_files(cfg: RunConfig) -> None:
 
 
 def _run_town(cfg: RunConfig, out: Path, todo: list[Stage]) -> list[StageResult]:
-    """Do the stages of one town."""
+    """Run the stages of one town."""
     for stage in todo:
         refuse_link(out / stage.name)
-    with _run_folder(cfg, out):
+    with _run_directory(cfg, out):
         results = [_do(stage, out, f"{number}/{len(todo)}") for number, stage in enumerate(todo, 1)]
-        tree = out / "render"
-        has_frames = (tree / "manifest.json").exists()
-        if has_frames and not (_is_summed_up(results, out) and (out / "viewer.html").exists()):
-            contact_sheet(tree, out / "contact_sheet.png")
+        # summary.json is written after the pictures: with these very stages in it, they are up to date.
+        is_shown = _summary(out).get("stages") == _rows(results) and (out / "viewer.html").exists()
+        if (out / "render/manifest.json").exists() and not is_shown:
+            contact_sheet(out / "render", out / "contact_sheet.png")
             write_viewer(out, out / "viewer.html", ViewerConfig())
         _save_summary(results, out)
     return results
 
 
 def _do(stage: Stage, out: Path, place: str) -> StageResult:
-    """Do a stage that is not complete; one that is refuses other settings, or goes on where more is to be done."""
+    """Run a stage; one that is complete refuses other settings, and continues where there is more to do."""
     folder = out / stage.name
     before = read_manifest(folder) if (folder / "manifest.json").exists() else None
     if before is None:
@@ -233,7 +225,7 @@ def _do(stage: Stage, out: Path, place: str) -> StageResult:
 
 
 def _save_run(cfg: RunConfig, out: Path) -> None:
-    """Write `run.yaml`: the resolved configuration, which runs as it is."""
+    """Write `run.yaml`: the resolved configuration, which can be run as it is."""
     header = f"# cosfly {cosfly.__version__}, Python {platform.python_version()}, {platform.platform()}\n"
     text = header + yaml.safe_dump(cfg.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
     write_bytes(out / "run.yaml", text.encode())
@@ -246,22 +238,16 @@ def _rows(results: list[StageResult]) -> list[dict[str, Any]]:
     ]
 
 
-def _summary(path: Path) -> dict[str, Any]:
-    return read_object(path, what="summary") if path.exists() else {}
-
-
-def _is_summed_up(results: list[StageResult], out: Path) -> bool:
-    """Return whether a run came to its end with these very stages: `summary.json` is written after the pictures."""
-    return _summary(out / SUMMARY).get("stages") == _rows(results)
+def _summary(out: Path) -> dict[str, Any]:
+    return read_object(out / SUMMARY, what="summary") if (out / SUMMARY).exists() else {}
 
 
 def _save_summary(results: list[StageResult], out: Path) -> None:
-    """Write `summary.json`: counts, seconds and peak memory. A resumed run adds to the peak of the one before."""
-    path = out / SUMMARY
-    before = _summary(path).get("peak_memory_mb", 0)
+    """Write `summary.json`: counts, seconds and peak memory, of a resumed run the larger of both peaks."""
+    before = _summary(out).get("peak_memory_mb", 0)
     if not isinstance(before, int | float):
-        where = f"{path}: peak_memory_mb"
-        raise InputError("not a summary", where=where, got=repr(before)[:80], expected="a number", fix="remove it")
+        where, got = f"{out / SUMMARY}: peak_memory_mb", repr(before)[:80]
+        raise InputError("the summary is damaged", where=where, got=got, expected="a number", fix="remove the file")
     unit = 1024 * 1024 if sys.platform == "darwin" else 1024
     peak_mb = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / unit
-    write_json(path, {"stages": _rows(results), "peak_memory_mb": round(max(before, peak_mb), 1)})
+    write_json(out / SUMMARY, {"stages": _rows(results), "peak_memory_mb": round(max(before, peak_mb), 1)})

@@ -84,9 +84,9 @@ def make_worker(cfg: BeamConfig, simplified_map: Path, seed: int) -> Work:
         return Planned(figures=figures, reason=trace.drop_reason, times_ms=times_ms)
 
     def work(item: Item) -> Outcome:
-        return Outcome(
-            {"flown": {str(beam): plan(*item.payload, cfg.at_beam(beam)).model_dump() for beam in cfg.beams}}
-        )
+        pedestrian, styles = item.payload
+        planned = {str(beam): plan(pedestrian, styles, cfg.at_beam(beam)).model_dump() for beam in cfg.beams}
+        return Outcome({"flown": planned})
 
     return work
 
