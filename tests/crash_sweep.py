@@ -230,7 +230,7 @@ COMMANDS: dict[str, list[str | Callable[[Place, Path], None]]] = {
         lambda place, out: copy_stage(place, out, "inspect"),
         "inspect review --inspect {out} --reject {walk} --by somebody --reason 'too near'",
     ],
-    "reproduce": ["reproduce {base} --out {out} --walks 1 --workers 1"],
+    "reproduce": ["reproduce {base} --out {out} --pedestrians 1 --workers 1"],
     "study depth": ["study depth --data {tree} --out {out}"],
     "caption": ["caption --data {tree} --out {out} {tiny}"],
     "caption, limited": [

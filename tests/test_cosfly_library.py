@@ -37,7 +37,7 @@ def town() -> BoxMap:
 
 @pytest.fixture(scope="module")
 def flight(town) -> DroneTrace:
-    return cosfly.plan(town, planner="muco", walk=WALK, seed=4)
+    return cosfly.plan(town, planner="muco", pedestrian=WALK, seed=4)
 
 
 def test_the_name_brings_nothing_heavy():
@@ -60,11 +60,11 @@ def test_a_flight_is_the_one_of_the_stages(town, flight, tmp_path):
 
 
 def test_a_way_of_ones_own_is_flown(town):
-    walk = cosfly.plan(town, planner="muco", walk=WALK, seed=4).targets_m[:, :2]
+    walk = cosfly.plan(town, planner="muco", pedestrian=WALK, seed=4).targets_m[:, :2]
     own = cosfly.plan(town, walk[::6], planner="muco", altitude_max_m=25)
     assert_allclose(own.targets_m[0, :2], walk[0], atol=1e-3)
     assert own.positions_m[:, 2].max() < 26
-    with pytest.raises(InputError, match=r"way_m: the route is invalid; got an array of shape \(3,\)"):
+    with pytest.raises(InputError, match=r"route_m: the route is invalid; got an array of shape \(3,\)"):
         cosfly.plan(town, [1, 2, 3])
 
 
@@ -93,10 +93,10 @@ def test_what_is_wrong_is_said_as_on_the_command_line(town):
         (lambda: cosfly.load_map("a.json", source="synthetic"), ConfigError, "reads no file"),
         (lambda: cosfly.load_map("nowhere.json"), InputError, r"nowhere\.json"),
         (lambda: cosfly.load_map(**TOWN | {"seed": "x"}), ConfigError, "the seed is invalid; got 'x'"),
-        (lambda: cosfly.plan(town, "abc"), InputError, "way_m: the route is invalid"),
-        (lambda: cosfly.plan(town, [[0, 0, 0]]), InputError, "way_m: the route is invalid"),
-        (lambda: cosfly.plan(town, [[0, "a"], [1, 2]]), InputError, "way_m: the route is invalid"),
-        (lambda: cosfly.plan(town, [[0, 0], [9, 9], [9, 9]]), InputError, "way_m: the route is invalid"),
+        (lambda: cosfly.plan(town, "abc"), InputError, "route_m: the route is invalid"),
+        (lambda: cosfly.plan(town, [[0, 0, 0]]), InputError, "route_m: the route is invalid"),
+        (lambda: cosfly.plan(town, [[0, "a"], [1, 2]]), InputError, "route_m: the route is invalid"),
+        (lambda: cosfly.plan(town, [[0, 0], [9, 9], [9, 9]]), InputError, "route_m: the route is invalid"),
         (lambda: cosfly.plan(town, planer="muco"), ConfigError, "plan: planer: unknown setting"),
         (lambda: cosfly.render_frames(town, [0, 0, 9]), InputError, "the camera has no direction"),
         (
@@ -119,17 +119,17 @@ TAKING = {
     "plan": (
         PlanConfig,
         PlanConfig.model_fields.keys(),
-        [lambda the_map, n=n: cosfly.plan(the_map, walk=WALK, planner=n, styles={"side": 1}) for n in PLANNERS],
+        [lambda the_map, n=n: cosfly.plan(the_map, pedestrian=WALK, planner=n, styles={"side": 1}) for n in PLANNERS],
     ),
     "walk": (
         PedestriansConfig,
-        library.OF_WALK,
-        [lambda the_map, p=p, **more: cosfly.plan(the_map, walk=WALK | p | more) for p in ({}, HURRY)],
+        library.OF_PEDESTRIAN,
+        [lambda the_map, p=p, **more: cosfly.plan(the_map, pedestrian=WALK | p | more) for p in ({}, HURRY)],
     ),
     "walk on a way": (
         PedestriansConfig,
         library.OF_PACE,
-        [lambda the_map, p=p, **more: cosfly.plan(the_map, PATH, walk=p | more) for p in ({}, HURRY)],
+        [lambda the_map, p=p, **more: cosfly.plan(the_map, PATH, pedestrian=p | more) for p in ({}, HURRY)],
     ),
     "render": (
         RenderConfig,

@@ -279,7 +279,7 @@ def write_predictions(place: Path, records: list[Prediction], name: str = "predi
     (place / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-CFG = EvaluateConfig(resamples=100)
+CFG = EvaluateConfig()
 
 
 def test_without_a_model_the_report_says_so_and_gives_no_number(place):
@@ -310,7 +310,6 @@ def test_students_side_by_side(place):
         run(CFG, place / f"{name}.jsonl", place / "set", place / "students" / name)
     folders = [place / "students" / name for name in ("right", "predictions")]
     words = ["distill", "report", *map(str, folders), "--out", str(place / "table")]
-    words += ["--set", "distill.report.resamples=100"]
     result = invoke(words)
     assert result.exit_code == 0, result.output
     page = (place / "table" / "comparison.md").read_text()
@@ -320,7 +319,7 @@ def test_students_side_by_side(place):
     assert re.search(r"\| decision accuracy, all answers \| \+0\.5000 \|", page)
     assert (place / "table" / "comparison.html").read_text().count("<svg") == 3
     with pytest.raises(InputError, match="one name"):
-        compare.run(compare.ReportConfig(), [folders[0], folders[0]], place / "x")
+        compare.run([folders[0], folders[0]], place / "x")
 
 
 def make_encoder(folder: Path) -> Path:

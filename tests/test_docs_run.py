@@ -85,7 +85,7 @@ SMALL = {
     ),
     "run quickstart --out runs/five": _set("pedestrians.num_paths=2"),
     "bench": ["--workers", "2"],
-    "reproduce": ["--walks", "1", "--workers", "1"],
+    "reproduce": ["--pedestrians", "1", "--workers", "1"],
     "distill train": _set(
         *("distill.train.max_steps=2", "distill.train.max_pixels=4096", "distill.train.samples_per_step=2"),
         *("distill.train.batch_size=1", "distill.train.validation_samples=2", "distill.train.data_workers=0"),
@@ -95,7 +95,7 @@ SMALL = {
         *("distill.infer.max_samples=2", "distill.infer.max_new_tokens=8", "distill.infer.max_pixels=4096")
     ),
     "distill evaluate": _set(
-        *("distill.evaluate.resamples=100", "distill.evaluate.bertscore.en.layer=2"),
+        "distill.evaluate.bertscore.en.layer=2",
         "distill.evaluate.bertscore.zh.layer=2",
     ),
 }

@@ -40,9 +40,7 @@ def caption(
     job: Job,
     data: options.Trees = None,
     out: Annotated[Path | None, Option(show_default="`caption` next to the tree", help="Output directory.")] = None,
-    plan_only: Annotated[
-        bool, Option("--plan", help="Ask about a few windows, print calls, tokens, time and cost, and stop.")
-    ] = False,
+    plan_only: Annotated[bool, Option("--plan", help="Ask about a few windows and estimate the rest.")] = False,
     retry_failed: Annotated[bool, Option("--retry-failed", help="Only the windows in quarantine.jsonl.")] = False,
     check: Annotated[bool, Option(help="Test the server before the first request of a directory.")] = True,
 ) -> None:

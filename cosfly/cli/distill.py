@@ -145,7 +145,7 @@ def distill_evaluate(
 
 
 @app.command("report", epilog="cosfly distill report evaluation-2B evaluation-4B --out report")
-@takes("distill", "seed resume")
+@takes("", "seed resume")
 def distill_report(
     job: Job,
     evaluations: Annotated[list[Path], Argument(help="Output directories of `distill evaluate`, one per student.")],
@@ -154,4 +154,4 @@ def distill_report(
     """Compare students: the trade-off table, and differences by paired bootstrap over pedestrians."""
     from distill.evaluation import compare
 
-    typer.echo(compare.run(job.cfg.distill.report, evaluations, out, seed=job.cfg.seed, resume=job.resume))
+    typer.echo(compare.run(evaluations, out, seed=job.cfg.seed, resume=job.resume))

@@ -29,19 +29,11 @@ def fly(
     out: options.Out,
     map_: Annotated[Path | None, Option("--map", help="Boxes that are drawn: boxes_3d.json.")] = None,
     paths: Annotated[Path | None, Option(help="Pedestrian trajectories: path.json.")] = None,
-    env: Annotated[
-        str | None, Option(help="Benchmark list of episodes instead of map and paths: cosfly/Follow-v0.")
-    ] = None,
-    policy: Annotated[
-        str | None, Option(metavar="MODULE:CLASS", help="Your own policy instead of --student: runs its code.")
-    ] = None,
-    simplified: Annotated[
-        Path | None, Option(show_default="that of --map", help="Boxes for collisions: step2_simplified.json.")
-    ] = None,
+    env: Annotated[str | None, Option(help="Benchmark instead of map and paths: cosfly/Follow-v0.")] = None,
+    policy: Annotated[str | None, Option(metavar="MODULE:CLASS", help="Policy to import and run.")] = None,
+    simplified: Annotated[Path | None, Option(help="Simplified map for collisions; by default --map.")] = None,
     others: options.Bystanders = None,
-    relabel: Annotated[
-        Path | None, Option(help="Output directory of `cosfly fly`: let the planner continue from the student's poses.")
-    ] = None,
+    relabel: Annotated[Path | None, Option(help="Output of `cosfly fly` to relabel by the planner.")] = None,
 ) -> None:
     """Fly a student in a closed loop: its decisions move the drone, and the new view is drawn."""
     from cosfly.closed_loop import stage
@@ -77,14 +69,9 @@ def fly(
 @takes("", "seed resume")
 def leaderboard(
     job: Job,
-    folders: Annotated[
-        list[str],
-        Argument(metavar="[NAME=]DIR...", help="Output directories of `cosfly fly`; one name is one student."),
-    ],
+    folders: Annotated[list[str], Argument(metavar="[NAME=]DIR...", help="Outputs of `cosfly fly`, by student.")],
     out: options.Out,
-    rounds: Annotated[
-        bool, Option("--rounds", help="They are rounds of one student, in order: report the gain of each.")
-    ] = False,
+    rounds: Annotated[bool, Option("--rounds", help="They are rounds of one student, in order.")] = False,
 ) -> None:
     """Compare students: figures with intervals, and frames of their best and worst trajectories."""
     from cosfly.closed_loop import leaderboard as board

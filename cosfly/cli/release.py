@@ -13,6 +13,8 @@ from cosfly.cli.options import WORKERS, Job, Short, takes
 
 app = typer.Typer(no_args_is_help=True, help="Package captions and frames as a data set that opens with one line.")
 
+Split = Literal["train", "validation", "test"]
+
 
 @app.command("build", epilog="cosfly release build runs/diverse --out release")
 @takes(
@@ -27,10 +29,7 @@ def release_build(
     out: Annotated[Path, Option(help="Release directory.")],
     runs: options.Runs = None,
     captions: Annotated[list[Path] | None, Option(help="captions.jsonl of a tree; repeat with --data.")] = None,
-    inspected: Annotated[
-        list[Path] | None,
-        Option("--inspect", help="inspect.json of a tree, one for each, or none: then all tracks are released."),
-    ] = None,
+    inspected: Annotated[list[Path] | None, Option("--inspect", help="inspect.json of each tree, or none.")] = None,
     data: options.Trees = None,
 ) -> None:
     """Select frames of one or more runs, join captions, write parquet, data-set card and checksums."""
@@ -103,13 +102,8 @@ def release_export(
     ],
     shard_mb: Annotated[int | None, Option(help="Approximate size of a file of many frames, MB.")] = None,
     language: Annotated[Literal["en", "zh", "both"], Option(help="Captions: languages of the texts.")] = "both",
-    frames: Annotated[
-        Literal["all", "last"], Option(help="Conversations: pictures of all frames of the window, or of the last one.")
-    ] = "all",
-    split: Annotated[
-        Literal["train", "validation", "test"] | None,
-        Option(help="Captions: only this split; conversations of one split go to one file."),
-    ] = None,
+    frames: Annotated[Literal["all", "last"], Option(help="Conversations: pictures of these frames.")] = "all",
+    split: Annotated[Split | None, Option(help="Captions: only this split.")] = None,
     overwrite: Annotated[bool, Option("--overwrite", help="Captions: replace an existing file.")] = False,
 ) -> None:
     """Write a release in another format, without loss, or its accepted captions to one file."""

@@ -27,9 +27,7 @@ PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)}
 def run(
     job: Job,
     config: Annotated[Path, Argument(help=CONFIG)],
-    out: Annotated[
-        Path | None, Option(show_default="runs/<name>, or that of the run.yaml", help="Run directory.")
-    ] = None,
+    out: Annotated[Path | None, Option(show_default="runs/<name>", help="Run directory.")] = None,
     dry_run: Annotated[bool, Option("--dry-run", help="Estimate time and disk by stage and write nothing.")] = False,
     until: Annotated[Until, Option(help="Last stage to run.")] = "release",
 ) -> None:
@@ -167,13 +165,13 @@ def reproduce(
     job: Job,
     config: Annotated[Path, Argument(metavar="[RUN]", help="Run directory; of several towns, that of one.")] = Path(),
     out: Annotated[Path | None, Option(show_default="RUN/reproduce", help="Folder for the page.")] = None,
-    walks: Annotated[int, Option(min=1, help="Pedestrians that planners are measured on.")] = 20,
+    pedestrians: Annotated[int, Option(min=1, help="Number that planners are measured on.")] = 20,
 ) -> None:
     """Compare the paper's tables and figures with those of one run, on one page. Repeat the command to resume."""
     from cosfly.pipeline import reproduce as reproduction
 
     out = out or config / "reproduce"
-    typer.echo(reproduction.run(job.cfg, config, out, walks=walks, resume=job.resume))
+    typer.echo(reproduction.run(job.cfg, config, out, pedestrians=pedestrians, resume=job.resume))
 
 
 config_app = typer.Typer(no_args_is_help=True, help="Check and show configurations.")
@@ -195,9 +193,7 @@ def config_check(job: Job, config: Annotated[Path, Argument(help="YAML file, or 
 
 @config_app.command("show", epilog="cosfly config show --describe plan")
 def config_show(
-    config: Annotated[
-        str | None, Argument(help="YAML file, or the name of a shipped one; none: the defaults. Or a section.")
-    ] = None,
+    config: Annotated[str | None, Argument(help="YAML file, a shipped name, or a section; none: defaults.")] = None,
     section: Annotated[str | None, Argument(help="Only this section or setting, such as plan.muco.")] = None,
     overrides: Annotated[list[str] | None, Option("--set", "-s", metavar="A.B=C", help="Set a setting.")] = None,
     describe: Annotated[bool, Option("--describe", help="Explain each setting, and what it may be.")] = False,

@@ -193,12 +193,8 @@ def render(
     traces: options.Traces,
     out: options.Out,
     others: options.Bystanders = None,
-    require_rgb: Annotated[
-        bool | None, Option("--require-rgb/--no-require-rgb", help="Write RGB.", show_default="as in settings")
-    ] = None,
-    require_depth: Annotated[
-        bool | None, Option("--require-depth/--no-require-depth", help="Write depth.", show_default="as in settings")
-    ] = None,
+    require_rgb: Annotated[bool | None, Option(show_default="as in settings", help="Write RGB.")] = None,
+    require_depth: Annotated[bool | None, Option(show_default="as in settings", help="Write depth.")] = None,
     gif: Annotated[bool, Option("--gif", help="Also write an animation of the first trajectory.")] = False,
     gif_fps: Annotated[float, Option(min=0.1, max=50, help="Frames per second of the animation.")] = 4.0,
     gif_name: Annotated[str, Option(help="File name of the animation, in the output directory.")] = "preview.gif",

@@ -21,10 +21,7 @@ def study_depth(
     job: Job,
     out: Annotated[Path, Option(help="Folder for depth_study.json, depth_study.md and depth_study.png.")],
     data: options.Trees = None,
-    frame: Annotated[
-        Path | None,
-        Option(show_default="one that shows the target", help="Frame folder in the tree, or a .npy in metres."),
-    ] = None,
+    frame: Annotated[Path | None, Option(help="Frame folder in the tree, or a .npy in metres.")] = None,
 ) -> None:
     """Compare ways to store the depth of one frame: errors, entropy, edges and size."""
     from cosfly.studies import depth

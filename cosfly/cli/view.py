@@ -18,24 +18,13 @@ app = typer.Typer()
 def view(
     job: Job,
     source: Annotated[Path, Argument(help="Map (a file), playback tree, run directory or release.")],
-    out: Annotated[
-        Path,
-        Option(help="Page (.html); of a playback tree also a contact sheet (.png) or an animation (.gif)."),
-    ],
+    out: Annotated[Path, Option(help="Page (.html), or of a playback tree a .png or .gif.")],
     paths: Annotated[Path | None, Option(help="With a map: pedestrian trajectories, path.json.")] = None,
-    traces: Annotated[
-        list[Path] | None,
-        Option(help="With a map: drone trajectories, drone_trace.json; repeat it to compare planners."),
-    ] = None,
+    traces: Annotated[list[Path] | None, Option(help="With a map: drone_trace.json; repeat it.")] = None,
     data: Annotated[Path | None, Option(help="With a map: playback tree with the frames of both tracks.")] = None,
     captions: Annotated[Path | None, Option(help="With a playback tree: its captions.jsonl.")] = None,
-    frame: Annotated[
-        str | None,
-        Option(help="With a playback tree and a .png: the four pictures of this frame, or of `best`."),
-    ] = None,
-    map_: Annotated[
-        Path | None, Option("--map", help="With --frame: boxes_3d.json that was drawn; needed without debug.png.")
-    ] = None,
+    frame: Annotated[str | None, Option(help="With a .png: the pictures of this frame, or `best`.")] = None,
+    map_: Annotated[Path | None, Option("--map", help="With --frame: boxes_3d.json that was drawn.")] = None,
     picture_px: Annotated[int, Option(min=32, max=1280, help="Width of a frame on a page, px.")] = 320,
     max_mb: Annotated[int, Option(min=1, help="Size of a page, MB; frames are omitted to stay below it.")] = 24,
 ) -> None:

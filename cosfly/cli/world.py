@@ -26,9 +26,7 @@ app = typer.Typer()
 def world(
     job: Job,
     prompt: Annotated[str, Argument(help="The world, in plain English.")],
-    out: Annotated[
-        Path | None, Option(show_default="worlds/<prompt>-<time>", help="New folder for the world, or the worlds.")
-    ] = None,
+    out: Annotated[Path | None, Option(show_default="worlds/<prompt>-<time>", help="New folder.")] = None,
     count: Annotated[int, Option(min=1, max=1000, help="Number of worlds, each with its own seed.")] = 1,
     run: Annotated[bool, Option("--run", help="Also make a data set in it, as `cosfly run` does.")] = False,
 ) -> None:

@@ -1,1 +1,1 @@
-"""The application: stages in one run, and what looks at runs."""
+"""All stages in one run, and summaries, estimates and measurements of runs."""

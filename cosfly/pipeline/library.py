@@ -34,7 +34,9 @@ from cosfly.simplify.passes import SimplifyConfig, simplify
 __all__ = ["BoxMap", "DroneTrace", "Frame", "load_map", "plan", "read_captions", "render_frames"]
 
 # Settings that a function uses; it refuses the others of the section.
-OF_WALK = PedestriansConfig.model_fields.keys() - {*("num_paths", "others", "look_alikes", "traffic", "roi_vertices")}
+OF_PEDESTRIAN = PedestriansConfig.model_fields.keys() - {
+    *("num_paths", "others", "look_alikes", "traffic", "roi_vertices")
+}
 OF_PACE = {
     "cruise_speed_mps", "curvature_gain_m", "speed_jitter", "min_speed_mps", "pace", "hurry_speed_mps",
     "dt_s",
@@ -73,13 +75,13 @@ def load_map(path: str | Path | None = None, *, source: str | None = None, seed:
 
 
 def plan(
-    box_map: BoxMap, way_m: Any = None, *, seed: int = 0, walk: dict[str, Any] | None = None, **settings: Any
+    box_map: BoxMap, route_m: Any = None, *, seed: int = 0, pedestrian: dict[str, Any] | None = None, **settings: Any
 ) -> DroneTrace:
     """Plan one drone trajectory behind one pedestrian. A map that is not simplified yet is simplified first.
 
     Args:
-        way_m: (k, 2) route of the pedestrian over free ground; None draws one for the seed.
-        walk: Settings of the pedestrian, as in `pedestrians` of a configuration.
+        route_m: (k, 2) route of the pedestrian over free ground; None draws one for the seed.
+        pedestrian: Settings of the pedestrian, as in `pedestrians` of a configuration.
         settings: As in `plan` of a configuration: `plan(box_map, planner="muco", altitude_max_m=30)`.
 
     Raises:
@@ -88,31 +90,31 @@ def plan(
     from cosfly.geometry.kernels import obstacle_index
     from cosfly.planners.reacquire import screens_of
 
-    walking = build(PedestriansConfig, walk or {}, "plan: walk")
-    _check_taken(walk or {}, OF_WALK if way_m is None else OF_PACE, "plan: walk")
+    walking = build(PedestriansConfig, pedestrian or {}, "plan: pedestrian")
+    _check_taken(pedestrian or {}, OF_PEDESTRIAN if route_m is None else OF_PACE, "plan: pedestrian")
     cfg = build(PlanConfig, settings, "plan")
     _check_taken(settings, settings.keys() - ({"track_astar"} - {cfg.planner}), "plan")
     if not box_map.header.passes:
         box_map = simplify(box_map, SimplifyConfig()).box_map
     rng = rng_for(seed, "pedestrians", "path_00000")
-    if way_m is None:
+    if route_m is None:
         person = make_pedestrian("path_00000", walkable_ground(box_map, walking), walking, rng).walk
     else:
-        route_m = _route(way_m)
+        route_m = _checked_route(route_m)
         person = walk_along("path_00000", route_m, box_map.ground, walking, rng, rng.spawn(1)[0])
     return plan_trajectory(person, obstacle_index(box_map), cfg, seed, screens_of(box_map))
 
 
-def _route(way_m: Any) -> np.ndarray:
+def _checked_route(given: Any) -> np.ndarray:
     """Return a route, (k, 2) m, checked."""
     what, expected = "the route is invalid", "(k, 2) finite positions in m, at least two, successive ones different"
     try:
-        route_m = np.asarray(way_m, dtype=np.float64)
+        route_m = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError):
-        raise InputError(what, where="way_m", got=repr(way_m)[:60], expected=expected) from None
+        raise InputError(what, where="route_m", got=repr(given)[:60], expected=expected) from None
     is_way = route_m.ndim == 2 and route_m.shape[1] == 2 and len(route_m) >= 2 and np.isfinite(route_m).all()
     if not is_way or not np.diff(route_m, axis=0).any(axis=1).all():
-        raise InputError(what, where="way_m", got=f"an array of shape {route_m.shape}", expected=expected)
+        raise InputError(what, where="route_m", got=f"an array of shape {route_m.shape}", expected=expected)
     return route_m
 
 

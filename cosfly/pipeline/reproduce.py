@@ -103,11 +103,11 @@ def read_paper() -> Paper:
     return build(Paper, read_yaml(path), path)
 
 
-def run(cfg: RunConfig, folder: Path, out: Path, *, walks: int = 20, resume: Resume) -> Path:
+def run(cfg: RunConfig, folder: Path, out: Path, *, pedestrians: int = 20, resume: Resume) -> Path:
     """Read a run directory; write `reproduction.html` and `reproduction.json`, and return the page.
 
     Args:
-        walks: Number of pedestrians that planners are measured on.
+        pedestrians: Number of pedestrians that planners are measured on.
 
     Raises:
         InputError: It is not a run directory, has several towns, or no drone trajectories yet.
@@ -118,7 +118,7 @@ def run(cfg: RunConfig, folder: Path, out: Path, *, walks: int = 20, resume: Res
         what, got = "the run has no drone trajectories yet", f"no {', no '.join(missing)}"
         raise InputError(what, where=folder, got=got, fix=fix)
     printed = read_paper()
-    made = measure(cfg, folder, out, walks, done, {**worker_options(cfg), "resume": resume})
+    made = measure(cfg, folder, out, pedestrians, done, {**worker_options(cfg), "resume": resume})
     places = Places([folder, out], made)
     made |= work(cfg, folder, places, done)
     parts, left_out = [settings(cfg, printed)], dict(printed.left_out)
@@ -131,7 +131,7 @@ def run(cfg: RunConfig, folder: Path, out: Path, *, walks: int = 20, resume: Res
         tables = read_object(out / "release/stats.json", what="statistics")["tables"]
         parts += [Part(**one) for one in tables if one["key"] in OF_RELEASE]
     name, machine = run_name(folder / "plan"), f"cosfly {cosfly.__version__}, {len(os.sched_getaffinity(0))} cores"
-    facts = {"run": name, "made_by": machine, "walks": walks, "left_out": left_out}
+    facts = {"run": name, "made_by": machine, "pedestrians": pedestrians, "left_out": left_out}
     listed = [one.model_dump(mode="json") for one in parts]
     write_json(out / "reproduction.json", {**FORMAT.header, **facts, "parts": listed})
     text = page("cosfly/pipeline/reproduce.html", title=name, style=STYLE, facts=facts, parts=parts, look=TABLE_LOOK)
@@ -281,7 +281,7 @@ def settings(cfg: RunConfig, printed: Paper) -> Part:
 
 
 def measure(
-    cfg: RunConfig, run: Path, out: Path, num_walks: int, done: Sequence[str], worker_options: dict[str, Any]
+    cfg: RunConfig, run: Path, out: Path, num_pedestrians: int, done: Sequence[str], worker_options: dict[str, Any]
 ) -> dict[str, Any]:
     """Measure what the run has not recorded, in folders below `out`; return the facts that are in no file.
 
@@ -290,8 +290,10 @@ def measure(
     """
     boxes, simplified = run / "maps/boxes_3d.json", run / "simplify/step2_simplified.json"
     traces, tree, how = run / "plan/drone_trace.json", run / "render", {"seed": cfg.seed, **worker_options}
-    walking = cfg.pedestrians.model_copy(update={"num_paths": num_walks, "others": 0, "traffic": 0, "look_alikes": 0})
-    paths = cosfly.pedestrians.stage.run(walking, simplified, out / "walks", roi=cfg.roi, **how)
+    walking = cfg.pedestrians.model_copy(
+        update={"num_paths": num_pedestrians, "others": 0, "traffic": 0, "look_alikes": 0}
+    )
+    paths = cosfly.pedestrians.stage.run(walking, simplified, out / "pedestrians", roi=cfg.roi, **how)
     plan = cfg.plan.model_copy(update={"styles": {FOLLOW: 1.0}})
     compared = build(compare.CompareConfig, plan.model_dump() | {"planners": PLANNERS}, "planners")
     compare.run(compared, simplified, paths, out / "compare", **how)

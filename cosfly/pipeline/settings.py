@@ -20,7 +20,6 @@ from cosfly.runtime.errors import ConfigError
 from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import SimplifyConfig
 from cosfly.worldgen.settings import WorldConfig
-from distill.evaluation.compare import ReportConfig
 from distill.evaluation.stage import EvaluateConfig
 from distill.inference.stage import InferConfig
 from distill.prepare.dual_track import DualTrackConfig
@@ -39,7 +38,6 @@ class DistillConfig(Config):
     train: TrainConfig = Field(default_factory=TrainConfig, description="LoRA training")
     infer: InferConfig = Field(default_factory=InferConfig, description="answers of the student")
     evaluate: EvaluateConfig = Field(default_factory=EvaluateConfig, description="scores")
-    report: ReportConfig = Field(default_factory=ReportConfig, description="students side by side")
 
 
 class RunConfig(CommandConfig):

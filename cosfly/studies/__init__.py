@@ -1,1 +1,1 @@
-"""What depth formats, zoom and weather do to the same frames and flights: `cosfly study ...`."""
+"""Studies of depth formats, zoom, weather and TA*'s beam on the same frames and trajectories."""

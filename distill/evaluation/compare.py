@@ -10,8 +10,6 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field
-
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import for_markdown
@@ -49,12 +47,7 @@ from distill.evaluation.scores import (
 STAGE = "distill.report"
 FLOORS = ("majority", "rule", "blind", "shuffled", "constant", "teacher")
 Names = dict[str, Evaluation]
-
-
-class ReportConfig(Config):
-    """Settings of `distill report`."""
-
-    resamples: int = Field(5000, ge=100, description="draws of walks that they are made of")
+RESAMPLES = 5000  # draws of walks for the intervals
 
 
 class Pairing(Record):
@@ -78,7 +71,7 @@ class StudentComparison(Record):
     resamples: int
 
 
-def run(cfg: ReportConfig, folders: Sequence[Path], out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
+def run(folders: Sequence[Path], out: Path, *, seed: int = 0, resume: Resume = "if-same") -> Path:
     """Read the evaluations of several students; write their comparison.
 
     Returns:
@@ -91,7 +84,7 @@ def run(cfg: ReportConfig, folders: Sequence[Path], out: Path, *, seed: int = 0,
         fix = "give folders of different names: they name the rows"
         raise InputError("two evaluations have one name", got=", ".join(names), fix=fix)
     inputs = {f"evaluation/{name}": folder for name, folder in zip(names, folders, strict=True)}
-    stage = StageFolder.open(out, STAGE, config=cfg, inputs=inputs, seed=seed, resume=resume)
+    stage = StageFolder.open(out, STAGE, config=Config(), inputs=inputs, seed=seed, resume=resume)
     path = out / "comparison.md"
     if stage.is_complete:
         return path
@@ -100,7 +93,7 @@ def run(cfg: ReportConfig, folders: Sequence[Path], out: Path, *, seed: int = 0,
     splits = {report.split for report in reports.values()}
     if len(splits) > 1:
         raise InputError("evaluations of one split are needed", got=", ".join(sorted(splits)))
-    comparison = compare(cfg, reports, of_names, seed)
+    comparison = compare(reports, of_names, seed)
     record, page = out / "comparison.json", out / "comparison.html"
     write_model(record, comparison, FileFormat("cosfly.distill_comparison", "1.0"))
     write_bytes(path, markdown_of(comparison, reports).encode())
@@ -109,14 +102,14 @@ def run(cfg: ReportConfig, folders: Sequence[Path], out: Path, *, seed: int = 0,
     return path
 
 
-def compare(cfg: ReportConfig, reports: Names, folders: Mapping[str, Path], seed: int) -> StudentComparison:
+def compare(reports: Names, folders: Mapping[str, Path], seed: int) -> StudentComparison:
     """Put students side by side; of the floors those of the first."""
     scores = {name: read_scores(folder / SCORES) for name, folder in folders.items()}
     pairings, strangers = [], []
     for first, second in combinations(reports, 2):
         _check_references(first, scores[first], second, scores[second])
         rng = rng_for(seed, STAGE, f"{first}/{second}")
-        given: Any = {"resamples": cfg.resamples, "confidence": CONFIDENCE, "rng": rng}
+        given: Any = {"resamples": RESAMPLES, "confidence": CONFIDENCE, "rng": rng}
         count, found = differences_of(scores[first], scores[second], **given)
         if not count:
             strangers.append(f"{first} and {second} were asked no sample in common")
@@ -129,7 +122,7 @@ def compare(cfg: ReportConfig, reports: Names, folders: Mapping[str, Path], seed
         pairings=pairings,
         not_comparable=[*_mismatches(reports), *strangers],
         confidence=CONFIDENCE,
-        resamples=cfg.resamples,
+        resamples=RESAMPLES,
     )
 
 

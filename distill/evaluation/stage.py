@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from pydantic import Field
 
@@ -52,7 +52,7 @@ THUMBNAIL_PX = 256  # width of a frame on the page
 class EvaluateConfig(Config):
     """Settings of `distill evaluate`."""
 
-    resamples: int = Field(2000, ge=100, description="draws of walks that the intervals are made of")
+    resamples: ClassVar[int] = 2000  # draws of walks for the intervals
     bertscore: BertScoreConfig = Field(BertScoreConfig(), description="semantic similarity of the texts")
 
 
