@@ -167,7 +167,7 @@ def test_no_setting_is_ignored(town, monkeypatch, section):
             call(town)
     assert set(taken) - read == set(), "taken, and never read"
     for name in model.model_fields.keys() - taken:
-        with pytest.raises(ConfigError, match=f"{name}: changes nothing here"):
+        with pytest.raises(ConfigError, match=f"{name}: has no effect here"):
             calls[0](town, **{name: dict(model())[name]})
 
 
