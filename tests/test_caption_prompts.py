@@ -69,7 +69,7 @@ def test_all_problems_are_told_at_once(tmp_path, caplog):
     (folder / "hints_en.txt").write_text("# version: 1\nx\n")
     (folder / "system_en.txt").write_bytes(b"\xff\xfe")
     (folder / "mirror_user.txt").write_text("# version: 1\n\n")
-    with pytest.raises(ConfigError, match="5 to mend"):
+    with pytest.raises(ConfigError, match="5 to fix"):
         own_prompts(folder)
     told = "\n".join(record.message for record in caplog.records)
     assert "hints_en.txt: no prompt has this name (did you mean 'hint_en'?)" in told

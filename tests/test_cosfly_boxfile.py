@@ -106,7 +106,7 @@ def test_what_is_wrong_with_many_rows_hides_nothing_else(tmp_path):
     assert "line 2: unknown type 'house' (and 39 more)" in str(caught.value)
     line_42 = "line 42: unknown type 'road' (did you mean 'Roads'?), height_m is not a finite number: 'wide'"
     assert line_42 in str(caught.value)
-    assert "2 to mend" in str(caught.value)
+    assert "2 to fix" in str(caught.value)
 
 
 def test_the_documents_list_every_type():
@@ -172,7 +172,7 @@ def test_all_that_is_wrong_with_geojson_is_told(tmp_path, subtests):
                 ),
                 r"unknown column 'levels'.*feature 1 \(way/7\): a geometry.*feature 2 \(old oak\): "
                 r"no length_m, no width_m, height_m is not a finite number: 'tall'"
-                r".*feature 3: unknown type 'house'.*expected columns .*types .*4 to mend",
+                r".*feature 3: unknown type 'house'.*expected columns .*types .*4 to fix",
             ),
             (json.dumps({"type": "Topology"}), "not GeoJSON"),
             (collection(), "holds no boxes"),

@@ -14,9 +14,9 @@ import cosfly
 def make_package(root: Path) -> Path:
     """A package of our name that compiles as ours does."""
     package = root / "src" / "cosfly"
-    (package / "work").mkdir(parents=True)
-    for name in ("__init__.py", "work/__init__.py", "work/compiled.py"):
-        shutil.copy(Path(cosfly.__file__).parent / name, package / name)
+    package.mkdir(parents=True)
+    shutil.copy(Path(cosfly.__file__).parent / "__init__.py", package)
+    shutil.copytree(Path(cosfly.__file__).parent / "runtime", package / "runtime")
     return package
 
 

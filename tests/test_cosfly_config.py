@@ -36,7 +36,7 @@ def test_all_problems_at_once_with_the_nearest_name(tmp_path):
         "did you mean 'seed'",
         "plan.altitud_m: unknown setting (did you mean 'altitude_m'?)",
         "greater than 0",
-        "3 to mend",
+        "3 to fix",
         "c.yaml",
     ):
         assert words in text

@@ -87,13 +87,6 @@ def test_honest_json_passes(tmp_path, text, value):
     assert value is None or list(found.values()) == value
 
 
-def test_a_key_that_is_given_twice_in_a_file_of_ours(tmp_path):
-    (tmp_path / "x.json").write_text('{"result": "rejected", "result": "accepted"}')
-    assert json_io.read_json(tmp_path / "x.json") == {"result": "accepted"}
-    with pytest.raises(InputError, match="'result' is given twice"):
-        json_io.read_json(tmp_path / "x.json", each_key_once=True)
-
-
 @pytest.mark.parametrize("field", ["shards", "flights", "maps"])
 def test_a_list_of_empty_objects_is_refused_at_the_first(tmp_path, field):
     head = {**RELEASE_FORMAT.header, field: [{}] * 30_000}

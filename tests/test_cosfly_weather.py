@@ -129,7 +129,7 @@ def test_presets_of_ones_own(tmp_path):
 def test_pools_that_cannot_be_are_one_error_with_all_problems(tmp_path):
     sky, tod = tmp_path / "sky.yaml", tmp_path / "tod.yaml"
     rest = "precipitation: 0, fog_density: 0, fog_distance: 9}"
-    many = ["a.cloudiness", "presets.a.precipitation", "finite", "a.fog_density", "a.fog_distance", "4 to mend"]
+    many = ["a.cloudiness", "presets.a.precipitation", "finite", "a.fog_density", "a.fog_distance", "4 to fix"]
     outside = "cloudiness: 101, precipitation: .nan, fog_density: -1, fog_distance: 0"
     for text, words in (
         ("presets: {a: {cloudiness: 1, fog_density: 5, fog_distance: 9}}", ["presets.a.precipitation", "required"]),

@@ -55,11 +55,11 @@ def test_all_tables_of_a_small_run(tmp_path, monkeypatch, capsys):
     frames = (90, 110, 100, 120)
     for stage in simulation.STAGES:
         log = EventLog(tmp_path / "run" / stage)
-        log.tell("began", workers=2)
+        log.write("began", workers=2)
         for k, count in enumerate(frames):
             steps = {"plan": 0, "inspect": 2 * count, "caption": count - 4}.get(stage, count)
-            log.tell("item_done", worker=k % 2, item=f"{k}", status="kept", seconds=0.05 * count, steps=steps)
-        log.tell("ended")
+            log.write("item_done", worker=k % 2, item=f"{k}", status="kept", seconds=0.05 * count, steps=steps)
+        log.write("ended")
         log.close()
     assert simulation.Profile.of(tmp_path / "run").seconds["inspect"] == pytest.approx([0.05] * 4)
     monkeypatch.chdir(tmp_path)

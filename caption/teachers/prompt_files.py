@@ -55,7 +55,7 @@ def own_prompts(folder: Path) -> dict[str, str]:
             "these prompts cannot be used", where=folder,
             got=problems[0] + (f", and {len(problems) - 1} more" if problems[1:] else ""),
             expected="the files and slots of those that ship",
-            fix=f"{len(problems)} to mend; cosfly caption prompts --export DIR writes those that ship",
+            fix=f"{len(problems)} to fix; cosfly caption prompts --export DIR writes those that ship",
         )  # fmt: skip
     return found
 

@@ -1,6 +1,6 @@
 """Meshes: glTF 2.0 (.glb, .gltf) and Wavefront OBJ (.obj) read through trimesh, and `meshes.glb` next to a map.
 
-Triangles and plain colours, no textures. +y is up in glTF and becomes +z; an OBJ is read as it is, z up. trimesh is given
+Triangles and plain colours, no textures. +y is up in glTF and becomes +z; an OBJ is read as it is, z up. trimesh gets
 bytes only: files that a mesh names are read here, from below its folder, and counts are bounded before they are loaded.
 Planners and visibility use boxes only.
 """

@@ -1,9 +1,8 @@
-"""Pictures and NumPy arrays: the header is read first, and nothing is allocated for what it claims before that is
-checked.
+"""PNG pictures and NumPy arrays: the header is checked before anything is allocated for what it claims.
 
-PNG is the only picture format of a data set, so no other decoder is ever given a file. NumPy's own reader evaluates
-headers as Python literals, which a crafted one makes slow and two threads at once make fail (Python before 3.11.8, its
-issue 106905); the three fields are found by their patterns here. Format: numpy.lib.format, versions 1 to 3.
+PNG is the only picture format of a data set, so no other decoder is given a file. NumPy's own reader evaluates headers
+as Python literals, which a crafted one makes slow and two threads at once make fail (Python before 3.11.8, its issue
+106905); the three fields are found by their patterns here. Format: numpy.lib.format, versions 1 to 3.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ import math
 import os
 import re
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,12 +31,14 @@ _DESCR = re.compile(rb"'descr' *: *'([<>|=][a-z][0-9]{1,2})'")
 _ORDER = re.compile(rb"'fortran_order' *: *(True|False)")
 _SHAPE = re.compile(rb"'shape' *: *\(([0-9, ]{0,200})\)")
 
+_Bytes = io.BufferedReader | io.BytesIO
+
 
 # --- NumPy arrays -----------------------------------------------------------------------------------------------------
 
 
 class ArrayHeader(NamedTuple):
-    """What stands before the numbers of a `.npy` file, and where these begin."""
+    """The header of a `.npy` file; the numbers begin at byte `offset`."""
 
     dtype: np.dtype
     shape: tuple[int, ...]
@@ -50,17 +50,13 @@ class ArrayHeader(NamedTuple):
 
 
 def array_header(path: Path, *, tree: Path | None = None) -> ArrayHeader:
-    """Read the header of a `.npy` file, and see that the numbers are all there.
-
-    Raises:
-        InputError: it cannot be read, or is no complete array.
-    """
+    """Read the header of a `.npy` file, and check that the numbers are all there."""
     with open_file(path, what="array", tree=tree) as file:
         return _header(file, path, "array")
 
 
 def parse_array_header(data: memoryview, where: str | Path, *, what: str = "array") -> ArrayHeader:
-    """Read the header of the bytes of a `.npy` file, which are not copied; raises as `array_header`."""
+    """Return the header of the bytes of a `.npy` file, which are not copied."""
     return _header(io.BytesIO(data[: MOST_HEADER_BYTES + 12]), where, what, len(data))
 
 
@@ -71,11 +67,11 @@ def read_array(path: Path, *, dtype: type, ndim: int, what: str = "array", tree:
 
 
 def parse_array(data: bytes, where: str | Path, *, dtype: type, ndim: int, what: str = "array") -> np.ndarray:
-    """Read the bytes of a `.npy` file; raises as `read_array`."""
+    """Return the array of the bytes of a `.npy` file."""
     return _array(io.BytesIO(data), where, what, dtype, ndim)
 
 
-def _array(file: io.BufferedReader | io.BytesIO, where: str | Path, what: str, dtype: type, ndim: int) -> np.ndarray:
+def _array(file: _Bytes, where: str | Path, what: str, dtype: type, ndim: int) -> np.ndarray:
     header = _header(file, where, what)
     if header.dtype != dtype or len(header.shape) != ndim:
         expected = f"{np.dtype(dtype)} of {ndim} dimensions"
@@ -89,9 +85,7 @@ def _array(file: io.BufferedReader | io.BytesIO, where: str | Path, what: str, d
     return values
 
 
-def _header(
-    file: io.BufferedReader | io.BytesIO, where: str | Path, what: str, whole_size: int | None = None
-) -> ArrayHeader:
+def _header(file: _Bytes, where: str | Path, what: str, whole_size: int | None = None) -> ArrayHeader:
     with disk_errors(Path(where), what):
         size = file.seek(0, os.SEEK_END) if whole_size is None else whole_size
         file.seek(0)
@@ -105,23 +99,18 @@ def _header(
             raise _no_array(where, what, f"a header of {length} bytes")
         file.seek(first)
         text = file.read(length)
-    found = [pattern.search(text) for pattern in (_DESCR, _ORDER, _SHAPE)]
-    if not all(found):
+    found = [match.group(1).decode() for p in (_DESCR, _ORDER, _SHAPE) if (match := p.search(text))]
+    if len(found) < 3:
         raise _no_array(where, what, repr(text[:80].decode("latin-1")))
-    descr, order, shape = (match.group(1).decode() for match in found if match)
+    descr, order, shape = found
     with contextlib.suppress(TypeError, ValueError):
-        header = ArrayHeader(np.dtype(descr), _lengths(shape), order == "True", first + length)
-        # With a length of 0 the product says nothing of the others, which may be beyond every machine.
-        if (
-            math.prod(header.shape) * header.dtype.itemsize == size - header.offset
-            and max(header.shape, default=0) <= size
-        ):
+        lengths = tuple(int(part) for part in shape.split(",") if part.strip())
+        header = ArrayHeader(np.dtype(descr), lengths, order == "True", first + length)
+        is_whole = math.prod(lengths) * header.dtype.itemsize == size - header.offset
+        # With a length of 0 the product says nothing about the others, which may be beyond every machine.
+        if is_whole and max(lengths, default=0) <= size:
             return header
     raise _no_array(where, what, f"{size} bytes that are not a complete NumPy array, {descr} ({shape})")
-
-
-def _lengths(text: str) -> tuple[int, ...]:
-    return tuple(int(part) for part in text.split(",") if part.strip())
 
 
 def _no_array(where: str | Path, what: str, got: str) -> InputError:
@@ -132,11 +121,10 @@ def _no_array(where: str | Path, what: str, got: str) -> InputError:
 
 
 def check_pixels(num_pixels: float, where: str | Path, got: str) -> None:
-    """Refuse what has more pixels than a picture may have."""
+    """Refuse more pixels than a picture may have."""
     if num_pixels > LONGEST_SIDE_PX**2:
-        raise over_limit(
-            where, got, f"{LONGEST_SIDE_PX} x {LONGEST_SIDE_PX} px", "scale the pictures down, or cut them"
-        )
+        fix = "scale the pictures down, or cut them"
+        raise over_limit(where, got, f"{LONGEST_SIDE_PX} x {LONGEST_SIDE_PX} px", fix)
 
 
 def png_size(data: bytes) -> tuple[int, int] | None:
@@ -148,39 +136,32 @@ def png_size(data: bytes) -> tuple[int, int] | None:
 
 
 def picture_size(path: Path, *, tree: Path | None = None) -> tuple[int, int] | None:
-    """Return (width, height) px of a PNG file from its header, None if it is none; raises as `open_file`."""
+    """Return (width, height) px of a PNG file from its header, None if it is none."""
     with open_file(path, what="image", tree=tree) as file, disk_errors(path, "image"):
         return png_size(file.read(PNG_HEADER_BYTES))
 
 
 def read_picture(path: Path, *, tree: Path | None = None) -> np.ndarray:
-    """Read a PNG file, (h, w, 3) uint8 in OpenCV's order of colours; raises as `parse_picture`, and where it cannot be
-    read.
-    """
+    """Read a PNG file, (h, w, 3) uint8 in OpenCV's order of colours."""
     return parse_picture(read_bytes(path, what="image", tree=tree), path)
 
 
 def parse_picture(data: bytes, where: str | Path, *, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
-    """Decode a PNG.
-
-    Raises:
-        InputError: it is none, damaged, or larger than pictures may be.
-    """
-    size = png_size(data)
-    image = None
+    """Return the pixels of a PNG; InputError where it is none, damaged, or larger than pictures may be."""
+    size, image, got = png_size(data), None, f"{len(data)} bytes"
     if size is not None and _holds_its_chunks(data):
         check_pixels(size[0] * size[1], where, "{} x {} px".format(*size))
-        with decoder_errors(where):
+        try:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        except cv2.error as error:
+            got = str(error)
     if image is None:
-        raise InputError("not an image", where=where, got=f"{len(data)} bytes", expected="a PNG")
+        raise InputError("not an image", where=where, got=got, expected="a PNG")
     return image
 
 
 def _holds_its_chunks(data: bytes) -> bool:
-    """Return whether no chunk of a PNG says that it goes on beyond the file: OpenCV makes room for what a chunk
-    says, up to gigabytes.
-    """
+    """Return whether no chunk claims to end beyond the file: OpenCV allocates what a chunk claims, up to gigabytes."""
     place = len(PNG_SIGNATURE)
     while place + 8 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, place)
@@ -188,14 +169,3 @@ def _holds_its_chunks(data: bytes) -> bool:
         if kind == b"IEND":
             break
     return place <= len(data)
-
-
-@contextlib.contextmanager
-def decoder_errors(where: str | Path) -> Iterator[None]:
-    """Turn what OpenCV raises on a file that it cannot decode into an InputError; only the call of a decoder stands in
-    it.
-    """
-    try:
-        yield
-    except cv2.error as error:
-        raise InputError("the image does not decode", where=where, got=str(error), expected="a PNG") from None

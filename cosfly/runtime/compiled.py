@@ -1,13 +1,13 @@
 """Numba's `njit` with a cache that never serves stale code.
 
-Numba keeps a compiled function until its own file changes, with everything it calls compiled in: after an update of
-`kernels.py` alone, a planner would go on with the old kernels. Here every version of the compiled sources, taken
-together, has a cache folder of its own: $XDG_CACHE_HOME/cosfly/<digest>. NUMBA_CACHE_DIR, if set, is left alone.
+Numba keeps a compiled function, with everything it calls, until its own file changes: after an update of `kernels.py`
+alone, a planner would keep the old kernels. Here every version of all compiled sources together has its own cache
+folder, $XDG_CACHE_HOME/cosfly/<digest>. NUMBA_CACHE_DIR, if set, is used as it is. Of several processes that need a
+function, one compiles it and the others wait for its lock and load it.
 
-Of several processes that need a function, one compiles it and the others wait for its lock and load it. Compiling costs
-seconds at first use. Two habits keep it down: a constant among the arguments of a compiled function is a type of its
-own to numba, which compiles the function once more, so it is passed as `int64(0)`; and whole arrays are set by `fill`
-or a loop, because numba's `array[:] = ...` brings the formatting of its error message along.
+Two habits keep compiling short: a literal argument is a type of its own to numba, which compiles the function once
+more, so it is passed as `int64(0)`; and whole arrays are set by `fill` or a loop, because numba's `array[:] = ...`
+compiles the formatting of its error message too.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ UNUSED_DAYS = 30  # a cache of other sources that no process has opened for so l
 
 
 class _SharedCache(caching.FunctionCache):
-    """What is compiled of a function. Who finds nothing holds the function's lock until it has saved its own."""
+    """The cache of a function. A process that finds nothing holds the function's lock until it has saved its own."""
 
     _lock: Any = None
 
@@ -75,8 +75,7 @@ class _SharedCache(caching.FunctionCache):
 
 
 def njit(**options: Any) -> Callable[[Callable], Callable]:
-    """Numba's decorator, without the wrapper for callers in C, which nobody uses and which takes a tenth of the
-    time."""
+    """Return numba's decorator without the wrapper for callers in C, which takes a tenth of the time to compile."""
     compile_lazily = numba.njit(no_cfunc_wrapper=True, **options)  # type: ignore[call-overload]
 
     def decorate(function: Callable) -> Callable:
@@ -88,19 +87,13 @@ def njit(**options: Any) -> Callable[[Callable], Callable]:
     return decorate
 
 
-def sources_digest(package: Path) -> str:
-    """Hash the sources below a folder that hold compiled functions, 16 hex digits."""
-    digest = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        text = read_bytes(path)
-        if b"@njit" in text:
-            digest.update(str(path.relative_to(package)).encode() + b"\0" + text)
-    return digest.hexdigest()[:16]
-
-
-def use_own_cache(caches: Path, digest: str, now_s: float) -> None:
-    """Let numba cache in `caches/digest`, if it can be made, and delete what has not been used for long."""
-    folder = caches / digest
+def _use_own_cache(caches: Path) -> None:
+    """Let numba cache in a folder of the sources' own, if it can be made, and delete those unused for long."""
+    digest, now_s = hashlib.sha256(), time.time()
+    for path in sorted(PACKAGE.rglob("*.py")):
+        if b"@njit" in (text := read_bytes(path)):
+            digest.update(str(path.relative_to(PACKAGE)).encode() + b"\0" + text)
+    folder = caches / digest.hexdigest()[:16]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         os.utime(folder, (now_s, now_s))
@@ -113,24 +106,19 @@ def use_own_cache(caches: Path, digest: str, now_s: float) -> None:
                 shutil.rmtree(other, ignore_errors=True)
 
 
-def cache_folder() -> Path | None:
-    """Where numba keeps what it has compiled; None: beside the sources."""
-    return Path(numba.config.CACHE_DIR) if numba.config.CACHE_DIR else None  # type: ignore[attr-defined]
-
-
-class _Tells(event.Listener):
-    """Says that something is compiled, which is not what usually takes time: it is loaded from the cache."""
+class _CompileListener(event.Listener):
+    """Logs that kernels are compiled, which happens once per machine; later they are loaded from the cache."""
 
     def on_start(self, event: event.Event) -> None:
-        place = cache_folder() or "__pycache__"
+        place = numba.config.CACHE_DIR or "__pycache__"  # type: ignore[attr-defined]
         log.info("compiling kernels, once on this machine (planning: about 30 s); kept in %s", place)
 
     def on_end(self, event: event.Event) -> None:
-        """Nothing to say."""
+        """Log nothing."""
 
 
-class FirstRecord(logging.Filter):
-    """Lets one record through: a process hears of compiling by itself, and from each of its workers."""
+class _FirstRecord(logging.Filter):
+    """Passes one record: a process compiles several functions, and so does each of its workers."""
 
     has_passed = False
 
@@ -139,9 +127,8 @@ class FirstRecord(logging.Filter):
         return not had_passed
 
 
-log.addFilter(FirstRecord())
-event.register("numba:compile", _Tells())
+log.addFilter(_FirstRecord())
+event.register("numba:compile", _CompileListener())
 
 if "NUMBA_CACHE_DIR" not in os.environ:
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    use_own_cache(Path(home) / "cosfly", sources_digest(PACKAGE), time.time())
+    _use_own_cache(Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "cosfly")

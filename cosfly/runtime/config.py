@@ -1,4 +1,8 @@
-"""Settings: YAML and `--set a.b=c` into strict pydantic models, with all problems reported at once."""
+"""Settings: YAML and `--set a.b=c` into strict pydantic models, with all problems reported at once.
+
+Settings are YAML limited to the values of JSON, with comments and anchors: a tag, a key that is given twice and a key
+that is no plain word are errors; a date is text.
+"""
 
 from __future__ import annotations
 
@@ -17,56 +21,14 @@ from cosfly.runtime.errors import ConfigError, InputError, nearest, plain
 from cosfly.runtime.io import read_text
 
 MOST_BYTES = 1_000_000  # a run's settings are some 10 kB; the longest word list that ships has 100
-
-
-class _Loader(yaml.SafeLoader):
-    """The safe loader, with keys that are given once."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict:
-        seen = set[str]()
-        for key, _ in node.value:
-            if not isinstance(key, yaml.ScalarNode):
-                raise yaml.constructor.ConstructorError(None, None, "a key that is no word", key.start_mark)
-            if key.value in seen and key.value != "<<":
-                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} is given twice", key.start_mark)
-            seen.add(key.value)
-        return super().construct_mapping(node, deep)
-
-
-# Only what JSON has: without the resolver a date stays text, which is what its users mean.
-_KINDS = {f"tag:yaml.org,2002:{kind}" for kind in ("null", "bool", "int", "float", "str", "seq", "map", "merge")}
-_Loader.yaml_constructors = {
-    tag: constructor for tag, constructor in yaml.SafeLoader.yaml_constructors.items() if tag is None or tag in _KINDS
-}
-_Loader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in resolvers if tag in _KINDS]
-    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-
-
-def parse_yaml(text: str, where: str | Path, *, what: str = "configuration") -> Any:
-    """Read YAML text.
-
-    Raises:
-        ConfigError: it is not valid, or too long.
-    """
-    if len(text) > MOST_BYTES:
-        expected = f"at most {MOST_BYTES / 1e6:g} MB"
-        raise ConfigError(f"the {what} is too long", where=where, got=f"{len(text) / 1e6:.1f} MB", expected=expected)
-    try:
-        return yaml.load(text, _Loader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ConfigError(f"the {what} is not valid YAML", where=where, got=str(error)) from None
-
-
 MOST_LISTED = 15  # names of settings in a message
 MOST_ELSEWHERE = 3  # places of an unknown name, as in "did you mean plan.x or render.x"
 MOST_PARTS = 32  # of a setting's name
-# What validators are given as context where wrong values were left out: then what is lacking is nobody's mistake.
 
 T = TypeVar("T")
+C = TypeVar("C", bound=BaseModel)
 
-# MayDiffer[int] is a setting that changes how a stage works and not what it makes: it does not stand in `stage.json`,
+# MayDiffer[int] is a setting that changes how a stage works and not what it makes: it is not recorded in `stage.json`,
 # and a stage may be resumed with another value.
 _MAY_DIFFER = "may differ on resume"
 MayDiffer = Annotated[T, _MAY_DIFFER]
@@ -100,27 +62,59 @@ class Config(BaseModel):
         return name in cls.model_fields and _MAY_DIFFER in cls.model_fields[name].metadata
 
 
-C = TypeVar("C", bound=BaseModel)
+# --- YAML -------------------------------------------------------------------------------------------------------------
+
+
+class _Loader(yaml.SafeLoader):
+    """The safe loader, with each key given once."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict:
+        seen = set[str]()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise yaml.constructor.ConstructorError(None, None, "a key that is no word", key.start_mark)
+            if key.value in seen and key.value != "<<":
+                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} is given twice", key.start_mark)
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+# Only what JSON has: without the resolver a date stays text, which is what its users mean.
+_KINDS = {f"tag:yaml.org,2002:{kind}" for kind in ("null", "bool", "int", "float", "str", "seq", "map", "merge")}
+_Loader.yaml_constructors = {
+    tag: constructor for tag, constructor in yaml.SafeLoader.yaml_constructors.items() if tag is None or tag in _KINDS
+}
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag in _KINDS]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+
+
+def parse_yaml(text: str, where: str | Path, *, what: str = "configuration") -> Any:
+    """Return the value of YAML text; ConfigError where it is not valid or too long."""
+    if len(text) > MOST_BYTES:
+        expected = f"at most {MOST_BYTES / 1e6:g} MB"
+        raise ConfigError(f"the {what} is too long", where=where, got=f"{len(text) / 1e6:.1f} MB", expected=expected)
+    try:
+        return yaml.load(text, _Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ConfigError(f"the {what} is not valid YAML", where=where, got=str(error)) from None
 
 
 def read_yaml(path: Path) -> dict:
-    """Read a YAML mapping.
-
-    Raises:
-        ConfigError: it cannot be read, is not YAML, not a mapping, or says more than settings may.
-    """
+    """Read a YAML mapping; ConfigError where the file holds none."""
     try:
         text = read_text(path, what="configuration")
     except InputError as error:
         raise ConfigError(error.what, where=path, got=error.got, fix=error.fix) from None
     value = parse_yaml(text, path)
-    if value is None:
-        return {}
-    if not isinstance(value, dict):
-        raise ConfigError(
-            "the configuration is not a mapping", where=path, got=type(value).__name__, expected="key: value lines"
-        )
-    return value
+    if not isinstance(value, dict | None):
+        what, expected = "the configuration is not a mapping", "key: value lines"
+        raise ConfigError(what, where=path, got=type(value).__name__, expected=expected)
+    return value or {}
+
+
+# --- from settings to models ------------------------------------------------------------------------------------------
 
 
 def apply_overrides(data: dict, overrides: Iterable[str]) -> dict:
@@ -129,12 +123,8 @@ def apply_overrides(data: dict, overrides: Iterable[str]) -> dict:
     for override in overrides:
         key, equals, text = override.partition("=")
         if not equals or not all(key.split(".")) or key.count(".") > MOST_PARTS:
-            raise ConfigError(
-                "not an assignment",
-                where="--set",
-                got=override[:80],
-                expected="key=value, for instance pedestrians.num_paths=3",
-            )
+            expected = "key=value, for instance pedestrians.num_paths=3"
+            raise ConfigError("not an assignment", where="--set", got=override[:80], expected=expected)
         value = parse_yaml(text, f"--set {key}", what="value")
         node = data
         *parents, last = key.split(".")
@@ -147,22 +137,15 @@ def apply_overrides(data: dict, overrides: Iterable[str]) -> dict:
 
 
 def build(model: type[C], data: dict, source: str | Path) -> C:
-    """Make a model from plain data.
-
-    Raises:
-        ConfigError: names every problem, and for an unknown key the nearest known one.
-    """
+    """Return a model of plain data; ConfigError names every problem, and the nearest known key of an unknown one."""
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        problems = [_problem(model, detail) for detail in error.errors()]
-        raise ConfigError(
-            "; ".join(problems), where=source, fix=f"{len(problems)} to mend" if len(problems) > 1 else None
-        ) from None
+        raise ConfigError.of_all([_problem(model, detail) for detail in error.errors()], where=source) from None
 
 
 def load(model: type[C], path: Path | None, overrides: Iterable[str] = ()) -> C:
-    """Defaults, then the file, then the overrides."""
+    """Return a model of the defaults, then the file, then the overrides."""
     overrides = list(overrides)
     data = apply_overrides(read_yaml(path) if path else {}, overrides)
     return build(model, data, " with ".join([*([str(path)] if path else []), *(["--set"] if overrides else [])]))
@@ -170,21 +153,19 @@ def load(model: type[C], path: Path | None, overrides: Iterable[str] = ()) -> C:
 
 def _problem(model: type[BaseModel], detail: Any) -> str:
     field = ".".join(str(part) for part in detail["loc"]) or "settings"
-    if detail["type"] == "extra_forbidden":
+    kind = detail["type"]
+    if kind == "extra_forbidden":
         *parents, last = detail["loc"]
-        group = _group(model, parents)
-        known = list(getattr(group, "model_fields", {}))
+        known = list(getattr(_group(model, parents), "model_fields", {}))
         elsewhere = [name for name in _names(model) if f".{name}".endswith(f".{last}")]
         if 0 < len(elsewhere) <= MOST_ELSEWHERE:
             return f"{field}: unknown setting (did you mean {' or '.join(map(repr, elsewhere))}?)"
         hint = nearest(str(last), known) or (f" (there are {', '.join(known)})" if len(known) <= MOST_LISTED else "")
         return f"{field}: unknown setting{hint}"
-    got = "" if isinstance(detail["input"], dict) else f", got {detail['input']!r}"
-    kind = detail["type"]
     if kind in ("list_type", "tuple_type"):
         return f"{field}: not a list, got {detail['input']!r}; write [{detail['input']}]"
-    what = "not a group of settings" if kind == "model_type" else plain(detail["msg"])
-    return f"{field}: {what}{got}"
+    got = "" if isinstance(detail["input"], dict) else f", got {detail['input']!r}"
+    return f"{field}: {'not a group of settings' if kind == 'model_type' else plain(detail['msg'])}{got}"
 
 
 def _names(model: Any, above: str = "") -> Iterator[str]:
@@ -205,27 +186,28 @@ def _group(model: Any, parents: Iterable[Any]) -> Any:
     return model
 
 
+# --- files of settings ------------------------------------------------------------------------------------------------
+
+
 def shipped(name: str) -> Path:
     """Return the path of a file that ships in `configs/`, wherever cosfly is installed."""
     return Path(str(importlib.resources.files("cosfly_configs") / name))
 
 
 def config_file(config: Path | None) -> Path | None:
-    """Return the file of a configuration: that of a path, of a run folder, or of the bare name of one that ships."""
+    """Return the file of a configuration, given as a path, a run directory, or the bare name of one that ships."""
     if config is None or config.is_file():
         return config
     if (config / "run.yaml").is_file():
         return config / "run.yaml"
     is_bare = config.suffix == "" and len(config.parts) == 1
     if is_bare and (packaged := shipped(f"{config}.yaml")).exists():
-        return packaged  # whatever folder of this name stands here
+        return packaged  # even where a folder has this name
     names = sorted(path.stem for path in shipped(".").glob("*.yaml") if path.stem != "glossary")
-    expected = f"a YAML file, a run folder, or one that ships: {', '.join(names)}"
+    expected = f"a YAML file, a run directory, or one that ships: {', '.join(names)}"
     if config.is_dir():
-        fix = f"cosfly list {config} names the runs in it"
-        raise ConfigError(
-            "a folder, and not that of a run", where=config, got="no run.yaml", expected=expected, fix=fix
-        )
+        what, fix = "this folder is not a run directory", f"cosfly list {config} names the runs in it"
+        raise ConfigError(what, where=config, got="no run.yaml", expected=expected, fix=fix)
     if is_bare:
         raise ConfigError(f"no such configuration{nearest(str(config), names)}", where=config, expected=expected)
     return config

@@ -1,16 +1,16 @@
-"""What data, configuration or the environment can cause. Everything else is a bug and keeps its traceback.
+"""Errors that data, configuration or the environment can cause. Everything else is a bug and keeps its traceback.
 
 CosflyError
 |-- ConfigError         a setting is unknown, of the wrong type, or contradicts another
-|-- InputError          a file is missing, malformed, of another version, or holds a value that cannot be
+|-- InputError          a file is missing, malformed, of another version, or holds an impossible value
 |-- ResumeError         a folder holds work made with other settings or inputs
-|-- EnvironmentMissing  a package, library, device or GL backend is not there      (fatal)
+|-- EnvironmentMissing  a package, library, device or GL backend is missing        (fatal)
 |-- StorageError        a disk is full or not writable                             (fatal)
-|-- NoPathError         no endpoints, no route, no feasible flight
+|-- NoPathError         no endpoints, no route, no feasible trajectory
 |-- NothingKept         a stage has nothing for the next one
 |-- RenderError         a frame cannot be made or is not what it must be
 |-- TeacherError        an endpoint cannot be reached or does not speak the protocol (fatal)
-`-- VerifyError         a finished product is not what its records say
+`-- VerifyError         a finished product differs from its records
 
 A *fatal* error ends the stage; any other, raised inside one item, is recorded for that item and counted.
 """
@@ -26,18 +26,20 @@ from typing import Any, Self
 
 from cosfly.runtime.escaping import for_terminal
 
-MOST_TOLD = 12  # problems in a message
+MOST_NAMED = 12  # problems in a message
+# Names of settings that share words are nearer than their letters: goal_min_m is min_distance_m, not resolution_m.
+NEAR, SHARED_WORD = 0.6, 0.15
 
 
 class CosflyError(Exception):
     """An error that a user can act on.
 
     Args:
-        what: what failed, one short sentence.
-        where: the file, item id or field.
-        got: the offending value.
-        expected: what would have been right.
-        fix: what to do.
+        what: What failed, one short sentence.
+        where: The file, item id or field.
+        got: The offending value.
+        expected: The right value.
+        fix: What to do.
     """
 
     fatal = False
@@ -68,10 +70,10 @@ class CosflyError(Exception):
 
     @classmethod
     def of_all(cls, problems: Sequence[str], *, where: str | Path, expected: str | None = None) -> Self:
-        """Return one error of all that is wrong with a file: the first of them, and how many there are."""
-        more = f"; and {len(problems) - MOST_TOLD} more" if len(problems) > MOST_TOLD else ""
-        count = f"{len(problems)} to mend" if len(problems) > 1 else None
-        return cls("; ".join(problems[:MOST_TOLD]) + more, where=where, expected=expected, fix=count)
+        """Return one error for several problems of a file: the first of them, and how many there are."""
+        more = f"; and {len(problems) - MOST_NAMED} more" if len(problems) > MOST_NAMED else ""
+        count = f"{len(problems)} to fix" if len(problems) > 1 else None
+        return cls("; ".join(problems[:MOST_NAMED]) + more, where=where, expected=expected, fix=count)
 
     def __reduce__(self) -> tuple:
         # Errors cross process borders; the default reduction would drop the keyword arguments.
@@ -122,10 +124,6 @@ class VerifyError(CosflyError):
     code = "verify"
 
 
-# Names of settings that share words are nearer than their letters tell: goal_min_m is min_distance_m, not resolution_m.
-NEAR, SHARED_WORD = 0.6, 0.15
-
-
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return ' (did you mean X?)' for the nearest known name, or the empty string."""
     found = max(known, key=partial(_nearness, name), default="")
@@ -133,12 +131,12 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def _nearness(name: str, known: str) -> float:
-    """How near two names are: the share of letters in common, and more for each word, where one of them is no unit."""
+    """Return the share of letters that two names have in common, and more for each common word that is no unit."""
     shared = {*re.split(r"[\W_]+", name)} & {*re.split(r"[\W_]+", known)}
     counts = len(shared) if any(len(word) > 2 for word in shared) else 0
     return SequenceMatcher(None, name, known).ratio() + SHARED_WORD * counts
 
 
 def plain(message: str) -> str:
-    """Return what a validator of ours said, without what pydantic puts before it."""
+    """Return the message of a validator of ours without pydantic's prefix."""
     return message.removeprefix("Value error, ")

@@ -1,6 +1,6 @@
-"""Foreign text on its way to people: escaped and cut here for terminal and Markdown; for HTML in `cosfly/viz/page.py`.
+"""Foreign text for people: escaped and cut here for terminal and Markdown, for HTML in `cosfly/viz/page.py`.
 
-Names of folders, contents of files and words of servers may hold escape sequences, tags, table bars, or 200 MB.
+Names of folders, contents of files and answers of servers may hold escape sequences, tags, table bars, or 200 MB.
 """
 
 from __future__ import annotations
@@ -9,18 +9,16 @@ import html
 import re
 from typing import Any
 
-LONGEST = 2_000  # characters of one foreign text that a person is shown; the middle of a longer one is left out
+LONGEST = 2_000  # characters of one foreign text that a person is shown; the middle of a longer one is cut
 LONGEST_LOG = 20_000  # of one log record, which may be the traceback of a bug
 
-# What a terminal obeys instead of printing (C0, DEL, C1), and what turns the order of letters round (bidirectional
-# controls). Line feed and tab are harmless; whoever wants one line splits and joins before.
+# Control characters that a terminal obeys (C0, DEL, C1) and bidirectional controls. Line feed and tab are harmless.
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _MARKDOWN = re.compile(r"([\\`*\[\]|~#]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9]))")  # within a word, _ means itself
 
 
 def cut(text: str, longest: int = LONGEST) -> str:
-    """Return a text of at most about `longest` characters: the middle of a longer one is left out, and says how
-    much."""
+    """Return a text of about `longest` characters at most: the middle of a longer one is replaced by its length."""
     if len(text) <= longest:
         return text
     head = longest * 2 // 3
@@ -28,7 +26,7 @@ def cut(text: str, longest: int = LONGEST) -> str:
 
 
 def for_terminal(text: str, longest: int = LONGEST) -> str:
-    """Return text that a terminal prints and never obeys: control characters as `\\x1b`."""
+    """Return text with control characters as `\\x1b`, which a terminal prints."""
     return _CONTROLS.sub(lambda match: ascii(match[0])[1:-1], cut(text, longest))
 
 
@@ -58,7 +56,7 @@ RELATIVE = re.compile(r"\.{1,2}[\\/]\S*|[\w.-]+(?:[\\/][\w.-]+){2,}[\\/]?|[\w.-]
 
 
 def published_name(text: str) -> str:
-    """Return a text with the last name in the place of each path, and `an address` in that of each URL."""
+    """Return a text with each path replaced by its last name, and each URL by `an address`."""
     if IS_ABSOLUTE.match(text) or RELATIVE.fullmatch(text):
         return _last_name(text)
     text = ADDRESS.sub("an address", text)
@@ -66,7 +64,7 @@ def published_name(text: str) -> str:
 
 
 def published(value: Any) -> Any:
-    """Return settings with published names."""
+    """Return settings with paths and URLs replaced as by `published_name`."""
     if isinstance(value, str):
         return published_name(value)
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""`events.jsonl`: what happened to a stage's workers, for people and `cosfly bench`; nothing is decided by it."""
+"""`events.jsonl`: a log of a stage's workers for people and `cosfly bench`; nothing is decided by it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import os
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -42,9 +42,9 @@ Kind = Literal[
 
 class Event(BaseModel):
     """A line of `events.jsonl`. at_s: seconds since 1970. worker: its place, 0 and up; a restarted one keeps it. node:
-    the name of the machine where it works, of a cluster's.
+    the name of its machine in a cluster.
 
-    Of a probe: rss_mib by worker (the most since the probe before), cores in use by all workers, free disk space, mean
+    Of a probe: rss_mib by worker (the most since the last probe), cores in use by all workers, free disk space, mean
     load and memory in use of all NVIDIA devices of the machine where it has some.
     """
 
@@ -69,7 +69,7 @@ class Event(BaseModel):
 
 
 class Vitals(NamedTuple):
-    """What the system of its machine says of a worker process."""
+    """The processor time and memory of a worker process."""
 
     cpu_s: float
     rss_mib: float
@@ -80,21 +80,21 @@ class Vitals(NamedTuple):
 
 
 class EventLog:
-    """Adds to a stage's `events.jsonl`. A kill costs the line in hand."""
+    """Appends to a stage's `events.jsonl`. A kill costs the last line."""
 
     def __init__(self, folder: Path) -> None:
         self._journal, self._folder = Journal(folder / EVENTS), folder
         self._num_probes, self._pace, self._probed_s = 0, 1, time.monotonic()
         self._peaks_mib: dict[int, float] = {}
-        self._cpu_s: dict[int, float] = {}  # by worker, at the probe before
+        self._cpu_s: dict[int, float] = {}  # by worker, at the last probe
         self._used_s = 0.0  # by all workers since the last line
 
-    def tell(self, event: Kind, **fields: object) -> None:
+    def write(self, event: Kind, **fields: object) -> None:
         line = Event.model_validate({"at_s": round(time.time(), 3), "event": event, **fields})
         self._journal.append(line.model_dump(exclude_none=True), sync=False)
 
     def probe(self, workers: Mapping[int, Vitals]) -> None:
-        """Look at memory and time of the workers (by place) and at the disk; not every look is written."""
+        """Measure memory and time of the workers (by place) and the disk; not every measurement is written."""
         for worker, (cpu_s, mib) in workers.items():
             self._peaks_mib[worker] = max(self._peaks_mib.get(worker, 0.0), mib)
             before_s = self._cpu_s.get(worker, 0.0)
@@ -106,7 +106,7 @@ class EventLog:
         elapsed_s = time.monotonic() - self._probed_s
         cores = round(self._used_s / elapsed_s, 2) if elapsed_s else 0.0
         free = shutil.disk_usage(self._folder).free / MEBIBYTE
-        self.tell("probe", rss_mib=self._peaks_mib, cores_used=cores, disk_free_mib=round(free, 1), **gpu_use())
+        self.write("probe", rss_mib=self._peaks_mib, cores_used=cores, disk_free_mib=round(free, 1), **gpu_use())
         self._peaks_mib, self._used_s, self._probed_s = {}, 0.0, time.monotonic()
         if self._num_probes == self._pace * PROBES_OF_ONE_PACE:
             self._num_probes, self._pace = 0, 2 * self._pace
@@ -116,7 +116,7 @@ class EventLog:
 
 
 def read_events(folder: Path) -> list[Event]:
-    """Read the events of a stage folder in order; damaged lines and those of a later cosfly are left out."""
+    """Read the events of a stage folder in order; damaged lines and those of a later cosfly are skipped."""
     events = list[Event]()
     for line in Journal(folder / EVENTS).read():
         with contextlib.suppress(ValidationError):
@@ -125,33 +125,46 @@ def read_events(folder: Path) -> list[Event]:
 
 
 def lost_steps(folder: Path) -> int:
-    """Count the steps, as frames, of items which then failed or were lost with their worker: they are in no product."""
+    """Return the number of steps, as frames, of items that then failed or were lost with their worker."""
     events = read_events(folder)
     return sum(event.steps or 0 for event in events if event.event in LOSSES or event.status == "failed")
 
 
-# --- what the system says of a process --------------------------------------------------------------------------------
+# --- processes and devices --------------------------------------------------------------------------------------------
+
+
+def process_stat(pid: int) -> list[bytes]:
+    """Read the fields of /proc/PID/stat from the state on; empty where there are none."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
+    except OSError:
+        return []
 
 
 def cpu_seconds(pid: int) -> float:
-    """Return the processor time of a process and all its threads; 0 where the system does not tell, or it is gone."""
+    """Return the processor time of a process and all its threads; 0 where it is gone or unknown."""
     fields = process_stat(pid)
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK") if fields else 0.0  # utime, stime: proc(5)
 
 
+def rss_mib(pid: int) -> float:
+    """Return the resident memory of a process, MiB; 0 where it is gone or unknown."""
+    fields = process_stat(pid)
+    return round(int(fields[21]) * os.sysconf("SC_PAGE_SIZE") / MEBIBYTE, 1) if fields else 0.0
+
+
 def gpu_use() -> dict[str, float]:
-    """Return what the driver reports of the machine's NVIDIA devices: `gpu_percent`, their mean load, and `gpu_mib`,
-    their memory in use together; nothing where there is none."""
+    """Return `gpu_percent`, the mean load of the machine's NVIDIA devices, and `gpu_mib`, their memory in use; empty
+    where there is none."""
     nvml, loads, used_mib = _nvml(), list[float](), 0.0
     if nvml is None:
         return {}
-    for index in range(_asked(nvml.nvmlDeviceGetCount) or 0):
-        if (device := _asked(nvml.nvmlDeviceGetHandleByIndex, index)) is None:
-            continue
-        if rates := _asked(nvml.nvmlDeviceGetUtilizationRates, device):
-            loads.append(rates.gpu)
-        if memory := _asked(nvml.nvmlDeviceGetMemoryInfo, device):
-            used_mib += memory.used / MEBIBYTE
+    with contextlib.suppress(nvml.NVMLError, nvml.NVMLLibraryMismatchError):
+        for index in range(nvml.nvmlDeviceGetCount()):
+            with contextlib.suppress(nvml.NVMLError):  # a virtual device, or a missing right
+                device = nvml.nvmlDeviceGetHandleByIndex(index)
+                used_mib += nvml.nvmlDeviceGetMemoryInfo(device).used / MEBIBYTE
+                loads.append(nvml.nvmlDeviceGetUtilizationRates(device).gpu)
     return {"gpu_percent": round(sum(loads) / len(loads), 1), "gpu_mib": round(used_mib, 1)} if loads else {}
 
 
@@ -165,30 +178,3 @@ def _nvml() -> Any:
     except pynvml.NVMLError:
         return None
     return pynvml
-
-
-def _asked(call: Callable[..., Any], *arguments: Any) -> Any:
-    """Ask the driver; None where it does not tell: an old one, a virtual device, a right that is not ours."""
-    import pynvml
-
-    try:
-        return call(*arguments)
-    except (pynvml.NVMLError, pynvml.NVMLLibraryMismatchError):
-        return None
-
-
-def process_stat(pid: int) -> list[bytes]:
-    """Read what /proc tells of a process, from its state on; empty where there is nothing."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
-    except OSError:
-        return []
-
-
-def rss_mib(pid: int) -> float:
-    """Return the resident memory of a process, MiB; 0 where the system does not tell, or it is gone."""
-    try:
-        pages = int(Path(f"/proc/{pid}/statm").read_bytes().split()[1])
-    except OSError:
-        return 0.0
-    return round(pages * os.sysconf("SC_PAGE_SIZE") / MEBIBYTE, 1)

@@ -1,7 +1,7 @@
-"""Read and write files: regular ones of a bounded size, atomic writes, checksums, folders that appear whole.
+"""Read and write files: regular ones of a bounded size, atomic writes, checksums, directories that appear whole.
 
-A pipe would block for ever, a device never end, and a link may lead out of a tree. What the system reports against a
-file becomes an InputError or a StorageError here and nowhere else.
+A pipe would block for ever, a device never end, and a link may lead out of a tree. What the system reports about a file
+becomes an InputError or a StorageError here and nowhere else.
 """
 
 from __future__ import annotations
@@ -27,63 +27,66 @@ from cosfly.runtime.errors import InputError, StorageError
 log = logging.getLogger(__name__)
 
 MB = 1_000_000
-FILE_MB = 2_048  # read as a whole: the flights of a town are some 100 MB a million frames
+FILE_MB = 2_048  # read as a whole: the trajectories of a town are some 100 MB a million frames
 LINE_MB = 64  # of a JSON-lines file: a caption with its evidence has some 8 kB
-UNPACK_FACTOR = 100  # times its own size may a packed file unpack to: JSON packs to a third, an indented one to a 15th
+UNPACK_FACTOR = 100  # largest ratio of unpacked to packed size: JSON packs to a third, indented JSON to a 15th
+SMALL_UNPACKED_MB = 64  # what any packed file may unpack to, however small it is
+CHUNK = 16 * MB
 CHECK_PATH = "check the path"
 SPLIT = "split it, or cut out the part that is needed"
 GZIP_MAGIC = b"\x1f\x8b"
-SMALL_UNPACKED_MB = 64  # what any packed file may unpack to, however small it is
-CHUNK = 16 * MB
-
-_KINDS = (
-    (stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a named pipe"), (stat.S_ISCHR, "a device"), (stat.S_ISBLK, "a device"),
-)  # fmt: skip
+LONGEST_NAME = 255  # bytes of one part of a path, on every common file system
+CHECKSUMS = "checksums.sha256"
+DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EIO})
+NO_SUCH_PLACE = frozenset({errno.ENOENT, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP})
 
 
 class LinkedPath(PosixPath):
-    """A folder or file that the user trusts: links below it are followed wherever they lead.
+    """A directory or file that the user trusts: links below it are followed wherever they lead.
 
-    Every path that is made from it is one too, also in another process, so nothing else tells readers.
+    Every path derived from it is one too, also in another process, so readers need no option.
     """
 
 
 def over_limit(where: object, got: str, expected: str, fix: str) -> InputError:
-    """Return the error of what is larger than its reader takes."""
+    """Return the error of an input that is larger than its reader accepts."""
     return InputError("over the limit", where=str(where), got=got, expected=f"at most {expected}", fix=fix)
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
 
 
 def open_file(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None) -> io.BufferedReader:
     """Open a regular file to read its bytes.
 
     Args:
-        what, fix: for the message.
-        tree: the folder whose files are being read: a link that leads out of it is refused. None: the user named this
-        file.
+        what, fix: Words for the message.
+        tree: The directory whose files are being read: a link that leads out of it is refused. None: the user named
+            this file.
+
     Raises:
-        InputError: it is missing, no regular file, not readable, or not below its tree.
+        InputError: The file is missing, not regular, not readable, or not below its tree.
     """
     if tree is not None:
         check_stays_below(path, tree)
     try:
         # A named pipe without a writer would hold a plain open for ever.
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    except OSError as error:
-        got = "a socket" if error.errno == errno.ENXIO else error.strerror
+    except (OSError, ValueError) as error:  # ValueError: a name that no system has
+        got = "a socket" if getattr(error, "errno", 0) == errno.ENXIO else getattr(error, "strerror", str(error))
         raise InputError(f"cannot read the {what}", where=path, got=got, fix=fix) from None
-    except ValueError as error:  # a name that no system has
-        raise InputError(f"cannot read the {what}", where=path, got=str(error), fix=fix) from None
     mode = os.fstat(number).st_mode
     if not stat.S_ISREG(mode):
         os.close(number)
-        got = next((name for is_kind, name in _KINDS if is_kind(mode)), "something else")
+        got = {"d": "a folder", "p": "a named pipe"}.get(stat.filemode(mode)[0], "a device")
         raise InputError(f"cannot read the {what}", where=path, got=got, expected="a regular file", fix=fix)
     return os.fdopen(number, "rb")
 
 
 @contextlib.contextmanager
 def disk_errors(path: Path, what: str, fix: str = CHECK_PATH) -> Iterator[None]:
-    """Turn what the system says while it reads into an InputError; only calls that read stand in it."""
+    """Convert an OSError while a file is read into an InputError."""
     try:
         yield
     except OSError as error:
@@ -91,51 +94,30 @@ def disk_errors(path: Path, what: str, fix: str = CHECK_PATH) -> Iterator[None]:
 
 
 def read_bytes(
-    path: Path,
-    *,
-    what: str = "file",
-    fix: str = CHECK_PATH,
-    tree: Path | None = None,
-    most_mb: float = FILE_MB,
-    split: str = SPLIT,
+    path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None, most_mb: float = FILE_MB
 ) -> bytes:
-    """Read a whole file.
-
-    Args:
-        what, fix, tree: as for `open_file`. most_mb: its largest size. split: what to do about a larger one.
-    Raises:
-        InputError: as `open_file`; or it is over the limit.
-    """
+    """Read a whole file of at most `most_mb`; other arguments as for `open_file`."""
     with open_file(path, what=what, fix=fix, tree=tree) as file, disk_errors(path, what, fix):
-        return file.read(_size_within(file, path, most_mb, split))
+        size = os.fstat(file.fileno()).st_size
+        if size > most_mb * MB:
+            raise over_limit(path, f"{size / MB:,.3g} MB", f"{most_mb:,g} MB in one piece", SPLIT)
+        return file.read(size)
 
 
-def read_span(path: Path, first: int, size: int, *, what: str = "file", fix: str = CHECK_PATH) -> bytes:
-    """Read `size` bytes from byte `first` on of a file that the user named; raises as `read_bytes`, and where it ends
-    before.
-    """
+def read_span(path: Path, first: int, size: int, *, what: str = "file") -> bytes:
+    """Read `size` bytes from byte `first` on of a file that the user named."""
     if size > FILE_MB * MB:
         raise over_limit(path, f"{size / MB:,.0f} MB", f"{FILE_MB:,} MB in one piece", SPLIT)
-    with open_file(path, what=what, fix=fix) as file, disk_errors(path, what, fix):
+    with open_file(path, what=what) as file, disk_errors(path, what):
         file.seek(first)
         data = file.read(size)
     if len(data) != size:
-        raise InputError(
-            f"the {what} became shorter while it was read", where=path, got=f"{first + len(data)} bytes", fix=fix
-        )
+        raise InputError(f"the {what} became shorter while it was read", where=path, got=f"{first + len(data)} bytes")
     return data
 
 
-def _size_within(file: io.BufferedReader, path: Path, most_mb: float = FILE_MB, split: str = SPLIT) -> int:
-    """Return the size of an open file; InputError where it is larger."""
-    size = os.fstat(file.fileno()).st_size
-    if size > most_mb * MB:
-        raise over_limit(path, f"{size / MB:,.3g} MB", f"{most_mb:,g} MB in one piece", split)
-    return size
-
-
 def read_text(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None) -> str:
-    """Read a whole file of UTF-8 text; raises as `read_bytes`, and for other text."""
+    """Read a whole file of UTF-8 text."""
     return decoded(read_bytes(path, what=what, fix=fix, tree=tree), path)
 
 
@@ -144,18 +126,13 @@ def decoded(data: bytes, where: object) -> str:
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise not_utf8(error, where) from None
-
-
-def not_utf8(error: UnicodeDecodeError, where: object) -> InputError:
-    """Return which byte of which line is no UTF-8, and what to do."""
-    line = error.object[: error.start].count(b"\n") + 1
-    got = f"the byte 0x{error.object[error.start]:02x} in line {line}"
-    return InputError("not UTF-8 text", where=str(where), got=got, fix="if it is text, save it as UTF-8")
+        line = data[: error.start].count(b"\n") + 1
+        got = f"the byte 0x{data[error.start]:02x} in line {line}"
+        raise InputError("not UTF-8 text", where=str(where), got=got, fix="if it is text, save it as UTF-8") from None
 
 
 def read_lines(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: Path | None = None) -> Iterator[bytes]:
-    """Yield the lines of a file, each with its end; raises as `open_file`, and for a line over the limit."""
+    """Yield the lines of a file, each with its end and of at most LINE_MB."""
     with open_file(path, what=what, fix=fix, tree=tree) as file:
         for number in itertools.count(1):
             with disk_errors(path, what, fix):
@@ -169,7 +146,7 @@ def read_lines(path: Path, *, what: str = "file", fix: str = CHECK_PATH, tree: P
 
 
 def read_unpacked(path: Path, *, what: str = "file", most_mb: float = FILE_MB) -> bytes:
-    """Read a whole file, and unpack it where it is gzipped; raises as `read_bytes`, and for damaged gzip data."""
+    """Read a whole file, and unpack it where it is gzipped."""
     data = read_bytes(path, what=what, most_mb=most_mb)
     if not data.startswith(GZIP_MAGIC):
         return data
@@ -191,17 +168,21 @@ def read_unpacked(path: Path, *, what: str = "file", most_mb: float = FILE_MB) -
 
 
 def sha256_file(path: Path, *, tree: Path | None = None) -> str:
-    """Return the hex digest of a file; raises as `open_file`."""
+    """Return the hex digest of a file."""
     with open_file(path, tree=tree) as file, disk_errors(path, "file"):
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def files_named(tree: Path, name: str) -> list[Path]:
-    """Find the files of a name below a tree, sorted; what begins with a dot is left out, and nothing is looked for
-    below a folder that has one.
+def sha256_bytes(data: bytes) -> str:
+    """Return the hex digest of some bytes."""
+    return hashlib.sha256(data).hexdigest()
 
-    A folder that is a link is gone into where it leads to a place inside the tree's parent folder, or anywhere with
-    `follow_links`; of others the log tells.
+
+def files_named(tree: Path, name: str) -> list[Path]:
+    """Return the files of a name below a tree, sorted; hidden entries, and what is below a match, are skipped.
+
+    A linked directory is entered if it leads to a place inside the tree's parent directory, or anywhere with
+    `follow_links`; others are logged.
     """
     found: list[Path] = []
     waiting: list[tuple[Path, tuple[str, ...]]] = [(tree, (os.path.realpath(tree),))]
@@ -216,24 +197,23 @@ def files_named(tree: Path, name: str) -> list[Path]:
         for entry in entries.values():
             if entry.is_dir(follow_symlinks=False):
                 waiting.append((folder / entry.name, above))
-            elif entry.is_symlink() and os.path.isdir(entry.path):  # a link to itself is none, and no error
+            elif entry.is_symlink() and os.path.isdir(entry.path):  # isdir is false for a link to itself
                 real = os.path.realpath(entry.path)
                 if not (isinstance(tree, LinkedPath) or is_below(real, parent)):
-                    log.warning("%s: leads to %s, which is not looked at; --set follow_links=true", entry.path, real)
+                    log.warning("%s leads to %s and is skipped; --set follow_links=true follows it", entry.path, real)
                 elif real not in above and real != parent:  # a link to a folder above would go round for ever
                     waiting.append((folder / entry.name, (*above, real)))
     return sorted(found)
 
 
-# --- links ------------------------------------------------------------------------------------------------------------
+# --- names and links --------------------------------------------------------------------------------------------------
 
 
 def check_stays_below(path: Path, tree: Path, *, beside: bool = False) -> None:
-    """Check that no symbolic link leads from a tree to a file outside; `beside`: out of the folder that the tree stands
-    in.
+    """Check that no symbolic link leads from a tree to a file outside; `beside`: outside of the tree's parent.
 
-    The tree itself may be a link. Where it is a snapshot in the cache of the hub's client, whose files are links to
-    blobs, these are part of it.
+    The tree itself may be a link. In the cache of the hub's client, where a snapshot's files are links to blobs, the
+    blobs are part of the tree.
     """
     if isinstance(tree, LinkedPath):
         return
@@ -241,7 +221,8 @@ def check_stays_below(path: Path, tree: Path, *, beside: bool = False) -> None:
         real, root = real_path(path), real_path(tree)
     except ValueError as error:  # a NUL in a name
         raise InputError("not a name of a file", where=tree, got=str(error)) from None
-    if not any(is_below(real, allowed) for allowed in (os.path.dirname(root) if beside else root, *_blobs(Path(root)))):
+    blobs = [str(folder.parent / "blobs") for folder in Path(root).parents if folder.name == "snapshots"][:1]
+    if not any(is_below(real, allowed) for allowed in (os.path.dirname(root) if beside else root, *blobs)):
         raise InputError(
             "a link leads out of its folder", where=path, got=real, expected=f"a file below {tree}",
             fix="if you trust it, --set follow_links=true",
@@ -249,9 +230,7 @@ def check_stays_below(path: Path, tree: Path, *, beside: bool = False) -> None:
 
 
 def real_path(path: Path) -> str:
-    """As `os.path.realpath`, which looks at every folder on the way, by asking the system, where there is such a file
-    and it can be asked.
-    """
+    """Return `os.path.realpath`, by asking the system where it can be asked: that looks at no folder on the way."""
     try:
         number = os.open(path, os.O_PATH | os.O_CLOEXEC)
     except (OSError, AttributeError):  # not there, or another system
@@ -265,61 +244,80 @@ def real_path(path: Path) -> str:
 
 
 def is_below(path: str, root: str) -> bool:
-    """Tell of two real paths whether the first is the second or stands below it."""
+    """Return whether one real path is another or is below it."""
     return path == root or path.startswith(root.rstrip(os.sep) + os.sep)
 
 
-def _blobs(root: Path) -> list[str]:
-    """Return the folder of blobs of a tree in the hub client's cache: `<repository>/snapshots/<revision>/...` links to
-    `<repository>/blobs`.
+def inside(root: Path, name: str, *, beside: bool = False) -> Path:
+    """Join a name from a file to a root; InputError where it leads out, by its parts or by a link.
+
+    Args:
+        beside: A link may lead into the parent directory of the root.
     """
-    snapshots = next((folder for folder in root.parents if folder.name == "snapshots"), None)
-    if snapshots is None:
-        return []
-    blobs = snapshots.parent / "blobs"
-    return [str(blobs)] if blobs.is_dir() else []
+    plain = _plain_name(root, name)
+    check_stays_below(root / plain, root, beside=beside)
+    return root / plain
 
 
-DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EIO})
-NO_SUCH_PLACE = frozenset({errno.ENOENT, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP})
+def _plain_name(root: Path, name: str) -> str:
+    """Return a name without detours, which may still lead out by a link."""
+    plain = os.path.normpath(name)
+    if "\0" in name or max(len(part.encode("utf-8", "surrogatepass")) for part in plain.split(os.sep)) > LONGEST_NAME:
+        expected = f"parts of at most {LONGEST_NAME} bytes"
+        raise InputError("not a name of a file", where=root, got=name, expected=expected)
+    if os.path.isabs(plain) or plain.split(os.sep)[0] == os.pardir:
+        raise InputError("a name leads out of its folder", where=root, got=name, expected="a path inside the folder")
+    return plain
 
 
-# --- bytes and JSON ---------------------------------------------------------------------------------------------------
+def refuse_link(path: Path) -> None:
+    """Refuse to write to a link, which may lead anywhere."""
+    if path.is_symlink():
+        raise StorageError(
+            "this path is a link, and cosfly does not write through links",
+            where=path, got=f"a link to {os.readlink(path)}",
+            fix="remove it, or put what it leads to in its place; the folder that --out names may itself be a link",
+        )  # fmt: skip
+
+
+def refuse_links(folder: Path) -> None:
+    """Refuse to write into a folder that contains a link at any depth; the folder itself may be one."""
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.is_symlink():
+                refuse_link(Path(entry.path))
+            elif entry.is_dir():
+                refuse_links(Path(entry.path))
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
 def storage_errors(path: Path) -> Iterator[None]:
-    """Turn a full, read-only or otherwise unusable disk into a StorageError that names the file."""
+    """Convert the error of a full, read-only or otherwise unusable disk into a StorageError that names the file."""
     try:
         yield
     except OSError as error:
+        name = os.fsdecode(error.filename) if error.filename is not None else None
+        is_about_path = name is not None and path.absolute().is_relative_to(Path(name).absolute())
         if error.errno in DISK_FULL:
             fix = "free some space or choose another --out, then run the same command again: finished work is kept"
-        elif error.errno in NOT_WRITABLE or (error.errno in NO_SUCH_PLACE and _concerns(error, path)):
-            fix = "choose another --out, or mend the folder and run the same command again: finished work is kept"
+        elif error.errno in NOT_WRITABLE or (error.errno in NO_SUCH_PLACE and is_about_path):
+            fix = "choose another --out, or fix the folder and run the same command again: finished work is kept"
         else:
             raise
         raise StorageError("cannot write", where=path, got=error.strerror, fix=fix) from error
 
 
-def _concerns(error: OSError, path: Path) -> bool:
-    """Return whether an error is about the file that is being written or a folder above it, not about something
-    read."""
-    return error.filename is not None and path.absolute().is_relative_to(Path(os.fsdecode(error.filename)).absolute())
-
-
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[IO[bytes]]:
-    """Fill a file under a temporary name; rename it when the block ends, so that a kill leaves either the old file or
-    the new."""
+    """Open a file under a temporary name that is renamed at the end: a kill leaves either the old file or the new."""
     refuse_link(path)
-    if path.is_dir():  # asked first: `.` and `/` have no name to put a temporary one beside
+    if path.is_dir():
         raise StorageError("cannot write a file where a folder is", where=path, fix="name a file in it")
-    partial = _partial(path)
     with storage_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        remove_left(path)
+        partial = _new_partial(path)
         try:
             with open(partial, "xb") as file:
                 yield file
@@ -331,20 +329,33 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
             raise
 
 
-def _partial(path: Path) -> Path:
-    """Return the temporary name of a file or folder; `remove_partials` knows it."""
-    return path.with_name(f".{path.name}.{os.getpid()}.partial")
+@contextlib.contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """Make a folder under a temporary name that is renamed when the block ends without an error."""
+    refuse_link(path)
+    with storage_errors(path):
+        partial = _new_partial(path)
+        partial.mkdir()
+        try:
+            yield partial
+        except BaseException:
+            shutil.rmtree(partial, ignore_errors=True)
+            raise
+        if path.exists():
+            shutil.rmtree(path)
+        os.replace(partial, path)
 
 
-def remove_left(path: Path) -> None:
-    """Remove what kills left under the temporary names of a file or folder: names of processes that are gone, and of
-    this one."""
+def _new_partial(path: Path) -> Path:
+    """Return the temporary name of a file or folder, once what killed processes left under such names is removed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     begin = f".{path.name}."
     for name in os.listdir(path.parent):
         if name.startswith(begin) and name.endswith(".partial"):
             owner = name.removeprefix(begin).removesuffix(".partial")
             if owner.isdecimal() and not _is_another(int(owner)):
                 _remove(path.with_name(name))
+    return path.with_name(f"{begin}{os.getpid()}.partial")
 
 
 def _is_another(pid: int) -> bool:
@@ -370,43 +381,8 @@ def is_partial_of(name: str, path: Path) -> bool:
     return fnmatch(path.name, f".{name}.*.partial")
 
 
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file under a temporary name, then rename it."""
-    with atomic_file(path) as file:
-        file.write(data)
-
-
-def sha256_bytes(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
-
-
-# --- folders of many files --------------------------------------------------------------------------------------------
-
-
-def refuse_link(path: Path) -> None:
-    """Refuse to write to a link, which may lead anywhere."""
-    if path.is_symlink():
-        raise StorageError(
-            "a link stands where files are written, and writing follows none",
-            where=path,
-            got=f"a link to {os.readlink(path)}",
-            fix="remove it, or put what it leads to in its place; the folder that --out names may itself be a link",
-        )
-
-
-def refuse_links(folder: Path) -> None:
-    """Refuse to write into a folder in which a link stands, at any depth; the folder itself may be one."""
-    with os.scandir(folder) as entries:
-        for entry in entries:
-            if entry.is_symlink():
-                refuse_link(Path(entry.path))
-            elif entry.is_dir():
-                refuse_links(Path(entry.path))
-
-
 def remove_partials(folder: Path) -> None:
-    """Remove what a kill left under temporary names. A folder with checksums appeared whole, so what is below it is not
-    looked at: a flight has a folder for each frame."""
+    """Remove files and folders with temporary names; a folder with checksums appeared whole and is not searched."""
     for place, folders, files in os.walk(folder):
         partials = {name for name in (*folders, *files) if name.startswith(".") and name.endswith(".partial")}
         for name in partials:
@@ -414,36 +390,10 @@ def remove_partials(folder: Path) -> None:
         folders[:] = [] if CHECKSUMS in files else [name for name in folders if name not in partials]
 
 
-LONGEST_NAME = 255  # bytes of one part of a path, on every common file system
-
-
-def inside(root: Path, name: str, *, beside: bool = False) -> Path:
-    """Join a name from a file to a root.
-
-    Args:
-        beside: a link may lead into the folder that the root stands in.
-
-    Raises:
-        InputError: the name leads out of the root, or a link that stands there does; or no file can have it.
-    """
-    plain = _plain_name(root, name)
-    check_stays_below(root / plain, root, beside=beside)
-    return root / plain
-
-
-def _plain_name(root: Path, name: str) -> str:
-    """Return a name without detours; raises as `inside`, but looks at no link."""
-    plain = os.path.normpath(name)
-    if "\0" in name or max(len(part.encode("utf-8", "surrogatepass")) for part in plain.split(os.sep)) > LONGEST_NAME:
-        raise InputError(
-            "not a name of a file", where=root, got=name, expected=f"parts of at most {LONGEST_NAME} bytes"
-        )
-    if os.path.isabs(plain) or plain.split(os.sep)[0] == os.pardir:
-        raise InputError("a name leads out of its folder", where=root, got=name, expected="a path inside the folder")
-    return plain
-
-
-CHECKSUMS = "checksums.sha256"
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file under a temporary name, then rename it."""
+    with atomic_file(path) as file:
+        file.write(data)
 
 
 def write_checksums(folder: Path, digests: dict[str, str]) -> None:
@@ -457,49 +407,20 @@ def checksum_lines(digests: Mapping[str, str]) -> str:
 
 
 def read_checksums(folder: Path) -> dict[str, str]:
-    """Read `checksums.sha256`: relative name -> hex digest.
-
-    Raises:
-        InputError: it is missing or broken, or a name leads out of the folder.
-    """
+    """Read `checksums.sha256`: relative name -> hex digest; InputError where a name leads out of the folder."""
     path = folder / CHECKSUMS
     digests: dict[str, str] = {}
-    plain_folders, root = {""}, f"{folder}{os.sep}"
+    root, checked = f"{folder}{os.sep}", {""}  # each folder once: a flight has thousands of files
     for number, line in enumerate(read_text(path, what="checksums", tree=folder).splitlines(), 1):
         digest, _, name = line.partition("  ")
         if len(digest) != 64 or not name:
             raise InputError("a broken checksum line", where=f"{path}:{number}", got=line[:80])
         plain = _plain_name(folder, name)
-        if not _is_plain_folder(root, os.path.dirname(plain), plain_folders) or os.path.islink(root + plain):
+        above = os.path.dirname(plain)
+        if above not in checked:
+            check_stays_below(folder / above, folder)
+            checked.add(above)
+        if os.path.islink(root + plain):
             check_stays_below(folder / plain, folder)
         digests[plain] = digest
     return digests
-
-
-def _is_plain_folder(root: str, name: str, known: set[str]) -> bool:
-    """Return whether no part of a folder's name is a link; `known` are those of which that is known, each looked at
-    once."""
-    if name not in known:
-        if not _is_plain_folder(root, os.path.dirname(name), known) or os.path.islink(root + name):
-            return False
-        known.add(name)
-    return True
-
-
-@contextlib.contextmanager
-def atomic_folder(path: Path) -> Iterator[Path]:
-    """Fill a folder under a temporary name; rename it when the block ends without an error."""
-    partial = _partial(path)
-    refuse_link(path)
-    with storage_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        remove_left(path)
-        partial.mkdir()
-        try:
-            yield partial
-        except BaseException:
-            shutil.rmtree(partial, ignore_errors=True)
-            raise
-        if path.exists():
-            shutil.rmtree(path)
-        os.replace(partial, path)

@@ -1,4 +1,4 @@
-"""Append-only journals whose lines carry their own checksums: what a kill cannot half write."""
+"""Append-only journals whose lines carry their own checksums, so that a line cut short by a kill is recognized."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ T = TypeVar("T")
 class Journal:
     """An append-only JSON-lines file whose every line carries its own checksum.
 
-    A line is on the disk before `append` returns, or with `sync=False` in the hands of the system, which a kill of this
-    process does not reach; `sync` then waits for the disk. A line that a kill cut short, or that was damaged, is
-    skipped by `read` and counted in `num_damaged`; what stood in it is done again. `is_cut_short`: the last of these
-    has no end, as a kill leaves it. `line_num`, `line_byte`: number and first byte of the line that was read last.
+    A line is on the disk before `append` returns, or with `sync=False` held by the system, which survives a kill of
+    this process; `sync` then waits for the disk. A line that a kill cut short, or that was damaged, is skipped by
+    `read` and counted in `num_damaged`; its item is done again. `is_cut_short`: the last of these has no end, as after
+    a kill. `line_num`, `line_byte`: number and first byte of the line that was read last.
     """
 
     def __init__(self, path: Path) -> None:
@@ -36,7 +36,7 @@ class Journal:
         self._lock = threading.Lock()
 
     def read(self) -> Iterator[dict]:
-        """Yield the records in order, damaged lines left out."""
+        """Yield the records in order; damaged lines are skipped."""
         self.num_damaged, self.is_cut_short = 0, False
         if not self.path.exists():
             return
@@ -51,23 +51,20 @@ class Journal:
                 yield record
 
     def read_as(self, read_record: Callable[[dict], T]) -> Iterator[T]:
-        """Yield what `read_record` makes of the records."""
+        """Yield `read_record` of each record; its ValidationError becomes an InputError that names the line."""
         for record in self.read():
             try:
                 found = read_record(record)
             except ValidationError as error:
-                raise self._unusable(error) from None
+                detail = error.errors(include_url=False, include_input=False)[0]
+                field = ".".join(str(part)[:40] for part in detail["loc"]) or "top level"
+                where, got = f"{self.path}:{self.line_num}", f"{field}: {plain(detail['msg'])[:200]}"
+                fix = "delete this line from the file and run the same command: the item of the line is done again"
+                raise InputError("a line that cannot be used", where=where, got=got, fix=fix) from None
             yield found
 
-    def _unusable(self, error: ValidationError) -> InputError:
-        detail = error.errors(include_url=False, include_input=False)[0]
-        field = ".".join(str(part)[:40] for part in detail["loc"]) or "top level"
-        where, got = f"{self.path}:{self.line_num}", f"{field}: {plain(detail['msg'])[:200]}"
-        fix = "delete this line from the file and run the same command: the item of the line is done again"
-        return InputError("a line that cannot be used", where=where, got=got, fix=fix)
-
     def read_at(self, line_bytes: Iterable[int]) -> Iterator[dict]:
-        """Yield the records of the lines that begin at these bytes; InputError where one is there no more."""
+        """Yield the records of the lines that begin at these bytes; InputError where one is not there any more."""
         if not self.path.exists():
             return
         with open_file(self.path, what="journal") as file:
@@ -76,12 +73,12 @@ class Journal:
                     file.seek(line_byte)
                     record = _record_of(file.readline())
                 if record is None:
-                    fix = "run the same command again: what stood in it is done again"
+                    fix = "run the same command again: the item of the line is done again"
                     raise InputError("a line was damaged meanwhile", where=f"{self.path}: byte {line_byte}", fix=fix)
                 yield record
 
     def append(self, record: dict, *, sync: bool = True) -> int:
-        """Add a record and, unless told otherwise, wait until it is on the disk; gives the byte where it begins."""
+        """Add a record, wait until it is on the disk if `sync`, and return the byte at which it begins."""
         body = dump_json(record).encode()
         line = sha256_bytes(body)[:16].encode() + b" " + body + b"\n"
         with self._lock, storage_errors(self.path):
@@ -105,7 +102,7 @@ class Journal:
     def close(self) -> None:
         if self._file is not None:
             file, self._file = self._file, None
-            with contextlib.suppress(OSError):  # a line that did not fit stays in the buffer; `append` has told of it
+            with contextlib.suppress(OSError):  # a line that did not fit is still in the buffer; `append` raised
                 file.close()
 
     def __enter__(self) -> Journal:
@@ -116,11 +113,11 @@ class Journal:
 
 
 def _record_of(line: bytes) -> dict | None:
-    """Read a line; None where it was cut short or damaged."""
+    """Return the record of a line; None where it was cut short or damaged."""
+    digest, _, body = line.removesuffix(b"\n").partition(b" ")
+    if not line.endswith(b"\n") or digest != sha256_bytes(body)[:16].encode():
+        return None
     try:
-        digest, body = line.rstrip(b"\n").split(b" ", 1)
-        if not line.endswith(b"\n") or digest.decode("ascii") != sha256_bytes(body)[:16]:
-            return None
         record = parse_json(body)
     except ValueError:
         return None
@@ -128,7 +125,7 @@ def _record_of(line: bytes) -> dict | None:
 
 
 def _cut_torn_line(path: Path) -> None:
-    """Take off the line that a kill cut short, which must not come back to life when more is written."""
+    """Remove a line that a kill cut short, which would become valid when more is written."""
     if not path.exists() or not path.stat().st_size:  # nothing can be mapped of an empty file
         return
     with open(path, "r+b") as file:

@@ -1,13 +1,19 @@
-"""Worker processes that are watched: one that dies, stalls or takes for ever is replaced, and its item tried again.
+"""Items to work: a pool of watched processes with resume, progress, a tally that adds up and a record per failure.
 
-All that can block on a worker (sending it an item, reading from it) happens in a thread of its own, so that nothing a
-worker does or leaves undone holds up the stage. Where a process runs and how it is reached is its `Transport`:
-here one of this machine, at the other end of a pipe (`worker`); in `ray_engine` one on a node of a cluster.
+`run_items` is the whole interface. A stage gives it items (an id and a payload that pickles) and `make_worker`, a
+module-level function that is called once in each worker process with `worker_args` and returns the function that does
+one item. Load maps and open GL contexts in it. A worker that dies, stalls or takes too long is replaced, and its item
+is tried again.
+
+Everything that can block on a worker (sending it an item, reading from it) happens in a thread of its own, so no worker
+can hold up the stage. Where a process runs and how it is reached is its `Transport`: here one of this machine, at the
+other end of a pipe (`worker`); in `ray_engine` one on a node of a cluster.
 """
 
 from __future__ import annotations
 
 import atexit
+import contextlib
 import logging
 import math
 import multiprocessing
@@ -17,15 +23,22 @@ import statistics
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from multiprocessing import resource_tracker
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
+import numpy as np
+
+from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import CosflyError, EnvironmentMissing
 from cosfly.runtime.events import LOSSES, EventLog, Loss, Vitals
-from cosfly.runtime.run_dir import Failed, ItemRecord
+from cosfly.runtime.io import remove_partials
+from cosfly.runtime.journal import Journal
+from cosfly.runtime.ray_engine import ALL_ROOM, Cluster, RayConfig
+from cosfly.runtime.run_dir import Dropped, Failed, ItemRecord, Kept, StageFolder, Tally, read_item, write_failures
 from cosfly.runtime.worker import (
     Abort,
     Item,
@@ -34,43 +47,26 @@ from cosfly.runtime.worker import (
     Start,
     Work,
     WorkerOptions,
+    attempt,
+    counted_steps,
     signals_held_back,
     work_through,
 )
 
-if TYPE_CHECKING:
-    from cosfly.runtime.ray_engine import RayConfig
-
-
-import contextlib
-from collections.abc import Generator, Iterable
-from functools import partial
-
-import numpy as np
-
-from cosfly.runtime.console import progress_bar
-from cosfly.runtime.io import remove_partials
-from cosfly.runtime.journal import Journal
-from cosfly.runtime.ray_engine import ALL_ROOM, Cluster
-from cosfly.runtime.run_dir import Dropped, Kept, StageFolder, Tally, read_item, write_failures
-from cosfly.runtime.worker import attempt, counted_steps
-
 log = logging.getLogger(__name__)
 
 LEAST_LIMIT_S, TYPICAL_ITEMS = 600.0, 20.0  # of the default limit: at least so long, and so many times what items take
-ITEMS_REMEMBERED = 1000  # for what items take
+ITEMS_REMEMBERED = 1000  # to know what items take
 PATIENCE_S = 5.0  # for a worker that has no more to do to end by itself
 
 
 @dataclass(frozen=True)
 class Watch:
-    """Where workers work, when one counts as stalled, and what is done then; the times are those of the paper
-    (sec:dataset_watchdog).
+    """The place of the workers, and when one counts as stalled; with the times of the paper (sec:dataset_watchdog).
 
-    ray: the cluster; None: this machine.
-    item_limit_s: how long an item may go without getting on (no step of it is told of); 0: for ever; None: ten minutes
-    or 20 times what items take, whichever is more, and with each new attempt twice as long, as for the start of a
-    worker.
+    ray: The cluster; None: this machine.
+    item_limit_s: The time for which an item may report no step; 0: unlimited; None: ten minutes or 20 times what items
+    take, whichever is more. It doubles with each attempt, as it does for the start of a worker.
     """
 
     ray: RayConfig | None = None
@@ -83,343 +79,16 @@ class Watch:
     restarts: int = 20  # of workers, beyond one for each item that was done: after that the machine is not fit
 
 
-def limit_s(watch: Watch, seconds: Collection[float], attempt: int, has_begun: bool) -> float:
-    """Return how long an item may go without getting on.
-
-    Args:
-        seconds: what items took that are done.
-        attempt: 0 for the first.
-        has_begun: False while the worker still reads maps and compiles, which a limit that somebody set was not meant
-            for.
-    """
-    if watch.item_limit_s == 0:
-        return math.inf
-    if watch.item_limit_s is not None and has_begun:
-        return watch.item_limit_s
-    typical_s = statistics.median(seconds) if seconds else 0.0
-    return max(LEAST_LIMIT_S, TYPICAL_ITEMS * typical_s, watch.item_limit_s or 0.0) * 2**attempt
-
-
-class Transport(Protocol):
-    """A worker's process, wherever it is: `work_through` at the other end.
-
-    pid: None until it has started. node: its machine's name, of a cluster's.
-    """
-
-    pid: int | None
-    node: str | None
-
-    def send(self, what: Start | Item | None) -> None:
-        """Return it its Start, then items one by one, at last None; may wait for as long as it likes."""
-
-    def receive(self) -> Message:
-        """Wait for what it says next. Raises EOFError or OSError when it is gone."""
-
-    def look(self) -> Vitals | None:
-        """Return what its system says of it, at once; None: it is gone."""
-
-    def kill(self, patience_s: float) -> None:
-        """End it: by itself, if it has been given None and can within the time. It is gone, or out of reach, then."""
-
-
-StartTransport = Callable[[WorkerOptions], Transport]
-
-
-class LocalTransport:
-    """A process of this machine, which it starts."""
-
-    node: str | None = None
-
-    def __init__(self, worker_options: WorkerOptions) -> None:
-        context = multiprocessing.get_context("spawn")  # fork would copy GL and thread-pool state
-        self.connection, there = context.Pipe()
-        self._process = context.Process(target=work_through, args=(there, worker_options), daemon=True)
-        resource_tracker.ensure_running()  # the first worker would start this, and with it end the holding back
-        with signals_held_back():
-            self._process.start()
-        there.close()
-        # A second Ctrl-C may break off what ends it, and the SIGTERM that Python sends at the end it does not heed.
-        atexit.register(self._process.kill)
-        self.pid: int | None = self._process.pid
-
-    def send(self, what: Start | Item | None) -> None:
-        self.connection.send(what)
-
-    def receive(self) -> Message:
-        return self.connection.recv()
-
-    def look(self) -> Vitals | None:
-        return Vitals.of(self._process.pid or 0) if self._process.is_alive() else None
-
-    def kill(self, patience_s: float) -> None:
-        if patience_s:
-            self._process.join(patience_s)
-        self._process.kill()
-        self._process.join()
-        atexit.unregister(self._process.kill)
-
-
-@dataclass(frozen=True)
-class _Attempt:
-    item_index: int  # among all items
-    item: Item
-    number: int = 0
-
-
-@dataclass(eq=False)
-class _Worker:
-    """One process, and what is known of it."""
-
-    place: int
-    post: Transport
-    inbox: queue.SimpleQueue[Item | None] = field(default_factory=queue.SimpleQueue)
-    is_known: bool = False  # to the log of events
-    attempt: _Attempt | None = None
-    num_steps: int = 0
-    has_begun: bool = False  # the item; before that, a new worker reads maps and compiles
-    begun_s: float = 0.0
-    has_told: bool = False  # since the last check
-    cpu_s: float = 0.0  # at the last check
-    failed_checks: int = 0
-    quiet_s: float = 0.0  # since the item got on
-
-    def give(self, attempt: _Attempt) -> None:
-        self.attempt, self.num_steps, self.has_begun = attempt, 0, False
-        self.has_told, self.failed_checks, self.quiet_s = True, 0, 0.0
-        self.inbox.put(attempt.item)
-
-
-@dataclass
-class WorkerPool:
-    """Does items in `num_workers` processes. on_steps(item, n) hears how many steps of an item in hand are done."""
-
-    make_worker: Callable[..., Work]
-    worker_args: tuple
-    num_workers: int
-    watch: Watch
-    events: EventLog
-    on_steps: Callable[[Item, int], None]
-    start_transport: StartTransport = LocalTransport
-    num_lost: int = 0
-    _num_done: int = 0
-    _seconds: deque[float] = field(default_factory=lambda: deque(maxlen=ITEMS_REMEMBERED))
-    _fresh: Iterator[tuple[int, Item]] = field(default_factory=lambda: iter(()))  # with their indices
-    _num_fresh: int = 0
-    _again: deque[_Attempt] = field(default_factory=deque)
-    _alone: deque[_Attempt] = field(default_factory=deque)  # last attempts
-    _workers: dict[int, _Worker] = field(default_factory=dict)
-    _lost: set[int] = field(default_factory=set)  # places that wait for a new worker
-    _messages: queue.SimpleQueue[tuple[_Worker, Message | None]] = field(default_factory=queue.SimpleQueue)
-
-    def outcomes(self, items: Sequence[Item]) -> Iterator[tuple[int, ItemRecord]]:
-        """Yield the index of each item, and its record, as it is done.
-
-        Raises:
-            CosflyError: a fatal one of a worker; or EnvironmentMissing: workers die or stall all the time.
-        """
-        self.events.tell("began", workers=self.num_workers)
-        self._fresh, self._num_fresh = enumerate(items), len(items)
-        next_check_s, next_probe_s = time.monotonic() + self.watch.check_s, time.monotonic()
-        try:
-            while self._num_fresh or self._again or self._alone or self._busy():
-                self._hand_out()
-                for worker, message in self._told(min(next_check_s, next_probe_s)):
-                    yield from self._hear(worker, message)
-                if (now_s := time.monotonic()) >= next_probe_s:
-                    next_probe_s = now_s + self.watch.probe_s
-                    self.events.probe(
-                        {w.place: seen for w in self._workers.values() if w.post.pid and (seen := w.post.look())}
-                    )
-                if now_s >= next_check_s:
-                    next_check_s = now_s + self.watch.check_s
-                    yield from self._check()
-        except BaseException:
-            self._end(patience_s=0.0)
-            raise
-        self._end(patience_s=PATIENCE_S)
-        self.events.tell("ended")
-
-    # --- giving work --------------------------------------------------------------------------------------------------
-
-    def _busy(self) -> list[_Worker]:
-        return [worker for worker in self._workers.values() if worker.attempt is not None]
-
-    def _hand_out(self) -> None:
-        """Return every free worker an item, and start those that are missing."""
-        for place in range(self.num_workers):
-            worker = self._workers.get(place) or (self._start(place) if self._is_short() else None)
-            if worker is None or worker.attempt is not None or worker.post.pid is None:
-                continue
-            if not worker.is_known:
-                worker.is_known = True
-                self.events.tell("restarted" if place in self._lost else "worker_started", **self._about(worker))
-                self._lost.discard(place)
-            if (attempt := self._next_attempt(place)) is not None:
-                worker.give(attempt)
-
-    def _is_short(self) -> bool:
-        """Return whether there is more to do now than workers without an item, those that still start among them."""
-        num_idle = len(self._workers) - len(self._busy())
-        return num_idle < (self._num_fresh + len(self._again) or int(bool(self._alone) and not self._busy()))
-
-    def _next_attempt(self, place: int) -> _Attempt | None:
-        """Take what is to be done next, at a place. A last attempt is made alone: there may not be the memory for
-        two."""
-        if self._num_fresh:
-            self._num_fresh -= 1
-            return _Attempt(*next(self._fresh))
-        if self._again:
-            return self._again.popleft()
-        if self._alone and not self._busy():
-            for worker in [worker for worker in self._workers.values() if worker.place != place]:
-                self._stop(worker, PATIENCE_S)
-            return self._alone.popleft()
-        return None
-
-    def _start(self, place: int) -> _Worker:
-        worker_options = WorkerOptions(os.getpid(), self.watch.heartbeat_s, logging.getLogger().level, place)
-        worker = self._workers[place] = _Worker(place, self.start_transport(worker_options))
-        start = Start(self.make_worker, self.worker_args)
-        threading.Thread(target=_attend, args=(worker, start, self._messages), daemon=True).start()
-        return worker
-
-    def _about(self, worker: _Worker) -> dict[str, object]:
-        return {"worker": worker.place, "node": worker.post.node, "pid": worker.post.pid}
-
-    # --- hearing what comes of it -------------------------------------------------------------------------------------
-
-    def _told(self, until_s: float) -> list[tuple[_Worker, Message | None]]:
-        """Wait for a message, at most until then; those of workers that were given up count no more."""
-        try:
-            worker, message = self._messages.get(timeout=max(0.0, until_s - time.monotonic()))
-        except queue.Empty:
-            return []
-        return [(worker, message)] if self._workers.get(worker.place) is worker else []
-
-    def _hear(self, worker: _Worker, message: Message | None) -> Iterator[tuple[int, ItemRecord]]:
-        if message is None:
-            yield from self._lose(worker, "worker_died")
-        elif isinstance(message, Abort):
-            error, node = message.error, worker.post.node
-            if node is not None and isinstance(error, CosflyError):
-                error.where = f"node {node}" if error.where is None else f"node {node}: {error.where}"
-            raise error
-        elif isinstance(message, logging.LogRecord):
-            logging.getLogger(message.name).handle(message)
-        elif isinstance(message, Sign):
-            attempt = worker.attempt
-            if attempt is None or message.item_id != attempt.item.item_id:
-                return
-            if not worker.has_begun:
-                worker.has_begun, worker.begun_s, worker.quiet_s = True, time.monotonic(), 0.0
-            elif message.num_steps != worker.num_steps:
-                worker.num_steps, worker.quiet_s = message.num_steps, 0.0
-                self.on_steps(attempt.item, message.num_steps)
-        elif (attempt := worker.attempt) is not None:
-            seconds = time.monotonic() - worker.begun_s
-            self._seconds.append(seconds)
-            self._num_done += 1
-            worker.attempt = None
-            about = {"status": message.status, "seconds": round(seconds, 3), "steps": worker.num_steps}
-            self.events.tell("item_done", worker=worker.place, item=message.id, **about)
-            yield attempt.item_index, message
-
-    def _check(self) -> Iterator[tuple[int, ItemRecord]]:
-        """Look for workers that neither tell that they live nor compute, and for items that do not get on.
-
-        Time counts here by checks: while this process itself was stopped, nobody could tell us anything.
-        """
-        for worker in self._busy():
-            assert worker.attempt is not None
-            seen = worker.post.look()
-            cpu_s = worker.cpu_s if seen is None else seen.cpu_s
-            lives = worker.has_told or cpu_s != worker.cpu_s
-            worker.failed_checks = 0 if lives else worker.failed_checks + 1
-            worker.has_told, worker.cpu_s = False, cpu_s
-            worker.quiet_s += self.watch.check_s
-            if seen is None:
-                yield from self._lose(worker, "worker_died")
-            elif worker.failed_checks >= self.watch.failed_checks:
-                yield from self._lose(worker, "heartbeat_lost")
-            elif worker.quiet_s > limit_s(self.watch, self._seconds, worker.attempt.number, worker.has_begun):
-                yield from self._lose(worker, "timed_out")
-
-    # --- losing a worker ----------------------------------------------------------------------------------------------
-
-    def _lose(self, worker: _Worker, loss: Loss) -> Iterator[tuple[int, ItemRecord]]:
-        """End a worker that is of no use any more; its item is tried again, or has failed."""
-        self._stop(worker, 0.0)
-        self._lost.add(worker.place)
-        attempt, self.num_lost = worker.attempt, self.num_lost + 1
-        item, about = None if attempt is None else attempt.item, self._about(worker)
-        if item is not None:
-            seconds = round(time.monotonic() - worker.begun_s, 3) if worker.has_begun else 0.0
-            about |= {"item": item.item_id, "seconds": seconds, "steps": worker.num_steps}
-            self.on_steps(item, 0)
-        self.events.tell(loss, **about)
-        if self.num_lost > self.watch.restarts + self._num_done:
-            raise EnvironmentMissing(
-                "workers die or stall all the time",
-                where=None if item is None else item.item_id,
-                got=f"{self.num_lost} lost, {self._num_done} items done; the last: {LOSSES[loss]}",
-                fix="see events.jsonl; free some memory, use fewer --workers or raise item_limit_s, then run the same "
-                "command again: finished items are kept",
-            )
-        if attempt is None or item is None:  # it had nothing in hand
-            return
-        if attempt.number < self.watch.retries:
-            log.warning("%s: %s; it is tried again", item.item_id, LOSSES[loss])
-            is_last = attempt.number + 1 == self.watch.retries
-            (self._alone if is_last else self._again).append(replace(attempt, number=attempt.number + 1))
-            self.events.tell("retried", item=item.item_id, attempt=attempt.number + 1)
-            return
-        self.events.tell("given_up", item=item.item_id)
-        code = "worker_died" if loss == "worker_died" else "timed_out"
-        message = f"{item.item_id}: {LOSSES[loss]}, {attempt.number + 1} times"
-        yield attempt.item_index, Failed(id=item.item_id, code=code, message=message)
-
-    def _stop(self, worker: _Worker, patience_s: float) -> None:
-        """End a worker: by itself, if it can within the time given."""
-        del self._workers[worker.place]
-        worker.inbox.put(None)
-        worker.post.kill(patience_s)
-
-    def _end(self, patience_s: float) -> None:
-        if workers := list(self._workers.values()):
-            with ThreadPoolExecutor(len(workers)) as at_once:
-                list(at_once.map(lambda worker: self._stop(worker, patience_s), workers))
-
-
-def _attend(worker: _Worker, start: Start, messages: queue.SimpleQueue) -> None:
-    """Carry items to a worker and what it says to the pool, until either wants no more; None in `messages`: it is
-    gone."""
-    post = worker.post
-    try:
-        post.send(start)
-        messages.put((worker, Sign(None, 0)))  # it may be given an item
-        while (item := worker.inbox.get()) is not None:
-            post.send(item)
-            while True:
-                message = post.receive()
-                worker.has_told = True
-                messages.put((worker, message))
-                if isinstance(message, Abort | ItemRecord):
-                    break
-        post.send(None)
-    except (EOFError, OSError):
-        messages.put((worker, None))
-    except Exception as error:  # an item that does not pickle, a message that does not unpickle
-        messages.put((worker, Abort(error)))
+# --- the interface ----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class ItemOutcomes:
-    """What became of all items of a stage. The records stay on the disk: each look through them, in the order of the
-    items, reads them again, one at a time."""
+    """The outcomes of all items of a stage. The records stay on the disk and are read again by each iteration."""
 
     tally: Tally
     _journal: Journal
-    _line_bytes: np.ndarray  # (n,) int64, by item: where its record begins
+    _line_bytes: np.ndarray  # (n,) int64, by item: the first byte of its record
 
     @property
     def records(self) -> Iterator[ItemRecord]:
@@ -443,15 +112,16 @@ def run_items(
     """Do all items that the stage's journal does not hold yet.
 
     An item whose work raises is recorded as failed and counted; a fatal CosflyError (full disk, no GL) stops the stage,
-    and what was finished stays. A worker that dies (out of memory, kill) or stalls costs only its item, which gets two
+    and finished items stay. A worker that dies (out of memory, kill) or stalls costs only its item, which gets two
     more tries, the last one alone. An item that stalls again has failed; if one's worker dies again, the others are
     finished first and the stage then stops, unfinished. On a later run kept and dropped items are taken from the
     journal and failed ones are tried again.
 
     Args:
-        make_worker: module-level function; `make_worker(*worker_args)` returns the work function, once in each process.
-        workers: processes; 0 works in this process, where nothing can end an item that hangs.
-        watch: where workers work, and when one counts as stalled.
+        make_worker: Module-level function; `make_worker(*worker_args)` returns the work function, once per process.
+        workers: Processes; 0 works in this process, where nothing can end an item that hangs.
+        watch: The place of the workers, and when one counts as stalled.
+
     Returns:
         Records and tally, in the order of `items` whatever the order of work.
     """
@@ -462,19 +132,19 @@ def run_items(
         log.info("%s: %d of %d items were finished before", stage.stage, num_finished, len(items))
     progress = _Progress(items, todo)
     if workers and todo:
-        outcomes = _in_processes(stage, todo, (make_worker, worker_args), workers, watch, progress)
+        outcomes = _in_processes(stage, todo, Start(make_worker, worker_args), workers, watch, progress)
     else:
-        outcomes = _in_this_process(todo, (make_worker, worker_args), progress.move)
-    # Closed at once, also while an error is on its way: no worker goes on behind it.
+        outcomes = _in_this_process(todo, Start(make_worker, worker_args), progress.move)
+    # Closed at once, also while an error is on its way: no worker outlives the call.
     with stage.journal as journal, progress.shown(label or stage.stage), contextlib.closing(outcomes):
         for todo_index, record in outcomes:
             line_bytes[indices[todo_index]] = journal.append(record.model_dump())
-            _tell(stage.stage, record)
+            _log(stage.stage, record)
             progress.finish(todo[todo_index])
     finished = ItemOutcomes(tally := Tally(input=len(items)), stage.journal, line_bytes)
     write_failures(stage.path / "failures.jsonl", _counted(finished.records, tally))
     if "worker_died" in tally.failed:
-        # That is the machine's doing, not the item's: it must not become a result. The stage stays open.
+        # The cause is the machine, not the item: it must not become a result. The stage stays open.
         raise EnvironmentMissing(
             "worker processes were killed, three times for the same item",
             where=stage.path,
@@ -485,8 +155,7 @@ def run_items(
 
 
 def _finished_before(stage: StageFolder, items: Sequence[Item]) -> np.ndarray:
-    """Return of each item the byte from which the journal tells that it is finished, (n,) int64; -1 where it does
-    not."""
+    """Return the byte of each item's record in the journal, (n,) int64; -1 where it is not finished."""
     indices = {item.item_id: index for index, item in enumerate(items)}
     assert len(indices) == len(items), "item ids must be unique"
     line_bytes, journal = np.full(len(items), -1), stage.journal
@@ -496,7 +165,7 @@ def _finished_before(stage: StageFolder, items: Sequence[Item]) -> np.ndarray:
     return line_bytes
 
 
-def _tell(stage: str, record: ItemRecord) -> None:
+def _log(stage: str, record: ItemRecord) -> None:
     if isinstance(record, Failed):
         named = "" if record.id in record.message else f"{record.id}: "
         log.error("%s: %s%s", stage, named, record.message)
@@ -517,31 +186,26 @@ def _counted(records: Iterable[ItemRecord], tally: Tally) -> Iterator[Failed]:
             yield record
 
 
-_Start = tuple[Callable[..., Work], tuple]  # make_worker, worker_args
-
-
 def _in_this_process(
-    items: Sequence[Item], start: _Start, on_steps: Callable[[Item, int], None]
+    items: Sequence[Item], start: Start, on_steps: Callable[[Item, int], None]
 ) -> Generator[tuple[int, ItemRecord], None, None]:
-    if not items:
-        return
-    make_worker, worker_args = start
-    work = make_worker(*worker_args)
+    work = start.make_worker(*start.worker_args) if items else None
     for index, item in enumerate(items):
+        assert work is not None
         with counted_steps(partial(on_steps, item)):
             record = attempt(work, item)
         yield index, record
 
 
 def _in_processes(
-    stage: StageFolder, items: Sequence[Item], start: _Start, workers: int, watch: Watch, progress: _Progress
+    stage: StageFolder, items: Sequence[Item], start: Start, workers: int, watch: Watch, progress: _Progress
 ) -> Generator[tuple[int, ItemRecord], None, None]:
     start_transport: StartTransport = LocalTransport
     if watch.ray is not None:
         cluster = Cluster(watch.ray, stage.path)
         start_transport, workers = cluster.start_transport, cluster.room if workers == ALL_ROOM else workers
     events = EventLog(stage.path)
-    pool = WorkerPool(*start, min(workers, len(items)), watch, events, progress.move, start_transport)
+    pool = WorkerPool(start, min(workers, len(items)), watch, events, progress.move, start_transport)
     try:
         yield from pool.outcomes(items)
     except CosflyError:
@@ -550,17 +214,17 @@ def _in_processes(
     finally:
         events.close()
     if pool.num_lost:
-        remove_partials(stage.path)  # what the lost workers had in hand
+        remove_partials(stage.path)  # of the lost workers
 
 
 class _Progress:
-    """How far a stage is: in steps, as frames, where every item says how many it has, else in items."""
+    """The progress of a stage: in steps, as frames, where every item has a number of them, else in items."""
 
     def __init__(self, items: Sequence[Item], todo: Sequence[Item]) -> None:
         self._in_steps = all(item.num_steps for item in items)
         self._total = sum(map(self._size, items))
         self._done = self._total - sum(map(self._size, todo))
-        self._in_hand: dict[str, int] = {}  # of `done`, by item
+        self._current: dict[str, int] = {}  # of `done`, by item
         self._advance: Callable[[int], None] = lambda count: None
 
     def _size(self, item: Item) -> int:
@@ -572,15 +236,345 @@ class _Progress:
             yield
 
     def move(self, item: Item, num_steps: int) -> None:
-        """Note how many steps of an item are done; fewer than before where it is begun again."""
+        """Set the number of steps done of an item; fewer than before where it is started again."""
         if self._in_steps:
             self._set(item, min(num_steps, self._size(item)))
 
     def finish(self, item: Item) -> None:
         self._set(item, self._size(item))
-        del self._in_hand[item.item_id]
+        del self._current[item.item_id]
 
     def _set(self, item: Item, count: int) -> None:
-        gained = count - self._in_hand.get(item.item_id, 0)
-        self._in_hand[item.item_id] = count
+        gained = count - self._current.get(item.item_id, 0)
+        self._current[item.item_id] = count
         self._advance(gained)
+
+
+# --- how a process is reached -----------------------------------------------------------------------------------------
+
+
+class Transport(Protocol):
+    """A worker's process, wherever it is, which runs `work_through`.
+
+    pid: None until it has started. node: The name of its machine in a cluster.
+    """
+
+    pid: int | None
+    node: str | None
+
+    def send(self, what: Start | Item | None) -> None:
+        """Send it its Start, then items one by one, at last None; may block."""
+
+    def receive(self) -> Message:
+        """Return its next message; EOFError or OSError when it is gone."""
+
+    def look(self) -> Vitals | None:
+        """Return its vitals without blocking; None: it is gone."""
+
+    def kill(self, patience_s: float) -> None:
+        """End it, at once or after the time in which it may end by itself; it is gone or out of reach then."""
+
+
+StartTransport = Callable[[WorkerOptions], Transport]
+
+
+class LocalTransport:
+    """A process of this machine, which it starts."""
+
+    node: str | None = None
+
+    def __init__(self, worker_options: WorkerOptions) -> None:
+        context = multiprocessing.get_context("spawn")  # fork would copy GL and thread-pool state
+        self.connection, there = context.Pipe()
+        self._process = context.Process(target=work_through, args=(there, worker_options), daemon=True)
+        resource_tracker.ensure_running()  # else the first worker starts it, and with it ends the holding back
+        with signals_held_back():
+            self._process.start()
+        there.close()
+        # A second Ctrl-C may interrupt the code that ends it, and it ignores the SIGTERM that Python sends at the end.
+        atexit.register(self._process.kill)
+        self.pid: int | None = self._process.pid
+
+    def send(self, what: Start | Item | None) -> None:
+        self.connection.send(what)
+
+    def receive(self) -> Message:
+        return self.connection.recv()
+
+    def look(self) -> Vitals | None:
+        return Vitals.of(self._process.pid or 0) if self._process.is_alive() else None
+
+    def kill(self, patience_s: float) -> None:
+        if patience_s:
+            self._process.join(patience_s)
+        self._process.kill()
+        self._process.join()
+        atexit.unregister(self._process.kill)
+
+
+# --- the pool ---------------------------------------------------------------------------------------------------------
+
+
+def limit_s(watch: Watch, seconds: Collection[float], attempt: int, has_begun: bool) -> float:
+    """Return how long an item may report no step.
+
+    Args:
+        seconds: The times of finished items.
+        attempt: 0 for the first.
+        has_begun: False while the worker still reads maps and compiles, for which a limit that somebody set was not
+            meant.
+    """
+    if watch.item_limit_s == 0:
+        return math.inf
+    if watch.item_limit_s is not None and has_begun:
+        return watch.item_limit_s
+    typical_s = statistics.median(seconds) if seconds else 0.0
+    return max(LEAST_LIMIT_S, TYPICAL_ITEMS * typical_s, watch.item_limit_s or 0.0) * 2**attempt
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    item_index: int  # among all items
+    item: Item
+    number: int = 0
+
+
+@dataclass(eq=False)
+class _Worker:
+    """One process, its current item, and the signs of life since the last check."""
+
+    place: int
+    transport: Transport
+    inbox: queue.SimpleQueue[Item | None] = field(default_factory=queue.SimpleQueue)
+    is_known: bool = False  # to the log of events
+    attempt: _Attempt | None = None
+    num_steps: int = 0
+    has_begun: bool = False  # the item; before that, a new worker reads maps and compiles
+    begun_s: float = 0.0
+    has_reported: bool = False  # since the last check
+    cpu_s: float = 0.0  # at the last check
+    failed_checks: int = 0
+    quiet_s: float = 0.0  # since the item got on
+
+    def assign(self, attempt: _Attempt) -> None:
+        self.attempt, self.num_steps, self.has_begun = attempt, 0, False
+        self.has_reported, self.failed_checks, self.quiet_s = True, 0, 0.0
+        self.inbox.put(attempt.item)
+
+    @property
+    def about(self) -> dict[str, object]:
+        return {"worker": self.place, "node": self.transport.node, "pid": self.transport.pid}
+
+
+@dataclass
+class WorkerPool:
+    """Does items in `num_workers` processes; on_steps(item, n) is called with the steps done of a current item."""
+
+    start: Start
+    num_workers: int
+    watch: Watch
+    events: EventLog
+    on_steps: Callable[[Item, int], None]
+    start_transport: StartTransport = LocalTransport
+    num_lost: int = 0
+    _num_done: int = 0
+    _seconds: deque[float] = field(default_factory=lambda: deque(maxlen=ITEMS_REMEMBERED))
+    _new: Iterator[tuple[int, Item]] = field(default_factory=lambda: iter(()))  # with their indices
+    _num_new: int = 0
+    _again: deque[_Attempt] = field(default_factory=deque)
+    _alone: deque[_Attempt] = field(default_factory=deque)  # last attempts
+    _workers: dict[int, _Worker] = field(default_factory=dict)
+    _lost: set[int] = field(default_factory=set)  # places that wait for a new worker
+    _messages: queue.SimpleQueue[tuple[_Worker, Message | None]] = field(default_factory=queue.SimpleQueue)
+
+    def outcomes(self, items: Sequence[Item]) -> Iterator[tuple[int, ItemRecord]]:
+        """Yield the index and the record of each item as it is done.
+
+        Raises:
+            CosflyError: A fatal one of a worker; or EnvironmentMissing: workers die or stall all the time.
+        """
+        self.events.write("began", workers=self.num_workers)
+        self._new, self._num_new = enumerate(items), len(items)
+        next_check_s, next_probe_s = time.monotonic() + self.watch.check_s, time.monotonic()
+        try:
+            while self._num_new or self._again or self._alone or self._busy():
+                self._hand_out()
+                yield from self._handle_message(min(next_check_s, next_probe_s))
+                if (now_s := time.monotonic()) >= next_probe_s:
+                    next_probe_s = now_s + self.watch.probe_s
+                    self.events.probe(
+                        {
+                            w.place: seen
+                            for w in self._workers.values()
+                            if w.transport.pid and (seen := w.transport.look())
+                        }
+                    )
+                if now_s >= next_check_s:
+                    next_check_s = now_s + self.watch.check_s
+                    yield from self._check()
+        except BaseException:
+            self._end(patience_s=0.0)
+            raise
+        self._end(patience_s=PATIENCE_S)
+        self.events.write("ended")
+
+    def _busy(self) -> list[_Worker]:
+        return [worker for worker in self._workers.values() if worker.attempt is not None]
+
+    def _hand_out(self) -> None:
+        """Give every free worker an item, and start missing workers."""
+        for place in range(self.num_workers):
+            worker = self._workers.get(place) or (self._start(place) if self._is_short() else None)
+            if worker is None or worker.attempt is not None or worker.transport.pid is None:
+                continue
+            if not worker.is_known:
+                worker.is_known = True
+                self.events.write("restarted" if place in self._lost else "worker_started", **worker.about)
+                self._lost.discard(place)
+            if (attempt := self._next_attempt(place)) is not None:
+                worker.assign(attempt)
+
+    def _is_short(self) -> bool:
+        """Return whether there is more to do now than workers without an item, including those that still start."""
+        num_idle = len(self._workers) - len(self._busy())
+        return num_idle < (self._num_new + len(self._again) or int(bool(self._alone) and not self._busy()))
+
+    def _next_attempt(self, place: int) -> _Attempt | None:
+        """Return the next attempt for a place. A last attempt runs alone: there may not be the memory for two."""
+        if self._num_new:
+            self._num_new -= 1
+            return _Attempt(*next(self._new))
+        if self._again:
+            return self._again.popleft()
+        if self._alone and not self._busy():
+            for worker in [worker for worker in self._workers.values() if worker.place != place]:
+                self._stop(worker, PATIENCE_S)
+            return self._alone.popleft()
+        return None
+
+    def _start(self, place: int) -> _Worker:
+        worker_options = WorkerOptions(os.getpid(), self.watch.heartbeat_s, logging.getLogger().level, place)
+        worker = self._workers[place] = _Worker(place, self.start_transport(worker_options))
+        threading.Thread(target=_attend, args=(worker, self.start, self._messages), daemon=True).start()
+        return worker
+
+    def _handle_message(self, until_s: float) -> Iterator[tuple[int, ItemRecord]]:
+        """Wait for a message, at most until a time, and handle it."""
+        try:
+            worker, message = self._messages.get(timeout=max(0.0, until_s - time.monotonic()))
+        except queue.Empty:
+            return
+        if self._workers.get(worker.place) is not worker:  # it was given up
+            return
+        attempt = worker.attempt
+        if message is None:
+            yield from self._lose(worker, "worker_died")
+        elif isinstance(message, Abort):
+            error, node = message.error, worker.transport.node
+            if node is not None and isinstance(error, CosflyError):
+                error.where = f"node {node}" if error.where is None else f"node {node}: {error.where}"
+            raise error
+        elif isinstance(message, logging.LogRecord):
+            logging.getLogger(message.name).handle(message)
+        elif attempt is None:
+            return
+        elif isinstance(message, Sign):
+            if message.item_id != attempt.item.item_id:
+                return
+            if not worker.has_begun:
+                worker.has_begun, worker.begun_s, worker.quiet_s = True, time.monotonic(), 0.0
+            elif message.num_steps != worker.num_steps:
+                worker.num_steps, worker.quiet_s = message.num_steps, 0.0
+                self.on_steps(attempt.item, message.num_steps)
+        else:
+            seconds = time.monotonic() - worker.begun_s
+            self._seconds.append(seconds)
+            self._num_done += 1
+            worker.attempt = None
+            about = {"status": message.status, "seconds": round(seconds, 3), "steps": worker.num_steps}
+            self.events.write("item_done", worker=worker.place, item=message.id, **about)
+            yield attempt.item_index, message
+
+    def _check(self) -> Iterator[tuple[int, ItemRecord]]:
+        """Look for workers that neither report nor compute, and for items that do not get on.
+
+        Time is counted in checks here: while this process itself was stopped, no worker could report.
+        """
+        for worker in self._busy():
+            assert worker.attempt is not None
+            seen = worker.transport.look()
+            cpu_s = worker.cpu_s if seen is None else seen.cpu_s
+            lives = worker.has_reported or cpu_s != worker.cpu_s
+            worker.failed_checks = 0 if lives else worker.failed_checks + 1
+            worker.has_reported, worker.cpu_s = False, cpu_s
+            worker.quiet_s += self.watch.check_s
+            if seen is None:
+                yield from self._lose(worker, "worker_died")
+            elif worker.failed_checks >= self.watch.failed_checks:
+                yield from self._lose(worker, "heartbeat_lost")
+            elif worker.quiet_s > limit_s(self.watch, self._seconds, worker.attempt.number, worker.has_begun):
+                yield from self._lose(worker, "timed_out")
+
+    def _lose(self, worker: _Worker, loss: Loss) -> Iterator[tuple[int, ItemRecord]]:
+        """End a worker that is of no use any more; its item is tried again, or has failed."""
+        self._stop(worker, 0.0)
+        self._lost.add(worker.place)
+        attempt, self.num_lost = worker.attempt, self.num_lost + 1
+        about = worker.about
+        if attempt is not None:
+            seconds = round(time.monotonic() - worker.begun_s, 3) if worker.has_begun else 0.0
+            about |= {"item": attempt.item.item_id, "seconds": seconds, "steps": worker.num_steps}
+            self.on_steps(attempt.item, 0)
+        self.events.write(loss, **about)
+        if self.num_lost > self.watch.restarts + self._num_done:
+            raise EnvironmentMissing(
+                "workers die or stall all the time",
+                where=None if attempt is None else attempt.item.item_id,
+                got=f"{self.num_lost} lost, {self._num_done} items done; the last: {LOSSES[loss]}",
+                fix="see events.jsonl; free some memory, use fewer --workers or raise item_limit_s, then run the same "
+                "command again: finished items are kept",
+            )
+        if attempt is None:
+            return
+        item, tries = attempt.item, attempt.number + 1
+        if tries <= self.watch.retries:
+            log.warning("%s: %s; it is tried again", item.item_id, LOSSES[loss])
+            (self._alone if tries == self.watch.retries else self._again).append(replace(attempt, number=tries))
+            self.events.write("retried", item=item.item_id, attempt=tries)
+            return
+        self.events.write("given_up", item=item.item_id)
+        code = "worker_died" if loss == "worker_died" else "timed_out"
+        message = f"{item.item_id}: {LOSSES[loss]}, {tries} times"
+        yield attempt.item_index, Failed(id=item.item_id, code=code, message=message)
+
+    def _stop(self, worker: _Worker, patience_s: float) -> None:
+        """End a worker, at once or after the time in which it may end by itself."""
+        del self._workers[worker.place]
+        worker.inbox.put(None)
+        worker.transport.kill(patience_s)
+
+    def _end(self, patience_s: float) -> None:
+        if workers := list(self._workers.values()):
+            with ThreadPoolExecutor(len(workers)) as at_once:
+                list(at_once.map(lambda worker: self._stop(worker, patience_s), workers))
+
+
+def _attend(worker: _Worker, start: Start, messages: queue.SimpleQueue) -> None:
+    """Carry items to a worker and its messages to the pool, until either is done; None in `messages`: it is gone."""
+    transport = worker.transport
+    try:
+        transport.send(start)
+        messages.put((worker, Sign(None, 0)))  # it may be given an item
+        while (item := worker.inbox.get()) is not None:
+            transport.send(item)
+            while True:
+                message = transport.receive()
+                worker.has_reported = True
+                messages.put((worker, message))
+                if isinstance(message, Abort | ItemRecord):
+                    break
+        transport.send(None)
+    except (EOFError, OSError):
+        messages.put((worker, None))
+    except Exception as error:  # an item that does not pickle, a message that does not unpickle
+        messages.put((worker, Abort(error)))

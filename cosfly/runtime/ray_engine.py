@@ -1,8 +1,8 @@
-"""Stages on a Ray cluster: an actor is the post of a worker process, on whichever node Ray has room for it.
+"""Stages on a Ray cluster: an actor starts a worker process on whichever node Ray has room for it, and relays messages.
 
-Ray finds the node, carries bytes and tells of nodes that are lost. When a worker counts as stalled, what is tried again
-and what is told of it is `worker_pool`'s, as for the processes of one machine. Files do not travel: the nodes share the
-folder of the stage and its inputs. Items are handed out one at a time, and no frame passes through Ray.
+Ray finds the node, carries bytes and reports lost nodes. When a worker counts as stalled, and what is tried again, is
+decided in `pool`, as for the processes of one machine. Files do not travel: the nodes share the folder of the stage and
+its inputs. Items are handed out one at a time, and no frame passes through Ray.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from cosfly.runtime.worker import Item, Message, Start, WorkerOptions
 log = logging.getLogger(__name__)
 
 ALL_ROOM = 2**31  # as many workers as the cluster has room for when a stage begins
-STORE_BYTES = 80_000_000  # of a cluster of this machine: what Ray asks for at least; nothing of ours is kept in it
+STORE_BYTES = 80_000_000  # of a cluster of this machine: Ray's minimum; nothing of ours is kept in it
 ANSWER_S = 5.0  # within which a head node or an actor answers
 ENVIRONMENT = {
-    "RAY_USAGE_STATS_ENABLED": "0",  # it would tell its makers
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # it would hide the GPUs from workers that ask for no share
+    "RAY_USAGE_STATS_ENABLED": "0",  # no report to its makers
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # else it hides the GPUs from workers that ask for no share
 }
-WAITING_S = 30.0  # after so long it is told that there is no room
+WAITING_S = 30.0  # after so long the log says that there is no room
 
 
 class RayConfig(Config):
@@ -64,36 +64,32 @@ class Cluster:
             nodes = [node["Resources"] for node in self._alive()]
             got = ", ".join(f"{node.get('CPU', 0):g} CPUs and {node.get('GPU', 0):g} GPUs" for node in nodes)
             fix = "lower ray.worker_cpus or ray.worker_gpus, or add a node that has as many"
-            raise EnvironmentMissing(
-                "no node has room for a worker", got=f"nodes of {got}", expected=self.needs, fix=fix
-            )
+            what = "no node has room for a worker"
+            raise EnvironmentMissing(what, got=f"nodes of {got}", expected=self.needs, fix=fix)
 
     @property
     def needs(self) -> str:
-        """What a worker takes, in words."""
+        """Return the resources of a worker in words."""
         gpus = f" and {self._cfg.worker_gpus:g} GPUs" if self._cfg.worker_gpus else ""
         return f"{self._cfg.worker_cpus:g} CPUs{gpus}"
 
     @cached_property
     def room(self) -> int:
-        """How many workers the nodes have room for, if nobody else is there."""
-        shares = {"CPU": self._cfg.worker_cpus, "GPU": self._cfg.worker_gpus}
-        taken = [(name, share) for name, share in shares.items() if share]
-        return sum(
-            min(int(node["Resources"].get(name, 0.0) / share + 1e-6) for name, share in taken) for node in self._alive()
-        )
+        """Return how many workers fit on the nodes when they are otherwise idle."""
+        taken = [("CPU", self._cfg.worker_cpus), *([("GPU", self._cfg.worker_gpus)] if self._cfg.worker_gpus else [])]
+        nodes = (node["Resources"] for node in self._alive())
+        return sum(min(int(node.get(name, 0.0) / share + 1e-6) for name, share in taken) for node in nodes)
 
     def _alive(self) -> list[dict[str, Any]]:
         return [node for node in self._ray.nodes() if node["Alive"]]
 
     def start_transport(self, worker_options: WorkerOptions) -> RayTransport:
-        """Ask for a worker somewhere."""
+        """Request a worker on any node."""
         takes = {"num_cpus": self._cfg.worker_cpus, "num_gpus": self._cfg.worker_gpus, "max_restarts": 0}
-        host = self._actor.options(**takes).remote(
-            worker_options.heartbeat_s, worker_options.log_level, worker_options.place
-        )
-        begun = host.begin.remote(str(self._folder), self._record, os.getcwd(), sys.path, cosfly.__version__)
-        return RayTransport(self._ray, host, begun, worker_options.place, self.needs)
+        heartbeat_s, log_level, place = worker_options.heartbeat_s, worker_options.log_level, worker_options.place
+        host = self._actor.options(**takes).remote(heartbeat_s, log_level, place)
+        started = host.start.remote(str(self._folder), self._record, os.getcwd(), sys.path, cosfly.__version__)
+        return RayTransport(self._ray, host, started, place, self.needs)
 
     @cached_property
     def _actor(self) -> Any:
@@ -101,46 +97,46 @@ class Cluster:
 
 
 class RayTransport:
-    """The way to a worker process on a node."""
+    """The connection to a worker process on a node."""
 
-    def __init__(self, ray: Any, host: Any, begun: Any, place: int, needs: str) -> None:
+    def __init__(self, ray: Any, host: Any, started: Any, place: int, needs: str) -> None:
         self.pid: int | None = None
         self.node: str | None = None
-        self._ray, self._host, self._begun, self._place, self._needs = ray, host, begun, place, needs
-        self._said: Any = None
-        self._heard = deque[bytes]()
+        self._ray, self._host, self._started, self._place, self._needs = ray, host, started, place, needs
+        self._call: Any = None
+        self._received = deque[bytes]()
         self._vitals: Vitals | None = Vitals(0.0, 0.0)
 
     def send(self, what: Start | Item | None) -> None:
         data = pickle.dumps(what)
         with self._gone_as_eof():
             if self.pid is None:
-                self._settle()
-            self._said = self._host.talk.remote(data)
+                self._wait_for_node()
+            self._call = self._host.exchange.remote(data)
 
-    def _settle(self) -> None:
-        """Wait until it has a node and has started there; raises EnvironmentMissing where the node will not do."""
-        while not self._ray.wait([self._begun], timeout=WAITING_S)[0]:
+    def _wait_for_node(self) -> None:
+        """Wait until the worker has started on a node; EnvironmentMissing where the node is not fit for it."""
+        while not self._ray.wait([self._started], timeout=WAITING_S)[0]:
             if self._place == 0:
-                log.warning("worker 0 waits for a node with %s free; `ray status` tells who has them", self._needs)
-        node, pid, problem = self._ray.get(self._begun)
+                log.warning("worker 0 waits for a node with %s free; `ray status` shows who has them", self._needs)
+        node, pid, problem = self._ray.get(self._started)
         if problem:
             raise EnvironmentMissing(where=f"node {node}", **problem)
         self.node, self.pid = node, pid
 
     def receive(self) -> Message:
-        while not self._heard:
+        while not self._received:
             if self._vitals is None:
                 raise EOFError
             with self._gone_as_eof():
-                said, self._said = self._said or self._host.talk.remote(None), None
-                heard, vitals = self._ray.get(said)
-            self._heard.extend(heard)
+                call, self._call = self._call or self._host.exchange.remote(None), None
+                received, vitals = self._ray.get(call)
+            self._received.extend(received)
             self._vitals = None if vitals is None else Vitals(*vitals)
-        return pickle.loads(self._heard.popleft())
+        return pickle.loads(self._received.popleft())
 
     def look(self) -> Vitals | None:
-        return self._vitals  # the last that came: those of a node that is lost change no more
+        return self._vitals  # the last that came: those of a lost node change no more
 
     def kill(self, patience_s: float) -> None:
         unreachable = self._ray.exceptions.RayError
@@ -162,11 +158,11 @@ class RayTransport:
 
 
 def _host() -> type:
-    """Make the class of the actors. Within a function: so Ray carries its code along, and not only its name, and it
-    can speak on a node that has another cosfly, or none."""
+    """Return the class of the actors, which Ray pickles by value because it is local: it also runs on a node that has
+    another cosfly, or none, and can report that."""
 
     class Host:
-        """Starts a worker on its node, and passes on what it is told and says. One call at a time."""
+        """Starts a worker on its node and relays its messages. One call at a time."""
 
         def __init__(self, heartbeat_s: float, log_level: int, place: int) -> None:
             import queue
@@ -174,8 +170,8 @@ def _host() -> type:
             self.heartbeat_s, self.log_level, self.place = heartbeat_s, log_level, place
             self.inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()  # a worker that still imports reads nothing
 
-        def begin(self, folder: str, record: str, cwd: str, path: list[str], version: str) -> tuple:
-            """Return the node's name, the worker's process id, and what is wrong with the node."""
+        def start(self, folder: str, record: str, cwd: str, path: list[str], version: str) -> tuple:
+            """Return the node's name, the worker's process id, and the node's problem as an error's arguments."""
             import os
             import socket
             import sys
@@ -211,47 +207,47 @@ def _host() -> type:
                 os.environ.setdefault("GLCONTEXT_DEVICE_INDEX", str(devices[0]))  # of EGL, which counts NVIDIA's first
             sys.path.extend(place for place in path if place not in sys.path)  # a spawned process takes it over
             vars(sys.modules["__main__"]).pop("__file__", None)  # Ray's own, which a spawned process would run again
-            self.post = LocalTransport(WorkerOptions(os.getpid(), self.heartbeat_s, self.log_level, self.place))
+            self.worker = LocalTransport(WorkerOptions(os.getpid(), self.heartbeat_s, self.log_level, self.place))
             threading.Thread(target=self._send, daemon=True).start()
-            return node, self.post.pid, None
+            return node, self.worker.pid, None
 
         def _send(self) -> None:
             try:
                 while True:
-                    self.post.connection.send_bytes(self.inbox.get())
+                    self.worker.connection.send_bytes(self.inbox.get())
             except OSError:
-                pass  # the worker is gone; `talk` tells
+                pass  # the worker is gone; `exchange` reports it
 
-        def talk(self, data: bytes | None) -> tuple:
-            """Pass something on; give what the worker has said since, and how it is: None if it is gone."""
+        def exchange(self, data: bytes | None) -> tuple:
+            """Relay a message; return those of the worker since the last call and its vitals, None if it is gone."""
             if data is not None:
                 self.inbox.put(data)
-            heard: list[bytes] = []
+            received: list[bytes] = []
             try:
-                while self.post.connection.poll(0.0 if heard else self.heartbeat_s):
-                    heard.append(self.post.connection.recv_bytes())
+                while self.worker.connection.poll(0.0 if received else self.heartbeat_s):
+                    received.append(self.worker.connection.recv_bytes())
             except (EOFError, OSError):
-                return heard, None
-            vitals = self.post.look()
-            return heard, None if vitals is None and not heard else tuple(vitals or (0.0, 0.0))[:2]
+                return received, None
+            vitals = self.worker.look()
+            return received, None if vitals is None and not received else tuple(vitals or (0.0, 0.0))[:2]
 
         def end(self, patience_s: float) -> None:
             """End the worker; it is gone then."""
-            self.post.kill(patience_s)
+            self.worker.kill(patience_s)
 
     return Host
 
 
-# --- the way in -------------------------------------------------------------------------------------------------------
+# --- the connection ---------------------------------------------------------------------------------------------------
 
 
 def connected(cfg: RayConfig) -> Any:
-    """Connect this process to the cluster, if it is not; gives the module `ray`."""
+    """Connect this process to the cluster, if it is not connected, and return the module `ray`."""
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     try:
         import ray
-        from ray._private import worker as speaker
+        from ray._private import worker as ray_worker
     except ImportError:
         fix = "pip install 'cosfly[ray]', on every node"
         raise EnvironmentMissing("the package ray is missing", where="--engine ray", fix=fix) from None
@@ -259,22 +255,22 @@ def connected(cfg: RayConfig) -> Any:
         return ray
     address = cfg.address or os.environ.get("RAY_ADDRESS") or "local"
     own: dict[str, Any] = {"object_store_memory": STORE_BYTES, "include_dashboard": False} if address == "local" else {}
-    _knock(address)
-    ends_it = signal.getsignal(signal.SIGTERM)
+    _check_reachable(address)
+    handler = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(address, **own, log_to_driver=False, logging_level=logging.ERROR, namespace="cosfly")
     except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
         raise _refused(address, error) from None
     finally:
-        # What it tells of nodes that are lost it would write on the standard output.
-        speaker.print_to_stdstream = lambda data, **_: log.debug("ray: %s", " ".join(data["lines"]))
+        # It would write messages about lost nodes on the standard output.
+        ray_worker.print_to_stdstream = lambda data, **_: log.debug("ray: %s", " ".join(data["lines"]))
         with contextlib.suppress(ValueError, TypeError):  # not the main thread, where Ray leaves it alone
-            signal.signal(signal.SIGTERM, ends_it)
+            signal.signal(signal.SIGTERM, handler)
     return ray
 
 
-def _knock(address: str) -> None:
-    """See that somebody who speaks gRPC is at a host and port: Ray itself would try for a quarter of an hour."""
+def _check_reachable(address: str) -> None:
+    """Check that a gRPC server is at a host and port: Ray itself would try for a quarter of an hour."""
     import grpc
     from ray._private.gcs_utils import create_gcs_channel
 

@@ -1,4 +1,4 @@
-"""Random choices: all derive from (seed, stage, item), so none depends on worker count, order or resumption."""
+"""Random choices, derived from (seed, stage, item), so that none depends on the workers, their order or a resume."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ def rng_for(seed: int, stage: str, item_id: str) -> np.random.Generator:
 
 
 def draws_for(seed: int, stage: str, item_id: str) -> bytes:
-    """Return 32 random bytes of one item: enough for a few choices, and made in a twentieth of a generator's time."""
+    """Return 32 random bytes of one item: enough for a few choices, in a twentieth of a generator's time."""
     return hashlib.sha256(f"{seed}/{stage}/{item_id}".encode()).digest()
 
 
 BLOCK = 8  # draws to a quota that are as far apart as they can be; more hold shares no better where few are drawn
-GOLDEN = 0.5 * (5**0.5 - 1)  # by so much turned, blocks lie between each other for ever
+GOLDEN = 0.5 * (5**0.5 - 1)  # blocks turned by this much never coincide
 
 
 def draw_to_quota(shares: Mapping[str, float], rng: np.random.Generator) -> Iterator[str]:
-    """Yield names for ever, in random order, so that of any number of them each has its share but for three at most.
+    """Yield names without end, in random order: after any number of draws each has its share within three.
 
-    What is drawn first does not depend on how many are. Raises as `draw_by_share`.
+    The first draws do not depend on how many follow.
     """
     names, ends = _ends(shares)
     start = rng.random()
@@ -37,13 +37,13 @@ def draw_to_quota(shares: Mapping[str, float], rng: np.random.Generator) -> Iter
 
 
 def draw_by_share(shares: Mapping[str, float], rng: np.random.Generator) -> str:
-    """Return one of the names, each with the probability of its share. The order of names does not matter; one draw."""
+    """Return one of the names, each with the probability of its share, whatever their order."""
     names, ends = _ends(shares)
     return names[int(np.searchsorted(ends, rng.random() * ends[-1], side="right"))]
 
 
 def _ends(shares: Mapping[str, float]) -> tuple[list[str], np.ndarray]:
-    """Return the names in order, and where the share of each ends when they stand one after the other."""
+    """Return the sorted names, and the cumulative sum of their shares."""
     names = sorted(shares)
     weights = np.array([shares[name] for name in names], dtype=np.float64)
     if not ((weights >= 0).all() and weights.sum() > 0):

@@ -1,4 +1,4 @@
-"""Parquet files: opened as any other file, and what pyarrow says of damage becomes an InputError."""
+"""Parquet files of bounded size, read row group by row group; damage becomes an InputError."""
 
 from __future__ import annotations
 
@@ -20,25 +20,24 @@ import pyarrow.parquet as pq
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import FILE_MB, MB, SMALL_UNPACKED_MB, UNPACK_FACTOR, open_file, over_limit
 
-MOST_FOOTER_BYTES = 100 * MB  # what the footer's strings and lists may take; ours have some 10 kB
-
-WORTH_THREADS_BYTES = 8 * MB  # of a row group: one thread takes less time for fewer, and each keeps memory of its own
-
-LEAST_ROW_BYTES = 1_000  # of a row in memory, as values of Python: packed, a million equal ones are a few kB
+MOST_FOOTER_BYTES = 100 * MB  # of the footer's strings and lists; ours have some 10 kB
+WORTH_THREADS_BYTES = 8 * MB  # of a row group: below, one thread takes less time, and each keeps memory of its own
+LEAST_ROW_BYTES = 1_000  # of a row as Python values: packed, a million equal ones are a few kB
+GROUPS_HELD = 4  # row groups that reading single rows keeps in memory
 SMALLER_GROUPS = "write it again with smaller row groups, as pyarrow's row_group_size does"
 
 
 @contextlib.contextmanager
 def arrow_errors(path: Path | str) -> Iterator[None]:
-    """Turn what pyarrow raises on a damaged file into an InputError; only its calls stand in it."""
+    """Convert what pyarrow raises on a damaged file into an InputError."""
     try:
         yield
-    except (pa.ArrowException, OSError, ValueError) as error:  # damage shows as what depends on the byte
+    except (pa.ArrowException, OSError, ValueError) as error:  # which one depends on the damaged byte
         raise InputError("not a whole parquet file", where=path, got=str(error)) from None
 
 
 class _Table(pq.ParquetFile):
-    """A parquet file. packed: the same, which leaves texts as their dictionaries and indices."""
+    """A parquet file. packed: the same file, read with texts as dictionaries and indices."""
 
     def __init__(self, file: io.IOBase, **how: Any) -> None:
         how |= {"thrift_string_size_limit": MOST_FOOTER_BYTES, "thrift_container_size_limit": MOST_FOOTER_BYTES}
@@ -48,19 +47,14 @@ class _Table(pq.ParquetFile):
         self.packed = pq.ParquetFile(file, metadata=self.metadata, read_dictionary=texts, **how)
 
     def _repeats(self, j: int) -> bool:
-        """Return whether a column holds bytes of any kind by a dictionary; pictures stand plainly, and looking for
-        equal ones would take long."""
+        """Return whether a column stores bytes by a dictionary; pictures are stored plainly, which is faster."""
         groups = (self.metadata.row_group(k).column(j) for k in range(self.num_row_groups))
         return any(one.physical_type == "BYTE_ARRAY" and one.has_dictionary_page for one in groups)
 
 
 @contextlib.contextmanager
 def open_table(path: Path, *, tree: Path | None = None) -> Iterator[_Table]:
-    """Open a parquet file for its schema and metadata.
-
-    Raises:
-        InputError: as `open_file`; or it is no whole parquet file.
-    """
+    """Open a parquet file for its schema and metadata; InputError where it is damaged."""
     with open_file(path, what="parquet file", tree=tree) as file:
         with arrow_errors(path):
             table = _Table(file)
@@ -69,7 +63,7 @@ def open_table(path: Path, *, tree: Path | None = None) -> Iterator[_Table]:
 
 
 def num_rows(path: Path) -> int:
-    """Return the number of rows; raises as `open_table`."""
+    """Return the number of rows."""
     with open_table(path) as table:
         return table.metadata.num_rows
 
@@ -77,8 +71,7 @@ def num_rows(path: Path) -> int:
 def row_groups(
     path: Path, columns: list[str] | None = None, *, tree: Path | None = None, wanted: Collection[int] | None = None
 ) -> Iterator[pa.Table]:
-    """Yield the row groups of a parquet file, of these numbers or all, in memory one at a time; raises as `open_table`,
-    and for one over the limit."""
+    """Yield the row groups of a parquet file, the wanted ones or all, one at a time; InputError over the limit."""
     with open_table(path, tree=tree) as table:
         for k in range(table.num_row_groups):
             if wanted is None or k in wanted:
@@ -86,9 +79,7 @@ def row_groups(
 
 
 def read_row_group(path: Path | str, table: _Table, k: int, columns: list[str] | None) -> pa.Table:
-    """Read one row group of an open table; `path` is for messages. A text is unpacked once it is known how much all of
-    them are.
-    """
+    """Read one row group of an open table; texts are unpacked once their total size is known."""
     _check_size(path, table, k)
     about = table.metadata.row_group(k)
     with arrow_errors(path):
@@ -123,8 +114,7 @@ def _plain(kind: pa.DataType) -> pa.DataType:
 
 
 def row_batches(path: Path | str, table: _Table, k: int, columns: list[str], num_rows: int) -> Iterator[pa.RecordBatch]:
-    """Yield one row group of an open table, few rows at a time, so that the same memory serves again; raises as
-    `read_row_group`."""
+    """Yield one row group of an open table in batches, which reuse the same memory."""
     _check_size(path, table, k)
     with arrow_errors(path):
         batches = table.iter_batches(num_rows, row_groups=[k], columns=columns, use_threads=False)
@@ -144,20 +134,15 @@ def _check_size(path: Path | str, table: _Table, k: int) -> None:
 
 
 def rows_of(path: Path, columns: list[str] | None = None, *, tree: Path | None = None) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a parquet file; raises as `row_groups`."""
+    """Yield the rows of a parquet file."""
     for group in row_groups(path, columns, tree=tree):
-        with arrow_errors(path):  # text that is no UTF-8 shows here
+        with arrow_errors(path):  # for text that is not UTF-8
             rows = group.to_pylist()
         yield from rows
 
 
-GROUPS_HELD = 4  # row groups that a look at single rows keeps
-
-
 class TableRows(Sequence[dict[str, Any]]):
-    """The rows of a parquet file by number. The file stays open, a few row groups in memory; each process opens its
-    own.
-    """
+    """The rows of a parquet file by number. It stays open, with a few row groups in memory; each process has its own."""
 
     def __init__(self, path: Path, columns: list[str]) -> None:
         self._path, self._columns = path, columns

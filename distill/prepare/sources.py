@@ -16,7 +16,7 @@ from cosfly.formats.splits import Course, walks_of
 from cosfly.formats.tracks import find_tracks, track_of
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.io import check_stays_below, inside
-from cosfly.runtime.run_dir import was_made_of
+from cosfly.runtime.run_dir import record_of
 from cosfly.viz.frame_views import VIEW_FILES, View
 
 log = logging.getLogger(__name__)
@@ -70,7 +70,7 @@ def check_sources(sources: Sequence[RunSource], unbound: Literal["refuse", "acce
     """Check that run names differ, and that the captions are recorded as made from a tree; the stage checks which."""
     check_names([source.run for source in sources])
     for source in sources:
-        if was_made_of(source.captions, "data") is not None:
+        if (record := record_of(source.captions)) is not None and "data" in record.inputs:
             continue
         if unbound == "refuse":
             words = "no record says of which playback tree these captions were made"

@@ -30,7 +30,7 @@ from cosfly.formats.png import parse_png
 from cosfly.runtime.arrays import PNG_HEADER_BYTES, png_size
 from cosfly.runtime.errors import CosflyError, InputError, VerifyError
 from cosfly.runtime.io import CHECKSUMS, atomic_file, check_stays_below, read_bytes, read_checksums, sha256_file
-from cosfly.runtime.run_dir import FLIGHT, digest_of, folder_digests
+from cosfly.runtime.run_dir import TRACK_FILE, digest_of, folder_digests
 from cosfly.runtime.worker import advance
 from release import columns
 from release.columns import Placement, ReleasedCaption, caption_values
@@ -229,7 +229,7 @@ def _digests(candidate: Candidate) -> dict[str, str]:
             got, expected = digest_of(digests), f"{candidate.sha256}, as in the inspection"
             what = "the flight is not the one that was inspected"
             raise VerifyError(what, where=folder, got=got, expected=expected, fix=ANEW)
-    _check_digest(folder, FLIGHT, None, digests)
+    _check_digest(folder, TRACK_FILE, None, digests)
     _check_digest(folder, TARGET_FILE, None, digests)
     return digests
 

@@ -15,7 +15,7 @@ from cosfly.formats.town import read_town_map
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.io import check_stays_below, inside, read_text
-from cosfly.runtime.run_dir import is_bound
+from cosfly.runtime.run_dir import record_of
 from release.package.captions import FlightKey
 from release.record import ReleasedMap
 
@@ -149,7 +149,7 @@ def gather(
     found: list[tuple[int, Place, Path, str | None, str | None, float | None]] = []
     inspections: list[Inspection] = []
     for number, source in enumerate(sources):
-        if not accept_unbound and not is_bound(source.captions):
+        if not accept_unbound and record_of(source.captions) is None:
             raise InputError(
                 "no record says of which tree these captions were made", where=source.captions,
                 expected="stage.json of the stage that made them beside the captions",
