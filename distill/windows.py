@@ -109,7 +109,7 @@ class _Tree:
     def places(self, left_out: Counter[str]) -> Iterator[WindowPlace]:
         whole: dict[Path, set[int]] = {}
         for caption in read_captions(self.captions):
-            folder = inside(self.tree, f"{caption.town}/{caption.trajectory}/{caption.variant}", beside=True)
+            folder = inside(self.tree, f"{caption.town}/{caption.trajectory}/{caption.variant}", in_parent=True)
             if folder not in whole:
                 whole[folder] = _frames_in(folder)
             if caption.status != "accepted":

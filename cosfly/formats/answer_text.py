@@ -56,7 +56,7 @@ def answer_schema(
 
 @dataclass(frozen=True)
 class Parsed:
-    """A checked answer: `coc` is None when the structure is wrong, for the `reason`; `recovered` names what was mended.
+    """A checked answer: `coc` is None when the structure is wrong, for the `reason`. recovered: from which wrappings.
 
     therefore: the action of that field, where it was asked for. more: the other further fields, as they came.
     """
@@ -100,7 +100,7 @@ def parse_answer(
     """
     names = (*FIELDS, *more)
     found = find_object(text, names, finish_reason)
-    recovered = list(found.mended)
+    recovered = list(found.recovered)
     if found.value is None:
         parsed = Parsed(None, found.reason)
     else:

@@ -1,1 +1,1 @@
-"""How work is done and kept: settings, stage folders, journals, items on workers."""
+"""How work is done and stored: settings, run directories, journals, and items on worker processes."""

@@ -200,7 +200,9 @@ def files_named(tree: Path, name: str) -> list[Path]:
             elif entry.is_symlink() and os.path.isdir(entry.path):  # isdir is false for a link to itself
                 real = os.path.realpath(entry.path)
                 if not (isinstance(tree, LinkedPath) or is_below(real, parent)):
-                    log.warning("%s leads to %s and is skipped; --set follow_links=true follows it", entry.path, real)
+                    log.warning(
+                        "%s: leads to %s, which is skipped; --set follow_links=true follows it", entry.path, real
+                    )
                 elif real not in above and real != parent:  # a link to a folder above would go round for ever
                     waiting.append((folder / entry.name, (*above, real)))
     return sorted(found)
@@ -209,8 +211,8 @@ def files_named(tree: Path, name: str) -> list[Path]:
 # --- names and links --------------------------------------------------------------------------------------------------
 
 
-def check_stays_below(path: Path, tree: Path, *, beside: bool = False) -> None:
-    """Check that no symbolic link leads from a tree to a file outside; `beside`: outside of the tree's parent.
+def check_stays_below(path: Path, tree: Path, *, in_parent: bool = False) -> None:
+    """Check that no symbolic link leads out of a tree, or with `in_parent` out of the tree's parent directory.
 
     The tree itself may be a link. In the cache of the hub's client, where a snapshot's files are links to blobs, the
     blobs are part of the tree.
@@ -222,7 +224,7 @@ def check_stays_below(path: Path, tree: Path, *, beside: bool = False) -> None:
     except ValueError as error:  # a NUL in a name
         raise InputError("not a name of a file", where=tree, got=str(error)) from None
     blobs = [str(folder.parent / "blobs") for folder in Path(root).parents if folder.name == "snapshots"][:1]
-    if not any(is_below(real, allowed) for allowed in (os.path.dirname(root) if beside else root, *blobs)):
+    if not any(is_below(real, allowed) for allowed in (os.path.dirname(root) if in_parent else root, *blobs)):
         raise InputError(
             "a link leads out of its folder", where=path, got=real, expected=f"a file below {tree}",
             fix="if you trust it, --set follow_links=true",
@@ -248,14 +250,14 @@ def is_below(path: str, root: str) -> bool:
     return path == root or path.startswith(root.rstrip(os.sep) + os.sep)
 
 
-def inside(root: Path, name: str, *, beside: bool = False) -> Path:
+def inside(root: Path, name: str, *, in_parent: bool = False) -> Path:
     """Join a name from a file to a root; InputError where it leads out, by its parts or by a link.
 
     Args:
-        beside: A link may lead into the parent directory of the root.
+        in_parent: A link may lead into the parent directory of the root.
     """
     plain = _plain_name(root, name)
-    check_stays_below(root / plain, root, beside=beside)
+    check_stays_below(root / plain, root, in_parent=in_parent)
     return root / plain
 
 
@@ -410,7 +412,7 @@ def read_checksums(folder: Path) -> dict[str, str]:
     """Read `checksums.sha256`: relative name -> hex digest; InputError where a name leads out of the folder."""
     path = folder / CHECKSUMS
     digests: dict[str, str] = {}
-    root, checked = f"{folder}{os.sep}", {""}  # each folder once: a flight has thousands of files
+    root, checked = f"{folder}{os.sep}", {""}  # each folder once: a track has thousands of files
     for number, line in enumerate(read_text(path, what="checksums", tree=folder).splitlines(), 1):
         digest, _, name = line.partition("  ")
         if len(digest) != 64 or not name:

@@ -1,6 +1,6 @@
-"""The JSON object in what a model wrote: the last complete one of its final message.
+"""The JSON object in a model's answer: the last complete one of its final message.
 
-Thoughts, drafts, fences and prose around it are passed over. Nothing is completed or chosen: an object that ends in the
+Thoughts, drafts, fences and prose around it are skipped. Nothing is completed or chosen: an object that ends in the
 middle, or has a key twice, is a failure with a reason.
 """
 
@@ -15,14 +15,14 @@ from typing import Any
 from cosfly.runtime.json_io import is_deep
 
 MAX_DIGITS = 18  # of an integer; what has more is read as a float
-MAX_CHARACTERS = 100_000  # more than any reasoning and answer take; what is longer is not read
-MAX_SCANNED = 50 * MAX_CHARACTERS  # in beginnings of objects that turn out to be none
+MAX_CHARACTERS = 100_000  # more than any reasoning and answer take; a longer text is not read
+MAX_SCANNED = 50 * MAX_CHARACTERS  # in texts that begin like an object and are none
 MAX_WRAPPERS = 3  # around the object that was asked for
 
-# How models mark where their thoughts begin and end: tags, special tokens, channels, sentences. What is before the
-# last end that has no beginning was thought, too: templates put the beginning into the prompt.
+# Marks of the beginning and end of thoughts: tags, special tokens, channels, sentences. The text before the last end
+# that has no beginning is thought, too: templates put the beginning into the prompt.
 _THOUGHT = r"(?:think(?:ing|_fast|_faster)?|thoughts?|reasoning|reflection|analysis|scratchpad)"
-_TAG = rf"(?:[\w|:]{{1,20}}[_:|]|ant)?{_THOUGHT}"  # bounded, as all here: else the worst texts take quadratic time
+_TAG = rf"(?:[\w|:]{{1,20}}[_:|]|ant)?{_THOUGHT}"  # bounded, as all here: else some texts take quadratic time
 _END = r"(?=[\w:]{0,20}end)"
 _TOKEN = rf"(?:[\w:]{{1,20}}[_:])?{_THOUGHT}[\w:]{{0,20}}\|>"
 _OPENS = (
@@ -38,42 +38,39 @@ _CLOSES = (
 _MARK = re.compile(rf"(?P<opens>{_OPENS})|(?P<closes>{_CLOSES})|\{{(?!\{{)", re.IGNORECASE)
 _CLOSE = re.compile(_CLOSES, re.IGNORECASE)
 
-CONTEXT_FULL = "context_full"  # why an answer ended: prompt and answer fill the context, before `max_tokens`
+CONTEXT_FULL = "context_full"  # finish reason: prompt and answer fill the context, before `max_tokens`
 _NOTHING = re.compile(r"(?:[\s\u00ad\u200b-\u200f\u2028-\u202e\u2060-\u2064\ufeff]|```\w*)*+")
 # Finish reason -> ours, of a message that was cut off.
-_CUT = {
-    "length": "cut_short",
-    "max_tokens": "cut_short",
-    "content_filter": "content_filter",
-    CONTEXT_FULL: CONTEXT_FULL,
-}
+_CUT = {"length": "cut_short", "max_tokens": "cut_short"} | {name: name for name in ("content_filter", CONTEXT_FULL)}
 
-# Half a surrogate pair, which no file can hold, and what a decoder puts in the place of bytes that it could not read.
+# Half a surrogate pair, which no file can hold, and the replacement of bytes that a decoder could not read.
 _UNREADABLE = re.compile("[\ud800-\udfff\ufffd]")
 
 
 @dataclass(frozen=True)
 class Found:
-    """The object, or None and the reason; `mended` names what was around it. is_end: nothing was written after it."""
+    """The object, or None and the reason. recovered: the kinds of text around it. is_end: no text follows it."""
 
     value: dict[str, Any] | None
     reason: str | None = None
-    mended: tuple[str, ...] = ()
+    recovered: tuple[str, ...] = ()
     is_end: bool = True
 
 
 def find_object(text: str, names: Collection[str], finish_reason: str | None = None) -> Found:
-    """Find the last complete object of the final message that has one of these names, which its keys are spelled as.
+    """Return the last complete object of the final message that has one of these names, with keys spelled like them.
 
     Reasons: empty, too_long, no_json_object, only_thinking, broken_json, duplicate_key, not_finite,
     unreadable_character, and of a message that was cut off (an object that was not the end of it may be a draft)
-    cut_short, content_filter, context_full. An object that has none of the names is given where there is no other.
+    cut_short, content_filter, context_full. An object that has none of the names is returned where there is no other.
     """
     if len(text) > MAX_CHARACTERS:
         return Found(None, "too_long")
     found = _found(text, names)
     cut = _CUT.get((finish_reason or "").lower())
-    return found if cut is None or (found.value is not None and found.is_end) else Found(None, cut, found.mended, False)
+    return (
+        found if cut is None or (found.value is not None and found.is_end) else Found(None, cut, found.recovered, False)
+    )
 
 
 def _found(text: str, names: Collection[str]) -> Found:
@@ -85,13 +82,13 @@ def _found(text: str, names: Collection[str]) -> Found:
         if message.broken_at >= one.end:
             return Found(None, "broken_json", is_end=False)
         around = (text[message.start : one.start], text[one.end :])
-        mended = ["thinking_tags"] if message.has_thoughts else []
-        mended += ["code_fence"] if any("```" in part for part in around) else []
-        mended += [] if all(_NOTHING.fullmatch(part) for part in around) else ["prose_around"]
+        recovered = ["thinking_tags"] if message.has_thoughts else []
+        recovered += ["code_fence"] if any("```" in part for part in around) else []
+        recovered += [] if all(_NOTHING.fullmatch(part) for part in around) else ["prose_around"]
         is_end = _NOTHING.fullmatch(around[1]) is not None
         if one.problem is not None:
-            return Found(None, one.problem, tuple(mended), is_end)
-        return _named(one.value, names, mended, is_end)
+            return Found(None, one.problem, tuple(recovered), is_end)
+        return _named(one.value, names, recovered, is_end)
     return _without_names(text, message)
 
 
@@ -100,7 +97,7 @@ def _found(text: str, names: Collection[str]) -> Found:
 
 @dataclass
 class _Object:
-    """A complete object, text[start:end]. problem: why its value may not be taken."""
+    """A complete object, text[start:end]. problem: the reason why its value is refused."""
 
     value: dict[str, Any]
     start: int
@@ -110,9 +107,9 @@ class _Object:
 
 @dataclass
 class _Message:
-    """What was found of the final message up to some place.
+    """The objects of the final message, which begins at `start`.
 
-    start: where it begins. is_thought: it ends within thoughts. broken_at: of the last object that ends in the middle.
+    is_thought: it ends within thoughts. broken_at: the place of the last object that ends in the middle.
     """
 
     start: int = 0
@@ -134,7 +131,7 @@ def _read_message(text: str) -> _Message:
                 break
             at = close.end()
             message.start = message.start if message.objects else at
-        elif mark.lastgroup == "closes":  # all before it was thought
+        elif mark.lastgroup == "closes":  # everything before it is thought
             message = _Message(at, has_thoughts=True)
         else:
             try:
@@ -155,7 +152,7 @@ _KEY = re.compile(r'\s*"')
 
 
 class _Reader:
-    """Reads JSON objects, and notes why a value may not be taken."""
+    """Reads JSON objects, and notes the reason why a value is refused."""
 
     def __init__(self) -> None:
         self._problem: str | None = None
@@ -188,7 +185,7 @@ class _Reader:
 
 
 def _without_names(text: str, message: _Message) -> Found:
-    """Return why there is no object, or give one of other names."""
+    """Return the reason why there is no object, or one of other names."""
     if message.broken_at >= 0:
         return Found(None, "broken_json", is_end=False)
     if message.objects:
@@ -203,15 +200,12 @@ def _without_names(text: str, message: _Message) -> Found:
 
 
 def _plain(name: str) -> str:
-    """Return the letters of a name, however it is spelled: criticalComponents, Critical-Components, **critical
-    components**.
-    """
+    """Return the letters of a name in any spelling: criticalComponents, Critical-Components, **critical component**."""
     return re.sub(r"[\W_]+", "", name).lower()
 
 
 def _unwrapped(value: dict[str, Any], plain_names: Collection[str], wrappers: int = 0) -> dict[str, Any] | None:
-    """Return the object that has one of the names: this one, or the only one in it, as in a function call; else
-    None."""
+    """Return the object that has one of the names: this one or the only one in it, as in a function call; or None."""
     if any(_plain(key) in plain_names for key in value):
         return value
     if wrappers == MAX_WRAPPERS:
@@ -232,17 +226,17 @@ def _object_of(member: Any) -> dict[str, Any] | None:
     return member if isinstance(member, dict) else None
 
 
-def _named(value: dict[str, Any], names: Collection[str], mended: list[str], is_end: bool) -> Found:
-    """Spell the keys of the object that was asked for as they are asked for."""
+def _named(value: dict[str, Any], names: Collection[str], recovered: list[str], is_end: bool) -> Found:
+    """Return the object with its keys spelled like the names."""
     names_by_plain = {_plain(name): name for name in names}
     inner = _unwrapped(value, names_by_plain.keys())
     if inner is None:
-        return Found(value, None, tuple(mended), is_end)
+        return Found(value, None, tuple(recovered), is_end)
     renamed = {names_by_plain.get(_plain(key), key): member for key, member in inner.items()}
     if len(renamed) < len(inner):
-        return Found(None, "duplicate_key", tuple(mended), is_end)
-    mended += ["wrapped"] if inner is not value else []
-    mended += ["key_names"] if renamed.keys() != inner.keys() else []
+        return Found(None, "duplicate_key", tuple(recovered), is_end)
+    recovered += ["wrapped"] if inner is not value else []
+    recovered += ["key_names"] if renamed.keys() != inner.keys() else []
     if _UNREADABLE.search(json.dumps(renamed, ensure_ascii=False)):
-        return Found(None, "unreadable_character", tuple(mended), is_end)
-    return Found(renamed, None, tuple(mended), is_end)
+        return Found(None, "unreadable_character", tuple(recovered), is_end)
+    return Found(renamed, None, tuple(recovered), is_end)

@@ -422,7 +422,7 @@ class WorkerPool:
         return [worker for worker in self._workers.values() if worker.attempt is not None]
 
     def _hand_out(self) -> None:
-        """Give every free worker an item, and start missing workers."""
+        """Assign an item to every free worker, and start missing workers."""
         for place in range(self.num_workers):
             worker = self._workers.get(place) or (self._start(place) if self._is_short() else None)
             if worker is None or worker.attempt is not None or worker.transport.pid is None:

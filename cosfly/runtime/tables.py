@@ -142,7 +142,7 @@ def rows_of(path: Path, columns: list[str] | None = None, *, tree: Path | None =
 
 
 class TableRows(Sequence[dict[str, Any]]):
-    """The rows of a parquet file by number. It stays open, with a few row groups in memory; each process has its own."""
+    """The rows of a parquet file by number. It stays open with a few row groups in memory; each process has its own."""
 
     def __init__(self, path: Path, columns: list[str]) -> None:
         self._path, self._columns = path, columns

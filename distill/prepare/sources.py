@@ -137,7 +137,7 @@ class Flights:
         if key not in self._found:
             if bad := [name for name in names if name != Path(name).name or name in ("", ".", "..")]:
                 raise InputError("not a folder name", where=f"{source.captions}: {caption.sample_id}", got=bad[0])
-            self._found[key] = self._read(source, inside(source.data, "/".join(names), beside=True))
+            self._found[key] = self._read(source, inside(source.data, "/".join(names), in_parent=True))
         return self._found[key]
 
     def _read(self, source: RunSource, folder: Path) -> CaptionedFlight:

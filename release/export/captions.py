@@ -105,7 +105,7 @@ def _of_captions(path: Path, tree: Path | None, left_out: Counter[str]) -> Itera
             continue
         named = f"{caption.town}/{caption.trajectory}/{caption.variant}"
         if named not in places:  # the tree may have been converted since
-            places[named] = named if tree is None else inside(tree, named, beside=True).relative_to(tree).as_posix()
+            places[named] = named if tree is None else inside(tree, named, in_parent=True).relative_to(tree).as_posix()
         images = [f"{places[named]}/{frame_name(index)}/{FILE_NAMES['rgb']}" for index in caption.window]
         if tree is not None and not all((tree / image).is_file() for image in images):
             left_out["missing_picture"] += 1

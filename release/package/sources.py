@@ -166,7 +166,7 @@ def gather(
         for flight in inspection.flights:
             left_out = None if flight.result in wanted else f"{flight.result}: {flight.reason}"
             left_out = left_out or _not_chosen(choice, flight.folder)
-            folder, five_ray = inside(source.data, flight.folder, beside=True), flight.metrics.get("five_ray_mean")
+            folder, five_ray = inside(source.data, flight.folder, in_parent=True), flight.metrics.get("five_ray_mean")
             found.append((number, _inspected_place(source, flight), folder, left_out, flight.sha256, five_ray))
     # What is left out makes no name longer: `release verify` knows the released ones alone.
     ids = flight_ids([place for _, place, *_ in found])
