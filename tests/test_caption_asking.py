@@ -7,7 +7,6 @@ import json
 import random
 import subprocess
 import sys
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from teacher_server import is_mirror, kept_answers
 
 from caption.run.stage import run
 from cosfly.formats.captions import read_captions
-from cosfly.llm import client
 from cosfly.llm.answers import Answer, AnswerBook
 from cosfly.runtime.errors import TeacherError
 from specimens import make_playback_tree
@@ -120,18 +118,6 @@ def test_the_quarantine_is_replayed_alone(tree, tmp_path, whole):
     assert (out / "manifest.json").exists()
 
 
-def test_the_total_timeout_bounds_all_tries(tree, tmp_path, monkeypatch):
-    monkeypatch.setattr(client, "FIRST_PAUSE_S", 0.3)
-    monkeypatch.setattr(client, "LONGEST_PAUSE_S", 0.3)
-    endpoint = {"max_tries": 50, "total_timeout_s": 0.5, "stop_after_failures": 1}
-    with deciding(fault=lambda number, body: "500") as server:
-        start_s = time.monotonic()
-        with pytest.raises(TeacherError, match="total_timeout"):
-            run(settings(server.url, endpoint=endpoint, limit=1), tree, tmp_path / "out")
-        assert time.monotonic() - start_s < 5.0
-        assert 1 <= len(server.bodies) <= 4
-
-
 # --- the request ------------------------------------------------------------------------------------------------------
 
 
@@ -168,32 +154,6 @@ def fill(folder: Path, num_flights: int, num_windows: int, unfinished: set[int])
                 book.forget(flight_name(flight))
 
     asyncio.run(write())
-
-
-def test_a_start_counts_the_answers_of_all_flights(tmp_path):
-    fill(tmp_path, 3, 20, unfinished={2})
-    with AnswerBook(tmp_path) as book:
-        assert book.totals == {"answers": 60, "prompt_tokens": 600, "completion_tokens": 120}
-        assert book.get(flight_name(2), record(2, 7).key) == record(2, 7)
-        assert book.get(flight_name(99), "no such key") is None
-
-
-def test_only_flights_that_are_worked_on_are_in_memory(tmp_path):
-    fill(tmp_path, 3, 4, unfinished=set())
-
-    async def go_on() -> None:
-        with AnswerBook(tmp_path) as book:
-            assert not book._flights
-            for flight in range(3):
-                book.get(flight_name(flight), "x")
-                await book.put(flight_name(flight), record(flight, 4))
-                assert list(book._flights) == [flight_name(flight)]
-                book.forget(flight_name(flight))
-            book.forget("never seen")
-
-    asyncio.run(go_on())
-    with AnswerBook(tmp_path) as book:
-        assert book.totals["answers"] == 15
 
 
 # --- the disk ---------------------------------------------------------------------------------------------------------

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import json
 from pathlib import Path
 
 import pytest
 from specimens_captions import VOCABULARY
 from teacher_server import TeacherServer
 
-from caption.run.compare import STRATEGIES, compare, run
+from caption.run.compare import compare, run
 from caption.run.window_loop import Trial, caption_window
 from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig, RepairConfig, WindowConfig
 from caption.teachers.teacher import RuleTeacher
 from cosfly.formats.captions import Caption, Coc
-from cosfly.runtime.errors import TeacherError
 from specimens import make_flight, make_playback_tree
 
 CFG = CaptionConfig(window=WindowConfig(require_images=False))
@@ -56,14 +54,6 @@ def coc(text: str) -> Coc:
     return Coc(critical_components=text, reasoning_trace="r", flight_decision="hover")
 
 
-def test_a_budget_that_is_used_up_is_one_clear_error(tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 1, 12)
-    with TeacherServer(decision=lambda body: "hover") as server:
-        cfg = CaptionConfig.model_validate({"teacher": server.url, "budget": {"max_tokens": 5_000}})
-        with pytest.raises(TeacherError, match=r"budget.max_tokens: .* of at most 5,000 tokens are used; raise it"):
-            run(cfg, tree, tmp_path / "out")
-
-
 def test_a_comparison_by_hand():
     trials = [
         Trial(coc("a b c"), coc("a b c"), "CONSISTENT", 1, 100),
@@ -76,21 +66,6 @@ def test_a_comparison_by_hand():
 
 
 SETTINGS = {"window": {"require_images": False}}
-
-
-def test_the_rule_teacher_repeats_itself_unless_it_is_anchored(tree, tmp_path):
-    found = {c.strategy: c for c in run(CaptionConfig.model_validate(SETTINGS), tree, tmp_path / "out")}
-    assert set(found) == set(STRATEGIES)
-    counts = {c.num_conflicts for c in found.values()}
-    assert len(counts) == 1
-    count = counts.pop()
-    assert count >= 3
-    assert found["anchored"].consistent == found["cascade"].consistent == count
-    assert (found["anchored"].asks_per_conflict, found["cascade"].asks_per_conflict) == (1.0, 3.0)
-    # Its decision depends on the facts alone, so asking again changes nothing.
-    assert found["hint"].repaired == found["multi_sample"].repaired == 0
-    value = json.loads((tmp_path / "out" / "compare_strategies.json").read_text())
-    assert [row["strategy"] for row in value["strategies"]] == list(STRATEGIES)
 
 
 def test_a_server_is_asked_once_for_the_first_answers(tree, tmp_path):

@@ -104,19 +104,6 @@ def test_a_sound_endpoint_passes_every_check():
     assert f"{15 * TOKENS_PER_IMAGE} tokens" in findings["image input"].detail
 
 
-def test_the_doctor_samples_as_a_run_does():
-    endpoint = {"temperature": 0.7, "top_p": 0.9, "max_tokens": 300, "extra_body": {"min_p": 0.1}}
-    with TeacherServer(respond=patient(), model_facts={"max_model_len": CONTEXT}) as server:
-        examine_endpoint(server.url, CaptionConfig.model_validate({"endpoint": endpoint}), VOCABULARY)
-    for body in map(json.loads, server.bodies):
-        assert {name: body[name] for name in ("temperature", "top_p", "min_p")} == {
-            "temperature": 0.7,
-            "top_p": 0.9,
-            "min_p": 0.1,
-        }
-        assert type(body["seed"]) is int
-
-
 # defect, the finding it must show in, its state, words of the detail
 DEFECTS = [
     ({"obeys_schema": False}, "JSON schema", "warning", "accepted and ignored"),
@@ -144,13 +131,6 @@ def test_a_defect_is_found(defect, name, state, words):
     findings = examine(patient(**defect), defect.get("context", CONTEXT))
     assert findings[name].state == state
     assert words in findings[name].detail
-
-
-def test_an_endpoint_that_is_none_and_a_missing_model(tmp_path):
-    with TeacherServer() as server:
-        found = examine_endpoint(server.url, CaptionConfig.model_validate({"endpoint": {"model": "other"}}), VOCABULARY)
-    assert [(finding.name, finding.state) for finding in found] == [("model", "unusable")]
-    assert "does not have this model" in found[0].detail
 
 
 def test_the_command_exits_with_1_when_unusable():

@@ -20,7 +20,6 @@ from cosfly.formats.captions import read_captions
 from cosfly.runtime.errors import TeacherError
 from specimens import make_playback_tree
 
-NUM_WINDOWS = 10
 TOO_LONG = "This model's maximum context length is 8192 tokens. However, you requested 8203 tokens."
 IMAGES = "At most 5 image(s) may be provided in one prompt."
 FILTERED = "The response was filtered due to the prompt triggering Azure OpenAI's content management policy."
@@ -206,32 +205,6 @@ def test_a_server_that_refuses_the_schema_is_asked_without_it(tree, tmp_path, na
 
 
 # --- room for the answer ----------------------------------------------------------------------------------------------
-
-
-def test_an_answer_that_the_server_had_no_room_for_is_named_and_not_asked_for_three_times(
-    tree, tmp_path, caplog, whole
-):
-    out = tmp_path / "out"
-    cut: list[int] = []
-
-    def fault(number, body):
-        if not is_mirror(body) and len(cut) < 3:
-            cut.append(body["seed"])
-        return "no_room" if cut and body["seed"] in cut and not mended else None
-
-    mended: list[bool] = []
-    with hovering(fault=fault, model_facts={"max_model_len": 1100}) as server:
-        run(settings(server.url), tree, out)
-        assert report_of(out)["windows"]["dropped"] == {"structure_context_full": 3}
-        assert len(server.bodies) == 3 + 2 * 7
-        assert any("--max-model-len" in line and "100 of 1024 tokens" in line for line in caplog.messages)
-        words = "cut: 1000 tokens asked and 100 answered fill the context"
-        assert {held["message"] for held in quarantine(out).values()} == {words}
-        assert report_of(out)["refusals"] == {"structure_context_full": words}
-        mended.append(True)  # the server has more room now; its old answer is not taken from the journal
-        path = run(settings(server.url), tree, out, retry_failed=True)
-    assert [caption.status for caption in read_captions(path)] == ["accepted"] * NUM_WINDOWS
-    assert path.read_bytes() == whole.product
 
 
 # --- outages ----------------------------------------------------------------------------------------------------------

@@ -20,9 +20,8 @@ from cosfly.formats.predictions import Prediction
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.settings import InspectConfig
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.run_dir import Failed
 from distill.inference import stage as infer
-from distill.inference.outcome import SampleOutcome, make_prediction, prediction_of
+from distill.inference.outcome import make_prediction
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import open_split
 from release.columns import caption_values
@@ -175,31 +174,6 @@ def test_a_students_answers_are_judged_marked_and_released(tree, rules, tmp_path
     rows = [caption_values(caption) for caption in by_flight[flight].read()]
     assert {row["teacher_kind"] for row in rows} == {"student"}
     assert (len(rows), account.accepted, account.dropped) == (6, 6, {"not_in_file": 5})
-
-
-def test_what_is_wrong_with_a_students_answer_drops_its_window(tree, rules, tmp_path):
-    said = (rules[0].en or rules[0].zh).model_dump()  # type: ignore[union-attr]
-    false = said | {"critical_components": "The person stands 777 m away from the drone, in front of it."}
-    predictions = [
-        predicted(rules[0], "en", "{broken"),
-        predicted(rules[1], "en", json.dumps(said)[:50], is_finished=False),
-        predicted(rules[2], "en").model_copy(update={"raw": "", "coc": None, "reason": "failed_oom"}),
-        predicted(rules[3], "en"),
-        predicted(rules[3], "zh", "no JSON"),
-        predicted(rules[4], "en", json.dumps(false | {"flight_decision": rules[4].label})),
-        predicted(rules[5], "en", json.dumps(said | {"flight_decision": (rules[5].checks.contradicted or [""])[0]})),
-        predicted(rules[6], "zh"),
-        predicted(rules[7], "en"),
-    ]
-    found = captions_of_student(predictions, tree, tmp_path, evidence={"drop": True})
-    assert [caption.drop_reason for caption in found[:8]] == [
-        "structure_broken_json", "structure_cut_short", "failed_oom", "bilingual_structure_no_json_object", "evidence",
-        "conflict_not_repairable", "not_in_file", None,
-    ]  # fmt: skip
-    sample = make_sample(rules[2], "en", PrepareConfig())
-    assert not isinstance(sample, str)
-    failed = SampleOutcome(sample, Failed(id=sample.key, code="oom", message="no"))
-    assert prediction_of(failed, "test").reason == "failed_oom"
 
 
 def test_from_a_students_answers_to_a_release(tree, rules, tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections import Counter
 
 import pytest
 from specimens_captions import VOCABULARY
@@ -72,15 +71,6 @@ def test_a_hard_conflict_stays_one_whatever_the_judge_says(tree, tmp_path):
     assert len(server.bodies) == len(hard) + len(soft)  # consistent answers are not judged
 
 
-def test_a_label_is_not_put_under_a_text_that_states_another_decision(tree, tmp_path):
-    fix = '{"verdict": "FIX_LABEL", "reason": "replace it"}'
-    captions, _, _ = judged(tree, tmp_path / "out", lambda body: fix)
-    asked = [c for c in captions if c.judge]
-    assert asked
-    # The rule teacher names its decision in the text, so replacing the token alone would make a lie.
-    assert all(c.judge.overruled_by == "text" and c.repair.rung == "anchored" for c in asked)
-
-
 def test_a_label_is_put_in_where_the_text_allows_it(tree, tmp_path):
     fix = '{"verdict": "FIX_LABEL", "reason": "replace it"}'
     with TeacherServer(decision=lambda body: "hover") as teacher, judging_server(lambda body: fix) as judge:
@@ -117,13 +107,6 @@ def test_a_judges_tokens_count_in_the_budget_and_are_shown(tree, tmp_path):
 
 
 # --- the check --------------------------------------------------------------------------------------------------------
-
-
-def test_the_gold_set_is_balanced_and_of_conflicts_only():
-    gold = gold_conflicts()
-    assert Counter(right for _, right in gold) == dict.fromkeys(JUDGEMENTS, 43)
-    assert all(case.answer.flight_decision != case.label for case, _ in gold)
-    assert len({case.sample_id for case, _ in gold}) == len(gold)
 
 
 def few_conflicts():

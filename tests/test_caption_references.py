@@ -14,8 +14,7 @@ from caption.schema import WindowConfig
 from caption.truth.claims import judge_claim
 from caption.truth.facts import measure_facts
 from caption.truth.references import Fact, look_up, parse_reference, word_holds
-from cosfly.formats.captions import Claim, Coc
-from cosfly.formats.sentences import sentences_of
+from cosfly.formats.captions import Claim
 from specimens import make_flight
 
 FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, 6.0, 10.0))
@@ -75,33 +74,6 @@ def test_what_names_nothing(address):
     assert parse_reference(address) is None
 
 
-@each(
-    ("address", "word", "holds"),
-    [
-        ("trend:altitude", "increasing", True),
-        ("trend:altitude", "steady", False),
-        ("trend:distance", "blue", False),  # no word of trends, whichever way it goes
-        ("trend:altitude", "blue", False),
-        ("comparison:speed", "blue", False),
-        ("trend:pitch", "decreasing", True),  # by a little
-        ("trend:pitch", "increasing", False),
-        ("side:yaw", "right", False),
-        ("side:offset_x@t1", "right", True),
-        ("side:offset_x", "centred", False),
-        ("visibility@t2", "visible", True),
-        ("visibility@t0", "partly_occluded", False),
-        ("visibility@t1", "illegible", False),
-        ("comparison:speed", "slower", False),
-        ("target_motion", "standing", False),
-        ("heading", "left", None),
-    ],
-)
-def test_whether_a_word_holds(address, word, holds):
-    reference = parse_reference(address)
-    assert reference is not None
-    assert word_holds(word, reference, FACTS) is holds
-
-
 def test_a_series_that_ends_where_it_began_has_no_trend():
     for distance_m in ((20.5, 20.8, 20.5, 19.3, 20.5), (20.0, 22.0, 18.0, 21.0, 20.2)):
         facts = dataclasses.replace(FACTS, distance_m=distance_m)
@@ -130,14 +102,6 @@ def test_a_series_that_ends_where_it_began_has_no_trend():
 )
 def test_a_claim_against_the_facts(quantity, at, value, unit, state):
     assert judge_claim(Claim(sentence="C1", quantity=quantity, at=at, value=value, unit=unit), FACTS) == state
-
-
-def test_sentences_of_both_languages():
-    text = "It is approx. 5 m away, i.e. near. Speed 1.02 m/s; fine!\n- visible"
-    coc = Coc(critical_components=text, reasoning_trace="目标可见。距离 20.5 米；稳定！继续", flight_decision="hover")
-    names = [name for name, _ in sentences_of(coc)]
-    assert names == ["C1", "C2", "C3", "R1", "R2", "R3"]
-    assert dict(sentences_of(coc))["C1"] == "It is approx. 5 m away, i.e. near."
 
 
 def test_measured_series_agree_with_each_other():

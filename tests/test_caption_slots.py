@@ -14,14 +14,13 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from specimens_captions import FOLLOW, GAP, WAY, report_of, saying, settings
+from specimens_captions import GAP, WAY, report_of, saying, settings
 from tables import each
 from teacher_server import CHINESE, ENGLISH, TeacherServer, is_mirror
 
 from caption.run.stage import run
 from caption.run.windows import cut_windows
 from caption.schema import WindowConfig
-from caption.teachers.rules import describe
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.mirror import check_translation
 from caption.truth.references import Fact, look_up, parse_reference
@@ -29,7 +28,6 @@ from caption.writing.contract import Draft, Refused
 from caption.writing.filling import Filler
 from caption.writing.slots import fact_table
 from caption.writing.templates import Sentence, read_sentence
-from cosfly.formats.actions import TOKENS
 from cosfly.formats.answer_text import Parsed
 from cosfly.formats.captions import Coc, Language, read_captions
 from cosfly.runtime.errors import NothingKept
@@ -160,15 +158,6 @@ def earned_texts() -> dict[str, list[str]]:
     return found
 
 
-@pytest.mark.parametrize("language", ["en", "zh"])
-def test_natural_templates_are_not_refused(language):
-    """What a careful writer puts down who has read the prompt; written before the checks were tried on them."""
-    texts = earned_texts()[f"natural {language}"]
-    refused = {text: found for text in texts if isinstance(found := read_sentence(text, language, 5, 0.5), Refused)}
-    assert len(texts) >= 30
-    assert len(refused) <= 0.05 * len(texts), refused
-
-
 # --- right by construction: the filler against an oracle of its own ---------------------------------------------------
 
 SERIES = {  # slot -> field, digits, unit in both languages
@@ -287,26 +276,6 @@ def test_a_translation_has_the_same_sentences_and_the_glossarys_words():
     assert check_translation(english, other) == ("glossary", 'write "无人机" for "drone"')
 
 
-@each(
-    ("reasons", "decision", "is_taken"),
-    [
-        ("Braking is the safe choice here.", "speed_up", False),
-        ("Braking is the safe choice here.", "slow_down", True),
-        ("So the drone should back away from the person.", "move_forward", False),
-        ("So the drone should hover.", "speed_up", False),
-        ("Braking is not needed here.", "speed_up", True),
-        ("Instead of braking it should follow at once.", "speed_up", True),
-        ("If the person stopped, the drone would have to brake.", "speed_up", True),
-        ("The drone was braking before.", "speed_up", True),
-    ],
-)
-def test_a_reasoning_that_argues_against_its_decision_is_refused(reasons, decision, is_taken):
-    answer = Coc(critical_components="The gap is {distance}.", reasoning_trace=reasons, flight_decision=decision)
-    found = WAY.read(Parsed(answer, therefore=decision), FACTS)
-    assert isinstance(found, Draft) == is_taken, found
-    assert is_taken or found.reason == "decision_against_reasoning"
-
-
 def test_a_sentence_is_proved_only_where_its_words_are_true_with_its_slots():
     texts = earned_texts()
     for language in ("en", "zh"):
@@ -317,21 +286,6 @@ def test_a_sentence_is_proved_only_where_its_words_are_true_with_its_slots():
             found = read_sentence(text, language, 5, 0.5)
             assert isinstance(found, Sentence), (text, found)
             assert found.state == "proved", text
-
-
-def test_the_words_of_a_comparison_a_place_and_a_way_are_those_of_the_window():
-    """FOLLOW: the drone does 3.4 m/s and the walker 1.4; he is 52 px right of the middle and walks ahead of the
-    drone."""
-    cases = {
-        ("en", "The walker is {compare:target_speed,drone_speed} the drone."): "The walker is slower than the drone.",
-        ("zh", "行人{compare:target_speed,drone_speed}无人机。"): "行人慢于无人机。",
-        ("en", "The walker {walking} the drone."): "The walker walks away from the drone.",
-        ("zh", "行人{walking}无人机。"): "行人远离无人机。",
-        ("en", "The walker is {framing}, on the {side:target}."): "The walker is off-centre, on the right.",
-        ("zh", "行人{framing}。"): "行人偏离中心。",
-    }
-    for (language, template), text in cases.items():
-        assert filled(template, language, FOLLOW) == text
 
 
 # --- through the loop -------------------------------------------------------------------------------------------------
@@ -417,15 +371,6 @@ def test_a_record_holds_the_plain_text_and_the_template(tree, tmp_path):
         assert caption.coverage("en") == 0.5
 
 
-def test_a_measurable_word_that_no_slot_says_is_asked_for_once_and_then_left_unread(tree, tmp_path):
-    for better, state in (("The gap to the target pedestrian is {distance}.", "proved"), (None, "unread")):
-        with writing_server("The gap of {distance} is stable.", better) as server:
-            captions = list(read_captions(run(settings(server.url, limit=2), tree, tmp_path / state)))
-        assert [caption.checks.sentences["en"][1] for caption in captions] == [state] * 2
-        assert [caption.checks.refused for caption in captions] == [["unread"]] * 2
-        assert sum(not is_mirror(json.loads(body)) for body in server.bodies) == 4
-
-
 def test_claims_beside_slots_are_recorded_in_the_caption_and_its_evidence(tree, tmp_path):
     """The distance of these flights is steady; the Chinese claim comes with the mirror."""
 
@@ -498,40 +443,3 @@ def test_the_question_shows_what_is_known_by_its_slot(tree, tmp_path):
     questions = [body["messages"] for body in map(json.loads, server.bodies) if not is_mirror(body)]
     assert all("{distance@t0} to {distance@t4}: " in user["content"][-1]["text"] for _, user in questions)
     assert len({system["content"] for system, _ in questions}) == 1  # a constant prefix
-
-
-def test_every_slot_of_the_table_can_be_written():
-    for facts in [FACTS, *WINDOWS[:4]]:
-        for address, text in re.findall(r"\{([a-z_:@0-9]+)\} ([^;\n]+)", fact_table(facts).partition("\n")[2]):
-            if text != "to":
-                found = filled(f"it {{{address}}} it", "en", facts)
-                assert found == f"it {text} it" or text.startswith("to {"), address
-
-
-def test_actions_named_in_words_are_those_of_the_answer():
-    for action in TOKENS:
-        sentence = read_sentence("So the drone should {decision} now.", "en", 5, 0.5)
-        assert isinstance(sentence, Sentence)
-        assert isinstance(Filler(FACTS, action, "en").fill(sentence), str)
-
-
-@pytest.mark.parametrize(
-    ("mean_mps", "step_mps", "is_compared"), [(1.4, 1.4, True), (3.9, 1.4, False), (1.4, 3.9, False)]
-)
-def test_the_rule_teacher_compares_where_the_targets_mean_and_last_step_agree(mean_mps, step_mps, is_compared):
-    """The drone flies 3.4 m/s. The mean stands in the text, the comparison is with the last step."""
-    facts = dataclasses.replace(
-        FOLLOW, target_speed_mps=mean_mps, target_speeds_mps=(*FOLLOW.target_speeds_mps[:-1], step_mps)
-    )
-    texts = [text for ways in describe(facts) for both in ways for text in both]
-    assert any("{comparison:speed}" in text for text in texts) is is_compared
-
-
-@pytest.mark.parametrize("name", ["distance", "speed", "altitude"])
-def test_the_rule_teacher_says_of_no_series_that_it_varies_from_a_value_to_the_same(name):
-    series = {"distance": "distance_m", "speed": "speed_mps", "altitude": "altitude_m"}[name]
-    for values, varies in (((20.0, 20.0, 21.0, 20.6, 20.0), False), ((20.0, 20.0, 21.0, 20.6, 20.1), True)):
-        facts = dataclasses.replace(FOLLOW, **{series: values})
-        texts = [text for ways in describe(facts) for both in ways for text in both if f"{{{name}}}" in text]
-        assert len(texts) >= 2
-        assert any(f"{{trend:{name}}}" in text for text in texts) is varies

@@ -10,9 +10,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from caption.run import stage
 from caption.run.ledger import NUM_CARDS, CaptionReport
-from caption.run.report import page_html
 from caption.run.stage import run
 from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig
@@ -20,7 +18,6 @@ from caption.truth.actions import TABLE, measure
 from cosfly.formats.captions import read_captions
 from cosfly.formats.playback import read_track, write_track
 from cosfly.formats.tracks import find_tracks
-from cosfly.llm.budget import BudgetConfig
 from cosfly.runtime.errors import NothingKept, ResumeError
 from specimens import make_playback_tree
 
@@ -107,16 +104,6 @@ def test_a_product_never_loses_captions(tmp_path):
     assert (out / "captions.jsonl").read_bytes() == before
 
 
-@pytest.mark.parametrize("name", ["glossary"])
-def test_captions_of_another_prompt_are_refused_by_name(tree, tmp_path, monkeypatch, name):
-    shutil.copytree(run(CaptionConfig(), tree, tmp_path / "first").parent, tmp_path / "out")
-    changed = tmp_path / "changed"
-    changed.write_text("otherwise")
-    monkeypatch.setitem(stage.PACKAGE_FILES, name, changed)
-    with pytest.raises(ResumeError, match=f"the {name} changed"):
-        run(CaptionConfig(), tree, tmp_path / "out")
-
-
 def test_bad_flights_are_counted_and_the_others_captioned(tree, tmp_path):
     root = tmp_path / "tree"
     shutil.copytree(tree, root)
@@ -197,20 +184,3 @@ def test_the_page_is_whole_self_contained_and_small(done):
 
 def report_of(done):
     return CaptionReport.model_validate_json((done / "caption_report.json").read_text())
-
-
-def test_sentences_are_marked_by_what_was_read_of_them(done):
-    caption = next(caption for caption in read_captions(done / "captions.jsonl") if caption.status == "accepted")
-    answer = caption.en.model_copy(
-        update={"critical_components": "It is near. It is <red>!", "reasoning_trace": "So be it."}
-    )
-    checks = caption.checks.model_copy(update={"sentences": {"en": ["proved", "unread", "contradicted"]}})
-    page = page_html(
-        report_of(done),
-        [caption.model_copy(update={"en": answer, "checks": checks})],
-        {},
-        BudgetConfig(),
-        "x",
-    )
-    for text, state in (("It is near.", "proved"), ("It is &lt;red&gt;!", "unread"), ("So be it.", "contradicted")):
-        assert f'class="sentence {state}">{text}</span>' in page

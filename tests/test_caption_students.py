@@ -20,7 +20,7 @@ from caption.schema import CaptionConfig
 from caption.teachers.students import as_taught
 from cosfly.formats.captions import Caption, read_captions
 from cosfly.llm.student_chat import TAUGHT, read_taught, write_taught
-from cosfly.runtime.errors import ConfigError, NothingKept, ResumeError
+from cosfly.runtime.errors import ConfigError, ResumeError
 from distill.inference import stage as infer
 from distill.schema import Sample, open_split
 from distill.training.stage import taught_by
@@ -95,28 +95,6 @@ def test_requests_are_those_of_infer_to_the_byte(place, tmp_path, constrained):
         sent = [json.loads(body)["messages"][1]["content"] for body in server.bodies]
         assert {sum(part["type"] == "image_url" for part in parts) for parts in sent} == {10}
         assert all(("response_format" in json.loads(body)) == constrained for body in server.bodies)
-
-
-@pytest.mark.slow
-def test_a_real_model_is_asked_the_same(place, tmp_path):
-    """The same against a small random model behind a server of another make."""
-    pytest.importorskip("torch")
-    from model_server import ModelServer
-
-    from distill.student.random_student import make_tiny_student
-
-    with ModelServer(make_tiny_student(tmp_path / "student")) as server:
-        samples = infer_all(place, server.url, tmp_path / "infer", max_new_tokens=4)
-        asked = {body for body in server.bodies if json.loads(body)["messages"][0]["content"].isascii()}
-        assert len(asked) == sum(sample.language == "en" for sample in samples)
-        server.bodies.clear()
-        with pytest.raises(NothingKept, match="structure_"):  # noise is no caption: all windows are dropped
-            captions_of(
-                place, tmp_path / "captions", server.url, student={"folder": place / "trained", "max_new_tokens": 4}
-            )
-        assert asked <= set(server.bodies)
-    captions = list(read_captions(tmp_path / "captions" / "captions.jsonl"))
-    assert {caption.status for caption in captions} == {"dropped"}
 
 
 def test_unlabelled_flights_are_captioned_and_marked(place, tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import re
 import socket
 from contextlib import nullcontext
 from pathlib import Path
@@ -15,13 +14,11 @@ from specimens_captions import deciding, report_of
 from specimens_captions import settings as quick
 from teacher_server import TeacherServer
 
-from caption.run.reasons import REASONS
 from caption.run.stage import run
 from caption.schema import CaptionConfig
 from cosfly.formats.captions import read_captions
 from cosfly.llm.client import KEY_VARIABLE
 from cosfly.llm.throttle import Throttle
-from cosfly.llm.wire import base_url
 from cosfly.runtime.errors import CosflyError, NothingKept, TeacherError
 
 KEEP = {"hard_conflict": "keep"}
@@ -36,32 +33,6 @@ def settings(url: str, **changes) -> CaptionConfig:
 def first(fault: str, count: int = 1):
     """The fault for the first requests only."""
     return lambda number, body: fault if number < count else None
-
-
-def test_a_hopeless_teacher_is_stopped_and_its_commonest_reasons_are_explained(tree, tmp_path):
-    """Of its first answers none is accepted; a teacher of whom one was is not stopped, and a setting goes on."""
-    cfg = {"stop_after_dropped": 3, "endpoint": {"concurrency": 1}, "repair": KEEP}
-    told = r"none of the first 3 answers.*3 structure_.*\(no answer had the fields"
-    with deciding("ascend", lambda number, body: "short") as server:
-        with pytest.raises(TeacherError, match=told):
-            run(settings(server.url, **cfg), tree, tmp_path / "out")
-        with pytest.raises(NothingKept):
-            run(settings(server.url, **cfg | {"stop_after_dropped": 0}), tree, tmp_path / "out")
-    assert report_of(tmp_path / "out")["windows"]["input"] > 3
-    with deciding("ascend", lambda number, body: "short" if number > 6 else None) as server:
-        run(settings(server.url, **cfg), tree, tmp_path / "one")
-    assert report_of(tmp_path / "one")["windows"]["kept"] > 0
-
-
-def test_every_code_of_a_dropped_window_is_explained_in_one_table():
-    """The documents' table is the messages' one, and holds every code that the ways of writing and the window loop
-    give."""
-    docs = (ROOT / "docs" / "captions.md").read_text("utf-8")
-    rows = dict(re.findall(r"^\| `([a-z_]+)(?:\.\.\.)?` \| (.+) \|$", docs, re.MULTILINE))
-    assert {code: rows.get(code) for code in REASONS} == REASONS
-    sources = [path.read_text("utf-8") for path in (ROOT / "caption").rglob("*.py") if path.name != "reasons.py"]
-    codes = {code for text in sources for code in re.findall(r"\"((?:slots|conflict|regeneration)_[a-z_]+)\"", text)}
-    assert {code for code in codes if code not in REASONS} <= {"slots_"}
 
 
 @pytest.mark.parametrize("writing", ["slots", "prose"])
@@ -151,12 +122,6 @@ def test_unreachable_and_unknown_model_and_not_an_endpoint(tree, tmp_path):
         with pytest.raises(TeacherError, match="may not be an OpenAI-compatible endpoint"):
             run(settings(server.url.removesuffix("/v1") + "/elsewhere"), tree, tmp_path / "d")
         assert not server.bodies
-
-
-def test_a_servers_address_is_read_in_the_ways_that_it_is_written():
-    assert base_url("http://h:8000") == base_url("http://h:8000/") == "http://h:8000/v1"
-    assert base_url("http://h/v1/chat/completions") == "http://h/v1"
-    assert base_url("https://h/api/v3/") == "https://h/api/v3"
 
 
 @pytest.mark.parametrize(

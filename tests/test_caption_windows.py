@@ -29,7 +29,6 @@ from caption.teachers.prompts import make_question, question_messages
 from caption.truth.actions import TABLE, measure
 from caption.truth.facts import measure_facts
 from cosfly.formats.boxes import MapHeader, make_box_map
-from cosfly.formats.captions import read_captions
 from cosfly.formats.playback import Track, read_track, write_track
 from cosfly.formats.segments import Mission
 from cosfly.formats.tracks import find_tracks, read_twin
@@ -336,15 +335,6 @@ def test_a_mission_reaches_no_request_before_its_order_stands(tree, ordered):
         assert after[1] == before[1] + "\n任务状态：电池电量已降至返航储备。"
 
 
-def test_the_rule_teacher_obeys_an_order(ordered, tmp_path):
-    product = run(CaptionConfig(window=NO_IMAGES), ordered, tmp_path / "out")
-    late = [c for c in read_captions(product) if c.sample_id[-2:] in ("08", "09", "10")]
-    assert len(late) == 3
-    for caption in late:
-        assert caption.label == caption.en.flight_decision == "break_off"
-        assert "reserve for the way home" in caption.en.reasoning_trace
-
-
 # --- keyframes --------------------------------------------------------------------------------------------------------
 
 
@@ -360,31 +350,3 @@ def test_no_change_is_missed_and_every_window_is_taken_or_counted(labels, stride
     # Whoever gives each window the label of the keyframe before it gets the flight's labels back.
     spread = [labels[max(k for k in chosen if k <= i)] for i in range(len(labels))]
     assert spread == labels
-
-
-def test_a_run_reports_what_it_saved(tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 2, 40, with_images=False)
-    window = {"require_images": False}
-    plain = run(CaptionConfig.model_validate({"window": window}), tree, tmp_path / "plain")
-    few = run(CaptionConfig.model_validate({"window": window | {"keyframes": True}}), tree, tmp_path / "few")
-    every = {caption.sample_id: caption for caption in read_captions(plain)}
-    taken = list(read_captions(few))
-    report = json.loads((tmp_path / "few" / "caption_report.json").read_text())["keyframes"]
-    assert report["windows"] == len(every) == 4 * 31
-    assert report["taken"] == len(taken) < len(every)
-    assert report["changes_missed"] == 0
-    assert report["calls_saved"] > 0
-    # Read anew from the flights: every window whose label differs from the one before was captioned.
-    ids = {caption.sample_id for caption in taken}
-    cfg = CaptionConfig.model_validate({"window": window})
-    for folder in find_tracks(tree):
-        samples = list(cut_windows(read_track(folder), cfg.window))
-        labels = [TABLE.label_of(measure(sample.future)) for sample in samples]
-        for before, after, sample in zip(labels, labels[1:], samples[1:], strict=False):
-            assert before == after or sample.observed.sample_id in ids
-    # The window itself is the same one: only the mark is added.
-    for caption in taken:
-        assert caption.checks.keyframe.missed == 0
-        caption.checks.keyframe = None
-        assert caption == every[caption.sample_id]
-    assert json.loads((tmp_path / "plain" / "caption_report.json").read_text())["keyframes"] is None

@@ -69,25 +69,6 @@ def test_a_decision_that_is_flown_for_its_horizon_shows_what_its_own_rule_asks_f
     assert shown(motion) >= 1.0, (token, shown(motion), motion)
 
 
-@pytest.mark.parametrize(
-    "token",
-    ["yaw_left_to_follow", "yaw_right_to_follow", "ascend", "descend", "strafe_left", "strafe_right", "hover",
-     "track_straight"],
-)  # fmt: skip
-def test_what_is_flown_is_what_the_label_would_have_been(begin, token):
-    _, motion, _ = flown(begin, *[token] * HORIZON)
-    assert LABELS.label_of(motion) == token
-
-
-def test_the_pace_is_kept_through_a_turn_and_a_missing_answer_and_ends_with_a_hover(begin):
-    moments, _, controller = flown(begin, "yaw_left_to_follow", None, "track_straight", "track_straight")
-    pace = controller.pace_mps
-    assert np.linalg.norm(moments[-1].velocity_mps) == pytest.approx(pace)
-    assert np.linalg.norm(moments[2].velocity_mps) < pace
-    assert flown(begin, "hover", "track_straight")[2].pace_mps == 0.0
-    assert flown(begin, *["slow_down"] * 20)[2].pace_mps == 0.0  # it flies no way back
-
-
 @pytest.mark.parametrize("command", [(99.0, 0, 0, 0, 0), (0, 0, 0, float("nan"), 0), (0, 0)])
 def test_a_command_that_cannot_be_flown_is_the_students_failure_and_the_drone_hovers(begin, command):
     flight, controller, moment = begin()

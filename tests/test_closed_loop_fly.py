@@ -103,19 +103,6 @@ def test_the_ceiling_sees_more_than_chance_and_all_is_the_same_however_many_fly_
     assert seen["random"] < seen["planner"]
 
 
-def test_a_policy_of_ones_own_flies_as_a_student_that_decides_the_same(town, tmp_path, monkeypatch):
-    code = "class Ahead:\n    def reset(self, goal, seed): pass\n    def act(self, seen): return 'track_straight'\n"
-    (tmp_path / "own.py").write_text(code)
-    monkeypatch.chdir(tmp_path)
-    flown = fly(town, tmp_path / "policy", f"{SHORT} --policy own:Ahead")
-    same = fly(town, tmp_path / "floor", f"{SHORT} --student track_straight")
-    for one, other in zip(flown.values(), same.values(), strict=True):
-        assert (one.engine, one.student) == ("policy", "own:Ahead")
-        assert [f.command for f in one.frames] == [f.command for f in other.frames]
-    assert "--policy" in attempt(town, tmp_path / "both", f"{SHORT} --policy own:Ahead --student rules").output
-    assert "own:Missing" in str(attempt(town, tmp_path / "none", f"{SHORT} --policy own:Missing").exception)
-
-
 # --- answers that are none --------------------------------------------------------------------------------------------
 
 ONE = "--set caption.endpoint.max_tries=1 --set fly.side_by_side=3"
@@ -162,15 +149,6 @@ def student(tmp_path_factory) -> Path:
     make_tiny_student(root / "model")
     write_taught(root / "model", taught_by(open_split(root / "set", "train"), 64 * 64))
     return root / "model"
-
-
-def test_a_student_in_this_process_answers_all_flights_as_one_batch(town, tmp_path, student):
-    few = "--set distill.infer.max_new_tokens=4 --set distill.infer.device=cpu --set fly.most_decisions=2"
-    flown = fly(town, tmp_path, f"{SHORT} {few} --student transformers:{student}")
-    for pursuit in flown.values():
-        assert pursuit.engine == "transformers"
-        assert {frame.answer for frame in pursuit.decisions} == {"unreadable"}  # of four tokens
-        assert all(frame.words is not None and frame.answer_s > 0 for frame in pursuit.decisions)
 
 
 def test_a_student_is_asked_with_the_very_prompts_that_it_was_taught_with(town, tmp_path, student):

@@ -1,6 +1,5 @@
 """Figures of closed-loop flights: small records that can be counted by hand, and sums that add up."""
 
-import numpy as np
 import pytest
 from test_formats_pursuits import frame, pursuit
 
@@ -61,18 +60,6 @@ def test_decisions_near_misses_and_failures_are_counted():
     assert sum(measure(one).answers.values()) == len(one.decisions)
     crash = of(one.model_copy(update={"ended": "crashed"}))
     assert crash["near_misses_pmin"] == pytest.approx(1 / (5 * 0.5 / 60), rel=1e-3)  # the last one was no miss
-
-
-def test_even_motion_has_no_jerk_and_a_turn_across_north_none_of_yaw():
-    poses = [(float(i), 0, 20, -43, (170 + 5 * i + 180) % 360 - 180, 0) for i in range(9)]
-    frames = tuple(frame(0.5 * i, "end" if i == 8 else "ok", pose=pose) for i, pose in enumerate(poses))
-    found = of(pursuit(frames=frames, num_walk_frames=8))
-    assert found["jerk_rms_mps3"] == pytest.approx(0, abs=1e-6)
-    assert found["yaw_jerk_rms_degps3"] == pytest.approx(0, abs=1e-6)
-    poses[4] = (5.0, *poses[4][1:])  # one pose is 1 m ahead: third differences 1, -3, 3, -1 of six
-    frames = tuple(frame(0.5 * i, "end" if i == 8 else "ok", pose=pose) for i, pose in enumerate(poses))
-    jerk = of(pursuit(frames=frames, num_walk_frames=8))["jerk_rms_mps3"]
-    assert jerk == pytest.approx(np.sqrt(20 / 6) / 0.5**3, rel=1e-3)
 
 
 def test_a_score_adds_up_is_read_as_written_and_marks_towns_that_were_trained_on(tmp_path):

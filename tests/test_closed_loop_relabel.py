@@ -48,19 +48,6 @@ def test_where_it_erred_the_planner_goes_on_and_what_is_made_is_captioned(town, 
     assert all(max(caption.window) < min(caption.future) for caption in captions)
 
 
-def test_a_decision_that_was_no_mistake_is_kept_unless_the_settings_say_otherwise(town, tmp_path):  # noqa: F811
-    fly(town, tmp_path / "flown", STUDENT)
-    counts = {}
-    for name in ("false", "true"):
-        done = relabel(town, tmp_path / "flown", tmp_path / name, f"--set fly.relabel.mistakes_only={name}")
-        assert done.exit_code == 0, (done.output, done.exception)
-        counts[name] = json.loads((tmp_path / name / "manifest.json").read_text())
-    every, mistakes = counts["false"]["counts"], counts["true"]["counts"]
-    assert mistakes["dropped"]["no_mistake"] >= 1
-    assert every["kept"] == mistakes["kept"] + mistakes["dropped"]["no_mistake"]
-    assert counts["false"]["reasons"] == counts["true"]["reasons"]
-
-
 def test_redrawn_frames_show_what_the_student_saw(town, tmp_path):  # noqa: F811
     weather = "--set render.weather_mode=random_per_path --set render.fovs_deg=[40,70]"
     fly(town, tmp_path / "flown", f"--workers 1 --student track_straight --set fly.most_decisions=20 {weather}")

@@ -6,13 +6,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from cosfly.geometry.grid import connected_parts
-from cosfly.pedestrians.astar import SQRT2, UNIFORM, find_route, route_cost
-
-
-def free_cells(text: str) -> np.ndarray:
-    """Make a grid from rows of text, row 0 first: # blocks."""
-    return np.array([[mark != "#" for mark in row] for row in text.split()])
-
+from cosfly.pedestrians.astar import UNIFORM, find_route, route_cost
 
 AXES = [(1, 0), (0, 1), (1, 1), (-1, 1)]
 
@@ -44,24 +38,6 @@ def problems(free: np.ndarray, route: np.ndarray) -> list[str]:
         elif not (free[y0, x1] and free[y1, x0]):
             found.append(f"cuts a corner: {(x0, y0)} {(x1, y1)}")
     return found + [f"blocked: {(x, y)}" for x, y in route.tolist() if not free[y, x]]
-
-
-def test_costs_by_hand():
-    for text, start, goal, cost in (
-        ("...", (1, 0), (1, 0), 0.0),
-        ("....", (0, 0), (3, 0), 3.0),
-        (".... .... .... ....", (0, 0), (3, 3), 3 * SQRT2),
-        (".... .... .... ....", (3, 0), (0, 1), 2 + SQRT2),
-        (". . .", (0, 2), (0, 0), 2.0),
-        (".# ..", (0, 0), (1, 1), 2.0),  # the corner may not be cut
-        (".#. .#. ...", (0, 0), (2, 0), 6.0),
-        ("..... .###. .....", (0, 1), (4, 1), 6.0),
-    ):
-        free = free_cells(text)
-        route = find_route(free, start, goal)
-        assert route_cost(route) == pytest.approx(cost, abs=1e-12)
-        assert (tuple(route[0]), tuple(route[-1])) == (start, goal)
-        assert problems(free, route) == []
 
 
 @settings(max_examples=60)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from cosfly.formats.segments import Segment
 from cosfly.geometry.axes import rotation_matrices
-from cosfly.geometry.blind import decide, fit_network, fit_rule, is_drawn_ahead, past_of
+from cosfly.geometry.blind import is_drawn_ahead, past_of
 from specimens import make_flight
 
 NUM = 12
@@ -50,21 +50,6 @@ def test_a_past_is_the_same_wherever_and_whenever_it_was(seed):
     assert not np.array_equal(past_of(flight, range(5), True), here)
 
 
-def test_a_past_is_without_perturbation_where_it_is_known_and_finite_where_nobody_is_seen():
-    (flight, _), (shaken, _) = make_flight(NUM), make_flight(NUM, variant="aug_001")
-    unknown = replace(shaken, drone_offsets_m=np.full((NUM, 3), np.nan))
-    clean = past_of(flight, range(5), False)[:6]  # velocities of the drone
-    np.testing.assert_allclose(past_of(shaken, range(5), False)[:6], clean, atol=1e-6)
-    assert np.abs(past_of(unknown, range(5), False)[:6] - clean).max() > 0.1
-    lost = replace(flight, targets_m=np.full((NUM, 3), np.nan))
-    assert np.isfinite(past_of(lost, range(5), False)).all()
-    of_one, of_two = past_of(flight, [7], False), past_of(flight, [6, 7], False)  # windows shorter than the past
-    assert of_one.shape == of_two.shape == past_of(flight, range(5), False).shape
-    assert np.isfinite(of_one).all()
-    assert not of_one[:6].any()
-    np.testing.assert_allclose(of_two[3:6], past_of(flight, range(3, 8), False)[3:6])
-
-
 @pytest.mark.parametrize(
     ("steps_m", "first", "last"),
     [
@@ -89,22 +74,3 @@ def test_turns_and_other_parts_are_drawn_ahead_and_bends_and_orders_are_not():
     nobody = replace(parts, targets_m=np.full((NUM, 3), np.nan))
     assert is_drawn_ahead(nobody, 4, 9, False) is None
     assert is_drawn_ahead(parts, 0, 5, False) is None
-
-
-def test_a_network_tells_what_two_comparisons_cannot_and_does_so_again():
-    """Four quarters of a circle that has a decision in every other eighth; the scale of a column does not matter."""
-    rng = np.random.default_rng(1)
-    table, spare = rng.normal(size=(600, 3)), rng.normal(size=(400, 3))
-
-    def told(rows):
-        return (np.floor(4.0 * np.arctan2(rows[:, 1], rows[:, 0]) / np.pi).astype(int) % 2) + (rows[:, 2] > 1.0)
-
-    networks = [
-        fit_network(table * scale, told(table), np.random.default_rng(0)) for scale in (1.0, 1.0, [1e3, 1e-3, 1.0])
-    ]
-    first, again, scaled = (net(spare * s) for net, s in zip(networks, (1.0, 1.0, [1e3, 1e-3, 1.0]), strict=True))
-    rule = fit_rule(table, told(table))
-    by_rule = np.array([decide(rule, row) for row in spare])
-    assert np.array_equal(first, again)
-    assert (scaled == first).mean() > 0.9
-    assert (first == told(spare)).mean() > (by_rule == told(spare)).mean() + 0.1

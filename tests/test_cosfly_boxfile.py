@@ -1,15 +1,14 @@
 """Maps of one's own: tables and GeoJSON of boxes as people write them, and what is wrong with others, all at once."""
 
 import json
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from cosfly.formats.boxes import BoxMap, read_boxes, write_boxes
-from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES, KINDS
+from cosfly.formats.boxes import BoxMap, write_boxes
+from cosfly.formats.kinds import KIND_NAMES
 from cosfly.maps.boxfile import BoxesConfig, load, plausibility
 from cosfly.maps.synthetic import SyntheticConfig
 from cosfly.maps.synthetic import load as invent
@@ -83,14 +82,6 @@ def test_outlines_and_points_of_geojson(tmp_path):
     assert_allclose(box_map.maxs[box_map.kinds == 1][0], [120, -4, 0])
 
 
-def test_longitude_and_latitude_become_metres(tmp_path):
-    """At 52 degrees north a degree of latitude is 111,267 m, one of longitude 68,677 m (tables of WGS 84)."""
-    ring = [[4.0, 52.0], [4.001, 52.0], [4.001, 52.001], [4.0, 52.001], [4.0, 52.0]]
-    box_map = loaded(tmp_path, collection(feature("Polygon", [ring], type="Buildings", height_m=9)), ".geojson")
-    size = sorted(box_map.half_extents[0, :2] * 2)
-    assert_allclose(size, [68.677, 111.267], rtol=2e-4)
-
-
 def test_ours_is_read_as_it_is_and_named_anew(tmp_path):
     write_boxes(tmp_path / "own.json", town())
     box_map = load(BoxesConfig(path=tmp_path / "own.json", name="Mine", licence="mit"))
@@ -107,24 +98,6 @@ def test_what_is_wrong_with_many_rows_hides_nothing_else(tmp_path):
     line_42 = "line 42: unknown type 'road' (did you mean 'Roads'?), height_m is not a finite number: 'wide'"
     assert line_42 in str(caught.value)
     assert "2 to fix" in str(caught.value)
-
-
-def test_the_documents_list_every_type():
-    page = (Path(__file__).parents[1] / "docs/files.md").read_text(encoding="utf-8")
-    listed = page[page.index("Types of surfaces") : page.index("A road, pavement or lawn without a height")]
-    assert set(re.findall(r"`(\w+)`", listed)) == KINDS.keys() - {"NONE"}
-    surfaces = re.findall(r"`(\w+)`", listed.partition(".")[0])
-    assert {KINDS[name] for name in surfaces} == GROUND_KINDS
-
-
-def test_a_map_far_from_the_origin_is_moved_there_and_says_so(tmp_path):
-    far = {",10,20,4": ",500010,5000020,4", ",40,-5,3": ",500040,4999995,3", ",25,0,-": ",500025,5000000,-"}
-    text = PLAIN
-    for near, place in far.items():
-        text = text.replace(near, place)
-    box_map = loaded(tmp_path, text)
-    assert box_map.header.offset_m == {"x": 500025.0, "y": 5000010.0, "z": 0.0}
-    assert np.abs(box_map.centers).max() < 100
 
 
 def test_all_that_is_wrong_with_a_table_is_told(tmp_path, subtests):
@@ -188,21 +161,3 @@ def test_a_file_is_needed_and_known_by_its_suffix(tmp_path):
         loaded(tmp_path, PLAIN, ".txt")
     with pytest.raises(ValueError, match="unknown type 'House'"):
         BoxesConfig(types={"haus": "House"})
-
-
-def test_what_a_map_tells_beside_its_boxes_must_follow_from_them(tmp_path, subtests):
-    for old, new, words in [
-        ('"id":1,', '"id":1,"yaw":3,', r"boxes\[0\]\.yaw: Extra inputs"),
-        ("x east, y north", "x forward, y right", r"axes: not what its boxes are.*expected right-handed"),
-        ('"num_boxes": ', '"num_boxes": 1', "num_boxes: not what its boxes are"),
-        ('"Buildings": ', '"Buildings": 1', "counts: not what its boxes are"),
-        ('"semantic_id":3', '"semantic_id":4', "semantic_id: not the number of its type; got 4; expected 3, Buildings"),
-        ('"max":[', '"max":[8', "max: does not follow from center, extent and rotation"),
-    ]:
-        with subtests.test(old=old, new=new):
-            path = tmp_path / "boxes_3d.json"
-            write_boxes(path, town())
-            assert old in path.read_text()
-            path.write_text(path.read_text().replace(old, new, 1))
-            with pytest.raises(InputError, match=words):
-                read_boxes(path)

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from cosfly.formats.actions import TOKENS
-from cosfly.formats.coverage import AXES, Coverage, azimuths_deg, coverage_of, default_coverage
+from cosfly.formats.coverage import AXES, Coverage, azimuths_deg, coverage_of
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.viz.coverage_page import coverage_html, ranges, shares
@@ -22,21 +18,6 @@ from specimens import make_playback_tree
 def flights(tmp_path_factory):
     tree = make_playback_tree(tmp_path_factory.mktemp("tree"), 2, 12, width_px=64, height_px=36)
     return [read_track(folder) for folder in find_tracks(tree)]
-
-
-@given(st.lists(st.floats(0, 99.9), min_size=1, max_size=300), st.floats(0.02, 0.98))
-def test_percentiles_are_numpys_to_a_bin(values, share):
-    axis = AXES["height_m"]
-    found = axis.percentile(axis.counts(np.array(values)), share)
-    low, high = (np.quantile(values, share, method=method) for method in ("lower", "higher"))
-    assert low - axis.step <= found <= high + axis.step
-
-
-def test_what_lies_beyond_counts_in_the_outermost_bins_and_nan_nowhere():
-    axis = AXES["visibility"]
-    counts = axis.counts(np.array([-5.0, 0.0, 0.97, 1.0, 7.0, np.nan]))
-    assert (counts[0], counts[-1], sum(counts)) == (2, 3, 5)
-    assert axis.percentile([], 0.5) is None
 
 
 def test_azimuths_count_from_the_walkers_heading_to_the_left():
@@ -59,25 +40,6 @@ def test_flights_add_up(flights):
     assert high == pytest.approx(np.quantile(heights, 0.95), abs=2.0)
     assert all(sum(total.bins[name]) == total.frames for name in ("height_m", "distance_m"))
     assert Coverage.total([]).frames == 0
-
-
-def test_who_stands_keeps_his_heading(flights):
-    flight = flights[0]
-    targets = flight.targets_m.copy()
-    targets[4:] = targets[4]  # stands from there on
-    headings = replace(flight, targets_m=targets).target_headings_deg
-    assert np.ptp(headings[5:]) < 1e-9
-    assert headings[-1] == pytest.approx(headings[5])
-    assert np.isnan(replace(flight, targets_m=np.repeat(targets[:1], len(flight), 0)).target_headings_deg).all()
-
-
-def test_the_plain_run_is_the_one_that_ships():
-    plain = default_coverage()
-    assert plain.styles == {"follow": plain.frames}
-    assert plain.frames > 500
-    assert set(plain.labels) <= set(TOKENS)
-    low, high = plain.range_of("height_m")
-    assert 15 < low < high < 25  # the paper's pilot: 20.4 +- 1.2 m
 
 
 def test_each_is_told_beside_the_plain_run(flights):

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.stage import load_map
 from cosfly.pedestrians.bystanders import bystanders_of
-from cosfly.pedestrians.crossings import CROSSING, ROAD, where_walked
+from cosfly.pedestrians.crossings import where_walked
 from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import PedestriansConfig, walkable_ground
 from cosfly.pipeline.settings import RunConfig
@@ -34,17 +33,6 @@ def street(*, marked: bool = False) -> BoxList:
     for y in np.arange(-3.2, 3.4, 1.2) if marked else ():
         boxes.add("RoadLines", (10, y), (3.0, 0.55), -0.1, -0.03)
     return boxes
-
-
-def footing_at(boxes: BoxList, *points) -> list[int]:
-    ground = walkable_ground(boxes.box_map(), CFG)
-    x, y = ground.grid.cells_at(np.array(points)).T
-    return ground.footing[y, x].tolist()
-
-
-def test_where_stripes_are_only_they_are_crossings_from_kerb_to_kerb_and_dashes_are_none():
-    places = (10.2, 0.2), (10.2, 3.7), (10.2, -3.7), (16.2, 0.2), (0.2, 20.2), (0.2, 0.2), (14.2, 2.2)
-    assert footing_at(street(marked=True), *places) == [CROSSING] * 3 + [ROAD] * 4
 
 
 @pytest.mark.parametrize(
@@ -96,21 +84,3 @@ def test_at_most_a_twentieth_of_the_walked_points_of_shipped_towns_is_on_the_roa
     assert on_crossings > 0.05  # people do cross
     paper, _ = shares(load(RunConfig, shipped("diverse.yaml"), ["pedestrians.road_cost=1"]), name)
     assert paper > 0.1
-
-
-@pytest.mark.parametrize("name", ["old_town", "market"])
-def test_people_walk_under_passages_and_arcades_of_the_simplified_town(name):
-    town = load(RunConfig, shipped("diverse.yaml")).of_town(name)
-    box_map = simplify(load_map(town.maps, seed=town.seed), town.simplify).box_map
-    ground = walkable_ground(box_map, town.pedestrians)
-    roofs = box_map.select(
-        (box_map.kinds == KINDS["Buildings"]) & (box_map.mins[:, 2] > town.pedestrians.human_height_m)
-    )
-    num_under = 0
-    for k in range(40):
-        places = make_pedestrian(
-            "p", ground, town.pedestrians, rng_for(0, "pedestrians", f"path_{k:05d}")
-        ).walk.positions_m
-        is_under = (places[:, None, :2] >= roofs.mins[:, :2]) & (places[:, None, :2] <= roofs.maxs[:, :2])
-        num_under += bool(is_under.all(axis=2).any())
-    assert num_under >= 4

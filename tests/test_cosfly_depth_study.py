@@ -3,24 +3,17 @@ nothing to study."""
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
-from cosfly.cli import app
-from cosfly.formats.frames import frame_name
-from cosfly.formats.tracks import find_tracks
-from cosfly.runtime.json_io import read_json
 from cosfly.studies.depth import (
     BITS,
     Study,
     quantised,
     run,
 )
-from specimens import make_playback_tree
 
 NEAR_M, FAR_M = 15.36, 38.32  # tab:depth_format_comparison
 
@@ -50,43 +43,6 @@ def test_depths_spread_evenly_give_the_papers_errors(tmp_path):
         assert row.psnr_db == pytest.approx(psnr_db, abs=0.3)
         kib = 360 * 640 * int(coding.removesuffix("-bit")) / 8 / 1024
         assert row.kilobytes == pytest.approx(kib), "as the paper's column counts them"
-
-
-def test_float32_against_float64(tmp_path):
-    np.save(tmp_path / "depth.npy", ramp(np.float64))
-    study = run(tmp_path / "depth.npy", tmp_path / "out")
-    single = rows_of(study)["32-bit float"]
-    assert study.truth == "float64"
-    assert 0 < single.max_cm <= np.spacing(np.float32(FAR_M)) / 2 * 100 * 1.001
-    assert single.psnr_db > 145
-
-
-def test_a_frame_of_the_tree_is_studied_with_its_picture(tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 1, 3, with_augmented=False)
-    frame = find_tracks(tree)[0] / frame_name(1)
-    answer = CliRunner().invoke(app, ["study", "depth", "--data", str(tree), "--out", str(tmp_path / "any")])
-    assert answer.exit_code == 0, answer.output
-    assert "32-bit float" in (tmp_path / "any/depth_study.md").read_text()
-    answer = CliRunner().invoke(app, ["study", "depth", "--frame", str(frame), "--out", str(tmp_path / "out")])
-    assert answer.exit_code == 0, answer.output
-    named = ["--data", str(tree), "--frame", frame.relative_to(tree).as_posix(), "--out", str(tmp_path / "named")]
-    assert CliRunner().invoke(app, ["study", "depth", *named]).exit_code == 0
-    assert (tmp_path / "named/depth_study.md").read_text() == (tmp_path / "out/depth_study.md").read_text()
-    study = Study.model_validate(
-        {k: v for k, v in read_json(tmp_path / "out/depth_study.json").items() if not k.startswith("schema")}
-    )
-    depth = np.load(frame / "depth.npy")
-    known = depth[(depth != 1000) & (depth != 0)]
-    assert study.share_measured == known.size / depth.size
-    rows = rows_of(study)
-    row = rows["32-bit float"]
-    assert (row.max_cm, row.psnr_db, row.unique) == (0.0, None, len(np.unique(known)))
-    assert rows["8-bit"].edges < rows["12-bit"].edges <= 1.0
-    table = (tmp_path / "out/depth_study.md").read_text()
-    assert table.count("\n| ") == 2 + len(study.rows)
-    assert str(tmp_path) not in table
-    picture = cv2.imread(str(tmp_path / "out/depth_study.png"))
-    assert picture.std() > 20
 
 
 @given(st.sampled_from(BITS), st.integers(0, 2**31))

@@ -10,7 +10,6 @@ from specimens_slopes import on_ground, sampled, sloped_city
 from cosfly.formats.boxes import BoxMap, read_boxes
 from cosfly.formats.kinds import GROUND_KINDS, KINDS
 from cosfly.geometry.grid import empty_grid, lies_off_ground, surface_kinds
-from cosfly.maps.boxfile import BoxesConfig
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.derived_ground import CREDITS, NEAR_M, PAVEMENT_M, with_derived_ground
@@ -51,20 +50,6 @@ def test_pavement_lies_along_facades_asphalt_between_near_buildings_and_lawn_els
     assert kinds_at(box_map, (0, 35), (20, far + 8), (-60, -29)) == [TERRAIN] * 3
 
 
-def test_what_is_derived_is_marked_and_a_map_with_ground_of_its_own_is_left_alone():
-    bare = houses()
-    box_map = with_derived_ground(bare)
-    assert len(box_map) - len(bare) == box_map.header.derived_ground == box_map.header.added_boxes
-    assert box_map.header.credits == CREDITS
-    assert len(np.unique(box_map.ids)) == len(box_map)
-    for name in ("centers", "half_extents", "ids", "kinds"):
-        assert (getattr(box_map, name)[: len(bare)] == getattr(bare, name)).all()
-    assert with_derived_ground(box_map) is box_map
-    lawn = BoxList()
-    lawn.add_span("Terrain", (0, 0), (9, 9), -1.0, 0.0)
-    assert with_derived_ground(lawn.box_map()).header.derived_ground == 0
-
-
 @pytest.mark.parametrize("shape", ["plane", "hill"])
 def test_on_a_slope_all_of_it_lies_in_the_ground(shape):
     box_map = with_derived_ground(on_ground(houses((0.0, 100.0, 30.0)), sampled(shape)))
@@ -88,17 +73,6 @@ def test_a_city_model_without_streets_gets_it_and_the_same_bytes_twice(tmp_path:
     assert header.credits == f"Its makers. {CREDITS}"
     path.write_text(json.dumps(sloped_city()))
     assert load_map(cfg).header.derived_ground == 0
-
-
-def test_boxes_of_ones_own_get_it_where_they_ask_for_it(tmp_path: Path):
-    path = tmp_path / "own.csv"
-    path.write_text("type,x_m,y_m,length_m,width_m,height_m\nBuildings,0,0,20,10,8\nBuildings,0,30,20,10,8\n")
-    plain, derived = (
-        load_map(MapsConfig(source="boxes", boxes=BoxesConfig(path=path, derive_ground=wanted)))
-        for wanted in (False, True)
-    )
-    assert plain.counts() == {"Buildings": 2}
-    assert {"Roads", "Sidewalks", "Terrain"} < derived.counts().keys()
 
 
 def test_people_of_a_foreign_city_of_buildings_alone_walk_on_its_pavements(shared_data: Path):

@@ -27,7 +27,7 @@ from cosfly.inspection.stage import run as inspect
 from cosfly.llm.budget import BudgetConfig
 from cosfly.runtime import console as shared
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.escaping import LONGEST, for_markdown, for_terminal
+from cosfly.runtime.escaping import LONGEST, for_terminal
 from cosfly.runtime.json_io import read_json
 from release.card.render import render_card
 from release.record import ReleaseRecord
@@ -175,14 +175,6 @@ def test_the_page_of_a_captioning_run_shows_forged_captions(tree, tmp_path):
 # --- the card ---------------------------------------------------------------------------------------------------------
 
 markdown = MarkdownIt("commonmark", {"html": True}).enable("table")
-
-
-@given(st.text(max_size=60))
-def test_markdown_shows_a_text_as_it_is(text):
-    [_, inline, _] = markdown.parse("x" + for_markdown("x" + text + "x") + "x")
-    assert {token.type for token in inline.children} <= {"text", "text_special"}
-    words = "".join(token.content for token in inline.children)
-    assert words == "xx" + " ".join(for_terminal("x" + text + "x").split())[1:] + "x"
 
 
 def test_a_card_shows_forged_texts(tree, inspection, tmp_path):

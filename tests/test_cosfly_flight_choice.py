@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 from specimens_foreign import write_foreign_tree
 
-from caption.run.stage import run as caption_run
-from caption.schema import CaptionConfig
 from cosfly.formats.places import TrackChoice
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.errors import InputError
-from distill.prepare import stage as prepare
-from distill.prepare.sources import RunSource as Prepared
-from distill.prepare.stage import PrepareConfig
-from distill.schema import open_split
 
 TOWNS, NAMES = ("Town01", "Town02_Opt"), ("trajectory_1777083733", "trajectory_1777090000")
 
@@ -59,18 +52,6 @@ def test_patterns_are_of_folders_and_those_above_them(tree):
 
 
 # --- all the way ------------------------------------------------------------------------------------------------------
-
-
-def test_a_training_set_takes_some_flights(tree, tmp_path):
-    captions = caption_run(CaptionConfig(), tree, tmp_path / "caption")
-    cfg = PrepareConfig(modalities=("rgb",), too_few="fill", flights=TrackChoice(match=("Town01",), tracks=("clean",)))
-    prepare.run(cfg, [Prepared.of_files(tree, captions)], tmp_path / "set")
-    splits = ("train", "val", "test")
-    flights = {(s.town, s.variant) for split in splits for s in open_split(tmp_path / "set", split)}
-    assert flights == {("Town01", "ORI")}
-    counts = json.loads((tmp_path / "set/manifest.json").read_text())["counts"]
-    assert counts["dropped"]["not_chosen"] == 2 * 6 * 5  # languages, flights, windows of each
-    assert counts["kept"] + sum(counts["dropped"].values()) == counts["input"]
 
 
 # --- smaller ----------------------------------------------------------------------------------------------------------

@@ -131,16 +131,6 @@ def fly(planner, scenario, obstacles):
     return load_planner(planner)(scenario, obstacles, CFG, rng_for(0, "plan", scenario.path_id))
 
 
-def test_it_climbs_over_what_blocks_every_ring():
-    ring = [((15 * np.cos(t), 15 * np.sin(t), 17), (9, 9, 17)) for t in np.arange(0, 2 * np.pi, np.pi / 4)]
-    wall = [((60 * np.cos(t), 60 * np.sin(t), 17), (30, 30, 17)) for t in np.arange(0, 2 * np.pi, np.pi / 4)]
-    obstacles = kernels.obstacle_index(town_of(*ring, *wall))
-    scenario = make_scenario(walk_along("w", [(-2, 0), (2, 0)]), obstacles, CFG)
-    made = fly("foresight", scenario, obstacles)
-    assert made.solver["start"] == "climbing search"
-    assert made.positions_m[:, 2].min() >= 34.0 + 3.0
-
-
 def test_it_changes_sides_before_a_row_of_trees_hides_the_walker():
     """Canopies along the right of the second half of a walk whose wished place, right of the walker, they would hide it
     from.
@@ -154,22 +144,6 @@ def test_it_changes_sides_before_a_row_of_trees_hides_the_walker():
     assert kernels.visibility(obstacles, requested, scenario.targets_m).mean() < 0.6
     flown = fly("foresight", scenario, obstacles).positions_m
     assert kernels.visibility(obstacles, flown, scenario.targets_m).mean() > 0.99
-
-
-def test_a_wished_bearing_counts_for_more_than_a_short_way(subtests):
-    for bearing_rad in [0.0, np.pi / 2, np.pi]:
-        with subtests.test(bearing_rad=bearing_rad):
-            scenario, obstacles = scenario_of("empty")
-            reference = replace(
-                scenario.reference,
-                bearing_rad=np.full_like(scenario.reference.bearing_rad, bearing_rad),
-                any_bearing=False,
-            )
-            points = fly("foresight", replace(scenario, reference=reference), obstacles).positions_m
-            away = points - scenario.targets_m
-            off = np.arctan2(away[:, 1], away[:, 0]) - (reference.heading_rad + bearing_rad)
-            assert np.abs(np.angle(np.exp(1j * off))).mean() < np.radians(8)
-            assert np.abs(np.linalg.norm(away, axis=1) - reference.distance_m).mean() < 3.0
 
 
 # --- from where a drone is --------------------------------------------------------------------------------------------

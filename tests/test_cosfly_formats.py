@@ -40,13 +40,6 @@ def test_boxes_round_trip(tmp_path_factory, n, seed):
     assert path.read_bytes() == first  # idempotent
 
 
-def test_the_papers_bare_list_loads(tmp_path):
-    path = tmp_path / "boxes.json"
-    write_boxes(path, some_boxes())
-    path.write_text(json.dumps(json.loads(path.read_text())["boxes"]))
-    assert len(read_boxes(path)) == 3
-
-
 def test_roi_forms(tmp_path):
     path = tmp_path / "roi_polygon.json"
     square = [[0, 0], [10, 0], [10, 10]]

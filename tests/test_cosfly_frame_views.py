@@ -14,13 +14,12 @@ from caption.run.window_loop import caption_window
 from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig, ImageConfig, Window, WindowConfig
 from caption.teachers.images import FrameEncoder, pictures_of
-from caption.teachers.prompts import make_question, prompt_hash, question_messages
+from caption.teachers.prompts import make_question, question_messages
 from caption.teachers.teacher import RuleTeacher
 from cosfly.formats.captions import PICTURES_MARK, Language
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
-from cosfly.runtime.errors import InputError
-from cosfly.viz.frame_views import PEDESTRIAN_RGB, Pictures
+from cosfly.viz.frame_views import PEDESTRIAN_RGB
 from distill.inference.stage import InferConfig, make_request
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import Sample
@@ -36,24 +35,6 @@ def tree(tmp_path_factory):
 @pytest.fixture(scope="module")
 def frame(tree):
     return read_track(find_tracks(tree)[0]).frame_folder(1)
-
-
-def test_the_middle_is_cut_out_wherever_the_person_is(tmp_path):
-    """A third of the width and of the height, in the size that the whole picture has in the prompt; where its size is
-    that, to the bit."""
-    rgb = np.random.default_rng(0).integers(0, 255, (90, 150, 3), dtype=np.uint8)
-    Image.fromarray(rgb).save(tmp_path / "rgb.png")
-    middle = Pictures(("middle",), (50, 30))
-    (shown,) = middle.read(tmp_path)
-    assert np.array_equal(shown, rgb[30:60, 50:100])
-    whole, larger = Pictures(("rgb", "middle"), (150, 90)).read(tmp_path)
-    assert np.array_equal(whole, rgb)
-    assert np.array_equal(larger[1::3, 1::3], shown)  # of each nine pixels the middle one is as it was
-    assert "1/3 of its width and height" in middle.sentence("en")
-    assert "a picture of the whole frame of 50 x 30 px" in middle.sentence("en")
-    assert "各 1/3" in middle.sentence("zh")
-    with pytest.raises(InputError, match="another size"):
-        Pictures(("middle",), (50, 20)).read(tmp_path)
 
 
 # --- what is told and what is shown ---
@@ -154,15 +135,6 @@ def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, 
         assert kinds == [word for i in range(5) for word in (f"t{i}:", *["picture"] * len(views))] + [text]
         for picture, wanted in zip(sent_pictures(request.messages), expected, strict=True):
             assert np.array_equal(picture, wanted)
-
-
-def test_the_hash_is_of_what_was_asked(window):
-    few, many = (
-        make_question(window.observed, ImageConfig(modalities=views), "prose", VOCABULARY)
-        for views in (("rgb",), ("rgb", "depth"))
-    )
-    assert few.prompts == many.prompts
-    assert prompt_hash(few) != prompt_hash(many)
 
 
 # --- pixels ---

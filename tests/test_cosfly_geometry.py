@@ -6,8 +6,6 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from cosfly.geometry.axes import (
-    axis_aligned_half_extents,
-    box_corners,
     intrinsic_matrix,
     look_at,
     mirror_positions,
@@ -15,21 +13,9 @@ from cosfly.geometry.axes import (
     project,
     rotation_matrix,
     world_from_camera,
-    wrap_deg,
 )
 
 angles = st.floats(-180, 180)
-
-
-def test_rotation_table():
-    for angles_deg, body, world in (
-        ((0, 0, 0), (1, 0, 0), (1, 0, 0)),
-        ((0, 90, 0), (1, 0, 0), (0, 1, 0)),  # yaw is counter-clockwise: forward turns from east to north
-        ((90, 0, 0), (1, 0, 0), (0, 0, 1)),  # pitch is nose-up
-        ((0, 0, 90), (0, 1, 0), (0, 0, 1)),  # roll is right-side-down: left goes up
-        ((-45, 90, 0), (1, 0, 0), (0, np.sqrt(0.5), -np.sqrt(0.5))),
-    ):
-        assert_allclose(rotation_matrix(*np.radians(angles_deg)) @ body, world, atol=1e-12)
 
 
 @given(angles, angles, angles)
@@ -62,20 +48,6 @@ def test_image_axes():
     assert z[2] == -10
 
 
-def test_axis_aligned_extents():
-    turned = axis_aligned_half_extents(np.array([[2.0, 1.0, 3.0]] * 2), np.array([[0, 90.0, 0], [0, 45.0, 0]]))
-    assert turned[0].tolist() == [1.0, 2.0, 3.0]  # a quarter turn is exact
-    assert_allclose(turned[1, :2], 3 / np.sqrt(2))
-
-
-@given(angles, angles, angles)
-def test_axis_aligned_extents_enclose_the_corners(pitch, yaw, roll):
-    half = np.array([2.0, 1.0, 3.0])
-    corners = box_corners(np.zeros(3), half) @ rotation_matrix(*np.radians([pitch, yaw, roll])).T
-    enclosing = axis_aligned_half_extents(half[None], np.array([[pitch, yaw, roll]]))[0]
-    assert_allclose(np.abs(corners).max(axis=0), enclosing, atol=1e-9)
-
-
 def test_mirroring_is_its_own_inverse_and_keeps_the_picture():
     """A scene mirrored with its camera is the mirror picture of the scene: nothing else changes at the door."""
     point, eye, rotation = np.array([12.0, 5.0, 1.0]), np.array([0.0, 1.0, 20.0]), np.array([-40.0, 25.0, 0.0])
@@ -87,7 +59,3 @@ def test_mirroring_is_its_own_inverse_and_keeps_the_picture():
     uv_mirrored, z_mirrored = project(mirror_positions(point)[None], mirrored, k)
     assert_allclose(z, z_mirrored)
     assert_allclose(uv_mirrored, [[1280 - uv[0, 0], uv[0, 1]]])
-
-
-def test_wrap():
-    assert wrap_deg(np.array([180.0, -180.0, 541.0])).tolist() == [-180.0, -180.0, -179.0]

@@ -13,8 +13,6 @@ from cosfly.geometry.axes import rotation_matrix
 from cosfly.geometry.grid import (
     OccupancyGrid,
     blocks_walking,
-    connected_parts,
-    inflate,
     occupancy,
     roi_mask,
     surface,
@@ -60,20 +58,6 @@ def test_only_boxes_at_a_persons_height_block(subtests):
             box_map = one_box((0, 0, (bottom_m + top_m) / 2), (1, 1, (top_m - bottom_m) / 2), kind=kind)
             assert blocks_walking(box_map).tolist() == [blocks]
             assert occupancy(box_map).occupied.any() == blocks
-
-
-def test_a_box_on_cell_borders_fills_its_cells_and_no_neighbour():
-    for box, like, cells in (
-        (one_box((3, 2, 1), (1, 1, 1)), free_grid(6, 4), "...... ..##.. ..##.. ......"),
-        (
-            one_box((3, 2, 1), (0.0, 1.0, 1)),
-            free_grid(6, 4),
-            "...... ..##.. ..##.. ......",
-        ),  # without thickness, no gap
-        (one_box((0, 0, 1), (2.5, 1.5, 1)), free_grid(3, 3), "... ### ###"),  # what lies outside is left out
-        (one_box((90, 90, 1), (2, 2, 1)), free_grid(3, 3), "... ... ..."),
-    ):
-        np.testing.assert_array_equal(occupancy(box, like=like).occupied, grid_of(cells).occupied)
 
 
 @settings(max_examples=60)
@@ -122,16 +106,6 @@ def test_surfaces_near_the_ground_count_and_a_flyover_does_not():
 # --- growing, cutting out, connecting ---------------------------------------------------------------------------------
 
 
-@settings(max_examples=25)
-@given(st.integers(0, 10**6), st.floats(0, 4))
-def test_inflation_equals_all_distances(seed, radius_m):
-    occupied = np.random.default_rng(seed).random((13, 17)) < 0.03
-    grown = inflate(OccupancyGrid(0.0, 0.0, 0.5, occupied), radius_m).occupied
-    for y, x in itertools.product(range(13), range(17)):
-        distances_m = np.hypot(*(np.argwhere(occupied) - [y, x]).T) * 0.5
-        assert grown[y, x] == bool((distances_m <= radius_m + 1e-9).any())
-
-
 def test_roi_with_holes_and_several_rings_equals_shapely():
     rng = np.random.default_rng(3)
     angles = np.sort(rng.uniform(0, 2 * np.pi, 15))
@@ -147,14 +121,3 @@ def test_roi_with_holes_and_several_rings_equals_shapely():
     expected = shapely.contains_xy(region, centers[..., 0], centers[..., 1])
     np.testing.assert_array_equal(roi_mask(grid, roi), expected)
     assert 0 < expected.sum() < expected.size
-
-
-def test_a_corner_joins_eight_neighbours_but_not_four():
-    free = grid_of("##... ##... ..### ..###").occupied
-    labels, sizes = connected_parts(free, 8)
-    assert sizes.tolist() == [0, 10]
-    assert set(labels[free]) == {1}
-    assert set(labels[~free]) == {0}
-    assert sorted(connected_parts(free, 4)[1].tolist()) == [0, 4, 6]
-    labels, sizes = connected_parts(np.zeros((3, 4), dtype=bool), 8)
-    assert (sizes.tolist(), labels.any()) == ([0], False)

@@ -34,7 +34,7 @@ from cosfly.geometry.axes import mask_box
 from cosfly.geometry.kernels import obstacle_index, signed_distances
 from cosfly.inspection import frames
 from cosfly.inspection.files import check_recorded
-from cosfly.inspection.frames import check_others, pedestrian_region
+from cosfly.inspection.frames import check_others
 from cosfly.inspection.settings import InspectConfig
 from cosfly.inspection.stage import run
 from cosfly.inspection.track import check_plan, is_shifted
@@ -614,32 +614,7 @@ def test_the_funnel_counts_prefiltered_and_unrendered_plans(workplace):
 boxes = st.tuples(*[st.integers(0, 12)] * 4).map(lambda v: np.array([v[0], v[1], v[0] + v[2], v[1] + v[3]], float))
 
 
-def test_the_region_is_the_one_at_the_target():
-    kinds = np.zeros((20, 20), np.uint8)
-    kinds[2:5, 2:4] = 12
-    kinds[10:18, 12:15] = 12
-    region = pedestrian_region(kinds, np.array([11.0, 9.0, 16.0, 19.0]))
-    assert mask_box(region).tolist() == [12, 10, 15, 18]
-    assert np.isnan(mask_box(np.zeros_like(region))).all()
-    assert pedestrian_region(kinds, np.array([6.0, 6.0, 9.0, 9.0])) is None
-
-
 # --- the stage --------------------------------------------------------------------------------------------------------
-
-
-def test_the_page_stands_alone_and_shows_every_flight(workplace):
-    flight = first_flight(workplace)
-    edit(flight, lambda t: t["source"].update(scenario_id="<b>&"))
-    found = inspect(workplace)
-    page = (workplace / "out" / "report.html").read_text(encoding="utf-8")
-    assert not re.search(r"(?:src|href)=\"(?!data:)|<script|@import|url\(", page)
-    assert page.count("data:image/jpeg;base64,") == (3 + 1) * len(found.flights) + 3  # and the opening
-    assert "<b>&amp;" not in page
-    assert "&lt;b&gt;&amp;" in page
-    for record in found.flights:
-        assert record.trajectory in page
-    funnel = page.partition("<h2>Funnel</h2>")[2].partition("<h2>")[0]
-    assert funnel.count("<span>accepted</span>") == 1, "of flights, as everywhere on the page"
 
 
 def test_the_four_states_of_perturbed_frames_are_counted_beside_the_papers_shares(workplace):

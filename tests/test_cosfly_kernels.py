@@ -6,8 +6,6 @@ import pytest
 from cosfly.geometry import kernels
 from cosfly.geometry.axes import rotation_matrices, rotation_matrix
 
-NO_TURN = np.eye(3)[None]
-
 
 def parts(index):
     """Centres (k, 3), half extents (k, 3) and rotations (k, 3, 3) of an index."""
@@ -57,22 +55,6 @@ def one_box(center=(0, 0, 0), half=(1, 2, 3), yaw_deg=0.0):
     return kernels.index_boxes([center], [half], rotation_matrix(0, np.radians(yaw_deg), 0)[None])
 
 
-BY_HAND = [  # point, signed distance to one_box(), outward normal
-    ((3, 0, 0), 2, (1, 0, 0)), ((-1.5, 0, 0), 0.5, (-1, 0, 0)), ((0, 6, 0), 4, (0, 1, 0)), ((0, 0, -5), 2, (0, 0, -1)),
-    ((4, 6, 3), 5, (0.6, 0.8, 0)), ((0.5, 0, 0), -0.5, (1, 0, 0)), ((0, -1.75, 0), -0.25, (0, -1, 0)),
-    ((0, 0, 0), -1, (1, 0, 0)),
-]  # fmt: skip
-
-
-def test_distance_and_normal_by_hand():
-    turned = one_box(half=(1, 2, 3), yaw_deg=90)  # now 2 along x, 1 along y
-    for index, rows in ((one_box(), BY_HAND), (turned, [((5, 0, 0), 3, (1, 0, 0)), ((0, 5, 0), 4, (0, 1, 0))])):
-        points, distances, normals = map(list, zip(*rows, strict=True))
-        found, boxes = kernels.signed_distances(index, points)
-        np.testing.assert_allclose(found, distances)
-        np.testing.assert_allclose(kernels.normals(index, points, boxes), normals, atol=1e-12)
-
-
 def test_nearest_agrees_with_all_pairs(subtests):
     for cell_m in [1.0, 8.0, 500.0]:
         for seed in range(4):
@@ -88,20 +70,6 @@ def test_nearest_agrees_with_all_pairs(subtests):
                 limited, in_reach = kernels.signed_distances(index, points, 10.0)
                 np.testing.assert_allclose(limited, np.minimum(expected.min(axis=1), 10.0), atol=1e-9)
                 assert ((in_reach == -1) == (expected.min(axis=1) >= 10.0)).all()
-
-
-def test_moving_along_the_normal_changes_the_distance_by_as_much(subtests):
-    for seed in range(3):
-        with subtests.test(seed=seed):
-            rng = np.random.default_rng(seed)
-            index = random_boxes(rng, 1)
-            points = rng.uniform(-90, 90, (100, 3))
-            distances, boxes = kernels.signed_distances(index, points)
-            normals = kernels.normals(index, points, boxes)
-            np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
-            moved, _ = kernels.signed_distances(index, points + 0.25 * normals)
-            outside = distances > 0
-            np.testing.assert_allclose(moved[outside], distances[outside] + 0.25, atol=1e-9)
 
 
 def test_segments_agree_with_plane_clipping(subtests):
@@ -136,15 +104,6 @@ def test_the_way_between_points_agrees_with_many_points_on_it(subtests):
             found = slow_distances(index, at)[np.arange(len(at)), boxes[:-1]]
             np.testing.assert_allclose(np.maximum(found, 0.0), np.maximum(gaps[:-1], 0.0), atol=1e-9)
             assert gaps[-1] == pytest.approx(slow_distances(index, points[-1:]).min())
-
-
-def test_the_way_past_a_corner_by_hand():
-    index = kernels.index_boxes(np.zeros((1, 3)), np.ones((1, 3)), NO_TURN)
-    points = np.array([[4.0, 1, 0], [1, 4, 0], [1, -4, 0], [-9, -4, 0], [-9, -4, 0]])
-    gaps, shares, boxes = kernels.swept_distances(index, points, 6.0)
-    np.testing.assert_allclose(gaps, [np.sqrt(4.5), 0.0, 3.0, 6.0, 6.0])
-    assert shares[0] == pytest.approx(0.5)
-    assert boxes.tolist() == [0, 0, 0, -1, -1]
 
 
 def test_visibility_agrees_with_slow_rays():

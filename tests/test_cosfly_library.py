@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
@@ -19,7 +18,6 @@ from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.pipeline import library
 from cosfly.planners import stage as plan_stage
 from cosfly.planners.contract import PLANNERS, PlanConfig
-from cosfly.render.contract import PERSON_ID
 from cosfly.render.settings import RenderConfig
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError
 from cosfly.simplify import stage as simplify_stage
@@ -57,32 +55,6 @@ def test_a_flight_is_the_one_of_the_stages(town, flight, tmp_path):
     for name in ("time_s", "positions_m", "targets_m", "rotations_deg"):
         assert_allclose(getattr(flight, name), getattr(made, name), atol=1e-3)
     assert flight.drop_reason == made.drop_reason
-
-
-def test_a_way_of_ones_own_is_flown(town):
-    walk = cosfly.plan(town, planner="muco", pedestrian=WALK, seed=4).targets_m[:, :2]
-    own = cosfly.plan(town, walk[::6], planner="muco", altitude_max_m=25)
-    assert_allclose(own.targets_m[0, :2], walk[0], atol=1e-3)
-    assert own.positions_m[:, 2].max() < 26
-    with pytest.raises(InputError, match=r"route_m: the route is invalid; got an array of shape \(3,\)"):
-        cosfly.plan(town, [1, 2, 3])
-
-
-def test_a_pose_is_drawn_and_its_depth_is_the_distance(town, flight):
-    i = len(flight.time_s) // 2
-    frames = cosfly.render_frames(
-        town, flight.positions_m[i : i + 2], target_m=flight.targets_m[i : i + 2], size_px=(320, 180)
-    )
-    assert [frame.rgb.shape for frame in frames] == [(180, 320, 3)] * 2
-    turned = cosfly.render_frames(
-        town, flight.positions_m[i], flight.rotations_deg[i], target_m=flight.targets_m[i], size_px=(320, 180)
-    )[0]
-    is_town = (turned.ids != PERSON_ID) & (frames[0].ids != PERSON_ID)  # a place alone has no stride
-    assert_allclose(turned.depth[is_town], frames[0].depth[is_town], atol=1e-4)  # the flight looks at the target too
-    distance_m = np.linalg.norm(flight.targets_m[i] - flight.positions_m[i])
-    assert abs(float(np.median(turned.depth[turned.ids == PERSON_ID])) - distance_m) < 0.5
-    empty = cosfly.render_frames(town, flight.positions_m[i], flight.rotations_deg[i], size_px=(320, 180))[0]
-    assert not (empty.ids == PERSON_ID).any()
 
 
 def test_what_is_wrong_is_said_as_on_the_command_line(town):

@@ -8,12 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
-from specimens_slopes import CITY_EAST_M, CITY_NORTH_M, city_height_m, sloped_city
 
 from cosfly.formats.boxes import BoxMap
-from cosfly.formats.kinds import GROUND_KINDS, KINDS
-from cosfly.geometry.grid import lies_off_ground
+from cosfly.formats.kinds import KINDS
 from cosfly.maps.cityjson import CityJsonConfig
 from cosfly.maps.stage import MapsConfig, load_map
 
@@ -225,44 +222,3 @@ def test_a_real_sequence_of_buildings_is_read(shared_data: Path):
 
 
 # --- grounds ---
-
-
-def height_in(box_map: BoxMap, places: np.ndarray) -> np.ndarray:
-    """What the model says of the ground's height, in the map's coordinates."""
-    offset = box_map.header.offset_m
-    x, y = places[:, 0] + offset["x"] - CITY_EAST_M, places[:, 1] + offset["y"] - CITY_NORTH_M
-    return city_height_m(x, y) - offset["z"]
-
-
-# name -> (the model, its ground's tolerance in m over streets, or None where the map is flat)
-GROUNDS: dict[str, tuple[Model, float | None]] = {
-    "terrain and streets": (sloped_city(), 0.05),
-    "terrain alone": (sloped_city(streets=False), 0.05),
-    "streets alone": (sloped_city(terrain=False), 0.05),
-    "feet of houses": (sloped_city(terrain=False, streets=False), 3.5),  # houses of 30 m stand on their lowest foot
-    "flat": (city(), None),
-}
-
-
-def test_the_ground_of_a_city_model_is_kept_where_it_slopes(tmp_path: Path, subtests):
-    for kind, (model, tolerance_m) in GROUNDS.items():
-        with subtests.test(kind):
-            box_map = load(tmp_path, document(model))
-            assert box_map.ground.is_flat == (tolerance_m is None)
-            if tolerance_m is None:
-                continue
-            # On the second street, which runs from the model's west to its east.
-            offset = box_map.header.offset_m
-            x = np.linspace(CITY_EAST_M + 10.0, CITY_EAST_M + 230.0, 60) - offset["x"]
-            street = np.column_stack([x, np.full(60, CITY_NORTH_M + 92.0 - offset["y"])])
-            assert_allclose(box_map.ground.height_at(street), height_in(box_map, street), atol=tolerance_m)
-            houses = box_map.select(box_map.kinds == KINDS["Buildings"])
-            feet, roofs = houses.mins[:, 2], houses.maxs[:, 2]
-            lowest, highest = box_map.ground.range_under(houses.mins, houses.maxs)
-            assert (feet <= lowest + 0.3).all()  # no house floats
-            assert (roofs > highest + 4.0).all()
-            surfaces = box_map.is_any_of(GROUND_KINDS)
-            assert not lies_off_ground(box_map, GROUND_KINDS)[surfaces].any()
-            walls = box_map.select(box_map.kinds == KINDS["Walls"])
-            over = walls.maxs[:, 2] - box_map.ground.height_at(walls.centers)
-            assert_allclose(over, 1.5, atol=0.3)

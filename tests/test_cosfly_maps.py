@@ -16,7 +16,7 @@ from test_cosfly_map_kinds import document, load
 from cosfly.formats.boxes import BoxMap, read_boxes
 from cosfly.formats.kinds import KINDS
 from cosfly.maps.cityjson import CityJsonConfig
-from cosfly.maps.footprints import Rectangle, cover, oriented_rectangle, rectangle_polygon, united
+from cosfly.maps.footprints import united
 from cosfly.maps.simworld import SimWorldConfig
 from cosfly.maps.stage import MapsConfig, load_map, run
 from cosfly.runtime.config import build
@@ -75,13 +75,6 @@ def test_the_census_town_has_the_papers_counts_and_simplifies_to_a_few_thousand(
     assert cross_validate(town, result.box_map)["iou"] > 0.92  # the paper's figure
 
 
-def test_surfaces_of_a_town_do_not_share_a_plane():
-    town = load_map(MapsConfig())
-    for one, other in combinations(("Roads", "Sidewalks", "RoadLines"), 2):
-        tops = [boxes_of(town, kind).maxs[:, 2] for kind in (one, other)]
-        assert abs(tops[0].max() - tops[1].max()) > 0.015
-
-
 @each(
     ("given", "words"),
     [({"preset": "rivers"}, "did you mean 'river'"), ({"blocks": {"markt": 1}}, "did you mean 'market'"),
@@ -128,30 +121,6 @@ def test_unreal_axes_become_right_handed_metres(tmp_path: Path):
     np.testing.assert_allclose(house.rotations_deg, [(0, -30, 0)])
 
 
-def test_sizes_scale_and_placeholders_get_plausible_sizes(tmp_path: Path):
-    cfg = write_world(tmp_path, node("BP_Tree1_C", 0, 0, z=20, scale=2.0), node("BP_Can_C", 900, 0, z=20))
-    city = simworld(cfg)
-    tree, can = boxes_of(city, "Vegetation"), boxes_of(city, "Static")
-    np.testing.assert_allclose(tree.half_extents[0, :2], (8, 6))
-    np.testing.assert_allclose((tree.mins[0, 2], tree.maxs[0, 2]), (0, 24.2))  # lets its foot down 20 cm
-    assert can.half_extents.max() < 0.6
-    assert city.header.extent_sources == {"road": 0, "bbox": 1, "engine": 0, "default": 1}
-
-
-def test_roads_take_their_width_from_what_stands_beside_them(tmp_path: Path):
-    houses = [node("BP_Building_01_C", x, side * 2500) for x in (-6000, 0, 6000) for side in (-1, 1)]
-    cans = [node("BP_Can_C", x, side * 900) for x in (-5000, -2000, 2000, 5000) for side in (-1, 1)]
-    city = simworld(write_world(tmp_path, node("BP_Road1_C", 0, 0), *houses, *cans))
-    assert city.header.roads == {"carriageway_m": 17.0, "front_to_front_m": 40.0}
-    roads, pavements = boxes_of(city, "Roads"), boxes_of(city, "Sidewalks")
-    for one, other in combinations([footprint(m, k) for m in (roads, pavements) for k in range(len(m))], 2):
-        assert one.intersection(other).area < 1e-6, "slabs overlap"
-    ground = united([footprint(m, k) for m in (roads, pavements) for k in range(len(m))])
-    assert ground.covers(box(-100, -19.9, 100, 19.9))
-    assert roads.maxs[:, 2].max() <= 0
-    assert pavements.maxs[:, 2].max() <= 0
-
-
 def test_an_asset_without_a_size_is_an_error_or_counted(tmp_path: Path):
     cfg = write_world(tmp_path, node("BP_Building_01_C", 0, 0), node("BP_Building_99_C", 9000, 0))
     with pytest.raises(InputError, match=r"without a size.*BP_Building_99_C.*unknown=drop"):
@@ -196,25 +165,6 @@ def test_known_answers_of_the_robotics_worlds(shared_data: Path, world: str, pai
 
 
 # --- footprints -------------------------------------------------------------------------------------------------------
-
-
-def test_the_smallest_rectangle_is_found_at_any_angle():
-    for yaw in (0.0, 12.0, 45.0, 80.0):
-        shape = rectangle_polygon(Rectangle((5.0, -3.0), (8.0, 2.0), yaw))
-        found = oriented_rectangle(shape)
-        assert sorted(found.size) == pytest.approx([2.0, 8.0])
-        assert rectangle_polygon(found).symmetric_difference(shape).area < 1e-6
-
-
-@pytest.mark.parametrize("shares", [(0.5,), (0.25, 0.5, 0.75)])
-def test_covers_hold_the_polygon_and_leave_courtyards_free(shares):
-    ring = Point(0, 0).buffer(100, quad_segs=64).difference(Point(0, 0).buffer(90, quad_segs=64))
-    rectangles = cover(ring, min_fill=0.8, min_size_m=2.0, shares=shares)
-    union = united([rectangle_polygon(r) for r in rectangles])
-    assert ring.difference(union).area < 0.001 * ring.area
-    assert union.area < 1.2 * ring.area
-    assert not union.contains(Point(0, 0))
-    assert max(max(r.size) for r in rectangles) < 100  # a single box would be 200 m wide
 
 
 # --- cityjson ---------------------------------------------------------------------------------------------------------
@@ -278,22 +228,6 @@ def delft() -> BoxMap:
     if not path.is_file():
         pytest.skip(f"the real map is not here: {path}")
     return load_map(MapsConfig(source="cityjson", cityjson=CityJsonConfig(name="Delft", path=path)))
-
-
-@pytest.mark.slow
-def test_delft_is_cut_up(delft: BoxMap):
-    assert delft.header.num_objects == 570
-    assert delft.header.dropped_objects == {}
-    assert delft.header.building_covered_share > 0.995
-    assert 1.0 <= delft.header.building_area_ratio < 1.08
-    assert 2 * delft.half_extents.max() < 100
-    obstacles = boxes_of(delft, "Walls", "Vegetation", "Static")
-    standing = obstacles.select(obstacles.maxs[:, 2] > 0.1)
-    assert 2 * standing.half_extents[:, :2].max() < 30
-    surfaces = boxes_of(delft, "Roads", "Sidewalks", "Ground", "Terrain", "Water", "Bridge")
-    assert surfaces.maxs[:, 2].max() <= 0
-    assert 0.1 < delft.header.offset_m["z"] < 0.5
-    np.testing.assert_allclose(sum(delft.bounds())[:2], 0, atol=25)
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------

@@ -11,8 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
 from cosfly.formats.frames import Look
@@ -20,8 +18,7 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.meshes import MESHES_FILE, Mesh, Meshes, MeshRef, read_meshes, write_meshes
 from cosfly.geometry.axes import intrinsic_matrix, look_at, world_from_camera
 from cosfly.maps import cityjson
-from cosfly.maps.cityjson import CityJsonConfig, solid_mesh, top_within, triangles_of
-from cosfly.maps.footprints import Rectangle
+from cosfly.maps.cityjson import CityJsonConfig, solid_mesh
 from cosfly.maps.stage import MapsConfig
 from cosfly.maps.stage import run as make_map
 from cosfly.render.contract import (
@@ -217,30 +214,6 @@ def test_a_box_names_no_file_outside_of_its_folder(tmp_path: Path) -> None:
 
 
 SQUARE = np.array([(0, 0, 0), (4, 0, 0), (4, 4, 0), (0, 4, 0)], dtype=float)
-HOLE = np.array([(1, 1, 0), (1, 2, 0), (2, 2, 0), (2, 1, 0)], dtype=float)
-ELL = np.array([(0, 0, 0), (4, 0, 0), (4, 1, 0), (1, 1, 0), (1, 3, 0), (0, 3, 0)], dtype=float)
-BOW = np.array([(0, 0, 0), (2, 2, 0), (2, 0, 0), (0, 2.5, 0)], dtype=float)
-
-
-@given(angle=st.floats(0.0, 3.0), shift=st.floats(-500.0, 500.0))
-@settings(max_examples=10, deadline=None)
-def test_polygons_become_triangles_that_face_as_they_do(angle: float, shift: float) -> None:
-    turn = trimesh.transformations.rotation_matrix(angle, (1.0, 0.3, -0.7))[:3, :3]
-    for rings, count, area in (
-        ([SQUARE], 2, 16.0),
-        ([SQUARE, HOLE], 8, 15.0),
-        ([ELL], 4, 6.0),
-        ([SQUARE[:3]], 1, 8.0),
-        ([SQUARE[[0, 1, 0]]], 0, 0.0),
-    ):
-        triangles = triangles_of([ring @ turn.T + shift for ring in rings])
-        assert len(triangles) == count
-        normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-        assert np.linalg.norm(normals, axis=1).sum() / 2 == pytest.approx(area, rel=1e-9)
-        assert (normals @ turn[:, 2] > 0).all()
-    crossing = triangles_of([BOW])  # an outline that crosses itself keeps its valid parts
-    assert len(crossing) > 0
-    assert np.isfinite(crossing).all()
 
 
 # --- CityJSON ---------------------------------------------------------------------------------------------------------
@@ -287,17 +260,6 @@ def test_a_solid_is_drawn_as_its_finest_surfaces_and_kept_out_of_as_boxes(tmp_pa
     assert not plain.meshes.refs
     assert len(plain) == len(box_map)
     assert not simplify(box_map, SimplifyConfig()).box_map.meshes.refs
-
-
-def test_a_spire_makes_only_the_boxes_below_it_higher() -> None:
-    low, spire = (trimesh.creation.box((s, 4.0, h)) for s, h in ((20.0, 5.0), (2.0, 30.0)))
-    spire.apply_translation((9.0, 0.0, 15.0))
-    rings = [[corners] for solid in (low, spire) for corners in solid.triangles]
-    mesh = solid_mesh(rings, -2.5)
-    assert mesh is not None
-    assert top_within(mesh, Rectangle((-5.0, 0.0), (10.0, 4.0), 0.0), 99.0) == 2.5
-    assert top_within(mesh, Rectangle((9.0, 0.0), (2.0, 4.0), 0.0), 99.0) == 30.0
-    assert top_within(mesh, Rectangle((500.0, 0.0), (2.0, 4.0), 0.0), 99.0) == 99.0
 
 
 # --- drawing ----------------------------------------------------------------------------------------------------------
@@ -401,24 +363,6 @@ def test_depth_and_ids_are_those_of_trimesh_rays(tmp_path: Path, name: str) -> N
         assert 41 not in frame.ids, "a thing of several boxes has the id of the first"
         assert (frame.kinds[frame.ids == 40] == KINDS["Buildings"]).all()
     assert {40, 9, 300, 7, 12} <= shown
-    renderer.close()
-
-
-def test_colours_of_a_file_are_seen_and_both_sides_of_a_sheet(tmp_path: Path) -> None:
-    (tmp_path / "green.mtl").write_text("newmtl g\nKd 0 1 0\n")
-    (tmp_path / "sheet.obj").write_text("mtllib green.mtl\nusemtl g\nv 0 0 0\nv 1 0 0\nv 1 0 1\nv 0 0 1\nf 1 2 3 4\n")
-    sheet = make_box_map([(0, 0, 2)], [(2, 0.1, 2)], [(0, 0, 0)], [KINDS["Static"]], [5])
-    sheet = replace(sheet, meshes=Meshes({5: MeshRef(file="sheet.obj")}, tmp_path))
-    renderer = open_renderer("gl", sheet, *SIZE, Look())
-    for side in (-1.0, 1.0):
-        eye = np.array([0.5, 8.0 * side, 3.0])
-        pitch, yaw = look_at(eye, np.array([0.0, 0.0, 2.0]))
-        pose = world_from_camera(eye, np.degrees([pitch, yaw, 0.0]))
-        frame = renderer.render(pose, intrinsic_matrix(*SIZE, 60.0), None)
-        seen = frame.rgb[frame.ids == 5].astype(int)
-        assert len(seen) > 1000
-        assert (seen[:, 1] > seen[:, 0] + 20).all()
-        assert (seen[:, 1] > seen[:, 2] + 20).all()
     renderer.close()
 
 

@@ -67,13 +67,6 @@ def test_the_band_solver_agrees_with_a_library(num_points):
     np.testing.assert_allclose(step.solve_band(band, damping, gradient), expected, rtol=1e-9, atol=1e-12)
 
 
-def test_an_indefinite_model_gives_each_waypoint_its_own_step():
-    band = np.zeros((loss.BAND_ROWS, 15))
-    band[0], band[3] = 1.0, 5.0
-    steps = step.solve_band(band, np.ones(5), np.ones((5, 3)))
-    np.testing.assert_allclose(steps, -0.5)
-
-
 def test_a_flight_does_not_depend_on_the_memory(monkeypatch):
     cfg, rng = PlanConfig(), np.random.default_rng(0)
     obstacles = random_boxes(rng, 60)

@@ -12,19 +12,13 @@ from test_renderers_contract import circling, street, write_inputs
 from typer.testing import CliRunner
 
 from cosfly.cli import app
-from cosfly.formats.frames import read_instance, read_meta, read_rgb
-from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.playback import read_track
-from cosfly.formats.town import read_instance_ids
 from cosfly.formats.tracks import find_tracks
-from cosfly.geometry.axes import box_corners, intrinsic_matrix, project, world_from_camera
-from cosfly.render.contract import instance_ids
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import read_checksums
 from cosfly.viz.gallery import four_panels
-from cosfly.viz.overlay import TARGET_COLOR, Overlay, _lines
 
 SETTINGS = {
     "width_px": 320,
@@ -61,34 +55,6 @@ def test_debug_pictures_are_written_where_they_are_asked_for(trees):
 
 
 @needs_gl
-def test_the_targets_box_stands_where_its_corners_are(trees):
-    frame = frame_of(trees[True])
-    flight, meta = read_track(find_tracks(trees[True])[0]), read_meta(frame)
-    drawn = np.asarray(Image.open(frame / "debug.png"))
-    corners = box_corners(flight.targets_m[1], np.array(PERSON_HALF_EXTENTS_M))
-    pose = world_from_camera(flight.positions_m[1], flight.rotations_deg[1])
-    uv, _ = project(corners, pose, flight.camera_at(1).intrinsic)
-    near = [
-        np.abs(drawn[round(v) - 1 : round(v) + 2, round(u) - 1 : round(u) + 2].astype(int) - TARGET_COLOR)
-        .sum(axis=2)
-        .min()
-        for u, v in uv
-    ]
-    assert max(near) < 120  # antialiased, one pixel wide; another colour is farther
-    again = Overlay(street(), instance_ids(street())).draw(read_rgb(frame), read_instance(frame)[1], meta)
-    np.testing.assert_array_equal(again, drawn)
-    assert (drawn != read_rgb(frame)).any(axis=2).mean() < 0.3
-
-
-def test_a_box_round_the_camera_is_cut_at_the_near_plane():
-    pose, intrinsic = world_from_camera(np.zeros(3), np.zeros(3)), intrinsic_matrix(320, 180, 90.0)
-    round_it = _lines(box_corners(np.zeros(3), np.full(3, 5.0)), pose, intrinsic, 0.3)
-    assert len(round_it) == 8  # the four edges behind are gone, the four that go backwards are cut
-    assert np.isfinite(np.array(round_it)).all()
-    assert _lines(box_corners(np.array([-20.0, 0, 0]), np.ones(3)), pose, intrinsic, 0.3) == []
-
-
-@needs_gl
 def test_four_pictures_of_a_frame(trees, tmp_path):
     result = CliRunner().invoke(app, ["view", str(trees[True]), "--frame", "best", "--out", str(tmp_path / "a.png")])
     assert result.exit_code == 0, result.output
@@ -106,9 +72,3 @@ def test_without_boxes_there_is_one_clear_error(trees, tmp_path):
         four_panels(trees[False], tmp_path / "a.png")
     with pytest.raises(InputError):
         four_panels(trees[True], tmp_path / "a.png", frame="../../elsewhere")
-
-
-@needs_gl
-def test_ids_of_boxes_are_those_of_the_renderer(trees):
-    ids = read_instance_ids(find_tracks(trees[True])[0].parents[1])
-    assert ids.of_boxes(street()).tolist() == instance_ids(street()).tolist()

@@ -8,7 +8,7 @@ import pytest
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.formats.ground import Ground
 from cosfly.formats.kinds import KINDS
-from cosfly.formats.pedestrian_paths import paces_of, read_paths
+from cosfly.formats.pedestrian_paths import read_paths
 from cosfly.formats.roi import Roi
 from cosfly.geometry.axes import DT_S
 from cosfly.geometry.grid import OccupancyGrid
@@ -19,7 +19,6 @@ from cosfly.pedestrians.stage import (
     make_pedestrian,
     run,
     sample_goal,
-    sample_start,
     walkable_ground,
 )
 from cosfly.runtime.json_io import dump_json
@@ -79,15 +78,6 @@ def write_roi(path: Path, points: list) -> Path:
 # --- sampling ---------------------------------------------------------------------------------------------------------
 
 
-def test_every_walkable_cell_starts_as_often():
-    ground = ground_of("0102 0000 1110 0000 0033")
-    rng = np.random.default_rng(0)
-    starts = [sample_start(ground, rng) for _ in range(7000)]
-    cells, counts = np.unique(np.array(starts), axis=0, return_counts=True)
-    assert {(x, y) for x, y in cells.tolist()} == {(x, y) for y, x in np.argwhere(ground.parts).tolist()}
-    assert abs(counts - 1000).max() < 150  # 5 standard deviations
-
-
 @pytest.mark.parametrize("start", [(0, 0), (4, 2), (6, 6)])
 def test_goals_are_all_cells_of_the_part_at_the_wanted_distance(start):
     rng = np.random.default_rng(1)
@@ -105,22 +95,6 @@ def test_goals_are_all_cells_of_the_part_at_the_wanted_distance(start):
 
 
 # --- the ground -------------------------------------------------------------------------------------------------------
-
-
-def test_counts_add_up_and_small_components_are_left_out():
-    # A wall cuts off 20 of 100 m: 0.5 m cells, wall of 2 and a margin of 1 on each side.
-    box_map = plain(100.0, ((20.5, 50.0, 1.0), (0.5, 50.0, 1.0)))
-    cfg = PedestriansConfig(min_component_cells=10_000)
-    ground = walkable_ground(box_map, cfg)
-    counts = ground.counts
-    assert counts["grid"] == [200, 200]
-    assert counts["cells_occupied"] == 2 * 200
-    assert counts["cells_inflated"] == 4 * 200
-    assert counts["cells_free"] == counts["cells_walkable"] == 196 * 200
-    assert (counts["components"], counts["components_used"]) == (2, 1)
-    assert counts["component_sizes_used"] == [157 * 200]
-    assert np.count_nonzero(ground.parts) == counts["cells_used"] == 157 * 200
-    assert not ground.parts[:, :43].any()
 
 
 def test_the_region_of_interest_bounds_every_walk():
@@ -181,14 +155,6 @@ def test_a_walk_depends_on_its_own_random_numbers_only():
     ]
     assert texts[0] == texts[1]
     assert len(set(texts)) == 3
-
-
-def test_paces_have_their_shares_whatever_the_seed_and_stay_where_walks_are_added():
-    shares = {"walk": 5.0, "fits_and_starts": 4.0, "hurry": 1.0}
-    for seed in range(20):
-        drawn = paces_of(40, shares, seed)
-        assert all(abs(drawn.count(name) - 4 * share) <= 2 for name, share in shares.items())
-        assert drawn[:7] == paces_of(7, shares, seed)
 
 
 def test_a_detour_is_given_up_and_counted():

@@ -16,8 +16,8 @@ from cosfly.formats.pedestrian_paths import write_paths
 from cosfly.formats.traces import read_traces
 from cosfly.geometry import kernels
 from cosfly.geometry import trajectory_metrics as metrics
-from cosfly.geometry.axes import DT_S, look_at
-from cosfly.planners.contract import MucoConfig, PlanConfig, TrackingReference
+from cosfly.geometry.axes import look_at
+from cosfly.planners.contract import MucoConfig, PlanConfig
 from cosfly.planners.muco import loss, muco, step
 from cosfly.planners.muco.nearby import nothing_nearby
 from cosfly.runtime.errors import ResumeError
@@ -35,20 +35,6 @@ def test_uniform_motion_is_perfectly_smooth():
     assert metrics.smoothness_score(0, 0) == 1
     assert metrics.length_m(line) == pytest.approx(49 * np.sqrt(0.3))
     assert metrics.speed_max_mps(line) == pytest.approx(2 * np.sqrt(0.3))
-
-
-def test_parabola_has_constant_acceleration_and_cubic_constant_jerk():
-    time_s = np.arange(40) * DT_S
-    parabola = np.stack([0.5 * 3.0 * time_s**2, time_s, 0 * time_s], axis=1)
-    assert metrics.accel_rms(parabola) == pytest.approx(3.0)
-    assert metrics.jerk_rms(parabola) == pytest.approx(0, abs=1e-9)
-    cubic = np.stack([0 * time_s, 2.0 * time_s**3 / 6, time_s], axis=1)
-    assert metrics.jerk_rms(cubic) == pytest.approx(2.0)
-
-
-def test_smoothness_score_by_hand():
-    assert metrics.smoothness_score(5, 10) == pytest.approx(np.exp(-1))
-    assert metrics.smoothness_score(5, 0) == pytest.approx(np.exp(-0.5))
 
 
 # --- the loss ---------------------------------------------------------------------------------------------------------
@@ -105,37 +91,6 @@ def test_terms_agree_with_their_definitions(world):
         assert min(expected.values()) > 0  # every term is at work somewhere
 
 
-def test_the_wish_of_each_waypoint_reaches_the_loss():
-    scenario, obstacles = scenario_of("corner")
-    num = len(scenario.targets_m)
-    paper = muco.make_problem(scenario, CFG)
-    np.testing.assert_array_equal(paper.pitches_rad, np.tile(np.radians([30, 45, 60]), (num, 1)))
-    np.testing.assert_array_equal(paper.altitudes, np.tile([20.0, 20.0, 100.0], (num, 1)))
-    assert (paper.bearing_weight, paper.altitude_weights[3]) == (1.0, 0.0)
-    np.testing.assert_array_equal(paper.views_rad, scenario.reference.heading_rad)  # the way that the walker goes
-    requested = TrackingReference(
-        heading_rad=scenario.reference.heading_rad,
-        bearing_rad=np.linspace(-3.0, 3.0, num),
-        distance_m=np.linspace(12.0, 40.0, num),
-        ground_distance_m=np.linspace(9.0, 30.0, num),
-        pitch_rad=np.linspace(0.3, 1.2, num),
-        altitude_m=np.linspace(8.0, 50.0, num),
-        altitude_min_m=np.linspace(6.0, 40.0, num),
-        altitude_max_m=np.full(num, 90.0),
-        keeps_sight=np.arange(num) % 2 == 0,
-    )
-    problem = muco.make_problem(replace(scenario, reference=requested), CFG)
-    points = requested.places_m(scenario.targets_m, scenario.ground_m)
-    np.testing.assert_allclose(np.hypot(*(points - scenario.targets_m)[:, :2].T), requested.ground_distance_m)
-    np.testing.assert_allclose(points[:, 2], requested.altitude_m)
-    yaw = look_at(points, scenario.targets_m)[1]
-    np.testing.assert_allclose(np.angle(np.exp(1j * (yaw - problem.views_rad))), 0, atol=1e-12)
-    points += np.random.default_rng(0).normal(0, 2.5, points.shape)
-    state = loss.make_state(num, len(obstacles.rows))
-    loss.evaluate(points, problem, obstacles, np.zeros(num, dtype=bool), state)
-    np.testing.assert_allclose(state.terms, list(plain_terms(points, problem, obstacles).values()), rtol=1e-9)
-
-
 def test_gradient_is_the_derivative_of_the_loss():
     points, problem, obstacles = shaken("corner")
     problem = problem._replace(weights=problem.weights * np.array([1, 1, 1, 1, 0, 1, 1]))  # visibility is a staircase
@@ -174,22 +129,6 @@ def test_curvature_is_positive_and_exact_for_the_quadratic_terms():
     np.testing.assert_allclose(matrix @ x, gradient, atol=1e-8)
     assert 0.5 * x @ matrix @ x == pytest.approx(value)
     assert np.linalg.eigvalsh(dense(problem)[0]).min() > -1e-8
-
-
-def test_masked_waypoints_have_no_visibility_or_view_gradient():
-    points, problem, obstacles = shaken("tower_behind")
-    only = problem._replace(
-        weights=problem.weights * np.array([0, 0, 0, 0, 1, 1, 0]), pitch_weight=0.0, altitude_weights=np.zeros(4)
-    )
-    state = loss.make_state(len(points), len(obstacles.rows))
-    free = loss.evaluate(points, only, obstacles, np.zeros(len(points), dtype=bool), state)
-    assert state.gradient.any()
-    assert state.visibility_gradient.any()
-    masked = loss.evaluate(points, only, obstacles, np.ones(len(points), dtype=bool), state)
-    assert not state.gradient.any()
-    assert not state.visibility_gradient.any()
-    assert not state.band.any()
-    assert masked == free  # the loss itself keeps them
 
 
 # --- start ------------------------------------------------------------------------------------------------------------

@@ -138,28 +138,3 @@ def test_the_known_answer_of_the_public_release(clean, tmp_path):
     flight = read_track(rewrite(clean, tmp_path, change), strict=False)
     assert_allclose((flight.positions_m[1] - flight.positions_m[0]) / 0.5, [-3.123, 2.072, -1.600])
     assert_allclose(flight.rotations_deg[1, 1] - flight.rotations_deg[0, 1], 3.13)  # a turn to the left
-
-
-def test_an_offset_that_is_not_on_record_is_unknown_and_no_zero(tree, tmp_path):
-    """Public files hold booleans where ours hold offsets."""
-    clean, perturbed = find_tracks(tree)
-
-    def change(value):
-        for point, group in zip(
-            value["points"], ({"drone_position": False}, {"drone_position": True}, {}, None), strict=False
-        ):
-            point["perturbation"] = group
-        value["points"][4]["is_perturbed"] = False
-        del value["points"][4]["perturbation"]
-
-    folder = rewrite(perturbed, tmp_path / "a", change)
-    flight = read_track(folder)
-    assert np.isnan(flight.drone_offsets_m).any(axis=1).tolist() == [False, True, True, True, False, False]
-    assert (flight.drone_offsets_m[[0, 4]] == 0).all()
-    assert (flight.drone_offsets_m[5] != 0).all()
-    assert (read_track(rewrite(clean, tmp_path / "b", change)).drone_offsets_m[:5] == 0).all()
-    target = tmp_path / "c" / "Town01" / folder.parent.name / folder.name
-    target.mkdir(parents=True)
-    write_track(target, flight)
-    assert json.loads((target / "trajectory.json").read_text())["points"][1]["perturbation"]["drone_position"] is True
-    assert_array_equal(read_track(target).drone_offsets_m, flight.drone_offsets_m)

@@ -76,17 +76,6 @@ def test_captions_of_another_tree_are_refused(run):
         run_dir.checked_inputs(two | {"0.captions": captions})
 
 
-def test_what_was_made_of_several_trees_goes_with_each_of_them(run):
-    """Answers to windows of two towns are judged town by town; a third town's tree is refused."""
-    south, third = (make_tree(run / name, f"of {name}") for name in ("south", "third"))
-    trees = {"1.data": run / "render", "2.data": south}
-    answers = make(run / "infer", "distill.infer", {"predictions.jsonl": "p"}, **trees) / "predictions.jsonl"
-    for tree in trees.values():
-        run_dir.checked_inputs({"predictions": answers, "data": tree})
-    with pytest.raises(VerifyError, match=r"another input '1\.data'.*given: .*third"):
-        run_dir.checked_inputs({"predictions": answers, "data": third})
-
-
 def test_a_map_that_the_plan_was_not_made_on_is_refused(run):
     other = make(run / "s2", "simplify", {"map.json": "other boxes"}) / "map.json"
     with pytest.raises(VerifyError, match=r"traces\.json: it was made of another input 'map'"):

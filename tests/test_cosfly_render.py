@@ -21,18 +21,14 @@ from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.people import draw_appearance
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
-from cosfly.geometry.axes import focal_px, intrinsic_matrix, look_at, world_from_camera
+from cosfly.geometry.axes import focal_px, intrinsic_matrix, look_at
 from cosfly.geometry.kernels import obstacle_index, signed_distances
 from cosfly.render.camera import rendered_visibility, view_target
 from cosfly.render.contract import (
-    FAR_M,
     MAX_BOX_ID,
-    NEAR_M,
     PERSON_ID,
     SHARED_ID,
     Frame,
-    PosedBystander,
-    PosedCar,
     PosedPerson,
     has_own_ids,
     instance_ids,
@@ -40,8 +36,6 @@ from cosfly.render.contract import (
 )
 from cosfly.render.gl import meshes as unit_meshes
 from cosfly.render.gl.figure import make_body
-from cosfly.render.gl.parts import Boxes, PartBuilder
-from cosfly.render.gl.view import CameraView
 from cosfly.render.person import cast_of, choose_clothes
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, in_frame, perturb
 from cosfly.render.settings import RenderConfig
@@ -51,7 +45,6 @@ from cosfly.runtime.config import build
 from cosfly.runtime.errors import ConfigError, EnvironmentMissing
 from cosfly.runtime.io import read_checksums, sha256_file
 
-LARGER = (640, 360)
 CAMERA = Camera(320, 180, intrinsic_matrix(320, 180, 90.0))
 ALL_MESHES = unit_meshes.all_meshes()
 SMALL = {"width_px": 160, "height_px": 90, "fovs_deg": [60.0, 90.0], "town": "Street", "first_timestamp": 1776000000}
@@ -70,48 +63,7 @@ NO_GL = without_gl()
 needs_gl = pytest.mark.skipif(bool(NO_GL), reason=NO_GL)
 
 
-def test_what_is_drawn_is_what_the_slow_way_finds():
-    rng, count = np.random.default_rng(0), 20_000
-    centers = rng.uniform(-600, 600, (count, 3))
-    half, ids = rng.uniform(0.05, 20.0, (count, 3)), np.ones(count, np.uint16)
-    builder = PartBuilder()
-    for layer, (low_px, high_px) in enumerate([(0.0, 14.0), (14.0, 1e9)]):
-        boxes = Boxes(
-            centers, half, np.broadcast_to(np.eye(3), (count, 3, 3)), ids, np.zeros(count), 1, np.zeros(count)
-        )
-        builder.add(boxes, 0, half, 0, (1.0, 1.0, 1.0), min_px=low_px, max_px=high_px, layer=layer)
-    parts = builder.finish()
-    pose = world_from_camera(np.array([10.0, -20.0, 40.0]), np.array([5.0, -25.0, 130.0]))
-    view = CameraView(pose[:3, :3], pose[:3, 3], intrinsic_matrix(320, 180, 70.0), 320, 180)
-    x, y, z = (in_camera := (parts.object_centers - view.eye) @ view.world_from_camera).T
-    radii, size, focal = parts.object_radii, np.array([320, 180]), view.intrinsic[0, 0]
-    size_px = focal * radii / np.maximum(np.linalg.norm(in_camera, axis=1) - radii, NEAR_M)
-    inside = (z + radii > NEAR_M) & (z - radii < FAR_M)
-    for along, half in zip((x, y), size / 2 / focal, strict=True):  # tangents of the picture's borders
-        inside &= np.abs(along) - z * half < radii * np.sqrt(1 + half**2)
-    inside &= (size_px >= np.maximum(parts.min_px, 0.4)) & (size_px < parts.max_px)
-    expected = np.flatnonzero(inside)
-    away = (in_camera[:, 2] - parts.object_radii)[expected]
-    expected = expected[np.lexsort((away, -parts.records["bias"][expected]))]
-    assert 1000 < len(expected) < count
-    np.testing.assert_array_equal(view.rows(parts), expected)
-
-
 # --- scene ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("number", range(10))
-def test_meshes_fit_into_the_unit_cube_and_face_outwards(number):
-    mesh = ALL_MESHES[number]
-    assert np.abs(mesh.vertices[:, :3]).max() <= 1.0 + 1e-6
-    np.testing.assert_allclose(np.linalg.norm(mesh.vertices[:, 3:], axis=1), 1.0, atol=1e-4)
-    corners = mesh.vertices[mesh.triangles]
-    turn = np.cross(corners[:, 1, :3] - corners[:, 0, :3], corners[:, 2, :3] - corners[:, 0, :3]).astype(float)
-    area = np.linalg.norm(turn, axis=1)
-    outwards = (turn * corners[:, :, 3:].sum(axis=1)).sum(axis=1)
-    assert (outwards[area > 1e-4] > 0).all()
-    volume = np.einsum("ij,ij->i", corners[:, 0, :3].astype(float), turn).sum() / 6.0
-    assert volume > 0.2
 
 
 def test_instance_ids_are_the_boxes_own_where_they_fit():
@@ -159,40 +111,6 @@ def test_the_figure_stands_on_the_ground_within_the_targets_box(heading, phase, 
     assert (np.hypot(ends[..., 0], ends[..., 1]) + body.bone_radii_m[:, None]).max() < 0.48, "and its shadow with it"
     assert ((body.records["tag"] >> 16) == PERSON_ID).all()
     assert ((body.records["tag"] & 0xFF) == KINDS["Pedestrians"]).all()
-
-
-@needs_gl
-@pytest.mark.parametrize("elevation_deg", [8.0, 42.0, 80.0])
-def test_shadows_of_those_who_move_lie_in_their_rectangles(elevation_deg, monkeypatch):
-    """Drawing only rectangles with these shadows gives the picture that drawing everything with them gives."""
-    look = Look(sun_elevation_deg=elevation_deg)
-    renderer = open_renderer("gl", street(), *LARGER, look, 3)
-    clothes = choose_clothes(np.random.default_rng(3))
-    walker = PosedPerson(np.array([4.0, -3.0, 0.9]), 0.7, 1.2, 1.0, clothes)
-    others = [
-        PosedBystander(
-            other_id(0), replace(walker, hip_m=np.array([5.2, -2.4, 0.9]))
-        ),  # its rectangle meets the walker's
-        PosedBystander(other_id(1), PosedCar(np.array([-9.0, 2.0, 0.75]), 0.6, (2.2, 0.9, 0.75), 0.3)),
-        PosedBystander(other_id(2), replace(walker, hip_m=np.array([-2.0, -14.8, 0.9]))),  # beside a wall
-    ]
-    whole = (0, 0, *LARGER)
-    for eye in ((-4.0, -24.0, 15.0), (4.0, -3.0, 30.0), (3.0, -5.0, 2.0)):
-        pose, intrinsic = pose_towards(eye, (2.0, -3.0, 0.0)), intrinsic_matrix(*LARGER, 90.0)
-        frame = renderer.render(pose, intrinsic, walker, others)
-        with monkeypatch.context() as patch:
-            patch.setattr(CameraView, "rectangle_px", lambda *_: whole)
-            expected = renderer.render(pose, intrinsic, walker, others)
-            patch.setattr(CameraView, "rectangle_px", lambda *_: None)
-            without = renderer.render(pose, intrinsic, walker, others)
-        assert (without.rgb != expected.rgb).any(axis=-1).sum() > 100, "shadows are seen"
-        differs = np.abs(frame.rgb.astype(int) - expected.rgb).max(axis=-1)
-        assert differs.max() <= 1
-        assert (differs > 0).mean() < 1e-3
-        for one in (expected, without):
-            np.testing.assert_array_equal(one.depth, frame.depth)
-            np.testing.assert_array_equal(one.ids, frame.ids)
-    renderer.close()
 
 
 def test_look_alikes_differ_from_the_target_in_one_thing_and_nobody_looks_just_like_it():
@@ -327,25 +245,6 @@ def test_a_frame_does_not_depend_on_what_happened_before():
     assert [s["position"] != "none" for s in free.states] == [s["position"] != "none" for s in strict.states]
 
 
-def test_a_walled_in_person_is_not_moved():
-    start = planned(1).targets_m[0]
-    cage = make_box_map(
-        start + 0.75 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]),
-        [[0.4, 4, 2], [0.4, 4, 2], [4, 0.4, 2], [4, 0.4, 2]], np.zeros((4, 3)), [KINDS["Walls"]] * 4,
-    )  # fmt: skip
-    found = [
-        perturbed(PerturbationConfig(position_probability=1.0, pedestrian_radius_m=1.0), 1, cage, seed)
-        for seed in range(30)
-    ]
-    outcomes = {f.states[0]["position"] for f in found}
-    assert "fallback: person in an obstacle" in outcomes
-    for f in found:
-        assert (
-            signed_distances(obstacle_index(cage), f.poses.targets_m)[0].min() >= 0.3
-            or f.states[0]["position"] != "applied"
-        )
-
-
 def along_a_wall(gap_m: float, n: int = 120) -> tuple[Poses, BoxMap]:
     """A flight along a wall of 40 m, `gap_m` beside it all the way, and the wall."""
     t = np.arange(n) * 0.5
@@ -378,14 +277,6 @@ def test_a_whole_flight_along_a_planted_wall_keeps_the_planners_clearance(gap_m,
         np.random.default_rng(1),
     )
     assert (careless.poses.clearances_m.min() < 2.5) == (gap_m < 6.0), "or the wall would prove nothing"
-
-
-def test_ground_height_finds_the_pavement():
-    surroundings = Surroundings(street())
-    assert surroundings.surface_z_m(0.0, -9.0, 0.0) == pytest.approx(0.1)
-    assert surroundings.surface_z_m(0.0, 0.0, 0.1) == pytest.approx(0.0)
-    assert surroundings.surface_z_m(500.0, 500.0, 0.4) == 0.4
-    assert surroundings.surface_z_m(0.0, -9.0, 20.0) == 20.0
 
 
 # --- settings ---------------------------------------------------------------------------------------------------------

@@ -9,13 +9,11 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from browser import Page, browser
 from commands import invoke
 
-from cosfly.formats.backdrop import WorldFrame, write_backdrop
 from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import read_paths
@@ -161,20 +159,6 @@ def test_only_our_own_page_is_answered(map_file, tmp_path):
         status, said = asked(server, "POST", f"{ours}save", body)
         assert (status, b"changed by somebody else" in said) == (400, True)
         assert len(read_roi(out).points_world) == 3
-
-
-def test_a_backdrop_is_shown_where_it_lies(map_file, tmp_path):
-    picture = np.zeros((40, 60, 3), np.uint8)
-    picture[..., 0] = 200  # red
-    world = WorldFrame(west_m=10, north_m=70, metres_per_px=0.5)
-    write_backdrop(tmp_path / "above.png", cv2.imencode(".png", picture[..., ::-1])[1].tobytes(), world)
-    with serving(map_file, tmp_path / "roi.json", backdrop=tmp_path / "above.png") as server:
-        assert server.editor.backdrop.frame() == {"west": 10, "north": 70, "width": 30, "height": 20}
-        for name, color in (("picture", [0, 0, 200]), ("above", None)):
-            status, data = asked(server, "POST", f"/{server.token}/{name}")
-            found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-            assert status == 200
-            assert color is None or found[0, 0].tolist() == color
 
 
 def test_a_proposal_is_a_region_that_keeps_the_ground(map_file, tmp_path):

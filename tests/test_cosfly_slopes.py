@@ -6,22 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from specimens_slopes import CELL_M, SHAPES, TILT, flat_town, on_ground, plane_m, sampled, sloped_town
+from specimens_slopes import SHAPES, TILT, flat_town, on_ground, plane_m, sampled, sloped_town
 from test_renderers_contract import NAMES
 
 from cosfly.formats.boxes import BoxMap, make_box_map, read_boxes, write_boxes
-from cosfly.formats.ground import Ground
-from cosfly.formats.kinds import GROUND_KINDS, KINDS
+from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.geometry.axes import DT_S, intrinsic_matrix, world_from_camera
 from cosfly.geometry.grid import blocks_walking
 from cosfly.geometry.kernels import index_boxes, obstacle_index, signed_distances
-from cosfly.pedestrians.stage import PedestriansConfig, walkable_ground
 from cosfly.planners.contract import PLANNERS, PlanConfig
 from cosfly.planners.stage import plan_trajectory
-from cosfly.render.draping import BARE_GROUND, drape, is_draped
 from cosfly.render.stage import open_renderer
-from cosfly.simplify.passes import SimplifyConfig, simplify
 
 
 @pytest.fixture(scope="module", params=SHAPES)
@@ -30,19 +26,6 @@ def town(request) -> BoxMap:
 
 
 # --- the product ---
-
-
-def test_heights_are_those_of_the_triangles_and_go_on_beyond_the_border():
-    rng = np.random.default_rng(0)
-    ground = Ground(rng.uniform(0.0, 3.0, (6, 9)), -7.0, 3.0, 2.5)
-    triangles = ground.triangles(reach_m=50.0)
-    shares = rng.dirichlet([1.0, 1.0, 1.0], len(triangles))
-    places = np.einsum("nk,nki->ni", shares, triangles)
-    assert_allclose(ground.height_at(places), places[:, 2], atol=1e-9)
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    assert (normals[:, 2] > 0).all()  # counter-clockwise from above
-    slopes = np.linalg.norm(normals[:, :2], axis=1) / normals[:, 2]
-    assert_allclose(ground.slope_at(triangles.mean(axis=1)), slopes, atol=1e-9)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -73,18 +56,6 @@ def test_a_sloped_map_survives_its_file_and_a_flat_one_says_nothing_of_it(tmp_pa
 # --- simplify and walk ---
 
 
-def test_simplify_counts_heights_from_the_ground_under_each_box():
-    alone = {"merge": False, "prune_nested": False}  # in a flat world parts of a crown may share a top
-    flat, tilted = flat_town(), sloped_town("plane")
-    for cfg in (SimplifyConfig(**alone), SimplifyConfig(**alone, crop_strategy="adaptive", below_ground="clip")):
-        low, high = simplify(flat, cfg), simplify(tilted, cfg)
-        assert high.passes == low.passes
-        lifted = on_ground(low.box_map, tilted.ground)
-        assert_allclose(high.box_map.centers, lifted.centers, atol=1e-6)
-        assert_allclose(high.box_map.half_extents, low.box_map.half_extents, atol=1e-6)
-        assert high.box_map.header.ground == tilted.header.ground
-
-
 def test_what_stands_on_a_slope_is_in_the_way_and_what_hangs_over_it_is_not(town: BoxMap):
     flat = flat_town()
     is_small = flat.half_extents[:, :2].max(axis=1) < 3.0
@@ -97,18 +68,6 @@ def test_what_stands_on_a_slope_is_in_the_way_and_what_hangs_over_it_is_not(town
     )
     assert blocks_walking(lifted).all()
     assert tilted.height_at(np.zeros((1, 2)))[0] == pytest.approx(30.0)
-
-
-def test_nobody_walks_on_ground_as_steep_as_a_roof():
-    # 45 degrees in the east.
-    heights = np.add.outer(np.zeros(40), np.where(np.arange(40) < 20, 0.0, np.arange(40) - 19.0))
-    flat = make_box_map([[80, 80, -0.1]], [[80, 80, 0.1]], np.zeros((1, 3)), [KINDS["Roads"]])
-    box_map = on_ground(flat, Ground(CELL_M * heights, 0.0, 0.0, CELL_M))
-    found = walkable_ground(box_map, PedestriansConfig())
-    x, _ = found.grid.centers_of(np.argwhere(found.walkable)[:, ::-1]).T
-    assert x.max() < 80.0
-    assert found.counts["cells_steep"] > 20_000
-    assert set(box_map.kinds) <= GROUND_KINDS
 
 
 # --- plan ---
@@ -148,21 +107,6 @@ def test_flights_count_their_altitude_from_the_ground_under_the_walker(shape: st
 
 
 # --- draw ---
-
-
-def test_draped_surfaces_lie_on_the_ground_and_keep_their_areas(town: BoxMap):
-    draped, lies = drape(town), is_draped(town)
-    assert lies.sum() == town.is_any_of(GROUND_KINDS).sum()
-    middles = draped.corners_m.mean(axis=1)
-    inside = (np.abs(middles[:, :2]) < 160.0).all(axis=1)
-    assert_allclose(middles[inside, 2], town.ground.height_at(middles[inside]), atol=1e-6)
-    edges = draped.corners_m[:, 1:, :2] - draped.corners_m[:, :1, :2]
-    areas = 0.5 * (edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
-    assert (areas >= -1e-9).all()
-    is_box = draped.rows != BARE_GROUND
-    sums = np.bincount(draped.rows[is_box], areas[is_box], len(town))
-    expected = np.where(lies, 4.0 * town.half_extents[:, 0] * town.half_extents[:, 1], 0.0)
-    assert_allclose(sums, expected, rtol=1e-6, atol=1e-6)
 
 
 def rays(camera_pose: np.ndarray, intrinsic: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cosfly.formats.playback import Track, read_track, write_track
-from cosfly.formats.splits import SPLITS, Course, assign_splits, town_family, walks_of
+from cosfly.formats.splits import SPLITS, Course, assign_splits, walks_of
 from cosfly.runtime.errors import InputError
 from specimens import make_flight
 
@@ -65,28 +65,6 @@ def test_another_timestamp_planner_or_run_is_the_same_walk():
         course("a/Town01/trajectory_2", points),
         course("b/Town01/trajectory_1", (points[0], points[1] + noise)),
     ) == [{"a/Town01/trajectory_1", "a/Town01/trajectory_2", "b/Town01/trajectory_1"}]
-
-
-def test_builds_of_a_town_are_one_and_other_towns_are_not():
-    points = walk(60)
-    lower = (points[0], points[1] - [0, 0, 3.0])  # the other build's ground
-    found = groups(course("a", points, "Town03"), course("b", lower, "Town03_Opt"), course("c", points, "Town04"))
-    assert found == [{"a", "b"}, {"c"}]
-    assert [town_family(town) for town in ("Town03", "Town03_Opt", "Town03_Opt_Opt", "Town_Option")] == [
-        "Town03", "Town03", "Town03", "Town_Option",
-    ]  # fmt: skip
-
-
-def test_walks_that_cross_or_follow_or_begin_together_are_two():
-    along = walk(80)
-    across = walk(80, begin=(1.4 * 20, -1.4 * 20), heading_deg=90.0)  # both at (28, 0) after 20 s
-    assert np.abs(along[1][40] - across[1][40]).max() < 1e-9
-    assert groups(course("along", along), course("across", across)) == [{"across"}, {"along"}]
-    later = (along[0], along[1] - [1.4 * 10, 0, 0])  # ten seconds behind on the same way
-    faster = walk(80, speed_mps=2.0)
-    assert groups(course("a", along), course("b", later), course("c", faster)) == [{"a"}, {"b"}, {"c"}]
-    there, back = walk(8, speed_mps=0.4), walk(8, speed_mps=0.4, heading_deg=180.0)  # near for one second of four
-    assert groups(course("there", there), course("back", back)) == [{"back"}, {"there"}]
 
 
 def test_walks_agree_with_a_slow_plain_comparison():

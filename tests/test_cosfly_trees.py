@@ -293,28 +293,6 @@ def test_a_foreign_tree_gives_samples_and_a_release(way):
     assert record.history.captions.released == 4 * 4
 
 
-def test_without_twins_perturbed_labels_say_that_they_hold_noise(tmp_path):
-    tree = write_foreign_tree(tmp_path / "tree")
-    shutil.rmtree(tree / "Town01/trajectory_1777083733/ORI")
-    found = list(read_captions(caption_stage.run(CaptionConfig(), tree, tmp_path / "caption")))
-    assert {caption.label_from for caption in found} == {"perturbed"}
-
-
-def test_a_tree_of_pictures_alone_is_released_without_depth(tmp_path):
-    tree = write_foreign_tree(tmp_path / "tree", num_points=11, files=("rgb.png",))
-    inspected = inspection.run(InspectConfig(), None, None, tree, tmp_path / "inspect")
-    assert {flight.result for flight in read_inspection(inspected).flights} == {"accepted"}
-    captions = caption_stage.run(CaptionConfig(), tree, tmp_path / "caption")
-    assert {caption.status for caption in read_captions(captions)} == {"accepted"}
-    source = Source("theirs", tree, captions, inspected)
-    package.run(ReleaseConfig(licence="mit", modalities=("rgb",)), [source], tmp_path / "release")
-    assert verify(tmp_path / "release").is_ok
-    one = find_tracks(tree)[0] / "frames_playback/frame_00003/instance.png"
-    one.write_bytes(b"")  # one frame has it now, so the others lack it
-    found = read_inspection(inspection.run(InspectConfig(), None, None, tree, tmp_path / "again"))
-    assert sorted(flight.result for flight in found.flights) == ["accepted", "rejected"]
-
-
 def test_of_a_foreign_tree_what_was_inspected_is_released_and_nothing_else(tmp_path):
     tree = write_foreign_tree(tmp_path / "tree", num_points=11, files=("rgb.png",))
     inspected = inspection.run(InspectConfig(), None, None, tree, tmp_path / "inspect")

@@ -5,46 +5,16 @@ from hypothesis import strategies as st
 
 from cosfly.pedestrians.walking import (
     PACES,
-    SLOWEST_SPEED_MPS,
     arrival_times,
-    menger_curvature,
     resample,
-    speed_profile,
     stood_s,
     take_pace,
 )
 
-
-def calm(curvatures, **settings_):
-    return speed_profile(np.asarray(curvatures, dtype=float), np.random.default_rng(0), jitter=0.0, **settings_)
-
-
 # --- curvature --------------------------------------------------------------------------------------------------------
 
 
-def test_curvature_by_hand():
-    for points, curvature in (
-        ([(0, 0), (1, 0), (2, 0)], 0.0),
-        ([(0, 0), (0.5, 0), (0.5, 0.5)], 2 * np.sqrt(2)),  # of a 0.5 m square: radius 0.3536
-        ([(0, 0), (0.5, 0), (1, 0.5)], 4 / np.sqrt(10)),  # a straight step, then a diagonal one
-        ([(0, 0), (1, 0), (1, 0)], 0.0),  # no distance, no curvature
-        ([(0, 0), (1, 0), (0, 0)], 0.0),  # there and back
-        ([(0, 0), (1e-3, 0), (1e-3, 1e-3)], 0.0),  # product of lengths 1.4e-9 m3, below the guard
-    ):
-        assert menger_curvature(np.array(points, dtype=float)).tolist() == pytest.approx([0.0, curvature, 0.0])
-    for count in (1, 2):
-        assert menger_curvature(np.ones((count, 2))).tolist() == [0.0] * count
-
-
 # --- speed ------------------------------------------------------------------------------------------------------------
-
-
-def test_speeds_by_hand():
-    np.testing.assert_allclose(calm([0.0, 0.2, 1.0]), [1.2, 0.6, 0.2])
-    np.testing.assert_allclose(calm([0.0, 1.0], cruise_speed_mps=3.0), [1.6, 0.5])
-    np.testing.assert_allclose(calm([0.0, 1.0], min_speed_mps=0.4), [1.2, 0.4])
-    np.testing.assert_allclose(calm([5.0], curvature_gain_m=0.0), [1.2])
-    assert calm([1e9]).tolist() == [SLOWEST_SPEED_MPS], "nobody stands still for ever"
 
 
 # --- time -------------------------------------------------------------------------------------------------------------
@@ -82,18 +52,6 @@ def test_samples_agree_with_a_walk_in_tiny_steps(seed, count):
     np.testing.assert_allclose(sampled, np.interp(now_s, times, speeds), atol=1e-9)
     np.testing.assert_allclose(positions[[0, -1]], polyline[[0, -1]], atol=1e-9)
     assert np.linalg.norm(np.diff(positions, axis=0), axis=1).max() <= 1.6 * 0.5 + 1e-9
-
-
-def test_a_stop_by_hand():
-    """1 m at an even brake, 3 s standing, 1 m of getting on: 2 s each at a mean of 0.5 m/s."""
-    polyline, speeds = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]), np.array([1.0, 0.0, 1.0])
-    stops = np.array([0.0, 3.0, 0.0])
-    time_s, positions, sampled = resample(polyline, speeds, arrival_times(polyline, speeds), 0.5, stops)
-    assert time_s[-1] == 7.0
-    np.testing.assert_allclose(positions[4:11, 0], 1.0)
-    np.testing.assert_allclose(sampled[4:11], 0.0, atol=1e-12)
-    np.testing.assert_allclose(positions[[2, 12], 0], [0.75, 1.25])
-    np.testing.assert_allclose(positions[-1], [2.0, 0.0])
 
 
 @settings(max_examples=40)

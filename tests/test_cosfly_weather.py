@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import random
-from collections import Counter
 
 import numpy as np
 import pytest
@@ -16,16 +15,14 @@ from cosfly.formats.frames import read_depth, read_instance, read_meta, read_rgb
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
-from cosfly.formats.weather import TIMES, WEATHER_GROUPS, WEATHERS, WeatherParams, resolved, sky_kind
+from cosfly.formats.weather import TIMES, WEATHER_GROUPS, WEATHERS, WeatherParams, resolved
 from cosfly.geometry.axes import intrinsic_matrix
-from cosfly.pipeline.settings import RunConfig
 from cosfly.render.contract import PosedPerson
-from cosfly.render.gl.weather_pass import light_direction, lights_on
 from cosfly.render.person import choose_clothes
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import open_renderer, run
 from cosfly.render.weather import path_seed, read_pools, weather_of
-from cosfly.runtime.config import build, load, shipped
+from cosfly.runtime.config import build
 from cosfly.runtime.errors import ConfigError
 from cosfly.runtime.json_io import read_json
 
@@ -68,25 +65,6 @@ def test_a_draw_is_that_of_the_formula_and_uniform():
     assert weather_of(config(**RANDOM, weather_seed=1), pools, 5) != drawn[5]
 
 
-def test_drawn_by_weight_skies_have_their_shares_in_each_town_and_in_all():
-    """Of ten flights a town of `diverse`, on ten seeds; a flight's sky is the same however many follow it."""
-    cfg = load(RunConfig, shipped("diverse.yaml"))
-    towns = [cfg.of_town(name).render for name in cfg.towns]
-    assert {town.weather_mode for town in towns} == {"by_weight"}
-    assert len({town.weather_seed for town in towns}) == 8
-    assert towns[0].sky_shares["day_dry"] == 0.7 * sum(towns[0].sky_shares.values())
-    for seed in range(10):
-        total = Counter()
-        for town in towns:
-            chosen = town.model_copy(update={"weather_seed": town.weather_seed + 1000 * seed})
-            skies = [weather_of(chosen, read_pools(chosen), k) for k in range(10)]
-            kinds = Counter(sky_kind(sky.params) for sky in skies)
-            assert 5 <= kinds["day_dry"] <= 9, "seven of ten, give or take two"
-            total += kinds
-        assert 0.65 <= total["day_dry"] / 80 <= 0.75
-        assert set(total) >= {kind for kind, share in towns[0].sky_shares.items() if share > 5}, "each occurs"
-
-
 def test_off_is_the_default_and_leaves_no_trace():
     cfg = config()
     assert weather_of(cfg, read_pools(cfg), 0) is None
@@ -109,21 +87,6 @@ def test_fixed_takes_the_named_presets():
     for name in ("heavy_rain", "heavy rain", "Heavy-Rain"):
         cfg = config(weather_mode="fixed", weather_name=name, tod_name="night")
         assert weather_of(cfg, read_pools(cfg), 3).model_dump() == wanted
-
-
-POOL = "presets:\n  sleet: {cloudiness: 90, precipitation: 40, fog_density: 20, fog_distance: 25}\n"
-
-
-def test_presets_of_ones_own(tmp_path):
-    (tmp_path / "sky.yaml").write_text(POOL)
-    (tmp_path / "tod.yaml").write_text("presets:\n  late: {sun_altitude_angle: 5, sun_azimuth_angle: 250.5}\n")
-    files = {"weather_pool": str(tmp_path / "sky.yaml"), "tod_pool": str(tmp_path / "tod.yaml")}
-    cfg = config(**RANDOM, **files)
-    record = weather_of(cfg, read_pools(cfg), 0)
-    assert (record.weather_name, record.tod_name, record.params.sun_azimuth_angle) == ("sleet", "late", 250.5)
-    assert "weather_pool" not in cfg.recorded(), "its content is an input of the stage, its place is of this machine"
-    with pytest.raises(ConfigError, match="did you mean 'sleet'"):
-        read_pools(config(weather_mode="fixed", weather_name="sleat", tod_name="late", **files))
 
 
 def test_pools_that_cannot_be_are_one_error_with_all_problems(tmp_path):
@@ -157,16 +120,6 @@ def test_pools_that_cannot_be_are_one_error_with_all_problems(tmp_path):
 
 def params(weather: str = "clear", time: str = "noon", **knobs: float) -> WeatherParams:
     return resolved(WEATHERS[weather], TIMES[time]).model_copy(update=knobs)
-
-
-def test_the_sun_stands_where_its_knobs_say():
-    np.testing.assert_allclose(
-        light_direction(params(time="morning")), [np.cos(np.radians(15)), 0, np.sin(np.radians(15))], atol=1e-12
-    )
-    np.testing.assert_allclose(light_direction(params())[:2] / np.cos(np.radians(75)), [0, -1], atol=1e-12)
-    assert light_direction(params(time="dusk"))[0] < -0.99
-    assert light_direction(params(time="night"))[2] > 0.5, "the moon"
-    assert [lights_on(params(time=time)) > 0.5 for time in TIMES] == [False, False, True, True], "lamps in the dark"
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
@@ -223,36 +176,6 @@ def test_labels_never_change_and_every_pair_of_presets_is_another_picture(render
 
 def brightness(rgb: np.ndarray, where: np.ndarray) -> float:
     return float(rgb[where].mean())
-
-
-def test_a_map_without_lamps_is_lit_along_its_streets_and_only_when_it_is_dark(renderer, monkeypatch):
-    assert len(renderer.scene.lamps) == 0, "it has lamps of its own"
-    frames = {}
-    for name in ("lit", "dark"):
-        if name == "dark":
-            monkeypatch.setattr("cosfly.render.gl.scene.lamps_along_streets", lambda box_map: np.zeros((0, 3)))
-        plain = opened("gl", street())
-        frames[name] = {time: drawn(plain, params(time=time)) for time in ("noon", "night")}
-        plain.close()
-    lit, dark = frames["lit"], frames["dark"]
-    road = dark["night"].kinds == KINDS["Roads"]
-    assert brightness(lit["night"].rgb, road) > 2.0 * brightness(dark["night"].rgb, road)
-    assert len({labels(frame) for pair in (lit, dark) for frame in pair.values()}) == 1
-    np.testing.assert_array_equal(lit["noon"].rgb, dark["noon"].rgb)
-
-
-def test_rain_falls_and_wets_the_road(renderer):
-    dry = params("overcast", fog_density=0, precipitation=0)
-    wet = dry.model_copy(update={"precipitation": 90.0})
-    before, after = drawn(renderer, dry), drawn(renderer, wet)
-    sky = before.kinds == KINDS["Sky"]
-    assert after.rgb[sky].astype(float).std() > before.rgb[sky].astype(float).std(), "streaks"
-    above = pose_towards((0.0, -1.0, 12.0), (0.0, 0.0, 0.0))
-    road = [drawn(renderer, knobs, above) for knobs in (dry, wet)]
-    where = road[0].kinds == KINDS["Roads"]
-    assert np.median(road[1].rgb[where]) < 0.85 * np.median(road[0].rgb[where]), "darker from above"
-    moved = drawn(renderer, wet, pose_towards((-14.0, -16.0, 8.01), (12.0, 2.0, 2.0)))
-    assert (moved.rgb[:20] != after.rgb[:20]).any(), "drops fall anew in another frame"
 
 
 # --- files ------------------------------------------------------------------------------------------------------------

@@ -12,15 +12,12 @@ import pytest
 from test_cosfly_render import needs_gl
 from test_renderers_contract import circling, write_inputs
 
-from cosfly.formats.frames import level_name, read_meta
-from cosfly.formats.inspection import read_inspection
+from cosfly.formats.frames import read_meta
 from cosfly.formats.playback import read_track, write_track
 from cosfly.formats.segments import Segment
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.tracks import find_tracks
-from cosfly.inspection import stage as inspection
-from cosfly.inspection.track import InspectConfig
-from cosfly.render.lens import ZoomConfig, cameras_of, zoomed_deg
+from cosfly.render.lens import ZoomConfig, zoomed_deg
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
 from cosfly.runtime.config import build
@@ -39,17 +36,6 @@ def zoomed(num_frames: int, seed: int = 0, segments: tuple[Segment, ...] = (), *
 
 
 # --- levels -----------------------------------------------------------------------------------------------------------
-
-
-def test_focal_lengths_and_names_of_levels():
-    """Of a picture 1280 px wide; a lens of 18 mm shows 90 degrees on film 36 mm wide."""
-    found = [
-        cameras_of((1280, 720), fov, LEVELS, ZoomConfig(), np.zeros(1), (), np.random.default_rng(0)) for fov in LEVELS
-    ]
-    np.testing.assert_allclose([camera.focal_px for (camera,) in found], [448.13, 640.0, 1108.51, 2388.51], atol=0.01)
-    np.testing.assert_allclose([camera.focal_35mm_mm for (camera,) in found], [12.60, 18.0, 31.18, 67.18], atol=0.01)
-    np.testing.assert_allclose([camera.fov_deg for (camera,) in found], LEVELS)
-    assert [level_name(fov) for fov in (*LEVELS, 45.0)] == ["wide-angle", "standard", "narrow", "telephoto", ""]
 
 
 def test_a_field_of_view_outside_0_to_180_is_an_error_and_any_inside_is_taken():
@@ -136,26 +122,6 @@ def test_every_frame_tells_the_camera_it_was_drawn_with(zoomed_tree):
             assert meta.intrinsic == camera.intrinsic.tolist()
             assert meta.fov_deg == pytest.approx(camera.fov_deg, abs=1e-6)
             assert meta.focal_length_35mm_mm == pytest.approx(camera.focal_35mm_mm, abs=1e-6)
-
-
-@needs_gl
-def test_the_inspection_projects_with_each_frames_camera(zoomed_tree, tmp_path):
-    """Its pixels, boxes and masks agree; with the first frame's camera for all they do not."""
-    tree, (_, simplified, traces) = zoomed_tree
-    cfg = InspectConfig(clearance_min_m=0.0, smoothness_min=0.0, jerk_rms_max_mps3=1e3, accel_rms_max_mps2=1e3)
-    codes = [
-        issue.code
-        for flight in read_inspection(inspection.run(cfg, simplified, traces, tree, tmp_path / "a")).flights
-        for issue in flight.issues
-        if issue.severity == "error"
-    ]
-    assert codes == []
-    for folder in find_tracks(tree):
-        flight = read_track(folder)
-        seen = np.flatnonzero(
-            flight.target_in_view & (np.abs(flight.intrinsics[:, 0, 0] / flight.camera.focal_px - 1) > 0.2)
-        )
-        assert len(seen)
 
 
 # --- what cannot be drawn ---------------------------------------------------------------------------------------------

@@ -73,10 +73,3 @@ def test_every_command_of_the_script_is_one_that_cosfly_takes(tmp_path, argument
     if len(found) > 1:
         assert all(words[1:5] == ["--config", "diverse", "--town", "park"] for words in found)
         assert all(words[words.index("--out") + 1] == f"shared/run/park/{words[0]}" for words in found)
-
-
-def test_a_task_without_a_town_ends_with_a_line(tmp_path):
-    job = {"SLURM_ARRAY_TASK_ID": "2"}
-    with pytest.raises(subprocess.CalledProcessError) as raised:
-        commands_of(tmp_path, [*RUN, "grid", "park"], job)
-    assert "no town of this number" in raised.value.stderr

@@ -20,17 +20,16 @@ from specimens_distill import make_caption, make_captions, prepared
 from specimens_foreign import write_foreign_tree
 
 from cosfly.formats.actions import TOKENS
-from cosfly.formats.answer_text import parse_answer
 from cosfly.formats.captions import write_captions
 from cosfly.formats.playback import read_track
 from cosfly.formats.splits import SPLITS
 from cosfly.geometry.blind import past_of
-from cosfly.runtime.errors import ResumeError, VerifyError
+from cosfly.runtime.errors import VerifyError
 from distill.prepare import stage
 from distill.prepare.sources import RunSource
 from distill.prepare.splitting import check_no_leak
 from distill.prepare.stage import Balance, PrepareConfig, WindowRanks, balance_of, keeps, limit_to, make_sample
-from distill.schema import RECORD, Sample, open_split, resolve_trees, split_path
+from distill.schema import Sample, open_split, resolve_trees
 from specimens import make_playback_tree
 
 
@@ -69,16 +68,6 @@ def test_what_two_splits_share_is_found():
     ):  # fmt: skip
         with pytest.raises(VerifyError, match=words):
             check_no_leak({"train": train, "val": val}, split_by)
-
-
-def test_sample_holds_what_the_student_needs():
-    sample = sample_of(frame=6)
-    assert sample.key == "trajectory_1_ORI_frame_00006/en"
-    assert sample.images == [f"Town01/trajectory_1/ORI/frames_playback/frame_{i:05d}/rgb.png" for i in (2, 3, 4, 5, 6)]
-    assert parse_answer(sample.answer).coc is not None
-    assert parse_answer(sample.answer).recovered == ()
-    assert json.loads(sample.answer)["flight_decision"] == sample.decision
-    assert "行人" in sample_of(language="zh").answer  # not escaped: escapes would cost tokens
 
 
 def test_which_captions_teach_and_how_much():
@@ -186,15 +175,6 @@ def test_a_sample_has_its_past_and_whether_something_was_drawn_after_it(tree, ca
     assert {sample.drawn_ahead for sample in open_split(out, "train")} == {None}
 
 
-def test_run_twice_gives_the_same_bytes(tree, captions, tmp_path):
-    first, second = (prepared(tree, captions, tmp_path / name) for name in "ab")
-    for split in SPLITS:
-        assert split_path(first, split).read_bytes() == split_path(second, split).read_bytes()
-    assert prepared(tree, captions, first) == first
-    with pytest.raises(ResumeError, match="languages"):
-        prepared(tree, captions, first, languages=("en",))
-
-
 def test_run_counts_what_it_leaves_out(tree, tmp_path):
     records = make_captions(tmp_path / "all.jsonl", tree)
     records[0] = records[0].model_copy(update={"status": "dropped", "drop_reason": "hard_conflict"})
@@ -260,21 +240,6 @@ def test_any_sample_by_its_number_in_any_process(tree, captions, tmp_path, monke
         with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context(way)) as pool:
             assert list(pool.map(_keys, [samples] * 2)) == [_keys(whole)] * 2
     assert samples[order[0]] == whole[order[0]]
-
-
-def test_the_library_of_data_sets_opens_it(tree, captions, tmp_path):
-    datasets = pytest.importorskip("datasets", reason="needs the extra distill")
-    out = prepared(tree, captions, tmp_path / "set")
-    found = datasets.load_dataset(str(out), cache_dir=str(tmp_path / "cache"))
-    assert set(found) == {"train", "validation", "test"}
-    systems = json.loads((out / RECORD).read_text())["systems"]
-    assert len(systems) == 2  # one a language, however many samples
-    for split, name in (("train", "train"), ("val", "validation")):
-        samples = open_split(out, split)
-        assert len(found[name]) == len(samples)
-        row, sample = found[name][3], samples[3]
-        assert (row["prompt"], row["answer"], row["window"]) == (sample.prompt.user, sample.answer, list(sample.window))
-        assert systems[row["system"]] == sample.prompt.system
 
 
 # --- choice ---------------------------------------------------------------------------------------------------------

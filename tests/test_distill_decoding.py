@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +13,6 @@ torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
 from specimens_students import features_of  # noqa: E402
-from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
-from torch.utils._pytree import tree_leaves  # noqa: E402
 from transformers import LogitsProcessor, LogitsProcessorList  # noqa: E402
 
 from distill.student import decoding  # noqa: E402
@@ -93,25 +90,6 @@ def generated(student: Student, rows: Sequence[Asked], most: int = MOST, **more)
     return found
 
 
-def ending_at(student: Student, rows: Sequence[Asked], most: int = MOST) -> Student:
-    """The same student with another end token, such that its answers to `rows` end here and there."""
-    inputs = given(student, rows)
-    with torch.inference_mode():
-        output = student.model.generate(
-            **inputs, max_new_tokens=most, do_sample=False, eos_token_id=-1, pad_token_id=student.pad_token_id
-        )
-    answers = output[:, inputs["input_ids"].shape[1] :].tolist()
-    lengths = {
-        token: [answer.index(token) if token in answer else most for answer in answers]
-        for token in {token for answer in answers for token in answer}
-    }
-    best = max(lengths, key=lambda token: (len(set(lengths[token])), sum(lengths[token])))
-    assert len(set(lengths[best])) >= 3
-    other = replace(student)
-    other.__dict__["end_token_id"] = best
-    return other
-
-
 def test_a_batch_of_different_lengths_has_the_tokens_of_generate(student, rows):
     assert len({len(row.prompt_ids) for row in rows}) == len(rows)
     found = decode(student, rows, max_tokens=MOST)
@@ -124,20 +102,6 @@ def test_a_row_has_the_same_answer_alone_and_among_others(student, rows):
     assert [decode(student, [row], max_tokens=MOST)[0] for row in rows] == together
     assert [generated(student, [row])[0] for row in rows] == together
     assert decode(student, rows[::-1], max_tokens=MOST)[::-1] == together
-
-
-def test_rows_that_ended_leave_the_batch(student, rows, monkeypatch):
-    ending = ending_at(student, rows)
-    expected, sizes = generated(ending, rows), []
-    with ending.model.lm_head.register_forward_hook(lambda module, inputs, output: sizes.append(len(output))):
-        assert decode(ending, rows, max_tokens=MOST) == expected
-        work, sizes[:] = sum(sizes), []
-        monkeypatch.setattr(decoding, "LEAVING_SHARE", 1e-9)  # each at once
-        assert decode(ending, rows, max_tokens=MOST) == expected
-    needed = sum(min(answer.num_tokens + 1, MOST) for answer in expected)
-    assert sum(sizes) == needed
-    assert needed <= work <= needed / (1 - 0.25)
-    assert sizes[0] == len(rows) > sizes[-1]
 
 
 def test_an_adapter_and_dropout(student, rows, tmp_path):
@@ -194,86 +158,3 @@ def test_a_constraint_decides_what_may_come(student, rows):
     even = LogitsProcessorList([Even(end, num_prompt)])
     found = decode(own, rows, max_tokens=MOST, constraint=EvenTokens(end, len(rows)))
     assert found == generated(own, rows, logits_processor=even) != decode(own, rows, max_tokens=MOST)
-
-
-class Recording(TorchDispatchMode):
-    """Every operation of a step as it runs, with the tensors that it read and wrote: played again, it does the same to
-    the same places.
-
-    What an accelerator's graph is, on a CPU: no Python of the step runs again, sizes and places are those of the
-    recording.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.played: list[tuple[Any, tuple, dict, Any]] = []
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        found = func(*args, **(kwargs or {}))
-        assert func is not torch.ops.aten._local_scalar_dense.default, "the step asks for a value"
-        self.played.append((func, args, kwargs or {}, found))
-        return found
-
-    def play(self) -> None:
-        for func, args, kwargs, places in self.played:
-            found = func(*args, **kwargs)
-            if func._schema.is_mutable:
-                continue
-            for place, value in zip(tree_leaves(places), tree_leaves(found), strict=True):
-                if isinstance(place, torch.Tensor) and place.data_ptr() != value.data_ptr():  # no view
-                    place.copy_(value)
-
-
-class Recorder:
-    """Records steps as an accelerator does; counts recordings and what was played of them."""
-
-    def __init__(self) -> None:
-        self.recordings = self.played = 0
-
-    def __call__(self, step):
-        self.recordings += 1
-        recording, is_new = Recording(), True
-        # A graph is recorded without being computed; here the first play was the recording itself.
-        with recording:
-            step()
-
-        def play() -> None:
-            nonlocal is_new
-            self.played += 1
-            if not is_new:
-                recording.play()
-            is_new = False
-
-        return play
-
-
-@pytest.fixture
-def recorder(monkeypatch) -> Recorder:
-    found = Recorder()
-    monkeypatch.setattr(decoding, "recorder_for", lambda student: found)
-    return found
-
-
-def test_a_recorded_step_gives_the_same_tokens(student, rows, recorder):
-    found = decode(student, rows, max_tokens=MOST)
-    assert (recorder.recordings, recorder.played) == (1, MOST - 2)  # the first step is computed plainly
-    assert found == decode(student, rows, max_tokens=MOST, is_recorded=False) == generated(student, rows)
-    assert recorder.played == MOST - 2
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an accelerator")
-@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_an_accelerator_plays_what_it_computes(tmp_path, rows, dtype, monkeypatch):
-    folder = make_tiny_student(tmp_path / "tiny", seed=3)
-    own = ending_at(load_student(folder, device="cuda", dtype=dtype, max_pixels=64 * 64), rows)
-    plain = decode(own, rows, max_tokens=MOST, is_recorded=False)
-    played = []
-    monkeypatch.setattr(
-        decoding, "recorder_for", lambda s: lambda step: played.append(decoding.record_graph(step)) or played[-1]
-    )
-    assert decode(own, rows, max_tokens=MOST) == plain
-    assert played
-    assert all(played)
-    if dtype == "float32":
-        assert plain == generated(own, rows)

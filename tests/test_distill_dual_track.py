@@ -14,7 +14,7 @@ from cosfly.formats.playback import read_track
 from cosfly.formats.splits import SPLITS
 from cosfly.runtime.run_dir import read_failures, read_manifest
 from distill.prepare import dual_track
-from distill.prepare.dual_track import DualTrackConfig, TrackSample, read_track_samples, read_track_set, windows_of
+from distill.prepare.dual_track import DualTrackConfig, TrackSample, read_track_samples, windows_of
 from specimens import make_playback_tree
 
 NUM_POINTS = 24
@@ -76,13 +76,6 @@ def test_a_window_holds_both_tracks_frame_by_frame(tree, dataset):
         )
 
 
-def test_no_walk_is_in_two_splits(dataset):
-    walks = [{sample.walk for sample in found} for found in samples(dataset).values()]
-    assert all(walks)
-    assert sum(map(len, walks)) == len(set.union(*walks)) == 4
-    assert read_track_set(dataset).samples == {split: len(found) for split, found in samples(dataset).items()}
-
-
 def test_a_bad_flight_stops_no_other(own_tree, tmp_path):
     flights = sorted(own_tree.glob("*/*/aug_001"))
     (flights[0] / "trajectory.json").write_text("{")
@@ -97,15 +90,3 @@ def test_a_bad_flight_stops_no_other(own_tree, tmp_path):
     assert counts.dropped == {"no_clean_flight": 1, "clean_flight_of_other_frames": 1}
     assert counts.failed.total() == 1
     assert flights[0].parent.name in read_failures(out / "failures.jsonl")[0].id
-
-
-def test_windows_over_a_gap_are_left_out(own_tree, tmp_path):
-    for folder in sorted(own_tree.glob("*/*"))[0].iterdir():
-        raw = json.loads((folder / "trajectory.json").read_text())
-        for point in raw["points"][12:]:
-            point["timing"]["trace_timestamp"] += 5.0
-        (folder / "trajectory.json").write_text(json.dumps(raw))
-    out = run(own_tree, tmp_path / "set")
-    # Of the begins 0, 3, 6, 9, 12 those of 3, 6, 9 reach over the step from frame 11 to frame 12.
-    assert read_manifest(out).facts["windows_left_out"] == {"uneven_steps": 3}
-    assert sum(read_track_set(out).samples.values()) == 4 * 5 - 3

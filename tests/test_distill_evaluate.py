@@ -36,7 +36,6 @@ from distill.evaluation.scores import (
     Scores,
     differences_of,
     figures_of,
-    macro_f1,
     score_answers,
 )
 from distill.evaluation.stage import EvaluateConfig, run
@@ -141,20 +140,6 @@ def test_verdicts_are_those_of_the_true_future(samples):
     assert words == ["CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", *[None] * 5]
     found, _ = figures(scores)
     assert (found["consistent"].value, found["hard_conflict"].count) == (1 / 3, 3)
-
-
-def test_macro_f1_agrees_with_counting():
-    rng = np.random.default_rng(3)
-    references, answers = rng.integers(0, 5, 200), rng.choice([0, 1, 2, 3, 4, 9, 17], 200)
-    confusion = np.zeros((17, 18))
-    np.add.at(confusion, (references, answers), 1)
-    expected = []
-    for decision in range(5):
-        hits = sum(r == a == decision for r, a in zip(references, answers, strict=True))
-        precision, recall = hits / max(1, (answers == decision).sum()), hits / (references == decision).sum()
-        expected.append(0.0 if not hits else 2 * precision * recall / (precision + recall))
-    assert macro_f1(confusion) == pytest.approx(np.mean(expected))
-    assert np.isnan(macro_f1(np.zeros((17, 18))))
 
 
 def made_up(num_walks: int, rng: np.random.Generator, *, size: int = 6, skill: float = 0.6) -> Scores:

@@ -12,10 +12,9 @@ import pytest
 from commands import invoke
 from PIL import Image
 from specimens_distill import make_captions, prepared
-from teacher_server import TeacherServer, kept_answers
+from teacher_server import TeacherServer
 
 from cosfly.formats.predictions import read_predictions
-from cosfly.runtime.errors import ResumeError, TeacherError
 from distill.inference import stage as infer
 from distill.schema import open_split
 from specimens import make_playback_tree
@@ -65,25 +64,6 @@ def test_a_server_is_asked_as_the_student_was_taught(place, tmp_path):
     assert all(image.width * image.height <= 300 for image in sent)
 
 
-def test_nothing_answered_is_asked_twice(place, tmp_path):
-    out = tmp_path / "out"
-    cfg = settings(endpoint={"stop_after_failures": 2})
-    with TeacherServer(lambda number, body: "500" if number >= 5 else None) as server:
-        with pytest.raises(TeacherError, match=r"[2-9] samples in a row got no answer.*http_500.*same command"):
-            infer_with(cfg, place, server.url, out)
-        num_kept = len(kept_answers(out))
-        assert num_kept >= 5 - ENDPOINT["concurrency"]
-        assert not (out / "predictions.jsonl").exists()
-        server.fault, num_asked = (lambda number, body: None), len(server.bodies)
-        path = infer_with(cfg, place, server.url, out)
-        num_samples = len(read_predictions(path))
-        assert len(server.bodies) == num_asked + num_samples - num_kept
-        (out / "manifest.json").unlink()
-        before = path.read_bytes()
-        assert infer_with(cfg, place, server.url, out).read_bytes() == before
-        assert len(server.bodies) == num_asked + num_samples - num_kept
-
-
 def test_one_sample_without_an_answer_costs_no_other(place, tmp_path):
     """And the command ends with status 1; run again, it asks about that sample alone."""
     words = ["distill", "infer", "--dataset", place / "set", "--data", place / "tree", "--engine", "endpoint"]
@@ -103,21 +83,3 @@ def test_one_sample_without_an_answer_costs_no_other(place, tmp_path):
         assert result.exit_code == 0, result.output
         assert len(server.bodies) == num_asked + 1
     assert all(p.coc is not None for p in read_predictions(tmp_path / "out" / "predictions.jsonl"))
-
-
-def test_a_folder_answers_for_one_student(place, tmp_path):
-    with TeacherServer(models=("one",)) as server:
-        path = infer_with(settings(max_samples=3), place, server.url, tmp_path / "out")
-        assert {p.model for p in read_predictions(path)} == {"one"}
-        url, num_asked = server.url, len(server.bodies)
-    assert infer_with(settings(max_samples=3), place, url, tmp_path / "out") == path  # complete: nobody is asked
-    with TeacherServer(models=("two",)) as server:
-        with pytest.raises(ResumeError, match=r"endpoint.model was 'one', is 'two'"):
-            infer_with(settings(max_samples=3), place, server.url, tmp_path / "out")
-        assert not server.bodies
-    with TeacherServer(models=("one",)) as server:  # the same student, served elsewhere
-        assert infer_with(settings(max_samples=3), place, server.url, tmp_path / "out") == path
-        assert not server.bodies
-    told = (tmp_path / "out" / "stage.json").read_text() + (tmp_path / "out" / "manifest.json").read_text()
-    assert "127.0.0.1" not in told
-    assert num_asked == 3

@@ -102,31 +102,6 @@ def test_a_merged_student_sees_pictures_as_it_was_taught(place, tmp_path):
     assert sum(base) > sum(beside)
 
 
-def test_each_picture_is_looked_at_once_and_rows_of_like_length_go_together(place, clean, tmp_path, monkeypatch):
-    looked, lengths = [], []
-
-    def load(*args: Any, **more: Any) -> Any:
-        student = load_student(*args, **more)
-        student.model.get_base_model().model.visual.register_forward_pre_hook(
-            lambda module, inputs: looked.append(inputs[0])
-        )
-        return student
-
-    def watched(student: Any, rows: Any, features: Any, **more: Any) -> Any:
-        lengths.append([len(row.prompt_ids) for row in rows])
-        return decode(student, rows, features, **more)
-
-    monkeypatch.setattr(infer, "load_student", load)
-    monkeypatch.setattr("distill.inference.local.decode", watched)
-    assert answer(place, tmp_path / "out").read_bytes() == clean.read_bytes()
-    samples = samples_of(place)
-    images = [image for sample in samples for image in sample.images]
-    assert len(looked) == len(set(images)) < len(images) / 2
-    together = [length for batch in lengths for length in batch]
-    assert together == sorted(together, reverse=True)
-    assert len(set(together)) > 1
-
-
 def test_one_bad_picture_costs_its_samples_only(place, clean, tmp_path):
     tree = shutil.copytree(place / "tree", tmp_path / "tree")
     samples = samples_of(place)

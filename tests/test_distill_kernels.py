@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-import types
 
 import pytest
 
@@ -85,26 +84,3 @@ def installed(monkeypatch):
 
     monkeypatch.setattr(sys, "modules", dict(sys.modules))
     return install
-
-
-def test_the_convolution_of_linear_attention_stands_in(installed):
-    """Held against the library's own function, through a stand-in written from what flash-linear-attention documents: x
-    is (b, t, d)."""
-
-    def causal_conv1d(x, weight, bias=None, activation=None):
-        width = weight.shape[1]
-        padded = torch.nn.functional.pad(x, (0, 0, width - 1, 0))
-        found = sum(padded[:, i : i + x.shape[1]] * weight[:, i] for i in range(width))
-        return (found if activation is None else torch.nn.functional.silu(found)), None
-
-    installed("fla")
-    kernels.use_kernels_for(torch.bfloat16, "cuda")
-    stand_in = sys.modules["causal_conv1d"]
-    assert stand_in.__spec__ is not None  # whoever looks for the package finds it
-    sys.modules["fla.modules.causal_conv1d"] = types.SimpleNamespace(causal_conv1d=causal_conv1d)
-    x, weight = torch.randn(2, 6, 9), torch.randn(6, 4)
-    wanted = library.causal_conv1d_fn(x, weight, None, activation="silu")
-    assert torch.allclose(stand_in.causal_conv1d_fn(x, weight, None, activation="silu"), wanted, atol=1e-5)
-    installed()
-    kernels.use_kernels_for(torch.bfloat16, "cuda")
-    assert "causal_conv1d" not in sys.modules

@@ -12,14 +12,11 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
-from safetensors import safe_open  # noqa: E402
 from safetensors.torch import load_file, save_file  # noqa: E402
-from specimens_distill import TEACHING, make_adapter  # noqa: E402
+from specimens_distill import make_adapter  # noqa: E402
 from specimens_students import inputs_of, samples_of, trees_of  # noqa: E402
 
-from cosfly.llm.student_chat import TAUGHT, read_taught  # noqa: E402
 from cosfly.runtime.errors import InputError  # noqa: E402
-from cosfly.runtime.json_io import write_json  # noqa: E402
 from distill.inference import merge  # noqa: E402
 from distill.student.model import Student, load_student  # noqa: E402
 from distill.student.random_student import make_tiny_student  # noqa: E402
@@ -86,33 +83,6 @@ def test_merged_as_peft_merges(base, tmp_path, changes):
     assert not any("visual" in name for name in changed)
     for name, tensor in found.items():
         torch.testing.assert_close(tensor, expected[name], rtol=1e-6, atol=1e-6)
-
-
-def test_a_model_folder_is_whole(base, adapter, tmp_path):
-    model = merge.run(base, adapter, tmp_path / "out")
-    assert {path.name for path in model.iterdir()} == {path.name for path in base.iterdir()} | {TAUGHT}
-    for name in {path.name for path in base.iterdir()} - {"model.safetensors"}:
-        assert (model / name).read_bytes() == (base / name).read_bytes()
-    with safe_open(model / "model.safetensors", "pt") as file:
-        assert file.metadata() == {"format": "pt"}
-    assert read_taught(model) == read_taught(tmp_path / "out") == TEACHING
-    from transformers import AutoModelForImageTextToText
-
-    _, told = AutoModelForImageTextToText.from_pretrained(model, output_loading_info=True)
-    assert not any(told[f"{kind}_keys"] for kind in ("missing", "unexpected", "mismatched"))
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [({"use_dora": True}, "use_dora"), ({"rank_pattern": {"q_proj": 2}}, "rank_pattern"), ({"bias": "all"}, "bias")],
-)
-def test_another_kind_of_adapter_is_refused(base, adapter, tmp_path, changes, words):
-    shutil.copytree(adapter, tmp_path / "adapter")
-    path = tmp_path / "adapter" / "adapter_config.json"
-    write_json(path, json.loads(path.read_text()) | changes)
-    with pytest.raises(InputError, match=words):
-        merge.run(base, tmp_path / "adapter", tmp_path / "out")
-    assert not (tmp_path / "out" / "model").exists()
 
 
 def test_damaged_adapters_are_refused(base, adapter, tmp_path):

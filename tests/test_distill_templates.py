@@ -120,16 +120,6 @@ def test_prompt_answer_and_end_are_the_whole_chat(place, processor, version):
         assert taught == prompt_text(processor, sample, counts) + sample.answer + END_OF_TURN
 
 
-def test_thinking_would_be_another_prompt(place, processor):
-    """The templates do branch: what the tests above hold is not an accident of templates that ignore it."""
-    messages = [{"role": "system", "content": "Fly."}, {"role": "user", "content": "Now?"}]
-    for version, template in TEMPLATES.items():
-        processor.tokenizer.chat_template = template
-        text = processor.tokenizer.apply_chat_template(messages, tokenize=False, add_generation_prompt=True)
-        assert text.endswith("<think>\n")
-        assert ("Reasoning effort is set to xhigh." in text) is (version == "3.8")
-
-
 def test_a_template_that_writes_something_else_ends_before_the_first_step(place, tmp_path):
     """One that signs every answer: what is taught would not be what the student's own template writes."""
     import shutil

@@ -19,7 +19,7 @@ from cosfly.formats.predictions import read_predictions  # noqa: E402
 from distill.inference import stage as infer  # noqa: E402
 from distill.student import model as student  # noqa: E402
 from distill.student.checkpoint import load_checkpoint  # noqa: E402
-from distill.student.encoding import IGNORED, encode_text, load_pictures, padded, prompt_batch  # noqa: E402
+from distill.student.encoding import IGNORED, encode_text, load_pictures, padded  # noqa: E402
 from distill.training import stage as train  # noqa: E402
 from distill.training.settings import Steps, TrainConfig  # noqa: E402
 
@@ -79,18 +79,6 @@ def test_mask_covers_exactly_the_answer(place):
         assert before.endswith("<|im_start|>assistant\n")
         assert sample.prompt.user in before
         assert len(rows[i]) == places[-1] + 1
-
-
-def test_positions_are_the_librarys(place):
-    """For every sample, and for pictures of two shapes between texts of all lengths."""
-    own = load(place)
-    rows = [encode_text(own, sample) for sample in samples_of(place)]
-    for row in rows:
-        inputs = prompt_batch(own, [row])
-        names = ("input_ids", "mm_token_type_ids", "image_grid_thw")
-        wanted, _ = own.core.model.get_rope_index(*(inputs[n] for n in names), attention_mask=inputs["attention_mask"])
-        found = padded(own, [row])[2][:, 0, : len(row.prompt_ids)]
-        assert np.array_equal(found, wanted[:, 0].numpy())
 
 
 def test_each_epoch_sees_each_sample_once():

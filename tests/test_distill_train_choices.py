@@ -4,26 +4,19 @@ ends."""
 from __future__ import annotations
 
 import json
-from collections import Counter
 
-import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
 
 from safetensors.torch import load_file  # noqa: E402
-from specimens_students import MAX_PIXELS, inputs_of, load, log_of, losses_of, run, samples_of, trees_of  # noqa: E402
+from specimens_students import MAX_PIXELS, inputs_of, load, log_of, run, samples_of, trees_of  # noqa: E402
 
 from cosfly.runtime.errors import InputError  # noqa: E402
-from distill.schema import Sample  # noqa: E402
-from distill.student.checkpoint import Progress  # noqa: E402
 from distill.student.decoding import Completion  # noqa: E402
 from distill.student.model import load_student  # noqa: E402
 from distill.training import fit  # noqa: E402
-from distill.training.fit import Validation, judged  # noqa: E402
-from distill.training.loading import choose_over_all  # noqa: E402
-from distill.training.settings import TrainConfig  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -48,49 +41,6 @@ def test_a_model_trained_in_full_is_a_whole_folder(place, tmp_path):
     assert any("language_model" in name for name in changed)
     assert not any("visual" in name for name in changed)
     assert (folder / "cosfly_student.json").exists()
-
-
-@pytest.mark.slow
-def test_bfloat16_computes_with_float32_weights_that_learn(place, tmp_path):
-    settings = {"method": "full", "max_steps": 4, "learning_rate": 1e-3, "validation_answers": True}
-    for dtype in ("float32", "bfloat16"):
-        run(place, tmp_path / dtype, dtype=dtype, max_new_tokens=4, **settings)
-    found, wanted = losses_of(tmp_path / "bfloat16"), losses_of(tmp_path / "float32")
-    assert found == pytest.approx(wanted, rel=0.02)
-    assert found != wanted
-    newest = sorted((tmp_path / "bfloat16" / "checkpoints").iterdir())[-1]
-    assert {tensor.dtype for tensor in load_file(newest / "weights.safetensors").values()} == {torch.float32}
-
-
-def sample_like(base: Sample, flight: int, frame: int, decision: str) -> Sample:
-    return base.model_copy(update={"sample_id": f"trajectory_{flight}_ORI_frame_{frame:05d}", "decision": decision})
-
-
-def test_validation_is_drawn_over_all_decisions_and_flights(place):
-    """One decision and one flight have most of the samples; still each of the others is asked about."""
-    base = samples_of(place)[0]
-    samples = [sample_like(base, flight % 3, flight, "track_straight") for flight in range(300)]
-    samples += [sample_like(base, flight, 400, "hover") for flight in range(5)]
-    samples += [sample_like(base, 9, frame, "ascend") for frame in range(500, 502)]
-    chosen = choose_over_all(samples, 12, np.random.default_rng(0))
-    assert chosen == sorted(set(chosen))
-    assert Counter(samples[i].decision for i in chosen) == {"track_straight": 5, "hover": 5, "ascend": 2}
-    assert len({samples[i].sample_id.split("_")[1] for i in chosen if samples[i].decision == "track_straight"}) == 3
-    again, other = (choose_over_all(samples, 12, np.random.default_rng(seed)) for seed in (0, 1))
-    assert again == chosen != other
-    assert choose_over_all(samples, 1000, np.random.default_rng(0)) == list(range(len(samples)))
-    assert choose_over_all([], 5, np.random.default_rng(0)) == []
-
-
-def test_the_best_is_who_decides_best_and_patience_ends():
-    progress, cfg, found = Progress(), TrainConfig(patience=2), []
-    for step, (share, loss) in enumerate([(0.2, 3.0), (0.5, 2.0), (0.5, 1.0), (0.4, 0.5), (0.5, 1.5)], 1):
-        validation = Validation(samples=4, loss=loss, accuracy=share, consistent=0.1 * step)  # the latter only grows
-        progress = judged(progress.model_copy(update={"step": step}), validation, cfg)
-        found.append((progress.best_step, progress.stale, progress.has_ended))
-    assert found == [(1, 0, False), (2, 0, False), (3, 0, False), (3, 1, False), (3, 2, True)]
-    patient = TrainConfig(patience=0)
-    assert not judged(Progress(step=9, best_score=(1.0, 0.0)), Validation(samples=1, loss=1.0), patient).has_ended
 
 
 def test_an_answer_is_judged_by_the_teacher_and_by_the_future(place):

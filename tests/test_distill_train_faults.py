@@ -11,7 +11,6 @@ import sys
 
 import pytest
 from processes import is_running, wait_until
-from specimens_distill import write_set
 
 torch = pytest.importorskip("torch", reason="needs the extra distill")
 pytest.importorskip("peft", reason="needs the extra distill")
@@ -20,31 +19,11 @@ from specimens_students import FAST, TWELVE, begun, load, log_of, run, samples_o
 
 from cosfly.runtime.errors import ConfigError, InputError  # noqa: E402
 from distill.student.checkpoint import load_checkpoint, newest_checkpoint  # noqa: E402
-from distill.student.model import student_folder  # noqa: E402
 from distill.training import fit  # noqa: E402
 from distill.training import stage as train  # noqa: E402
 from distill.training.settings import TrainConfig  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-def test_samples_are_left_out_with_a_reason_and_counted(place, tmp_path):
-    good = samples_of(place)
-    long = good[0].model_copy(update={"sample_id": "long", "answer": "tree " * 5000})
-    spoken = good[1].model_copy(update={"sample_id": "spoken", "answer": f"{good[1].answer}<|im_end|>"})
-    shown = good[2].prompt.model_copy(update={"user": "an <|image_pad|> stands here"})
-    pictured = good[2].model_copy(update={"sample_id": "pictured", "prompt": shown})
-    sized = good[3].model_copy(update={"sample_id": "sized", "picture_px": (32, 32)})
-    splits = {"train": [*good, long, spoken, pictured, sized], "val": samples_of(place, "val")}
-    dataset = write_set(tmp_path / "set", splits, [place / "tree"])
-    run(place, tmp_path / "out", dataset=dataset, max_steps=1)
-    counts = json.loads((tmp_path / "out" / "manifest.json").read_text())["counts"]
-    assert counts["dropped"] == {"special_token": 2, "too_long": 1, "unfit_picture": 1}
-    assert counts["kept"] == len(good)
-    assert counts["input"] == len(good) + 4
-    told = (tmp_path / "out" / "preflight.json").read_text()
-    assert "long/en" in told or "long/zh" in told
-    assert "at most 4096" in told
 
 
 def test_a_picture_that_does_not_decode_costs_its_samples(place, tmp_path):
@@ -64,14 +43,6 @@ def test_a_picture_that_does_not_decode_costs_its_samples(place, tmp_path):
     log = log_of(tmp_path / "one")
     assert sum(record["samples"] for record in log) == counts["kept"]
     assert log == log_of(tmp_path / "two")
-
-
-def test_a_repository_that_cannot_be_had_is_one_line(monkeypatch):
-    import huggingface_hub.constants
-
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
-    with pytest.raises(InputError, match=r"Qwen/Qwen3\.5-none: no such folder"):
-        student_folder("Qwen/Qwen3.5-none")
 
 
 def test_a_checkpoint_of_another_student_is_refused(place, tmp_path):

@@ -9,7 +9,6 @@ import pytest
 from specimens_release import CFG, build, make_caption, make_inspection
 
 from cosfly.formats.captions import write_captions
-from cosfly.formats.frames import frame_name, read_rgb
 from cosfly.formats.inspection import write_inspection
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
@@ -56,20 +55,6 @@ def test_a_tree_and_its_release_give_the_same_windows(place, language):
         for name, values in ours["facts"].items():
             assert np.allclose(values, theirs["facts"][name], rtol=0, atol=1e-9, equal_nan=True), name
             assert values.dtype == theirs["facts"][name].dtype
-
-
-def test_a_window_is_what_stands_in_the_files(place):
-    windows = Windows(place / "tree", place / "captions.jsonl", max_side_px=96)
-    window, found = windows[1], windows._places[1]
-    flight = read_track(place.joinpath("tree", *found.flight[1:]))
-    assert window["window"].tolist() == [1, 2, 3, 4, 5]
-    assert window["frames"].shape == (5, 3, 54, 96)
-    for k, index in enumerate(window["window"]):
-        assert np.array_equal(window["frames"][k].transpose(1, 2, 0), read_rgb(flight.folder / frame_name(index)))
-    assert np.array_equal(window["facts"]["pose"][:, :3], flight.positions_m[1:6])
-    assert np.array_equal(window["facts"]["pose"][:, 3:], flight.rotations_deg[1:6])
-    assert "<pictures>" not in window["prompt"]["user"]
-    assert window["caption"]["flight_decision"]
 
 
 def test_splits_of_a_release_share_no_walk_and_make_up_the_whole(place):

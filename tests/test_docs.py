@@ -154,11 +154,6 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     }
 
 
-def test_every_page_stands_in_the_site_s_list():
-    listed = set(re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text(encoding="utf-8")))
-    assert listed == {page.name for page in (ROOT / "docs").rglob("*.md")}
-
-
 HEADING = re.compile(r"^## (\d+\.\d+\.\d+) \((unreleased|\d{4}-\d\d-\d\d)\)$", re.MULTILINE)
 
 
@@ -176,17 +171,3 @@ def test_one_version_is_named_everywhere_and_every_tag_has_its_heading():
         ["git", "tag", "--list", "v*"], cwd=ROOT, capture_output=True, text=True, check=False
     ).stdout.split()
     assert set(tags) <= {f"v{number}" for number, day in found if day != "unreleased"}
-
-
-def test_templates_of_issues_are_forms():
-    folder = ROOT / ".github/ISSUE_TEMPLATE"
-    forms = {path.stem: yaml.safe_load(path.read_text(encoding="utf-8")) for path in folder.glob("*.yml")}
-    assert forms.pop("config").keys() == {"blank_issues_enabled"}
-    assert len(forms) == 3
-    for form in forms.values():
-        assert form.keys() == {"name", "description", "body"}
-        ids = [field["id"] for field in form["body"]]
-        assert len(ids) == len(set(ids))
-        assert all(
-            field["type"] in ("input", "textarea", "checkboxes", "dropdown", "markdown") for field in form["body"]
-        )

@@ -1,10 +1,8 @@
 """Styles: what the table says is what is drawn, flown by every planner, and seen in the labels."""
 
-import re
 from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,10 +12,9 @@ from caption.schema import FutureMotion
 from caption.truth.actions import TABLE as ACTION_TABLE
 from caption.truth.actions import measure
 from cosfly.formats.actions import TOKENS
-from cosfly.formats.boxes import write_boxes
 from cosfly.formats.frames import LEGIBLE_HEIGHT_PX, Camera
-from cosfly.formats.pedestrian_paths import paces_of, walk_id, write_paths
-from cosfly.formats.traces import DroneTrace, read_traces
+from cosfly.formats.pedestrian_paths import paces_of, walk_id
+from cosfly.formats.traces import DroneTrace
 from cosfly.geometry import kernels
 from cosfly.geometry.axes import intrinsic_matrix, look_at, world_from_camera, wrap_deg
 from cosfly.maps.stage import load_map
@@ -25,15 +22,13 @@ from cosfly.pedestrians.stage import make_pedestrian
 from cosfly.pedestrians.walkable import walkable_ground
 from cosfly.pipeline.settings import RunConfig
 from cosfly.planners.contract import PLANNERS, PlanConfig
-from cosfly.planners.courses import reference_of
-from cosfly.planners.intent import draw_intent, draw_styles
+from cosfly.planners.intent import draw_intent
 from cosfly.planners.reacquire import finds_again, screens_of
-from cosfly.planners.stage import draw_styles_of, make_scenario, plan_trajectory, run, style_rng
-from cosfly.planners.styles import FOLLOW, NAMES, OTHER_SIDE, REACQUIRE, RETURN_HOME, TABLE
+from cosfly.planners.stage import draw_styles_of, make_scenario, plan_trajectory, style_rng
+from cosfly.planners.styles import FOLLOW, NAMES, REACQUIRE, RETURN_HOME, TABLE
 from cosfly.render.camera import view_target
 from cosfly.runtime.config import load, shipped
 from cosfly.runtime.errors import NoPathError
-from cosfly.runtime.run_dir import read_manifest
 from cosfly.runtime.seeding import rng_for
 from cosfly.simplify.passes import simplify
 
@@ -87,18 +82,6 @@ def test_a_style_shows_the_decisions_that_it_is_for(name):
     assert len(TABLE[name].purpose) == 1 or all(label in share for label in TABLE[name].purpose if "_left" not in label)
 
 
-def test_the_wish_of_parts_has_no_jumps_and_keeps_to_the_speed_limit():
-    scenario = make_scenario(walk_along("w", [(0, 0), (60, 0), (60, 60), (0, 60)]), OPEN, PlanConfig())
-    names = [*TABLE, FOLLOW, *reversed(TABLE)]
-    reference = reference_of(names, scenario, OPEN, PlanConfig(), np.random.default_rng(5))
-    steps_m = np.linalg.norm(np.diff(reference.places_m(scenario.targets_m, scenario.ground_m), axis=0), axis=1)
-    assert steps_m.max() / scenario.dt_s <= 10.0
-    np.testing.assert_allclose(
-        reference.distance_m**2, reference.ground_distance_m**2 + (reference.altitude_m - 0.9) ** 2, rtol=1e-9
-    )
-    np.testing.assert_allclose(np.tan(reference.pitch_rad), (reference.altitude_m - 0.9) / reference.ground_distance_m)
-
-
 # --- flights ----------------------------------------------------------------------------------------------------------
 
 
@@ -137,21 +120,6 @@ def test_parts_draw_their_styles_and_cover_the_flight():
     assert trace.segments[-1].end == len(trace.time_s)
 
 
-def test_styles_are_drawn_to_their_shares_whatever_the_seed():
-    """Also both sides of a style of either."""
-    shares = {"top": 1.0, "side": 2.0, "trail": 1.0, "rise": 1.0, "reacquire": 1.0, "return_home": 1.0}
-    cfg = PlanConfig(styles=shares, segment_s=40)
-    walks = [walk_along(f"w{k}", [(0, 0), (way_m, 0)]) for k, way_m in enumerate([140, 48, 54, 96] * 15)]
-    for seed in range(10):
-        drawn = draw_styles(walks, cfg, np.random.default_rng(seed))
-        whole = Counter(names[-1] for names in drawn)
-        assert abs(whole[REACQUIRE] - 60 / 7) <= 2
-        assert abs(whole[RETURN_HOME] - 60 / 7) <= 2
-        parts = Counter(name for names in drawn for name in names if name not in (REACQUIRE, RETURN_HOME))
-        for name in ("top", "side", OTHER_SIDE + "side", "rise", "trail"):
-            assert abs(parts[name] - parts.total() / 5) <= 2.5
-
-
 def test_a_style_that_the_map_does_not_hold_is_dropped_or_followed_and_says_why():
     dropped = plan_trajectory(STRAIGHT, OPEN, styled(REACQUIRE), 0)
     assert dropped.drop_reason == "no_hiding_place"
@@ -167,29 +135,7 @@ def test_a_style_that_the_map_does_not_hold_is_dropped_or_followed_and_says_why(
     assert plan_trajectory(STRAIGHT, walled, fallback, 0).drop_reason is None
 
 
-def test_what_was_asked_what_was_flown_and_what_was_in_the_way_is_said(tmp_path, caplog):
-    towers = [((x, side * 13, 40), (12, 8, 40)) for x in range(-40, 140, 25) for side in (-1, 1)]
-    write_boxes(tmp_path / "map.json", town_of(*towers))
-    write_paths(tmp_path / "path.json", [STRAIGHT], {})
-    cfg = styled("orbit_left", planner="muco", styles_fallback="follow", five_ray_mean_min=0)
-    product = run(cfg, tmp_path / "map.json", tmp_path / "path.json", tmp_path / "plan")
-    (trace,) = read_traces(product)
-    assert trace.instead_of == "orbit_left: style_not_held"
-    asked = r"orbit_left, \d+% of frames 0 to \d+: asked \d+ m up, \d+ m away, at -?\d+ deg; "
-    words = asked + r"flown \d+ m up, .* because .*\d+% nearer"
-    assert re.match(words, trace.not_held)
-    assert read_manifest(tmp_path / "plan").model_dump()["styles_not_held"] == {"straight": trace.not_held}
-    assert trace.not_held in caplog.text
-
-
 # --- ranges -----------------------------------------------------------------------------------------------------------
-
-
-def test_every_style_stands_in_the_documents_with_a_picture():
-    docs = Path(__file__).parents[1] / "docs"
-    pictures = [f"images/style-{name}.png" for name in NAMES]
-    assert all(f"]({picture}) |" in (docs / "styles.md").read_text() for picture in pictures)
-    assert sum((docs / picture).stat().st_size for picture in pictures) < 400_000
 
 
 # --- the shipped towns ------------------------------------------------------------------------------------------------

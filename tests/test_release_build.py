@@ -7,7 +7,6 @@ import json
 import shutil
 import struct
 import zlib
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -21,7 +20,6 @@ from specimens_release import FREE, all_bytes, make_caption, make_inspection, re
 from caption.run import stage as caption_stage
 from caption.schema import CaptionConfig
 from cosfly.formats.captions import write_captions
-from cosfly.formats.frames import depth_bytes, read_depth
 from cosfly.formats.inspection import write_inspection
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
@@ -31,7 +29,7 @@ from release.package.config import ReleaseConfig
 from release.package.sources import Source
 from release.package.stage import run
 from release.record import ReleaseRecord, read_record
-from specimens import make_playback_tree, pack_depth
+from specimens import make_playback_tree
 
 POINTS = 14
 
@@ -113,25 +111,6 @@ def test_neither_twin_goes_without_the_other_unless_asked(copy, tmp_path):
     assert {flight.pair for flight in clean.flights} == {None}
 
 
-def test_every_released_caption_has_its_whole_window(tmp_path):
-    tree = make_playback_tree(tmp_path / "tree", 1, 100, width_px=32, height_px=18)
-    captions = [make_caption(f, i) for f in map(read_track, find_tracks(tree)) for i in range(4, 90)]
-    write_captions(tmp_path / "captions.jsonl", captions)
-    write_inspection(tmp_path / "inspect.json", make_inspection(tree, {}))
-    folder = run(split_cfg(num_frames=60), [source_of(tmp_path)], tmp_path / "r")
-    rows = table_of(folder, ["variant", "frame_index", "caption_window", "has_caption"])
-    for variant in ("ORI", "aug_001"):
-        own = [row for row in rows if row["variant"] == variant]
-        frames = {row["frame_index"] for row in own}
-        assert len(frames) == 60
-        assert sum(b - a > 1 for a, b in pairwise(sorted(frames))) == 1  # two runs of thirty
-        released = [row for row in own if row["has_caption"]]
-        assert all(set(row["caption_window"]) <= frames for row in released)
-        assert len(released) >= 0.8 * len([index for index in frames if 4 <= index < 90])
-    everything = run(split_cfg(num_frames=None), [source_of(tmp_path)], tmp_path / "all")
-    assert read_record(everything / "release.json").history.captions.released == 2 * 86
-
-
 def test_a_public_tree_without_an_inspection_is_released(tmp_path):
     tree = write_foreign_tree(tmp_path / "tree", num_points=13)
     captions = caption_stage.run(CaptionConfig(), tree, tmp_path / "caption")
@@ -144,19 +123,6 @@ def test_a_public_tree_without_an_inspection_is_released(tmp_path):
 
 
 # --- what a row and the record hold -----------------------------------------------------------------------------------
-
-
-def test_rows_hold_prompts_and_the_state_of_each_sentence(few, tmp_path):
-    run(split_cfg(), [source_of(few)], tmp_path / "r")
-    names = ["has_caption", "frame_index", "system_en", "prompt_zh", "sentence_states_en", "sentence_states_zh"]
-    for row in table_of(tmp_path / "r/dataset", names):
-        if not row["has_caption"]:
-            assert all(row[name] is None for name in names[2:])
-            continue
-        assert (row["system_en"], row["prompt_zh"]) == ("s", "u <pictures>")
-        if row["frame_index"] % 2:
-            assert row["sentence_states_en"] == ["proved", "unread"]
-        assert row["sentence_states_zh"] is None
 
 
 def test_the_record_says_where_it_comes_from_and_nothing_of_this_machine(copy, tmp_path):
@@ -177,21 +143,6 @@ def test_the_record_says_where_it_comes_from_and_nothing_of_this_machine(copy, t
         assert b"/home/somebody" not in data
         assert str(tmp_path).encode() not in data
     assert {row["teacher_model"] for row in table_of(tmp_path / "r/dataset", ["teacher_model"])} == {"teacher-7", None}
-
-
-def test_depth_is_lossless_in_either_form_of_the_tree(material, tmp_path):
-    folder = run(split_cfg(), [source_of(material)], tmp_path / "r")
-    row = table_of(folder, ["town", "trajectory", "variant", "frame_index", "depth"])[3]
-    flight = read_track(material / "tree" / row["town"] / row["trajectory"] / row["variant"])
-    assert row["depth"] == depth_bytes(read_depth(flight.frame_folder(row["frame_index"])))
-    packed = shutil.copytree(material, tmp_path / "packed")
-    pack_depth(packed)
-    write_inspection(packed / "inspect.json", make_inspection(packed / "tree", {}))
-    assert {
-        p.name: p.read_bytes() for p in run(split_cfg(), [source_of(packed)], tmp_path / "p").rglob("*.parquet")
-    } == {p.name: p.read_bytes() for p in folder.rglob("*.parquet")}, (
-        "a release does not tell in which form the tree keeps depth"
-    )
 
 
 # --- what is refused, with all that is wrong --------------------------------------------------------------------------

@@ -12,22 +12,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from public_reader import read_public
 from specimens_release import (
-    CFG,
     NUM_POINTS,
     all_bytes,
-    build,
-    make_inspection,
     make_release,
     rows_by_id,
 )
 
-from cosfly.formats.captions import write_captions
-from cosfly.formats.frames import depth_bytes
-from cosfly.formats.inspection import write_inspection
 from cosfly.formats.playback import read_track
 from cosfly.formats.town import read_town_map
 from cosfly.formats.tracks import find_tracks
@@ -38,13 +30,10 @@ from cosfly.runtime.io import CHECKSUMS, read_checksums, sha256_file
 from cosfly.runtime.json_io import read_model
 from release.columns import POSE
 from release.export.contract import FORMATS, ExportConfig, ExportUnit, Files, FormatFacts
-from release.export.lerobot import merged, runs_of, states, summarize, tiff_of_depth
+from release.export.lerobot import runs_of, states
 from release.export.source import ReleasedRows, Span, open_release, rows_of_flight, scan
 from release.export.stage import EXPORT_FORMAT, ExportRecord
 from release.export.stage import run as export
-from release.package import stage as package
-from release.package.sources import Source
-from release.verify.verify import verify
 
 
 def config(format: str, **more) -> ExportConfig:
@@ -107,26 +96,6 @@ def test_tree_to_release_to_tree_loses_nothing(whole, dataset, tmp_path):
     assert read_town_map(product / "Town01").licence == about.maps[0].licence
 
 
-def test_a_second_release_of_the_exported_tree_has_the_same_rows(whole, dataset, tmp_path):
-    """tree -> release -> tree -> release: pictures, poses, and all that follows from them."""
-    product = export(config("tree"), dataset, tmp_path / "out")
-    write_captions(tmp_path / "captions.jsonl", [])
-    write_inspection(tmp_path / "inspect.json", make_inspection(product, {}))
-    shutil.copytree(product, tmp_path / "tree")
-    again = build(tmp_path, tmp_path / "release", CFG.model_copy(update={"num_frames": 400}))
-    first, second = rows_by_id(dataset), rows_by_id(again)
-    assert first.keys() == second.keys()
-    told_elsewhere = {name for name in next(iter(first.values())) if name.startswith(("caption_", "proved", "prompt_",
-    "system_"))} | {
-        "has_caption", "decision", "label", "label_from", "verdict", "repair_strategy", "teacher_kind", "teacher_model",
-        "writing", "evidence", "look",
-    }  # fmt: skip
-    for name, row in first.items():
-        for column in row.keys() - told_elsewhere:
-            if "sentence" not in column:
-                assert row[column] == second[name][column], (name, column)
-
-
 # --- WebDataset -------------------------------------------------------------------------------------------------------
 
 
@@ -162,18 +131,6 @@ def names_in(shard: Path) -> list[str]:
         return tar.getnames()
 
 
-def test_webdataset_shards_keep_to_their_size(dataset, tmp_path):
-    release = open_release(dataset)
-    flights = scan(release)
-    for flight in flights:
-        flight.num_bytes = 900_000 * len(flight)  # of 12 frames in one row group
-    from release.export import webdataset
-
-    units = webdataset.plan(release, flights, config("webdataset", shard_mb=20))
-    assert [unit.frames for unit in units] == [24, 24, 24]  # two row groups pass 20 MB
-    assert [unit.name for unit in units] == ["train-00000", "train-00001", "train-00002"]
-
-
 def test_webdataset_opens_it(dataset, tmp_path):
     wds = pytest.importorskip("webdataset", reason="extra dev")
     product = export(config("webdataset"), dataset, tmp_path / "out")
@@ -207,27 +164,6 @@ def test_a_state_is_the_motion_that_led_to_a_frame():
     ]
     expected = [[0, 0, 0, 0, -9], [0, -4, 2, 180, -8], [0, 0, 0, 20, -7]]  # it flew north, and looks west
     assert np.allclose(states(rows), expected)
-
-
-@given(st.lists(st.floats(0, 1000, width=32), min_size=1, max_size=40))
-def test_depth_as_tiff_is_the_same_numbers(values):
-    from PIL import Image
-
-    exact = np.array([values], dtype=np.float32)
-    with Image.open(io.BytesIO(tiff_of_depth(depth_bytes(exact), "x"))) as image:
-        assert np.asarray(image).tobytes() == exact.tobytes()
-
-
-@given(st.lists(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=9), min_size=1, max_size=5))
-def test_merged_statistics_are_those_of_all_values(groups):
-    parts = [summarize(np.array(group).reshape(-1, 1), len(group)) for group in groups]
-    values = np.concatenate(groups)
-    found = merged(parts)
-    assert found["count"] == [len(values)]
-    assert found["min"] == [values.min()]
-    assert found["max"] == [values.max()]
-    assert found["mean"] == pytest.approx([values.mean()], abs=1e-6)
-    assert found["std"] == pytest.approx([values.std()], abs=1e-3)
 
 
 def test_a_flight_with_gaps_is_several_episodes(spread, tmp_path):
@@ -300,14 +236,6 @@ def finish(release, units, written, folder, cfg):
     return FormatFacts(version="1", codings={"pose": "CSV"}, how_to_open="open(...)", files=files.digests)
 
 
-def test_a_format_of_your_own_takes_three_functions(dataset, tmp_path, monkeypatch):
-    monkeypatch.setitem(FORMATS, "lerobot", __name__)
-    product = export(config("lerobot"), dataset, tmp_path / "out")
-    assert (product / "lines.txt").read_text() == "72"
-    assert len(list(product.glob("*.csv"))) == 6
-    assert all(sha256_file(product / name) == digest for name, digest in read_checksums(product).items())
-
-
 # --- what is no release -----------------------------------------------------------------------------------------------
 
 
@@ -376,18 +304,3 @@ def test_a_unit_that_fails_publishes_nothing(broken, tmp_path, change, words):
 
 
 # --- verified ---------------------------------------------------------------------------------------------------------
-
-
-def test_the_tree_of_two_runs_verifies(whole, tmp_path):
-    sources = []
-    for run in ("one", "two"):
-        for name in ("tree", "captions.jsonl", "inspect.json"):
-            place = tmp_path / run / name
-            place.parent.mkdir(exist_ok=True)
-            place.symlink_to(whole / name)
-        sources.append(Source.of_files(*(tmp_path / run / n for n in ("tree", "captions.jsonl", "inspect.json"))))
-    package.run(CFG.model_copy(update={"unbound": "accept"}), sources, tmp_path / "release")
-    product = export(config("tree"), tmp_path / "release/dataset", tmp_path / "out")
-    assert {path.name for path in product.iterdir() if path.is_dir()} == {"one", "two"}
-    report = verify(product, level="structure")
-    assert report.is_ok, report

@@ -16,9 +16,6 @@ from cosfly.formats.people import People
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from release.columns import SCALARS, Placement
-from release.export.lerobot import task_of
-from release.export.source import ReleasedRows
-from release.export.tree import flight_of_rows
 from release.flight_rows import FlightRows, Row
 from release.verify.findings import Findings
 from release.verify.scene import check_goal, decode
@@ -96,14 +93,3 @@ def test_lies_about_goals_are_found(flights):
         "no picture": [{**row, "target_picture": row["target_picture"] and {"bytes": b"x"}} for row in flight.rows],
     }
     assert {name: bool(told(rows, folder)) for name, rows in lies.items()} == dict.fromkeys(lies, True)
-
-
-def test_an_exported_tree_and_its_tasks_have_the_goal(flights):
-    flight, _ = flights[0]
-    placed = ReleasedRows("r", "t", "trajectory_1", "ORI", "train", frames=[np.arange(1, 3)], times=[np.arange(2.0)])
-    rows = [{**row, "goal_frame": 1} for row in flight.rows[1:]]
-    assert flight_of_rows(rows, placed, 0).goal == replace(flight.goal, frame=0)
-    assert flight_of_rows(rows, placed, 0).people == flight.people
-    assert flight_of_rows([{**row, "goal_frame": 0} for row in rows], placed, 0).goal is None
-    assert task_of(flight.goal.en, "hover") == f"Follow {flight.goal.en} from the air. Now: hover."
-    assert task_of("", "") == "Follow the walking person from the air."

@@ -118,46 +118,6 @@ def test_numbers_against_a_slow_oracle(loaded, built):
     assert numbers["files"]["bytes"] == sum(p.stat().st_size for p in (built / "data").iterdir())
 
 
-def test_the_account_names_every_flight_and_caption(built):
-    history = read_json(built / "release.json")["history"]
-    assert history["flights"] == {
-        "found": 6, "inspected": 6, "released": 4, "left_out": {"rejected: missing_file": 1, "review: stray_frame": 1},
-    }  # fmt: skip
-    captions = history["captions"]
-    assert captions["read"] == 6 * 8
-    assert captions["dropped"] == {"hard_conflict": 6}
-    assert captions["flight_left_out"] == 2 * 7
-    # Of 12 frames 2 to 9 are released; captions stand at 4 to 10, and each needs the four frames before its own.
-    assert captions["released"] == 4 * 4
-    assert captions["window_not_whole"] == 4 * 2
-    assert captions["frame_not_selected"] == 4
-
-
-def test_the_papers_stride_is_a_setting_and_leaves_no_window_whole(release_inputs, tmp_path):
-    folder = build(release_inputs, tmp_path / "r", CFG.model_copy(update={"uniform_stride": True, "num_frames": 6}))
-    assert verify(folder).is_ok
-    record = read_record(folder / "release.json")
-    flight = [row["frame_index"] for row in rows_of(folder)][:6]
-    assert flight == [0, 2, 4, 6, 8, 11]
-    assert record.settings.window_frames == 5
-    assert record.history.captions.released == 0
-    assert record.history.captions.window_not_whole == 4 * 3
-
-
-def test_shards_hold_whole_row_groups_in_order(built):
-    record = read_json(built / "release.json")
-    assert len(record["shards"]) > 0
-    for entry in record["shards"]:
-        file = pq.ParquetFile(built / entry["path"])
-        assert b"huggingface" in file.schema_arrow.metadata
-        group = file.metadata.row_group(0)
-        assert all(group.column(k).has_offset_index for k in range(group.num_columns))
-        by_path = {group.column(k).path_in_schema: group.column(k) for k in range(group.num_columns)}
-        assert by_path["image.bytes"].compression == "UNCOMPRESSED"
-        assert by_path["frame_index"].has_column_index
-        assert file.metadata.num_rows == entry["rows"]
-
-
 # --- whose it is ------------------------------------------------------------------------------------------------------
 
 

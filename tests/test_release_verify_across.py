@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
-from tables import each
 
 from cosfly.geometry.reprojection import Agreement
 from release.flight_rows import FlightRows
@@ -124,40 +122,3 @@ def test_every_pixel_is_counted(seed, sky):
     assert list(found[:-1]) == counts
     assert found.box.tolist() == box
     assert (found.num_odd_sky > 0) == sky
-
-
-@pytest.mark.parametrize("corner", [(0, 0), (0, -1), (-1, 0), (-1, -1)])
-def test_pixels_at_corners_are_seen(corner):
-    depth, mask = np.full((9, 13), 5.0, np.float32), np.zeros((9, 13, 3), np.uint8)
-    mask[corner] = (PERSON, 255, 255)
-    depth[corner] = FAR_M
-    found, (counts, box) = survey(depth, mask), _obvious(depth, mask)
-    assert list(found[:-1]) == counts
-    assert found.box.tolist() == box
-    mask[corner] = (200, 1, 0)
-    assert survey(depth, mask).most_kind == 200
-
-
-@each(
-    ("odd", "limits"),
-    [
-        (np.nan, (np.nan, np.nan)), (-np.nan, (np.nan, np.nan)), (np.inf, (np.nan, np.nan)),
-        (-np.inf, (np.nan, np.nan)),
-        (-3.5, (-3.5, 7.0)), (0.0, (0.0, 7.0)), (-0.0, (0.0, 7.0)), (1e-42, (np.float32(1e-42), 7.0)),
-        (2000.0, (5.0, 2000.0)),
-    ],
-)  # fmt: skip
-def test_limits_of_depth(odd, limits):
-    depth = np.full((9, 13), 5.0, np.float32)
-    depth[2, 3], depth[8, 12] = 7.0, odd
-    found = survey(depth, np.empty((0, 0, 3), np.uint8))
-    assert_array_equal([found.low_m, found.high_m], limits)
-
-
-def test_a_frame_may_lack_mask_or_depth():
-    depth, mask = _frame(0)
-    alone = survey(depth, np.empty((0, 0, 3), np.uint8))
-    assert (alone.low_m, alone.high_m, alone.num_person, alone.num_odd_sky) == (depth.min(), depth.max(), 0, 0)
-    alone = survey(np.empty((0, 0), np.float32), mask)
-    assert (alone.low_m, alone.num_odd_sky, alone.most_kind) == (0.0, 0, mask[..., 0].max())
-    assert alone.num_person == _obvious(depth, mask)[0][3]

@@ -12,9 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from browser import browser
-from release_tampering import forge
 from specimens_distill import WINDOW, make_caption
-from specimens_foreign import hub_snapshot
 
 from cosfly.formats.boxes import make_box_map, write_boxes
 from cosfly.formats.captions import write_captions
@@ -22,14 +20,12 @@ from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.runtime.tables import rows_of
-from cosfly.viz.frame_views import read_view
 from release.columns import PLACE, POINT
 from release.record import read_record
-from release.stats import stats
 from release.viewer.content import (
     ViewerConfig,
 )
-from release.viewer.page import VIEW_OF, picture, run
+from release.viewer.page import run
 from specimens import make_playback_tree
 
 NUM_POINTS = 24
@@ -154,41 +150,6 @@ def test_a_release_is_shown_as_its_rows_say(built, tmp_path):
     two = data_of(run(built, tmp_path / "two.html", ViewerConfig(flights=2, frames=1)).read_text(encoding="utf-8"))
     assert len(two["flights"]) <= 2
     assert any("flights are shown" in note for note in two["notes"])
-
-
-def test_a_snapshot_in_the_hubs_cache_is_shown(built, tmp_path):
-    """Its files are links to blobs beside it."""
-    snapshot = hub_snapshot(built, tmp_path)
-    direct, linked = (
-        run(place, tmp_path / name, ViewerConfig(frames=2)) for place, name in ((built, "a.html"), (snapshot, "b.html"))
-    )
-    assert direct.read_bytes() == linked.read_bytes()
-    direct, linked = (stats.run(place, tmp_path / name, pixels=3) for place, name in ((built, "a"), (snapshot, "b")))
-    assert direct.read_bytes() == linked.read_bytes()
-
-
-def test_pictures_of_a_release_look_like_those_of_its_tree(release_inputs, built):
-    record = read_record(built / "release.json")
-    row = next(rows_of(built / record.shards[0].path))
-    place = release_inputs / "tree" / row["town"] / row["trajectory"] / row["variant"]
-    frame = read_track(place).frame_folder(row["frame_index"])
-    for file, view in VIEW_OF.items():
-        assert (picture(row, file, record) == read_view(frame, view)).all()
-
-
-def test_words_and_boxes_that_no_release_has_are_shown_as_they_are(built, tmp_path):
-    def lie(rows):
-        for row in rows:
-            row["track"] = "third"
-            row["sentence_states_en"] = row["sentence_states_en"] and ["odd"] * len(row["sentence_states_en"])
-            row["target_bbox"] = row["target_bbox"] and dict.fromkeys(row["target_bbox"])
-
-    shown = data_of(run(forge(built, tmp_path / "forged", lie), tmp_path / "p.html", ViewerConfig()).read_text())
-    assert {flight["track"] for flight in shown["flights"]} == {"third"}
-    frames = [frame for flight in shown["flights"] for frame in flight["frames"]]
-    assert {frame["box"] for frame in frames} == {None}
-    captions = [frame["caption"] for frame in frames if frame["caption"]]
-    assert {sentence["state"] for caption in captions for sentence in caption["texts"]["en"]} <= {"odd", None}
 
 
 def test_a_page_keeps_its_size(run_folder, tmp_path):

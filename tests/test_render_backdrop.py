@@ -15,9 +15,8 @@ from cosfly.formats.backdrop import Backdrop
 from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, write_boxes
 from cosfly.formats.kinds import KINDS
 from cosfly.geometry.axes import box_corners
-from cosfly.render.backdrop import draw_backdrop, run
+from cosfly.render.backdrop import draw_backdrop
 from cosfly.render.settings import RenderConfig
-from cosfly.runtime.errors import ConfigError
 from cosfly.viz.topview import TopView
 
 
@@ -65,11 +64,3 @@ def test_carla_gives_the_same_picture_by_the_same_way(tmp_path):
     assert pictures[0].std() > 20
     ours, theirs = (picture[..., 2].reshape(-1) for picture in pictures)
     assert np.corrcoef(ours, theirs)[0, 1] > 0.95, "in blue, which the server's haze and shadows change least"
-
-
-def test_what_cannot_be_is_told(tmp_path):
-    boxes = tmp_path / "boxes_3d.json"
-    write_boxes(boxes, street())
-    for bounds_m in ((5.0, 0.0, 5.0, 9.0), (0.0, 0.0, 99999.0, 9.0), (float("nan"), 0.0, 1.0, 1.0)):
-        with pytest.raises(ConfigError, match=r"--bounds: no picture of this size.*px"):
-            run(RenderConfig(), boxes, tmp_path / "above.png", bounds_m=bounds_m, pixels_per_m=2.0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 
-import numpy as np
 import pytest
 from test_cosfly_render import needs_gl
 from test_renderers_contract import circling, write_inputs
@@ -12,25 +11,10 @@ from test_renderers_contract import circling, write_inputs
 from cosfly.formats.frames import LEGIBLE_CONTRAST, TargetMeta, frame_name, read_meta
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
-from cosfly.render.camera import contrast_of, legibility
+from cosfly.render.camera import legibility
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import run
 from cosfly.runtime.config import build
-
-
-def test_contrast_is_of_the_person_against_what_is_around():
-    rgb, is_person = np.full((90, 160, 3), 120, np.uint8), np.zeros((90, 160), bool)
-    assert contrast_of(rgb, is_person) is None
-    is_person[40:60, 70:78] = True
-    assert contrast_of(rgb, is_person) == pytest.approx(0.0, abs=0.1)
-    rgb[40:50, 70:78] = 30  # a dark jacket over trousers of the ground's colour
-    dark = contrast_of(rgb, is_person)
-    assert dark is not None
-    assert dark > 30
-    rgb[:, 120:] = 255  # far beside
-    assert contrast_of(rgb, is_person) == dark
-    fog = (0.95 * 150 + 0.05 * rgb.astype(float)).astype(np.uint8)
-    assert (contrast_of(fog, is_person) or 0.0) < LEGIBLE_CONTRAST
 
 
 @pytest.mark.parametrize(
