@@ -18,11 +18,8 @@ quickstart: $(VENV)/.installed  ## Map to release on the embedded synthetic town
 	$(BIN)/cosfly run quickstart --out $(RUN)
 
 test: $(VENV)/.installed-dev  ## What must hold, without the tests that take long; with SLOW=1 everything
-	{ $(LINT); } >$(VENV)/lint.txt 2>&1 & lint=$$!
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(if $(SLOW),,-m "not slow") && failed=0 || failed=1
-	wait $$lint || failed=1
-	cat $(VENV)/lint.txt
-	exit $$failed
+	$(BIN)/python -m pytest -n 2 --dist worksteal $(if $(SLOW),,-m "not slow")
+	$(LINT)
 
 lint: $(VENV)/.installed-dev
 	$(LINT)

@@ -1,6 +1,8 @@
 """Fixtures shared by all tests."""
 
 import contextlib
+import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -9,6 +11,7 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+from filelock import FileLock
 
 # A busy machine is not a failure; pytest-timeout ends what hangs. Equal examples in every run: what no change caused
 # fails nobody's change.
@@ -18,18 +21,6 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("cosfly")
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
-
-
-# Files that take a minute or more, the longest first: begun last, one would leave the other worker without work.
-LONG = (
-    "test_docs_run.py", "test_release_honest.py", "test_crashes.py", "test_release_verify.py",
-    "test_pipeline_tiny.py", "test_planners_contract.py", "test_release_build.py",
-)  # fmt: skip
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long files first; `--dist loadfile --no-loadscope-reorder` hands files out in this order."""
-    items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
 
 
 @pytest.fixture
@@ -76,29 +67,55 @@ def held_by_another() -> Callable[[Path], contextlib.AbstractContextManager[subp
     return _held_by_another
 
 
+Make = Callable[[Path], object]
+
+
 @pytest.fixture(scope="session")
-def place(tmp_path_factory) -> Path:
-    """A playback tree, a training set and a tiny student, read by many tests; what a test writes has a folder of its
-    own."""
+def built_once(tmp_path_factory) -> Callable[[str, Make], Path]:
+    """Return a function that gives a directory by its name; the first worker of the session that asks fills it.
+
+    What is in it is read by many tests; what a test writes has a directory of its own.
+    """
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def give(name: str, make: Make) -> Path:
+        folder, finished = base / "built_once" / name, base / "built_once" / f"{name}.finished"
+        folder.parent.mkdir(exist_ok=True)
+        with FileLock(f"{folder}.lock"):
+            if not finished.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                make(folder)
+                finished.touch()
+        return folder
+
+    return give
+
+
+@pytest.fixture(scope="session")
+def place(built_once) -> Path:
+    """A playback tree, a training set and a tiny student."""
     from specimens_students import make_place
 
-    return make_place(tmp_path_factory.mktemp("students") / "students0")  # its run, by whose name chance is drawn
+    # The last name is that of its run, from which random numbers are drawn.
+    return built_once("students", lambda root: make_place(root / "students0")) / "students0"
 
 
 @pytest.fixture(scope="session")
-def tree(tmp_path_factory) -> Path:
-    """A tree of one flight of fourteen frames, which are five windows; read by many tests."""
+def tree(built_once) -> Path:
+    """A tree of one track of fourteen frames, which are five windows."""
     from specimens import make_playback_tree
 
-    return make_playback_tree(tmp_path_factory.mktemp("five"), 1, 14, with_augmented=False)
+    return built_once("five", lambda root: make_playback_tree(root, 1, 14, with_augmented=False))
 
 
 @pytest.fixture(scope="session")
-def two_splits(tmp_path_factory) -> Path:
-    """A release of six flights in two towns, a split each, several shards; read by many tests."""
+def two_splits(built_once) -> Path:
+    """A release of six tracks in two towns, a split each, several shards."""
     from specimens_release import TWO_SPLITS, make_release
 
-    return make_release(tmp_path_factory.mktemp("two_splits"), **TWO_SPLITS)
+    return built_once("two_splits", lambda root: make_release(root, **TWO_SPLITS)) / "release" / "dataset"
 
 
 @pytest.fixture(scope="session")
@@ -108,19 +125,19 @@ def dataset(two_splits) -> Path:
 
 
 @pytest.fixture(scope="session")
-def release_inputs(tmp_path_factory) -> Path:
-    """tree/, captions.jsonl and inspect.json of six flights, two of which are not accepted; read by many tests."""
+def release_inputs(built_once) -> Path:
+    """tree/, captions.jsonl and inspect.json of six tracks, two of which are not accepted."""
     from specimens_release import make_inputs
 
-    return make_inputs(tmp_path_factory.mktemp("inputs"))
+    return built_once("release_inputs", make_inputs)
 
 
 @pytest.fixture(scope="session")
-def built(release_inputs, tmp_path_factory) -> Path:
-    """What `release_inputs` become: a release of eight frames of each of four flights; read by many tests."""
+def built(release_inputs, built_once) -> Path:
+    """A release of eight frames of each of the four accepted tracks of `release_inputs`."""
     from specimens_release import build
 
-    return build(release_inputs, tmp_path_factory.mktemp("built") / "release")
+    return built_once("built", lambda root: build(release_inputs, root / "release")) / "release" / "dataset"
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from specimens_captions import VOCABULARY
+from tables import each
 from teacher_server import TeacherServer
 
 from caption.run.compare import compare, run
@@ -21,7 +22,7 @@ from specimens import make_flight, make_playback_tree
 CFG = CaptionConfig(window=WindowConfig(require_images=False))
 
 
-@pytest.mark.parametrize("treatment", ["keep", "repair", "drop"])
+@each("treatment", ["keep", "repair", "drop"])
 def test_what_becomes_of_a_soft_conflict(treatment):
     flight = dataclasses.replace(make_flight(60)[0], folder=Path("nowhere"))
     windows = list(cut_windows(flight, CFG.window))

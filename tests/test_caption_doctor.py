@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from commands import invoke
 from specimens_captions import VOCABULARY, deciding, report_of, settings
+from tables import each
 from teacher_server import ENGLISH, TeacherServer
 
 from caption.run.forecast import make_forecast
@@ -126,7 +127,7 @@ def test_an_answer_in_parts_is_read_and_a_null_field_is_left_out():
     assert {finding.state for finding in findings.values()} == {"ok"}
 
 
-@pytest.mark.parametrize(("defect", "name", "state", "words"), DEFECTS, ids=lambda value: str(value))
+@each(("defect", "name", "state", "words"), DEFECTS, ids=lambda value: str(value))
 def test_a_defect_is_found(defect, name, state, words):
     findings = examine(patient(**defect), defect.get("context", CONTEXT))
     assert findings[name].state == state
@@ -160,7 +161,7 @@ def test_the_plan_is_what_the_run_then_takes(tree, tmp_path):
     assert num_trial_requests == asked  # the run did not ask about the trial windows again
 
 
-@pytest.mark.parametrize("writing", ["slots", "prose"])
+@each("writing", ["slots", "prose"])
 def test_the_largest_prompt_bounds_real_ones_with_their_corrections(tree, tmp_path, writing):
     with deciding("ascend", lambda number, body: "wrong_therefore") as server:
         cfg = CaptionConfig.model_validate({"teacher": server.url, "writing": writing, "limit": 2})

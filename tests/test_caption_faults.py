@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from specimens_captions import deciding, report_of, settings
+from tables import each
 from teacher_server import MODEL, TeacherServer, is_mirror, refusal
 
 from caption.run.stage import run
@@ -86,7 +87,7 @@ SERVER_FAULTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", SERVER_FAULTS)
+@each("name", SERVER_FAULTS)
 def test_what_is_the_servers_fault_ends_the_run_and_is_no_windows(tree, tmp_path, whole, name):
     status, text, words = SERVER_FAULTS[name]
     out, behaviour = tmp_path / "out", Switched(status, text)
@@ -145,7 +146,7 @@ class Picky:
         return refusal(self.status, self.text) if self.is_on and body["seed"] in self.seeds else None
 
 
-@pytest.mark.parametrize("name", WINDOW_FAULTS)
+@each("name", WINDOW_FAULTS)
 def test_what_is_a_windows_fault_costs_that_window_and_is_kept_in_the_servers_words(tree, tmp_path, whole, name):
     status, text, reason = WINDOW_FAULTS[name]
     out = tmp_path / "out"
@@ -193,7 +194,7 @@ SCHEMA_FAULTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", SCHEMA_FAULTS)
+@each("name", SCHEMA_FAULTS)
 def test_a_server_that_refuses_the_schema_is_asked_without_it(tree, tmp_path, name):
     status, text, num_refused = SCHEMA_FAULTS[name]
     with hovering(lambda body: refusal(status, text) if "response_format" in body else None) as server:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from commands import invoke
 from specimens_distill import prepared
+from tables import each
 from teacher_server import MODEL, TeacherServer
 
 from caption.run.stage import run
@@ -96,7 +97,7 @@ def test_a_contradiction_is_on_record_and_drops_its_window_where_the_settings_sa
     assert [caption.drop_reason for caption in dropped[:2]] == ["evidence", None]
 
 
-@pytest.mark.parametrize(
+@each(
     ("changes", "reason"),
     [
         ({"therefore": "return_to_home"}, "decision_against_reasoning"),
@@ -125,7 +126,7 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("text", "field"), BAD)
+@each(("text", "field"), BAD)
 def test_a_bad_line_names_file_line_and_field(tmp_path, text, field):
     path = tmp_path / "theirs.jsonl"
     good = json.dumps({"sample_id": "first", "en": EN | {"flight_decision": "hover"}})

@@ -19,6 +19,7 @@ from typing import BinaryIO
 import pytest
 from specimens_captions import deciding
 from specimens_captions import settings as quick
+from tables import each
 from teacher_server import MODEL, Sent, Wild, obedient_answer
 
 from caption.run.stage import run
@@ -259,7 +260,7 @@ LISTS: dict[str, tuple] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", LISTS)
+@each("name", LISTS)
 def test_what_becomes_of_a_run_at_a_list_of_models_like_this(tree, tmp_path, monkeypatch, whole, name):
     monkeypatch.setenv(KEY_VARIABLE, "sk-very-secret")
     respond, words = LISTS[name]

@@ -411,7 +411,7 @@ def test_a_refused_answer_is_mended_when_it_is_told_what_was_wrong(tree, tmp_pat
     assert all('"18.5"' in text and "reasoning_trace, sentence 1" in text for text in complaints)
 
 
-@pytest.mark.parametrize(
+@each(
     ("reasons", "reason"),
     [
         ("The gap of 18.5 m calls for nothing.", "slots_number_outside"),

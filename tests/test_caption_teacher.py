@@ -12,6 +12,7 @@ import pytest
 from commands import invoke
 from specimens_captions import deciding, report_of
 from specimens_captions import settings as quick
+from tables import each
 from teacher_server import TeacherServer
 
 from caption.run.stage import run
@@ -54,7 +55,7 @@ def test_a_decision_against_its_own_reasoning_is_asked_for_again_with_what_was_w
     assert corrected["seed"] != asked["seed"]
 
 
-@pytest.mark.parametrize(
+@each(
     ("strategy", "rungs"),
     [
         ("anchored", ["anchored"] * 3),
@@ -124,9 +125,7 @@ def test_unreachable_and_unknown_model_and_not_an_endpoint(tree, tmp_path):
         assert not server.bodies
 
 
-@pytest.mark.parametrize(
-    "url", ["http://[::1", "http://user:hunter2@h/v1", "http://h/v1?api_key=hunter2", "http://u:hunter 2: 3@h"]
-)
+@each("url", ["http://[::1", "http://user:hunter2@h/v1", "http://h/v1?api_key=hunter2", "http://u:hunter 2: 3@h"])
 def test_no_command_takes_a_url_that_cannot_be_asked_or_holds_a_secret(tmp_path, url):
     at, data, asked = ["--out", tmp_path / "out"], ["--data", tmp_path], [url]
     commands = [

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from specimens_captions import VOCABULARY
+from tables import each
 from teacher_server import TeacherServer
 
 from caption.run.stage import run
@@ -47,7 +48,7 @@ def flight_in(root):
     return read_track(find_tracks(root)[0], strict=False)
 
 
-@pytest.mark.parametrize(
+@each(
     ("num_points", "stride", "expected"),
     [(9, 1, []), (10, 1, [4]), (12, 1, [4, 5, 6]), (20, 5, [4, 9, 14]), (0, 1, [])],
 )

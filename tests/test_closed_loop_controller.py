@@ -5,6 +5,7 @@ from collections import deque
 import numpy as np
 import pytest
 from specimens_planning import town_of, walk_along
+from tables import each
 
 from caption.schema import FutureMotion
 from caption.truth.actions import TABLE, Motion, Thresholds, measure
@@ -59,7 +60,7 @@ def flown(begin, *tokens) -> tuple[list, Motion, Controller]:
     return moments, measure(future), controller
 
 
-@pytest.mark.parametrize("token", [t for t in TOKENS if t != "search_to_reacquire_target"])
+@each("token", [t for t in TOKENS if t != "search_to_reacquire_target"])
 def test_a_decision_that_is_flown_for_its_horizon_shows_what_its_own_rule_asks_for(begin, token):
     _, motion, _ = flown(begin, *[token] * HORIZON)
     if token in ("break_off", "return_to_home"):  # orders of a mission; who leaves without one leaves the person
@@ -69,7 +70,7 @@ def test_a_decision_that_is_flown_for_its_horizon_shows_what_its_own_rule_asks_f
     assert shown(motion) >= 1.0, (token, shown(motion), motion)
 
 
-@pytest.mark.parametrize("command", [(99.0, 0, 0, 0, 0), (0, 0, 0, float("nan"), 0), (0, 0)])
+@each("command", [(99.0, 0, 0, 0, 0), (0, 0, 0, float("nan"), 0), (0, 0)])
 def test_a_command_that_cannot_be_flown_is_the_students_failure_and_the_drone_hovers(begin, command):
     flight, controller, moment = begin()
     under_way = OpenFlight("path_00000", flight, controller, deque([moment]))

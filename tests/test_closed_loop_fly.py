@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from commands import invoke
 from specimens_distill import prepared
+from tables import each
 from teacher_server import TeacherServer
 
 from caption.run.stage import run as caption_tree
@@ -33,8 +34,11 @@ SHORT = "--workers 1 --set fly.most_decisions=6 --set fly.tree=false"
 
 
 @pytest.fixture(scope="module")
-def town(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("town")
+def town(built_once) -> Path:
+    return built_once("closed_loop_town", make_town)
+
+
+def make_town(root: Path) -> None:
     for words in (
         f"maps {TINY} --out {root}/maps",
         f"simplify {TINY.replace('--seed 4', '')} --map {root}/maps/boxes_3d.json --out {root}/simplify",
@@ -42,7 +46,6 @@ def town(tmp_path_factory) -> Path:
     ):
         done = invoke(words)
         assert done.exit_code == 0, done.output
-    return root
 
 
 def fly(town: Path, out: Path, more: str) -> dict[str, Pursuit]:
@@ -108,7 +111,7 @@ def test_the_ceiling_sees_more_than_chance_and_all_is_the_same_however_many_fly_
 ONE = "--set caption.endpoint.max_tries=1 --set fly.side_by_side=3"
 
 
-@pytest.mark.parametrize(
+@each(
     ("fault", "answer"),
     [("wrong_decision", "invalid"), ("wrong_shape", "unreadable"), ("empty_choices", "none")],
 )

@@ -1,6 +1,7 @@
 """Figures of closed-loop flights: small records that can be counted by hand, and sums that add up."""
 
 import pytest
+from tables import each
 from test_formats_pursuits import frame, pursuit
 
 from cosfly.closed_loop.measures import MEASURES, measure, score_pursuits
@@ -33,7 +34,7 @@ def test_a_flight_that_is_counted_by_hand():
     assert (found["success"], found["left"], found["crashed"]) == (0, 1, 0)
 
 
-@pytest.mark.parametrize(
+@each(
     ("seen", "more", "success"),
     [
         ("1111", {}, 1),

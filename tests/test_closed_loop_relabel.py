@@ -4,8 +4,8 @@ import json
 
 import cv2
 import numpy as np
-import pytest
 from commands import invoke
+from tables import each
 from test_closed_loop_fly import TINY, fly, town  # noqa: F401
 
 from cosfly.closed_loop.settings import Drone
@@ -69,7 +69,7 @@ def test_redrawn_frames_show_what_the_student_saw(town, tmp_path):  # noqa: F811
             )  # shadows of a tree are as fine as its flight is short
 
 
-@pytest.mark.parametrize(
+@each(
     ("more", "reason"),
     [
         ("--set plan.safety_distance_m=25 --set plan.relaxed_safety_m=25", "too_near"),

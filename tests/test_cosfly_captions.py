@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 from specimens_distill import make_caption
+from tables import each
 
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.answer_text import answer_schema, normalize_action, parse_answer
@@ -37,7 +38,7 @@ def test_what_the_reasoning_leads_to_stands_before_the_decision():
     assert len(schema["properties"]["therefore"]["enum"]) == 17
 
 
-@pytest.mark.parametrize(
+@each(
     ("fields", "outcome"),
     [
         ({"therefore": "Track straight"}, "track_straight"),
@@ -81,7 +82,7 @@ def test_captions_round_trip_and_errors_name_the_line(tmp_path):
         list(read_captions(tmp_path / "nowhere.jsonl"))
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "value"), [("depth_range_m", float("nan")), ("depth_range_m", float("inf")), ("picture_px", (2**64, 36))]
 )
 def test_no_caption_holds_what_is_no_number(name, value):

@@ -1,7 +1,7 @@
 """cosfly/pedestrians/crossings.py: what is under the feet, what a crossing is, and that walkers keep to it."""
 
 import numpy as np
-import pytest
+from tables import each
 
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.maps.boxlist import BoxList
@@ -35,7 +35,7 @@ def street(*, marked: bool = False) -> BoxList:
     return boxes
 
 
-@pytest.mark.parametrize(
+@each(
     ("way", "marked", "counts"),
     [
         ([[20.25, -6.25], [20.25, 6.25]], False, (0, 16)),  # straight across, 8 m at two points a metre
@@ -77,7 +77,7 @@ def shares(cfg: RunConfig, name: str, num_others: int = 0) -> tuple[float, float
     return counts[0] / counts[2], counts[1] / counts[2]
 
 
-@pytest.mark.parametrize("name", ["old_town", "park", "river"])
+@each("name", ["old_town", "park", "river"])
 def test_at_most_a_twentieth_of_the_walked_points_of_shipped_towns_is_on_the_road_away_from_crossings(name):
     away, on_crossings = shares(load(RunConfig, shipped("diverse.yaml")), name)
     assert away <= 0.05

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from specimens_planning import WORLDS, scenario_of, town_of, walk_along
+from tables import each
 
 from cosfly.geometry import kernels, trajectory_metrics
 from cosfly.planners import foresight, smoothing
@@ -48,7 +49,7 @@ def test_the_wished_places_are_in_the_lattice_and_cost_nothing():
 # --- search -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(2))
+@each("seed", range(2))
 def test_the_survey_measures_what_the_kernels_measure(seed):
     obstacles = random_town(seed)
     scenario = straight_scenario(obstacles)
@@ -89,7 +90,7 @@ def cheapest_by_trying_all(places, own, longest_m, index, clearance_m, links, nu
     return cost.min()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@each("seed", range(3))
 def test_no_sequence_of_places_is_cheaper(seed):
     rng, num_azimuths, obstacles = np.random.default_rng(seed), 8, random_town(seed)
     made = foresight.make_lattice(straight_scenario(obstacles, 6.0), climbing=False)
@@ -109,7 +110,7 @@ def test_no_sequence_of_places_is_cheaper(seed):
 # --- smoothing --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(3))
+@each("seed", range(3))
 def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
     obstacles = random_town(seed)
     scenario = straight_scenario(obstacles, 60.0)
@@ -149,7 +150,7 @@ def test_it_changes_sides_before_a_row_of_trees_hides_the_walker():
 # --- from where a drone is --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each(
     ("place_m", "velocity_mps"),
     [((-20, 0, 20), (1.2, 0, 0)), ((45, 3, 24), (-6, 0, 2)), ((-60, 0, 30), (-9, 0, 0)), ((5, 2, 12), (0, 0, -2))],
 )

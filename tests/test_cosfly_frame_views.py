@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from specimens_captions import VOCABULARY
+from tables import each
 
 from caption.run.window_loop import caption_window
 from caption.run.windows import cut_windows
@@ -106,7 +107,7 @@ def test_a_teacher_is_told_what_it_is_shown(window):
             assert {picture.shape for picture in pictures} == {(height, across * width, 3)}
 
 
-@pytest.mark.parametrize(("views", "layout", "max_side_px"), SHAPES)
+@each(("views", "layout", "max_side_px"), SHAPES)
 def test_a_student_is_told_what_it_is_shown_and_sees_what_its_teacher_saw(tree, window, views, layout, max_side_px):
     """The teacher gets all three; the student any of them, in any order."""
     image = {"layout": layout, "max_side_px": max_side_px, "depth_range_m": 40.0}

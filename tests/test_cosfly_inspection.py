@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from hypothesis import strategies as st
+from tables import each
 
 from cosfly.formats.boxes import make_box_map, read_boxes, write_boxes
 from cosfly.formats.frames import (
@@ -151,7 +152,7 @@ def test_checksums_that_the_tree_lists_cannot_be_taken_away(workplace):
     assert [(issue.code, issue.where) for issue in report.issues] == [("missing_file", CHECKSUMS)]
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "code", "severity"),
     [
         ({"positions": 3.0}, "acceleration", "error"),

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from numpy.testing import assert_allclose
+from tables import each
 
 import cosfly
 from cosfly.formats.boxes import BoxMap
@@ -114,7 +115,7 @@ TAKING = {
 }
 
 
-@pytest.mark.parametrize("section", TAKING)
+@each("section", TAKING)
 def test_no_setting_is_ignored(town, monkeypatch, section):
     """Each setting of a section is read by the function that takes it, or refused."""
     (model, taken, calls), read, is_built = TAKING[section], set(), False

@@ -40,7 +40,7 @@ def footprint(box_map: BoxMap, row: int, *, with_yaw: bool = True) -> Polygon:
 # --- synthetic --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@each("seed", [0, 1, 2])
 def test_a_town_has_what_the_passes_and_the_walks_need(seed):
     town = load_map(MapsConfig(), seed=seed)
     kinds = set(town.counts())

@@ -1,10 +1,10 @@
 """Remembered boxes answer as the index, the band solver as a library; a flight does not depend on the memory."""
 
 import numpy as np
-import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solveh_banded
+from tables import each
 
 from cosfly.geometry import kernels
 from cosfly.planners.contract import PlanConfig, Scenario
@@ -49,7 +49,7 @@ def test_memory_answers_as_the_index_does(seed, count, far):
             assert set(room[:hits].tolist()) == wanted
 
 
-@pytest.mark.parametrize("num_points", [3, 4, 30])
+@each("num_points", [3, 4, 30])
 def test_the_band_solver_agrees_with_a_library(num_points):
     rng = np.random.default_rng(num_points)
     size = 3 * num_points

@@ -4,6 +4,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tables import each
 
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.formats.ground import Ground
@@ -78,7 +79,7 @@ def write_roi(path: Path, points: list) -> Path:
 # --- sampling ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("start", [(0, 0), (4, 2), (6, 6)])
+@each("start", [(0, 0), (4, 2), (6, 6)])
 def test_goals_are_all_cells_of_the_part_at_the_wanted_distance(start):
     rng = np.random.default_rng(1)
     parts = rng.integers(0, 3, (8, 9)).astype(np.int32)
@@ -110,7 +111,7 @@ def test_the_region_of_interest_bounds_every_walk():
         assert not ((xy > 60) & (xy < 100)).all()
 
 
-@pytest.mark.parametrize(("ground", "columns"), [("anywhere", 300), ("surfaces", 240), ("paved", 160)])
+@each(("ground", "columns"), [("anywhere", 300), ("surfaces", 240), ("paved", 160)])
 def test_people_walk_where_the_settings_say(ground, columns):
     # 80 m of road, 40 m of lawn, 30 m of nothing up to a far wall; boxes of 30 m by 0.2 m.
     kinds = [ROADS, KINDS["Terrain"], BUILDINGS]

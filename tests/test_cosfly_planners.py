@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 from specimens_planning import CANYON, WORLDS, assert_safe, first_points, scenario_of, town_of, walk_along
+from tables import each
 
 import cosfly.planners.stage as planners
 from cosfly.formats.boxes import write_boxes
@@ -79,7 +80,7 @@ def shaken(world, seed=3):
     return points, problem, obstacles
 
 
-@pytest.mark.parametrize("world", ["empty", "canyon", "corner", "tower_behind"])
+@each("world", ["empty", "canyon", "corner", "tower_behind"])
 def test_terms_agree_with_their_definitions(world):
     points, problem, obstacles = shaken(world)
     state = loss.make_state(len(points), len(obstacles.rows))
@@ -137,7 +138,7 @@ def test_curvature_is_positive_and_exact_for_the_quadratic_terms():
 # --- flights ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("world", WORLDS)
+@each("world", WORLDS)
 def test_the_loss_never_rises_and_the_flight_is_safe(world):
     scenario, obstacles = scenario_of(world)
     problem = muco.make_problem(scenario, CFG)
@@ -230,7 +231,7 @@ def test_a_thin_wall_between_two_waypoints_is_a_collision():
     assert step.is_feasible(points - np.array([5.0, 0, 0]), problem, wall, nothing_nearby(len(points)))
 
 
-@pytest.mark.parametrize("name", ["five_ray_mean", "accel_rms_mps2", "jerk_rms_mps3"])
+@each("name", ["five_ray_mean", "accel_rms_mps2", "jerk_rms_mps3"])
 def test_the_prefilter_has_three_rules_of_motion_and_sight(name):
     fine = {"five_ray_mean": 0.40, "accel_rms_mps2": 5.0, "jerk_rms_mps3": 10.0}
     assert planners.drop_reason(fine, CFG, True) is None

@@ -190,7 +190,7 @@ def perturbed(cfg: PerturbationConfig, n: int = 200, box_map=None, seed: int = 0
     return perturb(planned(n, box_map), [CAMERA] * n, Surroundings(box_map), cfg, np.random.default_rng(seed))
 
 
-@pytest.mark.parametrize("sampling", ["cubic", "spherical"])
+@each("sampling", ["cubic", "spherical"])
 def test_perturbed_frames_keep_their_promises(sampling):
     cfg = PerturbationConfig(sampling=sampling)
     before, after = planned(), perturbed(cfg)
@@ -256,7 +256,7 @@ def along_a_wall(gap_m: float, n: int = 120) -> tuple[Poses, BoxMap]:
     return Poses(drones, rotations, targets, np.full(n, gap_m)), wall
 
 
-@pytest.mark.parametrize(("gap_m", "least_m"), [(12.0, 3.0), (4.0, 3.0), (3.0, 3.0), (2.5, 2.5)])
+@each(("gap_m", "least_m"), [(12.0, 3.0), (4.0, 3.0), (3.0, 3.0), (2.5, 2.5)])
 def test_a_whole_flight_along_a_planted_wall_keeps_the_planners_clearance(gap_m, least_m):
     """3.0 m, or as near as the plan itself where that flies at its relaxed floor of 2.5 m; far from the wall nothing
     falls back."""

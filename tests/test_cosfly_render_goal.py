@@ -54,9 +54,13 @@ def test_what_a_wall_hides_is_not_said(y_m, says_legs):
 
 
 @pytest.fixture(scope="session")
-def crowded_tree(tmp_path_factory):
-    """Two walks, both tracks, each among eight others of whom four look alike the target but for one thing."""
-    folder, traces = tmp_path_factory.mktemp("crowd"), [circling(3, f"path_{k:03d}") for k in range(2)]
+def crowded_tree(built_once):
+    """Two walks, both tracks, each among eight bystanders of whom four look alike the target but for one thing."""
+    return built_once("crowd", make_crowded_tree) / "out"
+
+
+def make_crowded_tree(folder):
+    traces = [circling(3, f"path_{k:03d}") for k in range(2)]
     places_m = [[x, y, -0.9] for x in (-4.0, -1.5, 1.0, 3.5) for y in (-2.0, 2.0)]
     crowd = [
         Bystander("Pedestrians", trace.targets_m + place_m, np.zeros(3), k < 4)
@@ -66,7 +70,7 @@ def crowded_tree(tmp_path_factory):
         folder / "others.json", [Bystanders(t.path_id, crowd[i * 8 :][:8]) for i, t in enumerate(traces)], {}
     )
     cfg = build(RenderConfig, {"width_px": 320, "height_px": 180, "fovs_deg": [60.0]}, "test")
-    return run(cfg, *write_inputs(folder / "in", traces), folder / "out", seed=2, others=folder / "others.json")
+    run(cfg, *write_inputs(folder / "in", traces), folder / "out", seed=2, others=folder / "others.json")
 
 
 @needs_gl

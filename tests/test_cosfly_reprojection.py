@@ -1,13 +1,13 @@
 """cosfly/geometry/reprojection.py: what two frames say of each other."""
 
 import numpy as np
-import pytest
+from tables import each
 
 from cosfly.formats.kinds import KINDS
 from cosfly.geometry.reprojection import View, compare_views
 
 
-@pytest.mark.parametrize(
+@each(
     ("kinds", "is_same"),
     [(("Roads", "Roads"), True), (("Roads", "Sidewalks"), False), (("Buildings", "Buildings"), False)],
 )
@@ -33,17 +33,13 @@ def building_at(depth_m: float) -> View:
     return View(np.full((90, 160), depth_m, np.float32), instance, np.eye(3), np.zeros(3))
 
 
-@pytest.mark.parametrize(
-    ("before_m", "after_m", "is_found"), [(20.0, 23.0, True), (23.0, 20.0, False), (20.0, 20.0, False)]
-)
+@each(("before_m", "after_m", "is_found"), [(20.0, 23.0, True), (23.0, 20.0, False), (20.0, 20.0, False)])
 def test_a_thing_that_is_farther_has_moved_and_one_that_is_nearer_may_hide_itself(before_m, after_m, is_found):
     """From behind a corner another wall of the same building stands before the one that was seen."""
     assert (compare_views(building_at(before_m), building_at(after_m), CAMERA).shifted > 0) == is_found
 
 
-@pytest.mark.parametrize(
-    ("kind", "num_renamed", "is_found"), [("Buildings", 40, True), ("Buildings", 2, False), ("Roads", 40, False)]
-)
+@each(("kind", "num_renamed", "is_found"), [("Buildings", 40, True), ("Buildings", 2, False), ("Roads", 40, False)])
 def test_a_thing_under_another_id_is_told_but_for_ground(kind, num_renamed, is_found):
     """A wall at one place, of which in the second picture so many columns have another id."""
     views = [building_at(20.0), building_at(20.0)]

@@ -132,7 +132,7 @@ def test_the_guard_keeps_a_street_between_two_askew_rows_and_the_papers_rule_doe
     assert walkable[1] > 0.9 * cross_validate(street, street)["raw_walkable_m2"]
 
 
-@pytest.mark.parametrize(
+@each(
     ("rectangle", "share"),
     [
         ((0.5, 0.5, 1.0, 0.0, 0.5, 0.5), 1.0),
@@ -225,7 +225,7 @@ def test_clipping_cuts_off_what_lies_below_the_ground():
     np.testing.assert_array_equal(stays.half_extents, leaning.select(leaning.maxs[:, 2] > 0).half_extents)
 
 
-@pytest.mark.parametrize(
+@each(
     ("inner", "kind", "kept"),
     [
         (((1, 1, 1), (2, 2, 2)), "Buildings", [1]),

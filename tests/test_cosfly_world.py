@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from commands import invoke
 from pydantic import ValidationError
+from tables import each
 from teacher_server import TeacherServer
 
 from cosfly.maps.simworld import SimWorldConfig
@@ -31,7 +32,7 @@ def by_rules(prompt: str) -> WorldPlan:
     return plan_by_rules(prompt, 0)[0]
 
 
-@pytest.mark.parametrize("row", PROMPTS, ids=[row["name"] for row in PROMPTS])
+@each("row", PROMPTS, ids=[row["name"] for row in PROMPTS])
 def test_a_prompt_gives_a_valid_world_with_each_named_object(row):
     plan = by_rules(row["prompt"])
     town = build(plan, "W", 0)
@@ -98,7 +99,7 @@ def test_what_a_prompt_says_there_is_none_of_is_not_there():
     assert [one.name for one in by_rules("a village, no fountain but a well").objects] == ["well"]
 
 
-@pytest.mark.parametrize("prompt", ["asdf qwer zxcv", "一个带喷泉的小村庄", "42"])
+@each("prompt", ["asdf qwer zxcv", "一个带喷泉的小村庄", "42"])
 def test_a_prompt_of_which_nothing_can_be_read_is_refused_in_words(prompt):
     with pytest.raises(InputError, match=r"nothing that the rules can read.*expected English.*--planner URL"):
         by_rules(prompt)

@@ -6,8 +6,8 @@ import shlex
 import subprocess
 from pathlib import Path
 
-import pytest
 import typer
+from tables import each
 
 from cosfly.cli import app
 
@@ -54,7 +54,7 @@ def parsed(words: list[str]) -> str:
 RUN = ["diverse", "shared/run"]
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "job", "commands"),
     [
         (RUN, {"SLURM_JOB_NUM_NODES": "1", "SLURM_CPUS_PER_TASK": "16"}, ["run"]),

@@ -4,6 +4,7 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
+from tables import each
 
 from cosfly.formats.people import COLORS, HAIR, Appearance, People, draw_appearance, look_alike
 from cosfly.runtime.errors import InputError
@@ -40,7 +41,7 @@ def test_the_most_alike_differs_least_the_greatest_id_of_several():
     assert people.most_alike([]) == (None, None)
 
 
-@pytest.mark.parametrize(("field", "value"), [("top", "toga"), ("hat_color", "red"), ("figure", 3), ("bag", None)])
+@each(("field", "value"), [("top", "toga"), ("hat_color", "red"), ("figure", 3), ("bag", None)])
 def test_what_the_wardrobe_lacks_is_refused(field, value):
     bare = asdict(Appearance("man", "jacket", "red", "shorts", "blue"))
     with pytest.raises(InputError, match=field):

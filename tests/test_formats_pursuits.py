@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from tables import each
 
 from cosfly.formats.pursuits import Pursuit, PursuitFrame, WalkStyle, pursuit_file, read_pursuit, write_pursuit
 from cosfly.runtime.errors import InputError
@@ -35,7 +36,7 @@ def test_a_record_is_read_as_it_was_written_and_tells_lead_and_decisions_apart(t
     assert [f.time_s for f in found.flown] == [1.5, 2.0]  # what came of the two decisions
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "words"),
     [
         ({"frames": [{"time_s": 0.5}]}, "missing|required"),

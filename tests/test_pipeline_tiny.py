@@ -41,11 +41,9 @@ def tiny(**changes) -> RunConfig:
 
 
 @pytest.fixture(scope="module")
-def base(tmp_path_factory):
+def base(built_once):
     """One undisturbed run; tests copy what they need of it."""
-    out = tmp_path_factory.mktemp("base") / "run"
-    pipeline.run(tiny(), out)
-    return out
+    return built_once("tiny_run", lambda root: pipeline.run(tiny(), root / "run")) / "run"
 
 
 def products(folder: Path) -> dict[str, str]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from specimens_planning import CANYON, WORLDS, assert_safe, town_of, walk_along
+from tables import each
 
 from cosfly.geometry import kernels
 from cosfly.geometry.axes import look_at
@@ -23,9 +24,20 @@ ALL = WORLDS | ON_A_HILL | TWO_POINTS
 NOT_REPAIRED = {("minimum_jerk", "corner"), ("trajopt", "corner")}
 
 
-@pytest.mark.parametrize("world", ALL)
-@pytest.mark.parametrize("name", ALL_PLANNERS)
-def test_a_flight_is_whole_safe_and_smooth_and_sees_the_target_it_looks_at(name, world):
+# The planners that a run flies with; those of the comparison take longer.
+EACH_PLANNER = pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in REFERENCES else ()) for name in ALL_PLANNERS]
+)
+
+
+@EACH_PLANNER
+def test_a_flight_is_whole_safe_and_smooth_and_sees_the_target_it_looks_at(name, subtests):
+    for world in ALL:
+        with subtests.test(world=world):
+            check_flight(name, world)
+
+
+def check_flight(name: str, world: str) -> None:
     box_map, corners = ALL[world]
     walk, up = walk_along(world, corners), np.array([0.0, 0.0, UP_M * (world in ON_A_HILL)])
     walk = replace(walk, positions_m=walk.positions_m + up)
@@ -64,7 +76,7 @@ def test_a_flight_is_whole_safe_and_smooth_and_sees_the_target_it_looks_at(name,
         assert trace.solver["smooth"]
 
 
-@pytest.mark.parametrize("name", ALL_PLANNERS)
+@EACH_PLANNER
 def test_the_same_seed_gives_the_same_flight_and_inputs_stay_as_they_are(name):
     """Planned twice: alone, and by the stage with a generator of the same seed."""
     box_map, corners = WORLDS["tower_midway"]
@@ -79,10 +91,15 @@ def test_the_same_seed_gives_the_same_flight_and_inputs_stay_as_they_are(name):
     assert json.dumps(trace.solver) == json.dumps(plan.solver)
 
 
-@pytest.mark.parametrize("dt_s", [0.25, 1.0])
-@pytest.mark.parametrize("name", ALL_PLANNERS)
-def test_the_time_step_is_the_walks(name, dt_s):
-    """Speed limit, metrics and duration count in the walk's own step."""
+@EACH_PLANNER
+def test_the_time_step_is_the_pedestrians(name, subtests):
+    """Speed limit, metrics and duration count in the pedestrian trajectory's own step."""
+    for dt_s in (0.25, 1.0):
+        with subtests.test(dt_s=dt_s):
+            check_time_step(name, dt_s)
+
+
+def check_time_step(name: str, dt_s: float) -> None:
     box_map, corners = WORLDS["canyon"]
     walk = walk_along("w", corners, dt_s=dt_s)
     cfg = PlanConfig(planner=name, speed_max_mps=3.0)
@@ -95,7 +112,7 @@ def test_the_time_step_is_the_walks(name, dt_s):
     assert trace.metrics["accel_rms_mps2"] == pytest.approx(np.sqrt((accel**2).mean()), abs=1e-3)
 
 
-@pytest.mark.parametrize("name", ALL_PLANNERS)
+@each("name", ALL_PLANNERS)
 def test_where_there_is_no_way_it_says_so(name):
     roof = kernels.obstacle_index(town_of(((0, 0, 60), (300, 300, 50))))
     scenario = make_scenario(walk_along("w", [(0, 0), (50, 0)]), roof, PlanConfig())

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from specimens_planning import WORLDS, assert_safe, town_of, walk_along
+from tables import each
 
 from caption.schema import FutureMotion
 from caption.truth.actions import TABLE as ACTION_TABLE
@@ -68,7 +69,7 @@ def labels_of(trace):
 # --- the table --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", TABLE)
+@each("name", TABLE)
 def test_a_style_shows_the_decisions_that_it_is_for(name):
     counts = Counter()
     for seed in range(3):

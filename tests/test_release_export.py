@@ -19,6 +19,7 @@ from specimens_release import (
     make_release,
     rows_by_id,
 )
+from tables import each
 
 from cosfly.formats.playback import read_track
 from cosfly.formats.town import read_town_map
@@ -204,7 +205,7 @@ def test_the_same_bytes_with_one_process_and_with_two(format, dataset, tmp_path)
     assert not unlisted or format == "tree"  # whose flights have lists of their own
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@each("format", FORMATS)
 def test_an_export_says_where_it_came_from_and_whose_it_is(format, dataset, tmp_path):
     product = export(config(format), dataset, tmp_path / "out")
     about, record = read_model(product / "export.json", ExportRecord, EXPORT_FORMAT), open_release(dataset).record
@@ -250,7 +251,7 @@ def change_record(folder: Path, change) -> None:
     (folder / "release.json").write_text(json.dumps(record))
 
 
-@pytest.mark.parametrize(
+@each(
     "path",
     ["../../secret.parquet", "/etc/passwd", "data/x.parquet", "data/train-0123456789ab-00000-of-00001.parquet/../x"],
 )

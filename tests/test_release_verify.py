@@ -21,6 +21,7 @@ from release_lies import LIES, at, captioned, change, everything, put
 from release_tampering import errors_in, forge, read_all, set_depth
 from specimens_foreign import hub_snapshot, write_foreign_tree
 from specimens_release import run_here
+from tables import each
 
 from caption.run.released import read_released
 from cosfly.formats.frames import instance_bytes
@@ -43,14 +44,14 @@ TINY = [
 
 
 @pytest.fixture(scope="module")
-def honest_run(tmp_path_factory) -> Path:
-    return run_here(TINY, tmp_path_factory.mktemp("verify") / "run")
+def honest_run(built_once) -> Path:
+    return built_once("honest_run", lambda root: run_here(TINY, root / "run")) / "run"
 
 
 @pytest.fixture(scope="module")
-def honest(honest_run, tmp_path_factory) -> Path:
+def honest(honest_run, built_once) -> Path:
     """A small release of what the whole way makes: two walks, both tracks, twenty frames each."""
-    return released(honest_run, tmp_path_factory.mktemp("verify") / "release")
+    return built_once("honest", lambda root: released(honest_run, root / "release")) / "release" / "dataset"
 
 
 def released(run: Path, out: Path, **settings) -> Path:
@@ -66,7 +67,7 @@ def dataset(honest, tmp_path) -> Path:
 # --- honest -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("level", ["structure", "rows", "pixels"])
+@each("level", ["structure", "rows", "pixels"])
 def test_an_honest_release_passes(honest, level):
     report = verify(honest, level=level, reader=read_released)
     assert report.is_ok, str(report)
@@ -86,7 +87,7 @@ def test_processes_find_what_one_finds(honest, tmp_path):
     assert str(one) == str(two)
 
 
-@pytest.mark.parametrize(
+@each(
     ("add", "expected"),
     [
         (lambda place: place.symlink_to("/etc/hostname"), {"unreadable": 1}),
@@ -153,7 +154,7 @@ def _seed_of_other_splits(record: dict) -> int:
     return next(seed for seed in range(100) if split_groups(walks, told["fractions"], seed, "walks") != walks)
 
 
-@pytest.mark.parametrize("name", [name for name in RECORD_LIES if name != "splits by town"])
+@each("name", [name for name in RECORD_LIES if name != "splits by town"])
 def test_a_lie_of_the_record_is_found(honest, tmp_path, name):
     forged = forge(honest, tmp_path / "forged", change_record=RECORD_LIES[name])
     assert errors_in(forged, "rows"), name
@@ -270,7 +271,7 @@ ODD_ROWS = {
 }
 
 
-@pytest.mark.parametrize("name", ODD_ROWS)
+@each("name", ODD_ROWS)
 def test_odd_rows_are_findings_and_no_traceback(honest, tmp_path, name):
     try:
         forged = forge(honest, tmp_path / "forged", ODD_ROWS[name])
@@ -329,7 +330,7 @@ def exported_as(name: str, release: Path, out: Path) -> Path:
     return export(ExportConfig(format=name), release, out, workers=0)
 
 
-@pytest.mark.parametrize("name", ["depth_doubled", "empty_instances", "another_camera_all_along"])
+@each("name", ["depth_doubled", "empty_instances", "another_camera_all_along"])
 def test_a_lie_is_found_in_a_tree(near, tmp_path, name):
     forged = forge(near, tmp_path / "forged", LIES[name][0])
     assert errors_in(exported_as("tree", forged, tmp_path / "export"))

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tables import each
 
 from cosfly.geometry.reprojection import Agreement
 from release.flight_rows import FlightRows
@@ -23,7 +24,7 @@ def flight(number: int, **values) -> Summary:
     return Summary(**(told | values))
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "codes"),
     [
         ({}, []), ({"split": "test"}, []), ({"split": "test", "walk": "1"}, ["leak"]),
@@ -45,7 +46,7 @@ WHOLE = Agreement(
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "code"),
     [
         ({}, None), ({"renamed": 34}, "scene_instance"), ({"same": 1800}, "scene_instance"),
@@ -69,7 +70,7 @@ def test_neighbouring_frames_show_one_world(change, code):
     assert [kind.code for kind in findings.kinds.values()] == [code] * (code is not None)
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "error", "is_found"),
     [("error_flat", 1e-6, False), ("error_flat", 8e-5, True), ("error_standing", 3e-5, False),
      ("error_standing", 1.8e-4, True)],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-import pytest
+from tables import each
 from test_cosfly_render import needs_gl
 from test_renderers_contract import circling, write_inputs
 
@@ -17,7 +17,7 @@ from cosfly.render.stage import run
 from cosfly.runtime.config import build
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "is_legible"),
     [({}, True), ({"visible": False}, False), ({"visibility": 0.2}, False), ({"contrast": 3.0}, False),
      ({"contrast": None}, False), ({"bbox_2d": [0.0, 0.0, 6.0, 15.0]}, False), ({"bbox_2d": None}, False)],
