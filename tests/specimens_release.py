@@ -141,6 +141,6 @@ def all_bytes(folder: Path) -> dict[str, bytes]:
 
 def run_here(told: list[str], out: Path) -> Path:
     """Go the whole way from a map to a release in this process: workers take longer to start than a few flights."""
-    with mock.patch.object(pipeline, "manner_of_work", return_value={"workers": 0}):
+    with mock.patch.object(pipeline, "worker_options", return_value={"workers": 0}):
         pipeline.run(load(RunConfig, None, told), out)
     return out

@@ -60,6 +60,7 @@ def flown(begin, *tokens) -> tuple[list, Motion, Controller]:
     return moments, measure(future), controller
 
 
+@pytest.mark.slow
 @each("token", [t for t in TOKENS if t != "search_to_reacquire_target"])
 def test_a_decision_that_is_flown_for_its_horizon_shows_what_its_own_rule_asks_for(begin, token):
     _, motion, _ = flown(begin, *[token] * HORIZON)

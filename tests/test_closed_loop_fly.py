@@ -62,6 +62,7 @@ def attempt(town: Path, out: Path, more: str):
 # --- what is flown ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(town, tmp_path):
     flown = fly(town, tmp_path, "--workers 2 --set fly.most_decisions=12 --student rules")
     assert len(flown) == 3
@@ -94,6 +95,7 @@ def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(t
     assert np.mean(same) == 1.0
 
 
+@pytest.mark.slow
 def test_the_ceiling_sees_more_than_chance_and_all_is_the_same_however_many_fly_at_once(town, tmp_path):
     seen = {}
     for student, alone in (("planner", False), ("random", True)):

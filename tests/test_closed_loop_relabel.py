@@ -4,6 +4,7 @@ import json
 
 import cv2
 import numpy as np
+import pytest
 from commands import invoke
 from tables import each
 from test_closed_loop_fly import TINY, fly, town  # noqa: F401
@@ -24,6 +25,7 @@ def relabel(town, flown, out, more=""):  # noqa: F811
     return invoke(f"fly {TINY} {boxes} --relabel {flown} --workers 1 --out {out} --set fly.relabel.stride=8 {more}")
 
 
+@pytest.mark.slow
 def test_where_it_erred_the_planner_goes_on_and_what_is_made_is_captioned(town, tmp_path):  # noqa: F811
     flown = fly(town, tmp_path / "flown", STUDENT)
     done = relabel(town, tmp_path / "flown", tmp_path / "made", "--set fly.relabel.round=2")
@@ -48,6 +50,7 @@ def test_where_it_erred_the_planner_goes_on_and_what_is_made_is_captioned(town, 
     assert all(max(caption.window) < min(caption.future) for caption in captions)
 
 
+@pytest.mark.slow
 def test_redrawn_frames_show_what_the_student_saw(town, tmp_path):  # noqa: F811
     weather = "--set render.weather_mode=random_per_path --set render.fovs_deg=[40,70]"
     fly(town, tmp_path / "flown", f"--workers 1 --student track_straight --set fly.most_decisions=20 {weather}")

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 from specimens_planning import CANYON, town_of, walk_along
 
 from cosfly.formats.boxes import write_boxes
@@ -27,6 +28,7 @@ def test_differences_are_those_of_the_walks_that_both_fly():
     assert nobody[PAPER_BEAM] == {"walks": 1, "kept": 0, "figures": {}}
 
 
+@pytest.mark.slow
 def test_the_study_of_beams_twice_gives_the_same_bytes(tmp_path):
     write_boxes(tmp_path / "map.json", town_of(*CANYON))
     write_paths(tmp_path / "path.json", [walk_along("path_00000", [(0, 0), (30, 0)])], {})

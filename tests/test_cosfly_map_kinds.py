@@ -182,6 +182,7 @@ def load(tmp_path: Path, data: bytes) -> BoxMap:
     return load_map(MapsConfig(source="cityjson", cityjson=CityJsonConfig(path=path)))
 
 
+@pytest.mark.slow
 def test_every_form_of_a_city_model_gives_the_same_map(tmp_path: Path, subtests):
     plain = load(tmp_path, document(city()))
     assert plain.counts()["Buildings"] == 2

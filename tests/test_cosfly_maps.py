@@ -62,6 +62,7 @@ def test_a_town_has_what_the_passes_and_the_walks_need(seed):
     assert walkable["simplified_largest_part_m2"] > 0.98 * walkable["simplified_walkable_m2"]
 
 
+@pytest.mark.slow
 def test_the_census_town_has_the_papers_counts_and_simplifies_to_a_few_thousand():
     town, other = (census_town("Town", seed) for seed in (0, 1))
     assert town.counts() == other.counts() == CENSUS
@@ -154,6 +155,7 @@ def test_known_answer_no_buildings_overlap_with_yaw_and_19_pairs_without(shared_
     assert city.header.extent_sources | {"road": 0} == {"road": 0, "bbox": 280, "engine": 0, "default": 155}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("world", "pairs"), [("middle_mode_road_20", 24), ("sample_task_dist_11", 27)])
 def test_known_answers_of_the_robotics_worlds(shared_data: Path, world: str, pairs: int):
     folder = shared_data / "simworld-robotics"

@@ -30,6 +30,7 @@ def same_boxes(one: BoxMap, other: BoxMap) -> None:
         np.testing.assert_allclose(getattr(left, name), getattr(right, name), atol=2e-4, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_served_town_comes_back_as_it_is(tmp_path):
     town = invent(SyntheticConfig(), 3)
     with serving(town, tmp_path / "town") as port:

@@ -161,6 +161,7 @@ def test_the_same_numbers_give_the_same_company_and_more_keep_the_first(placed):
 # --- the stage --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_stage_writes_others_only_where_they_are_wanted(tmp_path: Path, caplog):
     write_boxes(tmp_path / "map.json", crossing_town(("Terrain", (0, 0, -1.0), (90, 90, 0.5))))
     plain = PedestriansConfig(num_paths=3)

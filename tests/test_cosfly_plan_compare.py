@@ -108,7 +108,7 @@ def test_a_walk_that_one_planner_cannot_fly_is_counted(inputs, tmp_path, monkeyp
             raise NoPathError("lame", where="b")
         return real(walk, obstacles, cfg, *rest)
 
-    monkeypatch.setattr(compare, "plan_flight", lame)
+    monkeypatch.setattr(compare, "plan_trajectory", lame)
     record = json.loads(compare.run(CFG, *inputs, tmp_path / "out").read_text())
     manifest = json.loads((tmp_path / "out/manifest.json").read_text())
     assert manifest["counts"]["dropped"] == {"no_muco_flight": 1}

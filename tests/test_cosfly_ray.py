@@ -71,6 +71,7 @@ def items_of(*kinds: str) -> list[Item]:
     return [Item(f"i{k}", (kind, bytes(1_000_000))) for k, kind in enumerate(kinds)]
 
 
+@pytest.mark.slow
 def test_workers_that_die_and_stall_once_cost_nothing_but_time(tmp_path, nodes, caplog):
     nodes.add(num_cpus=2)
     kinds = ["once-stop", "once-die", "once-sleep", "nothing", "nothing"]

@@ -43,7 +43,11 @@ def tiny(**changes) -> RunConfig:
 @pytest.fixture(scope="module")
 def base(built_once):
     """One undisturbed run; tests copy what they need of it."""
-    return built_once("tiny_run", lambda root: pipeline.run(tiny(), root / "run")) / "run"
+    return built_once("tiny_run", make_tiny_run) / "run"
+
+
+def make_tiny_run(root: Path) -> None:
+    pipeline.run(tiny(), root / "run")
 
 
 def products(folder: Path) -> dict[str, str]:

@@ -129,7 +129,7 @@ KINDS = {
 def stages(cfg: RunConfig, out: Path) -> list[pipeline.Stage]:
     """Give the stages of a run, which do their work in this process: workers take longer to start than these
     flights."""
-    with mock.patch.object(pipeline, "manner_of_work", return_value={"workers": 0}):
+    with mock.patch.object(pipeline, "worker_options", return_value={"workers": 0}):
         return pipeline.stages(cfg, out)
 
 

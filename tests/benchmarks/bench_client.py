@@ -26,6 +26,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from specimens_captions import VOCABULARY
+from teacher_server import CHINESE, ENGLISH
 
 from caption.run.asking import Asking
 from caption.run.flights import allot, named_flights
@@ -40,18 +41,6 @@ from cosfly.viz.frame_views import VIEW_FILES
 from specimens import make_playback_tree
 
 WIDTH, HEIGHT, DELAY_S = 640, 360, 0.2
-ENGLISH = {
-    "critical_components": "The target pedestrian is visible and walks on the road ahead of the drone.",
-    "reasoning_trace": "The line of sight is free and the motion is regular, so this manoeuvre keeps the target in "
-    "frame.",
-    "therefore": "hover",
-    "flight_decision": "hover",
-}
-CHINESE = {
-    "critical_components": "目标行人可见，正在无人机前方的道路上行走。",
-    "reasoning_trace": "视线通畅且运动规律，因此该动作可将目标保持在画面内。",
-    "flight_decision": "hover",
-}
 
 
 def main() -> None:
@@ -172,7 +161,8 @@ def _make_tree(root: Path, num_windows: int) -> Path:
 
 def _serve(port) -> None:
     """Answer chat completions after the fixed delay, with as little work as can be."""
-    replies = [_reply(answer) for answer in (ENGLISH, CHINESE)]
+    decided = {"flight_decision": "hover"}
+    replies = [_reply(ENGLISH | {"therefore": "hover"} | decided), _reply(CHINESE | decided)]
 
     async def handle(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:

@@ -171,9 +171,9 @@ def measure_speed(num_frames: int, folder: Path, rounds: int) -> None:
         for what, column in (("on the clock", 0), ("by CPU", 1)):
             told = ", ".join(f"{100 * share[column]:.0f} %" for share in own)
             print(f"stored as they are: {told} of a {name} {what}")
-    few = min(num_frames, 2 * FRAMES_RELEASED)
-    for path in find_tracks(tree)[few // FRAMES_RELEASED :]:
-        shutil.rmtree(path.parent, ignore_errors=True)
+    few = 2 * FRAMES_RELEASED  # the first pair of tracks
+    for path in find_tracks(tree)[2::2]:
+        shutil.rmtree(path.parent)
     make_captions(folder / "captions.jsonl", tree)
     before_s = cpu_seconds()
     seconds = build(folder, folder / "depth", ("depth",), 1)
