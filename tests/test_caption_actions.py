@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tables import each
 
 from caption.schema import FutureMotion
-from caption.truth.actions import TABLE, ActionTable, Thresholds, measure
+from caption.truth.actions import TABLE, Thresholds, measure
 
 THRESHOLDS = Thresholds()
 
@@ -134,15 +134,6 @@ HARD = [  # the opposite, then what is plainly not there
 def test_contradiction_of_each_action(decision, motion):
     measured = measure(future(**motion))
     assert TABLE.verdict_of(decision, measured, TABLE.label_of(measured)) == "HARD_CONFLICT"
-
-
-def test_share_zero_leaves_only_the_opposite_as_a_contradiction():
-    lenient = ActionTable(Thresholds(absent_share=0.0))
-    for up, verdict in ((0.1, "SOFT_CONFLICT"), (-0.1, "HARD_CONFLICT")):
-        motion = measure(future(**STEADY, up=up))
-        assert lenient.verdict_of("ascend", motion, lenient.label_of(motion)) == verdict
-        assert TABLE.verdict_of("ascend", motion, TABLE.label_of(motion)) == "HARD_CONFLICT"
-    assert lenient.verdict_of("hover", measure(future(**STEADY)), "track_straight") == "HARD_CONFLICT"
 
 
 # --- properties -------------------------------------------------------------------------------------------------------

@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import random
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -34,13 +32,6 @@ def whole(tree, tmp_path_factory) -> bytes:
 
 def keys_of(out: Path) -> list[str]:
     return [record["key"] for record in kept_answers(out)]
-
-
-def keys_by_flight(out: Path) -> dict[str, list[str]]:
-    found: dict[str, list[str]] = {}
-    for kept in kept_answers(out):
-        found.setdefault(kept["sample_id"].partition("_frame_")[0], []).append(kept["key"])
-    return found
 
 
 # --- limits -----------------------------------------------------------------------------------------------------------
@@ -157,37 +148,3 @@ def fill(folder: Path, num_flights: int, num_windows: int, unfinished: set[int])
 
 
 # --- the disk ---------------------------------------------------------------------------------------------------------
-
-
-def test_a_disk_that_fills_up_costs_nothing_that_was_written(tree, tmp_path, whole):
-    """The limit on a file's size stands for the disk: the system cuts the line that passes it short, as a full disk
-    does."""
-    out = tmp_path / "out"
-    with deciding() as server:
-        config = settings(server.url)
-        filled = subprocess.run(
-            [sys.executable, "-c", LIMITED, "9000", str(tree), str(out), config.model_dump_json()],
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        assert "cannot write" in filled.stderr, filled.stderr
-        assert "finished work is kept" in filled.stderr
-        assert not (out / "manifest.json").exists()
-        kept = keys_by_flight(out)
-        assert run(config, tree, out).read_bytes() == whole
-    now = keys_by_flight(out)
-    assert all(now[flight][: len(keys)] == keys for flight, keys in kept.items())
-    assert len(keys_of(out)) == len(set(keys_of(out)))
-
-
-LIMITED = """
-import json, resource, sys
-from pathlib import Path
-from caption.schema import CaptionConfig
-from caption.run.stage import run
-from cosfly.runtime.errors import StorageError
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2)
-try:
-    run(CaptionConfig.model_validate(json.loads(sys.argv[4])), Path(sys.argv[2]), Path(sys.argv[3]))
-except StorageError as error:
-    print(error, file=sys.stderr)
-"""

@@ -6,14 +6,12 @@ from __future__ import annotations
 import dataclasses
 import re
 
-import pytest
 from specimens_captions import FACTS
 from tables import each
 
 from caption.schema import Judged
 from caption.truth.claims import judge_sentence
 from caption.truth.facts import Facts
-from caption.truth.numerals import chinese_number, english_number
 from cosfly.formats.captions import Claim, Language
 
 
@@ -156,16 +154,3 @@ def test_a_plan_is_held_against_the_decision(planned, modality, decision, is_pro
     plan = "So the nose should now turn to the left without delay."
     reasons = judged(plan, [claim(planned, modality=modality)], decision=decision)
     assert bool(reasons.problems) == is_problem, reasons.problems
-
-
-@each(
-    ("read", "text", "value"),
-    [
-        (english_number, "twenty-one", 21), (english_number, "one point two five", 1.25),
-        (english_number, "a hundred and five", 105), (english_number, "zero", 0), (english_number, "ninety", 90),
-        (chinese_number, "二十一", 21), (chinese_number, "一点二五", 1.25), (chinese_number, "一百零五", 105),
-        (chinese_number, "十二", 12), (chinese_number, "两", 2),
-    ],
-)  # fmt: skip
-def test_numbers_in_words(read, text, value):
-    assert read(text) == pytest.approx(value)

@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 from specimens_captions import VOCABULARY
 from tables import each
-from teacher_server import TeacherServer
 
-from caption.run.compare import compare, run
+from caption.run.compare import compare
 from caption.run.window_loop import Trial, caption_window
 from caption.run.windows import cut_windows
 from caption.schema import CaptionConfig, RepairConfig, WindowConfig
@@ -67,18 +66,3 @@ def test_a_comparison_by_hand():
 
 
 SETTINGS = {"window": {"require_images": False}}
-
-
-def test_a_server_is_asked_once_for_the_first_answers(tree, tmp_path):
-    with TeacherServer() as server:
-        cfg = CaptionConfig.model_validate(SETTINGS | {"teacher": server.url})
-        found = {c.strategy: c for c in run(cfg, tree, tmp_path / "out", conflicts=6)}
-        assert {c.num_conflicts for c in found.values()} == {6}
-        assert found["anchored"].consistent == 6
-        assert found["anchored"].tokens_per_conflict == 1100.0
-        assert found["cascade"].asks_per_conflict <= 3.0
-        assert len(set(server.digests())) == len(server.digests()), "an answer that is kept was asked again"
-        num_asked = len(server.bodies)
-        again = run(cfg, tree, tmp_path / "out", conflicts=6)
-        assert {c.strategy: c for c in again} == found
-        assert len(server.bodies) == num_asked

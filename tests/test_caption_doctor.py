@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-import pytest
 from commands import invoke
 from specimens_captions import VOCABULARY, deciding, report_of, settings
 from tables import each
@@ -15,8 +14,7 @@ from teacher_server import ENGLISH, TeacherServer
 from caption.run.forecast import make_forecast
 from caption.run.stage import run
 from caption.schema import CaptionConfig
-from caption.teachers.doctor import ODD_WORD, Finding, examine_endpoint, largest_messages
-from cosfly.runtime.errors import NothingKept
+from caption.teachers.doctor import ODD_WORD, Finding, examine_endpoint
 
 TOKENS_PER_IMAGE, CONTEXT = 220, 8192
 
@@ -159,19 +157,3 @@ def test_the_plan_is_what_the_run_then_takes(tree, tmp_path):
     assert rows["tokens out"] == f"{report['tokens']['completion_tokens']:,}" == "1,000"
     assert rows["cost"] == "0.03"
     assert num_trial_requests == asked  # the run did not ask about the trial windows again
-
-
-@each("writing", ["slots", "prose"])
-def test_the_largest_prompt_bounds_real_ones_with_their_corrections(tree, tmp_path, writing):
-    with deciding("ascend", lambda number, body: "wrong_therefore") as server:
-        cfg = CaptionConfig.model_validate({"teacher": server.url, "writing": writing, "limit": 2})
-        with pytest.raises(NothingKept):
-            run(cfg, tree, tmp_path / "out")
-        bodies = [json.loads(body) for body in server.bodies]
-
-    def size(messages: list[dict]) -> int:
-        contents = [message["content"] for message in messages]
-        return sum(len(part.get("text", "")) if isinstance(part, dict) else len(part) for c in contents for part in c)
-
-    assert len(bodies) >= 2
-    assert max(size(body["messages"]) for body in bodies) <= size(largest_messages(cfg, VOCABULARY, []))

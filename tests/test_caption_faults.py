@@ -167,23 +167,6 @@ def test_what_is_a_windows_fault_costs_that_window_and_is_kept_in_the_servers_wo
         assert reason in page
 
 
-@pytest.mark.parametrize("limit", [None, 8], ids=["all", "limit"])
-def test_retry_failed_asks_about_what_was_refused_and_nothing_else(tree, tmp_path, whole, limit):
-    out, behaviour = tmp_path / "out", Picky(400, FILTERED, whole.seeds[:1])
-    with hovering(behaviour) as server:
-        cfg = settings(server.url, limit=limit)
-        path = run(cfg, tree, out)
-        asked = len(server.bodies)
-        assert run(cfg, tree, out) == path  # complete: nothing is asked
-        assert len(server.bodies) == asked
-        behaviour.is_on = False
-        run(cfg, tree, out, retry_failed=True)
-        assert len(server.bodies) == asked + 2  # that window in two languages
-    assert path.read_bytes() == b"".join(whole.product.splitlines(keepends=True)[:limit])
-    assert quarantine(out) == {}
-    assert (out / "manifest.json").exists()
-
-
 # --- the schema -------------------------------------------------------------------------------------------------------
 
 # How a server that takes no schema says so, and how many requests with one it is sent, one at a time.

@@ -16,7 +16,6 @@ from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers.foreign import read_foreign
 from cosfly.formats.captions import Caption, Language, read_captions, write_captions
-from cosfly.formats.places import town_folder
 from cosfly.formats.predictions import Prediction
 from cosfly.inspection import stage as inspection
 from cosfly.inspection.settings import InspectConfig
@@ -25,9 +24,7 @@ from distill.inference import stage as infer
 from distill.inference.outcome import make_prediction
 from distill.prepare.stage import PrepareConfig, make_sample
 from distill.schema import open_split
-from release.columns import caption_values
 from release.package import stage as package
-from release.package.captions import index_captions
 from release.package.sources import Source
 from release.record import read_record
 from release.verify.verify import verify
@@ -147,34 +144,6 @@ def predicted(caption: Caption, language: Language, text: str | None = None, *, 
     text = sample.answer if text is None else text
     answer = make_prediction(sample, "test", text, 99, is_finished)
     return answer.model_copy(update={"model": "base+mine"})
-
-
-def captions_of_student(predictions: list[Prediction], tree: Path, folder: Path, **settings) -> list[Caption]:
-    (folder / "infer").mkdir(parents=True)
-    lines = "".join(prediction.model_dump_json() + "\n" for prediction in predictions)
-    (folder / "infer/predictions.jsonl").write_text(lines, encoding="utf-8")
-    cfg = CaptionConfig.model_validate({"teacher": f"student:{folder / 'infer'}", **settings})
-    return list(read_captions(run(cfg, tree, folder / "out")))
-
-
-def test_a_students_answers_are_judged_marked_and_released(tree, rules, tmp_path):
-    both = [predicted(caption, language) for caption in rules[:6] for language in ("en", "zh")]
-    found = captions_of_student(both, tree, tmp_path)
-    assert [caption.status for caption in found] == ["accepted"] * 6 + ["dropped"] * 5
-    assert {caption.drop_reason for caption in found[6:]} == {"not_in_file"}
-    for caption, taught in zip(found[:6], rules, strict=False):
-        assert (caption.teacher.kind, caption.teacher.model, caption.writing) == ("student", "base+mine", "prose")
-        assert (caption.en, caption.zh, caption.label) == (taught.en, taught.zh, taught.label)
-        assert (caption.checks.sentences or {}).keys() == {"en", "zh"}
-    flight = town_folder(found[0].town), found[0].trajectory, found[0].variant
-    problems: list[object] = []
-    by_flight, account = index_captions(
-        tmp_path / "out/captions.jsonl", {flight: 100}, set(), lambda *told: problems.append(told)
-    )
-    assert problems == []
-    rows = [caption_values(caption) for caption in by_flight[flight].read()]
-    assert {row["teacher_kind"] for row in rows} == {"student"}
-    assert (len(rows), account.accepted, account.dropped) == (6, 6, {"not_in_file": 5})
 
 
 def test_from_a_students_answers_to_a_release(tree, rules, tmp_path):

@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
-import pytest
 from specimens_captions import GAP
 from tables import each
 
-from caption.run.windows import cut_windows
-from caption.schema import WindowConfig
 from caption.truth.claims import judge_claim
-from caption.truth.facts import measure_facts
 from caption.truth.references import Fact, look_up, parse_reference, word_holds
 from cosfly.formats.captions import Claim
-from specimens import make_flight
 
 FACTS = dataclasses.replace(GAP, yaw_deg=(0.0, 1.0, 3.0, 6.0, 10.0))
 
@@ -102,17 +96,3 @@ def test_a_series_that_ends_where_it_began_has_no_trend():
 )
 def test_a_claim_against_the_facts(quantity, at, value, unit, state):
     assert judge_claim(Claim(sentence="C1", quantity=quantity, at=at, value=value, unit=unit), FACTS) == state
-
-
-def test_measured_series_agree_with_each_other():
-    flight = dataclasses.replace(make_flight(40)[0], folder=Path("nowhere"))
-    for window in cut_windows(flight, WindowConfig(require_images=False)):
-        facts = measure_facts(window.observed)
-        series = [getattr(facts, field.name) for field in dataclasses.fields(facts)]
-        assert {len(values) for values in series if isinstance(values, tuple)} == {len(facts)}
-        assert facts.travelled_m[-1] >= facts.displacement_m[-1] - 0.1
-        for slant, level, over, depression in zip(
-            facts.slant_m, facts.distance_m, facts.height_over_target_m, facts.depression_deg, strict=True
-        ):
-            assert (level**2 + over**2) ** 0.5 == pytest.approx(slant, abs=0.15)
-            assert abs(depression) <= 90.0

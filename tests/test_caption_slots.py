@@ -22,8 +22,6 @@ from caption.run.stage import run
 from caption.run.windows import cut_windows
 from caption.schema import WindowConfig
 from caption.truth.facts import Facts, measure_facts
-from caption.truth.mirror import check_translation
-from caption.truth.references import Fact, look_up, parse_reference
 from caption.writing.contract import Draft, Refused
 from caption.writing.filling import Filler
 from caption.writing.slots import fact_table
@@ -217,21 +215,6 @@ def test_the_numbers_of_both_languages_are_the_facts(facts, chosen):
         assert [float(number) for number, _ in found] == pytest.approx([number for number, _ in expected], abs=1e-6)
 
 
-@given(
-    st.sampled_from(WINDOWS), st.sampled_from(["yaw", "offset_x", "offset_y", "bearing", "yaw_rate"]), st.integers(0, 4)
-)
-def test_a_size_and_its_side_are_its_sign(facts, name, frame):
-    text = filled(f"It is {{{name}@t{frame}}} to the {{side:{name}@t{frame}}}.", "en", facts)
-    fact = look_up(parse_reference(f"{name}@t{frame}"), facts)
-    if not isinstance(fact, Fact) or not fact.value or isinstance(text, Refused):
-        assert isinstance(text, Refused)
-        return
-    positive = {"offset_x": "right", "offset_y": "below"}.get(name, "left")
-    negative = {"offset_x": "left", "offset_y": "above"}.get(name, "right")
-    assert text.endswith(f" to the {positive if fact.value > 0 else negative}.")
-    assert "-" not in text
-
-
 # --- the mirror -------------------------------------------------------------------------------------------------------
 
 
@@ -262,18 +245,6 @@ def test_the_mirror_holds_the_same_slots_sentence_by_sentence(english, chinese, 
     assert (found.reason if isinstance(found, Refused) else None) == reason
     if isinstance(found, Refused):
         assert found.complaint
-
-
-def test_a_translation_has_the_same_sentences_and_the_glossarys_words():
-    english = Coc(
-        critical_components="The drone climbs. The target walks.", reasoning_trace="So be it.", flight_decision="hover"
-    )
-    chinese = Coc(critical_components="无人机爬升。目标行走。", reasoning_trace="如此。", flight_decision="hover")
-    assert check_translation(english, chinese) is None
-    one = chinese.model_copy(update={"critical_components": "无人机爬升，目标行走。"})
-    assert check_translation(english, one)[0] == "sentences"
-    other = chinese.model_copy(update={"critical_components": "飞行器爬升。目标行走。"})
-    assert check_translation(english, other) == ("glossary", 'write "无人机" for "drone"')
 
 
 def test_a_sentence_is_proved_only_where_its_words_are_true_with_its_slots():
@@ -369,32 +340,6 @@ def test_a_record_holds_the_plain_text_and_the_template(tree, tmp_path):
         assert f"{number} 米" in caption.zh.reasoning_trace
         assert caption.checks.sentences == {"en": ["unread", "proved"], "zh": ["unread", "unread"]}  # "ahead"
         assert caption.coverage("en") == 0.5
-
-
-def test_claims_beside_slots_are_recorded_in_the_caption_and_its_evidence(tree, tmp_path):
-    """The distance of these flights is steady; the Chinese claim comes with the mirror."""
-
-    def text(body: dict) -> str:
-        schema = body["response_format"]["json_schema"]["schema"]["properties"]
-        assert "quote" in schema["claims"]["items"]["properties"]  # the mirror is asked for them, too
-        if is_mirror(body):
-            [english] = json.loads(body["messages"][-1]["content"])["claims"]
-            reasons = {
-                "reasoning_trace": "水平距离为 {distance}，目前保持稳定。",
-                "claims": [english | {"quote": "保持稳定"}],
-            }
-            return json.dumps({**CHINESE, **reasons, "flight_decision": "hover"})
-        reasons = {
-            "reasoning_trace": "The distance of {distance} is steady now.",
-            "claims": [STEADY("is steady") | {"quantity": "trend:distance"}],
-        }
-        return json.dumps({**ENGLISH, **reasons, "therefore": "hover", "flight_decision": "hover"})
-
-    with saying(text) as server:
-        captions = list(read_captions(run(settings(server.url, limit=2), tree, tmp_path / "out")))
-    for caption in captions:
-        assert caption.checks.sentences["en"] == ["unread", "proved"]
-        assert [claim.quote for claim in caption.evidence.slots["zh"].claims] == ["保持稳定"]
 
 
 def test_a_refused_answer_is_mended_when_it_is_told_what_was_wrong(tree, tmp_path):

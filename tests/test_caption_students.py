@@ -4,7 +4,6 @@ other."""
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from caption.schema import CaptionConfig
 from caption.teachers.students import as_taught
 from cosfly.formats.captions import Caption, read_captions
 from cosfly.llm.student_chat import TAUGHT, read_taught, write_taught
-from cosfly.runtime.errors import ConfigError, ResumeError
+from cosfly.runtime.errors import ConfigError
 from distill.inference import stage as infer
 from distill.schema import Sample, open_split
 from distill.training.stage import taught_by
@@ -142,19 +141,3 @@ def test_another_version_of_the_prompt_is_refused(place, tmp_path):
     folder = taught_otherwise(place, tmp_path / "zh", prompts={"zh": taught["prompts"]["zh"]})
     with pytest.raises(ConfigError, match="taught no English"):
         as_taught(settings("http://127.0.0.1:1/v1", folder), VOCABULARY)
-
-
-def test_a_folder_holds_the_captions_of_one_student(place, tmp_path):
-    """Another student that is served under the same name, and was taught the same way."""
-    one, other = (Path(shutil.copytree(place / "trained", tmp_path / name)) for name in ("one", "other"))
-    weights = "adapter/adapter_model.safetensors"
-    for folder in (one, other):
-        (folder / weights).write_bytes(b"weights")
-    with TeacherServer(decision=label_of(place)) as server:
-        run(settings(server.url, one), place / "tree", tmp_path / "out")
-        num_asked = len(server.bodies)
-        run(settings(server.url, other), place / "tree", tmp_path / "out")  # where it stands does not matter
-        (other / weights).write_bytes(b"others!")
-        with pytest.raises(ResumeError, match=r"adapter_model\.safetensors"):
-            run(settings(server.url, other), place / "tree", tmp_path / "out")
-        assert len(server.bodies) == num_asked

@@ -190,33 +190,6 @@ def test_facts_of_a_hand_made_window(tree):
     assert "Velocity: [0.0, 4.47, 4.47, 4.47, 4.47] m/s" in doubled["en"].user
 
 
-def test_a_foreign_tree_without_boxes_scores_depth_and_meta(tmp_path):
-    """Older public trees: bbox null, no visibility, no meta.json, RGBA pictures, no depth."""
-    root = make_playback_tree(tmp_path / "tree", 1, 12, with_augmented=False)
-    folder = find_tracks(root)[0]
-    raw = json.loads((folder / "trajectory.json").read_text())
-    del raw["augmentation"], raw["coordinates"]
-    for point in raw["points"]:
-        point["target"]["bbox_2d"] = None
-        del point["target"]["visibility"], point["perturbation"]
-    (folder / "trajectory.json").write_text(json.dumps(raw))
-    for frame in (folder / "frames_playback").iterdir():
-        (frame / "meta.json").unlink()
-        (frame / "depth.npy").unlink()
-        rgb = cv2.imread(str(frame / "rgb.png"))
-        cv2.imwrite(str(frame / "rgb.png"), cv2.cvtColor(rgb, cv2.COLOR_BGR2BGRA))
-    sample = next(cut_windows(flight_in(root), WindowConfig()))
-    facts = measure_facts(sample.observed)
-    assert facts.box_width_px == (None,) * 5
-    assert facts.offset_x_px[-1] is not None  # from image_uv
-    question = make_question(sample.observed, ImageConfig(), "prose", VOCABULARY)
-    assert question.pictures.views == ("rgb", "segmentation")
-    _, digests = question_messages(question, FrameEncoder(ImageConfig()))
-    assert len(digests) == 10
-    path = run(CaptionConfig(), root, tmp_path / "out")
-    assert len(path.read_text().splitlines()) == 3
-
-
 # --- labels of perturbed flights --------------------------------------------------------------------------------------
 
 NUM_POINTS = 160

@@ -8,7 +8,7 @@ from cosfly.cli import app
 from cosfly.pipeline.bench import Bench, row_of, run, stage_rows, tables
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.errors import ConfigError, ResumeError
-from cosfly.runtime.events import Event, read_events
+from cosfly.runtime.events import Event
 from cosfly.runtime.pool import Watch, run_items
 from cosfly.runtime.run_dir import Manifest, Tally, read_manifest
 from cosfly.runtime.worker import Item
@@ -80,19 +80,6 @@ def test_what_lost_workers_had_done_is_counted_and_left_out(tmp_path):
     assert read_manifest(tmp_path / "s").facts["lost_steps"] == 3
     (row,) = stage_rows(tmp_path, ["s", "t"])
     assert (row.launches, row.restarts, row.modes) == (2, 1, {"worker_died": 1})
-
-
-def test_frames_of_a_trajectory_that_fails_are_counted_and_left_out(tmp_path):
-    """Its worker lives: it fails by itself after four of nine steps."""
-    items = [Item("a", num_steps=9), Item("b", "fail", num_steps=4)]
-    folder = stage_in(tmp_path)
-    finished = run_items(folder, items, make_counting_worker, (tmp_path,), workers=1)
-    (tmp_path / "s/product").write_text("x")
-    folder.finish([tmp_path / "s/product"], finished.tally)
-    manifest = read_manifest(tmp_path / "s")
-    assert (manifest.counts.kept, manifest.counts.failed, manifest.facts["lost_steps"]) == (1, {"render": 1}, 4)
-    row = row_of(read_events(tmp_path / "s"), manifest, 1, counts_frames=True)
-    assert (row.attempted, row.successful, row.failed) == (13, 9, 1)
 
 
 def test_what_cannot_be_measured(tmp_path):

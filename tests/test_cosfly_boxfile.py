@@ -90,16 +90,6 @@ def test_ours_is_read_as_it_is_and_named_anew(tmp_path):
         load(BoxesConfig(path=tmp_path / "own.json", ignore=["*"]))
 
 
-def test_what_is_wrong_with_many_rows_hides_nothing_else(tmp_path):
-    rows = [f"house,{x},0,4,4,6" for x in range(0, 400, 10)] + ["road,5,5,90,7,wide"]
-    with pytest.raises(InputError) as caught:
-        loaded(tmp_path, "\n".join(["type,x_m,y_m,length_m,width_m,height_m", *rows]))
-    assert "line 2: unknown type 'house' (and 39 more)" in str(caught.value)
-    line_42 = "line 42: unknown type 'road' (did you mean 'Roads'?), height_m is not a finite number: 'wide'"
-    assert line_42 in str(caught.value)
-    assert "2 to fix" in str(caught.value)
-
-
 def test_all_that_is_wrong_with_a_table_is_told(tmp_path, subtests):
     for text, words in [
             (PLAIN.replace("Vegetation", "vegetable").replace("Roads", "roads"),

@@ -1,7 +1,5 @@
 """Foresight: lattice, search and smoothing against slow plain versions, and whole flights where looking ahead pays."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from specimens_planning import WORLDS, scenario_of, town_of, walk_along
@@ -130,21 +128,6 @@ def test_smoothing_keeps_sight_and_safety_and_takes_the_jerk(seed):
 
 def fly(planner, scenario, obstacles):
     return load_planner(planner)(scenario, obstacles, CFG, rng_for(0, "plan", scenario.path_id))
-
-
-def test_it_changes_sides_before_a_row_of_trees_hides_the_walker():
-    """Canopies along the right of the second half of a walk whose wished place, right of the walker, they would hide it
-    from.
-    """
-    canopies = [((x, -6, 6), (4.5, 2.5, 5.5)) for x in range(40, 101, 8)]
-    obstacles = kernels.obstacle_index(town_of(*canopies))
-    scenario = make_scenario(walk_along("w", [(0, 0), (90, 0)]), obstacles, CFG)
-    right = replace(scenario.reference, bearing_rad=np.full_like(scenario.reference.bearing_rad, 1.5 * np.pi))
-    scenario = replace(scenario, reference=right)
-    requested = right.places_m(scenario.targets_m, scenario.ground_m)
-    assert kernels.visibility(obstacles, requested, scenario.targets_m).mean() < 0.6
-    flown = fly("foresight", scenario, obstacles).positions_m
-    assert kernels.visibility(obstacles, flown, scenario.targets_m).mean() > 0.99
 
 
 # --- from where a drone is --------------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ import numpy as np
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import linprog
 
 from cosfly.formats.boxes import make_box_map
 from cosfly.formats.kinds import KINDS
@@ -74,22 +73,6 @@ def test_turned_boxes_fill_the_cells_that_shapely_finds(x, y, half_x, half_y, ya
             assert grid.occupied[row, column]
         elif not footprint.intersects(cell):
             assert not grid.occupied[row, column]
-
-
-def test_a_tilted_box_fills_what_its_slice_at_walking_height_covers(subtests):
-    for rotation_deg in [(25, 40, 0), (70, -15, 33), (0, 10, 60), (-90, 20, 0)]:
-        with subtests.test(rotation_deg=rotation_deg):
-            center, half_extents = np.array([6.3, 5.2, 2.9]), np.array([4.0, 1.3, 2.1])
-            grid = occupancy(one_box(center, half_extents, rotation_deg), like=free_grid(12, 11))
-            pitch, yaw, roll = np.radians(rotation_deg)
-            body_from_world = rotation_matrix(pitch, yaw, roll).T
-            sides = np.vstack([body_from_world, -body_from_world])
-            limits = np.concatenate([half_extents, half_extents]) + sides @ center
-            assert 0 < grid.occupied.sum() < grid.occupied.size
-            for row, column in itertools.product(range(11), range(12)):
-                bounds = [(column, column + 1), (row, row + 1), (0, 2)]
-                is_met = linprog([0, 0, 0], A_ub=sides, b_ub=limits, bounds=bounds).status == 0
-                assert grid.occupied[row, column] == is_met, (row, column)
 
 
 def test_surfaces_near_the_ground_count_and_a_flyover_does_not():

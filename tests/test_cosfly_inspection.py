@@ -616,30 +616,3 @@ boxes = st.tuples(*[st.integers(0, 12)] * 4).map(lambda v: np.array([v[0], v[1],
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
-
-
-def test_the_four_states_of_perturbed_frames_are_counted_beside_the_papers_shares(workplace):
-    """Of two perturbed flights of 10 frames: two with neither offset, one shifted alone, two turned alone, the others
-    both."""
-    for number, flight in enumerate(sorted((workplace / "tree").glob("*/*/aug_001"))):
-
-        def change(record: dict, number: int = number) -> None:
-            for i, point in enumerate(record["points"]):
-                if number or i in (0, 3, 4):
-                    point["perturbation"]["drone_rotation"] = dict.fromkeys(("pitch", "yaw", "roll"), 0.0)
-                if (number and i < 1) or (not number and i in (0, 1, 2)):
-                    point["perturbation"]["drone_position"] = dict.fromkeys("xyz", 0.0)
-
-        edit(flight, change)
-    inspect(workplace)
-    page = (workplace / "out" / "report.html").read_text(encoding="utf-8")
-    section = page.partition("<h2>Perturbation</h2>")[2].partition("</table>")[0]
-    rows = re.findall(
-        r'<td>([a-z ]+)</td><td class="n">(\d+)</td><td class="n">([\d.]+)%</td><td class="n">(\d+)%</td>', section
-    )
-    assert rows == [
-        ("unperturbed", "2", "10.0", "16"),
-        ("position only", "11", "55.0", "24"),
-        ("rotation only", "2", "10.0", "24"),
-        ("full", "5", "25.0", "36"),
-    ]

@@ -20,7 +20,7 @@ from cosfly.pipeline import library
 from cosfly.planners import stage as plan_stage
 from cosfly.planners.contract import PLANNERS, PlanConfig
 from cosfly.render.settings import RenderConfig
-from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError
+from cosfly.runtime.errors import ConfigError
 from cosfly.simplify import stage as simplify_stage
 from cosfly.simplify.passes import SimplifyConfig
 
@@ -56,32 +56,6 @@ def test_a_flight_is_the_one_of_the_stages(town, flight, tmp_path):
     for name in ("time_s", "positions_m", "targets_m", "rotations_deg"):
         assert_allclose(getattr(flight, name), getattr(made, name), atol=1e-3)
     assert flight.drop_reason == made.drop_reason
-
-
-def test_what_is_wrong_is_said_as_on_the_command_line(town):
-    for call, error, words in (
-        (lambda: cosfly.load_map(sise_m=3), ConfigError, "sise_m: unknown setting.*'size_m'"),
-        (lambda: cosfly.load_map(source="gta"), ConfigError, "no such source of maps; got gta; expected synthetic"),
-        (lambda: cosfly.load_map(source="carla", port=1), EnvironmentMissing, r"127\.0\.0\.1:1 .*no CARLA server"),
-        (lambda: cosfly.load_map("a.json", source="synthetic"), ConfigError, "reads no file"),
-        (lambda: cosfly.load_map("nowhere.json"), InputError, r"nowhere\.json"),
-        (lambda: cosfly.load_map(**TOWN | {"seed": "x"}), ConfigError, "the seed is invalid; got 'x'"),
-        (lambda: cosfly.plan(town, "abc"), InputError, "route_m: the route is invalid"),
-        (lambda: cosfly.plan(town, [[0, 0, 0]]), InputError, "route_m: the route is invalid"),
-        (lambda: cosfly.plan(town, [[0, "a"], [1, 2]]), InputError, "route_m: the route is invalid"),
-        (lambda: cosfly.plan(town, [[0, 0], [9, 9], [9, 9]]), InputError, "route_m: the route is invalid"),
-        (lambda: cosfly.plan(town, planer="muco"), ConfigError, "plan: planer: unknown setting"),
-        (lambda: cosfly.render_frames(town, [0, 0, 9]), InputError, "the camera has no direction"),
-        (
-            lambda: cosfly.render_frames(town, [0, 9], [0, 0, 0]),
-            InputError,
-            "position_m: the array has the wrong shape",
-        ),
-        (lambda: cosfly.load_map("a", source="simworld", world="b"), ConfigError, "load_map: world: has no effect"),
-        (lambda: cosfly.plan(town, track_astar={"beam": 9}), ConfigError, "plan: track_astar: has no effect"),
-    ):
-        with pytest.raises(error, match=words):
-            call()
 
 
 VIEW = {"rotation_deg": [-30, 0, 0], "size_px": (32, 18)}

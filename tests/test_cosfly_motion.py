@@ -1,22 +1,14 @@
 """What a flight teaches a policy: actions that fly the plan, waypoints that lead to it, at the plan's rate and the
 frames'."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from cosfly.formats.boxes import make_box_map
 from cosfly.formats.motion import PlannedMotion
-from cosfly.formats.playback import read_track, write_track
 from cosfly.formats.segments import Mission, Segment
 from cosfly.formats.traces import DroneTrace
-from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import rotation_matrices
-from cosfly.render.perturbation import Surroundings
-from cosfly.render.settings import RenderConfig
-from cosfly.render.stage import make_track_script
 from specimens import make_playback_tree
 
 
@@ -70,31 +62,3 @@ def test_flying_the_actions_gives_the_plan():
         assert_allclose(np.cos(np.radians(turned - trace.rotations_deg[part::5][:6, 1])), 1.0)
         assert_allclose(motion.actions[:-1, part - 1, 4], trace.rotations_deg[part::5][:6, 0])
     assert_allclose(motion.action[:-1, :4], motion.actions[:-1, :, :4].mean(axis=1))
-
-
-def test_frames_at_a_fifth_of_the_plans_rate(tree, tmp_path):
-    """What is not drawn stands in the tree; parts, orders and clearances keep their times."""
-    trace = curve(33)
-    around = Surroundings(make_box_map([[200.0, 0, 5]], [[1.0, 1, 5]], [[0.0, 0, 0]], [3]))
-    cfg = RenderConfig(frame_stride=5, width_px=64, height_px=36, first_timestamp=1)
-    script = make_track_script(trace, 0, "clean", "T", around, cfg, 0)
-    assert_allclose(script.time_s, np.arange(7) * 0.5)
-    assert_allclose(script.perturbed.poses.positions_m, trace.positions_m[::5])
-    least = [trace.clearances_m[begin : begin + 5].min() for begin in range(0, 33, 5)]
-    assert_allclose(script.perturbed.poses.clearances_m, least)
-    assert [(part.style, part.begin, part.end) for part in script.segments] == [("follow", 0, 3), ("hold", 3, 7)]
-    assert (script.mission.at_frame, script.mission.home_frame) == (4, 5)
-    assert (
-        make_track_script(trace, 0, "clean", "T", around, cfg.model_copy(update={"frame_stride": 1}), 0).between is None
-    )
-
-    flight = read_track(find_tracks(tree)[0])
-    between = np.random.default_rng(0).uniform(-20, 20, (len(flight), 4, 6))
-    between[-1] = np.nan
-    folder = tmp_path / "Town01" / flight.trajectory / "ORI"
-    folder.mkdir(parents=True)
-    write_track(folder, replace(flight, between=between))
-    back = read_track(folder)
-    assert_allclose(back.between, between)
-    write_track(folder, replace(back, raw={**back.raw, "points": [{"between": "no"} | p for p in back.raw["points"]]}))
-    assert_allclose(read_track(folder).between, between)

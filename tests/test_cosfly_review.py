@@ -17,7 +17,6 @@ from cosfly.formats.review import REVIEW, Choice, add_decisions, read_decisions,
 from cosfly.formats.traces import write_traces
 from cosfly.formats.tracks import find_tracks
 from cosfly.inspection.stage import run
-from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_file
 from release.package.sources import Source, gather
 from specimens import make_playback_tree
@@ -101,26 +100,3 @@ def test_the_command_decides_and_says_what_is_open(product):
     assert done.exit_code == 0, done.output
     assert "4 flights in review: 2 accepted, 1 rejected, 1 open" in done.output
     assert ask().output == done.output
-
-
-def test_a_trajectory_stands_for_its_flights(product):
-    """Accepted: those in review alone, for the rule's rejected one stays so; rejected: the accepted one too."""
-    clean, perturbed, other, *_ = folders_of(product)
-    trajectory = clean.rpartition("/")[0]
-    assert perturbed.startswith(trajectory)
-    assert not other.startswith(trajectory)
-    decide(product, "accepted", f"{trajectory}/")
-    assert {f: d.verdict for f, d in read_decisions(product).items()} == dict.fromkeys((clean, perturbed), "accepted")
-    product.with_name(REVIEW).unlink()
-    value = json.loads(product.read_text())
-    value["flights"][0]["result"] = "rejected"
-    product.write_text(json.dumps(value))
-    decide(product, "accepted", trajectory)
-    assert list(read_decisions(product)) == [perturbed]
-    product.with_name(REVIEW).unlink()
-    value["flights"][0]["result"] = "accepted"
-    product.write_text(json.dumps(value))
-    decide(product, "rejected", trajectory)
-    assert {f: d.verdict for f, d in read_decisions(product).items()} == dict.fromkeys((clean, perturbed), "rejected")
-    with pytest.raises(InputError, match="of a flight or of its trajectory"):
-        decide(product, "accepted", trajectory.rpartition("/")[0])

@@ -14,7 +14,7 @@ import pytest
 from browser import Page, browser
 from commands import invoke
 
-from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, read_boxes, write_boxes
+from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, write_boxes
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import read_paths
 from cosfly.formats.roi import read_roi
@@ -159,16 +159,3 @@ def test_only_our_own_page_is_answered(map_file, tmp_path):
         status, said = asked(server, "POST", f"{ours}save", body)
         assert (status, b"changed by somebody else" in said) == (400, True)
         assert len(read_roi(out).points_world) == 3
-
-
-def test_a_proposal_is_a_region_that_keeps_the_ground(map_file, tmp_path):
-    out = tmp_path / "roi.json"
-    settings = " ".join(f"--set pedestrians.{name}={getattr(CFG, name)}" for name in CFG.model_fields_set)
-    done = invoke(f"roi propose {map_file} --out {out} {settings}")
-    assert done.exit_code == 0, done.output
-    roi, box_map = read_roi(out), read_boxes(map_file)
-    assert (roi.map, len(roi.rings()), len(roi.rings()[0].holes)) == ("plaza", 1, 1), (
-        "the house is a hole, the bin is not"
-    )
-    free, within = walkable_ground(box_map, CFG).walkable, walkable_ground(box_map, CFG, roi).walkable
-    assert (free & within).sum() > 0.99 * free.sum()

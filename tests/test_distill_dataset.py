@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
-import pickle
 import re
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -218,28 +215,6 @@ def test_the_walk_of_a_flight_decides_its_split_and_not_its_name(tmp_path):
 def test_captions_that_no_record_binds_to_their_tree_are_refused(tree, captions, tmp_path):
     with pytest.raises(VerifyError, match=r"no record says of which playback tree.*unbound=accept"):
         stage.run(PrepareConfig(), [RunSource.of_files(tree, captions)], tmp_path / "set")
-
-
-def _keys(samples) -> list[str]:
-    return [sample.key for sample in samples]
-
-
-def test_any_sample_by_its_number_in_any_process(tree, captions, tmp_path, monkeypatch):
-    monkeypatch.setattr("distill.schema.ROWS_AT_ONCE", 7)
-    samples = open_split(prepared(tree, captions, tmp_path / "set"), "train")
-    whole = list(samples)
-    assert len(whole) == len(samples) > 30
-    order = np.random.default_rng(0).permutation(len(samples)).tolist()
-    assert [samples[i] for i in order] == [whole[i] for i in order]
-    assert samples[-1] == whole[-1]
-    assert samples[3:9:2] == whole[3:9:2]
-    with pytest.raises(IndexError):
-        samples[len(samples)]
-    assert list(pickle.loads(pickle.dumps(samples))) == whole
-    for way in ("fork", "spawn"):  # a fork has its parent's open file
-        with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context(way)) as pool:
-            assert list(pool.map(_keys, [samples] * 2)) == [_keys(whole)] * 2
-    assert samples[order[0]] == whole[order[0]]
 
 
 # --- choice ---------------------------------------------------------------------------------------------------------

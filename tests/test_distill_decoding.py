@@ -104,23 +104,6 @@ def test_a_row_has_the_same_answer_alone_and_among_others(student, rows):
     assert decode(student, rows[::-1], max_tokens=MOST)[::-1] == together
 
 
-def test_an_adapter_and_dropout(student, rows, tmp_path):
-    from peft import LoraConfig, get_peft_model
-
-    make_tiny_student(tmp_path / "tiny", seed=3)
-    own = load_student(tmp_path / "tiny", device="cpu", max_pixels=64 * 64)
-    plain = decode(own, rows, max_tokens=MOST)
-    own.model = get_peft_model(
-        own.model,
-        LoraConfig(r=4, lora_dropout=0.5, init_lora_weights=False, target_modules=r".*layers\.\d+\.mlp\.up_proj"),
-    )
-    own.model.train()
-    found = decode(own, rows, max_tokens=MOST)
-    assert own.model.training  # as it was
-    own.model.eval()
-    assert found == generated(own, rows) != plain
-
-
 class EvenTokens:
     """Allows even tokens only, and the end after five of them."""
 

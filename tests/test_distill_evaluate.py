@@ -10,16 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import invoke
 from specimens_distill import make_caption, write_set
 
 from cosfly.formats.actions import TOKENS
 from cosfly.formats.figures import draw_pedestrians
-from cosfly.formats.predictions import Prediction, read_predictions
+from cosfly.formats.predictions import Prediction
 from cosfly.geometry.blind import LEAST_WINDOWS
-from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import dump_json
-from distill.evaluation import compare
 from distill.evaluation.bertscore import BertScoreConfig, Scorer
 from distill.evaluation.floors import Floors, coc_of, majority
 from distill.evaluation.measure import (
@@ -41,7 +38,7 @@ from distill.evaluation.scores import (
 from distill.evaluation.stage import EvaluateConfig, run
 from distill.inference.outcome import failed_prediction, make_prediction
 from distill.prepare.stage import PrepareConfig, make_sample
-from distill.schema import Sample, open_split
+from distill.schema import Sample
 
 
 def sample_of(frame: int, language: str = "en") -> Sample:
@@ -284,27 +281,6 @@ def test_without_a_model_the_report_says_so_and_gives_no_number(place):
     again = run(CFG, place / "predictions.jsonl", place / "set", place / "again")
     for name in ("report.json", "evaluation.md", "evaluation.html", "scores.parquet"):
         assert (again.parent / name).read_bytes() == (path.parent / name).read_bytes()
-
-
-def test_students_side_by_side(place):
-    predictions = read_predictions(place / "predictions.jsonl")
-    samples = {sample.key: sample for sample in open_split(place / "set", "test")}
-    right = [make_prediction(samples[p.key], "test", samples[p.key].answer, 5, True) for p in predictions]
-    write_predictions(place, right, "right.jsonl")
-    for name in ("predictions", "right"):
-        run(CFG, place / f"{name}.jsonl", place / "set", place / "students" / name)
-    folders = [place / "students" / name for name in ("right", "predictions")]
-    words = ["distill", "report", *map(str, folders), "--out", str(place / "table")]
-    result = invoke(words)
-    assert result.exit_code == 0, result.output
-    page = (place / "table" / "comparison.md").read_text()
-    assert "| right | 100.00% " in page
-    assert "| floor: majority |" in page
-    assert "## right less predictions" in page
-    assert re.search(r"\| decision accuracy, all answers \| \+0\.5000 \|", page)
-    assert (place / "table" / "comparison.html").read_text().count("<svg") == 3
-    with pytest.raises(InputError, match="one name"):
-        compare.run([folders[0], folders[0]], place / "x")
 
 
 def make_encoder(folder: Path) -> Path:

@@ -14,9 +14,7 @@ from safetensors.torch import load_file  # noqa: E402
 from specimens_students import MAX_PIXELS, inputs_of, load, log_of, run, samples_of, trees_of  # noqa: E402
 
 from cosfly.runtime.errors import InputError  # noqa: E402
-from distill.student.decoding import Completion  # noqa: E402
 from distill.student.model import load_student  # noqa: E402
-from distill.training import fit  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -41,20 +39,6 @@ def test_a_model_trained_in_full_is_a_whole_folder(place, tmp_path):
     assert any("language_model" in name for name in changed)
     assert not any("visual" in name for name in changed)
     assert (folder / "cosfly_student.json").exists()
-
-
-def test_an_answer_is_judged_by_the_teacher_and_by_the_future(place):
-    sample = samples_of(place)[0].model_copy(update={"label": "hover", "contradicted": ("ascend",)})
-
-    def counts(changes: dict, **future: object) -> list[float]:
-        answer = json.dumps({**json.loads(sample.answer), **changes})
-        return fit._judged_answer(sample.model_copy(update=future), Completion(answer, 9, True)).tolist()
-
-    assert sample.decision != "hover"
-    assert counts({}) == [1, 1, 1, 0]
-    assert counts({"flight_decision": "hover"}) == [1, 0, 1, 1]
-    assert counts({"flight_decision": "hover"}, contradicted=None) == [1, 0, 0, 0]
-    assert counts({"flight_decision": "dance"}) == [0, 0, 1, 0]
 
 
 @pytest.mark.slow

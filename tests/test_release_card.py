@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from specimens_release import TWO_SPLITS, make_release, rows_by_id
+from specimens_release import rows_by_id
 from specimens_rows import make_row
 
 from cosfly.runtime.arrays import parse_picture
@@ -22,8 +22,7 @@ from release.card.numbers import RowCounts
 from release.card.render import first_split, render_card
 from release.columns import POINT
 from release.record import read_record
-from release.verify.findings import Findings
-from release.verify.verify import check_numbers, verify
+from release.verify.verify import verify
 
 ROOT = Path(__file__).resolve().parents[1]
 ROWS = [make_row(i, variant, f"trajectory_{k}") for k in (1, 2) for variant in ("ORI", "aug_001") for i in range(12)]
@@ -63,34 +62,6 @@ def test_rows_counted_in_pieces_give_the_same_numbers(cuts, groups):
 @pytest.fixture(scope="module")
 def record(built):
     return read_record(built / "release.json")
-
-
-def card_of(record, **change) -> str:
-    return render_card(record.model_copy(update=change))
-
-
-def test_what_is_told_without_a_picture_stands_on_the_card_and_is_measured_again(tmp_path, monkeypatch):
-    """Every label of the specimens is one and the same, so that all tell it; too few labels are said to be too few."""
-    few = read_record(make_release(tmp_path / "few", **TWO_SPLITS) / "release.json")
-    assert "are needed" in render_card(few)
-    assert few.ceilings is not None
-    assert (few.ceilings.fitted_on, few.ceilings.blind, few.ceilings.drawn_ahead) == (28, None, None)
-    assert "only after the window is not known" in render_card(few)
-    monkeypatch.setattr("release.flight_rows.FlightRows.is_foreign", False)  # as if cosfly had drawn it
-    for module in ("cosfly.geometry.blind", "release.card.ceilings"):
-        monkeypatch.setattr(f"{module}.LEAST_WINDOWS", 10)
-    path = make_release(tmp_path / "enough", **TWO_SPLITS) / "release.json"
-    record = read_record(path)
-    assert record.ceilings is not None
-    assert (record.ceilings.split, record.ceilings.majority, record.ceilings.blind) == ("validation", 1.0, 1.0)
-    assert record.ceilings.known == 18  # of each flight three windows whose label's future is whole
-    assert "**100.0 % by a network of one hidden layer**" in render_card(record)
-    for told, is_found in ((1.0, False), (0.98, False), (0.9, True), (None, True)):
-        findings = Findings()
-        lie = record.model_copy(update={"ceilings": record.ceilings.model_copy(update={"blind": told})})
-        check_numbers(path.parent, lie, findings)
-        assert [code for _, code in findings.kinds] == ["number"] * is_found
-    assert "without a picture is not known" in card_of(record, ceilings=None)
 
 
 def test_every_snippet_of_the_card_runs(record, built, tmp_path, monkeypatch):

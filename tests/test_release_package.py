@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from commands import invoke
 from hypothesis import given
 from hypothesis import strategies as st
 from specimens_release import CFG, all_bytes, build, make_inspection, rewrite_captions, source_of
@@ -204,29 +203,6 @@ def test_runs_of_other_towns_go_into_one_release_under_ids_of_their_own(release_
     (other / "tree").rename(other / "second")
     _, record = joined(tmp_path / "trees", source_of(release_inputs), replace(source_of(other), data=other / "second"))
     assert {one.flight.partition("/")[0] for one in record.flights} == {"one_tree", "one_second"}
-
-
-def test_runs_are_given_as_folders_or_file_by_file(release_inputs, tmp_path):
-    for name in ("a", "b"):
-        place = tmp_path / "runs" / name
-        (place / "caption").mkdir(parents=True)
-        (place / "inspect").mkdir()
-        (place / "render").symlink_to(release_inputs / "tree")
-        shutil.copy(release_inputs / "captions.jsonl", place / "caption")
-        shutil.copy(release_inputs / "inspect.json", place / "inspect")
-    a, b = (tmp_path / "runs" / name for name in ("a", "b"))
-    assert [Source.of_run(place).run for place in (a, b)] == ["a", "b"]
-    more = ["--out", tmp_path / "out", "--frames", 2]
-    more += ["--set", "release.licence=mit", "--set", "release.unbound=accept"]
-    files = ["--data", str(b / "render"), "--captions", str(b / "caption/captions.jsonl")]
-    result = invoke("release build", a, files, "--workers 0 --inspect", b / "inspect/inspect.json", more)
-    assert result.exit_code == 0, result.output
-    assert {i.partition("_")[0] for i in ids_of(tmp_path / "out/dataset")} == {"a", "b"}
-    assert invoke("release build", files[:2], more).exit_code == 2
-    assert invoke("release build", files, more, "--frames some").exit_code == 1
-    refused = invoke("release build", release_inputs, more)
-    assert isinstance(refused.exception, InputError)
-    assert "not a run folder" in str(refused.exception)
 
 
 @given(st.lists(st.integers(1, 50), max_size=30), st.integers(1, 120))

@@ -10,12 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from specimens_rows import make_row
 
-from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M
 from cosfly.geometry.trajectory_metrics import accel_rms, jerk_rms, length_m
 from cosfly.runtime.json_io import read_json
 from release.columns import POINT, POSE
 from release.stats.counting import Counts
-from release.stats.pixels import BIN_M, Pixels
 from release.stats.tables import Stats
 
 
@@ -51,18 +49,6 @@ def test_motion_is_that_of_the_plan_whatever_the_perturbation(seed, num):
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
-
-
-def test_depth_percentiles_against_numpy():
-    rng = np.random.default_rng(0)
-    depth = rng.uniform(1, 90, (50, 80)).astype(np.float32)
-    depth[:5], depth[5] = SKY_DEPTH_M, INVALID_DEPTH_M
-    pixels = Pixels()
-    pixels.add_depth(depth)
-    assert (pixels.sky, pixels.invalid) == (5 * 80, 80)
-    for share, found in pixels.percentiles_m():
-        assert found == pytest.approx(np.quantile(depth[6:], share), abs=2 * BIN_M)
-    assert Pixels().percentiles_m() == []
 
 
 # --- pages ------------------------------------------------------------------------------------------------------------

@@ -3,7 +3,6 @@ frames.
 
     python tests/benchmarks/bench_render.py parts                          # one process, no workers
     python tests/benchmarks/bench_render.py disk --workers 2               # the stage as it is used
-    python tests/benchmarks/bench_render.py disk --against ../older        # another checkout in turns, and its pictures
     python tests/benchmarks/bench_render.py tiles                          # the SimWorld city 12 x 12
     python tests/benchmarks/bench_render.py memory --frames 5000
     python tests/benchmarks/bench_render.py workers                        # 1, 2, 4, 6: the paper's tab:render_scaling
@@ -61,20 +60,21 @@ from dataclasses import replace
 from pathlib import Path
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.traces import read_traces
-from cosfly.render.track import Writing, render_flight
-from cosfly.render.stage import RenderConfig, open_renderer, script_flight  # where older checkouts have them all
+from cosfly.render.settings import RenderConfig
+from cosfly.render.stage import make_track_script, open_renderer
+from cosfly.render.track import Writing, render_track
 boxes, traces, out, number = *map(Path, sys.argv[1:4]), int(sys.argv[4])
 cfg = RenderConfig(fovs_deg=(90.0,), first_timestamp=1776000000)
 trace = read_traces(traces)[number]
 renderer = open_renderer("gl", read_boxes(boxes), cfg.width_px, cfg.height_px)
 settings = [cfg.visible_threshold]
 writing = Writing(tuple(cfg.modalities), *settings)
-script = script_flight(trace, number, "clean", "Town", None, cfg, 0)
+script = make_track_script(trace, number, "clean", "Town", None, cfg, 0)
 with tempfile.TemporaryDirectory() as scratch:
-    render_flight(renderer, script, Path(scratch), writing)  # compiles; nothing of it is counted
+    render_track(renderer, script, Path(scratch), writing)  # compiles; nothing of it is counted
 used_s, start_s = time.process_time(), time.perf_counter()
 (out / str(number)).mkdir()
-count = len(render_flight(renderer, script, out / str(number), writing))
+count = len(render_track(renderer, script, out / str(number), writing))
 print(json.dumps([count, time.process_time() - used_s, time.perf_counter() - start_s]))
 """
 
@@ -177,7 +177,7 @@ def parts(folder: Path, num_frames: int) -> tuple[str, list[Any]]:
 # --- to disk ----------------------------------------------------------------------------------------------------------
 
 
-def to_disk(folder: Path, out: Path, workers: int, num_points: int, checkout: Path | None) -> list[float]:
+def to_disk(folder: Path, out: Path, workers: int, num_points: int) -> list[float]:
     """Draw and write a flight with each of some processes at once, as the stage's workers do. Gives frames, CPU ms a
     frame, frames/s."""
     columns = ("time_s", "positions_m", "rotations_deg", "targets_m", "visibility", "clearances_m")
@@ -190,7 +190,7 @@ def to_disk(folder: Path, out: Path, workers: int, num_points: int, checkout: Pa
     write_traces(folder / "shortened.json", cut, {})
     program = folder / "worker.py"
     program.write_text(WORKER)
-    environment = os.environ | {"PYTHONPATH": str(checkout or REPOSITORY)}
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
     if workers > 1:
         environment["LP_NUM_THREADS"] = str(max(1, len(os.sched_getaffinity(0)) // workers))  # as the stage does
     out.mkdir()
@@ -202,36 +202,6 @@ def to_disk(folder: Path, out: Path, workers: int, num_points: int, checkout: Pa
     found = [json.loads(process.communicate()[0]) for process in running]
     count = sum(frames for frames, _, _ in found)
     return [count, 1e3 * sum(used_s for _, used_s, _ in found) / count, sum(n / clock_s for n, _, clock_s in found)]
-
-
-def ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Structural similarity of two pictures, (h, w, 3) uint8, of their brightness. Source: Wang et al. 2004."""
-    x, y = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float64) for picture in (a, b))
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        return cv2.GaussianBlur(values, (11, 11), 1.5)
-
-    mx, my = mean(x), mean(y)
-    vx, vy, xy = mean(x * x) - mx**2, mean(y * y) - my**2, mean(x * y) - mx * my
-    c1, c2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
-    return float(((2 * mx * my + c1) * (2 * xy + c2) / ((mx**2 + my**2 + c1) * (vx + vy + c2))).mean())
-
-
-def compared(ours: Path, theirs: Path) -> str:
-    """Compare the frames of two trees."""
-    found = sorted(path.parent.relative_to(ours) for path in ours.glob("*/frames_playback/*/rgb.png"))
-    similar = [ssim(frames.read_rgb(ours / place), frames.read_rgb(theirs / place)) for place in found]
-    same_depth = all((frames.read_depth(ours / p) == frames.read_depth(theirs / p)).all() for p in found)
-    same_ids = all(
-        np.array_equal(a, b)
-        for p in found
-        for a, b in zip(frames.read_instance(ours / p), frames.read_instance(theirs / p), strict=True)
-    )
-    return (
-        f"{len(found)} frames: SSIM {np.mean(similar):.4f}, lowest {min(similar):.4f}; depth "
-        f"{'equal' if same_depth else 'DIFFERS'}, "
-        f"kinds and ids {'equal' if same_ids else 'DIFFER'}"
-    )
 
 
 # --- size and time ----------------------------------------------------------------------------------------------------
@@ -313,7 +283,6 @@ def main() -> None:
     parser.add_argument("what", choices=("parts", "disk", "tiles", "memory", "workers"))
     parser.add_argument("--frames", type=int, help="frames of a measurement; of `disk` and `workers`, of each flight")
     parser.add_argument("--workers", type=int, nargs="+")
-    parser.add_argument("--against", type=Path, help="another checkout, for `disk`")
     given = parser.parse_args()
     scenes.one_thread_and_machine()
     cv2.setNumThreads(1)
@@ -344,19 +313,13 @@ def main() -> None:
             rows = [[name, *used, sum(used)] for name, (_, used) in found.items()]
             scenes.print_table(f"CPU ms a frame, {next(iter(found.values()))[0]}", names, rows)
             return
-        checkouts = {"this": None} | ({"other": given.against.resolve()} if given.against else {})
-        rows, said = [], []
+        rows = []
         for name, folder in folders.items():
             for workers in given.workers:
                 with tempfile.TemporaryDirectory() as scratch:
-                    for checkout, path in checkouts.items():
-                        row = to_disk(folder, Path(scratch, checkout), workers, given.frames or 60, path)
-                        rows.append([name, checkout, workers, *row])
-                    if given.against:
-                        said.append(f"{name}: {compared(Path(scratch, 'this'), Path(scratch, 'other'))}")
-        names = ["map", "checkout", "workers", "frames", "CPU ms a frame", "frames/s on the clock"]
+                    rows.append([name, workers, *to_disk(folder, Path(scratch, "out"), workers, given.frames or 60)])
+        names = ["map", "workers", "frames", "CPU ms a frame", "frames/s on the clock"]
         scenes.print_table("To disk", names, rows)
-        print("\n".join(said))
 
 
 if __name__ == "__main__":
