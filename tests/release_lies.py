@@ -247,13 +247,6 @@ def hard_conflict_called_soft(row: Row) -> None:
     row.update(dict.fromkeys(DECISIONS, wrong), verdict="SOFT_CONFLICT")
 
 
-def farther_but_for_the_person(depth: np.ndarray, row: Row) -> np.ndarray:
-    far, box = depth * 1.3, row["target_bbox"] or dict.fromkeys(BOX, 0)
-    part = np.s_[int(box["ymin_px"]) : int(box["ymax_px"]) + 1, int(box["xmin_px"]) : int(box["xmax_px"]) + 1]
-    far[part] = depth[part]
-    return far
-
-
 def along_the_ray(depth: np.ndarray, row: Row) -> np.ndarray:
     k, (v, u) = row["intrinsics"], np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
     return depth * np.sqrt(((u - k["cx"]) / k["fx"]) ** 2 + ((v - k["cy"]) / k["fy"]) ** 2 + 1)
@@ -262,13 +255,6 @@ def along_the_ray(depth: np.ndarray, row: Row) -> np.ndarray:
 def not_a_number(row: Row) -> None:
     depth = depth_of(row)
     depth[3, 3] = np.nan
-    set_depth(row, depth)
-
-
-def boxed(row: Row) -> None:
-    depth = depth_of(row)
-    side = depth.shape[1] // 8
-    depth[5 : 5 + side, 5 : 5 + side] = 3.0  # also where the sky is
     set_depth(row, depth)
 
 
@@ -333,15 +319,12 @@ box_moved = change(at(seen, 1), add("target_bbox", 4.0, *BOX))
 LIES_OF_ROWS: dict[str, Lie] = {
     "sample_id_of_another_frame": change(at(clean, 3), lambda r: r.update(sample_id=r["sample_id"][:-5] + "00999")),
     "label_outside_the_set": put(caption, label="fly_away"),
-    "verdict_outside_the_set": put(caption, verdict="FINE"),
     "consistent_with_another_decision": change(
         first(captioned, lambda r: r["label"] and r["decision"] == r["label"]),
         lambda r: r.update(label="hover" if r["label"] != "hover" else "ascend"),
     ),
     "visibility_above_one": put(at(clean, 0), visibility=1.7),
     "called_legible": put(at(clean, 0), target_legible=True, target_contrast=1.0),
-    "higher_than_its_box": put(first(seen, lambda r: r["target_height_px"] < 40), target_height_px=40.0),
-    "visible_but_not_in_view": put(at(seen, 0), target_in_view=False),
     "track_against_variant": put(clean, track="perturbed"),
     "path_that_escapes": put(clean, run=".."),
     "time_backwards": swapped(clean, 2, 3, "time_s"),
@@ -349,18 +332,14 @@ LIES_OF_ROWS: dict[str, Lie] = {
     "infinite_angle": change(at(clean, 1), lambda r: r["drone_offset"].update(roll_deg=math.inf)),
     "field_of_view_against_focal_length": put(clean, fov_deg=75.0),
     "focal_lengths_exchanged": turned(clean, lambda r: r["intrinsics"].update(fy=r["intrinsics"]["fy"] * 1.1)),
-    "principal_point_moved": turned(clean, add("intrinsics", 12.0, "cx")),
     "target_pixel_moved": change(at(seen, 1), add("target_uv", 3.0, "u_px")),
     "box_moved": box_moved,
     "target_depth_against_depth": change(at(seen, 1), add("target_depth_m", 5.0)),
     "pose_of_the_next_frame": lambda rows: with_poses(clean(rows)[4:5], clean(rows)[5:6]),
     "poses_of_two_frames_exchanged": lambda rows: with_poses(clean(rows)[4:10:5], clean(rows)[9:3:-5]),
-    "pose_frozen": lambda rows: with_poses(clean(rows)[5:12], clean(rows)[5:6] * 7),
     "pose_jumps": turned(at(clean, 6), add("pose", 20.0, "x_m")),
-    "lower_than_it_was": change(clean, add("pose", -3.0, "z_m")),
     "window_into_the_future": alter(caption, caption_window=lambda w: [i + 1 for i in w]),
     "window_with_a_gap": alter(caption, caption_window=lambda w: [w[0] - 1, *w[1:]]),
-    "window_with_a_frame_twice": alter(caption, caption_window=lambda w: [w[0], *w[:-1]]),
     "decision_differs_between_languages": put(not_hovering, caption_zh_flight_decision="hover"),
     "decision_and_label_changed_together": put(
         not_hovering, **dict.fromkeys((*DECISIONS, "label"), "hover"), verdict="CONSISTENT"
@@ -380,28 +359,19 @@ LIES_OF_PIXELS: dict[str, Lie] = {
     "depth_of_neighbours_exchanged": swapped(perturbed, 4, 5, "depth"),
     "depth_of_the_twin": lambda rows: swap(shifted(rows)[0], twin_of(rows, shifted(rows)[0]), "depth"),
     "instances_of_neighbours_exchanged": swapped(perturbed, 4, 5, "instance"),
-    "instances_exchanged_with_their_boxes": swapped(perturbed, 4, 5, "instance", "target_mask_bbox"),
     "depth_doubled": change(at(seen, 2), with_depth(lambda depth, _: depth * 2)),
-    "depth_doubled_but_at_the_person": change(at(clean, 4), with_depth(farther_but_for_the_person)),
     "depth_not_a_number": change(at(clean, 3), not_a_number),
     "distance_along_the_ray": change(clean, with_depth(along_the_ray)),
-    "depth_in_centimetres": change(clean, with_depth(lambda depth, _: depth / 10)),
-    "depth_a_hundredth_farther": change(middle, with_depth(lambda depth, _: depth * 1.01)),
-    "depth_in_decimetres_called_lossless": change(clean, with_depth(lambda depth, _: np.round(depth, 1) + 0.1)),
     "depth_in_centimetres_called_lossless": change(clean, with_depth(lambda depth, _: np.round(depth, 2))),
     "depth_scaled_by_a_fiftieth": change(everything, with_depth(lambda depth, _: depth * 1.02)),
     "depth_set_off": change(everything, with_depth(lambda depth, _: depth + 0.3)),
-    "noise_in_one_depth": change(middle, with_depth(noise)),
-    "obstacle_that_is_not_there": change(middle, boxed),
     "thing_farther_in_one_frame": change(middle, one_thing_farther),
     "empty_instances": change(at(seen, 2), with_ids(lambda pixels, _: pixels.fill(0))),
     "person_painted_over": change(at(seen, 2), with_ids(without_the_person((1, 0, 0)))),
-    "person_without_an_instance_of_a_person": change(at(seen, 2), with_ids(without_the_person(3))),
     "second_person_far_away": change(middle_seen, with_ids(second_person, box=True)),
     "ids_of_things_exchanged": ids_of_things_exchanged,
     "frame_mirrored_with_its_boxes": change(middle_seen, frame_mirrored_with_its_boxes),
     "jpeg_under_a_png_name": change(at(clean, 2), with_colours(as_jpeg)),
-    "smaller_picture": change(at(clean, 2), with_colours(lambda pixels, _: png(pixels[::2, ::2]))),
 }  # fmt: skip
 # name -> the lie, and whether only pixels tell it
 LIES = {name: (lie, False) for name, lie in LIES_OF_ROWS.items()} | {

@@ -4,7 +4,6 @@ import logging
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +119,6 @@ def test_ctrl_c_is_one_line(code):
     with subprocess.Popen([sys.executable, "-c", code], **pipes) as process:
         assert process.stdout is not None
         if process.stdout.readline() == "ready\n":
-            time.sleep(0.1)
             process.send_signal(signal.SIGINT)
         _, text = process.communicate(timeout=60)
     assert process.returncode == 130

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from processes import is_running, wait_until
+from processes import children_of, is_running, wait_until
 from toy_workers import make_worker, stage_in
 
 from cosfly.runtime.errors import EnvironmentMissing
@@ -112,7 +112,7 @@ def test_workers_end_when_their_parent_is_killed(tmp_path):
 def test_a_signal_ends_a_command_and_its_workers_in_one_line(tmp_path, until, number, word):
     options: dict = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "start_new_session": True}
     process = start_program(tmp_path, until, **options)
-    time.sleep(0.2)
+    wait_until(lambda: children_of(process.pid))
     os.killpg(process.pid, number)  # what a terminal and a service manager do
     text, _ = process.communicate(timeout=60)
     assert process.returncode == 128 + number
