@@ -5,9 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from tables import each
 
 import cosfly
 from cosfly.formats.boxes import BoxMap
@@ -19,8 +19,9 @@ from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.pipeline import library
 from cosfly.planners import stage as plan_stage
 from cosfly.planners.contract import PLANNERS, PlanConfig
+from cosfly.render.contract import PERSON_ID
 from cosfly.render.settings import RenderConfig
-from cosfly.runtime.errors import ConfigError
+from cosfly.runtime.errors import ConfigError, EnvironmentMissing, InputError
 from cosfly.simplify import stage as simplify_stage
 from cosfly.simplify.passes import SimplifyConfig
 
@@ -58,6 +59,58 @@ def test_a_flight_is_the_one_of_the_stages(town, flight, tmp_path):
     assert flight.drop_reason == made.drop_reason
 
 
+def test_a_way_of_ones_own_is_flown(town):
+    walk = cosfly.plan(town, planner="muco", pedestrian=WALK, seed=4).targets_m[:, :2]
+    own = cosfly.plan(town, walk[::6], planner="muco", altitude_max_m=25)
+    assert_allclose(own.targets_m[0, :2], walk[0], atol=1e-3)
+    assert own.positions_m[:, 2].max() < 26
+    with pytest.raises(InputError, match=r"route_m: the route is invalid; got an array of shape \(3,\)"):
+        cosfly.plan(town, [1, 2, 3])
+
+
+def test_a_pose_is_drawn_and_its_depth_is_the_distance(town, flight):
+    i = len(flight.time_s) // 2
+    frames = cosfly.render_frames(
+        town, flight.positions_m[i : i + 2], target_m=flight.targets_m[i : i + 2], size_px=(320, 180)
+    )
+    assert [frame.rgb.shape for frame in frames] == [(180, 320, 3)] * 2
+    turned = cosfly.render_frames(
+        town, flight.positions_m[i], flight.rotations_deg[i], target_m=flight.targets_m[i], size_px=(320, 180)
+    )[0]
+    is_town = (turned.ids != PERSON_ID) & (frames[0].ids != PERSON_ID)  # a place alone has no stride
+    assert_allclose(turned.depth[is_town], frames[0].depth[is_town], atol=1e-4)  # the flight looks at the target too
+    distance_m = np.linalg.norm(flight.targets_m[i] - flight.positions_m[i])
+    assert abs(float(np.median(turned.depth[turned.ids == PERSON_ID])) - distance_m) < 0.5
+    empty = cosfly.render_frames(town, flight.positions_m[i], flight.rotations_deg[i], size_px=(320, 180))[0]
+    assert not (empty.ids == PERSON_ID).any()
+
+
+def test_what_is_wrong_is_said_as_on_the_command_line(town):
+    for call, error, words in (
+        (lambda: cosfly.load_map(sise_m=3), ConfigError, "sise_m: unknown setting.*'size_m'"),
+        (lambda: cosfly.load_map(source="gta"), ConfigError, "no such source of maps; got gta; expected synthetic"),
+        (lambda: cosfly.load_map(source="carla", port=1), EnvironmentMissing, r"127\.0\.0\.1:1 .*no CARLA server"),
+        (lambda: cosfly.load_map("a.json", source="synthetic"), ConfigError, "reads no file"),
+        (lambda: cosfly.load_map("nowhere.json"), InputError, r"nowhere\.json"),
+        (lambda: cosfly.load_map(**TOWN | {"seed": "x"}), ConfigError, "the seed is invalid; got 'x'"),
+        (lambda: cosfly.plan(town, "abc"), InputError, "route_m: the route is invalid"),
+        (lambda: cosfly.plan(town, [[0, 0, 0]]), InputError, "route_m: the route is invalid"),
+        (lambda: cosfly.plan(town, [[0, "a"], [1, 2]]), InputError, "route_m: the route is invalid"),
+        (lambda: cosfly.plan(town, [[0, 0], [9, 9], [9, 9]]), InputError, "route_m: the route is invalid"),
+        (lambda: cosfly.plan(town, planer="muco"), ConfigError, "plan: planer: unknown setting"),
+        (lambda: cosfly.render_frames(town, [0, 0, 9]), InputError, "the camera has no direction"),
+        (
+            lambda: cosfly.render_frames(town, [0, 9], [0, 0, 0]),
+            InputError,
+            "position_m: the array has the wrong shape",
+        ),
+        (lambda: cosfly.load_map("a", source="simworld", world="b"), ConfigError, "load_map: world: has no effect"),
+        (lambda: cosfly.plan(town, track_astar={"beam": 9}), ConfigError, "plan: track_astar: has no effect"),
+    ):
+        with pytest.raises(error, match=words):
+            call()
+
+
 VIEW = {"rotation_deg": [-30, 0, 0], "size_px": (32, 18)}
 FIXED = {"weather_mode": "fixed", "weather_name": "clear", "tod_name": "night"}
 PATH, HURRY = [[0, 0], [9, 0]], {"pace": {"hurry": 1}}
@@ -89,7 +142,7 @@ TAKING = {
 }
 
 
-@each("section", TAKING)
+@pytest.mark.parametrize("section", TAKING)
 def test_no_setting_is_ignored(town, monkeypatch, section):
     """Each setting of a section is read by the function that takes it, or refused."""
     (model, taken, calls), read, is_built = TAKING[section], set(), False
