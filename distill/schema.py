@@ -18,7 +18,8 @@ import pyarrow.parquet as pq
 
 from cosfly.formats.captions import Language, Prompt
 from cosfly.formats.frames import frame_name
-from cosfly.formats.splits import SPLITS, Split
+from cosfly.formats.predictions import Split
+from cosfly.geometry.splits import SPLITS
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_file, write_bytes
 from cosfly.runtime.json_io import FileFormat, Record, read_model, validated, write_model

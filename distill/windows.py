@@ -148,7 +148,7 @@ def facts_of(flight: Track, window: Sequence[int]) -> dict[str, np.ndarray]:
     """Return FACTS of some frames of a flight."""
     if max(window) >= len(flight):
         raise InputError("a caption of a frame that is not in its flight", where=flight.folder, got=str(max(window)))
-    at, mask = list(window), flight.target_mask_bbox
+    at, mask = list(window), flight.target.mask_bbox
     values: dict[str, Any] = {
         "pose": np.hstack([flight.positions_m[at], flight.rotations_deg[at]]),
         "intrinsics": [flight.camera_at(i).intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]] for i in at],

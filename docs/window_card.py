@@ -31,7 +31,7 @@ def crop(run_tree: Path, caption, index: int) -> str:
     image = read_rgb(flight.frame_folder(index))
     scale = image.shape[1] / 1280
     width, height = int(CROP_PX[0] * scale), int(CROP_PX[1] * scale)
-    u, v = flight.target_uv[index]
+    u, v = flight.target.uv[index]
     left = int(min(max(u - width / 2, 0), image.shape[1] - width))
     top = int(min(max(v - height / 2, 0), image.shape[0] - height))
     part = cv2.resize(

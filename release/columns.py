@@ -30,11 +30,11 @@ from cosfly.formats.frames import (
     FrameFile,
     Look,
 )
-from cosfly.formats.motion import ACTION
 from cosfly.formats.places import sample_id
 from cosfly.formats.playback import EVENTS, Track
 from cosfly.formats.weather import WeatherMode, WeatherParams
 from cosfly.geometry.axes import BODY_FROM_CAMERA
+from cosfly.geometry.motion import ACTION
 from cosfly.runtime.escaping import published_name
 from cosfly.runtime.json_io import dump_json
 
@@ -300,16 +300,16 @@ FRAME = (  # everything of a frame but pictures and depth
     ),
     Column("target", POINT, lambda f, i: f.targets_m[i]),
     Column("target_heading_deg", "float64", lambda f, i: f.target_headings_deg[i], ranges={"": (-360.0, 360.0)}),
-    Column("target_uv", ("u_px", "v_px"), lambda f, i: f.target_uv[i]),
-    Column("target_bbox", BOX, lambda f, i: f.target_bbox[i]),
+    Column("target_uv", ("u_px", "v_px"), lambda f, i: f.target.uv[i]),
+    Column("target_bbox", BOX, lambda f, i: f.target.bbox[i]),
     Column(
         "target_mask_bbox", BOX,
-        lambda f, i: np.full(4, np.nan) if f.target_mask_bbox is None else f.target_mask_bbox[i],
+        lambda f, i: np.full(4, np.nan) if f.target.mask_bbox is None else f.target.mask_bbox[i],
     ),
-    Column("target_depth_m", "float64", lambda f, i: f.target_depth_m[i]),
-    Column("target_in_view", "bool", lambda f, i: f.target_in_view[i], required=True),
-    Column("target_visible", "bool", lambda f, i: f.target_visible[i], required=True),
-    Column("visibility", "float64", lambda f, i: f.visibility[i], ranges=NONE_TO_ONE),
+    Column("target_depth_m", "float64", lambda f, i: f.target.depth_m[i]),
+    Column("target_in_view", "bool", lambda f, i: f.target.in_view[i], required=True),
+    Column("target_visible", "bool", lambda f, i: f.target.visible[i], required=True),
+    Column("visibility", "float64", lambda f, i: f.target.visibility[i], ranges=NONE_TO_ONE),
     Column(
         "target_height_px", "float64", lambda f, i: f.told_legibility(i)["height_px"], ranges={"": (0.0, 100_000.0)},
     ),
@@ -326,10 +326,14 @@ FRAME = (  # everything of a frame but pictures and depth
         "alike_differences", "int32", partial(_of_company, 4), title="things in which the most alike differs",
         shown=True,
     ),
-    Column("is_perturbed", "bool", lambda f, i: f.is_perturbed[i], required=True),
+    Column("is_perturbed", "bool", lambda f, i: f.perturbation.is_perturbed[i], required=True),
     Column("perturbation", "events", lambda f, i: f.events(i)),
-    Column("drone_offset", POSE, lambda f, i: np.concatenate([f.drone_offsets_m[i], f.rotation_offsets_deg[i]])),
-    Column("target_offset", POINT, lambda f, i: f.target_offsets_m[i]),
+    Column(
+        "drone_offset",
+        POSE,
+        lambda f, i: np.concatenate([f.perturbation.drone_m[i], f.perturbation.rotation_deg[i]]),
+    ),
+    Column("target_offset", POINT, lambda f, i: f.perturbation.target_m[i]),
     Column("action", ACTION, lambda f, i: f.motion.action[i]),
     Column("actions", "numbers", lambda f, i: f.motion.actions[i]),
     Column("waypoints", "numbers", lambda f, i: f.motion.waypoints(i)),

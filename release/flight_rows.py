@@ -11,10 +11,9 @@ import numpy as np
 
 from cosfly.formats.captions import Language
 from cosfly.formats.frames import Camera
-from cosfly.formats.goals import Goal
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
-from cosfly.formats.people import People
-from cosfly.formats.playback import EVENTS, Track
+from cosfly.formats.people import Goal, People, read_goal
+from cosfly.formats.playback import EVENTS, Perturbation, TargetRecord, Track
 from cosfly.formats.shown_captions import ShownCaption, ShownFlight
 from cosfly.geometry.axes import BODY_FROM_CAMERA, CORNER_SIGNS, rotation_matrices
 from cosfly.runtime.json_io import parse_document, validated
@@ -132,7 +131,7 @@ class FlightRows:
         """Whom to follow; its frame is that of the whole flight."""
         told = {name: self.rows[0].get(f"goal_{name}") for name in ("frame", "en", "zh", "says")}
         is_told = told["frame"] is not None
-        return Goal.from_json(told, MOST_FRAMES, self.where(0, "goal_en")) if is_told else None
+        return read_goal(told, MOST_FRAMES, self.where(0, "goal_en")) if is_told else None
 
     @property
     def is_clean(self) -> bool:
@@ -148,13 +147,16 @@ class FlightRows:
         return Track(
             town=str(first.get("town")), trajectory=str(first.get("trajectory")), variant=str(first.get("variant")),
             camera=camera, time_s=self.time_s, positions_m=self.pose[:, :3], rotations_deg=self.pose[:, 3:],
-            targets_m=self.target_m, target_in_view=self.flags("target_in_view"),
-            target_visible=self.flags("target_visible"), target_depth_m=self.numbers("target_depth_m"),
-            target_uv=self.uv, target_bbox=self.box, visibility=self.numbers("visibility"),
-            is_perturbed=self.flags("is_perturbed"), drone_offsets_m=self.drone_offset[:, :3],
-            rotation_offsets_deg=self.drone_offset[:, 3:], target_offsets_m=self.target_offset,
-            target_mask_bbox=self.mask_box if has_mask else None, is_original=self.is_clean,
-            target_legible=None if None in self.column("target_legible") else self.flags("target_legible"),
+            targets_m=self.target_m, is_original=self.is_clean,
+            target=TargetRecord(
+                in_view=self.flags("target_in_view"), visible=self.flags("target_visible"),
+                depth_m=self.numbers("target_depth_m"), uv=self.uv, bbox=self.box,
+                visibility=self.numbers("visibility"), mask_bbox=self.mask_box if has_mask else None,
+                legible=None if None in self.column("target_legible") else self.flags("target_legible"),
+            ),
+            perturbation=Perturbation(
+                self.flags("is_perturbed"), self.drone_offset[:, :3], self.drone_offset[:, 3:], self.target_offset
+            ),
             intrinsics=matrices if self.zooms else None, between=between_of(self.rows),
             people=self.people, goal=self.goal, bystanders=None if None in self.column("others_in_view")
             else np.stack([self.numbers(name) for name in COMPANY_COLUMNS], axis=1),

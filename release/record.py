@@ -9,10 +9,10 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from cosfly.formats.coverage import Coverage
 from cosfly.formats.frames import INVALID_DEPTH_M, SKY_DEPTH_M, FrameFile
 from cosfly.formats.inspection import TrajectoryFunnel
 from cosfly.formats.town import TownMap
+from cosfly.geometry.coverage import Coverage
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import FileFormat, read_model, write_model

@@ -11,7 +11,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from cosfly.formats.splits import Split, assign_splits
+from cosfly.formats.predictions import Split
+from cosfly.geometry.splits import assign_splits
 from release.columns import SplitName
 
 WINDOWS_A_RUN = 6  # a run of 6 (w - 1) frames holds 5 (w - 1) + 1 whole windows of w frames

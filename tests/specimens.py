@@ -30,7 +30,7 @@ from cosfly.formats.frames import (
 )
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
-from cosfly.formats.playback import Track, write_track
+from cosfly.formats.playback import Perturbation, TargetRecord, Track, write_track
 from cosfly.geometry.axes import DT_S, box_corners, intrinsic_matrix, look_at, project, world_from_camera
 
 PERSON_ID = 0x1234  # two different bytes, so that a swap of the channels shows
@@ -127,16 +127,15 @@ def make_flight(
         positions_m=positions,
         rotations_deg=rotations,
         targets_m=targets,
-        target_in_view=~np.isnan(bbox[:, 0]),
-        target_visible=visibility >= 0.3,
-        target_depth_m=np.array([view[2] for view in views]),
-        target_uv=np.array([view[1] for view in views]),
-        target_bbox=bbox,
-        visibility=visibility,
-        is_perturbed=is_perturbed,
-        drone_offsets_m=drone_offsets,
-        rotation_offsets_deg=rotation_offsets,
-        target_offsets_m=zero.copy(),
+        target=TargetRecord(
+            in_view=~np.isnan(bbox[:, 0]),
+            visible=visibility >= 0.3,
+            depth_m=np.array([view[2] for view in views]),
+            uv=np.array([view[1] for view in views]),
+            bbox=bbox,
+            visibility=visibility,
+        ),
+        perturbation=Perturbation(is_perturbed, drone_offsets, rotation_offsets, zero.copy()),
         source={
             "path_index": seed,
             "scenario_id": f"specimen_{seed}",
@@ -300,10 +299,10 @@ def _meta(flight: Track, i: int, num_pixels: int) -> FrameMeta:
         semantic_id=KINDS["Pedestrians"],
         image_uv=None,
         bbox_2d=None,
-        depth_m=float(flight.target_depth_m[i]),
-        in_view=bool(flight.target_in_view[i]),
-        visible=bool(flight.target_visible[i]),
-        visibility=float(flight.visibility[i]),
+        depth_m=float(flight.target.depth_m[i]),
+        in_view=bool(flight.target.in_view[i]),
+        visible=bool(flight.target.visible[i]),
+        visibility=float(flight.target.visibility[i]),
         num_pixels=num_pixels,
     )
     return FrameMeta(

@@ -16,8 +16,8 @@ from caption.teachers.prompt_files import vocabulary_of
 from caption.teachers.rules import write_templates
 from caption.truth.facts import Facts
 from caption.writing.contract import Draft, way_of
-from cosfly.formats.answer_text import Parsed
 from cosfly.formats.captions import Coc
+from cosfly.llm.answer_text import Parsed
 
 VOCABULARY = vocabulary_of(CaptionConfig())  # what ships
 WAY = way_of("slots", VOCABULARY)

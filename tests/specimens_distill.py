@@ -9,7 +9,7 @@ from typing import Any
 from cosfly.formats.captions import PICTURES_MARK, Caption, Coc, Prompt, write_captions
 from cosfly.formats.places import sample_id
 from cosfly.formats.playback import read_track
-from cosfly.formats.splits import Split
+from cosfly.formats.predictions import Split
 from cosfly.formats.tracks import find_tracks
 from cosfly.llm.student_chat import FrameLook, Taught, write_taught
 from cosfly.runtime.json_io import write_json

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from cosfly.formats.boxes import BoxMap
-from cosfly.formats.ground import Ground, GroundGrid
+from cosfly.formats.boxes import BoxMap, GroundGrid
+from cosfly.geometry.ground import Ground
 from cosfly.maps.synthetic import SyntheticConfig, load
 
 TILT = np.array([0.08, -0.05])  # rise over run to the east and to the north

@@ -19,7 +19,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import BinaryIO
 
-from cosfly.formats.actions import TOKENS
+from cosfly.formats.captions import TOKENS
 from cosfly.llm import client
 from cosfly.runtime.journal import Journal
 

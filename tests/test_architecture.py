@@ -17,6 +17,8 @@ STAGES = ("maps", "simplify", "pedestrians", "planners", "render", "inspection")
 # From the ground up: a room may import what stands before it, and itself; stages do not import each other, nor do
 # siblings.
 ROOMS = ("runtime", "axes", "formats", "geometry", "viz", "llm", "simulators", "stages", "siblings", "pipeline", "cli")
+# Geometry that knows no file, so that formats may use it.
+BELOW_FORMATS = {f"cosfly.geometry.{name}" for name in ("axes", "coverage", "ground", "motion")}
 ASSEMBLY = ("pipeline", "closed_loop", "envs", "studies", "worldgen")  # what may know all stages and siblings
 HEAVY = {
     *("torch", "transformers", "peft", "accelerate", "bert_score", "datasets"),
@@ -75,7 +77,7 @@ def room(name: str) -> str:
         return "stages"
     if first in ("", "__main__"):  # the front door: `import cosfly`, `python -m cosfly`
         return "cli"
-    return "axes" if name == "cosfly.geometry.axes" else first  # what formats and geometry share
+    return "axes" if name in BELOW_FORMATS else first
 
 
 def house(name: str) -> str:

@@ -15,11 +15,11 @@ from caption.truth.facts import measure_facts
 from caption.truth.references import find_fact, number_holds, parse_reference
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import way_of
-from cosfly.formats.answer_text import Parsed
 from cosfly.formats.captions import Coc, Prompt
-from cosfly.formats.goals import Goal
+from cosfly.formats.people import Goal
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
+from cosfly.llm.answer_text import Parsed
 from specimens import make_playback_tree
 
 GOAL = Goal(0, "the woman in the red jacket", "穿红色夹克的女子", ("figure", "top"))

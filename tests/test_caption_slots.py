@@ -26,8 +26,8 @@ from caption.writing.contract import Draft, Refused
 from caption.writing.filling import Filler
 from caption.writing.slots import fact_table
 from caption.writing.templates import Sentence, read_sentence
-from cosfly.formats.answer_text import Parsed
 from cosfly.formats.captions import Coc, Language, read_captions
+from cosfly.llm.answer_text import Parsed
 from cosfly.runtime.errors import NothingKept
 from specimens import make_flight
 

@@ -17,8 +17,7 @@ from caption.schema import WindowConfig
 from caption.truth.facts import Facts, measure_facts
 from caption.truth.mirror import check_mirror, flight_numbers
 from caption.writing.prose import judge_prose
-from cosfly.formats.actions import ACTIONS, TOKENS
-from cosfly.formats.captions import Coc
+from cosfly.formats.captions import ACTIONS, TOKENS, Coc
 from specimens import make_flight
 
 # tab:coc_sample_en and tab:coc_sample_zh, trajectory_1776047127_ORI_frame_00004.

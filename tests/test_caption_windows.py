@@ -30,7 +30,7 @@ from caption.teachers.prompts import make_question, question_messages
 from caption.truth.actions import TABLE, measure
 from caption.truth.facts import measure_facts
 from cosfly.formats.boxes import MapHeader, make_box_map
-from cosfly.formats.playback import Track, read_track, write_track
+from cosfly.formats.playback import Perturbation, Track, read_track, write_track
 from cosfly.formats.segments import Mission
 from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, perturb
@@ -74,24 +74,17 @@ def spoil_future(root, current: int) -> None:
     flight = read_track(folder, strict=False)
     rng = np.random.default_rng(1)
     later = np.arange(len(flight)) > current
-    columns = {}
-    for name in (
-        "positions_m",
-        "rotations_deg",
-        "targets_m",
-        "target_uv",
-        "target_bbox",
-        "target_depth_m",
-        "visibility",
-    ):
-        values = getattr(flight, name).copy()
-        values[later] = rng.uniform(5.0, 30.0, values[later].shape)
-        columns[name] = values
-    for name in ("target_in_view", "target_visible"):
-        values = getattr(flight, name).copy()
-        values[later] = ~values[later]
-        columns[name] = values
-    write_track(folder, dataclasses.replace(flight, **columns))
+
+    def spoiled(record, *names):
+        columns = {name: getattr(record, name).copy() for name in names}
+        for values in columns.values():
+            is_flag = values.dtype == bool
+            values[later] = ~values[later] if is_flag else rng.uniform(5.0, 30.0, values[later].shape)
+        return dataclasses.replace(record, **columns)
+
+    target = spoiled(flight.target, "uv", "bbox", "depth_m", "visibility", "in_view", "visible")
+    flight = dataclasses.replace(flight, target=target)
+    write_track(folder, spoiled(flight, "positions_m", "rotations_deg", "targets_m"))
     for i in np.flatnonzero(later):
         frame = flight.frame_folder(int(i))
         h, w = flight.camera.height_px, flight.camera.width_px
@@ -218,9 +211,11 @@ def two_tracks(tmp_path_factory):
     hidden[60:66] = True
     perturbed = dataclasses.replace(
         clean, variant="aug_001", is_original=False, positions_m=shaken.poses.positions_m,
-        rotations_deg=shaken.poses.rotations_deg, targets_m=shaken.poses.targets_m, is_perturbed=shaken.is_perturbed,
-        drone_offsets_m=shaken.drone_offsets_m, rotation_offsets_deg=shaken.rotation_offsets_deg,
-        target_offsets_m=shaken.target_offsets_m, target_visible=clean.target_visible & ~hidden,
+        rotations_deg=shaken.poses.rotations_deg, targets_m=shaken.poses.targets_m,
+        perturbation=Perturbation(
+            shaken.is_perturbed, shaken.drone_offsets_m, shaken.rotation_offsets_deg, shaken.target_offsets_m
+        ),
+        target=dataclasses.replace(clean.target, visible=clean.target.visible & ~hidden),
     )  # fmt: skip
     root = tmp_path_factory.mktemp("two")
     for flight in (clean, perturbed):

@@ -14,7 +14,7 @@ from cosfly.closed_loop.pilots import PilotAnswer
 from cosfly.closed_loop.settings import CONTROLLER_FILE, Drone
 from cosfly.closed_loop.stage import OpenFlight
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory
-from cosfly.formats.actions import TOKENS
+from cosfly.formats.captions import TOKENS
 from cosfly.planners.contract import PlanConfig
 from cosfly.planners.stage import plan_trajectory
 from cosfly.render.settings import RenderConfig

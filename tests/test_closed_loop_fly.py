@@ -87,7 +87,7 @@ def test_what_is_flown_is_inspected_captioned_and_released_as_any_other_flight(t
         assert flight.source["algorithm"].startswith("flown by rules")
         pursuit = flown[flight.source["scenario_id"]]
         assert np.allclose(flight.positions_m, [frame.pose[:3] for frame in pursuit.frames], atol=1e-3)
-        assert list(flight.target_visible) == [frame.visible for frame in pursuit.frames]
+        assert list(flight.target.visible) == [frame.visible for frame in pursuit.frames]
         decided |= {f"{flight.flight_id}_frame_{i:05d}": frame.action for i, frame in enumerate(pursuit.frames)}
     asked = [caption for caption in captions if decided[caption.sample_id] is not None and caption.repair is None]
     assert asked

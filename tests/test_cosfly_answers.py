@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosfly.formats.answer_text import normalize_action, parse_answer
 from cosfly.formats.captions import Coc
+from cosfly.llm.answer_text import normalize_action, parse_answer
 from cosfly.llm.contract import Reply
 from cosfly.llm.protocol import error_words, read_body, read_completion, read_models
 from cosfly.llm.wire import Response

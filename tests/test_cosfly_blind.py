@@ -19,8 +19,9 @@ def flight_of(walked_m, **changes):
     """A flight 20 m behind and 10 m above a walker at places (n, 2)."""
     flight, _ = make_flight(len(walked_m))
     targets = np.column_stack([walked_m, np.full(len(walked_m), 0.9)])
-    still = {"target_offsets_m": np.zeros_like(targets), "is_original": True}
-    return replace(flight, targets_m=targets, positions_m=targets + np.array([-20.0, 3.0, 10.0]), **still, **changes)
+    still = replace(flight.perturbation, target_m=np.zeros_like(targets))
+    positions = targets + np.array([-20.0, 3.0, 10.0])
+    return replace(flight, targets_m=targets, positions_m=positions, perturbation=still, is_original=True, **changes)
 
 
 def straight(steps_m):

@@ -9,9 +9,8 @@ from pydantic import ValidationError
 from specimens_distill import make_caption
 from tables import each
 
-from cosfly.formats.actions import TOKENS
-from cosfly.formats.answer_text import answer_schema, normalize_action, parse_answer
-from cosfly.formats.captions import Caption, Coc, read_captions, write_captions
+from cosfly.formats.captions import TOKENS, Caption, Coc, read_captions, write_captions
+from cosfly.llm.answer_text import answer_schema, normalize_action, parse_answer
 from cosfly.runtime.errors import InputError
 
 GOOD = {

@@ -7,9 +7,10 @@ import itertools
 import numpy as np
 import pytest
 
-from cosfly.formats.coverage import AXES, Coverage, azimuths_deg, coverage_of
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
+from cosfly.geometry.coverage import AXES, Coverage, azimuths_deg
+from cosfly.inspection.track import coverage_of
 from cosfly.viz.coverage_page import coverage_html, ranges, shares
 from specimens import make_playback_tree
 

@@ -120,7 +120,7 @@ def test_clean_flights_are_accepted(workplace):
     }  # fmt: skip
     metrics = found.flights[0].metrics
     flight = read_track(first_flight(workplace))
-    assert metrics["rendered_visibility_mean"] == pytest.approx(flight.visibility.mean(), abs=1e-4)
+    assert metrics["rendered_visibility_mean"] == pytest.approx(flight.target.visibility.mean(), abs=1e-4)
     assert metrics["num_frames_checked"] == NUM_POINTS
     assert 0.5 < metrics["track_quality"] <= 1.0  # the specimen's person fills its box
 

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from cosfly.formats.motion import PlannedMotion
 from cosfly.formats.segments import Mission, Segment
 from cosfly.formats.traces import DroneTrace
 from cosfly.geometry.axes import rotation_matrices
+from cosfly.geometry.motion import PlannedMotion
 from specimens import make_playback_tree
 
 

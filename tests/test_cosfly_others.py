@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from cosfly.formats.boxes import BoxMap, MapHeader, make_box_map, write_boxes
-from cosfly.formats.bystanders import Bystander, Bystanders, gaps_m, read_bystanders, write_bystanders
+from cosfly.formats.bystanders import Bystander, Bystanders, read_bystanders, write_bystanders
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import read_paths
-from cosfly.pedestrians.bystanders import bystanders_of
+from cosfly.pedestrians.bystanders import bystanders_of, gaps_m
 from cosfly.pedestrians.lanes import lanes_of
 from cosfly.pedestrians.stage import PedestriansConfig, make_pedestrian, run, walkable_ground
 from cosfly.runtime.errors import InputError

@@ -7,12 +7,12 @@ import pytest
 from tables import each
 
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
-from cosfly.formats.ground import Ground
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import read_paths
 from cosfly.formats.roi import Roi
 from cosfly.geometry.axes import DT_S
 from cosfly.geometry.grid import OccupancyGrid
+from cosfly.geometry.ground import Ground
 from cosfly.pedestrians.crossings import costs_of
 from cosfly.pedestrians.stage import (
     PedestriansConfig,

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -49,14 +50,14 @@ def test_poses_and_pictures_agree(tree):
     seen = 0
     for folder in find_tracks(tree):
         flight = read_track(folder)
-        for i in np.flatnonzero(flight.target_visible):
+        for i in np.flatnonzero(flight.target.visible):
             uv, z = project(
                 flight.targets_m[i][None],
                 world_from_camera(flight.positions_m[i], flight.rotations_deg[i]),
                 flight.camera.intrinsic,
             )
-            assert_allclose(uv[0], flight.target_uv[i], atol=1e-6)
-            assert_allclose(z[0], flight.target_depth_m[i], atol=1e-6)
+            assert_allclose(uv[0], flight.target.uv[i], atol=1e-6)
+            assert_allclose(z[0], flight.target.depth_m[i], atol=1e-6)
             kinds, ids = read_instance(flight.frame_folder(i))
             rows, columns = np.nonzero(ids == PERSON_ID)
             assert set(kinds[rows, columns].tolist()) == {12}
@@ -79,18 +80,23 @@ def test_round_trip_keeps_unknown_keys_and_numbers(clean, tmp_path):
     folder = rewrite(clean, tmp_path / "a", change)
     first = json.loads((folder / "trajectory.json").read_text())
     flight = read_track(folder)
-    assert flight.target_bbox[2].tolist() == flight.target_mask_bbox[2].tolist() == [1, 2, 3, 4]
-    assert np.isnan(np.delete(flight.target_mask_bbox, 2, axis=0)).all()
-    assert read_track(clean).target_mask_bbox is None
+    assert flight.target.bbox[2].tolist() == flight.target.mask_bbox[2].tolist() == [1, 2, 3, 4]
+    assert np.isnan(np.delete(flight.target.mask_bbox, 2, axis=0)).all()
+    assert read_track(clean).target.mask_bbox is None
     target = tmp_path / "b" / "Town01" / folder.parent.name / folder.name
     target.mkdir(parents=True)
     write_track(target, flight)
     assert json.loads((target / "trajectory.json").read_text()) == first
     again = read_track(target)
-    columns = [name for name, value in vars(flight).items() if isinstance(value, np.ndarray)]
-    assert len(columns) == 15
-    for name in columns:
-        assert_array_equal(getattr(again, name), getattr(flight, name))
+    pairs = [
+        (getattr(old, column.name), getattr(new, column.name))
+        for old, new in ((flight, again), (flight.target, again.target), (flight.perturbation, again.perturbation))
+        for column in fields(old)
+        if isinstance(getattr(old, column.name), np.ndarray)
+    ]
+    assert len(pairs) == 15
+    for before, after in pairs:
+        assert_array_equal(after, before)
 
 
 def test_strict_raises_and_tolerant_notes(clean, tmp_path):

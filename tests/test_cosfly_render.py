@@ -18,7 +18,6 @@ from cosfly.formats.bystanders import Bystander
 from cosfly.formats.frames import Camera, Look, frame_name, read_depth, read_instance, read_meta, read_rgb
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
-from cosfly.formats.people import draw_appearance
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import focal_px, intrinsic_matrix, look_at
@@ -36,7 +35,7 @@ from cosfly.render.contract import (
 )
 from cosfly.render.gl import meshes as unit_meshes
 from cosfly.render.gl.figure import make_body
-from cosfly.render.person import cast_of, choose_clothes
+from cosfly.render.person import cast_of, choose_clothes, draw_appearance
 from cosfly.render.perturbation import PerturbationConfig, Poses, Surroundings, in_frame, perturb
 from cosfly.render.settings import RenderConfig
 from cosfly.render.stage import make_track_script, open_renderer, run
@@ -341,21 +340,21 @@ def test_frames_hold_what_their_annotation_says(finished):
             assert depth.shape == kinds.shape == (90, 160)
             assert (meta.index, meta.variant) == (i, folder.name)
             assert meta.target.num_pixels == int((ids == PERSON_ID).sum()) > 0
-            assert meta.target.visible == bool(flight.target_visible[i])
-            assert meta.target.visibility == pytest.approx(flight.visibility[i], abs=1e-6)
+            assert meta.target.visible == bool(flight.target.visible[i])
+            assert meta.target.visibility == pytest.approx(flight.target.visibility[i], abs=1e-6)
             assert meta.drone_pose.y == pytest.approx(-flight.positions_m[i, 1]), "the tree's axes are CARLA's"
             assert meta.look == Look(), "sun and air of the picture"
             assert meta.camera.intrinsic == flight.camera.intrinsic.tolist()
-            u, v = flight.target_uv[i]
-            x0, y0, x1, y1 = flight.target_bbox[i]
+            u, v = flight.target.uv[i]
+            x0, y0, x1, y1 = flight.target.bbox[i]
             assert x0 <= u <= x1
             assert y0 <= v <= y1
             rows, columns = np.nonzero(ids == PERSON_ID)
             assert columns.min() >= x0 - 2
             assert columns.max() <= x1 + 2
             seen = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
-            assert flight.target_mask_bbox[i].tolist() == meta.target.mask_bbox_2d == seen
-            assert np.abs(np.median(depth[ids == PERSON_ID]) - flight.target_depth_m[i]) < 0.5
+            assert flight.target.mask_bbox[i].tolist() == meta.target.mask_bbox_2d == seen
+            assert np.abs(np.median(depth[ids == PERSON_ID]) - flight.target.depth_m[i]) < 0.5
 
 
 class Curtain:
@@ -387,7 +386,7 @@ def test_a_shift_that_hides_a_seen_target_falls_back(tmp_path):
     curtain = Curtain(x_m=float(trace.targets_m[30, 0]))
     flight = render_track(curtain, script, tmp_path, Writing(("rgb",), 0.1))
     is_seen = trace.targets_m[:, 0] <= curtain.x_m
-    np.testing.assert_array_equal(flight.target_visible | ~is_seen, True)
+    np.testing.assert_array_equal(flight.target.visible | ~is_seen, True)
     states = [point["perturbation"] for point in flight.raw["points"]]
     fell_back = [i for i in range(60) if states[i]["position"] == "fallback: target hidden"]
     assert fell_back, "the curtain hid nobody"
@@ -398,7 +397,7 @@ def test_a_shift_that_hides_a_seen_target_falls_back(tmp_path):
         np.testing.assert_array_equal(flight.targets_m[i], trace.targets_m[i])
         np.testing.assert_array_equal(flight.positions_m[i], trace.positions_m[i])
         np.testing.assert_array_equal(flight.rotations_deg[i], without.poses.rotations_deg[i])
-        assert not flight.drone_offsets_m[i].any()
+        assert not flight.perturbation.drone_m[i].any()
         assert read_meta(tmp_path / frame_name(i)).perturbation.position == "fallback: target hidden"
     assert any(states[i]["position"] == "applied" for i in range(60) if not is_seen[i])
     assert curtain.num_drawn - 60 >= len(fell_back)

@@ -11,12 +11,12 @@ from test_renderers_contract import circling, pose_towards, write_inputs
 from cosfly.formats.boxes import make_box_map
 from cosfly.formats.bystanders import Bystander, Bystanders, write_bystanders
 from cosfly.formats.frames import PERSON_ID, read_depth, read_instance, read_rgb
-from cosfly.formats.goals import LANDMARKS, SIDES, SeenFrame, meant, target_picture, words_of
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.people import Appearance, People
 from cosfly.formats.playback import TARGET_FILE, read_track
 from cosfly.formats.tracks import find_tracks
 from cosfly.geometry.axes import intrinsic_matrix, world_from_camera
+from cosfly.geometry.goals import LANDMARKS, SIDES, SeenFrame, meant, target_picture, words_of
 from cosfly.render.contract import Frame, PosedBystander, PosedPerson, other_id
 from cosfly.render.person import choose_clothes
 from cosfly.render.settings import RenderConfig
@@ -91,7 +91,7 @@ def test_of_all_in_a_crowd_a_goal_means_the_target_alone(crowded_tree):
         assert {"en": goal.en, "zh": goal.zh} == words_of(goal.says, people.target)
         assert all(not flight.told_legibility(i)["legible"] for i in range(goal.frame)) or goal.frame == 0
         shown = read_picture(flight.folder / TARGET_FILE, tree=tree)
-        expected = target_picture(read_rgb(frame), flight.target_mask_bbox[goal.frame].tolist())
+        expected = target_picture(read_rgb(frame), flight.target.mask_bbox[goal.frame].tolist())
         np.testing.assert_array_equal(cv2.cvtColor(shown, cv2.COLOR_BGR2RGB), expected)
 
 

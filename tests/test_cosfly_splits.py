@@ -1,4 +1,4 @@
-"""cosfly/formats/splits.py: what one walk is, and splits that share none."""
+"""cosfly/geometry/splits.py: what one walk is, and splits that share none."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cosfly.formats.playback import Track, read_track, write_track
-from cosfly.formats.splits import SPLITS, Course, assign_splits, walks_of
+from cosfly.geometry.splits import SPLITS, Course, assign_splits, walks_of
 from cosfly.runtime.errors import InputError
 from specimens import make_flight
 
@@ -48,7 +48,8 @@ def test_perturbed_twins_are_one_walk_once_they_are_read_again(tmp_path):
     clean, _ = make_flight(40, seed=3)
     noisy, _ = make_flight(40, seed=3, variant="aug_001")
     offsets_m = np.random.default_rng(0).uniform(-1.5, 1.5, (40, 3))
-    shifted = replace(noisy, targets_m=noisy.targets_m + offsets_m, target_offsets_m=offsets_m)
+    perturbation = replace(noisy.perturbation, target_m=offsets_m)
+    shifted = replace(noisy, targets_m=noisy.targets_m + offsets_m, perturbation=perturbation)
     for flight in (clean, shifted):
         write_track(tmp_path / "Town01" / flight.trajectory / flight.variant, flight)
     read = [read_track(tmp_path / "Town01" / clean.trajectory / variant) for variant in ("ORI", "aug_001")]

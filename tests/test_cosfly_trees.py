@@ -220,8 +220,8 @@ def in_public_form(value: dict) -> dict:
 def test_nobody_is_no_target(foreign):
     flight = read_track(find_tracks(foreign)[0])
     assert np.isnan(flight.targets_m[NOBODY]).all()
-    assert not flight.target_visible[NOBODY]
-    assert flight.target_visible.sum() == len(flight) - 1
+    assert not flight.target.visible[NOBODY]
+    assert flight.target.visible.sum() == len(flight) - 1
     assert flight.time_s[0] == 7.5
 
 

@@ -16,11 +16,10 @@ from pydantic import ValidationError
 from specimens_distill import make_caption, make_captions, prepared
 from specimens_foreign import write_foreign_tree
 
-from cosfly.formats.actions import TOKENS
-from cosfly.formats.captions import write_captions
+from cosfly.formats.captions import TOKENS, write_captions
 from cosfly.formats.playback import read_track
-from cosfly.formats.splits import SPLITS
 from cosfly.geometry.blind import past_of
+from cosfly.geometry.splits import SPLITS
 from cosfly.runtime.errors import VerifyError
 from distill.prepare import stage
 from distill.prepare.sources import RunSource

@@ -11,7 +11,7 @@ import pytest
 from tables import each
 
 from cosfly.formats.playback import read_track
-from cosfly.formats.splits import SPLITS
+from cosfly.geometry.splits import SPLITS
 from cosfly.runtime.run_dir import read_failures, read_manifest
 from distill.prepare import dual_track
 from distill.prepare.dual_track import DualTrackConfig, TrackSample, read_track_samples, windows_of
@@ -72,7 +72,9 @@ def test_a_window_holds_both_tracks_frame_by_frame(tree, dataset):
         np.testing.assert_array_equal(sample.future_target_m, clean.targets_m[after])
         # What was added is what the flight's record says was added.
         np.testing.assert_allclose(
-            np.subtract(sample.observed_position_m, sample.clean_position_m), noisy.drone_offsets_m[seen], atol=1e-9
+            np.subtract(sample.observed_position_m, sample.clean_position_m),
+            noisy.perturbation.drone_m[seen],
+            atol=1e-9,
         )
 
 

@@ -26,9 +26,9 @@ from caption.run.stage import run
 from caption.schema import CaptionConfig
 from caption.teachers import teacher
 from caption.teachers.teacher import make_engine
-from cosfly.formats.answer_text import answer_schema, parse_answer
 from cosfly.formats.captions import Usage, read_captions
 from cosfly.formats.predictions import read_predictions
+from cosfly.llm.answer_text import answer_schema, parse_answer
 from cosfly.llm.answers import AnswerBook, KeptAnswers
 from cosfly.llm.client import ChatClient, EndpointConfig
 from cosfly.llm.contract import NoAnswer, Reply, Request, started

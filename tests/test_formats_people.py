@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from tables import each
 
-from cosfly.formats.people import COLORS, HAIR, Appearance, People, draw_appearance, look_alike
+from cosfly.formats.people import COLORS, HAIR, Appearance, People
+from cosfly.render.person import draw_appearance, look_alike
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import validated
 

@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 import pytest
 from specimens_release import build, make_inputs
 
-from cosfly.formats.answer_text import parse_answer
 from cosfly.formats.boxes import MapHeader, make_box_map, read_boxes, write_boxes
 from cosfly.formats.captions import read_captions
 from cosfly.formats.frames import DEPTH_PNG, read_depth, read_instance, read_meta, read_rgb
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.playback import read_track
 from cosfly.formats.roi import read_roi
+from cosfly.llm.answer_text import parse_answer
 from cosfly.maps import boxfile, cityjson, simworld
 from cosfly.runtime.errors import CosflyError
 from cosfly.runtime.io import CHECKSUMS, read_checksums

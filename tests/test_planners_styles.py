@@ -12,7 +12,7 @@ from tables import each
 from caption.schema import FutureMotion
 from caption.truth.actions import TABLE as ACTION_TABLE
 from caption.truth.actions import measure
-from cosfly.formats.actions import TOKENS
+from cosfly.formats.captions import TOKENS
 from cosfly.formats.frames import LEGIBLE_HEIGHT_PX, Camera
 from cosfly.formats.pedestrian_paths import paces_of, walk_id
 from cosfly.formats.traces import DroneTrace

@@ -11,10 +11,10 @@ from test_cosfly_render import needs_gl
 from test_cosfly_render_goal import crowded_tree  # noqa: F401
 
 from cosfly.formats.frames import FILE_NAMES, PERSON_ID, frame_path
-from cosfly.formats.goals import SLOTS, words_of
 from cosfly.formats.people import People
 from cosfly.formats.playback import read_track
 from cosfly.formats.tracks import find_tracks
+from cosfly.geometry.goals import SLOTS, words_of
 from release.columns import SCALARS, Placement
 from release.flight_rows import FlightRows, Row
 from release.verify.findings import Findings

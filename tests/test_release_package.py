@@ -76,7 +76,7 @@ def test_load_dataset_gives_pictures_poses_and_both_languages(loaded, release_in
         assert [row["pose"][k] for k in ("pitch_deg", "yaw_deg", "roll_deg")] == flight.rotations_deg[i].tolist()
         assert [row["target"][k] for k in ("x_m", "y_m", "z_m")] == flight.targets_m[i].tolist()
         assert row["time_s"] == flight.time_s[i]
-        assert row["is_perturbed"] == flight.is_perturbed[i]
+        assert row["is_perturbed"] == flight.perturbation.is_perturbed[i]
         assert row["perturbation"] == flight.events(i)
         assert row["track"] == ("clean" if row["variant"] == "ORI" else "perturbed")
     captioned = loaded.filter(lambda row: row["has_caption"])

@@ -47,7 +47,7 @@ def test_legibility_is_of_the_picture_as_written(tmp_path):
         found[name] = flight.told_legibility(1)
         told = read_meta(folder / frame_name(1)).target
         assert found[name] == told.model_dump(include=set(found[name]))
-        assert flight.target_visible.all()
+        assert flight.target.visible.all()
     assert found["plain"]["legible"] is True
     assert found["fog"]["legible"] is False
     assert float(found["fog"]["contrast"]) < LEGIBLE_CONTRAST

@@ -9,8 +9,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from cosfly.formats.actions import TOKENS
-from cosfly.formats.captions import Caption, TeacherRecord, Usage
+from cosfly.formats.captions import TOKENS, Caption, TeacherRecord, Usage
 from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.run_dir import Tally
 

@@ -14,7 +14,7 @@ from caption.run.windows import LabelMotion, cut_future, label_motion
 from caption.schema import FutureMotion
 from caption.teachers.prompts import mission_lines
 from caption.truth.actions import TABLE, ActionTable, Motion, Thresholds, measure
-from cosfly.formats.actions import ORDERS
+from cosfly.formats.captions import ORDERS
 from cosfly.formats.shown_captions import Lie, ShownCaption, ShownFlight
 
 NUDGE = 1e-9  # of a threshold: rounding error of subtracting the offsets again

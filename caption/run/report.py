@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from caption.run.ledger import CaptionReport
-from cosfly.formats.actions import TOKENS
-from cosfly.formats.captions import Caption, Language
+from cosfly.formats.captions import TOKENS, Caption, Language
 from cosfly.formats.frames import frame_name
 from cosfly.formats.places import flight_of
-from cosfly.formats.sentences import sentences_of
+from cosfly.llm.answer_text import sentences_of
 from cosfly.llm.budget import BudgetConfig
 from cosfly.runtime.io import read_text, write_bytes
 from cosfly.viz.frame_views import thumbnail

@@ -22,9 +22,8 @@ from caption.truth.mirror import check_translation
 from caption.truth.references import measured_series
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft, Refused, refuse_decision
-from cosfly.formats.actions import ACTIONS
-from cosfly.formats.answer_text import Parsed, parse_answer
 from cosfly.formats.captions import (
+    ACTIONS,
     Caption,
     Checks,
     Coc,
@@ -34,6 +33,7 @@ from cosfly.formats.captions import (
     Usage,
     Verdict,
 )
+from cosfly.llm.answer_text import Parsed, parse_answer
 from cosfly.llm.contract import NoAnswer, Reply
 from cosfly.runtime.errors import InputError, RenderError
 from cosfly.runtime.json_io import dump_json

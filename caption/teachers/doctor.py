@@ -27,7 +27,7 @@ from caption.teachers.prompts import (
 )
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import more_fields, way_of
-from cosfly.formats.answer_text import answer_schema
+from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import Reply
 from cosfly.llm.protocol import read_body, request_body, response_format, thoughts_of

@@ -16,8 +16,7 @@ from caption.truth.facts import Facts, measure_facts
 from caption.truth.glossary import load_glossary
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft, WayOfWriting, way_of
-from cosfly.formats.actions import ACTIONS, TOKENS
-from cosfly.formats.captions import GOAL_WORDS, PICTURES_MARK, Language, Prompt, Writing
+from cosfly.formats.captions import ACTIONS, GOAL_WORDS, PICTURES_MARK, TOKENS, Language, Prompt, Writing
 from cosfly.formats.segments import MISSION_KINDS
 from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import dump_json

@@ -20,8 +20,8 @@ from caption.teachers.images import EncodedImage
 from caption.teachers.prompts import Question, decision_words, system_prompt
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft
-from cosfly.formats.answer_text import answer_schema
 from cosfly.formats.captions import Language, Prompt
+from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.client import EndpointConfig
 from cosfly.llm.contract import Request
 from cosfly.llm.student_chat import (

@@ -28,9 +28,9 @@ from caption.teachers.rules import MODEL, write_templates
 from caption.teachers.students import TaughtStudent
 from caption.truth.vocabulary import Vocabulary
 from caption.writing.contract import Draft, more_fields, way_of
-from cosfly.formats.answer_text import answer_schema
 from cosfly.formats.captions import TeacherRecord, TeacherSettings, Writing
 from cosfly.formats.places import flight_of
+from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.answers import AnswerBook, KeptAnswers
 from cosfly.llm.budget import BYTES_PER_TOKEN, PIXELS_PER_TOKEN, Budget
 from cosfly.llm.client import ChatClient

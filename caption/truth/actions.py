@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from caption.schema import FutureMotion
-from cosfly.formats.actions import TOKENS
-from cosfly.formats.captions import Verdict
+from cosfly.formats.captions import TOKENS, Verdict
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,8 @@ from caption.truth.references import (
 from caption.truth.said import SCENE
 from caption.truth.sizes import BOUND_SHARE, RATIO_SLACK, about_share, numeral_of, written_digits
 from caption.truth.stated import read_stated
-from cosfly.formats.answer_text import normalize_action
 from cosfly.formats.captions import Claim, Language, SentenceState
+from cosfly.llm.answer_text import normalize_action
 
 TOLERANCES = {"m": 0.3, "mps": 0.15, "px": 3.0}  # of a number that a sentence calls approximate
 

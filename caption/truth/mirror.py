@@ -15,9 +15,8 @@ from caption.truth.glossary import load_glossary
 from caption.truth.numerals import Numeral, read_numerals
 from caption.truth.references import Series
 from caption.truth.vocabulary import terms_in
-from cosfly.formats.answer_text import is_in_script
 from cosfly.formats.captions import Coc, Language
-from cosfly.formats.sentences import cut_sentences
+from cosfly.llm.answer_text import cut_sentences, is_in_script
 
 TEXTS = ("critical_components", "reasoning_trace")
 

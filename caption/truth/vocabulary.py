@@ -9,7 +9,23 @@ from functools import cache, cached_property
 from string import Template
 
 from caption.truth.glossary import load_glossary, term_pattern
-from cosfly.formats.actions import ACTIONS, TERMS
+from cosfly.formats.captions import ACTIONS
+
+# Terms that a translation must have besides the names of the actions: English -> Chinese.
+TERMS = {
+    "target": "目标",
+    "pedestrian": "行人",
+    "drone": "无人机",
+    "bounding box": "边界框",
+    "image centre": "画面中心",
+    "horizontal distance": "水平距离",
+    "altitude": "高度",
+    "yaw": "偏航",
+    "speed": "速度",
+    "current frame": "当前帧",
+    "obstacle": "障碍物",
+    "stable": "稳定",
+}
 
 
 @dataclass(frozen=True, eq=False)

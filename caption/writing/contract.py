@@ -14,9 +14,8 @@ from typing import Any, Protocol
 from caption.schema import Judged
 from caption.truth.facts import Facts
 from caption.truth.vocabulary import Vocabulary
-from cosfly.formats.actions import TOKENS
-from cosfly.formats.answer_text import Parsed
-from cosfly.formats.captions import Coc, Language, Template, Writing
+from cosfly.formats.captions import TOKENS, Coc, Language, Template, Writing
+from cosfly.llm.answer_text import Parsed
 
 WAYS: dict[Writing, str] = {
     "slots": "caption.writing.slots:Slots",

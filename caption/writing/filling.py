@@ -9,8 +9,7 @@ from caption.truth.facts import Facts
 from caption.truth.references import QUANTITIES, Fact, Missing, Reference, find_fact, look_up, span_of
 from caption.writing.contract import DECISION_REASON, Refused
 from caption.writing.templates import NEITHER, TURNS, Sentence, Slot, read_sentence, units_behind, words_of
-from cosfly.formats.actions import ACTIONS
-from cosfly.formats.captions import Language
+from cosfly.formats.captions import ACTIONS, Language
 
 _DIRECTIONS = {
     "increasing": 1, "decreasing": -1, "left": 1, "right": -1, "above": -1, "below": 1, "faster": 1, "slower": -1,

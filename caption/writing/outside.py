@@ -12,8 +12,7 @@ from functools import lru_cache
 from caption.truth.glossary import load_glossary
 from caption.truth.numerals import read_numerals
 from caption.writing.contract import Refused
-from cosfly.formats.actions import ACTIONS
-from cosfly.formats.captions import Language
+from cosfly.formats.captions import ACTIONS, Language
 
 SLOT_MARK = "¤"
 

@@ -14,9 +14,8 @@ from caption.truth.mirror import check_mirror, flight_numbers
 from caption.truth.numerals import Numeral
 from caption.truth.stated import Pole, Stated, read_stated, subject_before
 from caption.writing.contract import Draft, Refused, WayOfWriting
-from cosfly.formats.answer_text import Parsed
 from cosfly.formats.captions import Coc, Language, Writing
-from cosfly.formats.sentences import sentences_of
+from cosfly.llm.answer_text import Parsed, sentences_of
 
 LONGEST = 500  # characters of a sentence that is read; a model that repeats itself ends none
 SHOWN = 120  # characters of a sentence in a problem

@@ -26,9 +26,8 @@ from caption.writing.earned import is_earned
 from caption.writing.filling import Filler, facts_of
 from caption.writing.outside import SLOT_MARK
 from caption.writing.templates import Sentence, read_sentence
-from cosfly.formats.answer_text import Parsed
 from cosfly.formats.captions import Claim, Coc, Language, Modality, SentenceState, Template, Writing
-from cosfly.formats.sentences import cut_sentences
+from cosfly.llm.answer_text import Parsed, cut_sentences
 
 MAX_CLAIMS = 60
 MAX_TEXT = 48  # characters of a claim's texts

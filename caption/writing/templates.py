@@ -24,9 +24,8 @@ from caption.truth.vocabulary import terms_in
 from caption.writing.contract import Refused
 from caption.writing.earned import is_earned
 from caption.writing.outside import SLOT_MARK, check_outside, decisions_named, decisions_opposed, states_beside
-from cosfly.formats.actions import ACTIONS
-from cosfly.formats.answer_text import is_in_script
-from cosfly.formats.captions import Language, SentenceState
+from cosfly.formats.captions import ACTIONS, Language, SentenceState
+from cosfly.llm.answer_text import is_in_script
 from cosfly.runtime.errors import nearest
 
 _BRACES = re.compile(r"\{([^{}]*)\}")

@@ -15,9 +15,9 @@ from pydantic import Field
 
 from cosfly.closed_loop.settings import Drone
 from cosfly.closed_loop.stepper import Moment
-from cosfly.formats.motion import in_axes_of
 from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.geometry.axes import look_at, wrap_deg
+from cosfly.geometry.motion import in_axes_of
 from cosfly.runtime.config import Config, build, read_yaml
 from cosfly.runtime.errors import ConfigError
 from cosfly.runtime.json_io import FileFormat

@@ -22,8 +22,7 @@ from cosfly.closed_loop.measures import (
     walk_sums,
 )
 from cosfly.closed_loop.settings import FLOORS
-from cosfly.formats.figures import Figure
-from cosfly.formats.flight_scores import Score, read_score
+from cosfly.formats.flight_scores import Figure, Score, read_score
 from cosfly.formats.playback import read_track
 from cosfly.formats.pursuits import Pursuit, pursuit_file, read_pursuit
 from cosfly.formats.tracks import find_tracks

@@ -15,10 +15,9 @@ from itertools import groupby, pairwise
 
 import numpy as np
 
-from cosfly.formats.figures import Figure, draw_pedestrians, figure_of_draws
-from cosfly.formats.flight_scores import FlightScore, Score
+from cosfly.formats.flight_scores import Figure, FlightScore, Score
 from cosfly.formats.pursuits import Pursuit
-from cosfly.geometry.trajectory_metrics import RELAXED_SAFETY_M, derivative_rms
+from cosfly.geometry.trajectory_metrics import RELAXED_SAFETY_M, derivative_rms, draw_pedestrians, figure_of_draws
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import sha256_bytes
 from cosfly.runtime.json_io import dump_json

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from cosfly.formats.motion import ACTION
+from cosfly.geometry.motion import ACTION
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import nearest
 

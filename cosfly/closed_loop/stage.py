@@ -23,14 +23,14 @@ from cosfly.closed_loop.measures import score_pursuits
 from cosfly.closed_loop.pilots import Outlook, PilotAnswer, open_pilot
 from cosfly.closed_loop.settings import FlyConfig
 from cosfly.closed_loop.stepper import Airspace, ClosedLoopTrajectory, Moment, as_drawn
-from cosfly.formats.actions import TOKENS
 from cosfly.formats.boxes import read_boxes
+from cosfly.formats.captions import TOKENS
 from cosfly.formats.flight_scores import SCORE, SCORE_FORMAT
-from cosfly.formats.motion import PlannedMotion
 from cosfly.formats.pursuits import Pursuit, PursuitFrame, WalkStyle, pursuit_file, read_pursuit, write_pursuit
 from cosfly.formats.traces import DroneTrace, read_traces, write_traces
 from cosfly.geometry.axes import headings_of, step_s
 from cosfly.geometry.kernels import BoxIndex, obstacle_index, visibility
+from cosfly.geometry.motion import PlannedMotion
 from cosfly.geometry.trajectory_metrics import trajectory_metrics
 from cosfly.planners import stage as planning
 from cosfly.planners.contract import PlanConfig

@@ -22,7 +22,7 @@ from cosfly.envs.episodes import (
     read_list,
     world_of,
 )
-from cosfly.formats.actions import TOKENS
+from cosfly.formats.captions import TOKENS
 from cosfly.render.contract import FAR_M
 from cosfly.runtime.errors import ConfigError, InputError
 

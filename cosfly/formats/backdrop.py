@@ -1,4 +1,4 @@
-"""A picture of a map from above, PNG, with its world frame beside it as JSON: what a region is drawn on."""
+"""A picture of a map from above (PNG) with its world frame (JSON), on which a region is drawn."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FORMAT = FileFormat("cosfly.backdrop", "1.0", "world frame of a picture")
 
 
 class WorldFrame(Record):
-    """Where a picture lies, north up: the world place of its top left corner, and the side of a pixel, m."""
+    """Position of a picture, north up: the world place of its top left corner, and the side of a pixel, m."""
 
     west_m: float = Field(ge=-LARGEST, le=LARGEST)
     north_m: float = Field(ge=-LARGEST, le=LARGEST)
@@ -34,11 +34,7 @@ class Backdrop:
 
     @classmethod
     def read(cls, path: Path) -> Backdrop:
-        """Read a picture, and the file of its name that ends in `.json`.
-
-        Raises:
-            InputError: one of them is missing or cannot be used.
-        """
+        """Read a picture and its world frame, the file of the same name that ends in `.json`."""
         return cls(read_picture(path)[..., ::-1], read_model(path.with_suffix(".json"), WorldFrame, FORMAT))
 
     def frame(self) -> dict[str, float]:
@@ -54,7 +50,7 @@ class Backdrop:
 
 
 def write_backdrop(path: Path, png: bytes, world: WorldFrame) -> None:
-    """Write a picture and its frame; the frame first, so that a picture never stands without."""
+    """Write a picture and its frame, the frame first, so that no picture lacks one."""
     path.unlink(missing_ok=True)  # which may lie elsewhere
     write_model(path.with_suffix(".json"), world, FORMAT)
     write_bytes(path, png)

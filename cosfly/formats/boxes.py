@@ -10,21 +10,21 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from cosfly.formats.columns import LARGEST, rounded
-from cosfly.formats.ground import Ground, GroundGrid
 from cosfly.formats.kinds import GROUND_KINDS, KIND_COLORS, KIND_NAMES, KINDS
 from cosfly.formats.meshes import Meshes, MeshRef
 from cosfly.geometry.axes import axis_aligned_half_extents
+from cosfly.geometry.ground import Ground
 from cosfly.runtime.errors import InputError, nearest
 from cosfly.runtime.io import write_bytes
-from cosfly.runtime.json_io import MISSING, FileFormat, check_schema, dump_json, read_json, validated
+from cosfly.runtime.json_io import MISSING, FileFormat, Record, check_schema, dump_json, read_json, validated
 
 BOXES_FORMAT = FileFormat("cosfly.boxes_3d", "1.0", "map")
 MAP_MB = 4_096  # 15 million boxes; ten million took 2.7 GB as they are written
 AXES = "right-handed, metres, x east, y north, z up; degrees"
-# How far a told corner may be from the one that follows: exporters round, and turn boxes in single precision.
+# How far a given corner may be from the computed one: exporters round, and turn boxes in single precision.
 CORNER_M = 0.05
 # Written from the boxes, never carried.
 COMPUTED = {"schema", "schema_version", "axes", "bounds", "num_boxes", "counts"}
@@ -44,13 +44,13 @@ LicenceId = Annotated[str, AfterValidator(_licence_id)]
 
 
 class _Kept(BaseModel):
-    """Keys that only a foreign file has are kept and written again."""
+    """Base of records that keep foreign keys."""
 
     model_config = ConfigDict(extra="allow", frozen=True, populate_by_name=True)
 
 
 class MapSource(_Kept):
-    """What a map was made with, and of which file or seed."""
+    """The tool, and the file or seed, of a map."""
 
     tool: str = ""
     version: str = ""
@@ -59,17 +59,44 @@ class MapSource(_Kept):
 
 
 class SimplifyPass(_Kept):
-    """What one pass of step 2 left; the first entry of a list is the input."""
+    """Boxes after one pass of step 2; the first entry of a list is the input."""
 
     name: str = Field(alias="pass")
     counts: dict[str, int]
 
 
-class MapHeader(_Kept):
-    """What a map says about itself; what is not set is not written.
+Height = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 
-    ground_z_m is the one height of the ground where it is flat; where it slopes, `ground` holds its heights. People
-    walk on it, and every stage counts heights from it: `BoxMap.ground`.
+
+class GroundGrid(Record):
+    """Sloping ground in the map header. heights_m: rows from south to north, each from west to east."""
+
+    west_m: Height
+    south_m: Height
+    cell_m: float = Field(gt=0, le=LARGEST)
+    heights_m: list[list[Height]] = Field(min_length=2)
+
+    @model_validator(mode="after")
+    def _rows_are_even(self) -> GroundGrid:
+        lengths = {len(row) for row in self.heights_m}
+        if len(lengths) != 1 or lengths.pop() < 2:
+            raise ValueError("the rows of heights_m are not of one length of at least two")
+        return self
+
+    def ground(self) -> Ground:
+        return Ground(np.array(self.heights_m, dtype=np.float64), self.west_m, self.south_m, self.cell_m)
+
+    @classmethod
+    def of(cls, ground: Ground) -> GroundGrid:
+        """Return the record of a ground, heights to a millimetre."""
+        rows = np.round(ground.heights_m, 3).tolist()
+        return cls(west_m=ground.west_m, south_m=ground.south_m, cell_m=ground.cell_m, heights_m=rows)
+
+
+class MapHeader(_Kept):
+    """The header of a map; fields that are not set are not written.
+
+    ground_z_m: height of flat ground; where it slopes, `ground` holds the heights. All stages use `BoxMap.ground`.
     """
 
     name: str = "map"
@@ -97,8 +124,7 @@ class BoxMap:
     """A map of boxes, the product of stages 1 and 2.
 
     centers, half_extents: (n, 3) float64, m. rotations_deg: (n, 3) float64: pitch, yaw, roll. kinds: (n,) uint8, KINDS.
-    ids: (n,) uint64, unique and stable. `header`: what the map says about itself. `meshes`: what some boxes are drawn
-    as; in maps as sources and files give them, not in simplified ones, whose boxes nobody draws.
+    ids: (n,) uint64, unique and stable. meshes: what some boxes are drawn as; none in simplified maps.
     """
 
     centers: np.ndarray
@@ -166,7 +192,7 @@ def make_box_map(
 
 
 def check_boxes(box_map: BoxMap, where: str | Path) -> None:
-    """Check what every map must hold, whoever made it."""
+    """Check finite numbers, extents, kinds and ids."""
     for name, field_name in (("centers", "center"), ("half_extents", "extent"), ("rotations_deg", "rotation")):
         bad = np.flatnonzero(~(np.abs(getattr(box_map, name)) <= LARGEST).all(axis=1))  # NaN is not
         if len(bad):
@@ -187,16 +213,16 @@ def check_boxes(box_map: BoxMap, where: str | Path) -> None:
 
 
 def check_ground(box_map: BoxMap, path: Path) -> None:
-    """Check that a map says where its ground is: a height, a grid of heights, or one box of it."""
-    told = box_map.header.model_fields_set & {"ground_z_m", "ground"}
-    if not told and not box_map.is_any_of(GROUND_KINDS).any():
+    """Check that a map has ground: a height, a grid of heights, or a box of it."""
+    given = box_map.header.model_fields_set & {"ground_z_m", "ground"}
+    if not given and not box_map.is_any_of(GROUND_KINDS).any():
         what, got = "the map has no ground", "neither ground_z_m nor heights in the header, and no box of the ground"
         fix = "put ground_z_m into the header, or boxes of Roads, Sidewalks, Terrain or Ground"
         raise InputError(what, where=path, got=got, expected="where people stand", fix=fix)
 
 
 class _Box(BaseModel):
-    """What is read of a box; the fields with a default follow from the others, and are compared with them."""
+    """A box of a file; fields with a default follow from the others and are compared with them."""
 
     model_config = ConfigDict(strict=True, extra="forbid")  # no numbers in quotes
 
@@ -224,19 +250,19 @@ class _Boxes(BaseModel):
 
 
 def write_boxes(path: Path, box_map: BoxMap) -> None:
-    """Write boxes in the paper's fields (tab:boxes_schema), one box a line; meshes in `meshes.glb` beside them."""
+    """Write boxes in the paper's fields (tab:boxes_schema), one box a line; meshes in `meshes.glb` next to them."""
     check_boxes(box_map, path)
     refs = box_map.meshes.beside(path.parent).refs
     columns = {name: np.round(getattr(box_map, name), 6) for name in ("centers", "half_extents", "rotations_deg")}
     box_map = replace(box_map, **columns)  # so that min and max agree with what is read back
     mins, maxs = box_map.mins, box_map.maxs
     low, high = box_map.bounds() if len(box_map) else (np.zeros(3), np.zeros(3))
-    told = box_map.header.model_dump(mode="json", by_alias=True, exclude_unset=True)
-    passes: dict[str, Any] = {name: told.pop(name) for name in ("passes", "simplify") if name in told}
-    heights = told.pop("ground", None)
+    fields = box_map.header.model_dump(mode="json", by_alias=True, exclude_unset=True)
+    passes: dict[str, Any] = {name: fields.pop(name) for name in ("passes", "simplify") if name in fields}
+    heights = fields.pop("ground", None)
     header: dict[str, Any] = {
         **BOXES_FORMAT.header,
-        **told,
+        **fields,
         "axes": AXES,
         "bounds": {"min": rounded(low), "max": rounded(high)},
         "num_boxes": len(box_map),
@@ -275,7 +301,7 @@ def read_boxes(path: Path) -> BoxMap:
     records: Any = value
     if not isinstance(value, list):
         records = check_schema(value, BOXES_FORMAT, path).pop("boxes", None)
-        header = validated(MapHeader, {key: told for key, told in value.items() if key not in COMPUTED}, path)
+        header = validated(MapHeader, {key: field for key, field in value.items() if key not in COMPUTED}, path)
         if records is None:
             raise InputError(MISSING, where=f"{path}: boxes", expected="a list")
         if not isinstance(records, list):
@@ -289,14 +315,14 @@ def read_boxes(path: Path) -> BoxMap:
     box_map = make_box_map(centers, extents, rotations, kinds, ids, header)
     box_map = replace(box_map, meshes=Meshes(refs, path.parent))
     check_boxes(box_map, path)
-    _check_told(value if isinstance(value, dict) else {}, boxes, box_map, path)
+    _check_computed(value if isinstance(value, dict) else {}, boxes, box_map, path)
     return box_map
 
 
-def _check_told(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, path: Path) -> None:
-    """Compare what a file tells beside its boxes with what follows from them, which other axes or units would not."""
-    told = (("axes", AXES), ("num_boxes", len(box_map)), ("counts", box_map.counts()))
-    for name, follows in told:
+def _check_computed(header: dict[str, Any], boxes: list[_Box], box_map: BoxMap, path: Path) -> None:
+    """Compare derived fields of a file with its boxes; other axes or units would not agree."""
+    derived = (("axes", AXES), ("num_boxes", len(box_map)), ("counts", box_map.counts()))
+    for name, follows in derived:
         if header.get(name, follows) != follows:
             got, expected = str(header[name])[:200], str(follows)[:200]
             raise InputError("not what its boxes are", where=f"{path}: {name}", got=got, expected=expected)

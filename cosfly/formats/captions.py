@@ -1,8 +1,4 @@
-"""Chain-of-Cause captions on disk: the three-field answer with its decision (actions.py), `captions.jsonl`.
-
-Shared by caption (which writes), distill and release (which read). What an answer must look like stands in
-answer_text.py; how a decision is judged against the geometry in caption/truth/actions.py.
-"""
+"""`captions.jsonl`: Chain-of-Cause captions, the three-field answer and its closed set of decisions."""
 
 from __future__ import annotations
 
@@ -10,10 +6,11 @@ from collections.abc import Collection, Iterable, Iterator
 from functools import partial
 from operator import is_
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_file
 from cosfly.runtime.json_io import Record, model_lines
 
@@ -24,8 +21,8 @@ Writing = Literal["slots", "prose"]
 Modality = Literal["observed", "predicted", "hypothetical"]
 SentenceState = Literal["proved", "contradicted", "unread"]
 Verdict = Literal["CONSISTENT", "SOFT_CONFLICT", "HARD_CONFLICT", "ABSTAIN"]
-# Whose motion a label was taken from: the flight's own, which nothing perturbed; the clean flight beside it; its own
-# less the recorded offsets; or, where nobody recorded them, the perturbed one: then the label holds noise.
+# The motion of a label: of a clean track itself, of its clean twin, of a perturbed track without the recorded offsets,
+# or, where they are not recorded, of the perturbed track: then the label holds noise.
 LabelFrom = Literal["flight", "twin", "offsets", "perturbed"]
 CAPTION_VERSION: Literal["2.0"] = "2.0"
 
@@ -56,7 +53,7 @@ class Coc(Record):
 
 
 def verdict_on(decision: str, label: str | None, contradicted: Collection[str]) -> Verdict:
-    """Return the verdict on a decision from what a caption's record says of its window's future, whoever decided."""
+    """Return the verdict on a decision, given the label and the contradicted decisions of its window."""
     if decision == label:
         return "CONSISTENT"
     if decision in contradicted:
@@ -64,28 +61,68 @@ def verdict_on(decision: str, label: str | None, contradicted: Collection[str]) 
     return "ABSTAIN" if label is None else "SOFT_CONFLICT"
 
 
+# --- decisions -------------------------------------------------------------------------------------------------------
+
+
+class Action(NamedTuple):
+    """One action. group: the heading of tables. en: an infinitive."""
+
+    group: str
+    en: str
+    zh: str
+
+
+# In the order of prompts, schemas and tables.
+ACTIONS = {
+    "track_straight": Action("tracking", "keep tracking straight ahead", "保持直线跟踪"),
+    "yaw_left_to_follow": Action("heading", "yaw left to follow", "向左偏航跟随"),
+    "yaw_right_to_follow": Action("heading", "yaw right to follow", "向右偏航跟随"),
+    "circle_left": Action("heading", "circle to the left", "向左环绕"),
+    "circle_right": Action("heading", "circle to the right", "向右环绕"),
+    "ascend": Action("vertical", "ascend", "上升"),
+    "descend": Action("vertical", "descend", "下降"),
+    "move_forward": Action("translation", "move forward", "前进"),
+    "move_backward": Action("translation", "move backward", "后退"),
+    "strafe_left": Action("translation", "strafe left", "向左平移"),
+    "strafe_right": Action("translation", "strafe right", "向右平移"),
+    "slow_down": Action("speed", "slow down", "减速"),
+    "speed_up": Action("speed", "speed up", "加速"),
+    "search_to_reacquire_target": Action("recovery", "search to reacquire the target", "搜索以重新捕获目标"),
+    "hover": Action("recovery", "hover", "悬停"),
+    "break_off": Action("recovery", "break off", "中止跟踪"),
+    "return_to_home": Action("recovery", "return to home", "返航"),
+}
+TOKENS = tuple(ACTIONS)
+ORDERS = ("break_off", "return_to_home")  # by a mission; geometry never implies them
+BY_LETTERS = {token.replace("_", ""): token for token in TOKENS}
+
+
+def not_in_set(token: object, where: object) -> InputError:
+    """Return the error of a decision that is not in the set."""
+    what, expected = "not an action of the closed set", f"one of {', '.join(TOKENS)}"
+    return InputError(what, where=str(where), got=str(token), expected=expected)
+
+
 # --- captions.jsonl ---------------------------------------------------------------------------------------------------
 
 
-OWN_PROMPTS = "prompts"  # beside `captions.jsonl`: the prompts of whoever made them, where these do not ship
+OWN_PROMPTS = "prompts"  # next to `captions.jsonl`: the prompts of its author, where they do not ship
 QUESTIONS = ("user_en", "user_zh")  # of them, what is asked of a window
 GOAL_WORDS: dict[Language, str] = {"en": "Goal: follow %s.", "zh": "任务：跟踪%s。"}  # in a prompt, a line of its own
 GOAL_BEGINS = tuple(words.partition("%s")[0] for words in GOAL_WORDS.values())
-PICTURES_MARK = "<pictures>"  # in a prompt: the place of the sentence that says what pictures are given
+PICTURES_MARK = "<pictures>"  # in a prompt: the place of the sentence about the pictures
 
 
 class Prompt(Record):
-    """A question in one language. That of a caption holds PICTURES_MARK: teacher and student see other pictures.
-
-    The line with the mark says what frames there are; those after it, what was measured, and the mission.
+    """A question in one language. That of a caption holds PICTURES_MARK, as teacher and student see other pictures; the
+    lines after it hold measurements and the mission.
     """
 
     system: str
     user: str
 
     def told(self, pictures: str, *, measured: bool = True) -> Prompt:
-        """Return the question with the sentence about the pictures at its mark, with or without what was measured; the
-        goal stays."""
+        """Return the question with the sentence about the pictures, with or without measurements; the goal stays."""
         begin, mark, end = self.user.partition(PICTURES_MARK)
         first, *lines = end.split("\n")
         kept = [first, *(line for line in lines if line.startswith(GOAL_BEGINS))]
@@ -94,7 +131,7 @@ class Prompt(Record):
 
 
 _Value = TypeVar("_Value")
-_Given = Annotated[_Value | None, Field(exclude_if=partial(is_, None))]  # a key that is left out where it has no value
+_Given = Annotated[_Value | None, Field(exclude_if=partial(is_, None))]  # a key that is skipped where it has no value
 
 
 class TeacherSettings(Record):
@@ -108,8 +145,8 @@ class TeacherSettings(Record):
 
 
 class TeacherRecord(Record):
-    """Who answered. structured: how the answer's shape was enforced (see Reply); left out where nothing was asked. run:
-    of a student's predictions for several trees, the one that these captions are of."""
+    """Who answered. structured: how the answer's shape was enforced (see Reply). run: of a student's predictions for
+    several trees, the one of these captions."""
 
     kind: TeacherKind
     model: str
@@ -119,7 +156,7 @@ class TeacherRecord(Record):
 
 
 class JudgeRecord(Record, frozen=False):
-    """What a judge said of a conflict: one of Judgement, or `unjudged`; overruled_by: geometry or text."""
+    """A judge's verdict on a conflict: one of Judgement, or `unjudged`; overruled_by: geometry or text."""
 
     verdict: str
     reason: str
@@ -128,10 +165,8 @@ class JudgeRecord(Record, frozen=False):
 
 
 class RepairRecord(Record, frozen=False):
-    """What became of a rejected answer.
-
-    rung: the ask that mended it (hint, multi_sample, anchored, fix_label). outcome: repaired, failed, no_label.
-    """
+    """The regeneration of a rejected answer. rung: the attempt that fixed it (hint, multi_sample, anchored, fix_label).
+    outcome: repaired, failed, no_label."""
 
     strategy: str
     rung: str | None = None
@@ -142,7 +177,7 @@ class RepairRecord(Record, frozen=False):
 
 
 class KeyframeRecord(Record, frozen=False):
-    """Why a window was taken (start, change, stride); windows left out up to the next; label changes among them."""
+    """Why a window was chosen (start, change, stride); windows skipped up to the next; label changes among them."""
 
     reason: str
     skipped: int
@@ -153,11 +188,11 @@ Pixels = Annotated[int, Field(ge=1, le=1 << 20)]
 
 
 class Claim(BaseModel):
-    """One thing that a sentence states.
+    """One statement of a sentence.
 
-    sentence: `C1` is the first of critical_components, `R1` of reasoning_trace. quantity: what is claimed, with its
-    aspect (`distance`, `trend:speed`), or `decision`. at: `t4`, `t0-t4`; empty: the current frame, the whole window.
-    unit: m, mps, deg ... quote: the words of the sentence that it stands for.
+    sentence: `C1` is the first of critical_components, `R1` of reasoning_trace. quantity: with its aspect (`distance`,
+    `trend:speed`), or `decision`. at: `t4`, `t0-t4`; empty: the current frame, the whole window. unit: m, mps, deg ...
+    quote: its words in the sentence.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -172,7 +207,7 @@ class Claim(BaseModel):
 
 
 class Template(Record):
-    """The two texts of an answer with slots in place of facts. claims: of words beside slots, which they quote."""
+    """The two texts of an answer with slots in place of facts. claims: of words outside slots, which they quote."""
 
     critical_components: str
     reasoning_trace: str
@@ -180,11 +215,9 @@ class Template(Record):
 
 
 class Evidence(Record):
-    """What the states of a caption's sentences follow from, so that an outsider can judge them again: the column
-    `evidence` of a release.
+    """The evidence for the states of a caption's sentences: the column `evidence` of a release.
 
-    slots: the templates that the texts were filled from. problems: what is contradicted. contradicted: decisions that
-    the flight contradicts.
+    slots: templates of the texts. problems: contradictions. contradicted: decisions that the track contradicts.
     """
 
     slots: _Given[dict[Language, Template]] = None
@@ -193,11 +226,10 @@ class Evidence(Record):
 
 
 class Checks(Record, frozen=False):
-    """What was checked. structure, bilingual: `ok` or a reason. refused: why answers of the right structure were
-    not taken, one reason each. evidence: `ok` or the contradictions. sentences: language -> state of
-    each sentence of both texts, in order. contradicted: decisions that the flight contradicts, whatever was decided.
-    recovered: what was mended in the answers' text. frame: what is wrong with a picture. refusal: the server's words
-    where it refused the window, or how it cut the answer short of `max_tokens`."""
+    """Results of checks. structure, bilingual: `ok` or a reason. refused: reasons for refusing answers of the right
+    structure. evidence: `ok` or the contradictions. sentences: language -> state of each sentence of both texts, in
+    order. contradicted: decisions that the track contradicts. recovered: fixes of the answers' text. frame: a picture's
+    problem. refusal: the server's words where it refused the window, or how it cut the answer short."""
 
     keyframe: _Given[KeyframeRecord] = None
     structure: _Given[str] = None
@@ -212,10 +244,9 @@ class Checks(Record, frozen=False):
 
 
 class Caption(BaseModel):
-    """One line of `captions.jsonl`: one window, its answers, and everything that was found out about them.
+    """One line of `captions.jsonl`: one window, its answers and their checks.
 
-    `en` and `zh` are None when the window was dropped before an answer of the right structure existed; `zh` also where
-    a file of captions has English alone.
+    en, zh: None where no answer of the right structure exists; `zh` also in files of English alone.
     """
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -267,15 +298,12 @@ def line_of(caption: Caption) -> bytes:
 
 
 def write_captions(path: Path, captions: Iterable[Caption]) -> int:
-    """Write `captions.jsonl` (one line per caption, in the order given) under a temporary name, then rename.
-
-    Streams, so memory stays flat. Returns the number of lines.
-    """
+    """Write `captions.jsonl`, streaming, in the given order; return the number of lines."""
     return write_caption_lines(path, map(line_of, captions))
 
 
 def write_caption_lines(path: Path, lines: Iterable[bytes]) -> int:
-    """Return the same for captions that are lines already (`line_of`)."""
+    """Write captions that are lines already (`line_of`); return their number."""
     count = 0
     with atomic_file(path) as file:
         for line in lines:
@@ -290,5 +318,5 @@ def read_captions(path: Path) -> Iterator[Caption]:
 
 
 def caption_lines(path: Path) -> Iterator[tuple[str, Caption]]:
-    """Yield each line of `captions.jsonl`, its end included, and what it says; raises as `read_captions`."""
+    """Yield each line of `captions.jsonl`, its end included, and its caption."""
     return model_lines(path, Caption, what="captions", fix="run cosfly caption first")

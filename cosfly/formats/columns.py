@@ -1,4 +1,4 @@
-"""Columns of numbers in JSON: how the products read and write them."""
+"""Columns of numbers in JSON products."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def is_number(value: Any) -> bool:
 
 
 def rounded(vector: np.ndarray, digits: int = 6) -> list[float]:
-    """Return a vector, (n,) m, for a file: micrometres are enough for a map, and short numbers keep files small."""
+    """Return a vector, (n,) m, rounded for a file."""
     return [round(float(v), digits) + 0.0 for v in vector]  # + 0.0 turns -0.0 into 0.0
 
 
@@ -47,7 +47,7 @@ def write_items(path: Path, form: FileFormat, name: str, items: list[Any], heade
 
 
 def step_field(items: list[Any]) -> dict[str, float | None]:
-    """Return what a product says of the step of its items' times."""
+    """Return the time step of a product's items."""
     return {"dt_s": round(step_s(items[0].time_s), 6) if items else None}
 
 

@@ -1,10 +1,8 @@
-"""The files of one frame folder of the playback tree: rgb.png, depth, instance.png, meta.json, and what `meta.json`
-holds.
+"""The files of one frame folder of the playback tree: rgb.png, depth, instance.png and meta.json.
 
-Depth is float32 and stands as `depth_float32.png`, packed without loss, or as `depth.npy`, as in the public layout.
-Readers ask `frame_path` for a file by its name in the public layout.
-
-Axes inside the tree are CARLA's (left-handed); `tree_...` below take the project's right-handed values.
+Depth is float32: `depth_float32.png`, packed without loss, or `depth.npy` as in the public layout. Ask `frame_path` for
+a file by its name in the public layout. Axes inside the tree are CARLA's (left-handed); `tree_...` functions take the
+project's right-handed values.
 """
 
 from __future__ import annotations
@@ -109,7 +107,7 @@ class Look(Config):
 
 
 class TreePosition(Record):
-    """A place or a shift in the tree's axes, m."""
+    """A position or a shift in the tree's axes, m."""
 
     x: float
     y: float
@@ -117,7 +115,7 @@ class TreePosition(Record):
 
     @property
     def vector_m(self) -> np.ndarray:
-        """The same in the project's axes, (3,)."""
+        """Position in the project's axes, (3,)."""
         return mirror_positions(np.array([self.x, self.y, self.z]))
 
 
@@ -166,14 +164,14 @@ class CameraMeta(Record):
     height: int
     fov_deg: float
     focal_length_px: float
-    focal_length_35mm_mm: float | None = None  # null in trees of before it stood here
+    focal_length_35mm_mm: float | None = None  # null in older trees
     intrinsic: list[list[float]]
     near_m: float
     far_m: float
 
 
 def camera_meta(camera: Camera, near_m: float, far_m: float) -> CameraMeta:
-    """Return what a frame says of its camera; clip planes in m."""
+    """Return the record of a camera; clip planes in m."""
     return CameraMeta(
         width=camera.width_px,
         height=camera.height_px,
@@ -187,7 +185,7 @@ def camera_meta(camera: Camera, near_m: float, far_m: float) -> CameraMeta:
 
 
 class TargetMeta(Record):
-    """The person in a frame: hip point, box and how much of it is seen; px unless said, null where there is none."""
+    """The target in a frame: hip point, box and visibility; px unless named otherwise, null where there is none."""
 
     world_location: TreePosition
     half_extents_m: tuple[float, float, float]
@@ -195,13 +193,13 @@ class TargetMeta(Record):
     semantic_id: int
     image_uv: list[float] | None
     bbox_2d: list[float] | None  # of the projected 3D box
-    mask_bbox_2d: list[float] | None = None  # of the person's pixels; absent in trees of before it stood here
+    mask_bbox_2d: list[float] | None = None  # of the target's pixels; absent in older trees
     depth_m: float
     in_view: bool
     visible: bool
     visibility: float
     num_pixels: int
-    # Of the picture as written; absent in trees of before, contrast null where no pixel of the person is seen.
+    # Of the picture as written; absent in older trees, contrast null where no pixel of the target is seen.
     height_px: float | None = None
     contrast: float | None = None
     legible: bool | None = None
@@ -213,7 +211,7 @@ class TargetMeta(Record):
 
 
 class PerturbationMeta(Record):
-    """What was done to a frame: none | applied | the reason for falling back, and the offsets."""
+    """The outcome of a frame's events (none, applied, fallback: reason) and the offsets."""
 
     position: str
     rotation: str
@@ -223,7 +221,7 @@ class PerturbationMeta(Record):
 
 
 class BystanderMeta(Record):
-    """Somebody beside the target: the middle of the box and its yaw in the tree's axes; how much of the picture."""
+    """A bystander: middle of the box and yaw in the tree's axes, and pixels in the picture."""
 
     instance_id: int
     semantic_id: int
@@ -239,20 +237,20 @@ class BystanderMeta(Record):
 
     @property
     def heading_rad(self) -> float:
-        """Counter-clockwise from east, as everywhere outside the tree."""
+        """Heading, counter-clockwise from east."""
         return float(np.radians(mirror_rotations(np.array([0.0, self.yaw, 0.0]))[1]))
 
 
 class BystandersMeta(Record):
-    """The others of a frame, and the shares of the target's box, 0 to 1, that they hide and that the map hides."""
+    """The bystanders of a frame, and the shares of the target's box, 0 to 1, that they and the map hide."""
 
     target_hidden_by_others: float
     target_hidden_by_map: float
     others: list[BystanderMeta]
 
     def people_of(self, target_m: np.ndarray, people: People | None) -> dict[str, float | None]:
-        """Tell of other people who have a pixel (COMPANY): how many, who is nearest to the target and how far, m over
-        the ground, and who looks most like it; null without any, and the last where nobody says what they look like."""
+        """Return BYSTANDER_COLUMNS: how many people have a pixel, how far the nearest is from the target, m over the
+        ground, its id, and who looks most like the target; None without any, the last also without `people`."""
         seen = [one for one in self.others if one.semantic_id == KINDS["Pedestrians"] and one.num_pixels]
         away_m = {one.instance_id: float(np.hypot(*(one.center_m - target_m)[:2])) for one in seen}
         nearest = min(away_m, key=away_m.__getitem__, default=None)
@@ -262,7 +260,7 @@ class BystandersMeta(Record):
 
 
 class FrameMeta(Record):
-    """`meta.json`: what a loader needs to know of one frame without opening anything else."""
+    """`meta.json`: all that a loader needs of one frame."""
 
     coordinates: dict[str, str] = COORDINATES
     index: int
@@ -274,11 +272,9 @@ class FrameMeta(Record):
     drone_pose: TreePose
     target: TargetMeta
     perturbation: PerturbationMeta
-    look: Look | None = None  # null with weather, and in trees of before it stood here
-    others: BystandersMeta | None = Field(
-        None, exclude_if=lambda others: others is None
-    )  # absent in runs without others
-    weather: WeatherRecord | None = Field(None, exclude_if=lambda weather: weather is None)  # in the place of `look`
+    look: Look | None = None  # null with weather, and in older trees
+    others: BystandersMeta | None = Field(None, exclude_if=lambda others: others is None)
+    weather: WeatherRecord | None = Field(None, exclude_if=lambda weather: weather is None)  # instead of `look`
 
     def to_bytes(self) -> bytes:
         """Return the content of the file."""
@@ -295,50 +291,41 @@ def read_meta(frame: Path) -> FrameMeta:
 
 
 def frame_name(index: int) -> str:
-    """Return a frame's folder below its flight's: `frames_playback/frame_00000`."""
+    """Return a frame's folder below its track's: `frames_playback/frame_00000`."""
     return f"{FRAMES_DIR}/frame_{index:05d}"
 
 
 def public_name(name: str) -> str:
-    """Return the name that a frame's file has in the public layout."""
+    """Return the name of a frame's file in the public layout."""
     return DEPTH_NPY if name == DEPTH_PNG else name
 
 
 def frame_path(frame: Path, name: str) -> Path:
-    """Return the path of a frame's file by its name in the public layout; of depth the packed one where there is
-    one."""
+    """Return the path of a frame's file by its name in the public layout; of depth the packed one if it exists."""
     packed = frame / DEPTH_PNG
     return packed if name == DEPTH_NPY and packed.exists() else frame / name
 
 
 def files_in(frame: Path) -> frozenset[str]:
-    """Return the names, in the public layout, of the files of a frame folder; none where there is no such folder."""
+    """Return the names, in the public layout, of the files of a frame folder; none without a folder."""
     try:
-        return frozenset(public_name(name) for name in os.listdir(frame))
+        return frozenset(map(public_name, os.listdir(frame)))
     except OSError:
         return frozenset()
 
 
 def tree_of(frame: Path) -> Path:
-    """Return the playback tree that a frame stands in."""
+    """Return the playback tree of a frame."""
     return tree_of_track(frame.absolute().parents[1])
 
 
 def read_rgb(frame: Path) -> np.ndarray:
-    """Read `rgb.png` of a frame folder, (h, w, 3) uint8 RGB; an alpha channel is left out.
-
-    Raises:
-        InputError: missing or not an image.
-    """
+    """Read `rgb.png` of a frame folder, (h, w, 3) uint8 RGB without alpha."""
     return cv2.cvtColor(read_picture(frame / "rgb.png", tree=tree_of(frame)), cv2.COLOR_BGR2RGB)
 
 
 def read_instance(frame: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read `instance.png` of a frame folder.
-
-    Returns:
-        semantic kinds (h, w) uint8 and instance ids (h, w) uint16.
-    """
+    """Read `instance.png` of a frame folder: semantic kinds (h, w) uint8 and instance ids (h, w) uint16."""
     bgr = read_picture(frame / "instance.png", tree=tree_of(frame))
     # OpenCV loads B, G, R: R is the semantic tag, G the low and B the high byte of the id.
     return bgr[..., 2], bgr[..., 1].astype(np.uint16) | (bgr[..., 0].astype(np.uint16) << 8)
@@ -349,26 +336,24 @@ def read_depth(frame: Path) -> np.ndarray:
     path = frame_path(frame, DEPTH_NPY)
     if path.name == DEPTH_PNG:
         return depth_values(read_bytes(path, what="depth image", tree=tree_of(frame)), path)
-    return far_clipped(read_array(path, dtype=np.float32, ndim=2, what="depth image", tree=tree_of(frame)))
+    return _far_clipped(read_array(path, dtype=np.float32, ndim=2, what="depth image", tree=tree_of(frame)))
 
 
-def far_clipped(depth: np.ndarray) -> np.ndarray:
-    """Return depths, m, of which those beyond SKY_DEPTH_M are the sky's; unchanged where one is not finite."""
+def _far_clipped(depth: np.ndarray) -> np.ndarray:
+    """Return depths, m, clipped at SKY_DEPTH_M; unchanged where one is not finite."""
     is_beyond = SKY_DEPTH_M < depth.max(initial=0.0) < np.inf
     return np.minimum(depth, np.float32(SKY_DEPTH_M)) if is_beyond else depth
 
 
 def depth_values(data: bytes | memoryview, where: Path) -> np.ndarray:
-    """Return the numbers of a depth image's bytes, of either form, (h, w) float32 as `read_depth`; of a `.npy`
-    without a copy.
-    """
+    """Return the depth of an image's bytes in either form, as `read_depth`; a `.npy` is not copied."""
     if is_packed(data):
-        return far_clipped(floats_of(data, where))
+        return _far_clipped(floats_of(data, where))
     header = parse_array_header(memoryview(data), where, what="depth image")
     if header.dtype != np.float32 or len(header.shape) != 2:
         raise InputError("not a depth image", where=where, got=str(header), expected="float32 of 2 dimensions")
     values = np.frombuffer(data, np.float32, offset=header.offset)
-    return far_clipped(values.reshape(header.shape, order="F" if header.is_fortran else "C"))
+    return _far_clipped(values.reshape(header.shape, order="F" if header.is_fortran else "C"))
 
 
 def rgb_bytes(rgb: np.ndarray) -> bytes:

@@ -1,4 +1,4 @@
-"""`inspect.json`, the product of step 6: one record per flight and the funnel."""
+"""`inspect.json`, the product of step 6: one record per track and the funnel."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 from pydantic import Field, FiniteFloat
 
-from cosfly.formats.coverage import Coverage
 from cosfly.formats.issues import Issue
 from cosfly.formats.playback import ORIGINAL
+from cosfly.geometry.coverage import Coverage
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 
@@ -21,23 +21,20 @@ RESULTS: tuple[Result, ...] = ("accepted", "review", "rejected")
 
 
 class TrackInspection(Record):
-    """What was found out about one flight. `folder` is relative to the playback tree; metrics are None where unknown.
-
-    sha256: of its files (`provenance.digest_of`), so that nobody takes another flight, or other pictures, for the one
-    inspected.
-    """
+    """The result of one track. folder: relative to the playback tree. sha256: of its files (`digest_of`). Metrics are
+    None where unknown."""
 
     town: str
     trajectory: str
     variant: str
-    is_original: bool | None = None  # None where nobody said: in inspections of before, and of what cannot be read
+    is_original: bool | None = None  # None in older inspections and for unreadable tracks
     folder: str
-    sha256: str | None = None  # None in inspections of before, and of what cannot be read
+    sha256: str | None = None  # None in older inspections and for unreadable tracks
     trace_id: str | None
     result: Result
     issues: list[Issue]
     metrics: dict[str, FiniteFloat | int | None]
-    # By a person, after the inspection: `review.py` puts it in, `inspect.json` never holds it.
+    # By a person, after the inspection (review.py); `inspect.json` never holds it.
     decided: Literal["accepted", "rejected"] | None = Field(None, exclude=True)
 
     @property
@@ -93,16 +90,15 @@ class Inspection(Record):
 
     settings: dict[str, Any]
     funnel: Funnel
-    coverage: Coverage | None = None  # of the accepted flights; None in inspections of before
+    coverage: Coverage | None = None  # of the accepted tracks; None in older inspections
     flights: list[TrackInspection]
 
 
 def count_trajectories(flights: list[TrackInspection], *, planned: bool) -> dict[str, int]:
-    """Count rendered trajectories by the result of their worst flight: `rendered`, `accepted`, `review`, `rejected`.
+    """Count rendered trajectories by the result of their worst track: `rendered`, `accepted`, `review`, `rejected`.
 
     Args:
-        planned: by their plans, so that those without one count for none; else by their folders, as names of several
-            runs may be the same.
+        planned: count plans, so that tracks without one are ignored; otherwise count folders.
     """
     results: dict[str, set[str]] = {}
     for flight in flights:

@@ -1,4 +1,4 @@
-"""What is wrong with a product: one type for inspection and verification (release), printed in one way."""
+"""Findings of inspection and of `release verify`: one type, printed in one way."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 
 class Issue(Record):
-    """One finding. `count` says how often it occurred; `where` and `got` are the first occurrence's."""
+    """One finding. `count`: its occurrences; `where` and `got` are those of the first."""
 
     severity: Severity
     code: str
@@ -29,19 +29,19 @@ class Issue(Record):
 
 
 def sort_key(issue: Issue) -> tuple:
-    """Worst first, then by code and place."""
+    """Return the key that sorts the worst first, then by code and place."""
     return SEVERITIES.index(issue.severity), issue.code, issue.where, issue.got
 
 
 @dataclass
 class Report:
-    """Findings of one check run; `facts` are lines that tell what was checked."""
+    """Findings of one check run. facts: lines about what was checked."""
 
     issues: list[Issue] = field(default_factory=list)
     facts: list[str] = field(default_factory=list)
 
     def add(self, severity: Severity, code: str, where: object, got: object, expected: str) -> None:
-        """Put a finding on the list."""
+        """Add a finding."""
         place, value = cut(str(where)), cut(str(got))
         self.issues.append(Issue(severity=severity, code=code, where=place, got=value, expected=expected))
 
@@ -53,7 +53,7 @@ class Report:
 
     @property
     def is_ok(self) -> bool:
-        """True when nothing is wrong; warnings and notes are not wrong."""
+        """Whether there is no error; warnings and notes are allowed."""
         return not self.num("error")
 
     def num(self, severity: Severity) -> int:
@@ -63,16 +63,12 @@ class Report:
         """Return one issue per severity and code, the first occurrence's, with the number of occurrences; sorted."""
         first: dict[tuple[str, str], Issue] = {}
         for issue in self.issues:
-            key = (issue.severity, issue.code)
-            known = first.get(key)
+            known = first.get(key := (issue.severity, issue.code))
             first[key] = issue if known is None else known.model_copy(update={"count": known.count + issue.count})
         return sorted(first.values(), key=sort_key)
 
     def __str__(self) -> str:
-        counts = ", ".join(
-            f"{self.num(severity):,} {severity}{'' if self.num(severity) == 1 else 's'}" for severity in SEVERITIES
-        )
-        verdict = "OK" if self.is_ok else "NOT OK"
-        return "\n".join(
-            [*map(for_terminal, self.facts), *map(str, sorted(self.issues, key=sort_key)), f"{verdict}: {counts}"]
-        )
+        numbers = [(severity, self.num(severity)) for severity in SEVERITIES]
+        counts = ", ".join(f"{number:,} {severity}{'' if number == 1 else 's'}" for severity, number in numbers)
+        lines = [*map(for_terminal, self.facts), *map(str, sorted(self.issues, key=sort_key))]
+        return "\n".join([*lines, f"{'OK' if self.is_ok else 'NOT OK'}: {counts}"])

@@ -204,9 +204,9 @@ def _read_obj(data: bytes, folder: _Folder) -> dict[str, Mesh]:
         folder.read(name.strip())  # trimesh would pass over what cannot be read
     scene, found = _scene(text.encode(), "obj", folder, folder, process=False), list[Mesh]()
     for shape in scene.geometry.values():
-        told = getattr(getattr(shape.visual, "material", None), "kwargs", {})
-        is_plain = "kd" in told and "pictured" not in told
-        color = np.clip(told["kd"], 0.0, 1.0) ** DISPLAY_GAMMA if is_plain else np.full(3, np.nan)
+        material = getattr(getattr(shape.visual, "material", None), "kwargs", {})
+        is_plain = "kd" in material and "pictured" not in material
+        color = np.clip(material["kd"], 0.0, 1.0) ** DISPLAY_GAMMA if is_plain else np.full(3, np.nan)
         corners = shape.vertices[getattr(shape, "faces", np.zeros((0, 3), int))]
         found.append(Mesh(corners, np.tile(np.reshape(color, 3), (len(corners), 1))))
     return {"mesh": joined(found)} if found else {}
@@ -214,7 +214,7 @@ def _read_obj(data: bytes, folder: _Folder) -> dict[str, Mesh]:
 
 MESHES_FILE = "meshes.glb"
 FLOAT, ARRAY_BUFFER = 5126, 34962
-UNTOLD = -1.0  # in the place of a colour that no file told, while they are sorted
+NO_COLOR = -1.0  # in the place of a colour that no file told, while they are sorted
 
 
 class MeshRef(BaseModel):
@@ -276,7 +276,7 @@ class Meshes:
         return found
 
     def beside(self, folder: Path) -> Meshes:
-        """Return the same, all in MESHES_FILE of a folder, which is written unless these stand there already."""
+        """Return the meshes moved to MESHES_FILE of a folder, writing it where needed."""
         if not self.refs or (self.folder == folder and not self.made):
             return self
         names: dict[MeshRef, str] = {}
@@ -298,12 +298,12 @@ def write_meshes(path: Path, meshes: dict[str, Mesh]) -> None:
         corners = mesh.corners_m.reshape(-1, 3) @ Z_UP  # the transpose leads back to +y up
         middle = np.round((corners.min(axis=0) + corners.max(axis=0)) / 2)
         primitives = []
-        colors = np.round(np.where(np.isnan(mesh.colors), UNTOLD, mesh.colors), 4)
+        colors = np.round(np.where(np.isnan(mesh.colors), NO_COLOR, mesh.colors), 4)
         for color in np.unique(colors, axis=0):
             chosen = np.repeat((colors == color).all(axis=1), 3)
             near = (corners[chosen] - middle).astype("<f4")
             primitive: dict = {"attributes": {"POSITION": len(accessors)}, "mode": TRIANGLES}
-            if (color != UNTOLD).all():
+            if (color != NO_COLOR).all():
                 rgb = tuple(color.tolist())
                 if rgb not in colors_known:
                     colors_known[rgb] = len(materials)

@@ -1,4 +1,4 @@
-"""`path.json`, the product of step 3: one timed walk for each path id."""
+"""`path.json`, the product of step 3: one pedestrian trajectory for each path id."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ PATHS_FORMAT = FileFormat("cosfly.path", "1.0", "pedestrian paths")
 
 @dataclass(frozen=True)
 class PedestrianTrajectory:
-    """One walk, the product of stage 3.
+    """One pedestrian trajectory, the product of stage 3.
 
-    polyline_m: (k, 2) the way: the A* route, or what a pace makes of it. time_s: (n,), even steps from 0.
+    polyline_m: (k, 2) the A* route, adapted to the pace. time_s: (n,), even steps from 0.
     positions_m: (n, 3), feet on the ground. speeds_mps: (n,), 0 at a stop. pace: the profile.
     """
 
@@ -64,22 +64,22 @@ class PedestrianTrajectory:
 
 
 def walk_id(number: int) -> str:
-    """Return the id of the walk that is made as that one of a map, counted from 0."""
+    """Return the id of a map's pedestrian trajectory, counted from 0."""
     return f"path_{number:05d}"
 
 
 def paces_of(num_walks: int, shares: Mapping[str, float], seed: int) -> list[str]:
-    """Draw the paces of the walks of a map to the quota of their shares; a walk's does not depend on later ones."""
+    """Draw the paces of a map's trajectories by quota; later ones do not change earlier ones."""
     return [*islice(draw_to_quota(shares, rng_for(seed, "pedestrians", "paces")), num_walks)]
 
 
 def pace_field(pace: str) -> dict[str, str]:
-    """Return what stands of a pace in the record of a walk or a flight."""
+    """Return the field of a pace in a trajectory's record."""
     return {} if pace == PLAIN_PACE else {"pace": pace}
 
 
 def pace_of(record: dict, where: str) -> str:
-    """Read the pace of such a record: PLAIN_PACE where it names none."""
+    """Read the pace of a record, PLAIN_PACE where it names none."""
     pace = record.get("pace", PLAIN_PACE)
     if not isinstance(pace, str):
         raise InputError("not a pace", where=f"{where}.pace", got=repr(pace)[:60], expected="a name")
@@ -87,10 +87,10 @@ def pace_of(record: dict, where: str) -> str:
 
 
 def write_paths(path: Path, paths: list[PedestrianTrajectory], header: dict) -> None:
-    """Write `path.json`; `header` holds the map's name, seed and whatever the stage wants on record."""
+    """Write `path.json`; header: the map's name, the seed and the settings."""
     write_items(path, PATHS_FORMAT, "paths", paths, header | step_field(paths))
 
 
 def read_paths(path: Path) -> list[PedestrianTrajectory]:
-    """Read `path.json`; raises as `read_items`."""
+    """Read `path.json`."""
     return read_items(path, PATHS_FORMAT, "paths", PedestrianTrajectory.from_json)

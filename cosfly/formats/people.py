@@ -1,17 +1,16 @@
-"""What people look like, in words and in colour: the wardrobe that walkers are dressed from.
-
-A garment or colour is one row. Renderers draw what the rows say, a goal in words says it in both languages, and two
-people look alike where their rows do.
-"""
+"""Appearance of people and the goal, `people` and `goal` of `trajectory.json`: the wardrobe in words and colours."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any
 
-import numpy as np
+from pydantic import Field
 
 from cosfly.formats.captions import Language
+from cosfly.runtime.errors import InputError
+from cosfly.runtime.json_io import validated
 
 Words = dict[Language, str]
 
@@ -57,10 +56,7 @@ HAIR = ("brown", "grey", "black")  # a cap of such a colour is taken for hair fr
 
 @dataclass(frozen=True)
 class Appearance:
-    """What one person looks like: names of the rows above; the colour of what is not worn is "".
-
-    figure: woman (slighter, long hair) or man (broader, short hair).
-    """
+    """What one person looks like: names of the rows above; the colour of a missing garment is ""."""
 
     figure: str
     top: str
@@ -74,7 +70,7 @@ class Appearance:
 
     @property
     def is_all_seen(self) -> bool:
-        """Whether each thing worn can be seen: a long coat leaves nothing of shorts or a skirt."""
+        """Whether each garment can be seen: a long coat hides shorts and skirts."""
         return self.top != "coat" or self.legs == "trousers"
 
     def __post_init__(self) -> None:
@@ -83,7 +79,7 @@ class Appearance:
                 raise ValueError(f"{name} must be one of {', '.join(map(repr, rows))}")
 
     def differences(self, other: Appearance) -> tuple[str, ...]:
-        """Name the fields that tell two people apart; empty where they look alike. A garment counts once."""
+        """Return the fields in which two people differ; a garment counts once."""
         slots = ("figure", *GARMENTS)
         mine, theirs = asdict(self), asdict(other)
         return tuple(
@@ -94,14 +90,13 @@ class Appearance:
 
 @dataclass(frozen=True)
 class People:
-    """What the people of one flight look like: the target, and by instance id whoever else walks about."""
+    """What the people of one track look like: the target, and the others by instance id."""
 
     target: Appearance
     others: dict[int, Appearance]
 
     def most_alike(self, numbers: Iterable[int]) -> tuple[int, int] | tuple[None, None]:
-        """Return who of some others looks most like the target, the greatest id of several, and in how many things that
-        one differs; nobody of nobody."""
+        """Return the id of the person most like the target, the greatest of several, and the number of differences."""
         differing = [(len(self.target.differences(self.others[number])), -number) for number in numbers]
         if not differing:
             return None, None
@@ -117,31 +112,29 @@ def _rows(name: str, record: dict) -> tuple[str, ...]:
     return tuple(COLORS) if record.get(name.removesuffix("_color")) else ("",)
 
 
-def draw_appearance(rng: np.random.Generator) -> Appearance:
-    """Draw a person, every garment and colour equally likely where all is seen, bare heads and hands by EMPTY_SHARE."""
-    while True:
-        drawn = {"figure": _one(rng, tuple(FIGURES))}
-        for slot in GARMENTS:
-            drawn |= _worn(rng, slot)
-        if (person := Appearance(**drawn)).is_all_seen:
-            return person
+GARMENT_TERMS = ("top", "legs", "bag", "hat")
+PLACE_TERMS = ("left", "right", "near", "far", "Vegetation", "Poles", "Car", "TrafficLight", "Fences", "Buildings")
+GOAL_TERMS = ("figure", *GARMENT_TERMS, *PLACE_TERMS)  # what a goal may use, in the order of its words
 
 
-def look_alike(person: Appearance, rng: np.random.Generator) -> Appearance:
-    """Draw somebody who looks like a person but for one garment or its colour."""
-    slot = _one(rng, tuple(GARMENTS))
-    while True:
-        other = replace(person, **_worn(rng, slot))
-        if person.differences(other) and other.is_all_seen:
-            return other
+@dataclass(frozen=True)
+class Goal:
+    """Whom to follow, in words that are true of the target alone in one frame. says: the GOAL_TERMS that they use."""
+
+    frame: Annotated[int, Field(strict=True, ge=0)]
+    en: str
+    zh: str
+    says: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if self.says != tuple(term for term in GOAL_TERMS if term in self.says) or not {*self.says} & {*GARMENT_TERMS}:
+            raise ValueError(f"says must name some of {', '.join(GOAL_TERMS)} in this order, and a garment")
 
 
-def _worn(rng: np.random.Generator, slot: str) -> dict[str, str]:
-    if rng.random() < EMPTY_SHARE.get(slot, 0.0):
-        return {slot: "", f"{slot}_color": ""}
-    colors = tuple(color for color in COLORS if slot != "hat" or color not in HAIR)
-    return {slot: _one(rng, tuple(filter(None, GARMENTS[slot]))), f"{slot}_color": _one(rng, colors)}
-
-
-def _one(rng: np.random.Generator, names: tuple[str, ...]) -> str:
-    return names[rng.integers(len(names))]
+def read_goal(record: Any, num_frames: int, where: str) -> Goal:
+    """Return the goal of a track of `num_frames` frames that a record holds."""
+    goal = validated(Goal, record, where)
+    if goal.frame >= num_frames:
+        got, expected = str(goal.frame), f"below {num_frames}"
+        raise InputError("the goal's frame does not exist", where=f"{where}.frame", got=got, expected=expected)
+    return goal

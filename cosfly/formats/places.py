@@ -1,9 +1,4 @@
-"""Where a flight stands in a playback tree, and what it and its samples are called.
-
-    Town*/trajectory_<unix seconds>/<variant>/
-
-Public readers look for `Town*/trajectory_*`.
-"""
+"""Folders and ids of tracks and samples in a playback tree: `Town*/trajectory_<unix seconds>/<variant>/`."""
 
 from __future__ import annotations
 
@@ -69,16 +64,15 @@ def town_folder(name: str) -> str:
 
 
 def place_of(folder: Path, run: str = "") -> Place:
-    """Tell a flight's place from its folder, as it is called in its tree, where it may be a link."""
+    """Return the place of a track from its folder's name in the tree, where it may be a link."""
     town, trajectory, variant = ("", "", *Path(os.path.abspath(folder)).parts)[-3:]
     return Place(run, town, trajectory, variant)
 
 
 def tree_of_track(folder: Path) -> Path:
-    """Return the tree that a flight's folder stands in by its name: no link in it may lead out of that.
+    """Return the tree of a track's folder, which no link may leave.
 
-    Of a flight that stands elsewhere inside the tree's parent folder, and in the tree by a link, the folder itself: its
-    files must be its own.
+    For a track that is linked into the tree from elsewhere below the tree's parent, return the track's own folder.
     """
     parents = folder.absolute().parents
     tree = parents[min(2, len(parents) - 1)]
@@ -91,13 +85,10 @@ def tree_of_track(folder: Path) -> Path:
 
 
 def flight_ids(places: Collection[Place]) -> dict[Place, str]:
-    """Return each flight an id of its own: `trajectory_1776047127_ORI`.
+    """Return a unique id for each track: `trajectory_1776047127_ORI`.
 
-    Trajectories of one name in several towns get the town in front, and where that does not tell them apart the run and
-    the town: all flights of a trajectory the same, for training sets know by it what belongs together.
-
-    Raises:
-        InputError: two flights are the same in all of it.
+    Trajectories that share a name get the town as a prefix, and if necessary the run and the town; all tracks of a
+    trajectory get the same prefix. Raises InputError if two tracks agree in all of these.
     """
     named: dict[str, list[Place]] = defaultdict(list)
     for place in places:

@@ -1,26 +1,28 @@
 """The playback tree (stages 5-7 and the release): the layout of the public CosFly-Track v7 data set.
 
-    Town*/trajectory_<unix seconds>/ORI/        the clean flight
-    Town*/trajectory_<unix seconds>/aug_001/    the perturbed flight, same frame indices
+    Town*/trajectory_<unix seconds>/ORI/        the clean track
+    Town*/trajectory_<unix seconds>/aug_001/    the perturbed track, same frame indices
         trajectory.json
         frames_playback/frame_00000/{rgb.png, depth_float32.png or depth.npy, instance.png, meta.json}
 
-Axes inside the tree are CARLA's (left-handed); they are converted here and for `meta.json` in frames.py, and everything
-else in the project sees the right-handed frame. Keys that we do not know are kept in `Track.raw` and survive a
-read-write round trip.
+Axes inside the tree are CARLA's (left-handed). They are converted here and, for `meta.json`, in frames.py; everything
+else sees the right-handed frame. Unknown keys are kept in `Track.raw` and survive a read-write round trip.
 """
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, astuple, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from pydantic import ValidationError
 
-from cosfly.formats.columns import is_number
+from cosfly.formats.columns import is_number, numbers
 from cosfly.formats.frames import (
     ANGLES,
     BYSTANDER_COLUMNS,
@@ -32,68 +34,81 @@ from cosfly.formats.frames import (
     frame_name,
     frame_path,
 )
-from cosfly.formats.goals import Goal
-from cosfly.formats.motion import PlannedMotion, without_perturbation
 from cosfly.formats.pedestrian_paths import pace_of
-from cosfly.formats.people import People
+from cosfly.formats.people import Goal, People, read_goal
 from cosfly.formats.places import place_of, tree_of_track
 from cosfly.formats.segments import FOLLOW, Mission, Segment, flown_as_json, mirrored, read_flown
-from cosfly.formats.trajectory import (
-    BBOX,
-    SCHEMA,
-    SCHEMA_VERSION,
-    FieldReader,
-    flags_of,
-    mask_boxes,
-    numbers_of,
-    object_of,
-    offsets_of,
-    vectors_of,
-)
 from cosfly.formats.weather import WeatherRecord
-from cosfly.geometry.axes import mirror_positions, mirror_rotations
+from cosfly.geometry.axes import mirror_positions, mirror_rotations, step_s
+from cosfly.geometry.motion import PlannedMotion, without_perturbation
+from cosfly.runtime.arrays import check_pixels
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import read_bytes
-from cosfly.runtime.json_io import read_json, validated, write_json
+from cosfly.runtime.json_io import MISSING, read_json, validated, write_json
 
-ORIGINAL = "ORI"  # the folder of a clean flight
-TARGET_FILE = "target.png"  # of a flight: the person of its goal, cut out of the frame that this is true of
+Value = TypeVar("Value")
+
+SCHEMA, SCHEMA_VERSION = "drone_nav_traj_v7", "7.0.0"
+WAYPOINT_TOLERANCE_M = 1e-5  # the public readers' own bound on nav_waypoint.t1_world
+BBOX = ("xmin", "ymin", "xmax", "ymax")
+ORIGINAL = "ORI"  # the folder of a clean track
+TARGET_FILE = "target.png"  # of a track: the target, cut out of the frame of its goal
 TREE_ACTION = ("forward_mps", "right_mps", "up_mps", "yaw_rate_degps", "gimbal_pitch_deg")  # motion.ACTION, mirrored
 LEGIBILITY = ("height_px", "contrast", "legible")  # of a point's target: cosfly/render/camera.py
-EVENTS = ("position", "rotation")  # of a frame of a perturbed flight; what became of them: docs/files.md
-# A frame of a perturbed flight by what was applied to it, and the shares of the paper, where each event has a chance of
+EVENTS = ("position", "rotation")  # of a frame of a perturbed track; their outcomes: docs/files.md
+# Frames of a perturbed track by what was applied, with the shares of the paper, where each event has a probability of
 # 0.6 (tab:augmentation_states).
 STATES = {"unperturbed": 0.16, "position only": 0.24, "rotation only": 0.24, "full": 0.36}
-DATASET_FORMAT = "cosfly_playback"  # of the flights that cosfly makes
-# What the record of a flight's presets may be called: the paper names it, no public file shows it.
+DATASET_FORMAT = "cosfly_playback"  # of the tracks that cosfly makes
+# Names that the record of presets may use: the paper names it, no public file shows it.
 WEATHER_KEYS = {
     "weather": ("weather_name", "weather", "preset", "name"),
     "time_of_day": ("tod_name", "time_of_day", "tod"),
 }
-# Whither a person walks: the way from so many frames before to so many after; who goes less than so far stands.
+# A heading is the way from so many frames before to so many after; who moves less stands.
 HEADING_FRAMES, STANDS_M = 2, 0.1
 
 
 @dataclass(frozen=True)
-class Track:
-    """One `trajectory.json`, n points, in right-handed axes.
+class TargetRecord:
+    """What the frames of a track show of its target, n frames; NaN where null or unknown.
 
-    time_s (n,) strictly increasing; positions_m (n, 3); rotations_deg (n, 3) pitch, yaw, roll of the camera;
-    targets_m (n, 3) hip height, NaN where the file has none; target_uv (n, 2) px and target_bbox (n, 4) xmin, ymin,
-    xmax, ymax px of its projected 3D box, NaN where null; target_mask_bbox (n, 4) the same of the person's pixels, NaN
-    where none is seen, target_legible (n,) bool, both None where the file does not say; target_depth_m (n,) z-depth;
-    target_in_view, target_visible (n,) bool (visible = occlusion-aware); visibility (n,) rendered score in [0, 1], NaN
-    where the file has none;
-    is_perturbed (n,) bool; drone_offsets_m, rotation_offsets_deg, target_offsets_m (n, 3): the perturbation applied to
-    each point, zero where none, NaN where the file has none for a perturbed point (public files say only that there was
-    one). segments, mission: the styles of its parts and the order that ended it, as its plan has them. intrinsics: (n,
-    3, 3) of a camera that zooms, frame by frame, `camera` is that of the first; None where it is that of all. Who
-    projects asks `camera_at`. between: (n, k - 1, 6) planned poses after each frame and before the next, of a flight
-    that was planned at k times the rate of its frames; NaN after the last. people: what they look like, None
-    where the file does not say. goal: whom to follow, None where nothing tells the target from others.
-    company: (n, 5), frames.COMPANY: how many other people are seen, how far the nearest of them is from the target, m,
-    its id, the id of who looks most like the target, in how many things that one differs; NaN where there is none, None
-    where the file does not say.
+    in_view, visible: (n,) bool, `visible` accounts for occlusion. depth_m: (n,) z-depth. uv: (n, 2) px. bbox: (n, 4)
+    xmin, ymin, xmax, ymax px of the projected 3D box. visibility: (n,) rendered score in [0, 1]. mask_bbox: (n, 4) of
+    the target's pixels; legible: (n,) bool; both None where the file has no such field.
+    """
+
+    in_view: np.ndarray
+    visible: np.ndarray
+    depth_m: np.ndarray
+    uv: np.ndarray
+    bbox: np.ndarray
+    visibility: np.ndarray
+    mask_bbox: np.ndarray | None = None
+    legible: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """What was applied to each of n frames: zero where nothing, NaN where the file does not say (public files only say
+    that there was something). is_perturbed: (n,) bool. drone_m, rotation_deg, target_m: (n, 3)."""
+
+    is_perturbed: np.ndarray
+    drone_m: np.ndarray
+    rotation_deg: np.ndarray
+    target_m: np.ndarray
+
+
+@dataclass(frozen=True)
+class Track:
+    """One `trajectory.json`, n points, in right-handed axes: poses, times, target and camera, and optional records.
+
+    time_s: (n,) strictly increasing. positions_m: (n, 3). rotations_deg: (n, 3) pitch, yaw, roll of the camera.
+    targets_m: (n, 3) hip of the target, NaN where the file has none. intrinsics: (n, 3, 3) of a camera that zooms, None
+    where `camera` is that of all frames; use `camera_at`. segments, mission: as planned. between: (n, k - 1, 6) planned
+    poses after each frame, of a trajectory planned at k times the rate of its frames; NaN after the last. people: what
+    they look like. goal: whom to follow. bystanders: (n, 5), frames.BYSTANDER_COLUMNS. These are None where the file
+    does not say.
     """
 
     town: str
@@ -104,24 +119,14 @@ class Track:
     positions_m: np.ndarray
     rotations_deg: np.ndarray
     targets_m: np.ndarray
-    target_in_view: np.ndarray
-    target_visible: np.ndarray
-    target_depth_m: np.ndarray
-    target_uv: np.ndarray
-    target_bbox: np.ndarray
-    visibility: np.ndarray
-    is_perturbed: np.ndarray
-    drone_offsets_m: np.ndarray
-    rotation_offsets_deg: np.ndarray
-    target_offsets_m: np.ndarray
-    target_mask_bbox: np.ndarray | None = None
-    target_legible: np.ndarray | None = None
+    target: TargetRecord
+    perturbation: Perturbation
     source: dict = field(default_factory=dict)
     is_original: bool = True
     folder: Path | None = None
     raw: dict = field(default_factory=dict)
-    issues: tuple[str, ...] = ()  # what a tolerant reader let pass
-    run: str = ""  # where flights of several runs are put together
+    issues: tuple[str, ...] = ()  # what a tolerant reader accepted
+    run: str = ""  # where tracks of several runs are put together
     segments: tuple[Segment, ...] = ()
     mission: Mission | None = None
     intrinsics: np.ndarray | None = None
@@ -129,7 +134,7 @@ class Track:
     people: People | None = None
     goal: Goal | None = None
     bystanders: np.ndarray | None = None
-    given_id: str | None = None  # where flights of several towns or runs share the plain one (places.py)
+    given_id: str | None = None  # where tracks of several towns or runs share the plain one (places.py)
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -140,7 +145,7 @@ class Track:
         return self.given_id or f"{self.trajectory}_{self.variant}"
 
     def camera_at(self, index: int) -> Camera:
-        """Return the camera that frame `index` was drawn with."""
+        """Return the camera of frame `index`."""
         return self.camera if self.intrinsics is None else replace(self.camera, intrinsic=self.intrinsics[index])
 
     @property
@@ -151,84 +156,103 @@ class Track:
 
     @cached_property
     def styles(self) -> list[str]:
-        """The style that each frame was flown in."""
+        """Manoeuvre style of each frame."""
         styles = [FOLLOW] * len(self)
         for part in self.segments:
             styles[part.begin : part.end] = [part.style] * (part.end - part.begin)
         return styles
 
-    @cached_property
-    def target_headings_deg(self) -> np.ndarray:
-        """Whither the person walks, (n,) counter-clockwise from east; NaN before the first step and where nobody is."""
-        frames = np.arange(len(self))
-        ahead, behind = np.minimum(frames + HEADING_FRAMES, len(self) - 1), np.maximum(frames - HEADING_FRAMES, 0)
-        steps = self.targets_m[ahead, :2] - self.targets_m[behind, :2]
-        moves = np.linalg.norm(np.nan_to_num(steps), axis=1) >= STANDS_M
-        last = np.maximum.accumulate(np.where(moves, frames, -1))  # who stands keeps the direction of before
-        return np.where(last >= 0, np.degrees(np.arctan2(steps[:, 1], steps[:, 0]))[last], np.nan)
-
-    @property
-    def walked_m(self) -> np.ndarray:
-        """Where the person walked, (n, 3), without what a perturbation added; NaN where nobody knows."""
-        return self.targets_m - self.target_offsets_m
-
-    @cached_property
-    def planned(self) -> tuple[np.ndarray, np.ndarray]:
-        """Poses (n, 6) and targets (n, 3) without what a perturbation added; NaN where nobody knows."""
-        poses = np.hstack([self.positions_m, self.rotations_deg])
-        if self.is_original:
-            return poses, self.targets_m
-        offsets = np.hstack([self.drone_offsets_m, self.rotation_offsets_deg])
-        return without_perturbation(poses, self.targets_m, offsets, self.target_offsets_m)
-
-    @cached_property
-    def motion(self) -> PlannedMotion:
-        """What it teaches a policy."""
-        between = np.empty((len(self), 0, 6)) if self.between is None else self.between
-        return PlannedMotion(self.time_s, self.planned[0], between, self.rotations_deg[:, 1], self.positions_m)
-
-    @property
-    def pace(self) -> str:
-        """The pace of the walk that it follows."""
-        return pace_of(self.source, str(self.folder))
-
-    @property
-    def weather(self) -> dict[str, str | None]:
-        """The presets of weather and time of day that the file names; None where it has no such record."""
-        word = self.raw.get("weather")
-        told = {"weather": word} if isinstance(word, str) else object_of(self.raw, "weather")
-        named = {own: (told.get(name) for name in names) for own, names in WEATHER_KEYS.items()}
-        return {own: next((one for one in found if isinstance(one, str)), None) for own, found in named.items()}
-
-    @cached_property
-    def weather_record(self) -> WeatherRecord | None:
-        """The whole record of weather, knobs and all; None where the file has none in the paper's form."""
-        try:
-            return WeatherRecord.model_validate(self.raw.get("weather"))
-        except ValidationError:
-            return None
-
-    def told_legibility(self, index: int) -> dict[str, float | bool | None]:
-        """Return what a point tells of LEGIBILITY; None where it says nothing."""
-        points = self.raw.get("points", [])
-        told = object_of(points[index], "target") if index < len(points) else {}
-        return {name: one if isinstance(one := told.get(name), bool) or is_number(one) else None for name in LEGIBILITY}
-
     @property
     def keeps_sight(self) -> np.ndarray:
-        """Tell of each frame whether it is judged by how much it sees of the target, (n,) bool."""
+        """Whether each frame is judged by how much it sees of the target, (n,) bool."""
         keeps = np.ones(len(self), dtype=bool)
         for part in self.segments:
             keeps[part.begin : part.end] = part.keeps_sight
         return keeps
 
+    @cached_property
+    def target_headings_deg(self) -> np.ndarray:
+        """Heading of the target, (n,) counter-clockwise from east; NaN before its first step and where unknown."""
+        frames = np.arange(len(self))
+        ahead, behind = np.minimum(frames + HEADING_FRAMES, len(self) - 1), np.maximum(frames - HEADING_FRAMES, 0)
+        steps = self.targets_m[ahead, :2] - self.targets_m[behind, :2]
+        moves = np.linalg.norm(np.nan_to_num(steps), axis=1) >= STANDS_M
+        last = np.maximum.accumulate(np.where(moves, frames, -1))  # who stands keeps the last direction
+        return np.where(last >= 0, np.degrees(np.arctan2(steps[:, 1], steps[:, 0]))[last], np.nan)
+
+    @property
+    def walked_m(self) -> np.ndarray:
+        """Target positions without perturbation, (n, 3); NaN where unknown."""
+        return self.targets_m - self.perturbation.target_m
+
+    @cached_property
+    def planned(self) -> tuple[np.ndarray, np.ndarray]:
+        """Poses (n, 6) and target positions (n, 3) without perturbation; NaN where unknown."""
+        poses = np.hstack([self.positions_m, self.rotations_deg])
+        if self.is_original:
+            return poses, self.targets_m
+        offsets = np.hstack([self.perturbation.drone_m, self.perturbation.rotation_deg])
+        return without_perturbation(poses, self.targets_m, offsets, self.perturbation.target_m)
+
+    @cached_property
+    def motion(self) -> PlannedMotion:
+        """The planned motion that a policy learns."""
+        between = np.empty((len(self), 0, 6)) if self.between is None else self.between
+        return PlannedMotion(self.time_s, self.planned[0], between, self.rotations_deg[:, 1], self.positions_m)
+
+    @property
+    def pace(self) -> str:
+        """Pace of the pedestrian trajectory."""
+        return pace_of(self.source, str(self.folder))
+
+    @property
+    def weather(self) -> dict[str, str | None]:
+        """Names of the presets of weather and time of day; None where the file has none."""
+        word = self.raw.get("weather")
+        found = {"weather": word} if isinstance(word, str) else object_of(self.raw, "weather")
+        named = {own: (found.get(name) for name in names) for own, names in WEATHER_KEYS.items()}
+        return {own: next((one for one in each if isinstance(one, str)), None) for own, each in named.items()}
+
+    @cached_property
+    def weather_record(self) -> WeatherRecord | None:
+        """The whole record of weather; None where the file has none in the paper's form."""
+        try:
+            return WeatherRecord.model_validate(self.raw.get("weather"))
+        except ValidationError:
+            return None
+
+    def _point(self, index: int, key: str) -> dict:
+        points = self.raw.get("points", [])
+        return object_of(points[index], key) if index < len(points) else {}
+
+    def told_legibility(self, index: int) -> dict[str, float | bool | None]:
+        """Return the LEGIBILITY fields of a point; None where the file does not say."""
+        point = self._point(index, "target")
+        return {name: v if isinstance(v := point.get(name), bool) or is_number(v) else None for name in LEGIBILITY}
+
+    def events(self, index: int) -> dict[str, str] | None:
+        """Return the outcome of a point's EVENTS (none, applied, fallback); None where the file does not say."""
+        point = self._point(index, "perturbation")
+        return {event: point[event] for event in EVENTS} if all(isinstance(point.get(e), str) for e in EVENTS) else None
+
+    @cached_property
+    def states(self) -> list[str | None]:
+        """Which of STATES each frame is in, after fallbacks; None where the file does not say."""
+        shifts, names, found = self.perturbation, tuple(STATES), []
+        for i in range(len(self)):
+            point = self._point(i, "perturbation")
+            shifted = _was_moved((shifts.drone_m[i], shifts.target_m[i]), point.get("drone_position"))
+            turned = _was_moved((shifts.rotation_deg[i],), point.get("drone_rotation"))
+            found.append(None if shifted is None or turned is None else names[shifted + 2 * turned])
+        return found
+
     @property
     def is_ours(self) -> bool:
-        """Whether cosfly made it, and not somebody else."""
+        """Whether cosfly made it."""
         return self.raw.get("dataset_format") == DATASET_FORMAT
 
     def target_picture(self, index: int) -> dict[str, str | bytes] | None:
-        """Return the picture of the target and its name, at the frame of the goal alone and where there is one."""
+        """Return the picture of the target and its name, at the frame of the goal only."""
         if self.goal is None or self.goal.frame != index or self.folder is None:
             return None
         if not (path := self.folder / TARGET_FILE).is_file():
@@ -240,37 +264,18 @@ class Track:
         assert self.folder is not None
         return self.folder / frame_name(index)
 
-    def events(self, index: int) -> dict[str, str] | None:
-        """Return what became of a point's EVENTS (none, applied, why it fell back); None where the file does not
-        say."""
-        points = self.raw.get("points", [])
-        told = object_of(points[index], "perturbation") if index < len(points) else {}
-        return {event: told[event] for event in EVENTS} if all(isinstance(told.get(e), str) for e in EVENTS) else None
-
-    @cached_property
-    def states(self) -> list[str | None]:
-        """Which of STATES each frame is in, after fallbacks; None where the file does not say."""
-        raw = [object_of(point, "perturbation") for point in self.raw.get("points", [])] or [{}] * len(self)
-        names, found = tuple(STATES), []
-        for i, told in enumerate(raw):
-            shifted = _was_moved((self.drone_offsets_m[i], self.target_offsets_m[i]), told.get("drone_position"))
-            turned = _was_moved((self.rotation_offsets_deg[i],), told.get("drone_rotation"))
-            found.append(None if shifted is None or turned is None else names[shifted + 2 * turned])
-        return found
-
     def missing_frames(self, names: tuple[str, ...] = FRAME_FILES) -> list[int]:
-        """Indices of the points that lack one of the files, by their names in the public layout."""
+        """Return the points that lack one of the files, by their names in the public layout."""
         folders = [self.frame_folder(i) for i in range(len(self))]
         return [i for i, folder in enumerate(folders) if not all(frame_path(folder, name).is_file() for name in names)]
 
 
-def _was_moved(offsets: tuple[np.ndarray, ...], told: object) -> bool | None:
-    """Return whether any offset is not zero; where they are not known, what the file says of the first; None where it
-    says nothing."""
+def _was_moved(offsets: tuple[np.ndarray, ...], flag: object) -> bool | None:
+    """Return whether any offset is not zero; where they are unknown, the file's flag; None without one."""
     if any((offset != 0).any() and not np.isnan(offset).any() for offset in offsets):
         return True
     if any(np.isnan(offset).any() for offset in offsets):
-        return told if isinstance(told, bool) else None
+        return flag if isinstance(flag, bool) else None
     return False
 
 
@@ -278,11 +283,11 @@ def _was_moved(offsets: tuple[np.ndarray, ...], told: object) -> bool | None:
 
 
 def read_track(folder: Path, *, strict: bool = True) -> Track:
-    """Read one flight folder.
+    """Read one track's folder.
 
     Args:
-        strict: every rule of the layout must hold. Tolerant: older names and missing optional fields are accepted, and
-            what was let pass stands in `Track.issues`; poses and times must be there and finite either way.
+        strict: every rule of the layout must hold. Otherwise older names and missing optional fields are accepted and
+            listed in `Track.issues`; poses and times must be there and finite either way.
     Raises:
         InputError: names the file, the point and the field.
     """
@@ -290,26 +295,23 @@ def read_track(folder: Path, *, strict: bool = True) -> Track:
     raw = read_json(path, what="trajectory", tree=tree_of_track(folder))
     if not isinstance(raw, dict):
         raise InputError("not a trajectory", where=path, got=type(raw).__name__, expected="an object")
-    reader = FieldReader(path, strict)
+    reader = _FieldReader(path, strict)
     _, town, trajectory, variant = astuple(place_of(folder))
-    reader.header(raw, variant)
+    for name, expected in (("schema", SCHEMA), ("schema_version", SCHEMA_VERSION), ("trace_dir", variant)):
+        reader.equal(name, raw.get(name), expected)
     points = reader.points(raw)
     time_s, poses = reader.times(points), reader.poses(points)
     targets, others = ([object_of(p, name) for p in points] for name in ("target", "others"))
     if not all(target or p.get("target", "missing") is None for target, p in zip(targets, points, strict=True)):
         reader.issue("points[].target", "missing", "an object, or null where there is nobody")
-    bystanders = np.column_stack([numbers_of(others, name) for name in BYSTANDER_COLUMNS])
-    segments, mission = reader.told(lambda: read_flown(raw, len(points), f"{path}: ")) or ((), None)
-    people = reader.told(lambda: validated(People, raw["people"], f"{path}: people")) if "people" in raw else None
+    bystanders = np.column_stack([_numbers_of(others, name) for name in BYSTANDER_COLUMNS])
+    segments, mission = reader.optional(lambda: read_flown(raw, len(points), str(path))) or ((), None)
+    people = reader.optional(lambda: validated(People, raw["people"], f"{path}: people")) if "people" in raw else None
     has_goal = raw.get("goal") is not None and "absent" not in object_of(raw, "goal")
-    goal = reader.told(lambda: Goal.from_json(raw["goal"], len(points), f"{path}: goal")) if has_goal else None
-    if {"params", "mode"} & object_of(raw, "weather").keys():  # public files may call something else so
-        reader.told(lambda: validated(WeatherRecord, raw["weather"], f"{path}: weather"))
+    goal = reader.optional(lambda: read_goal(raw["goal"], len(points), f"{path}: goal")) if has_goal else None
+    if {"params", "mode"} & object_of(raw, "weather").keys():  # public files may use the name for something else
+        reader.optional(lambda: validated(WeatherRecord, raw["weather"], f"{path}: weather"))
     is_original = bool(object_of(raw, "augmentation").get("is_original", variant == ORIGINAL))
-    drone, turn, walker = (
-        offsets_of(points, name, axes, is_original)
-        for name, axes in (("drone_position", XYZ), ("drone_rotation", ANGLES), ("target_position", XYZ))
-    )
     camera = reader.camera(raw.get("camera"))
     return Track(
         town=town,
@@ -321,21 +323,9 @@ def read_track(folder: Path, *, strict: bool = True) -> Track:
         time_s=time_s,
         positions_m=mirror_positions(poses[:, :3]),
         rotations_deg=mirror_rotations(poses[:, 3:]),
-        targets_m=mirror_positions(vectors_of(targets, "world_location", XYZ)),
-        target_in_view=flags_of(targets, "in_view", default_key="visible"),
-        target_visible=flags_of(targets, "visible"),
-        target_depth_m=numbers_of(targets, "depth"),
-        target_uv=vectors_of(targets, "image_uv", ("u", "v")),
-        target_bbox=vectors_of(targets, "bbox_2d", BBOX),
-        target_mask_bbox=mask_boxes(targets),
-        target_legible=flags_of(targets, "legible")
-        if all(isinstance(t.get("legible"), bool) for t in targets)
-        else None,
-        visibility=numbers_of(targets, "visibility"),
-        is_perturbed=np.array([bool(p.get("is_perturbed", False)) for p in points]),
-        drone_offsets_m=mirror_positions(drone),
-        rotation_offsets_deg=mirror_rotations(turn),
-        target_offsets_m=mirror_positions(walker),
+        targets_m=mirror_positions(_vectors_of(targets, "world_location", XYZ)),
+        target=_target_view(targets),
+        perturbation=_perturbation(points, is_original),
         source=object_of(raw, "source"),
         is_original=is_original,
         folder=folder,
@@ -349,62 +339,244 @@ def read_track(folder: Path, *, strict: bool = True) -> Track:
     )
 
 
+class _FieldReader:
+    """Checks fields of one file: strict raises, tolerant notes."""
+
+    def __init__(self, path: Path, strict: bool) -> None:
+        self.path, self.strict = path, strict
+        self.issues: list[str] = []
+
+    def error(self, message: str, where: str, got: object, expected: str) -> InputError:
+        if str(got) in ("None", "NoneType"):
+            return InputError(MISSING, where=f"{self.path}: {where}", expected=expected)
+        return InputError(message, where=f"{self.path}: {where}", got=str(got), expected=expected)
+
+    def issue(self, where: str, got: object, expected: str) -> None:
+        with self.noted():
+            raise self.error("breaks the layout", where, got, expected)
+
+    @contextmanager
+    def noted(self) -> Iterator[None]:
+        """Note an InputError that is raised within, unless the reader is strict."""
+        try:
+            yield
+        except InputError as error:
+            if self.strict:
+                raise
+            self.issues.append(str(error))
+
+    def optional(self, read: Callable[[], Value]) -> Value | None:
+        """Return an optional field; None, with a note, where it holds something else of this name."""
+        with self.noted():
+            return read()
+        return None
+
+    def equal(self, where: str, got: object, expected: object) -> None:
+        if got != expected:
+            self.issue(where, repr(got), repr(expected))
+
+    def points(self, raw: dict) -> list[dict]:
+        points = raw.get("points", None if self.strict else raw.get("waypoints"))
+        if not isinstance(points, list) or not points or not all(isinstance(p, dict) for p in points):
+            raise self.error("no points", "points", type(points).__name__, "a list of objects")
+        for i, point in enumerate(points):
+            self.equal(f"points[{i}].index", point.get("index"), i)
+        return points
+
+    def times(self, points: list[dict]) -> np.ndarray:
+        """Read the times of the points, (n,) s; they must increase."""
+        time_s = np.array([self.time(i, point) for i, point in enumerate(points)])
+        steps = np.diff(time_s)
+        if (steps <= 0).any():
+            where = f"points[{int(np.argmax(steps <= 0)) + 1}].timing.trace_timestamp"
+            raise self.error("time does not increase", where, float(steps.min()), "strictly increasing times")
+        dt_s = step_s(time_s)
+        if len(steps) and np.abs(steps - dt_s).max() > 1e-3:
+            got = f"steps of {steps.min():.3f} to {steps.max():.3f} s"
+            self.issue("points[].timing.trace_timestamp", got, f"even steps, most are {dt_s:g} s")
+        return time_s
+
+    def time(self, i: int, point: dict) -> float:
+        timing, where = object_of(point, "timing"), f"points[{i}].timing"
+        if self.strict or "trace_timestamp" in timing:
+            return self.number(where, timing, "trace_timestamp")
+        return self.number(where, timing if "timestamp" in timing else point, "timestamp")
+
+    def number(self, where: str, group: Any, name: str) -> float:
+        value = group.get(name) if isinstance(group, dict) else None
+        if value is None and name in ("pitch", "roll") and not self.strict:
+            return 0.0
+        if value is None or not is_number(value):
+            raise self.error("not a number", f"{where}.{name}", repr(value)[:60], "a finite number")
+        return float(value)
+
+    def poses(self, points: list[dict]) -> np.ndarray:
+        """Read poses as in the file, (n, 6): x, y, z, pitch, yaw, roll in CARLA's axes, and check the waypoints."""
+        groups = [(f"points[{i}].drone_pose", point.get("drone_pose")) for i, point in enumerate(points)]
+        poses = np.array([[self.number(where, group, name) for name in XYZ + ANGLES] for where, group in groups])
+        for i, point in enumerate(points):
+            nav = point.get("nav_waypoint")
+            found = nav.get("t1_world") if isinstance(nav, dict) else "missing"
+            where = f"points[{i}].nav_waypoint.t1_world"
+            if i + 1 == len(points):
+                if found is not None:
+                    self.issue(where, repr(found)[:60], "null at the last point")
+                break
+            vector, following = np.array(_parts_of(found, XYZ)), poses[i + 1, :3]
+            if np.isnan(vector).any() or np.abs(vector - following).max() > WAYPOINT_TOLERANCE_M:
+                self.issue(where, repr(found)[:60], f"the next point's position {following.tolist()}")
+                break  # one note is enough
+        return poses
+
+    def between(self, points: list[dict]) -> np.ndarray | None:
+        """Read planned poses after each point and before the next, (n, k - 1, 6), NaN after the last; None without."""
+        if len(points) < 2 or not any(point.get("between") for point in points):
+            return None
+        found = numbers([point.get("between") for point in points[:-1]], None, None, len(XYZ + ANGLES))
+        if found is None:
+            self.issue("points[].between", "something else", "as many poses of 6 finite numbers after each point")
+            return None
+        return np.concatenate([found, np.full((1, *found.shape[1:]), np.nan)])
+
+    def camera(self, group: Any) -> Camera:
+        if not isinstance(group, dict):
+            raise InputError("missing", where=f"{self.path}: camera", expected="width, height, intrinsic")
+        width, height = self.number("camera", group, "width"), self.number("camera", group, "height")
+        matrix = numbers(group.get("intrinsic"), 3, 3)
+        if matrix is None or matrix[0, 0] <= 0 or width < 1 or height < 1:
+            got, expected = repr(group.get("intrinsic"))[:60], "a 3x3 matrix with a positive focal length"
+            raise self.error("not a camera", "camera.intrinsic", got, expected)
+        check_pixels(width * height, f"{self.path}: camera", f"{width:g} x {height:g} px")
+        return Camera(int(width), int(height), matrix)
+
+    def intrinsics(self, points: list[dict], camera: Camera) -> np.ndarray | None:
+        """Read matrices of the frames, (n, 3, 3); None where `camera` is that of all."""
+        found = np.tile(camera.intrinsic, (len(points), 1, 1))
+        for i, own in enumerate(object_of(point, "camera") for point in points):
+            if own.get("intrinsic") is None:
+                continue
+            try:
+                size = {"width": camera.width_px, "height": camera.height_px}
+                found[i] = self.camera({**size, "intrinsic": own["intrinsic"]}).intrinsic
+            except InputError as error:
+                self.issue(f"points[{i}].camera.intrinsic", error.got, error.expected or "a camera")
+        return None if (found == camera.intrinsic).all() else found
+
+
+def object_of(group: dict, key: str) -> dict:
+    """Return the object under a key; an empty one where there is none, or something else."""
+    value = group.get(key)
+    return value if isinstance(value, dict) else {}
+
+
+def _parts_of(value: Any, names: tuple[str, ...]) -> list:
+    """Return the numbers of {"x": .., "y": ..} or [.., ..]; NaN for anything else, nulls included."""
+    parts = [value.get(n) for n in names] if isinstance(value, dict) else value
+    if isinstance(parts, list) and len(parts) == len(names) and all(map(is_number, parts)):
+        return parts
+    return [np.nan] * len(names)
+
+
+def _vectors_of(groups: list[dict], key: str, names: tuple[str, ...]) -> np.ndarray:
+    """Read a vector of each group, (n, len(names))."""
+    parts = [_parts_of(group.get(key), names) for group in groups]
+    return np.array(parts, dtype=np.float64).reshape(-1, len(names))
+
+
+def _numbers_of(groups: list[dict], key: str) -> np.ndarray:
+    """Read one number of each group, (n,); NaN for anything else."""
+    return np.array([_parts_of([group.get(key)], (key,))[0] for group in groups], dtype=np.float64)
+
+
+def _target_view(targets: list[dict]) -> TargetRecord:
+    flags = [target.get("legible") for target in targets]
+    has_mask = any("mask_bbox_2d" in target for target in targets)
+    return TargetRecord(
+        in_view=np.array([bool(target.get("in_view", target.get("visible", False))) for target in targets]),
+        visible=np.array([bool(target.get("visible", False)) for target in targets]),
+        depth_m=_numbers_of(targets, "depth"),
+        uv=_vectors_of(targets, "image_uv", ("u", "v")),
+        bbox=_vectors_of(targets, "bbox_2d", BBOX),
+        visibility=_numbers_of(targets, "visibility"),
+        mask_bbox=_vectors_of(targets, "mask_bbox_2d", BBOX) if has_mask else None,
+        legible=np.array(flags) if all(isinstance(flag, bool) for flag in flags) else None,
+    )
+
+
+def _perturbation(points: list[dict], is_original: bool) -> Perturbation:
+    groups = [object_of(point, "perturbation") for point in points]
+
+    def offsets(key: str, names: tuple[str, ...]) -> np.ndarray:
+        found = _vectors_of(groups, key, names)
+        pairs = zip(points, groups, strict=True)
+        is_none = [is_original or p.get("is_perturbed") is False or g.get(key) is False for p, g in pairs]
+        found[np.isnan(found).any(axis=1) & np.array(is_none)] = 0.0
+        return found
+
+    return Perturbation(
+        is_perturbed=np.array([bool(point.get("is_perturbed", False)) for point in points]),
+        drone_m=mirror_positions(offsets("drone_position", XYZ)),
+        rotation_deg=mirror_rotations(offsets("drone_rotation", ANGLES)),
+        target_m=mirror_positions(offsets("target_position", XYZ)),
+    )
+
+
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
-def write_track(folder: Path, flight: Track) -> None:
-    """Write `trajectory.json` into a folder. Unknown keys of `flight.raw` are kept, known ones set from the arrays."""
-    raw = copy.deepcopy(flight.raw)
-    points = raw.pop("points", None) or raw.pop("waypoints", None) or [{} for _ in range(len(flight))]
-    assert len(points) == len(flight), "raw points and columns differ in number"
-    raw.update(schema=SCHEMA, schema_version=SCHEMA_VERSION, trace_dir=flight.variant)
+def write_track(folder: Path, track: Track) -> None:
+    """Write `trajectory.json` into a folder. Unknown keys of `track.raw` are kept, known ones set from the arrays."""
+    raw = copy.deepcopy(track.raw)
+    points = raw.pop("points", None) or raw.pop("waypoints", None) or [{} for _ in range(len(track))]
+    assert len(points) == len(track), "raw points and columns differ in number"
+    raw.update(schema=SCHEMA, schema_version=SCHEMA_VERSION, trace_dir=track.variant)
     raw.setdefault("dataset_format", DATASET_FORMAT)
     raw.setdefault("frames_dir", FRAMES_DIR)
     raw.setdefault("coordinates", COORDINATES)
-    raw["source"] = flight.source
-    raw.update(flown_as_json(flight.segments, mirrored(flight.mission)))
-    if flight.people is not None:
-        raw["people"] = asdict(flight.people)
-    if flight.goal is not None:
-        raw["goal"] = asdict(flight.goal)
-    camera = flight.camera
+    raw["source"] = track.source
+    raw.update(flown_as_json(track.segments, mirrored(track.mission)))
+    if track.people is not None:
+        raw["people"] = asdict(track.people)
+    if track.goal is not None:
+        raw["goal"] = asdict(track.goal)
+    camera = track.camera
     raw["camera"] = {**object_of(raw, "camera"), "width": camera.width_px, "height": camera.height_px, **_focal(camera)}
     raw["augmentation"] = {
-        "enabled": not flight.is_original,
-        "aug_index": 0 if flight.is_original else 1,
+        "enabled": not track.is_original,
+        "aug_index": 0 if track.is_original else 1,
         **object_of(raw, "augmentation"),
-        "is_original": flight.is_original,
+        "is_original": track.is_original,
     }
-    positions = mirror_positions(flight.positions_m) + 0.0
-    poses = np.hstack([positions, mirror_rotations(flight.rotations_deg) + 0.0]).tolist()
-    between = _mirrored_poses(flight.between)
+    positions = mirror_positions(track.positions_m) + 0.0
+    poses = np.hstack([positions, mirror_rotations(track.rotations_deg) + 0.0]).tolist()
+    between = _mirrored_poses(track.between)
     vectors: list[tuple[str, str, tuple[str, ...], np.ndarray]] = [
-        ("target", "world_location", XYZ, mirror_positions(flight.targets_m)),
-        ("target", "image_uv", (), flight.target_uv),
-        ("target", "bbox_2d", BBOX, flight.target_bbox),
-        ("perturbation", "drone_position", XYZ, mirror_positions(flight.drone_offsets_m)),
-        ("perturbation", "drone_rotation", ANGLES, mirror_rotations(flight.rotation_offsets_deg)),
-        ("perturbation", "target_position", XYZ, mirror_positions(flight.target_offsets_m)),
+        ("target", "world_location", XYZ, mirror_positions(track.targets_m)),
+        ("target", "image_uv", (), track.target.uv),
+        ("target", "bbox_2d", BBOX, track.target.bbox),
+        ("perturbation", "drone_position", XYZ, mirror_positions(track.perturbation.drone_m)),
+        ("perturbation", "drone_rotation", ANGLES, mirror_rotations(track.perturbation.rotation_deg)),
+        ("perturbation", "target_position", XYZ, mirror_positions(track.perturbation.target_m)),
     ]
-    if flight.target_mask_bbox is not None:
-        vectors.append(("target", "mask_bbox_2d", BBOX, flight.target_mask_bbox))
+    if track.target.mask_bbox is not None:
+        vectors.append(("target", "mask_bbox_2d", BBOX, track.target.mask_bbox))
     for i, point in enumerate(points):
         point["index"] = i
-        point["is_perturbed"] = bool(flight.is_perturbed[i])
-        time_s = float(flight.time_s[i])
+        point["is_perturbed"] = bool(track.perturbation.is_perturbed[i])
+        time_s = float(track.time_s[i])
         point["timing"] = {"sim_timestamp": time_s, **object_of(point, "timing"), "trace_timestamp": time_s}
         point["drone_pose"] = {**object_of(point, "drone_pose"), **dict(zip(XYZ + ANGLES, poses[i], strict=True))}
         following = dict(zip(XYZ, poses[i + 1], strict=False)) if i + 1 < len(points) else None
         point["nav_waypoint"] = {**object_of(point, "nav_waypoint"), "t1_world": following}
         point["perturbation"] = object_of(point, "perturbation")
-        point["action"] = _tree_action(flight.motion.action[i])
+        point["action"] = _tree_action(track.motion.action[i])
         if between is not None:
             point["between"] = None if i + 1 == len(points) else (between[i] + 0.0).tolist()
-        if flight.intrinsics is not None:
-            point["camera"] = {**object_of(point, "camera"), **_focal(flight.camera_at(i))}
-        is_nobody = "target" in point and point["target"] is None and np.isnan(flight.targets_m[i]).all()
+        if track.intrinsics is not None:
+            point["camera"] = {**object_of(point, "camera"), **_focal(track.camera_at(i))}
+        is_nobody = "target" in point and point["target"] is None and np.isnan(track.targets_m[i]).all()
         if not is_nobody:
-            point["target"] = _target(object_of(point, "target"), flight, i)
+            point["target"] = _target(object_of(point, "target"), track, i)
         for group, key, names, values in vectors:
             if not (is_nobody and group == "target"):
                 _put_vector(point[group], key, names, values[i])
@@ -434,14 +606,14 @@ def _focal(camera: Camera) -> dict:
     }
 
 
-def _target(group: dict, flight: Track, i: int) -> dict:
+def _target(group: dict, track: Track, i: int) -> dict:
     """Return the target of point i without its vectors; what else the file says of it stays."""
     target = {"enabled": True} | group
-    target["visible"] = bool(flight.target_visible[i])
-    target["in_view"] = bool(flight.target_in_view[i])
-    target["depth"] = _number_or_none(flight.target_depth_m[i])
-    if not np.isnan(flight.visibility[i]) or "visibility" in target:
-        target["visibility"] = _number_or_none(flight.visibility[i])
+    target["visible"] = bool(track.target.visible[i])
+    target["in_view"] = bool(track.target.in_view[i])
+    target["depth"] = _number_or_none(track.target.depth_m[i])
+    if not np.isnan(track.target.visibility[i]) or "visibility" in target:
+        target["visibility"] = _number_or_none(track.target.visibility[i])
     return target
 
 

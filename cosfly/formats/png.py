@@ -1,11 +1,9 @@
-"""PNG as playback trees and releases hold it: 8 bits, grey to RGBA, not interlaced (RFC 2083).
+"""PNG of playback trees and releases: 8 bits, grey to RGBA, not interlaced (RFC 2083).
 
-Read: the checksums of chunks and stream and the number of bytes are always compared, so a picture that passes is whole;
-it is never unpacked to more than its header says. Filters are undone when pixels are wanted.
-
-Written, of three kinds: colours have texture, so each row is stored as the difference to the average of its left and
-upper neighbours. Instance masks have areas: their bytes stay as they are, and the packing finds the row above. Of depth
-a pixel's four channels are the bytes of a float32, lowest first, each row stored as the difference to the one above.
+Reading always compares the checksums of chunks and stream and the number of bytes, and never unpacks more than the
+header says. Writing has three kinds. Colours have texture: each row is stored as the difference to the average of its
+left and upper neighbours. Instance masks have areas: bytes stay as they are. Of depth, a pixel's four channels are the
+bytes of a float32, lowest first, each row stored as the difference to the one above.
 """
 
 from __future__ import annotations
@@ -30,8 +28,7 @@ NOT_UNPACKED: Any = zlib.error  # its stub says that it is no class
 
 
 class Png(NamedTuple):
-    """An unpacked PNG: `lines` (h, 1 + w * channels) uint8, of each row its filter and its bytes as the filter left
-    them."""
+    """An unpacked PNG. lines: (h, 1 + w * channels) uint8, the filter and the filtered bytes of each row."""
 
     lines: np.ndarray
     channels: int
@@ -42,11 +39,7 @@ class Png(NamedTuple):
 
 
 def parse_png(data: bytes | memoryview, where: object) -> Png:
-    """Unpack a PNG, and see that every checksum holds.
-
-    Raises:
-        InputError: it is none, damaged, of another kind, or larger than pictures may be.
-    """
+    """Unpack a PNG and check its checksums; raises InputError if it is damaged, of another kind or too large."""
     width, height, channels, packed = _chunks(data, where)
     stride = 1 + width * channels
     unpacker = zlib.decompressobj()
@@ -92,16 +85,15 @@ def floats_png(values: np.ndarray) -> bytes:
 
 
 def colours_of(data: bytes | memoryview, where: object) -> np.ndarray:
-    """Decode a picture of colours, (h, w, 3) uint8, without alpha; raises as `parse_png`, and where it is grey."""
+    """Decode a picture of colours, (h, w, 3) uint8, without alpha."""
     png = parse_png(data, where)
     if png.channels < RGB:
-        got = f"{png.channels} channels"
-        raise InputError("not a colour picture", where=str(where), got=got, expected="RGB or RGBA")
+        raise _broken(where, f"{png.channels} channels, not RGB or RGBA")
     return np.ascontiguousarray(png.pixels()[..., :RGB])
 
 
 def floats_of(data: bytes | memoryview, where: object) -> np.ndarray:
-    """Decode what `floats_png` wrote, (h, w) float32; raises as `parse_png`, and where it has not four channels."""
+    """Decode what `floats_png` wrote, (h, w) float32."""
     png = parse_png(data, where)
     if png.channels != RGBA:
         raise _broken(where, f"{png.channels} channels, not the 4 bytes of a float32")
@@ -119,12 +111,11 @@ def _png(lines: np.ndarray, channels: int) -> bytes:
 
 
 def _packed(data: memoryview) -> bytes:
-    """Pack bytes, the same ones to the same wherever in memory the library works.
+    """Pack bytes reproducibly.
 
-    At this level its loop for long inputs hashes an address in the place of the third byte (ISA-L,
-    `igzip_icf_body_h1_gr_bt.asm`, `.write_first_byte`), so that of a thousand depth pictures one came out a byte or
-    three longer in another thread. It has another loop for the last 16 bytes before a flush, which does not; so begun,
-    the long one is right. Costs about 2 bytes a picture, and no time.
+    ISA-L's loop for long inputs hashes an address in place of the third byte (`igzip_icf_body_h1_gr_bt.asm`,
+    `.write_first_byte`), so that results differ between threads; its loop for the last 16 bytes before a flush does
+    not. Flushing after FIRST bytes costs about 2 bytes a picture.
     """
     packer = zlib.compressobj(LEVEL)
     begun = packer.compress(data[:FIRST]) + packer.flush(zlib.Z_SYNC_FLUSH)
@@ -138,7 +129,7 @@ def _broken(where: object, got: str) -> InputError:
 def _chunks(data: bytes | memoryview, where: object) -> tuple[int, int, int, bytes]:
     """Return width, height, channels and the packed pixels of the chunks."""
     if data[:8] != PNG_SIGNATURE or data[12:16] != b"IHDR" or len(data) < 33:
-        raise InputError("not an image", where=str(where), got=f"{len(data)} bytes", expected="a PNG")
+        raise _broken(where, f"{len(data)} bytes that are not a PNG")
     width, height, depth, kind, packing, filters, interlace = struct.unpack_from(">IIBBBBB", data, 16)
     check_pixels(width * height, str(where), f"{width} x {height} px")
     if depth != 8 or kind not in CHANNELS or packing or filters or interlace or not width or not height:

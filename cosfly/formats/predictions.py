@@ -1,4 +1,4 @@
-"""`predictions.jsonl`: what a student answered. `distill infer` writes it; `distill evaluate` and `caption` read it."""
+"""`predictions.jsonl`, a student's answers: written by `distill infer`, read by `distill evaluate` and `caption`."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Literal
 
 from cosfly.formats.captions import Coc, Language
-from cosfly.formats.splits import Split
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import Record, model_lines
 
+Split = Literal["train", "val", "test"]
 PREDICTIONS = "predictions.jsonl"
 FAILED = "failed_"  # what the reason of a prediction begins with that could not be made
 
@@ -20,10 +20,10 @@ class Prediction(Record):
     schema_version: Literal["1.0"] = "1.0"
     sample_id: str
     language: Language
-    run: str = ""  # the tree of its window; empty in files of before it stood here
+    run: str = ""  # the tree of its window; empty in older files
     window_id: str = ""  # of the window in that tree; empty: sample_id
     split: Split
-    model: str | None = None  # who answered; None in files of before it stood here
+    model: str | None = None  # None in older files
     raw: str
     num_tokens: int
     is_finished: bool  # False: cut at max_new_tokens, or where the context was full

@@ -12,7 +12,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, NonNegativeInt, model_validator
 
-from cosfly.formats.motion import ACTION
+from cosfly.geometry.motion import ACTION
 from cosfly.runtime.json_io import FileFormat, Record, read_model, write_model
 
 PURSUITS = "pursuits"  # the folder of them in what `cosfly fly` writes
@@ -32,7 +32,7 @@ _Least = Annotated[FiniteFloat, Field(ge=0)]
 
 
 class PursuitFrame(Record):
-    """One frame. command: as ACTION (cosfly/formats/motion.py), None of the last. answer_s: how long the student took,
+    """One frame. command: as ACTION (cosfly/geometry/motion.py), None of the last. answer_s: how long the student took,
     None where nobody was asked. words: what it said, its reasons or, where they cannot be read, the raw answer.
 
     in_view: some of the target's box is in the picture; visible: and enough of it is not hidden, `visibility` its

@@ -1,5 +1,4 @@
-"""`roi_polygon.json`: where pedestrians may walk: the paper's form, ours with holes and several rings, and GeoJSON in
-metres."""
+"""`roi_polygon.json`, where pedestrians may walk: the paper's form, ours with holes, and GeoJSON in metres."""
 
 from __future__ import annotations
 
@@ -64,9 +63,9 @@ class Roi(RoiPolygon):
 
 def write_roi(path: Path, roi: Roi) -> None:
     """Write what `read_roi` reads; one polygon without holes is the paper's form (subsec:appendix_g_editor)."""
-    told = roi.model_dump(exclude_defaults=True)
-    points = {name: told.pop(name) for name in ("points_world", "holes", "polygons") if name in told}
-    write_json(path, {**told, "closed": True, **points}, indent=None)
+    fields = roi.model_dump(exclude_defaults=True)
+    points = {name: fields.pop(name) for name in ("points_world", "holes", "polygons") if name in fields}
+    write_json(path, {**fields, "closed": True, **points}, indent=None)
 
 
 def read_roi(path: Path, most_vertices: int = MOST_VERTICES) -> Roi:
@@ -96,12 +95,8 @@ def parse_roi(data: bytes, path: Path, most_vertices: int = MOST_VERTICES) -> Ro
                 raise InputError("not a ring", where=where, got=got, expected="at least three finite points")
             reason = shapely.is_valid_reason(shapely.Polygon(ring))
             if reason != "Valid Geometry":
-                raise InputError(
-                    "a ring crosses itself",
-                    where=f"{path}: polygon {number}",
-                    got=reason,
-                    fix="draw it again without crossings",
-                )
+                where, fix = f"{path}: polygon {number}", "draw it again without crossings"
+                raise InputError("a ring crosses itself", where=where, got=reason, fix=fix)
     return roi
 
 

@@ -1,22 +1,24 @@
-"""Styles of a flight's parts, and the mission that ended it: kept in `drone_trace.json` and `trajectory.json`.
+"""Manoeuvre styles of a trajectory's parts and the mission that ends it, in `drone_trace.json` and `trajectory.json`.
 
-A file without them holds a flight that follows the walker, as the paper's do, and no mission.
+A file without them follows the target from end to end, as the paper's do, without a mission.
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Literal, get_args
 
-from pydantic import Field
+from pydantic import BaseModel, Field
 
-from cosfly.formats.columns import is_number
+from cosfly.formats.columns import LARGEST
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import validated
 
-FOLLOW = "follow"  # the style where nothing else is said
-MISSION_KINDS = ("geofence", "battery", "time_over")
+FOLLOW = "follow"  # the default style
+MissionKind = Literal["geofence", "battery", "time_over"]
+MISSION_KINDS: tuple[MissionKind, ...] = get_args(MissionKind)
 Frame = Annotated[int, Field(strict=True, ge=0)]
+Coordinate = Annotated[float, Field(strict=True, ge=-LARGEST, le=LARGEST)]
 
 
 @dataclass(frozen=True)
@@ -31,33 +33,48 @@ class Segment:
 
 @dataclass(frozen=True)
 class Mission:
-    """An order that ends a pursuit. kind: of MISSION_KINDS, which the drone knows from `at_frame` on.
+    """An order that ends the tracking: from `at_frame` the drone breaks off, from `home_frame` it flies to `home_m`."""
 
-    From `at_frame` the drone breaks off, from `home_frame` it flies home, to home_m (x, y, z).
-    """
-
-    kind: str
+    kind: MissionKind
     at_frame: int
     home_frame: int
     home_m: tuple[float, float, float]
 
     def order_at(self, frame: int) -> str | None:
-        """Return the decision that stands as an order at a frame, None before the first."""
+        """Return the decision that is ordered at a frame, None before the first."""
         return None if frame < self.at_frame else "break_off" if frame < self.home_frame else "return_to_home"
 
-    def as_json(self) -> dict:
-        home = dict(zip("xyz", self.home_m, strict=True))
-        return {"kind": self.kind, "at_frame": self.at_frame, "home_frame": self.home_frame, "home": home}
+
+class _Home(BaseModel):
+    x: Coordinate
+    y: Coordinate
+    z: Coordinate
+
+
+class _Mission(BaseModel):
+    kind: MissionKind
+    at_frame: Frame
+    home_frame: Frame
+    home: _Home
+
+
+class _Flown(BaseModel):
+    segments: tuple[Segment, ...] | None = None
+    mission: _Mission | None = None
 
 
 def flown_as_json(segments: tuple[Segment, ...], mission: Mission | None) -> dict:
-    """Return the keys that a record has of them: none for a flight that follows from end to end."""
+    """Return the keys that `read_flown` reads; none for a trajectory that follows from end to end."""
     record: dict = {"segments": [asdict(part) for part in segments]} if segments else {}
-    return record | ({"mission": mission.as_json()} if mission is not None else {})
+    if mission is not None:
+        home = dict(zip("xyz", mission.home_m, strict=True))
+        record["mission"] = {name: getattr(mission, name) for name in ("kind", "at_frame", "home_frame")}
+        record["mission"]["home"] = home
+    return record
 
 
 def mirrored(mission: Mission | None) -> Mission | None:
-    """Change a mission between right-handed and CARLA axes."""
+    """Convert a mission between right-handed and CARLA axes."""
     if mission is None:
         return None
     x, y, z = mission.home_m
@@ -65,35 +82,19 @@ def mirrored(mission: Mission | None) -> Mission | None:
 
 
 def read_flown(record: dict, num_frames: int, where: str) -> tuple[tuple[Segment, ...], Mission | None]:
-    """Read what `flown_as_json` gives. where: what stands in a message before the names of the two keys."""
-    segments, mission = (record.get(name) for name in ("segments", "mission"))
-    return _segments(segments, num_frames, f"{where}segments"), _mission(mission, num_frames, f"{where}mission")
-
-
-def _segments(value: Any, num_frames: int, where: str) -> tuple[Segment, ...]:
-    segments = () if value is None else validated(tuple[Segment, ...], value, where)
-    for k, part in enumerate(segments):
-        for name in ("begin", "end"):
-            _frame(vars(part), name, num_frames, f"{where}[{k}]")
-    return segments
-
-
-def _mission(value: Any, num_frames: int, where: str) -> Mission | None:
-    if value is None:
-        return None
-    home = value.get("home") if isinstance(value, dict) else None
-    if not isinstance(home, dict) or not all(is_number(home.get(axis)) for axis in "xyz"):
-        raise InputError("not a mission", where=f"{where}.home", got=repr(home)[:60], expected="numbers x, y, z")
-    if value.get("kind") not in MISSION_KINDS:
-        raise InputError(
-            "unknown kind", where=f"{where}.kind", got=repr(value.get("kind"))[:60], expected=", ".join(MISSION_KINDS)
-        )
-    at, home_frame = (_frame(value, name, num_frames, where) for name in ("at_frame", "home_frame"))
-    return Mission(value["kind"], at, home_frame, (float(home["x"]), float(home["y"]), float(home["z"])))
-
-
-def _frame(group: dict, name: str, num_frames: int, where: str) -> int:
-    value = group.get(name)
-    if type(value) is not int or not 0 <= value <= num_frames:
-        raise InputError("not a frame", where=f"{where}.{name}", got=repr(value)[:60], expected=f"0 to {num_frames}")
-    return value
+    """Return segments and mission of a record of `num_frames` frames. where: file and place of the record."""
+    flown = validated(_Flown, {name: record.get(name) for name in _Flown.model_fields}, where)
+    segments, mission = flown.segments or (), flown.mission
+    frames = [
+        (f"segments[{k}].{name}", getattr(part, name)) for k, part in enumerate(segments) for name in ("begin", "end")
+    ]
+    if mission is not None:
+        frames += [(f"mission.{name}", getattr(mission, name)) for name in ("at_frame", "home_frame")]
+    for name, frame in frames:
+        if frame > num_frames:
+            expected = f"0 to {num_frames}"
+            raise InputError("the frame does not exist", where=f"{where}: {name}", got=str(frame), expected=expected)
+    if mission is None:
+        return segments, None
+    home = mission.home
+    return segments, Mission(mission.kind, mission.at_frame, mission.home_frame, (home.x, home.y, home.z))

@@ -1,7 +1,6 @@
-"""A caption as a release shows it, and what a reader of captions finds: what `release verify` and `caption` exchange.
+"""A caption as a release shows it, and what a checker of captions finds: what `release verify` and `caption` exchange.
 
-Release knows rows and pictures, caption knows labels and verdicts; neither imports the other. The command line brings
-them together.
+Release knows rows and pictures, caption knows labels and verdicts; the command line brings the two together.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from cosfly.formats.playback import Track
 
 @dataclass(frozen=True)
 class ShownCaption:
-    """One caption of a flight. frame_index: its current frame. prompts: by language, empty where none is shown."""
+    """One caption of a track. frame_index: its current frame. prompts: by language, empty where none is released."""
 
     sample_id: str
     frame_index: int
@@ -30,11 +29,9 @@ class ShownCaption:
 
 @dataclass(frozen=True)
 class ShownFlight:
-    """A flight as far as it is released. flight: of the frames `frame_indices` (n,), in order, which may have gaps.
-
-    twin: the clean flight of a perturbed one, of the same frames; None
-    where it is not released or shows others. settings: of the captions, as recorded; empty: the defaults.
-    """
+    """The released part of a track. flight: of the frames `frame_indices`, (n,), ascending, possibly with gaps. twin:
+    the clean track of a perturbed one with the same frames, None if not released. settings: of the captions as
+    recorded; empty means the defaults."""
 
     flight: Track
     frame_indices: np.ndarray
@@ -44,7 +41,7 @@ class ShownFlight:
 
 
 class Lie(NamedTuple):
-    """Something that cannot be, in the words of a finding."""
+    """A contradiction, in the words of a finding."""
 
     code: str
     where: str

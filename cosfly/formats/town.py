@@ -1,7 +1,5 @@
-"""What stands in a town's folder of the playback tree beside its flights; render writes both.
-
-`map.json`: what the flights show, and whose it is. `instance_ids.json`: which box an id of `instance.png` stands for.
-"""
+"""Files of a town's folder in the playback tree: `map.json` (name and licence of the map) and `instance_ids.json`
+(which box an id of `instance.png` means)."""
 
 from __future__ import annotations
 
@@ -26,14 +24,14 @@ class TownMap(Record):
 
 
 def write_town_map(town: Path, header: MapHeader) -> Path:
-    """Write what `read_town_map` reads; give the file."""
+    """Write what `read_town_map` reads; return the file."""
     shown = TownMap(name=header.name, licence=header.licence, credits=header.credits)
     write_model(town / TOWN_FILE, shown, TOWN_FORMAT)
     return town / TOWN_FILE
 
 
 def read_town_map(town: Path) -> TownMap:
-    """Read what a town's folder says of its map; a foreign tree has no such file, and its licence is unknown."""
+    """Read the map record of a town's folder; the licence of a foreign tree, without such a file, is unknown."""
     if not (town / TOWN_FILE).exists():
         return TownMap(name=town.name, licence=UNKNOWN_LICENCE, credits="")
     return read_model(town / TOWN_FILE, TownMap, TOWN_FORMAT, tree=town.parent)

@@ -1,4 +1,4 @@
-"""`drone_trace.json`, the product of step 4: one flight for each walk."""
+"""`drone_trace.json`, the product of step 4: one drone trajectory for each pedestrian trajectory."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from cosfly.runtime.json_io import FileFormat
 
 TRACE_FORMAT = FileFormat("cosfly.drone_trace", "1.0", "drone traces")
 ARRAYS = ("time_s", "positions_m", "rotations_deg", "targets_m", "visibility")
-MORE = ("metrics", "solver", "drop_reason", "instead_of", "not_held")  # fields of a flight that are taken as they are
-MOST_FLIGHTS = 1_000_000  # of a run that an excerpt is of
+MORE = ("metrics", "solver", "drop_reason", "instead_of", "not_held")  # fields without checks
+MOST_TRAJECTORIES = 1_000_000  # of a run
 
 
 @dataclass(frozen=True)
 class Excerpt:
-    """Of a flight that is a part of another, the whole one, with whose clothes, stride and weather it is drawn. number:
-    among those of its run; before_m: (m, 3), the tracked points up to the first of the part, m >= 1."""
+    """The whole trajectory that a trajectory is a part of; clothes, stride and weather follow it. number: its index in
+    its run. before_m: (m, 3), the tracked points up to the first of the part, m >= 1."""
 
     path_id: str
     number: int
@@ -36,24 +36,22 @@ class Excerpt:
     def from_json(cls, record: Any, where: str) -> Excerpt | None:
         if record is None:
             return None
-        if not isinstance(record, dict) or record.get("number") not in range(MOST_FLIGHTS):
-            expected = f"id, a number below {MOST_FLIGHTS} and before"
+        if not isinstance(record, dict) or record.get("number") not in range(MOST_TRAJECTORIES):
+            expected = f"id, a number below {MOST_TRAJECTORIES} and before"
             raise InputError("not a part of a flight", where=where, expected=expected)
         return cls(text_id(record, where), int(record["number"]), matrix(record, "before", 3, where))
 
 
 @dataclass(frozen=True)
 class DroneTrace:
-    """One flight, the product of stage 4; n points at the pedestrian's time stamps.
+    """One drone trajectory, the product of stage 4; n points at the pedestrian's time stamps.
 
     time_s: (n,). positions_m: (n, 3) drone. rotations_deg: (n, 3) pitch, yaw, roll of the camera, which looks at the
     target. targets_m: (n, 3) the pedestrian's tracked point (hip height). visibility: (n,) five-ray fraction in [0, 1].
     clearances_m: (n,) signed distance to the nearest obstacle, the least on the straight way to the next point. metrics
-    and solver: JSON-able facts. segments: the styles of its parts, none where it follows from end to end. mission: the
-    order that ended the pursuit. instead_of: the style that it should have had and the map did not hold, and why;
-    not_held: what was asked and what was flown. On the way home and in a search the camera looks elsewhere.
-    drop_reason: why the planner-stage prefilter (sec:step6) rejects the flight, None if it passes; only those are
-    rendered. pace: of the walk. part_of: what it is an excerpt of.
+    and solver: JSON-able facts. segments: styles of its parts, none where it follows from end to end. instead_of: the
+    style that the map did not permit, and why; not_held: what was requested and what was flown. drop_reason: why the
+    prefilter (sec:step6) drops it, None if it passes; only those are rendered. pace: of the pedestrian trajectory.
     """
 
     path_id: str
@@ -75,16 +73,16 @@ class DroneTrace:
     part_of: Excerpt | None = None
 
     def drawn_as(self, number: int) -> Excerpt:
-        """Return what decides how it looks, of the flight of that number."""
+        """Return the excerpt that decides its looks, for trajectory `number`."""
         return self.part_of or Excerpt(self.path_id, number, self.targets_m[:1])
 
     def until(self, end: int) -> DroneTrace:
-        """Return the flight up to that point, which is left out, without its parts and its order."""
+        """Return the trajectory before point `end`, without segments and mission."""
         cut = {name: getattr(self, name)[:end] for name in (*ARRAYS, "clearances_m")}
         return replace(self, **cut, segments=(), mission=None)
 
     def every(self, stride: int) -> DroneTrace:
-        """Return the flight at every so many of its points; clearances are the least until the next of them."""
+        """Return every `stride`-th point; clearances are the least until the next of them."""
         if stride == 1:
             return self
         points, order = np.arange(0, len(self.time_s), stride), self.mission
@@ -100,8 +98,7 @@ class DroneTrace:
         )
 
     def between(self, stride: int) -> np.ndarray | None:
-        """Return the poses that `every` leaves out, (n, stride - 1, 6) after each that it takes, NaN after the last;
-        None where it takes all."""
+        """Return the poses that `every` skips, (n, stride - 1, 6), NaN after the last; None where it skips none."""
         if stride == 1:
             return None
         points = np.arange(0, len(self.time_s), stride)
@@ -116,7 +113,7 @@ class DroneTrace:
             **pace_field(self.pace),
             "drop_reason": self.drop_reason,
             **flown_as_json(self.segments, self.mission),
-            **{name: said for name in ("instead_of", "not_held") if (said := getattr(self, name))},
+            **{name: text for name in ("instead_of", "not_held") if (text := getattr(self, name))},
             **({} if self.part_of is None else {"part_of": self.part_of.as_json()}),
             "metrics": self.metrics,
             "solver": self.solver,
@@ -140,7 +137,7 @@ class DroneTrace:
                 raise InputError("missing", where=f"{where}.{group}", expected="an object of columns")
             groups[group] = np.stack([column(part, name, f"{where}.{group}", len(time_s)) for name in names], axis=1)
         visibility, clearances_m = (column(record, name, where, len(time_s)) for name in ("visibility", "clearance"))
-        segments, mission = read_flown(record, len(time_s), f"{where}.")
+        segments, mission = read_flown(record, len(time_s), where)
         more: dict[str, Any] = {name: record[name] for name in MORE if name in record}
         more |= {"segments": segments, "mission": mission, "pace": pace_of(record, where)}
         more["part_of"] = Excerpt.from_json(record.get("part_of"), f"{where}.part_of")
@@ -149,7 +146,7 @@ class DroneTrace:
 
 
 def write_traces(path: Path, traces: list[DroneTrace], header: dict) -> None:
-    """Write `drone_trace.json`; `header` holds the map's name, planner settings and seed."""
+    """Write `drone_trace.json`; header: the map's name, planner settings and seed."""
     write_items(path, TRACE_FORMAT, "traces", traces, header | step_field(traces))
 
 

@@ -1,8 +1,7 @@
-"""The flights of a playback tree: which there are, which are chosen, and which two are of one walk."""
+"""Tracks of a playback tree: finding, choosing, and the clean twin of a perturbed one."""
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ TWIN_TOLERANCE_S = 1e-3
 
 
 def find_tracks(root: Path, choice: TrackChoice = ALL_FLIGHTS) -> list[Path]:
-    """Find the folders that hold a `trajectory.json`, sorted; of them those that are chosen."""
+    """Return the chosen folders that hold a `trajectory.json`, sorted."""
     if not root.is_dir():
         raise InputError("there is no such folder", where=root, expected="a playback tree", fix="check the path")
     folders = [path.parent for path in files_named(root, "trajectory.json")]
@@ -35,7 +34,7 @@ def find_tracks(root: Path, choice: TrackChoice = ALL_FLIGHTS) -> list[Path]:
 
 
 def chosen_tracks(folders: Sequence[Path], root: Path, choice: TrackChoice) -> list[Path]:
-    """Return the flights of a tree that are chosen."""
+    """Return the chosen tracks of a tree."""
     chosen = [folder for folder in folders if choice.names(folder.relative_to(root).as_posix())]
     if folders and not chosen:
         what, expected = "no flight of the tree has such a name", folders[0].relative_to(root).as_posix()
@@ -50,7 +49,7 @@ def chosen_tracks(folders: Sequence[Path], root: Path, choice: TrackChoice) -> l
 
 
 def track_of(folder: Path) -> TrackName:
-    """Tell a flight's track: by its folder's name, else by its file; one that cannot be read is perturbed."""
+    """Return the kind of a track by its folder's name or its file; an unreadable one counts as perturbed."""
     if folder.name == ORIGINAL:
         return "clean"
     if re.fullmatch(r"aug_\d+", folder.name):
@@ -62,11 +61,7 @@ def track_of(folder: Path) -> TrackName:
 
 
 def read_twin(flight: Track) -> Track | None:
-    """Read the clean flight beside a perturbed one, the same walk frame by frame; None where there is none.
-
-    Raises:
-        VerifyError: it is not the same frames.
-    """
+    """Read the clean twin of a perturbed track, None where there is none; raises VerifyError if its frames differ."""
     if flight.is_original or flight.folder is None:
         return None
     own = type(flight.folder)(os.path.abspath(flight.folder))
@@ -83,16 +78,6 @@ def read_twin(flight: Track) -> Track | None:
     if len(twin) != len(flight) or np.abs(twin.time_s - flight.time_s).max() >= TWIN_TOLERANCE_S:
         raise _no_twin(flight, twin)
     return twin
-
-
-def read_tracks_beside(flight: Track) -> list[Track]:
-    """Read the other flights of a trajectory, of the same walk; those that cannot be read are left out."""
-    found = list[Track]()
-    if flight.folder is not None:
-        for path in sorted(flight.folder.parent.glob("[!.]*/trajectory.json")):
-            with contextlib.suppress(InputError):
-                found += [read_track(path.parent, strict=False)] if path.parent != flight.folder else []
-    return found
 
 
 def _no_twin(flight: Track, other: Track) -> VerifyError:

@@ -1,7 +1,4 @@
-"""Weather and time of day: the paper's presets, their six knobs, and the record in a flight's files (app:weather).
-
-How a preset is chosen stands in `cosfly/render/weather.py`, what it looks like with the renderer that draws it.
-"""
+"""Weather and time of day: the paper's presets, their six knobs, and the record in a track's files (app:weather)."""
 
 from __future__ import annotations
 

@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from cosfly.formats.motion import in_axes_of
 from cosfly.formats.playback import Track
 from cosfly.geometry.axes import wrap_deg
+from cosfly.geometry.motion import in_axes_of
 
 LOOKS_BACK = 3  # frames: of fewer nothing turns, of five it tells no more
 FITTED_ON, LEAST_WINDOWS = 20_000, 100  # windows that a network is fitted on: at most, and at least
@@ -46,7 +46,7 @@ def past_of(flight: Track, window: Sequence[int], is_ordered: bool) -> np.ndarra
     turned_deg = np.asarray(wrap_deg(poses[:-1, 4] - yaw_deg))
     last = [bearing, moves * np.cos(seen_from), moves * np.sin(seen_from), is_ordered]
     parts = [flown, np.linalg.norm(flown, axis=1), walked, speeds, away[-1], apart_m, np.diff(apart_m), turned_deg]
-    parts += [poses[:, 3], flight.target_visible[at], np.array(last, dtype=float)]
+    parts += [poses[:, 3], flight.target.visible[at], np.array(last, dtype=float)]
     return np.nan_to_num(np.concatenate([part.ravel() for part in parts]))
 
 

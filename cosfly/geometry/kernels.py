@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cosfly.formats.boxes import BoxMap
+from cosfly.formats.bystanders import Bystander
 from cosfly.formats.kinds import GROUND_KINDS, KINDS
 from cosfly.geometry.axes import rotation_matrices
 from cosfly.runtime.compiled import njit
@@ -477,3 +478,11 @@ def _pair(starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     if len(starts) != len(ends):
         raise ValueError(f"{len(starts)} starts for {len(ends)} ends")
     return starts, ends
+
+
+def distances_to_boxes_m(points_m: np.ndarray, other: Bystander) -> np.ndarray:
+    """Return the distance of a point, (n, 3), from the box of a bystander at each time, (n,) m, 0 inside."""
+    offset = points_m - other.centers_m
+    cos, sin = np.cos(other.headings_rad), np.sin(other.headings_rad)
+    local = np.stack([offset[:, 0] * cos + offset[:, 1] * sin, offset[:, 1] * cos - offset[:, 0] * sin, offset[:, 2]])
+    return np.linalg.norm(np.maximum(np.abs(local) - np.array(other.build.half_extents_m)[:, None], 0.0), axis=0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from cosfly.formats.flight_scores import Figure
 from cosfly.geometry.axes import DT_S
 
 ACCEL_SCALE_MPS2, JERK_SCALE_MPS3 = 5.0, 10.0  # eq:smoothness_score
@@ -103,3 +104,28 @@ def _path(positions_m: np.ndarray) -> np.ndarray:
     if positions.ndim != 2 or positions.shape[1] != 3:
         raise ValueError(f"positions must be (n, 3), not {positions.shape}")
     return positions
+
+
+# --- intervals --------------------------------------------------------------------------------------------------------
+
+
+def draw_pedestrians(num_walks: int, resamples: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw as many walks as there are, with replacement, `resamples` times: (resamples, walks) counts."""
+    return rng.multinomial(num_walks, np.full(num_walks, 1.0 / num_walks), size=resamples).astype(float)
+
+
+def figure_of_draws(value: float, drawn: np.ndarray, count: int, num_walks: int, confidence: float) -> Figure:
+    """Return a figure whose value on each draw is `drawn`, (draws,); NaN: of nothing."""
+    if count == 0 or np.isnan(value):
+        return Figure(value=None, low=None, high=None, count=count)
+    low, high = interval_of(drawn, confidence) if num_walks > 1 else (None, None)  # one walk tells nothing of others
+    return Figure(value=value, low=low, high=high, count=count)
+
+
+def interval_of(drawn: np.ndarray, confidence: float) -> tuple[float | None, float | None]:
+    """Return the percentiles between which `confidence` of what was drawn lies, NaN left out."""
+    drawn = drawn[~np.isnan(drawn)]  # draws in which nothing of the kind occurs
+    if not len(drawn):
+        return None, None
+    low, high = np.quantile(drawn, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return float(low), float(high)

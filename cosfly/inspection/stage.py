@@ -12,7 +12,6 @@ from collections import Counter
 from pathlib import Path
 
 from cosfly.formats.boxes import read_boxes
-from cosfly.formats.coverage import Coverage
 from cosfly.formats.frames import FRAMES_DIR
 from cosfly.formats.inspection import (
     Funnel,
@@ -28,6 +27,7 @@ from cosfly.formats.playback import read_track
 from cosfly.formats.review import how_to_decide
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.tracks import find_tracks
+from cosfly.geometry.coverage import Coverage
 from cosfly.inspection.report import report_html
 from cosfly.inspection.settings import PAGE_MB, InspectConfig
 from cosfly.inspection.track import InspectedTrack, inspect_track, trace_id

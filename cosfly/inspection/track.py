@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import BaseModel
 
-from cosfly.formats.coverage import Coverage, coverage_of
 from cosfly.formats.frames import LEGIBLE_HEIGHT_PX
 from cosfly.formats.inspection import Result as FlightResult
 from cosfly.formats.inspection import TrackInspection
@@ -22,7 +21,9 @@ from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
 from cosfly.formats.playback import STATES, Track, read_track
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.tracks import read_twin
+from cosfly.formats.weather import preset_token
 from cosfly.geometry.axes import project, step_s, world_from_camera, wrap_deg
+from cosfly.geometry.coverage import Coverage, axis_values
 from cosfly.geometry.trajectory_metrics import (
     CLEARANCE_CAP_M,
     CLEARANCE_TOLERANCE_M,
@@ -126,6 +127,16 @@ def _digest(folder: Path) -> str | None:
         return None
 
 
+def coverage_of(flight: Track) -> Coverage:
+    """Count the frames of a flight."""
+    box = flight.target.bbox if flight.target.mask_bbox is None else flight.target.mask_bbox
+    offsets_m = flight.positions_m - flight.targets_m
+    heights_px, heading_deg = box[:, 3] - box[:, 1], flight.target_headings_deg
+    values = axis_values(offsets_m, heading_deg, heights_px, flight.target.visibility, TARGET_HEIGHT_M)
+    weather, time = (name and preset_token(name) for name in flight.weather.values())
+    return Coverage.of(values, flight.styles, [flight.pace] * len(flight), skies=[(weather, time)] * len(flight))
+
+
 def trace_id(flight: Track) -> str:
     """Return the id of the plan that a flight says it was rendered from."""
     return str(flight.source.get("scenario_id", ""))
@@ -207,7 +218,7 @@ def check_shifts(flight: Track, report: Report, metrics: dict[str, float | int |
         return
     if twin is None:
         return
-    is_hidden = is_shifted(flight) & twin.target_visible & ~flight.target_visible
+    is_hidden = is_shifted(flight) & twin.target.visible & ~flight.target.visible
     metrics.update(num_hidden_by_shift=int(is_hidden.sum()))
     for i in np.flatnonzero(is_hidden):
         where = f"trajectory.json: points[{i}].target.visible"
@@ -216,7 +227,7 @@ def check_shifts(flight: Track, report: Report, metrics: dict[str, float | int |
 
 def is_shifted(flight: Track) -> np.ndarray:
     """Return where drone or person were moved from their plan, (n,) bool; an offset that no file tells counts."""
-    return (flight.drone_offsets_m != 0).any(axis=1) | (flight.target_offsets_m != 0).any(axis=1)
+    return (flight.perturbation.drone_m != 0).any(axis=1) | (flight.perturbation.target_m != 0).any(axis=1)
 
 
 def check_poses(flight: Track, trace: DroneTrace, cfg: InspectConfig, report: Report) -> None:
@@ -234,13 +245,19 @@ def check_poses(flight: Track, trace: DroneTrace, cfg: InspectConfig, report: Re
     for i in np.flatnonzero(off_time):
         where = f"trajectory.json: points[{i}].timing.trace_timestamp"
         report.error("pose_differs", where, f"{flight.time_s[i]:.3f} s", "a time of the plan")
-    turns = wrap_deg(flight.rotations_deg - flight.rotation_offsets_deg - trace.rotations_deg[row])
+    shifts = flight.perturbation
+    turns = wrap_deg(flight.rotations_deg - shifts.rotation_deg - trace.rotations_deg[row])
     checks = (
-        ("drone_pose", flight.positions_m - flight.drone_offsets_m - trace.positions_m[row], POSE_TOLERANCE_M, "m"),
+        (
+            "drone_pose",
+            flight.positions_m - flight.perturbation.drone_m - trace.positions_m[row],
+            POSE_TOLERANCE_M,
+            "m",
+        ),
         ("drone_pose", np.where(is_shifted(flight)[:, None], 0.0, turns), ROTATION_TOLERANCE_DEG, "deg"),
         (
             "target.world_location",
-            flight.targets_m - flight.target_offsets_m - trace.targets_m[row],
+            flight.targets_m - flight.perturbation.target_m - trace.targets_m[row],
             POSE_TOLERANCE_M,
             "m",
         ),
@@ -254,7 +271,10 @@ def check_poses(flight: Track, trace: DroneTrace, cfg: InspectConfig, report: Re
 
 def check_motion(flight: Track, cfg: InspectConfig, report: Report) -> None:
     """Find teleports: steps between frames that nothing flies or walks. Recorded perturbations are taken off."""
-    drone_offsets_m, target_offsets_m = np.nan_to_num(flight.drone_offsets_m), np.nan_to_num(flight.target_offsets_m)
+    drone_offsets_m, target_offsets_m = (
+        np.nan_to_num(flight.perturbation.drone_m),
+        np.nan_to_num(flight.perturbation.target_m),
+    )
     limits = (
         ("drone_pose", flight.positions_m - drone_offsets_m, DRONE_SPEED_MAX_MPS),
         ("target.world_location", flight.targets_m - target_offsets_m, TARGET_SPEED_MAX_MPS),
@@ -271,17 +291,17 @@ def check_projection(flight: Track, cfg: InspectConfig, report: Report) -> None:
     for i in range(len(flight)):
         point = f"trajectory.json: points[{i}].target"
         if np.isnan(flight.targets_m[i]).any():
-            if flight.target_in_view[i]:
+            if flight.target.in_view[i]:
                 report.error("target_missing", f"{point}.world_location", "null", "a position: the target is in view")
             continue
         pose = world_from_camera(flight.positions_m[i], flight.rotations_deg[i])
         uv, depth_m = project(flight.targets_m[i : i + 1], pose, flight.camera_at(i).intrinsic)
         box = target_box(flight, i)
         recorded = (
-            ("image_uv", flight.target_uv[i], uv[0], REPROJECTION_TOLERANCE_PX, "px"),
+            ("image_uv", flight.target.uv[i], uv[0], REPROJECTION_TOLERANCE_PX, "px"),
             # Another's person is of another size than ours.
-            ("bbox_2d", flight.target_bbox[i] if flight.is_ours else box, box, 2 * REPROJECTION_TOLERANCE_PX, "px"),
-            ("depth", flight.target_depth_m[i : i + 1], depth_m, 0.01, "m"),
+            ("bbox_2d", flight.target.bbox[i] if flight.is_ours else box, box, 2 * REPROJECTION_TOLERANCE_PX, "px"),
+            ("depth", flight.target.depth_m[i : i + 1], depth_m, 0.01, "m"),
         )
         for name, found, expected, tolerance, unit in recorded:
             if np.isnan(found).any() or np.isnan(expected).any():
@@ -290,7 +310,7 @@ def check_projection(flight: Track, cfg: InspectConfig, report: Report) -> None:
             if distance > tolerance:
                 limit = f"the projection of the target within {tolerance:g} {unit}"
                 report.error("projection_differs", f"{point}.{name}", f"{distance:.2f} {unit} beside it", limit)
-        if flight.target_in_view[i] and np.isnan(flight.target_uv[i]).any():
+        if flight.target.in_view[i] and np.isnan(flight.target.uv[i]).any():
             report.error("target_missing", f"{point}.image_uv", "null", "a pixel: the target is in view")
 
 
@@ -311,12 +331,12 @@ def _rendered_metrics(
     flight: Track, frames: FrameNumbers, cfg: InspectConfig, report: Report, metrics: dict[str, float | int | None]
 ) -> None:
     """Add what the rendered frames say; rendered visibility describes, it never rejects (sec:dataset_stats)."""
-    known = flight.visibility[~np.isnan(flight.visibility)]
+    known = flight.target.visibility[~np.isnan(flight.target.visibility)]
     quality = float(np.mean(frames.track_ious)) if frames.track_ious else None
     invalid = max(frames.invalid_depth_shares, default=None)
     told, heights_px = (
-        flight.target_legible,
-        (flight.target_bbox[:, 3] - flight.target_bbox[:, 1])[flight.target_in_view],
+        flight.target.legible,
+        (flight.target.bbox[:, 3] - flight.target.bbox[:, 1])[flight.target.in_view],
     )
     metrics.update(
         num_frames_checked=frames.num_checked,
@@ -324,15 +344,15 @@ def _rendered_metrics(
         length_m=length_m(flight.positions_m),
         height_mean_m=float(np.nanmean(_heights_m(flight))) if not np.isnan(flight.targets_m).all() else None,
         rendered_visibility_mean=float(known.mean()) if len(known) else None,
-        visible_share=float(flight.target_visible.mean()),
+        visible_share=float(flight.target.visible.mean()),
         legible_share=None if told is None else float(told.mean()),
         small_share=None if told is None or not len(heights_px) else float((heights_px < LEGIBLE_HEIGHT_PX).mean()),
-        in_view_share=float(flight.target_in_view.mean()),
-        perturbed_share=float(flight.is_perturbed.mean()),
+        in_view_share=float(flight.target.in_view.mean()),
+        perturbed_share=float(flight.perturbation.is_perturbed.mean()),
         track_quality=quality,
         invalid_depth_share_max=invalid,
     )
-    if not flight.target_visible.any():
+    if not flight.target.visible.any():
         report.warn("never_visible", "trajectory.json: points[].target.visible", "false everywhere", "a target")
     if quality is not None and quality < TRACK_QUALITY_MIN:
         report.warn("track_quality", "instance.png", f"IoU {quality:.3f}", f"at least {TRACK_QUALITY_MIN}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Sequence
 from typing import Annotated
@@ -11,9 +12,9 @@ from pydantic import BaseModel, Field, FiniteFloat, model_validator
 
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.issues import Issue, sort_key
-from cosfly.formats.playback import Track
-from cosfly.formats.tracks import read_tracks_beside
+from cosfly.formats.playback import Track, read_track
 from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M
+from cosfly.runtime.errors import InputError
 from cosfly.viz.frame_views import small_jpeg, thumbnail
 from cosfly.viz.topview import INK, PAPER, TopView, draw_dot, draw_line, draw_map, draw_text
 
@@ -71,7 +72,7 @@ def draw_track(
     curves = {
         "altitude_m": heights_m,
         "distance_m": np.linalg.norm(flight.positions_m - flight.targets_m, axis=1),
-        "visibility": flight.visibility,
+        "visibility": flight.target.visibility,
         "clearance_m": clearance_m,
         "speed_mps": speeds_mps,
     }
@@ -81,7 +82,7 @@ def draw_track(
         time_s=[round(float(at_s), 2) for at_s in flight.time_s[rows]],
         curves={name: _numbers(values[rows]) for name, values in curves.items() if values is not None},
         pictures=[thumbnail(flight.frame_folder(i), width_px) for i in chosen],
-        plan=draw_plan(flight, box_map, read_tracks_beside(flight)),
+        plan=draw_plan(flight, box_map, _read_tracks_beside(flight)),
         frames=chosen,
     )
 
@@ -136,3 +137,13 @@ def _draw_scale(picture: np.ndarray, view: TopView) -> None:
     y = picture.shape[0] - 8.0
     draw_line(picture, np.array([[8.0, y], [8.0 + metres * view.pixels_per_m, y]]), INK, 2, halo=5)
     draw_text(picture, f"{metres:g} m", 8.0, y - 6.0, 0.4, halo=(255.0, 255.0, 255.0))
+
+
+def _read_tracks_beside(flight: Track) -> list[Track]:
+    """Read the other tracks of a trajectory, skipping unreadable ones."""
+    found = list[Track]()
+    if flight.folder is not None:
+        for path in sorted(flight.folder.parent.glob("[!.]*/trajectory.json")):
+            with contextlib.suppress(InputError):
+                found += [read_track(path.parent, strict=False)] if path.parent != flight.folder else []
+    return found

@@ -21,9 +21,9 @@ import shapely
 from pydantic import Field
 from shapely.geometry import Polygon
 
-from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, LicenceId, MapHeader, MapSource
-from cosfly.formats.ground import Ground, GroundGrid
+from cosfly.formats.boxes import UNKNOWN_LICENCE, BoxMap, GroundGrid, LicenceId, MapHeader, MapSource
 from cosfly.formats.meshes import MESHES_FILE, Mesh, Meshes, MeshRef
+from cosfly.geometry.ground import Ground
 from cosfly.maps.boxlist import BoxList
 from cosfly.maps.cityjson_file import CityObject, read_model
 from cosfly.maps.derived_ground import with_derived_ground

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cosfly.formats.bystanders import Bystander, Bystanders, gaps_m
-from cosfly.formats.ground import Ground
+from cosfly.formats.bystanders import Bystander, Bystanders
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory
 from cosfly.geometry.axes import headings_of
+from cosfly.geometry.ground import Ground
 from cosfly.pedestrians.lanes import Lane
 from cosfly.pedestrians.walkable import PedestriansConfig, WalkableGround, sample_goal
 from cosfly.pedestrians.walking import (
@@ -202,3 +202,16 @@ def draw_drive(
     limits_mps = np.minimum(CAR_SPEED_MPS * rng.uniform(*OWN_SPEED), np.sqrt(CAR_SIDEWAYS_MPS2 / curvatures))
     limits_mps[-1] = 0.0
     return Trip("Car", way, limits_mps)
+
+
+def gaps_m(one: Bystander, two: Bystander) -> np.ndarray:
+    """How far the discs of two are apart in each step of time, (n - 1,) m, negative where they overlap.
+
+    Between two times both go straight on, so the nearest place within a step is that of the origin to a segment.
+    """
+    apart = one.discs_m[:, :, None] - two.discs_m[:, None]  # (n, d, e, 2)
+    start, along = apart[:-1], np.diff(apart, axis=0)
+    squared = np.maximum((along**2).sum(axis=-1), 1e-12)
+    share = np.clip(-(start * along).sum(axis=-1) / squared, 0.0, 1.0)
+    nearest = np.linalg.norm(start + share[..., None] * along, axis=-1)
+    return nearest.min(axis=(1, 2)) - one.build.disc_radius_m - two.build.disc_radius_m

@@ -28,9 +28,9 @@ from pydantic import BaseModel
 
 from cosfly.formats.boxes import read_boxes
 from cosfly.formats.bystanders import OTHERS_FILE, Bystanders, write_bystanders
-from cosfly.formats.ground import Ground
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory, pace_field, paces_of, walk_id, write_paths
 from cosfly.formats.roi import read_roi
+from cosfly.geometry.ground import Ground
 from cosfly.pedestrians.astar import route_cost
 from cosfly.pedestrians.bystanders import bystanders_of
 from cosfly.pedestrians.crossings import CROSSING, ROAD, where_walked

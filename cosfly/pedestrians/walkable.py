@@ -20,7 +20,6 @@ import shapely
 from pydantic import Field, field_validator, model_validator
 
 from cosfly.formats.boxes import BoxMap
-from cosfly.formats.ground import Ground
 from cosfly.formats.kinds import GROUND_KINDS, PAVED_KINDS
 from cosfly.formats.pedestrian_paths import PLAIN_PACE
 from cosfly.formats.roi import MOST_VERTICES, Roi
@@ -37,6 +36,7 @@ from cosfly.geometry.grid import (
     roi_mask,
     surface,
 )
+from cosfly.geometry.ground import Ground
 from cosfly.pedestrians.astar import find_route
 from cosfly.pedestrians.crossings import CROSSING, ROAD, costs_of, footing_of
 from cosfly.pedestrians.walking import PACES, SLOWEST_SPEED_MPS

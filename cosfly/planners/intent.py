@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory
-from cosfly.formats.segments import FOLLOW, MISSION_KINDS, Mission, Segment
+from cosfly.formats.segments import FOLLOW, MISSION_KINDS, Mission, MissionKind, Segment
 from cosfly.geometry.axes import look_at
 from cosfly.planners.contract import PlanConfig, Scenario, TrackingReference
 from cosfly.planners.courses import ROUNDING_S, reference_of
@@ -44,7 +44,7 @@ class Intent:
     reference: TrackingReference
     segments: tuple[Segment, ...] = ()
     mission: Mission | None = None
-    order: str | None = None
+    order: MissionKind | None = None
     impossible: str | None = None
 
     @property

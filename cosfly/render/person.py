@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cosfly.formats.bystanders import Bystander, distances_to_boxes_m
+from cosfly.formats.bystanders import Bystander
 from cosfly.formats.frames import BystanderMeta, BystandersMeta, tree_position, tree_yaw
-from cosfly.formats.people import Appearance, People, draw_appearance, look_alike
+from cosfly.formats.people import COLORS, EMPTY_SHARE, FIGURES, GARMENTS, HAIR, Appearance, People
 from cosfly.geometry.axes import headings_of
+from cosfly.geometry.kernels import distances_to_boxes_m
 from cosfly.render.contract import Clothes, Frame, PosedBystander, PosedCar, PosedPerson, other_id
 
 STRIDE_M = 1.35  # two steps
 SLOW_MPS = 0.7  # below this speed the swing shrinks, down to standing
 
-HAIR = np.array([[0.02, 0.015, 0.01], [0.07, 0.035, 0.015], [0.22, 0.14, 0.05], [0.20, 0.19, 0.18]])
+HAIR_RGB = np.array([[0.02, 0.015, 0.01], [0.07, 0.035, 0.015], [0.22, 0.14, 0.05], [0.20, 0.19, 0.18]])
 SKIN = np.array([[0.58, 0.36, 0.26], [0.46, 0.27, 0.18], [0.30, 0.16, 0.10], [0.15, 0.08, 0.05]])
 SHOES = np.array([[0.03, 0.025, 0.02], [0.55, 0.55, 0.53], [0.14, 0.07, 0.03]])
 
@@ -23,7 +24,37 @@ SHOES = np.array([[0.03, 0.025, 0.02], [0.55, 0.55, 0.53], [0.14, 0.07, 0.03]])
 def choose_clothes(rng: np.random.Generator, looks: Appearance | None = None) -> Clothes:
     """Draw what a person looks like, or what an appearance leaves open."""
     looks = looks or draw_appearance(rng)
-    return Clothes(looks, *(palette[rng.integers(len(palette))] for palette in (HAIR, SKIN, SHOES)))
+    return Clothes(looks, *(palette[rng.integers(len(palette))] for palette in (HAIR_RGB, SKIN, SHOES)))
+
+
+def draw_appearance(rng: np.random.Generator) -> Appearance:
+    """Draw a person, every garment and colour equally likely where all is seen, bare heads and hands by EMPTY_SHARE."""
+    while True:
+        drawn = {"figure": _one(rng, tuple(FIGURES))}
+        for slot in GARMENTS:
+            drawn |= _worn(rng, slot)
+        if (person := Appearance(**drawn)).is_all_seen:
+            return person
+
+
+def look_alike(person: Appearance, rng: np.random.Generator) -> Appearance:
+    """Draw somebody who looks like a person but for one garment or its colour."""
+    slot = _one(rng, tuple(GARMENTS))
+    while True:
+        other = replace(person, **_worn(rng, slot))
+        if person.differences(other) and other.is_all_seen:
+            return other
+
+
+def _worn(rng: np.random.Generator, slot: str) -> dict[str, str]:
+    if rng.random() < EMPTY_SHARE.get(slot, 0.0):
+        return {slot: "", f"{slot}_color": ""}
+    colors = tuple(color for color in COLORS if slot != "hat" or color not in HAIR)
+    return {slot: _one(rng, tuple(filter(None, GARMENTS[slot]))), f"{slot}_color": _one(rng, colors)}
+
+
+def _one(rng: np.random.Generator, names: tuple[str, ...]) -> str:
+    return names[rng.integers(len(names))]
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,9 @@ made, and the frame says so.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -20,17 +21,18 @@ from cosfly.formats.boxes import BoxMap
 from cosfly.formats.frames import Camera
 from cosfly.formats.kinds import GROUND_KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
-from cosfly.formats.shift_draws import ShiftDraw, shift_draws
 from cosfly.geometry.axes import look_at, project, rotation_matrices, world_from_camera, wrap_deg
 from cosfly.geometry.kernels import obstacle_index, signed_distances
 from cosfly.geometry.trajectory_metrics import CLEARANCE_CAP_M, SAFETY_DISTANCE_M
 from cosfly.render.contract import plane_z_m
 from cosfly.render.person import NOBODY, Cast
 from cosfly.runtime.config import Config
+from cosfly.runtime.seeding import rng_for
 
 HEAD_OFFSET_M = np.array([0.0, 0.0, 0.6])  # from the hip point: where branches and signs may be in the way
 NONE, APPLIED = "none", "applied"
 OUT_OF_VIEW, HIDDEN = "fallback: target out of view", "fallback: target hidden"
+PERTURBED = "aug_001"  # the variant of the perturbed track
 STEP_UP_M = 0.5  # a shifted person may stand this much higher or lower than before, not on a roof
 
 
@@ -152,6 +154,46 @@ class Surroundings:
         offset = np.column_stack([x_m - self._centers[:, 0], y_m - self._centers[:, 1], np.zeros(len(self._centers))])
         local = np.einsum("nji,nj->ni", self._turns, offset)
         return (np.abs(local[:, :2]) <= self._half[:, :2]).all(axis=1)
+
+
+@dataclass(frozen=True)
+class ShiftDraw:
+    """One frame's draws. events: (2,) of position and rotation, below their probability; person_m, drone_m, view_m:
+    (3,); roll: share of the largest, -1 to 1."""
+
+    events: np.ndarray
+    person_m: np.ndarray
+    drone_m: np.ndarray
+    view_m: np.ndarray
+    roll: float
+
+
+def shift_draws(
+    rng: np.random.Generator, *, person_radius_m: float, drone_radius_m: float, view_radius_m: float, is_cubic: bool
+) -> Iterator[ShiftDraw]:
+    """Yield the draws of one frame after the other, without end; each takes the same number of the generator's."""
+    of_roll = rng.spawn(1)[0]  # the paper's track has none, and draws the same with and without
+    for _ in repeat(None):
+        yield ShiftDraw(
+            rng.random(2),
+            _offset(rng, person_radius_m, 2, is_cubic),
+            _offset(rng, drone_radius_m, 3, is_cubic),
+            _offset(rng, view_radius_m, 3, is_cubic),
+            of_roll.uniform(-1.0, 1.0),
+        )
+
+
+def rng_of_shifts(seed: int, path_id: str) -> np.random.Generator:
+    """Return the generator of the perturbed flight of a walk."""
+    return rng_for(seed, "render", f"{path_id}/{PERTURBED}")
+
+
+def _offset(rng: np.random.Generator, radius_m: float, num_axes: int, is_cubic: bool) -> np.ndarray:
+    """Return an offset evenly distributed in a cube or a ball, (3,); z is 0 for two axes."""
+    in_cube = radius_m * rng.uniform(-1.0, 1.0, num_axes)
+    direction, share = rng.normal(size=num_axes), rng.random()
+    in_ball = radius_m * direction / np.linalg.norm(direction) * share ** (1.0 / num_axes)
+    return np.append(in_cube if is_cubic else in_ball, np.zeros(3 - num_axes))
 
 
 def perturb(

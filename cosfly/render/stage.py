@@ -20,7 +20,6 @@ from cosfly.formats.bystanders import Bystander, Bystanders, read_bystanders
 from cosfly.formats.frames import Look
 from cosfly.formats.pedestrian_paths import pace_field
 from cosfly.formats.places import place_of, town_folder
-from cosfly.formats.shift_draws import PERTURBED, rng_of_shifts
 from cosfly.formats.town import IDS_FILE, IDS_FORMAT, write_town_map
 from cosfly.formats.traces import DroneTrace, read_traces
 from cosfly.formats.weather import WeatherRecord
@@ -28,7 +27,7 @@ from cosfly.geometry.axes import step_s
 from cosfly.render.contract import PERSON_ID, SHARED_ID, Renderer, has_own_ids, instance_ids, other_id
 from cosfly.render.lens import cameras_of
 from cosfly.render.person import cast_of, choose_clothes, gait_of
-from cosfly.render.perturbation import PerturbedTrack, Poses, Surroundings, perturb
+from cosfly.render.perturbation import PERTURBED, PerturbedTrack, Poses, Surroundings, perturb, rng_of_shifts
 from cosfly.render.rim import check_outside_rim, rim_of
 from cosfly.render.settings import RenderConfig
 from cosfly.render.track import TrackScript, Writing, check_track, render_track
@@ -385,9 +384,9 @@ def make_worker(
                 "num_frames": len(flight),
                 "fov_deg": round(flight.camera.fov_deg, 6),
                 **({} if flight.intrinsics is None else {"fovs_deg": [round(fov, 6) for fov in flight.fovs_deg]}),
-                "num_visible": int(flight.target_visible.sum()),
-                "mean_visibility": round(float(flight.visibility.mean()), 6),
-                "num_perturbed": int(flight.is_perturbed.sum()),
+                "num_visible": int(flight.target.visible.sum()),
+                "mean_visibility": round(float(flight.target.visibility.mean()), 6),
+                "num_perturbed": int(flight.perturbation.is_perturbed.sum()),
                 "goal": flight.raw["goal"]["absent"] if flight.goal is None else "told",
                 **({} if script.weather is None else _weather_told(script.weather, cfg.weather_seed)),
             }

@@ -26,15 +26,15 @@ from cosfly.formats.frames import (
     TargetMeta,
     frame_name,
 )
-from cosfly.formats.goals import Goal, SeenFrame, find_says, otherwise, target_picture, words_of
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M, TARGET_HEIGHT_M
-from cosfly.formats.people import Appearance, People
-from cosfly.formats.playback import LEGIBILITY, TARGET_FILE, Track, write_track
+from cosfly.formats.people import Appearance, Goal, People
+from cosfly.formats.playback import LEGIBILITY, TARGET_FILE, Perturbation, TargetRecord, Track, write_track
 from cosfly.formats.segments import Mission, Segment
 from cosfly.formats.traces import DroneTrace
 from cosfly.formats.weather import WeatherRecord
 from cosfly.geometry.axes import mask_box, world_from_camera
+from cosfly.geometry.goals import SeenFrame, find_says, otherwise, target_picture, words_of
 from cosfly.geometry.kernels import signed_distances
 from cosfly.render.camera import (
     TargetView,
@@ -366,17 +366,21 @@ def _flight(script: TrackScript, targets: list[TargetMeta], visibility: np.ndarr
         positions_m=perturbed.poses.positions_m,
         rotations_deg=perturbed.poses.rotations_deg,
         targets_m=perturbed.poses.targets_m,
-        target_in_view=np.array([target.in_view for target in targets]),
-        target_visible=np.array([target.visible for target in targets]),
-        target_depth_m=np.array([target.depth_m for target in targets]),
-        target_uv=np.array([target.image_uv or [np.nan] * 2 for target in targets]),
-        target_bbox=np.array([target.bbox_2d or [np.nan] * 4 for target in targets]),
-        target_mask_bbox=np.array([target.mask_bbox_2d or [np.nan] * 4 for target in targets]),
-        visibility=visibility,
-        is_perturbed=perturbed.is_perturbed,
-        drone_offsets_m=perturbed.drone_offsets_m,
-        rotation_offsets_deg=perturbed.rotation_offsets_deg,
-        target_offsets_m=perturbed.target_offsets_m,
+        target=TargetRecord(
+            in_view=np.array([target.in_view for target in targets]),
+            visible=np.array([target.visible for target in targets]),
+            depth_m=np.array([target.depth_m for target in targets]),
+            uv=np.array([target.image_uv or [np.nan] * 2 for target in targets]),
+            bbox=np.array([target.bbox_2d or [np.nan] * 4 for target in targets]),
+            visibility=visibility,
+            mask_bbox=np.array([target.mask_bbox_2d or [np.nan] * 4 for target in targets]),
+        ),
+        perturbation=Perturbation(
+            perturbed.is_perturbed,
+            perturbed.drone_offsets_m,
+            perturbed.rotation_offsets_deg,
+            perturbed.target_offsets_m,
+        ),
         source=script.source,
         segments=script.segments,
         mission=script.mission,

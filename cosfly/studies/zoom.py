@@ -87,14 +87,14 @@ def run(
 
 def track_figures(track: Track) -> dict[str, Any]:
     """Return the counts of frames of a track and its means by figure; None where no frame shows the target."""
-    seen = np.flatnonzero(track.visibility > 0)
-    boxes, masks = track.target_bbox, track.target_mask_bbox
+    seen = np.flatnonzero(track.target.visibility > 0)
+    boxes, masks = track.target.bbox, track.target.mask_bbox
     assert masks is not None, "the render stage writes it"
     rows = [
         (
             boxes[i, 2] - boxes[i, 0],
             boxes[i, 3] - boxes[i, 1],
-            track.visibility[i],
+            track.target.visibility[i],
             0.0 if np.isnan(masks[i]).any() else box_iou(boxes[i], masks[i]),
         )
         for i in seen
@@ -139,7 +139,7 @@ def text_table(product: dict[str, Any]) -> TextTable:
 
 def best_frame(track: Track) -> int:
     """Return the index of the frame that shows most of the target."""
-    return int(np.argmax(np.nan_to_num(track.visibility)))
+    return int(np.argmax(np.nan_to_num(track.target.visibility)))
 
 
 def draw_levels(levels: dict[float, list[Track]]) -> bytes:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from cosfly.formats.coverage import AXES, NAMED, PAIR, Axis, Coverage, default_coverage
 from cosfly.formats.weather import TIMES, WEATHERS, resolved, sky_kind
+from cosfly.geometry.coverage import AXES, NAMED, PAIR, Axis, Coverage, default_coverage
 from cosfly.viz.page import fragment
 
 WIDTH_PX, HEIGHT_PX = 300.0, 110.0

@@ -104,7 +104,7 @@ def best_frame(tree: Path, *names: str) -> Path:
     folders = find_tracks(tree)
     flight = read_track(next((f for f in folders if f.name == "ORI"), folders[0]), strict=False)
     frames = _frames_with(flight, *names)
-    return flight.frame_folder(max(frames, key=lambda i: (np.nan_to_num(flight.visibility[i]), i)))
+    return flight.frame_folder(max(frames, key=lambda i: (np.nan_to_num(flight.target.visibility[i]), i)))
 
 
 # --- pieces -----------------------------------------------------------------------------------------------------------
@@ -135,7 +135,7 @@ def _row(flight: Track) -> np.ndarray:
         else:
             tiles.append(_tile(np.zeros_like(tiles[0]), f"no {VIEW_FILES[view]}"))
     strip = np.full((22, TILE_PX[0] * len(tiles), 3), 24, np.uint8)
-    visible = f"target visible in {int(flight.target_visible.sum())} of {len(flight)} frames"
+    visible = f"target visible in {int(flight.target.visible.sum())} of {len(flight)} frames"
     fov = " to ".join(dict.fromkeys(f"{fov:.0f}" for fov in flight.fovs_deg))
     text = f"{flight.town}  {flight.trajectory}  {flight.variant}   fov {fov} deg   {visible}"
     draw_text(strip, text, 8, 15, 0.45, (235, 235, 235))
@@ -158,8 +158,8 @@ def _tile(picture: np.ndarray, text: str) -> np.ndarray:
 def _boxed(picture: np.ndarray, flight: Track, i: int) -> np.ndarray:
     """Draw the target's box if the frame has one."""
     picture = np.ascontiguousarray(picture)
-    if not np.isnan(flight.target_bbox[i]).any():
-        x0, y0, x1, y1 = (round(float(v)) for v in flight.target_bbox[i])
+    if not np.isnan(flight.target.bbox[i]).any():
+        x0, y0, x1, y1 = (round(float(v)) for v in flight.target.bbox[i])
         cv2.rectangle(picture, (x0, y0), (x1, y1), BOX_COLOR, max(1, picture.shape[1] // 400))
     return picture
 

@@ -130,7 +130,7 @@ def _of_trace(trace: DroneTrace) -> PageTrack:
 
 def _of_flight(flight: Track) -> PageTrack:
     rows = np.column_stack(
-        [flight.time_s, flight.positions_m, flight.rotations_deg[:, :2], flight.targets_m, flight.visibility]
+        [flight.time_s, flight.positions_m, flight.rotations_deg[:, :2], flight.targets_m, flight.target.visibility]
     )
     kind = "clean frames" if flight.is_original else "perturbed frames"
     return PageTrack(str(flight.source.get("scenario_id") or flight.trajectory), kind, rows, {}, flight)

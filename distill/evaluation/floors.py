@@ -17,8 +17,7 @@ from functools import cached_property
 
 import numpy as np
 
-from cosfly.formats.actions import TOKENS
-from cosfly.formats.captions import Coc, Language
+from cosfly.formats.captions import TOKENS, Coc, Language
 from cosfly.geometry.blind import FITTED_ON, Decider, fit_deciders
 from cosfly.runtime.json_io import parse_document, validated
 from cosfly.runtime.seeding import rng_for

@@ -6,9 +6,8 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cosfly.formats.actions import TOKENS
-from cosfly.formats.captions import FIELDS
-from cosfly.formats.figures import Figure
+from cosfly.formats.captions import FIELDS, TOKENS
+from cosfly.formats.flight_scores import Figure
 from cosfly.runtime.escaping import for_markdown
 from cosfly.runtime.io import read_text
 from cosfly.viz.page import page

@@ -4,7 +4,7 @@ A sample that got no answer (`answered` false: a picture could not be read, a se
 answer that does not parse is one: it decides nothing, and its texts score 0.
 
 Windows of a flight overlap, flights of a walk resemble each other and languages share windows, so samples are no
-independent draws: intervals are by bootstrap over whole walks (cosfly/formats/figures.py).
+independent draws: intervals are by bootstrap over whole walks (cosfly/geometry/trajectory_metrics.py).
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cosfly.formats.actions import TOKENS, not_in_set
-from cosfly.formats.captions import Coc, SentenceState, Verdict, verdict_on
-from cosfly.formats.figures import Figure, draw_pedestrians, figure_of_draws, interval_of
+from cosfly.formats.captions import TOKENS, Coc, SentenceState, Verdict, not_in_set, verdict_on
+from cosfly.formats.flight_scores import Figure
 from cosfly.formats.predictions import FAILED, Prediction
+from cosfly.geometry.trajectory_metrics import draw_pedestrians, figure_of_draws, interval_of
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_file, sha256_bytes
 from cosfly.runtime.json_io import Record, dump_json

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from cosfly.formats.answer_text import answer_schema
 from cosfly.formats.captions import Language
 from cosfly.formats.places import flight_of
+from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.answers import Answer, AnswerBook
 from cosfly.runtime.console import Advance
 from cosfly.runtime.errors import ConfigError, InputError

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from cosfly.formats.answer_text import parse_answer
 from cosfly.formats.places import flight_of
 from cosfly.formats.predictions import FAILED, PREDICTIONS, Prediction, Split
+from cosfly.llm.answer_text import parse_answer
 from cosfly.llm.answers import Answer, AnswerBook
 from cosfly.runtime.io import atomic_file
 from cosfly.runtime.json_io import dump_json

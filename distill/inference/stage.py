@@ -13,8 +13,8 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from cosfly.formats.answer_text import answer_schema
 from cosfly.formats.predictions import PREDICTIONS, Split
+from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.answers import Answer, AnswerBook, KeptAnswers, answer_key
 from cosfly.llm.client import ChatClient
 from cosfly.llm.contract import Engine, NoAnswer, Request, started

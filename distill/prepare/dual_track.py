@@ -17,9 +17,10 @@ from pydantic import Field
 
 from cosfly.formats.places import Place, flight_ids, place_of, sample_id
 from cosfly.formats.playback import ORIGINAL, Track, read_track
-from cosfly.formats.splits import SPLITS, Course, Split, walks_of
+from cosfly.formats.predictions import Split
 from cosfly.formats.tracks import find_tracks, read_twin
 from cosfly.geometry.axes import step_s
+from cosfly.geometry.splits import SPLITS, Course, walks_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.io import write_bytes

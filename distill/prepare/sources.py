@@ -12,8 +12,8 @@ from cosfly.formats.captions import Caption
 from cosfly.formats.frames import frame_name, frame_path
 from cosfly.formats.places import TRACKS, Place, TrackChoice, flight_ids, folder_name, sample_id
 from cosfly.formats.playback import read_track
-from cosfly.formats.splits import Course, walks_of
 from cosfly.formats.tracks import find_tracks, track_of
+from cosfly.geometry.splits import Course, walks_of
 from cosfly.runtime.errors import InputError, VerifyError
 from cosfly.runtime.io import check_stays_below, inside
 from cosfly.runtime.run_dir import record_of

@@ -9,7 +9,8 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from cosfly.formats.splits import SPLITS, Split, assign_splits, town_family
+from cosfly.formats.predictions import Split
+from cosfly.geometry.splits import SPLITS, assign_splits, town_family
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import VerifyError
 from distill.schema import SplitMember

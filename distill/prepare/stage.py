@@ -21,13 +21,13 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from cosfly.formats.actions import TOKENS, not_in_set
-from cosfly.formats.answer_text import parse_answer
-from cosfly.formats.captions import PICTURES_MARK, Caption, Language, Verdict, read_captions
+from cosfly.formats.captions import PICTURES_MARK, TOKENS, Caption, Language, Verdict, not_in_set, read_captions
 from cosfly.formats.places import TrackChoice
 from cosfly.formats.playback import read_track
-from cosfly.formats.splits import SPLITS, Split
+from cosfly.formats.predictions import Split
 from cosfly.geometry.blind import is_drawn_ahead, past_of
+from cosfly.geometry.splits import SPLITS
+from cosfly.llm.answer_text import parse_answer
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import dump_json

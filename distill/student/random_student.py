@@ -13,8 +13,7 @@ from typing import Any
 
 from pydantic import Field
 
-from cosfly.formats.actions import TOKENS
-from cosfly.formats.captions import FIELDS
+from cosfly.formats.captions import FIELDS, TOKENS
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_folder

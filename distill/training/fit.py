@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from cosfly.formats.answer_text import parse_answer
 from cosfly.formats.captions import verdict_on
+from cosfly.llm.answer_text import parse_answer
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.io import storage_errors

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from cosfly.formats.actions import TOKENS
+from cosfly.formats.captions import TOKENS
 from cosfly.runtime.errors import ConfigError, InputError
 from cosfly.runtime.json_io import write_json
 from distill.schema import Sample, Samples

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosfly.formats.actions import ORDERS, TOKENS
+from cosfly.formats.captions import ORDERS, TOKENS
 from cosfly.formats.segments import Segment
 from cosfly.geometry.blind import FITTED_ON, LEAST_WINDOWS, fit_deciders, is_drawn_ahead, past_of
 from cosfly.runtime.seeding import draws_for, rng_for

@@ -17,7 +17,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cosfly.formats.coverage import AXES, Coverage, axis_values
+from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
+from cosfly.formats.weather import preset_token
+from cosfly.geometry.coverage import AXES, Coverage, axis_values
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.tables import arrow_errors, num_rows, open_table, row_groups
 from release.columns import CAPTION_FIELDS, COUNTED, LANGUAGES, PICTURES, PLACE, POINT, REQUIRED, schema
@@ -205,8 +207,12 @@ class RowCounts:
                 names += [row[column]] if row[column] is not None else []
         if rows:
             values = np.array(seen, dtype=np.float64)
-            axes, skies = axis_values(values[:, :3], *values[:, 3:].T), [(r["weather"], r["time_of_day"]) for r in rows]
-            part = Coverage.of(axes, named["style"], named["pace"], named["label"], skies=skies)
+            heading_deg, height_px, visibility = values[:, 3:].T
+            axes = axis_values(values[:, :3], heading_deg, height_px, visibility, TARGET_HEIGHT_M)
+            weathers, times = ([r[k] and preset_token(r[k]) for r in rows] for k in ("weather", "time_of_day"))
+            part = Coverage.of(
+                axes, named["style"], named["pace"], named["label"], skies=zip(weathers, times, strict=True)
+            )
             self.coverage = Coverage.total([self.coverage, part]) if self.rows else part
         self.rows += len(rows)
 

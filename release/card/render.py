@@ -15,11 +15,10 @@ from typing import Any
 
 import yaml
 
-from cosfly.formats.actions import TOKENS
-from cosfly.formats.captions import FIELDS
-from cosfly.formats.coverage import NAMED
+from cosfly.formats.captions import FIELDS, TOKENS
 from cosfly.formats.frames import FrameFile
 from cosfly.geometry.blind import DRAWN_AHEAD, LEAST_WINDOWS, LOOKS_BACK
+from cosfly.geometry.coverage import NAMED
 from cosfly.runtime.escaping import for_terminal
 from cosfly.runtime.io import read_text
 from cosfly.viz.coverage_page import ranges, shares

@@ -23,10 +23,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cosfly.formats.actions import TOKENS
+from cosfly.formats.captions import TOKENS
 from cosfly.formats.frames import FrameFile
-from cosfly.formats.motion import ACTION, PlannedMotion
 from cosfly.geometry.axes import step_s
+from cosfly.geometry.motion import ACTION, PlannedMotion
 from cosfly.runtime.arrays import parse_array, parse_picture
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import atomic_file

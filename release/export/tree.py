@@ -22,8 +22,8 @@ import numpy as np
 
 from cosfly.formats.boxes import UNKNOWN_LICENCE
 from cosfly.formats.frames import BYSTANDER_COLUMNS, COORDINATES, FILE_NAMES, frame_name
-from cosfly.formats.goals import Goal
 from cosfly.formats.pedestrian_paths import pace_field
+from cosfly.formats.people import Goal
 from cosfly.formats.places import TOWN
 from cosfly.formats.playback import LEGIBILITY, TARGET_FILE, Track, write_track
 from cosfly.formats.segments import FOLLOW, Segment

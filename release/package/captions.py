@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from cosfly.formats.actions import ACTIONS, not_in_set
-from cosfly.formats.captions import Caption, caption_lines
+from cosfly.formats.captions import ACTIONS, Caption, caption_lines, not_in_set
 from cosfly.formats.places import sample_id
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.escaping import published_name

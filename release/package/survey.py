@@ -12,7 +12,7 @@ import numpy as np
 from cosfly.formats.frames import FRAMES_DIR, frame_name, read_meta
 from cosfly.formats.places import TrackName
 from cosfly.formats.playback import Track, read_track
-from cosfly.formats.splits import Course, town_family, walks_of
+from cosfly.geometry.splits import Course, town_family, walks_of
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.errors import InputError
 from release.columns import Placement, SplitName
@@ -77,7 +77,7 @@ def survey(
                     candidate.trajectory,
                     candidate.place.town,
                     flight.time_s,
-                    flight.targets_m - flight.target_offsets_m,
+                    flight.targets_m - flight.perturbation.target_m,
                 )
 
     walks = walks_of(courses())

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cosfly.formats.coverage import Coverage
+from cosfly.geometry.coverage import Coverage
 from cosfly.runtime.console import progress_bar
 from cosfly.runtime.escaping import for_markdown
 from cosfly.runtime.io import write_bytes

@@ -9,9 +9,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from cosfly.formats.actions import ACTIONS, TOKENS
-from cosfly.formats.answer_text import MIN_CHARACTERS, MIN_CHARACTERS_ZH
-from cosfly.formats.captions import FIELDS
+from cosfly.formats.captions import ACTIONS, FIELDS, TOKENS
 from cosfly.formats.frames import LEVEL_NAMES
 from cosfly.formats.weather import TIMES, WEATHERS, preset_token
 from cosfly.geometry.trajectory_metrics import (
@@ -20,6 +18,7 @@ from cosfly.geometry.trajectory_metrics import (
     JERK_RMS_MAX_MPS3,
     smoothness_score,
 )
+from cosfly.llm.answer_text import MIN_CHARACTERS, MIN_CHARACTERS_ZH
 from cosfly.runtime.json_io import Record
 from release.card.numbers import Sum, bounded, spread_of
 from release.columns import LANGUAGE_NAMES, LANGUAGES

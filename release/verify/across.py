@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cosfly.formats.splits import town_family
+from cosfly.geometry.splits import town_family
 from release.flight_rows import FlightRows
 from release.verify.findings import Findings
 

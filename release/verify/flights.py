@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from cosfly.formats.actions import TOKENS
+from cosfly.formats.captions import TOKENS
 from cosfly.formats.frames import LEGIBLE_CONTRAST, LEGIBLE_HEIGHT_PX, LEGIBLE_SHARE
 from cosfly.formats.shown_captions import CaptionReader
 from cosfly.geometry.axes import BODY_FROM_CAMERA

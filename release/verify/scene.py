@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from cosfly.formats.frames import PERSON_ID, SKY_DEPTH_M, FrameFile, depth_values
-from cosfly.formats.goals import LANDMARKS, SeenFrame, meant, target_picture, words_of
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.png import colours_of
 from cosfly.geometry.axes import BODY_FROM_CAMERA
+from cosfly.geometry.goals import LANDMARKS, SeenFrame, meant, target_picture, words_of
 from cosfly.geometry.reprojection import (
     COLUMNS,
     GRID_ROWS,

@@ -19,7 +19,7 @@ from typing import Any
 
 from cosfly.formats.playback import ORIGINAL
 from cosfly.formats.shown_captions import CaptionReader
-from cosfly.formats.splits import town_family
+from cosfly.geometry.splits import town_family
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.io import CHECKSUMS, open_file, read_bytes, read_checksums, sha256_file

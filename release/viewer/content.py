@@ -15,8 +15,8 @@ from pydantic import BaseModel, Field
 from cosfly.formats.boxes import BoxMap
 from cosfly.formats.captions import Coc, Language
 from cosfly.formats.kinds import GROUND_KINDS, KIND_NAMES
-from cosfly.formats.sentences import sentences_of
 from cosfly.geometry.axes import box_corners
+from cosfly.llm.answer_text import sentences_of
 from cosfly.runtime.config import Config
 from cosfly.runtime.errors import InputError
 from cosfly.viz.frame_views import View, small_jpeg

@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from caption.run.windows import current_frames, cut_future, label_motion, order_comes_within
 from caption.schema import WindowConfig
 from caption.truth.actions import TABLE, measure
-from cosfly.formats.actions import TOKENS
+from cosfly.formats.captions import TOKENS
 from cosfly.formats.pedestrian_paths import walk_id
 from cosfly.formats.playback import Track
 from cosfly.formats.traces import DroneTrace
@@ -65,9 +65,10 @@ def flight_of(trace: DroneTrace) -> Track:
     pitch, yaw = np.degrees(look_at(trace.positions_m, trace.targets_m))
     aside = np.abs(wrap_deg(yaw - trace.rotations_deg[:, 1])), np.abs(pitch - trace.rotations_deg[:, 0])
     visible = (trace.visibility > 0) & (aside[0] < HALF_VIEW_DEG[0]) & (aside[1] < HALF_VIEW_DEG[1])
+    flight = make_flight(len(trace.time_s))[0]
     return replace(
-        make_flight(len(trace.time_s))[0], time_s=trace.time_s, positions_m=trace.positions_m,
-        rotations_deg=trace.rotations_deg, targets_m=trace.targets_m, target_visible=visible,
+        flight, time_s=trace.time_s, positions_m=trace.positions_m,
+        rotations_deg=trace.rotations_deg, targets_m=trace.targets_m, target=replace(flight.target, visible=visible),
         segments=trace.segments, mission=trace.mission,
     )  # fmt: skip
 

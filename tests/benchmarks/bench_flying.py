@@ -21,8 +21,8 @@ from caption.schema import CaptionConfig
 from cosfly import load_map
 from cosfly.closed_loop import stage
 from cosfly.closed_loop.settings import FlyConfig
-from cosfly.formats.actions import TOKENS
 from cosfly.formats.boxes import write_boxes
+from cosfly.formats.captions import TOKENS
 from cosfly.pedestrians import stage as pedestrians
 from cosfly.pedestrians.walkable import PedestriansConfig
 from cosfly.planners.contract import PlanConfig

@@ -19,8 +19,7 @@ from typing import Any
 from cosfly.closed_loop import stage
 from cosfly.closed_loop.measures import score_pursuits
 from cosfly.closed_loop.pilots import Outlook, PilotAnswer, open_pilot
-from cosfly.formats.actions import TOKENS
-from cosfly.formats.captions import read_captions
+from cosfly.formats.captions import TOKENS, read_captions
 from cosfly.formats.flight_scores import SCORE, SCORE_FORMAT
 from cosfly.formats.pursuits import PURSUITS, read_pursuit
 from cosfly.formats.traces import read_traces

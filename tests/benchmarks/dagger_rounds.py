@@ -28,8 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from teacher_server import TeacherServer
 
-from cosfly.formats.actions import TOKENS
-from cosfly.formats.captions import read_captions
+from cosfly.formats.captions import TOKENS, read_captions
 
 TOKENS = TOKENS
 TUPLE, FRAMES = re.compile(r"\(([-\d.,; ]+)\)"), 5

@@ -8,9 +8,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cosfly.formats.boxes import BoxMap
-from cosfly.formats.ground import Ground
 from cosfly.formats.kinds import KINDS
 from cosfly.geometry.axes import rotation_matrices
+from cosfly.geometry.ground import Ground
 from cosfly.render.contract import (
     LAYER_STEP,
     NO_INSTANCE,

@@ -17,7 +17,6 @@ from cosfly.formats.captions import Language
 from cosfly.formats.frames import PERSON_ID
 from cosfly.formats.kinds import KINDS
 from cosfly.formats.people import COLORS, FIGURES, GARMENTS, Appearance, Words
-from cosfly.runtime.errors import InputError
 
 # What is large is said first. Slot -> how Chinese says that it is worn; what both languages say of nothing there.
 SLOTS = {"top": ("穿",), "legs": ("穿",), "bag": ("背", "no bag", "不带包"), "hat": ("戴", "no hat", "不戴帽子")}
@@ -32,30 +31,9 @@ LANDMARKS = {
     "TrafficLight": ("traffic light", "红绿灯", -np.inf), "Fences": ("fence", "栅栏", -np.inf),
     "Buildings": ("building", "建筑", -np.inf),
 }  # fmt: skip
-ORDER = ("figure", *SLOTS, *SIDES, *LANDMARKS)
 PICTURE_PX, ROOM_SHARE, ROOM_PX = 160, 0.25, 8  # of a target picture: longer side at least; room round a person
 _WITH = (("in", ("top", "legs")), ("with", ("bag", "hat")))
 BY_M, BY_MARGIN_M = 4.0, 2.0  # who is as near as this is by something; who is not is so much farther
-
-
-@dataclass(frozen=True)
-class Goal:
-    """Whom to follow, in words that are true of the target alone in one frame. says: of ORDER, what they say."""
-
-    frame: int
-    en: str
-    zh: str
-    says: tuple[str, ...]
-
-    @classmethod
-    def from_json(cls, record: object, num_frames: int, where: str) -> Goal:
-        """Read the goal of a flight; raises InputError where it is none."""
-        match record:
-            case {"frame": int(frame), "en": str(en), "zh": str(zh), "says": list(says)} if 0 <= frame < num_frames:
-                if says == [one for one in ORDER if one in says] and {*says} & {*SLOTS}:
-                    return cls(frame, en, zh, tuple(says))
-        expected = f"frame, en, zh, and says, of {', '.join(ORDER)}"
-        raise InputError("no goal", where=where, got=repr(record)[:80], expected=expected)
 
 
 @dataclass(frozen=True)

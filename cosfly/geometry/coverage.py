@@ -15,9 +15,6 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field, field_validator
 
-from cosfly.formats.pedestrian_paths import TARGET_HEIGHT_M
-from cosfly.formats.playback import Track
-from cosfly.formats.weather import preset_token
 from cosfly.runtime.json_io import Record, read_json, validated
 
 DEFAULT = Path(__file__).with_name("default_coverage.json")
@@ -99,7 +96,7 @@ class Coverage(Record):
         """Count frames: values, (n,) of each axis, NaN where unknown; style and pace of each; labels of those that have
         one; weather and time of day of each, None where nobody says.
         """
-        pairs = [(weather and preset_token(weather), time and preset_token(time)) for weather, time in skies]
+        pairs = list(skies)
         weathers, times = ([pair[k] for pair in pairs if pair[k] is not None] for k in (0, 1))
         both = [PAIR.join((weather, time)) for weather, time in pairs if weather is not None and time is not None]
         named = [dict(sorted(Counter(names).items())) for names in (styles, paces, labels, weathers, times, both)]
@@ -135,29 +132,25 @@ def azimuths_deg(offsets_m: np.ndarray, headings_deg: np.ndarray) -> np.ndarray:
 
 
 def axis_values(
-    offsets_m: np.ndarray, headings_deg: np.ndarray, target_heights_px: np.ndarray, visibility: np.ndarray
+    offsets_m: np.ndarray,
+    headings_deg: np.ndarray,
+    target_heights_px: np.ndarray,
+    visibility: np.ndarray,
+    hip_height_m: float,
 ) -> dict[str, np.ndarray]:
     """Return the value of each axis at each frame, NaN where unknown.
 
     Args:
-        offsets_m: (n, 3) from person to drone. headings_deg: (n,), of the walk. target_heights_px, visibility: (n,).
+        offsets_m: (n, 3) from the hip of the target to the drone. headings_deg: (n,), of the target.
+        target_heights_px, visibility: (n,).
     """
     return {
-        "height_m": offsets_m[:, 2] + TARGET_HEIGHT_M,
+        "height_m": offsets_m[:, 2] + hip_height_m,
         "distance_m": np.linalg.norm(offsets_m, axis=1),
         "azimuth_deg": azimuths_deg(offsets_m, headings_deg),
         "target_height_px": target_heights_px,
         "visibility": visibility,
     }
-
-
-def coverage_of(flight: Track) -> Coverage:
-    """Count the frames of a flight."""
-    box = flight.target_bbox if flight.target_mask_bbox is None else flight.target_mask_bbox
-    offsets_m = flight.positions_m - flight.targets_m
-    values = axis_values(offsets_m, flight.target_headings_deg, box[:, 3] - box[:, 1], flight.visibility)
-    sky = flight.weather["weather"], flight.weather["time_of_day"]
-    return Coverage.of(values, flight.styles, [flight.pace] * len(flight), skies=[sky] * len(flight))
 
 
 @cache

@@ -6,15 +6,8 @@ Triangles, not a bilinear surface: they are what renderers draw, so that feet, r
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
-from pydantic import Field, model_validator
-
-from cosfly.formats.columns import LARGEST
-from cosfly.runtime.json_io import Record
-
-Height = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 
 
 @dataclass(frozen=True)
@@ -126,29 +119,3 @@ class Ground:
         half = np.abs(np.einsum("nij,nki->nkj", turns, offsets)).max(axis=1)
         half[:, 2] = (middle_z - self.heights_m.min() + 2.0) / 2  # down to the lowest ground: nobody flies under a hill
         return tops - turns[:, :, 2] * half[:, 2:], half, turns
-
-
-class GroundGrid(Record):
-    """Ground that slopes, in the header of `boxes_3d.json`. heights_m: rows from south to north, each from west to
-    east."""
-
-    west_m: Height
-    south_m: Height
-    cell_m: float = Field(gt=0, le=LARGEST)
-    heights_m: list[list[Height]] = Field(min_length=2)
-
-    @model_validator(mode="after")
-    def _rows_are_even(self) -> GroundGrid:
-        lengths = {len(row) for row in self.heights_m}
-        if len(lengths) != 1 or lengths.pop() < 2:
-            raise ValueError("the rows of heights_m are not of one length of at least two")
-        return self
-
-    def ground(self) -> Ground:
-        return Ground(np.array(self.heights_m, dtype=np.float64), self.west_m, self.south_m, self.cell_m)
-
-    @classmethod
-    def of(cls, ground: Ground) -> GroundGrid:
-        """Return the record of a ground, heights to a millimetre."""
-        rows = np.round(ground.heights_m, 3).tolist()
-        return cls(west_m=ground.west_m, south_m=ground.south_m, cell_m=ground.cell_m, heights_m=rows)

@@ -16,9 +16,9 @@ from typing import Literal
 
 import numpy as np
 
+from cosfly.formats.predictions import Split
 from cosfly.runtime.errors import InputError
 
-Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = ("train", "val", "test")  # the order in which scarce groups are handed out
 
 OTHER_BUILD = "_Opt"  # what the name of a town's other build ends with
