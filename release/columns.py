@@ -311,10 +311,10 @@ FRAME = (  # everything of a frame but pictures and depth
     Column("target_visible", "bool", lambda f, i: f.target.visible[i], required=True),
     Column("visibility", "float64", lambda f, i: f.target.visibility[i], ranges=NONE_TO_ONE),
     Column(
-        "target_height_px", "float64", lambda f, i: f.told_legibility(i)["height_px"], ranges={"": (0.0, 100_000.0)},
+        "target_height_px", "float64", lambda f, i: f.legibility_at(i)["height_px"], ranges={"": (0.0, 100_000.0)},
     ),
-    Column("target_contrast", "float64", lambda f, i: f.told_legibility(i)["contrast"], ranges={"": (0.0, 300.0)}),
-    Column("target_legible", "bool", lambda f, i: f.told_legibility(i)["legible"]),
+    Column("target_contrast", "float64", lambda f, i: f.legibility_at(i)["contrast"], ranges={"": (0.0, 300.0)}),
+    Column("target_legible", "bool", lambda f, i: f.legibility_at(i)["legible"]),
     Column("others_in_view", "int32", partial(_of_company, 0), title="other people in view", shown=True),
     Column(
         "other_distance_m", "float64", lambda f, i: None if f.bystanders is None else f.bystanders[i, 1],

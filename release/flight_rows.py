@@ -14,7 +14,7 @@ from cosfly.formats.frames import Camera
 from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.formats.people import Goal, People, read_goal
 from cosfly.formats.playback import EVENTS, Perturbation, TargetRecord, Track
-from cosfly.formats.shown_captions import ShownCaption, ShownFlight
+from cosfly.formats.shown_captions import ReleasedTrack, ShownCaption
 from cosfly.geometry.axes import BODY_FROM_CAMERA, CORNER_SIGNS, rotation_matrices
 from cosfly.runtime.json_io import parse_document, validated
 from release.columns import BOX, COMPANY_COLUMNS, INTRINSICS, POINT, POSE, between_of, matrices_of
@@ -162,12 +162,12 @@ class FlightRows:
             else np.stack([self.numbers(name) for name in COMPANY_COLUMNS], axis=1),
         )  # fmt: skip
 
-    def shown(self, twin: FlightRows | None, settings: dict[str, Any]) -> ShownFlight:
+    def shown(self, twin: FlightRows | None, settings: dict[str, Any]) -> ReleasedTrack:
         """Return what a reader of captions gets. settings: of the captions, as the record has them."""
         captions = [shown_caption(row) for row in self.rows if row.get("has_caption")]
         same = twin is not None and np.array_equal(twin.index, self.index)
         other = twin.flight if twin is not None and same else None
-        return ShownFlight(self.flight, self.index, captions, other, settings)
+        return ReleasedTrack(self.flight, self.index, captions, other, settings)
 
 
 def shown_caption(row: Row) -> ShownCaption:

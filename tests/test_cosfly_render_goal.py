@@ -89,7 +89,7 @@ def test_of_all_in_a_crowd_a_goal_means_the_target_alone(crowded_tree):
         assert len({*people.others} & {*np.unique(ids).tolist()}) > 1, "no crowd"
         assert meant(goal.says, people.target, {PERSON_ID: people.target, **people.others}, seen) == {PERSON_ID}
         assert {"en": goal.en, "zh": goal.zh} == words_of(goal.says, people.target)
-        assert all(not flight.told_legibility(i)["legible"] for i in range(goal.frame)) or goal.frame == 0
+        assert all(not flight.legibility_at(i)["legible"] for i in range(goal.frame)) or goal.frame == 0
         shown = read_picture(flight.folder / TARGET_FILE, tree=tree)
         expected = target_picture(read_rgb(frame), flight.target.mask_bbox[goal.frame].tolist())
         np.testing.assert_array_equal(cv2.cvtColor(shown, cv2.COLOR_BGR2RGB), expected)

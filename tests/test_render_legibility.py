@@ -44,7 +44,7 @@ def test_legibility_is_of_the_picture_as_written(tmp_path):
         tree = run(build(RenderConfig, size | more, "test"), boxes, simplified, traces, tmp_path / name)
         (folder,) = find_tracks(tree)
         flight = read_track(folder)
-        found[name] = flight.told_legibility(1)
+        found[name] = flight.legibility_at(1)
         told = read_meta(folder / frame_name(1)).target
         assert found[name] == told.model_dump(include=set(found[name]))
         assert flight.target.visible.all()

@@ -15,12 +15,12 @@ from caption.schema import FutureMotion
 from caption.teachers.prompts import mission_lines
 from caption.truth.actions import TABLE, ActionTable, Motion, Thresholds, measure
 from cosfly.formats.captions import ORDERS
-from cosfly.formats.shown_captions import Lie, ShownCaption, ShownFlight
+from cosfly.formats.shown_captions import Mismatch, ReleasedTrack, ShownCaption
 
 NUDGE = 1e-9  # of a threshold: rounding error of subtracting the offsets again
 
 
-def read_released(shown: ShownFlight) -> list[Lie]:
+def read_released(shown: ReleasedTrack) -> list[Mismatch]:
     """Return the labels and verdicts of a flight's captions that its frames do not give."""
     rows = {int(index): row for row, index in enumerate(shown.frame_indices)}
     motion = label_motion(shown.flight, shown.twin)
@@ -36,14 +36,16 @@ def _has_order(caption: ShownCaption) -> bool:
     )
 
 
-def _label_lies(shown: ShownFlight, motion: LabelMotion, caption: ShownCaption, rows: dict[int, int]) -> list[Lie]:
+def _label_lies(
+    shown: ReleasedTrack, motion: LabelMotion, caption: ShownCaption, rows: dict[int, int]
+) -> list[Mismatch]:
     """Compare label and verdict with the frames after the window, where these are released."""
     where = f"{caption.sample_id}: label"
     is_order = caption.label in ORDERS
     has_order = _has_order(caption)
     if caption.prompts and is_order != has_order:
         got = f"{caption.label}, and {'an order' if has_order else 'no order'} in the prompt"
-        return [Lie("label", where, got, "an order as label exactly where the prompt tells of one")]
+        return [Mismatch("label", where, got, "an order as label exactly where the prompt tells of one")]
     num_future = int(shown.settings.get("window", {}).get("future_frames", 5))
     future = _future(shown, motion, caption, rows, num_future)
     if future is None:
@@ -53,13 +55,13 @@ def _label_lies(shown: ShownFlight, motion: LabelMotion, caption: ShownCaption, 
     measured = measure(future)
     label = TABLE.label_of(measured)
     if label != caption.label and caption.label not in _nearly(measured):
-        return [Lie("label", where, str(caption.label), f"{label}, which the frames after the window show")]
+        return [Mismatch("label", where, str(caption.label), f"{label}, which the frames after the window show")]
     if caption.verdict is None:
         return []
     verdict = TABLE.verdict_of(caption.decision, measured, caption.label)
     if verdict != caption.verdict:
         got = f"{caption.verdict} for {caption.decision} (label {caption.label})"
-        return [Lie("verdict", f"{caption.sample_id}: verdict", got, f"{verdict}, by the frames after the window")]
+        return [Mismatch("verdict", f"{caption.sample_id}: verdict", got, f"{verdict}, by the frames after the window")]
     return []
 
 
@@ -71,7 +73,7 @@ def _nearly(measured: Motion) -> set[str | None]:
 
 
 def _future(
-    shown: ShownFlight, motion: LabelMotion, caption: ShownCaption, rows: dict[int, int], num_future: int
+    shown: ReleasedTrack, motion: LabelMotion, caption: ShownCaption, rows: dict[int, int], num_future: int
 ) -> FutureMotion | None:
     """Return the motion after a window from the released rows; None where one of its frames is not released."""
     found = [rows.get(caption.frame_index + k) for k in range(-1, num_future + 1)]

@@ -13,8 +13,8 @@ from cosfly.formats.pedestrian_paths import PERSON_HALF_EXTENTS_M
 from cosfly.runtime.errors import InputError
 from cosfly.runtime.json_io import FileFormat
 
-OTHERS_FILE = "others.json"
-OTHERS_FORMAT = FileFormat("cosfly.others", "1.0", "others")
+BYSTANDERS_FILE = "others.json"
+BYSTANDERS_FORMAT = FileFormat("cosfly.others", "1.0", "others")
 
 
 @dataclass(frozen=True)
@@ -112,9 +112,9 @@ class Bystanders:
 
 def write_bystanders(path: Path, companions: list[Bystanders], header: dict) -> None:
     """Write `others.json`; `header` holds the map's name, the seed and the time step."""
-    write_items(path, OTHERS_FORMAT, "paths", companions, header)
+    write_items(path, BYSTANDERS_FORMAT, "paths", companions, header)
 
 
 def read_bystanders(path: Path) -> list[Bystanders]:
     """Read `others.json`."""
-    return read_items(path, OTHERS_FORMAT, "paths", Bystanders.from_json)
+    return read_items(path, BYSTANDERS_FORMAT, "paths", Bystanders.from_json)

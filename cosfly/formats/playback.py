@@ -225,7 +225,7 @@ class Track:
         points = self.raw.get("points", [])
         return object_of(points[index], key) if index < len(points) else {}
 
-    def told_legibility(self, index: int) -> dict[str, float | bool | None]:
+    def legibility_at(self, index: int) -> dict[str, float | bool | None]:
         """Return the LEGIBILITY fields of a point; None where the file does not say."""
         point = self._point(index, "target")
         return {name: v if isinstance(v := point.get(name), bool) or is_number(v) else None for name in LEGIBILITY}

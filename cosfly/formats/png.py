@@ -24,7 +24,7 @@ RGB, RGBA = 3, 4
 NONE, SUB, UP, AVERAGE, PAETH = range(5)  # filters
 LEVEL = 1
 FIRST = 16  # bytes that are packed apart from the rest
-NOT_UNPACKED: Any = zlib.error  # its stub says that it is no class
+UNPACK_ERROR: Any = zlib.error  # its stub says that it is no class
 
 
 class Png(NamedTuple):
@@ -45,7 +45,7 @@ def parse_png(data: bytes | memoryview, where: object) -> Png:
     unpacker = zlib.decompressobj()
     try:
         found = unpacker.decompress(packed, height * stride + 1)  # one more than there may be, so that more is noticed
-    except NOT_UNPACKED as error:
+    except UNPACK_ERROR as error:
         raise _broken(where, f"a compressed stream that does not unpack: {error}") from None
     if len(found) != height * stride or not unpacker.eof:
         raise _broken(where, "a compressed stream that does not unpack to the picture")

@@ -28,7 +28,7 @@ class ShownCaption:
 
 
 @dataclass(frozen=True)
-class ShownFlight:
+class ReleasedTrack:
     """The released part of a track. flight: of the frames `frame_indices`, (n,), ascending, possibly with gaps. twin:
     the clean track of a perturbed one with the same frames, None if not released. settings: of the captions as
     recorded; empty means the defaults."""
@@ -40,7 +40,7 @@ class ShownFlight:
     settings: dict[str, Any]
 
 
-class Lie(NamedTuple):
+class Mismatch(NamedTuple):
     """A contradiction, in the words of a finding."""
 
     code: str
@@ -49,4 +49,4 @@ class Lie(NamedTuple):
     expected: str
 
 
-CaptionReader = Callable[[ShownFlight], list[Lie]]
+CaptionReader = Callable[[ReleasedTrack], list[Mismatch]]

@@ -27,7 +27,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from cosfly.formats.boxes import read_boxes
-from cosfly.formats.bystanders import OTHERS_FILE, Bystanders, write_bystanders
+from cosfly.formats.bystanders import BYSTANDERS_FILE, Bystanders, write_bystanders
 from cosfly.formats.pedestrian_paths import PedestrianTrajectory, pace_field, paces_of, walk_id, write_paths
 from cosfly.formats.roi import read_roi
 from cosfly.geometry.ground import Ground
@@ -354,7 +354,7 @@ def run(
         write_paths(product, paths, {"map": box_map.name, "seed": seed, "settings": settings})
         if cfg.has_others:
             header = {"map": box_map.name, "seed": seed, "dt_s": cfg.dt_s}
-            outputs.append(out / OTHERS_FILE)
+            outputs.append(out / BYSTANDERS_FILE)
             summary["others"] = _write_companies(outputs[-1], [result.bystanders for result in results], header, cfg)
         write_json(out / "pedestrians_report.json", summary)
         share = summary["total"]["on_carriageway_share"]

@@ -24,7 +24,7 @@ import cosfly.planners.stage
 import cosfly.render.stage
 import cosfly.simplify.stage
 import release.package.stage
-from cosfly.formats.bystanders import OTHERS_FILE
+from cosfly.formats.bystanders import BYSTANDERS_FILE
 from cosfly.pipeline.command_settings import worker_options
 from cosfly.pipeline.settings import RunConfig
 from cosfly.runtime.errors import ConfigError, CosflyError, InputError, ResumeError
@@ -64,7 +64,7 @@ def stages(cfg: RunConfig, out: Path, *, resume: Resume = "if-same", into: Path 
     seed, pool = cfg.seed, worker_options(cfg)
     boxes, simplified = out / "maps/boxes_3d.json", out / "simplify/step2_simplified.json"
     paths, traces, tree = out / "pedestrians/path.json", out / "plan/drone_trace.json", out / "render"
-    others = paths.with_name(OTHERS_FILE) if cfg.pedestrians.has_others else None
+    others = paths.with_name(BYSTANDERS_FILE) if cfg.pedestrians.has_others else None
     inspected, captions = out / "inspect/inspect.json", out / "caption/captions.jsonl"
 
     def stage(name: str, product: Path, run: Callable[..., Path], *inputs: Any, **options: Any) -> Stage:

@@ -254,7 +254,7 @@ def _with_goal(flight: Track, renderer: Renderer, script: TrackScript, threshold
     if not renderer.dresses:
         return replace(flight, people=None, raw=flight.raw | {"goal": {"absent": "clothes_unknown"}})
     poses, people = script.perturbed.poses, script.others.people(script.clothes.looks)
-    legible = [i for i in range(len(flight)) if flight.told_legibility(i)["legible"]]
+    legible = [i for i in range(len(flight)) if flight.legibility_at(i)["legible"]]
     for i in legible[:MOST_TRIED]:
 
         def draw(looks: Appearance, i: int = i) -> Frame:
