@@ -221,7 +221,7 @@ class StudentConfig(Config):
         description="what `distill train` or `distill merge` wrote; it decides windows, pictures, prompts and "
         "sampling. Empty: the teacher is none",
     )
-    max_new_tokens: int = Field(MAX_ANSWER_TOKENS, ge=1, description="longest answer, tokens")
+    max_new_tokens: ClassVar[int] = MAX_ANSWER_TOKENS  # longest answer
     constrained: bool = Field(False, description="hold its answers to their JSON schema")
     run: str | None = Field(
         None,

@@ -116,7 +116,7 @@ def test_a_signal_ends_a_command_and_its_workers_in_one_line(tmp_path, until, nu
     os.killpg(process.pid, number)  # what a terminal and a service manager do
     text, _ = process.communicate(timeout=60)
     assert process.returncode == 128 + number
-    assert text.splitlines() == [f"error: {word}; finished work is kept: run the same command again to continue"]
+    assert text.splitlines() == [f"error: {word}; finished work is kept; run the same command again to resume"]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc")
