@@ -106,10 +106,13 @@ def test_what_is_the_servers_fault_ends_the_run_and_is_no_windows(tree, tmp_path
         assert run(settings(server.url), tree, out).read_bytes() == whole.product
 
 
-def test_a_server_that_refuses_every_window_ends_the_run_and_retry_failed_asks_again(tree, tmp_path, whole):
+def test_a_server_that_refuses_every_window_ends_the_run_and_retry_failed_asks_again(
+    tree, tmp_path, whole, monkeypatch
+):
+    monkeypatch.setattr("caption.run.asking.STOP_AFTER_FAILURES", 3)
     out, behaviour = tmp_path / "out", Switched(400, NOT_KNOWN)
     with hovering(behaviour) as server:
-        cfg = settings(server.url, endpoint={"concurrency": 1, "stop_after_failures": 3})
+        cfg = settings(server.url, endpoint={"concurrency": 1})
         with pytest.raises(TeacherError) as caught:
             run(cfg, tree, out)
         assert NOT_KNOWN in str(caught.value)

@@ -1,6 +1,7 @@
 """The documents are true: every command has help and stands in the README, and what they name exists."""
 
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -39,9 +40,11 @@ def test_there_are_commands():
     assert {("run",), ("caption",), ("release", "verify"), ("config", "check"), ("distill", "train")} <= words
 
 
-def test_every_command_has_help_and_stands_in_the_reference():
+def test_every_command_has_help_an_example_and_stands_in_the_reference():
     for path, command in COMMANDS:
         assert command.help, path
+        assert (command.epilog or "").startswith(f"cosfly {' '.join(path)}"), f"{path} has no example"
+        command.make_context("cosfly", shlex.split(command.epilog)[1 + len(path) :])  # it parses
         for parameter in command.params:
             assert getattr(parameter, "help", None), f"{path}: {parameter.name} has no help"
         assert f"cosfly {' '.join(path)}" in REFERENCE

@@ -28,6 +28,7 @@ from cosfly.formats.captions import Caption, Usage, read_captions, write_caption
 from cosfly.formats.places import flight_of
 from cosfly.llm.answers import AnswerBook
 from cosfly.llm.budget import BudgetSpent
+from cosfly.llm.client import STOP_AFTER_FAILURES
 from cosfly.llm.contract import NoAnswer, Troubles
 from cosfly.runtime.console import SECONDS_BETWEEN_LINES
 from cosfly.runtime.errors import CosflyError, InputError, TeacherError
@@ -259,7 +260,7 @@ class Asking:
     def _note_failure(self, got: str) -> None:
         """Note a window without an answer, or refused; so many in a row are the server's fault."""
         self.failed_in_row += 1
-        if self.failed_in_row >= self.cfg.endpoint.stop_after_failures:
+        if self.failed_in_row >= STOP_AFTER_FAILURES:
             raise TeacherError(
                 f"{self.failed_in_row} windows in a row got no answer",
                 where=self.cfg.teacher,

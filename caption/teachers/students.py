@@ -60,8 +60,9 @@ def as_taught(cfg: CaptionConfig, vocabulary: Vocabulary) -> CaptionConfig:
         "max_side_px": sides.pop(),
         "depth_range_m": ranges.pop(),
     }
-    sampling = StudentEndpointConfig(max_tokens=cfg.student.max_new_tokens, json_schema=cfg.student.constrained)
-    asked = sampling.model_dump(include={"temperature", "top_p", "max_tokens", "json_schema", "extra_body"})
+    sampling = StudentEndpointConfig()
+    asked = {name: getattr(sampling, name) for name in ("temperature", "top_p", "extra_body")}
+    asked |= {"max_tokens": cfg.student.max_new_tokens, "json_schema": cfg.student.constrained}
     return cfg.model_copy(update={
         "writing": "prose",
         "window": cfg.window.model_copy(update={"num_frames": taught.num_frames}),

@@ -171,7 +171,7 @@ class AskingTeacher:
         except BaseException:
             await self.__aexit__()
             raise
-        sampling = self.cfg.model_dump(include={"temperature", "top_p", "max_tokens", "extra_body"})
+        sampling = {name: getattr(self.cfg, name) for name in ("temperature", "top_p", "max_tokens", "extra_body")}
         settings = TeacherSettings(**sampling, seed=self.seed)
         kind = "student" if self.student else self.engine.kind
         self.record = TeacherRecord(kind=kind, model=self.engine.model, settings=settings)

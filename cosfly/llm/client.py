@@ -13,7 +13,7 @@ import random
 import time
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import httpx
 from pydantic import Field
@@ -38,6 +38,8 @@ from cosfly.runtime.model_json import CONTEXT_FULL
 
 log = logging.getLogger(__name__)
 
+TOTAL_TIMEOUT_S = 900.0  # limit of one answer with all its tries
+STOP_AFTER_FAILURES = 20  # unanswered windows or samples in a row that end a run
 BUSY_STATUS = frozenset({429, 503, 529})
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # after a failure: the pause doubles, with jitter
 MOST_REPLY_MB = 4.0  # of one answer, unpacked
@@ -47,7 +49,7 @@ MOST_SAID = 300  # characters of a server's words that are kept
 class EndpointConfig(Config):
     model: str | None = Field(None, description="model name; empty takes the endpoint's only model")
     temperature: float = Field(0.6, ge=0, le=2, description="sampling temperature; 0 is greedy")
-    top_p: float = Field(0.95, gt=0, le=1, description="nucleus sampling")
+    top_p: ClassVar[float] = 0.95  # nucleus sampling; extra_body may set another
     max_tokens: int = Field(1024, ge=64, description="longest answer, tokens")
     concurrency: MayDiffer[int] = Field(
         16, ge=1, le=4096, description="most requests in flight; fewer while it says it is busy"
@@ -55,13 +57,7 @@ class EndpointConfig(Config):
     timeout_s: MayDiffer[float] = Field(
         120.0, gt=0, description="limit of one request, from its first byte to its last"
     )
-    total_timeout_s: MayDiffer[float] = Field(
-        900.0, gt=0, description="limit of one answer with all its tries, from the first request on"
-    )
     max_tries: MayDiffer[int] = Field(6, ge=1, description="tries of one request when the server is busy or fails")
-    stop_after_failures: MayDiffer[int] = Field(
-        20, ge=1, description="windows in a row without an answer that end the run"
-    )
     json_schema: bool = Field(True, description="ask the server to enforce the answer's JSON schema")
     extra_body: dict[str, Any] = Field(
         default_factory=dict,
@@ -130,7 +126,7 @@ class ChatClient:
         while True:
             async with self._slot():
                 given_s = time.monotonic()
-                deadline_s = min(deadline_s, given_s + self.cfg.total_timeout_s)
+                deadline_s = min(deadline_s, given_s + TOTAL_TIMEOUT_S)
                 found = await self._attempt(request, given_s)
             if isinstance(found, Reply):
                 self.troubles.answered()
@@ -144,7 +140,7 @@ class ChatClient:
                 what = "given up" if is_last or is_late else "trying again"
                 log.warning("%s: %s; %s, failed tries so far: %d", self.where, found.detail, what, self.troubles.num)
             if is_late:
-                words = f"no answer within {self.cfg.total_timeout_s:g} s; the last: {found.detail}"
+                words = f"no answer within {TOTAL_TIMEOUT_S:g} s; the last: {found.detail}"
                 raise NoAnswer("total_timeout", words)
             if is_last:
                 raise NoAnswer(found.cause, found.detail)
@@ -215,7 +211,7 @@ class ChatClient:
             raise self.error(refusal.meaning.what, got=refusal.said, fix=refusal.meaning.fix)
         if refusal.may_pass:
             # Where nobody can wait as long as that, this request is given up and the others are not held.
-            is_long = wait_s is not None and wait_s > self.cfg.total_timeout_s
+            is_long = wait_s is not None and wait_s > TOTAL_TIMEOUT_S
             if status in BUSY_STATUS:
                 self.throttle.was_busy(given_s, None if is_long else wait_s)
             else:

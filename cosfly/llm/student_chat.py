@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from PIL import Image
@@ -33,9 +33,10 @@ MAX_ANSWER_TOKENS = 512  # unless told otherwise: an answer as long as is taught
 class StudentEndpointConfig(EndpointConfig):
     """How a student is asked: greedily and without thinking, as it was taught."""
 
-    temperature: float = Field(0.0, ge=0, le=2, description="sampling temperature; 0 is greedy")
-    top_p: float = Field(1.0, gt=0, le=1, description="nucleus sampling")
-    max_tokens: int = Field(MAX_ANSWER_TOKENS, ge=1, description="longest answer, tokens")
+    temperature: ClassVar[float] = 0.0  # type: ignore[misc]
+    top_p: ClassVar[float] = 1.0
+    max_tokens: ClassVar[int] = MAX_ANSWER_TOKENS  # type: ignore[misc]
+    json_schema: ClassVar[bool] = False  # type: ignore[misc]
     extra_body: dict[str, Any] = Field(
         {"chat_template_kwargs": {"enable_thinking": False}}, description="further fields of the request"
     )

@@ -16,7 +16,7 @@ from pydantic import Field
 from cosfly.formats.predictions import PREDICTIONS, Split
 from cosfly.llm.answer_text import answer_schema
 from cosfly.llm.answers import Answer, AnswerBook, KeptAnswers, answer_key
-from cosfly.llm.client import ChatClient
+from cosfly.llm.client import STOP_AFTER_FAILURES, ChatClient
 from cosfly.llm.contract import Engine, NoAnswer, Request, started
 from cosfly.llm.student_chat import TAUGHT, StudentEndpointConfig, picture_to_send, read_taught, student_request
 from cosfly.llm.vllm_engine import VllmConfig, VllmEngine
@@ -113,7 +113,7 @@ class EngineAnswers:
         if error.is_final:  # the server answers, if only with a refusal
             return
         self._failed_in_row += 1
-        if self._failed_in_row >= self.sampling.stop_after_failures:
+        if self._failed_in_row >= STOP_AFTER_FAILURES:
             words = f"{self._failed_in_row} samples in a row got no answer"
             fix = "see to the server, then run the same command again: nothing answered is asked twice"
             raise TeacherError(words, where=self.engine.where, got=str(error), fix=fix)
