@@ -151,8 +151,8 @@ def draw_levels(levels: dict[float, list[Track]]) -> bytes:
         i, tiles = best_frame(wide[k]), []
         for fov, tracks in levels.items():
             rgb, title = read_rgb(tracks[k].frame_folder(i)).copy(), f"{level_name(fov)} {fov:g} deg"
-            if tracks[k].target_in_view[i]:
-                x0, y0, x1, y1 = tracks[k].target_bbox[i].round().astype(int).tolist()
+            if tracks[k].target.in_view[i]:
+                x0, y0, x1, y1 = tracks[k].target.bbox[i].round().astype(int).tolist()
                 cv2.rectangle(rgb, (x0, y0), (x1, y1), TARGET_COLOR, max(1, rgb.shape[1] // 640))
                 title += f", target {x1 - x0} x {y1 - y0} px"
             tiles.append(_tile(rgb, TILE_WIDTH_PX, title))
