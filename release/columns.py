@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -35,7 +36,6 @@ from cosfly.formats.playback import EVENTS, Track
 from cosfly.formats.weather import WeatherMode, WeatherParams
 from cosfly.geometry.axes import BODY_FROM_CAMERA
 from cosfly.geometry.motion import ACTION
-from cosfly.runtime.escaping import published_name
 from cosfly.runtime.json_io import dump_json
 
 POSE = ("x_m", "y_m", "z_m", "pitch_deg", "yaw_deg", "roll_deg")
@@ -456,3 +456,34 @@ def flight_spans(rows: pa.Table) -> list[tuple[Place, int, int]]:
 def flight_name(place: Place) -> str:
     """Return the name of a flight in the records."""
     return "/".join(map(str, place))
+
+
+# --- published names --------------------------------------------------------------------------------------------------
+
+ADDRESS = re.compile(r"[A-Za-z][\w+.-]*://[^\s,;'\"]*")
+# From the root, a home or a drive; behind letters (`and/or`) it is no path.
+ABSOLUTE = re.compile(r"(?<![\w.])(?:~|[A-Za-z]:)?[\\/][^\s,;'\"]*")
+IS_ABSOLUTE = re.compile(r"~|[\\/]|[A-Za-z]:[\\/]")
+# One slash: a name on the hub.
+RELATIVE = re.compile(r"\.{1,2}[\\/]\S*|[\w.-]+(?:[\\/][\w.-]+){2,}[\\/]?|[\w.-]+\\[\w.-]+")
+
+
+def published_name(text: str) -> str:
+    """Return a text with each path replaced by its last name, and each URL by `an address`."""
+    if IS_ABSOLUTE.match(text) or RELATIVE.fullmatch(text):
+        return _last_name(text)
+    text = ADDRESS.sub("an address", text)
+    return ABSOLUTE.sub(lambda match: _last_name(match.group()), text)
+
+
+def published(value: Any) -> Any:
+    """Return settings with paths and URLs replaced as by `published_name`."""
+    if isinstance(value, str):
+        return published_name(value)
+    if isinstance(value, dict):
+        return {published_name(str(key)): published(member) for key, member in value.items()}
+    return [published(member) for member in value] if isinstance(value, list | tuple) else value
+
+
+def _last_name(path: str) -> str:
+    return next((part for part in reversed(re.split(r"[\\/]", path)) if part.strip("~.")), "a path")

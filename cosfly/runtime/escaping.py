@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import html
 import re
-from typing import Any
 
 LONGEST = 2_000  # characters of one foreign text that a person is shown; the middle of a longer one is cut
 LONGEST_LOG = 20_000  # of one log record, which may be the traceback of a bug
@@ -43,34 +42,3 @@ def markdown_code(text: str) -> str:
     fence = "`" * (max(map(len, runs), default=0) + 1)
     space = " " if runs or not line else ""
     return f"{fence}{space}{line}{space}{fence}"
-
-
-# --- published --------------------------------------------------------------------------------------------------------
-
-ADDRESS = re.compile(r"[A-Za-z][\w+.-]*://[^\s,;'\"]*")
-# From the root, a home or a drive; behind letters (`and/or`) it is no path.
-ABSOLUTE = re.compile(r"(?<![\w.])(?:~|[A-Za-z]:)?[\\/][^\s,;'\"]*")
-IS_ABSOLUTE = re.compile(r"~|[\\/]|[A-Za-z]:[\\/]")
-# One slash: a name on the hub.
-RELATIVE = re.compile(r"\.{1,2}[\\/]\S*|[\w.-]+(?:[\\/][\w.-]+){2,}[\\/]?|[\w.-]+\\[\w.-]+")
-
-
-def published_name(text: str) -> str:
-    """Return a text with each path replaced by its last name, and each URL by `an address`."""
-    if IS_ABSOLUTE.match(text) or RELATIVE.fullmatch(text):
-        return _last_name(text)
-    text = ADDRESS.sub("an address", text)
-    return ABSOLUTE.sub(lambda match: _last_name(match.group()), text)
-
-
-def published(value: Any) -> Any:
-    """Return settings with paths and URLs replaced as by `published_name`."""
-    if isinstance(value, str):
-        return published_name(value)
-    if isinstance(value, dict):
-        return {published_name(str(key)): published(member) for key, member in value.items()}
-    return [published(member) for member in value] if isinstance(value, list | tuple) else value
-
-
-def _last_name(path: str) -> str:
-    return next((part for part in reversed(re.split(r"[\\/]", path)) if part.strip("~.")), "a path")

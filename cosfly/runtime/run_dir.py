@@ -634,27 +634,3 @@ def _check_belongs(name: str, path: Path, inputs: Mapping[str, Path], found: Map
 def _role(name: str) -> str:
     role = name.rpartition(".")[2]
     return ROLES.get(role, role)
-
-
-def stages_behind(products: Iterable[Path]) -> list[StageRecord]:
-    """Return the records of the stages that made some products, each after those of its inputs that are unchanged."""
-    found: set[str] = set()
-    ordered: list[StageRecord] = []
-
-    def visit(record: StageRecord | None) -> None:
-        if record is None:
-            return
-        made_of = sorted((name, entry.sha256) for name, entry in record.inputs.items())
-        known = dump_json([record.stage, record.seed, record.config, made_of])  # without the place on disk
-        if known in found:
-            return
-        found.add(known)
-        for entry in record.inputs.values():
-            before = Path(entry.path)
-            if before.exists() and (earlier := record_of(before)) and fingerprint(before) == entry.sha256:
-                visit(earlier)
-        ordered.append(record)
-
-    for path in products:
-        visit(record_of(path))
-    return ordered

@@ -11,10 +11,9 @@ from pathlib import Path
 from cosfly.formats.captions import ACTIONS, Caption, caption_lines, not_in_set
 from cosfly.formats.places import sample_id
 from cosfly.runtime.errors import InputError
-from cosfly.runtime.escaping import published_name
 from cosfly.runtime.io import read_span
 from cosfly.runtime.json_io import dump_json, parse_document, parse_json, validated
-from release.columns import LANGUAGES
+from release.columns import LANGUAGES, published_name
 
 FlightKey = tuple[str, str, str]  # town's folder, trajectory, variant
 Span = tuple[int, int]  # first byte and size of lines that stand one after the other

@@ -7,7 +7,7 @@ import os
 import platform
 import shutil
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +15,13 @@ import pyarrow as pa
 
 import cosfly
 from cosfly.runtime.errors import VerifyError
-from cosfly.runtime.escaping import published
 from cosfly.runtime.io import sha256_file, write_bytes, write_checksums
-from cosfly.runtime.run_dir import StageInput, stages_behind
+from cosfly.runtime.json_io import dump_json
+from cosfly.runtime.run_dir import StageInput, StageRecord, fingerprint, record_of
 from release import columns
 from release.card.croissant import CROISSANT, render_croissant
 from release.card.render import render_card
+from release.columns import published
 from release.package.captions import CaptionAccount, teacher_settings
 from release.package.config import ReleaseConfig
 from release.package.plan import ReleasePlan
@@ -98,6 +99,30 @@ def _source(source: Source, names: dict[str, str], inputs: Mapping[str, StageInp
             for record in stages_behind(source.files.values())
         ],
     )
+
+
+def stages_behind(products: Iterable[Path]) -> list[StageRecord]:
+    """Return the records of the stages that made some products, each after those of its inputs that are unchanged."""
+    found: set[str] = set()
+    ordered: list[StageRecord] = []
+
+    def visit(record: StageRecord | None) -> None:
+        if record is None:
+            return
+        made_of = sorted((name, entry.sha256) for name, entry in record.inputs.items())
+        known = dump_json([record.stage, record.seed, record.config, made_of])  # without the place on disk
+        if known in found:
+            return
+        found.add(known)
+        for entry in record.inputs.values():
+            before = Path(entry.path)
+            if before.exists() and (earlier := record_of(before)) and fingerprint(before) == entry.sha256:
+                visit(earlier)
+        ordered.append(record)
+
+    for path in products:
+        visit(record_of(path))
+    return ordered
 
 
 def account_for(plan: ReleasePlan, written: list[ShardResult]) -> History:
